@@ -1,0 +1,25 @@
+"""The errors a user can cause or meet; each message carries the value, the limit and the valid names."""
+
+
+class IdentifyError(Exception):
+    """Base of every error that the command line shows as one line."""
+
+
+class ScenarioError(IdentifyError):
+    """A scenario that does not exist, cannot be read or contradicts itself."""
+
+
+class TrajectoryError(IdentifyError):
+    """A trajectory that leaves the robot's reach or its travel, or cannot be read."""
+
+
+class FilterError(IdentifyError):
+    """A filter that the sampling rate or the length of the record does not allow."""
+
+
+class RecordError(IdentifyError):
+    """A recorded file that is truncated, incomplete or of the wrong shape."""
+
+
+class OutputFolderError(IdentifyError):
+    """A run folder that already holds something, or lacks what an earlier stage writes."""

@@ -1,0 +1,68 @@
+"""Progress of the stages of a run: bars with the time left on a terminal, one plain line a stage elsewhere."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as RichBars
+
+Advance = Callable[..., None]
+"""``advance(n=1)``: n more steps of the stage are done."""
+
+
+class Progress(Protocol):
+    """What a stage needs to tell how far it is."""
+
+    def stage(self, name: str, total: int) -> AbstractContextManager[Advance]:
+        """Open a stage of ``total`` steps; the context yields ``advance(n=1)``."""
+        ...
+
+
+class SilentProgress:
+    """Says nothing."""
+
+    @contextmanager
+    def stage(self, name: str, total: int) -> Iterator[Advance]:
+        """Open a stage whose progress nobody sees."""
+        yield lambda n=1: None
+
+
+class RichProgress:
+    """Bars with elapsed time and time left; a plain line for each finished stage when not on a terminal."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = console or Console(stderr=True)
+
+    def stage(self, name: str, total: int) -> AbstractContextManager[Advance]:
+        """Open a stage of ``total`` steps."""
+        return self._bar(name, total) if self._console.is_terminal else self._line(name, total)
+
+    @contextmanager
+    def _bar(self, name: str, total: int) -> Iterator[Advance]:
+        columns = (
+            TextColumn("{task.description:<28}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+        )
+        with RichBars(*columns, console=self._console) as bars:
+            task = bars.add_task(name, total=total)
+            yield lambda n=1: bars.advance(task, n)
+
+    @contextmanager
+    def _line(self, name: str, total: int) -> Iterator[Advance]:
+        done = 0
+
+        def advance(n: int = 1) -> None:
+            nonlocal done
+            done += n
+
+        start = time.perf_counter()
+        yield advance
+        seconds = time.perf_counter() - start
+        self._console.print(f"{name}: {done} of {total} in {seconds:.1f} s", highlight=False, soft_wrap=True)

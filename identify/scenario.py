@@ -1,0 +1,245 @@
+"""A scenario: everything that decides a synthetic experiment, read from TOML and checked as a whole.
+
+Each field states its unit; an error names the key, the value, the unit and, for a wrong name, the valid names.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from identify.errors import ScenarioError
+from identify.scenario_text import one_line, to_toml
+
+BUILT_IN = Path(__file__).parent / "scenarios"
+
+FrictionLaw = Literal["coulomb_viscous", "smoothed"]
+"""``coulomb_viscous``: the exact law with stick and slip (eq. 24); ``smoothed``: tanh(theta_dot / v_s)."""
+
+
+def _quantity(default: Any, unit: str, what: str, **limits: Any) -> Any:
+    return Field(default, description=what, json_schema_extra={"unit": unit}, **limits)
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class Timing(_Section):
+    """Sampling of the pose sensor and of the visual servo."""
+
+    frame_rate_hz: float = _quantity(60.0, "Hz", "stereo frames a second; the servo acts once a frame", gt=0, le=2000)
+    latency_s: float = _quantity(0.0, "s", "delay from the exposure to the use of the pose", ge=0, le=1)
+    hold: Literal["zero", "linear"] = Field("zero", description="joint command between two frames")
+
+    @property
+    def frame_period_s(self) -> float:
+        """Time between two frames [s]."""
+        return 1.0 / self.frame_rate_hz
+
+    def frames(self, duration_s: float) -> int:
+        """Number of frame periods in ``duration_s``."""
+        return round(duration_s * self.frame_rate_hz)
+
+
+class Servo(_Section):
+    """Gains of the outer visual servo (eq. 30)."""
+
+    kp: float = _quantity(0.3, "1", "proportional gain", ge=0)
+    kd: float = _quantity(0.001, "s", "derivative gain", ge=0)
+    ki: float = _quantity(2.4, "1/s", "integral gain", ge=0)
+
+
+class _Friction(_Section):
+    friction: FrictionLaw = Field("coulomb_viscous", description="friction law of the joints")
+    smoothing_velocity_rad_s: float | None = _quantity(None, "rad/s", "v_s of the smoothed law", gt=0)
+
+    @model_validator(mode="after")
+    def _smoothing_only_where_smoothed(self) -> "_Friction":
+        if (self.friction == "smoothed") != (self.smoothing_velocity_rad_s is not None):
+            raise ValueError(
+                f"friction = {self.friction!r} with smoothing_velocity_rad_s = {self.smoothing_velocity_rad_s}: "
+                "the smoothed law needs a smoothing velocity [rad/s] and the other law has none"
+            )
+        return self
+
+
+class Plant(_Friction):
+    """The simulated real robot."""
+
+    parameters: str = Field("identified", description="named parameter set of the robot file, the truth")
+    steps_per_frame: int = _quantity(16, "1", "integration steps a frame", ge=1, le=10_000)
+
+
+class Model(_Friction):
+    """The estimator's model of the robot."""
+
+    start_parameters: str = Field("initial", description="named parameter set of the robot file, the starting guess")
+    steps_per_frame: int = _quantity(4, "1", "integration steps a frame", ge=1, le=10_000)
+
+
+class Excitation(_Section):
+    """The exciting trajectory (eq. 37) and its optimisation (eq. 39)."""
+
+    fundamental_hz: float = _quantity(0.1, "Hz", "fundamental frequency f0", gt=0)
+    harmonics: int = _quantity(5, "1", "number of harmonics n", ge=2, le=100)
+    duration_s: float = _quantity(20.0, "s", "length of the excitation run", gt=0, le=3600)
+    position_amplitude_m: float = _quantity(0.010, "m", "largest distance from home in x, y and z", gt=0)
+    orientation_amplitude_rad: float = _quantity(0.04, "rad", "largest angle from home in each axis", gt=0, lt=1.5)
+    travel_margin_rad: float = _quantity(0.10, "rad", "distance kept from the travel limit of the cranks", ge=0)
+    candidates: int = _quantity(64, "1", "random trajectories among which the best is chosen", ge=1, le=100_000)
+
+
+class Filter(_Section):
+    """Zero-phase Butterworth filter of the measured poses."""
+
+    order: int = _quantity(8, "1", "order of the filter, applied forward and reverse", ge=1, le=20)
+    cutoff_hz: float = _quantity(10.0, "Hz", "cutoff frequency", gt=0)
+
+
+class Identification(_Section):
+    """Output-error estimation and its stop criteria (eq. 35)."""
+
+    scale_anchor: str = Field("platform_mass", description="what fixes the overall scale of the parameters")
+    anchor_std: float | None = _quantity(None, "unit of the anchor", "standard deviation of the anchor", gt=0)
+    max_iterations: int = _quantity(30, "1", "iterations at most", ge=1, le=1000)
+    cost_tolerance: float = _quantity(1e-6, "1", "tol1 of eq. 35, relative change of the cost", gt=0, lt=1)
+    parameter_tolerance: float = _quantity(1e-3, "1", "tol2 of eq. 35, relative change of a parameter", gt=0, lt=1)
+    qr_threshold: float = _quantity(1e-3, "1", "relative threshold of a direction that can be identified", gt=0, lt=1)
+
+
+class Validation(_Section):
+    """Unseen trajectories on which the identified model is judged."""
+
+    count: int = _quantity(10, "1", "number of unseen trajectories", ge=1, le=1000)
+    duration_s: float = _quantity(10.0, "s", "length of each", gt=0, le=3600)
+
+
+class Scenario(_Section):
+    """A whole synthetic experiment; load one with :func:`load_scenario`."""
+
+    name: str = Field(description="short name, used for folders", pattern=r"^[\w.-]+$")
+    description: str = ""
+    robot: str = Field("rss6", description="built-in robot or path of a robot file")
+    sensor: str = Field("ctrack780", description="built-in sensor or path of a sensor file")
+    pose_method: Literal["registration", "planes"] = "registration"
+    timing: Timing = Timing()
+    servo: Servo = Servo()
+    plant: Plant = Plant()
+    model: Model = Model()
+    excitation: Excitation = Excitation()
+    filter: Filter = Filter()
+    identification: Identification = Identification()
+    validation: Validation = Validation()
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Scenario":
+        self._check_filter()
+        self._check_whole_frames("excitation.duration_s", self.excitation.duration_s)
+        self._check_whole_frames("validation.duration_s", self.validation.duration_s)
+        return self
+
+    def _check_filter(self) -> None:
+        nyquist, cutoff = self.timing.frame_rate_hz / 2, self.filter.cutoff_hz
+        if cutoff >= nyquist:
+            raise ValueError(
+                f"filter.cutoff_hz = {cutoff:g} Hz is not below the Nyquist frequency {nyquist:g} Hz "
+                f"of timing.frame_rate_hz = {self.timing.frame_rate_hz:g} Hz"
+            )
+        highest = self.excitation.fundamental_hz * self.excitation.harmonics
+        if cutoff <= highest:
+            raise ValueError(
+                f"filter.cutoff_hz = {cutoff:g} Hz would remove the excitation, "
+                f"whose highest harmonic is {highest:g} Hz"
+            )
+
+    def _check_whole_frames(self, key: str, duration_s: float) -> None:
+        frames = duration_s * self.timing.frame_rate_hz
+        if abs(frames - round(frames)) > 1e-6 or round(frames) < 1:
+            raise ValueError(
+                f"{key} = {duration_s:g} s is {frames:g} frames at {self.timing.frame_rate_hz:g} Hz, "
+                "not a whole number of frames"
+            )
+
+    def with_overrides(self, overrides: Mapping[str, Any]) -> "Scenario":
+        """Copy with values replaced by dotted path, such as ``{"timing.frame_rate_hz": 30.0}``.
+
+        Raises:
+            ScenarioError: a path that does not exist (with the valid names) or a value that does not fit.
+        """
+        data = self.model_dump(exclude_none=True)
+        for path, value in overrides.items():
+            _replace(data, path, value)
+        return scenario_from_dict(data, source=f"scenario {self.name!r}")
+
+    def to_toml(self) -> str:
+        """Fully resolved TOML text, every default written out with its unit; reading it gives an equal scenario."""
+        return to_toml(self)
+
+
+def scenario_names() -> list[str]:
+    """Names of the built-in scenarios."""
+    return sorted(path.stem for path in BUILT_IN.glob("*.toml"))
+
+
+def load_scenario(name_or_path: str | Path) -> Scenario:
+    """Load a built-in scenario by name, or one from a TOML file.
+
+    Raises:
+        ScenarioError: no such scenario (with the built-in names), no TOML, or wrong content.
+    """
+    text, source = _read(name_or_path)
+    return scenario_from_toml(text, source)
+
+
+def scenario_from_toml(text: str, source: str = "scenario") -> Scenario:
+    """Scenario from TOML text; ``source`` names it in error messages.
+
+    Raises:
+        ScenarioError: no TOML, or wrong content.
+    """
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{source} is not valid TOML: {error}") from error
+    return scenario_from_dict(data, source)
+
+
+def scenario_from_dict(data: Mapping[str, Any], source: str = "scenario") -> Scenario:
+    """Scenario from nested mappings, all wrong entries named in one line.
+
+    Raises:
+        ScenarioError: unknown keys, wrong types or values, or settings that contradict each other.
+    """
+    try:
+        return Scenario.model_validate(dict(data))
+    except ValidationError as error:
+        raise ScenarioError(f"{source}: {one_line(error, Scenario)}") from error
+
+
+def _read(name_or_path: str | Path) -> tuple[str, str]:
+    name = str(name_or_path)
+    if name in scenario_names():
+        return (BUILT_IN / f"{name}.toml").read_text(encoding="utf-8"), f"scenario {name!r}"
+    path = Path(name)
+    try:
+        return path.read_text(encoding="utf-8"), f"scenario file {name}"
+    except (OSError, UnicodeDecodeError) as error:
+        reason = f", and {error}" if path.exists() else " nor a file"
+        raise ScenarioError(
+            f"scenario {name!r} is neither built in ({', '.join(scenario_names())}){reason}"
+        ) from error
+
+
+def _replace(data: dict[str, Any], path: str, value: Any) -> None:
+    *sections, key = path.split(".")
+    for section in sections:
+        data = data.setdefault(section, {})
+        if not isinstance(data, dict):
+            raise ScenarioError(f"override {path!r}: {section!r} is a value, not a section")
+    if value is None:
+        data.pop(key, None)
+    else:
+        data[key] = value

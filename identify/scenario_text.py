@@ -1,0 +1,89 @@
+"""Scenarios as text: TOML with units, and the reasons for a refusal in one line."""
+
+import json
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+
+def to_toml(model: BaseModel) -> str:
+    """TOML text of a two-level pydantic model: plain values first, then one table a section, units as comments.
+
+    Fields whose value is None have no TOML form and are left out.
+    """
+    lines, sections = [], []
+    for name, field in type(model).model_fields.items():
+        value = getattr(model, name)
+        if isinstance(value, BaseModel):
+            sections += ["", f"[{name}]", *_entries(value)]
+        elif value is not None:
+            lines.append(_entry(name, value, field))
+    return "\n".join(lines + sections) + "\n"
+
+
+def one_line(error: ValidationError, model: type[BaseModel]) -> str:
+    """All complaints of a validation in one line, each with key, value, unit and, where wrong, the valid names."""
+    return "; ".join(_complaint(details, model) for details in error.errors())
+
+
+def _entries(section: BaseModel) -> list[str]:
+    fields = type(section).model_fields
+    return [_entry(n, getattr(section, n), f) for n, f in fields.items() if getattr(section, n) is not None]
+
+
+def _entry(name: str, value: Any, field: FieldInfo) -> str:
+    comment = "".join([f" [{unit}]" if (unit := _unit(field)) else "", f" {field.description or ''}"]).strip()
+    entry = f"{name} = {_toml_value(value)}"
+    return f"{entry:<40} # {comment}" if comment else entry
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return repr(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _complaint(details: ErrorDetails, model: type[BaseModel]) -> str:
+    path = [str(part) for part in details["loc"]]
+    key = ".".join(path)
+    if details["type"] == "extra_forbidden":
+        return f"unknown key {key!r}; valid names{_within(path)}: {', '.join(_siblings(path, model))}"
+    if details["type"] == "value_error":
+        return f"{key}: {details['ctx']['error']}" if key else str(details["ctx"]["error"])
+    if details["type"] == "missing":
+        return f"{key} is missing"
+    field = _field(path, model)
+    unit = f" [{u}]" if field is not None and (u := _unit(field)) else ""
+    message = details["msg"]
+    return f"{key} = {details['input']!r}{unit}: {message[0].lower()}{message[1:]}"
+
+
+def _within(path: list[str]) -> str:
+    return f" in [{'.'.join(path[:-1])}]" if len(path) > 1 else ""
+
+
+def _owner(path: list[str], model: type[BaseModel]) -> type[BaseModel] | None:
+    owner: Any = model
+    for part in path[:-1]:
+        field = owner.model_fields.get(part)
+        owner = field.annotation if field is not None else None
+        if not (isinstance(owner, type) and issubclass(owner, BaseModel)):
+            return None
+    return owner
+
+
+def _siblings(path: list[str], model: type[BaseModel]) -> list[str]:
+    owner = _owner(path, model)
+    return list(owner.model_fields) if owner is not None else []
+
+
+def _field(path: list[str], model: type[BaseModel]) -> FieldInfo | None:
+    owner = _owner(path, model)
+    return owner.model_fields.get(path[-1]) if owner is not None and path else None
+
+
+def _unit(field: FieldInfo) -> str:
+    extra = field.json_schema_extra
+    return str(extra["unit"]) if isinstance(extra, dict) and "unit" in extra else ""
