@@ -1,0 +1,91 @@
+"""Zero-phase Butterworth filter (section 4.2) and derivatives of filtered signals.
+
+Forward and reverse filtering squares the magnitude: ``order`` is that of one pass, as in Matlab's filtfilt, so the
+gain at the cutoff is 1/2.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import make_interp_spline
+from scipy.signal import butter, sosfiltfilt
+
+from identify.errors import FilterError
+from identify.trajectory import Array
+
+SPLINE_DEGREE = 5
+"""Quintic: the second derivative is still three times differentiable."""
+
+
+def zero_phase_filter(samples: ArrayLike, rate_hz: float, cutoff_hz: float, order: int = 8) -> Array:
+    """Low-pass filter samples (N, ...) along the first axis without shifting them in time.
+
+    Raises:
+        FilterError: cutoff at or above the Nyquist frequency, a record shorter than the padding, or samples that are
+            not finite.
+    """
+    values = _finite(samples)
+    check_cutoff(rate_hz, cutoff_hz)
+    padding = padding_samples(rate_hz, cutoff_hz, order)
+    if len(values) <= padding:
+        raise FilterError(
+            f"a record of {len(values)} samples is too short for a Butterworth filter of order {order} with cutoff "
+            f"{cutoff_hz:g} Hz at {rate_hz:g} Hz: more than {padding} samples are needed"
+        )
+    sections = butter(order, cutoff_hz, fs=rate_hz, output="sos")
+    return np.asarray(sosfiltfilt(sections, values, axis=0, padlen=padding), dtype=float)
+
+
+def check_cutoff(rate_hz: float, cutoff_hz: float) -> None:
+    """Refuse a cutoff that sampled data cannot have.
+
+    Raises:
+        FilterError: cutoff not positive, or at or above the Nyquist frequency.
+    """
+    if not 0 < cutoff_hz < rate_hz / 2:
+        raise FilterError(
+            f"filter cutoff {cutoff_hz:g} Hz must be above 0 and below the Nyquist frequency {rate_hz / 2:g} Hz "
+            f"of the sampling rate {rate_hz:g} Hz"
+        )
+
+
+def padding_samples(rate_hz: float, cutoff_hz: float, order: int) -> int:
+    """Samples by which a record is extended at both ends: three time constants of the filter's slowest pole."""
+    slowest_decay = 2 * np.pi * cutoff_hz / rate_hz * np.sin(np.pi / (2 * order))
+    return int(max(3 * (order + 1), np.ceil(3 / slowest_decay)))
+
+
+def filtered_derivatives(
+    samples: ArrayLike, rate_hz: float, cutoff_hz: float, order: int = 8
+) -> tuple[Array, Array, Array]:
+    """Filtered samples (N, ...) with their first and second time derivatives.
+
+    The filtered samples are interpolated by a quintic spline, which is then differentiated; towards both ends the
+    derivatives are less exact, so leave the first and last few samples out of a fit.
+
+    Raises:
+        FilterError: as :func:`zero_phase_filter`.
+    """
+    smooth = zero_phase_filter(samples, rate_hz, cutoff_hz, order)
+    return smooth, *spline_derivatives(smooth, rate_hz)
+
+
+def spline_derivatives(samples: ArrayLike, rate_hz: float) -> tuple[Array, Array]:
+    """First and second time derivative of samples (N, ...) through a quintic spline.
+
+    Raises:
+        FilterError: fewer samples than a quintic spline needs, or samples that are not finite.
+    """
+    values = _finite(samples)
+    if len(values) <= SPLINE_DEGREE:
+        raise FilterError(f"derivatives need more than {SPLINE_DEGREE} samples, got {len(values)}")
+    t = np.arange(len(values)) / rate_hz
+    spline = make_interp_spline(t, values, k=SPLINE_DEGREE)
+    return spline(t, nu=1), spline(t, nu=2)
+
+
+def _finite(samples: ArrayLike) -> Array:
+    values = np.asarray(samples, dtype=float)
+    bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1)) if values.size else []
+    if len(bad):
+        raise FilterError(f"sample {bad[0]} of {len(values)} is not a finite number; fill lost frames before filtering")
+    return values

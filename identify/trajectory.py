@@ -1,0 +1,152 @@
+"""Reference trajectories as finite Fourier series of the pose (eq. 37), starting at home and at rest.
+
+Pose ``[x y z alpha beta gamma]`` in m and rad. With ``w = 2 pi f0 l`` each component is
+
+    chi(t) = offset + sum_l  s_l sin(w t) / w  -  c_l cos(w t) / w.
+
+The start is smooth when the series begins at the home pose, at rest and without acceleration:
+``offset = home + sum_l c_l / w``, ``sum_l s_l = 0`` and ``sum_l l c_l = 0``.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dynamics.errors import DynamicsError
+from identify.errors import TrajectoryError
+
+Array = NDArray[np.float64]
+
+
+class TravelLimitedRobot(Protocol):
+    """What a trajectory needs to know of a robot."""
+
+    name: str
+    travel_limit: float
+
+    def inverse_kinematics(self, pose: Any) -> Any:
+        """Joint angles [rad], (N, 6), of poses (N, 6)."""
+        ...
+
+
+@dataclass(frozen=True)
+class FourierTrajectory:
+    """One trajectory; ``sine`` and ``cosine`` (6, n) are s and c of eq. 37 [m/s, rad/s], ``offset`` (6,) [m, rad]."""
+
+    fundamental_hz: float
+    sine: Array
+    cosine: Array
+    offset: Array
+
+    def __post_init__(self) -> None:
+        for name in ("sine", "cosine", "offset"):
+            value = np.array(getattr(self, name), dtype=float)
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        n = self.sine.shape[-1] if self.sine.ndim else 0
+        if self.sine.shape != (6, n) or self.cosine.shape != (6, n) or self.offset.shape != (6,) or n == 0:
+            raise TrajectoryError(
+                f"a trajectory needs sine (6, n), cosine (6, n) and offset (6,), "
+                f"got {self.sine.shape}, {self.cosine.shape} and {self.offset.shape}"
+            )
+        if not all(np.isfinite(a).all() for a in (self.sine, self.cosine, self.offset, self.fundamental_hz)):
+            raise TrajectoryError("a trajectory's coefficients must be finite numbers")
+
+    @property
+    def harmonics(self) -> int:
+        """Number of harmonics n."""
+        return int(self.sine.shape[1])
+
+    def pose(self, t: ArrayLike) -> Array:
+        """Poses (N, 6) [m, rad] at times ``t`` (N,) [s]; one pose (6,) for a single time."""
+        w, sin, cos = self._waves(t)
+        return self.offset + sin @ (self.sine / w).T - cos @ (self.cosine / w).T
+
+    def pose_rate(self, t: ArrayLike) -> Array:
+        """Time derivative of the pose, (N, 6) [m/s, rad/s]."""
+        _, sin, cos = self._waves(t)
+        return cos @ self.sine.T + sin @ self.cosine.T
+
+    def pose_acceleration(self, t: ArrayLike) -> Array:
+        """Second time derivative of the pose, (N, 6) [m/s², rad/s²] (eq. 36 without its stray factor t)."""
+        w, sin, cos = self._waves(t)
+        return cos @ (self.cosine * w).T - sin @ (self.sine * w).T
+
+    def _waves(self, t: ArrayLike) -> tuple[Array, Array, Array]:
+        w = 2 * np.pi * self.fundamental_hz * np.arange(1, self.harmonics + 1)
+        phase = np.asarray(t, dtype=float)[..., None] * w
+        return w, np.sin(phase), np.cos(phase)
+
+
+def random_trajectory(
+    rng: np.random.Generator,
+    home_pose: ArrayLike,
+    fundamental_hz: float,
+    harmonics: int,
+    position_amplitude_m: float,
+    orientation_amplitude_rad: float,
+) -> FourierTrajectory:
+    """Random trajectory with a smooth start whose largest distance from home fills the box in every component.
+
+    Normal coefficients are projected onto the conditions of a smooth start, then scaled axis by axis.
+
+    Raises:
+        TrajectoryError: fewer than two harmonics, which leave no freedom for a smooth start.
+    """
+    if harmonics < 2:
+        raise TrajectoryError(f"a smooth start needs at least 2 harmonics, got {harmonics}")
+    order = np.arange(1, harmonics + 1)
+    sine = _without(rng.standard_normal((6, harmonics)), np.ones(harmonics))
+    cosine = _without(rng.standard_normal((6, harmonics)), order.astype(float))
+    shape = _from_home(np.zeros(6), fundamental_hz, sine, cosine)
+    box = np.repeat([position_amplitude_m, orientation_amplitude_rad], 3)
+    period = np.linspace(0.0, 1.0 / fundamental_hz, 200 * harmonics, endpoint=False)
+    scale = (box / np.abs(shape.pose(period)).max(axis=0))[:, None]
+    return _from_home(np.asarray(home_pose, dtype=float), fundamental_hz, scale * sine, scale * cosine)
+
+
+def check_travel(
+    robot: TravelLimitedRobot, trajectory: FourierTrajectory, t: ArrayLike, margin_rad: float = 0.0
+) -> float:
+    """Largest crank angle [rad] of a trajectory sampled at times ``t`` (N,) [s].
+
+    Raises:
+        TrajectoryError: a pose out of reach, or an angle beyond the travel limit less the margin; the message
+            names time, leg, angle and limit.
+    """
+    times = np.asarray(t, dtype=float)
+    angles = np.abs(_joint_angles(robot, trajectory, times))
+    row, leg = np.unravel_index(np.argmax(angles), angles.shape)
+    worst, limit = float(angles[row, leg]), robot.travel_limit - margin_rad
+    if worst > limit:
+        raise TrajectoryError(
+            f"trajectory turns crank {leg + 1} of {robot.name} to {worst:.4f} rad at t = {times[row]:.3f} s, beyond "
+            f"{limit:.4f} rad (travel limit {robot.travel_limit:.4f} rad less margin {margin_rad:.4f} rad)"
+        )
+    return worst
+
+
+def _joint_angles(robot: TravelLimitedRobot, trajectory: FourierTrajectory, times: Array) -> Array:
+    poses = trajectory.pose(times)
+    try:
+        angles = np.asarray(robot.inverse_kinematics(poses), dtype=float)
+    except DynamicsError as error:
+        raise TrajectoryError(f"trajectory leaves the reach of {robot.name}: {error}") from error
+    if not np.isfinite(angles).all():
+        row, leg = np.argwhere(~np.isfinite(angles))[0]
+        raise TrajectoryError(
+            f"trajectory leaves the reach of {robot.name}: leg {leg + 1} at t = {times[row]:.3f} s, pose {poses[row]}"
+        )
+    return angles
+
+
+def _from_home(home: Array, fundamental_hz: float, sine: Array, cosine: Array) -> FourierTrajectory:
+    w = 2 * np.pi * fundamental_hz * np.arange(1, sine.shape[1] + 1)
+    return FourierTrajectory(fundamental_hz, sine, cosine, home + (cosine / w).sum(axis=1))
+
+
+def _without(rows: Array, direction: Array) -> Array:
+    unit = direction / np.linalg.norm(direction)
+    return rows - np.outer(rows @ unit, unit)
