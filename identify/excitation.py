@@ -11,10 +11,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.progress import Advance, Progress, SilentProgress
 from identify.scenario import Excitation, Scenario
-from identify.trajectory import Array, FourierTrajectory, TravelLimitedRobot, check_travel, random_trajectory
+from identify.trajectory import FourierTrajectory, TravelLimitedRobot, check_travel, random_trajectory
 from identify.trajectory_file import TrajectorySet
 
 NULL_TOLERANCE = 1e-9

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 from scipy.signal import butter, sosfiltfilt
 
+from identify.arrays import Array
 from identify.errors import FilterError
-from identify.trajectory import Array
 
 SPLINE_DEGREE = 5
 """Quintic: the second derivative is still three times differentiable."""
@@ -85,7 +85,7 @@ def spline_derivatives(samples: ArrayLike, rate_hz: float) -> tuple[Array, Array
 
 def _finite(samples: ArrayLike) -> Array:
     values = np.asarray(samples, dtype=float)
-    bad = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1)) if values.size else []
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
     if len(bad):
         raise FilterError(f"sample {bad[0]} of {len(values)} is not a finite number; fill lost frames before filtering")
     return values

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from dynamics.errors import DynamicsError
+from identify.arrays import Array
 from identify.errors import TrajectoryError
-
-Array = NDArray[np.float64]
 
 
 class TravelLimitedRobot(Protocol):
@@ -75,7 +74,7 @@ class FourierTrajectory:
         return cos @ (self.cosine * w).T - sin @ (self.sine * w).T
 
     def _waves(self, t: ArrayLike) -> tuple[Array, Array, Array]:
-        w = 2 * np.pi * self.fundamental_hz * np.arange(1, self.harmonics + 1)
+        w: Array = 2 * np.pi * self.fundamental_hz * np.arange(1, self.harmonics + 1, dtype=float)
         phase = np.asarray(t, dtype=float)[..., None] * w
         return w, np.sin(phase), np.cos(phase)
 
