@@ -1,0 +1,59 @@
+"""Errors of the sensor package. Each message carries the evidence: the value, the limit, the valid names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+
+class CmmError(ValueError):
+    """Base class of everything this package refuses."""
+
+
+class UnknownSensorError(CmmError):
+    """A sensor name is neither built in nor a file."""
+
+    def __init__(self, name: str, valid_names: Iterable[str]) -> None:
+        super().__init__(
+            f"unknown sensor {name!r}: neither a built-in name ({', '.join(sorted(valid_names))}) nor a TOML file"
+        )
+
+
+class SensorFileError(CmmError):
+    """A sensor file cannot be read, or holds an unknown key or a wrong value."""
+
+
+class UnknownOptionError(CmmError):
+    """An option has a value that is not on its list."""
+
+    def __init__(self, option: str, value: object, valid_names: Iterable[str]) -> None:
+        super().__init__(f"unknown {option} {value!r}: valid are {', '.join(sorted(valid_names))}")
+
+
+class UnknownBodyError(CmmError):
+    """An obstacle was posed that has never been registered."""
+
+    def __init__(self, name: str, valid_names: Iterable[str]) -> None:
+        names = ", ".join(sorted(valid_names)) or "none registered: call add_bodies first"
+        super().__init__(f"unknown body {name!r}: valid are {names}")
+
+
+class ShapeError(CmmError):
+    """An array does not have the shape or the finite values that are needed."""
+
+
+class LostError(CmmError):
+    """The stickers in the images do not determine a pose; the message becomes the measurement's reason."""
+
+
+class TeachingError(CmmError):
+    """The stickers could not be taught; the message says at which step."""
+
+
+class OpenGLMissingError(RuntimeError):
+    """pyrender found no OpenGL to draw with."""
+
+    def __init__(self, cause: BaseException) -> None:
+        super().__init__(
+            "OpenGL is missing, so no images can be rendered: on Debian install the packages "
+            f"libegl1 and libgl1-mesa-dri ({type(cause).__name__}: {cause})"
+        )

@@ -1,0 +1,167 @@
+"""Sensor files (TOML): what may stand in them, with units, and how a name becomes a file."""
+
+from __future__ import annotations
+
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from .errors import SensorFileError, UnknownSensorError
+from .pose import Array
+
+Vector3 = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Level = Annotated[int, Field(ge=0, le=255)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Timing(_Section):
+    """frame_rate Hz; exposure and latency s."""
+
+    frame_rate: Positive
+    exposure: NotNegative = 0.0
+    latency: NotNegative = 0.0
+
+
+class Rig(_Section):
+    """baseline m; focal_px, width, height px; position and target m in the base frame."""
+
+    baseline: Positive
+    focal_px: Positive
+    width: Annotated[int, Field(ge=64)]
+    height: Annotated[int, Field(ge=64)]
+    position: Vector3
+    target: Vector3
+
+
+class Camera(_Section):
+    """EMVA 1288 figures: electrons, grey values per electron, grey values."""
+
+    electrons_at_white: Positive
+    gain: Positive
+    dark_noise: NotNegative
+    full_well: Positive
+    black_level: NotNegative = 0.0
+    noise: bool = True
+
+
+class Stickers(_Section):
+    """Radii and placement distances m; levels of 255."""
+
+    radius: Positive
+    ring_radius: Positive
+    placement: tuple[NotNegative, NotNegative] = (0.0, 0.0)
+    placement_seed: int = 0
+    sticker_level: Level
+    ring_level: Level
+    body_level: Level
+    obstacle_level: Level
+    background_level: Level = 0
+
+
+class HalfSpace(_Section):
+    """normal outwards, any length; point on the plane, m."""
+
+    normal: Vector3
+    point: Vector3
+
+
+class StickerPlane(HalfSpace):
+    """across gives the u axis; stickers are nominal places [u, v], m from the point."""
+
+    across: Vector3
+    stickers: Annotated[list[tuple[float, float]], Field(min_length=3)]
+
+
+class Planes(_Section):
+    """The three planes of a body."""
+
+    A: StickerPlane
+    B: StickerPlane
+    C: StickerPlane
+
+
+class Body(_Section):
+    """A convex body with stickers on three planes."""
+
+    planes: Planes
+    cuts: list[HalfSpace]
+
+
+class Platform(Body):
+    """The moving body; home is its pose at teaching, [m, rad]."""
+
+    home: tuple[float, float, float, float, float, float]
+
+
+class SensorFile(_Section):
+    """A whole sensor file."""
+
+    name: str
+    timing: Timing
+    rig: Rig
+    camera: Camera
+    stickers: Stickers
+    platform: Platform
+    base: Body
+
+
+def built_in_names() -> list[str]:
+    """Names of the sensors that come with the package."""
+    return sorted(f.name[:-5] for f in resources.files(__package__).joinpath("sensors").iterdir()
+                  if f.name.endswith(".toml"))
+
+
+def read_sensor_file(name: str | Path) -> SensorFile:
+    """The sensor file of a built-in name or a path.
+
+    Raises UnknownSensorError for a name that is neither, SensorFileError (with the valid names) for a bad content.
+    """
+    if str(name) in built_in_names():
+        text = resources.files(__package__).joinpath("sensors", f"{name}.toml").read_text(encoding="utf-8")
+    elif Path(name).is_file():
+        text = Path(name).read_text(encoding="utf-8")
+    else:
+        raise UnknownSensorError(str(name), built_in_names())
+    try:
+        return SensorFile.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise SensorFileError(f"sensor file {name}: {error}") from error
+    except ValidationError as error:
+        lines = "; ".join(_explain(e) for e in error.errors())
+        raise SensorFileError(f"sensor file {name}: {lines}") from error
+
+
+def _explain(error: Any) -> str:
+    """One problem in words, with the valid names when a key is unknown."""
+    where = ".".join(str(part) for part in error["loc"])
+    if error["type"] == "extra_forbidden":
+        return f"unknown key {where!r}, valid are {', '.join(_valid_keys(error['loc'][:-1]))}"
+    return f"{where}: {error['msg']} (got {error['input']!r})"
+
+
+def _valid_keys(section: tuple[Any, ...]) -> list[str]:
+    model: Any = SensorFile
+    for part in section:
+        if isinstance(part, int):
+            continue
+        annotation = model.model_fields[part].annotation
+        model = getattr(annotation, "__args__", (annotation,))[0]
+    return sorted(model.model_fields)
+
+
+def unit(vector: Vector3 | Array) -> Array:
+    """Vector (3,) of length one. Raises SensorFileError for a zero vector."""
+    values = np.asarray(vector, dtype=float)
+    length = float(np.linalg.norm(values))
+    if length < 1e-9:
+        raise SensorFileError(f"a direction must not be zero, got {list(values)}")
+    return values / length
