@@ -1,0 +1,33 @@
+"""Errors of the dynamics package. Every message carries the value, the limit and the leg or name concerned."""
+
+
+class DynamicsError(Exception):
+    """Base class of every error this package raises on purpose."""
+
+
+class RobotFileError(DynamicsError):
+    """A robot name or robot file that cannot be used."""
+
+
+class ParameterError(DynamicsError):
+    """Dynamic parameters of the wrong number, or outside their physical range."""
+
+
+class ShapeError(DynamicsError):
+    """An array of the wrong shape, or with entries that are not finite."""
+
+
+class UnreachablePoseError(DynamicsError):
+    """A pose that a leg cannot reach."""
+
+
+class SingularPoseError(DynamicsError):
+    """A pose at which a Jacobian cannot be inverted."""
+
+
+class ConvergenceError(DynamicsError):
+    """An iteration that did not converge."""
+
+
+class SimulationError(DynamicsError):
+    """A closed-loop run that cannot be set up."""

@@ -1,0 +1,56 @@
+"""Geometry of a 6-RSS robot: six cranks (R) on the base, six links between two spherical joints (S) each."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynamics.errors import RobotFileError
+
+LEGS = 6
+
+
+@dataclass(frozen=True)
+class Rss6Geometry:
+    """Where the joints sit and how the legs reach. All lengths in m, all vectors in base axes unless named otherwise.
+
+    base_joints: B, crank axis foot points (6, 3); platform_joints: a in platform axes (6, 3);
+    crank_axes: s, unit (6, 3); crank_zero_directions: unit vector from B to the tip T at angle zero (6, 3);
+    crank_length, link_length: scalars; home_pose (6,); travel_limit: largest |theta| in rad; gravity (3,) in m/s^2.
+    Raises RobotFileError when a vector is not a unit vector, a crank direction is not normal to its axis,
+    or a length is not positive.
+    """
+
+    base_joints: np.ndarray
+    platform_joints: np.ndarray
+    crank_axes: np.ndarray
+    crank_zero_directions: np.ndarray
+    crank_length: float
+    link_length: float
+    home_pose: np.ndarray
+    travel_limit: float
+    gravity: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in ("base_joints", "platform_joints", "crank_axes", "crank_zero_directions", "home_pose", "gravity"):
+            array = np.array(getattr(self, name), dtype=float)
+            shape = {"home_pose": (6,), "gravity": (3,)}.get(name, (LEGS, 3))
+            if array.shape != shape or not np.isfinite(array).all():
+                raise RobotFileError(f"{name} must be finite with shape {shape}, got shape {array.shape}")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        for name in ("crank_length", "link_length", "travel_limit"):
+            if not getattr(self, name) > 0:
+                raise RobotFileError(f"{name} must be positive, got {getattr(self, name)}")
+        self._check_directions()
+
+    def _check_directions(self) -> None:
+        for leg in range(LEGS):
+            axis, zero = self.crank_axes[leg], self.crank_zero_directions[leg]
+            for name, vector in (("crank_axes", axis), ("crank_zero_directions", zero)):
+                if abs(np.linalg.norm(vector) - 1.0) > 1e-9:
+                    raise RobotFileError(f"{name} of leg {leg + 1} has length {np.linalg.norm(vector):.9g}, must be 1")
+            if abs(axis @ zero) > 1e-9:
+                raise RobotFileError(
+                    f"crank_zero_directions of leg {leg + 1} must be normal to its crank axis; "
+                    f"their dot product is {axis @ zero:.3g}, limit 1e-9"
+                )

@@ -1,0 +1,99 @@
+"""One leg as its platform joint A feels it: a function of the motion of A alone, in CasADi.
+
+Crank and link move as A makes them move (eq. 5-16), so each leg adds a force at A, and the robot's wrench is the sum
+of the platform's own and [F; a x F] over the legs. It is the virtual-work model of eq. 23 with the Jacobians taken
+with respect to the velocity of A (3 columns) in place of the twist (6 columns), at a fraction of the operations.
+All vectors in base axes; SI units.
+"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from dynamics.jacobians import crank_leverage
+from dynamics.kinematics import LegVectors
+
+
+@dataclass(frozen=True)
+class LegMotion:
+    """Crank rate and acceleration (scalars), second derivatives of crank and link vectors (3,), and the link's angular
+    velocity and acceleration (3,); the link does not spin about its own axis."""
+
+    crank_rate: ca.SX
+    crank_acceleration: ca.SX
+    tip_acceleration: ca.SX
+    link_acceleration: ca.SX
+    angular_velocity: ca.SX
+    angular_acceleration: ca.SX
+
+
+def torque_to_force(leg: LegVectors) -> ca.SX:
+    """l / m (3,): force at A of a unit crank torque, and gradient of the crank angle with respect to A (eq. 8)."""
+    return leg.link / crank_leverage(leg)
+
+
+def leg_motion(leg: LegVectors, velocity: ca.SX, acceleration: ca.SX) -> LegMotion:
+    """Motion of crank and link for a velocity (3,) and an acceleration (3,) of A."""
+    gradient, tangent = torque_to_force(leg), ca.cross(leg.axis, leg.crank)
+    rate = ca.dot(gradient, velocity)
+    link_rate = velocity - rate * tangent
+    # l . A_ddot + |l_dot|^2 = l . w_ddot: the link keeps its length.
+    stretch = ca.dot(link_rate, link_rate) + rate**2 * ca.dot(leg.link, leg.crank)
+    crank_acceleration = ca.dot(gradient, acceleration) + stretch / crank_leverage(leg)
+    tip_acceleration = crank_acceleration * tangent - rate**2 * leg.crank
+    link_acceleration = acceleration - tip_acceleration
+    square = ca.dot(leg.link, leg.link)
+    return LegMotion(
+        rate,
+        crank_acceleration,
+        tip_acceleration,
+        link_acceleration,
+        ca.cross(leg.link, link_rate) / square,
+        ca.cross(leg.link, link_acceleration) / square,
+    )
+
+
+def leg_columns(leg: LegVectors, motion: LegMotion, gravity: ca.DM) -> ca.SX:
+    """Force at A (3, 8) for unit crank mass, Ixx, Iyy, Izz and link mass, Ixx, Iyy, Izz."""
+    gradient, tangent = torque_to_force(leg), ca.cross(leg.axis, leg.crank)
+    crank_mass = gradient * ca.dot(tangent / 2, motion.tip_acceleration / 2 - gravity)
+    pull = motion.tip_acceleration + motion.link_acceleration / 2 - gravity
+    link_mass = (pull + gradient * ca.dot(tangent, pull)) / 2
+    # The crank turns about its own z alone, and a link without spin about l does no work against Izz.
+    none = ca.SX.zeros(3)
+    columns = [crank_mass, none, none, gradient * motion.crank_acceleration, link_mass]
+    lever = _spin_lever(leg)
+    for direction in link_axes(leg):
+        spin = ca.dot(direction, motion.angular_velocity)
+        gyroscopic = ca.cross(motion.angular_velocity, direction) * spin
+        moment = direction * ca.dot(direction, motion.angular_acceleration) + gyroscopic
+        columns.append(lever.T @ moment)
+    return ca.horzcat(*columns, none)
+
+
+def leg_mass(leg: LegVectors, crank: ca.SX, link: ca.SX) -> ca.SX:
+    """Mass (3, 3) the leg adds at A, for crank and link parameters (mass, Ixx, Iyy, Izz) each (4,)."""
+    gradient, tangent = torque_to_force(leg), ca.cross(leg.axis, leg.crank)
+    radius_square = ca.dot(leg.crank, leg.crank)
+    reflected = crank[3] + (crank[0] + link[0]) * radius_square / 4
+    mixed = gradient @ tangent.T
+    total = reflected * (gradient @ gradient.T) + link[0] / 4 * (ca.SX.eye(3) + mixed + mixed.T)
+    lever = _spin_lever(leg)
+    for inertia, direction in zip((link[1], link[2]), link_axes(leg), strict=True):
+        row = lever.T @ direction
+        total += inertia * (row @ row.T)
+    return total
+
+
+def link_axes(leg: LegVectors) -> tuple[ca.SX, ca.SX]:
+    """The link's x and y axes (3,) each: z from T to A, x = s x z normalised, y = z x x."""
+    z = leg.link / ca.norm_2(leg.link)
+    across = ca.cross(leg.axis, z)
+    x = across / ca.norm_2(across)
+    return x, ca.cross(z, x)
+
+
+def _spin_lever(leg: LegVectors) -> ca.SX:
+    """d(angular velocity of the link)/d(velocity of A) (3, 3), 1/m (eq. 13)."""
+    gradient, tangent = torque_to_force(leg), ca.cross(leg.axis, leg.crank)
+    return ca.skew(leg.link) @ (ca.SX.eye(3) - tangent @ gradient.T) / ca.dot(leg.link, leg.link)

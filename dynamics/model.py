@@ -1,0 +1,84 @@
+"""The CasADi functions of one robot: what `Robot` evaluates and what the closed loop integrates."""
+
+import casadi as ca
+
+from dynamics.geometry import Rss6Geometry
+from dynamics.jacobians import joint_jacobian, pose_jacobian
+from dynamics.kinematics import leg_vectors, reach_margin
+from dynamics.parameters import COULOMB, PARAMETER_NAMES, RIGID_BODY, VISCOUS
+from dynamics.pose_space_motion import equation_of_motion, motion_derivatives, rate_map_derivative
+from dynamics.rigid_body_dynamics import (
+    coriolis_matrix,
+    friction_regressor,
+    gravity_wrench,
+    inertial_wrench,
+    mass_matrix,
+    rigid_body_regressor,
+)
+from dynamics.rotation import pose_rate_to_twist, twist_bias
+
+FUNCTION_NAMES = (
+    "inverse_kinematics",
+    "joint_jacobian",
+    "pose_jacobian",
+    "twist",
+    "twist_dot",
+    "pose_rate",
+    "mass_matrix",
+    "coriolis_matrix",
+    "gravity_wrench",
+    "friction_wrench",
+    "regressor",
+    "inverse_dynamics",
+    "forward_dynamics",
+)
+
+
+def kinematic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
+    """Functions of pose and its rates alone: angles, reach, Jacobians, twist conversions."""
+    pose, rate, acceleration = ca.SX.sym("pose", 6), ca.SX.sym("pose_rate", 6), ca.SX.sym("pose_acceleration", 6)
+    twist = ca.SX.sym("twist", 6)
+    legs = leg_vectors(geometry, pose)
+    to_twist = pose_rate_to_twist(pose)
+    angles = ca.vertcat(*[leg.angle for leg in legs])
+    return [
+        ca.Function("inverse_kinematics", [pose], [angles, reach_margin(geometry, pose)]),
+        ca.Function("joint_jacobian", [pose], [joint_jacobian(geometry, pose)]),
+        ca.Function("pose_jacobian", [pose], [pose_jacobian(geometry, pose)]),
+        ca.Function("twist", [pose, rate], [to_twist @ rate]),
+        ca.Function("twist_dot", [pose, rate, acceleration], [to_twist @ acceleration + twist_bias(pose, rate)]),
+        ca.Function("pose_rate", [pose, twist], [ca.solve(to_twist, twist)]),
+    ]
+
+
+def dynamic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
+    """M, C, G, friction, regressor (eq. 23-26), inverse dynamics (eq. 17) and forward dynamics (eq. 40)."""
+    pose, twist, twist_dot = ca.SX.sym("pose", 6), ca.SX.sym("twist", 6), ca.SX.sym("twist_dot", 6)
+    torque, xi = ca.SX.sym("torque", 6), ca.SX.sym("parameters", len(PARAMETER_NAMES))
+    rigid = xi[RIGID_BODY]
+    jacobian = joint_jacobian(geometry, pose)
+    friction_columns = friction_regressor(jacobian, jacobian @ twist)
+    friction = friction_columns @ ca.vertcat(xi[COULOMB], xi[VISCOUS])
+    wrench = inertial_wrench(geometry, pose, twist, twist_dot, rigid) + friction
+    bias = inertial_wrench(geometry, pose, twist, ca.SX.zeros(6), rigid) + friction
+    mass = mass_matrix(geometry, pose, rigid)
+    regressor = ca.horzcat(rigid_body_regressor(geometry, pose, twist, twist_dot), friction_columns)
+    return [
+        ca.Function("mass_matrix", [pose, xi], [ca.densify(mass)]),
+        ca.Function("coriolis_matrix", [pose, twist, xi], [ca.densify(coriolis_matrix(geometry, pose, twist, rigid))]),
+        ca.Function("gravity_wrench", [pose, xi], [ca.densify(gravity_wrench(geometry, pose, rigid))]),
+        ca.Function("friction_wrench", [pose, twist, xi], [friction]),
+        ca.Function("regressor", [pose, twist, twist_dot], [ca.densify(regressor)]),
+        ca.Function("inverse_dynamics", [pose, twist, twist_dot, xi], [ca.solve(jacobian.T, wrench)]),
+        ca.Function("forward_dynamics", [pose, twist, torque, xi], [_ldl_solve(mass, jacobian.T @ torque - bias)]),
+    ]
+
+
+def motion_functions(geometry: Rss6Geometry) -> list[ca.Function]:
+    """What the closed-loop integrator evaluates (see `pose_space_motion`)."""
+    return [equation_of_motion(geometry), motion_derivatives(geometry), rate_map_derivative(geometry)]
+
+
+def _ldl_solve(matrix: ca.SX, right: ca.SX) -> ca.SX:
+    diagonal, upper, order = ca.ldl(matrix)
+    return ca.ldl_solve(right, diagonal, upper, order)

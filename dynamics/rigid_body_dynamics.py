@@ -1,0 +1,112 @@
+"""Virtual-work dynamics of the 6-RSS robot (eq. 17-26), in CasADi. Wrenches act at the platform origin, base axes.
+
+Signs: the paper's eq. 20 carries M, C, G of the fictitious forces (negative masses); here M is positive definite and
+tau_g = M twist_dot + C twist + G + tau_f as in eq. 17.
+"""
+
+import casadi as ca
+
+from dynamics.geometry import LEGS, Rss6Geometry
+from dynamics.jacobians import crank_jacobian, link_jacobian
+from dynamics.kinematics import LegVectors, leg_vectors, platform_arms
+from dynamics.leg_dynamics import leg_columns, leg_mass, leg_motion, link_axes
+from dynamics.rotation import pose_rate_to_twist, rotation_matrix
+
+
+def rigid_body_regressor(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> ca.SX:
+    """Columns of Gamma (6, 52) for the inertial parameters of platform, cranks and links (eq. 25)."""
+    gravity, omega, omega_dot = ca.DM(geometry.gravity), twist[3:6], twist_dot[3:6]
+    cranks, links = [], []
+    for leg, arm in zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True):
+        velocity = twist[0:3] + ca.cross(omega, arm)
+        acceleration = twist_dot[0:3] + ca.cross(omega_dot, arm) + ca.cross(omega, ca.cross(omega, arm))
+        forces = leg_columns(leg, leg_motion(leg, velocity, acceleration), gravity)
+        wrenches = ca.vertcat(forces, ca.skew(arm) @ forces)
+        cranks.append(wrenches[:, 0:4])
+        links.append(wrenches[:, 4:8])
+    return ca.horzcat(platform_columns(pose, twist, twist_dot, gravity), *cranks, *links)
+
+
+def platform_columns(pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, gravity: ca.DM) -> ca.SX:
+    """Wrench (6, 4) of the platform alone for unit mass, Ixx, Iyy, Izz about its own axes."""
+    frame, omega, omega_dot = rotation_matrix(pose[3:6]), twist[3:6], twist_dot[3:6]
+    moments = []
+    for axis in range(3):
+        direction = frame[:, axis]
+        gyroscopic = ca.cross(omega, direction) * ca.dot(direction, omega)
+        moments.append(direction * ca.dot(direction, omega_dot) + gyroscopic)
+    mass = ca.vertcat(twist_dot[0:3] - gravity, ca.SX.zeros(3))
+    return ca.horzcat(mass, ca.vertcat(ca.SX.zeros(3, 3), ca.horzcat(*moments)))
+
+
+def friction_regressor(joint_jacobian: ca.SX, joint_velocity: ca.SX) -> ca.SX:
+    """Columns of Gamma (6, 12) for Coulomb, then viscous friction (eq. 24 without its stray second v_E)."""
+    return ca.horzcat(joint_jacobian.T @ ca.diag(ca.sign(joint_velocity)), joint_jacobian.T @ ca.diag(joint_velocity))
+
+
+def inertial_wrench(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, rigid: ca.SX) -> ca.SX:
+    """M twist_dot + C twist + G (6,) for the 52 inertial parameters `rigid`; linear in them."""
+    return rigid_body_regressor(geometry, pose, twist, twist_dot) @ rigid
+
+
+def mass_matrix(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
+    """M (6, 6) of eq. 23, symmetric positive definite for positive parameters."""
+    total = _body_mass(rotation_matrix(pose[3:6]), rigid[0:4])
+    for index, (leg, arm) in enumerate(zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True)):
+        at_joint = leg_mass(leg, crank_parameters(rigid, index), link_parameters(rigid, index))
+        to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
+        total += to_joint.T @ at_joint @ to_joint
+    return total
+
+
+def coriolis_matrix(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, rigid: ca.SX) -> ca.SX:
+    """C (6, 6) of eq. 23: C twist is the Coriolis and centrifugal wrench. Jacobian rates by automatic derivatives."""
+    pose_rate = ca.solve(pose_rate_to_twist(pose), twist)
+    total = _body_coriolis(rotation_matrix(pose[3:6]), rigid[0:4], twist[3:6])
+    for index, (leg, arm) in enumerate(zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True)):
+        for jacobian, frame, parameters in (
+            (crank_jacobian(leg, arm), _crank_frame(leg), crank_parameters(rigid, index)),
+            (link_jacobian(leg, arm), _link_frame(leg), link_parameters(rigid, index)),
+        ):
+            rate = ca.jtimes(jacobian, pose, pose_rate)
+            total += jacobian.T @ _body_coriolis(frame, parameters, jacobian[3:6, :] @ twist) @ jacobian
+            total += jacobian.T @ _body_mass(frame, parameters) @ rate
+    return total
+
+
+def gravity_wrench(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
+    """G (6,) of eq. 23, N and N m: the wrench that holds the robot against gravity."""
+    gravity = ca.DM(geometry.gravity)
+    total = ca.vertcat(-rigid[0] * gravity, ca.SX.zeros(3))
+    for index, (leg, arm) in enumerate(zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True)):
+        total -= crank_parameters(rigid, index)[0] * crank_jacobian(leg, arm)[0:3, :].T @ gravity
+        total -= link_parameters(rigid, index)[0] * link_jacobian(leg, arm)[0:3, :].T @ gravity
+    return total
+
+
+def crank_parameters(rigid: ca.SX, index: int) -> ca.SX:
+    """Mass, Ixx, Iyy, Izz (4,) of one crank, index 0..5."""
+    return rigid[4 + 4 * index : 8 + 4 * index]
+
+
+def link_parameters(rigid: ca.SX, index: int) -> ca.SX:
+    """Mass, Ixx, Iyy, Izz (4,) of one link, index 0..5."""
+    return crank_parameters(rigid, LEGS + index)
+
+
+def _crank_frame(leg: LegVectors) -> ca.SX:
+    """Base-from-crank rotation (3, 3): x from B to T, z along the joint axis."""
+    x = leg.crank / ca.norm_2(leg.crank)
+    return ca.horzcat(x, ca.cross(leg.axis, x), leg.axis)
+
+
+def _link_frame(leg: LegVectors) -> ca.SX:
+    return ca.horzcat(*link_axes(leg), leg.link / ca.norm_2(leg.link))
+
+
+def _body_mass(frame: ca.SX, parameters: ca.SX) -> ca.SX:
+    return ca.diagcat(parameters[0] * ca.SX.eye(3), frame @ ca.diag(parameters[1:4]) @ frame.T)
+
+
+def _body_coriolis(frame: ca.SX, parameters: ca.SX, omega: ca.SX) -> ca.SX:
+    return ca.diagcat(ca.SX.zeros(3, 3), ca.skew(omega) @ frame @ ca.diag(parameters[1:4]) @ frame.T)

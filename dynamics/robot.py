@@ -1,0 +1,202 @@
+"""A robot as its users call it: kinematics and dynamics on NumPy arrays, one pose or a batch of them."""
+
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dynamics import forward_kinematics, model
+from dynamics.compilation import load_library
+from dynamics.errors import ShapeError, SingularPoseError, UnreachablePoseError
+from dynamics.geometry import LEGS
+from dynamics.parameters import PARAMETER_NAMES, check_parameters
+from dynamics.robot_file import ParameterSet, RobotDescription, read_robot_file
+
+# Below this the solution of M a = f loses all digits; a healthy robot is near 1e2 (poses in m and rad).
+CONDITION_LIMIT = 1e10
+
+
+def load_robot(name_or_path: str | Path) -> "Robot":
+    """A built-in robot by name, or the one in a TOML robot file. Raises RobotFileError (see `read_robot_file`)."""
+    return Robot(read_robot_file(name_or_path))
+
+
+class Robot:
+    """Kinematics and virtual-work dynamics of one robot.
+
+    Poses (6,) are [x y z alpha beta gamma] of the platform in the base frame (eq. 1); twists [h_dot, omega] in base
+    axes; SI units and rad. Every method also takes batches with a leading axis (N, 6), and then returns one more axis.
+    `parameters` (64,) or (N, 64) follow `parameter_names`; None means `nominal_parameters`, the set `initial`.
+    Methods raise ShapeError for wrong shapes or entries that are not finite, ParameterError for parameters outside
+    their range, UnreachablePoseError for a pose beyond a leg's reach, SingularPoseError where a Jacobian is singular.
+    """
+
+    def __init__(self, description: RobotDescription) -> None:
+        self.name = description.name
+        self.geometry = description.geometry
+        self.parameter_sets: dict[str, ParameterSet] = description.parameter_sets
+        self.parameter_names = PARAMETER_NAMES
+        self.nominal_parameters = description.parameter_sets["initial"].dynamic
+
+    @property
+    def home_pose(self) -> np.ndarray:
+        """Pose (6,) with all crank angles zero."""
+        return self.geometry.home_pose
+
+    @property
+    def travel_limit(self) -> float:
+        """Largest crank angle magnitude allowed, rad."""
+        return self.geometry.travel_limit
+
+    def inverse_kinematics(self, pose: ArrayLike) -> np.ndarray:
+        """Crank angles (6,) in rad, in closed form (eq. 3 and 4)."""
+        pose = self._poses(pose)
+        return self._call("inverse_kinematics", pose)[..., 0]
+
+    def forward_kinematics(self, theta: ArrayLike, initial_pose: ArrayLike | None = None) -> np.ndarray:
+        """Pose (6,) of crank angles (6,) by Newton's method from `initial_pose` (home by default).
+
+        Raises ConvergenceError, naming the residual, when no pose near the start has these angles.
+        """
+        theta = _rows("theta", theta, LEGS)
+        start = self.home_pose if initial_pose is None else _rows("initial_pose", initial_pose, 6)
+        return forward_kinematics.solve(self, theta, start)
+
+    def joint_jacobian(self, pose: ArrayLike) -> np.ndarray:
+        """J_ad (6, 6): theta_dot = J_ad twist (eq. 8)."""
+        return self._call("joint_jacobian", self._poses(pose))
+
+    def pose_jacobian(self, pose: ArrayLike) -> np.ndarray:
+        """J_theta (6, 6): theta_dot = J_theta pose_dot (eq. 29)."""
+        return self._call("pose_jacobian", self._poses(pose))
+
+    def twist(self, pose: ArrayLike, pose_rate: ArrayLike) -> np.ndarray:
+        """Twist (6,) of pose rates (6,) (eq. 2)."""
+        return self._call("twist", _rows("pose", pose, 6), _rows("pose_rate", pose_rate, 6))[..., 0]
+
+    def twist_dot(self, pose: ArrayLike, pose_rate: ArrayLike, pose_acceleration: ArrayLike) -> np.ndarray:
+        """Twist rate (6,) of pose rates and accelerations (6,) (eq. 38)."""
+        arguments = (("pose", pose), ("pose_rate", pose_rate), ("pose_acceleration", pose_acceleration))
+        return self._call("twist_dot", *[_rows(name, value, 6) for name, value in arguments])[..., 0]
+
+    def pose_rate(self, pose: ArrayLike, twist: ArrayLike) -> np.ndarray:
+        """Pose rates (6,) of a twist (6,); the inverse of `twist`."""
+        return self._call("pose_rate", _rows("pose", pose, 6), _rows("twist", twist, 6))[..., 0]
+
+    def mass_matrix(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
+        """M (6, 6) of eq. 23."""
+        return self._call("mass_matrix", self._poses(pose), self._parameters(parameters))
+
+    def coriolis_matrix(self, pose: ArrayLike, twist: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
+        """C (6, 6) of eq. 23."""
+        twist = _rows("twist", twist, 6)
+        return self._call("coriolis_matrix", self._poses(pose), twist, self._parameters(parameters))
+
+    def gravity_wrench(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
+        """G (6,) of eq. 23, N and N m."""
+        return self._call("gravity_wrench", self._poses(pose), self._parameters(parameters))[..., 0]
+
+    def friction_wrench(self, pose: ArrayLike, twist: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
+        """tau_f (6,) of eq. 24, N and N m, with the exact sign function (zero at rest)."""
+        twist = _rows("twist", twist, 6)
+        return self._call("friction_wrench", self._poses(pose), twist, self._parameters(parameters))[..., 0]
+
+    def regressor(self, pose: ArrayLike, twist: ArrayLike, twist_dot: ArrayLike) -> np.ndarray:
+        """Gamma (6, 64): tau_g = Gamma parameters (eq. 25)."""
+        return self._call("regressor", self._poses(pose), _rows("twist", twist, 6), _rows("twist_dot", twist_dot, 6))
+
+    def inverse_dynamics(
+        self, pose: ArrayLike, twist: ArrayLike, twist_dot: ArrayLike, parameters: ArrayLike | None = None
+    ) -> np.ndarray:
+        """Actuator torques (6,), N m, of a motion (eq. 17 and 23)."""
+        motion = (_rows("twist", twist, 6), _rows("twist_dot", twist_dot, 6))
+        return self._call("inverse_dynamics", self._regular(pose), *motion, self._parameters(parameters))[..., 0]
+
+    def forward_dynamics(
+        self, pose: ArrayLike, twist: ArrayLike, torque: ArrayLike, parameters: ArrayLike | None = None
+    ) -> np.ndarray:
+        """twist_dot (6,) under actuator torques (6,), with the exact sign function in the friction (eq. 40)."""
+        state = (self._regular(pose), _rows("twist", twist, 6), _rows("torque", torque, 6))
+        return self._call("forward_dynamics", *state, self._parameters(parameters))[..., 0]
+
+    def static_torque(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
+        """Actuator torques (6,), N m, that hold the robot at rest without help from friction."""
+        rest = np.zeros_like(np.asarray(pose, dtype=float))
+        return self.inverse_dynamics(pose, rest, rest, parameters)
+
+    def check_reach(self, pose: ArrayLike) -> None:
+        """Raise UnreachablePoseError, naming leg and pose, where a leg cannot reach."""
+        poses = np.atleast_2d(_rows("pose", pose, 6))
+        margin = np.atleast_2d(self._call("inverse_kinematics", poses, output=1)[..., 0])
+        if (margin > 0).all():
+            return
+        index, leg = (int(value) for value in np.argwhere(~(margin > 0))[0])
+        where = f" (row {index})" if np.ndim(pose) > 1 else ""
+        raise UnreachablePoseError(
+            f"leg {leg + 1} cannot reach pose {np.array2string(poses[index], precision=6)}{where}: "
+            f"reach margin {margin[index, leg]:.3g}, must be > 0"
+        )
+
+    @cached_property
+    def functions(self) -> dict[str, Callable]:
+        """CasADi functions by name: compiled where a C compiler is at hand, else for CasADi's virtual machine."""
+
+        def build(geometry: object) -> list[ca.Function]:
+            return model.kinematic_functions(self.geometry) + model.dynamic_functions(self.geometry)
+
+        library = load_library("functions", self.geometry, build)
+        if library is None:
+            return {function.name(): function for function in build(self.geometry)}
+        return {name: ca.external(name, str(library)) for name in model.FUNCTION_NAMES}
+
+    def _poses(self, pose: ArrayLike) -> np.ndarray:
+        poses = _rows("pose", pose, 6)
+        self.check_reach(poses)
+        return poses
+
+    def _regular(self, pose: ArrayLike) -> np.ndarray:
+        poses = self._poses(pose)
+        condition = np.atleast_1d(np.linalg.cond(self._call("joint_jacobian", poses)))
+        if not (condition < CONDITION_LIMIT).all():
+            index = int(np.argmax(~(condition < CONDITION_LIMIT)))
+            raise SingularPoseError(
+                f"the robot is singular at pose {np.array2string(np.atleast_2d(poses)[index], precision=6)}: "
+                f"condition of J_ad {condition[index]:.3g}, limit {CONDITION_LIMIT:.0e}"
+            )
+        return poses
+
+    def _parameters(self, parameters: ArrayLike | None) -> np.ndarray:
+        if parameters is None:
+            return self.nominal_parameters
+        values = np.asarray(parameters, dtype=float)
+        for row in np.atleast_2d(values):
+            check_parameters(row)
+        return values
+
+    def _call(self, name: str, *arguments: np.ndarray, output: int = 0) -> np.ndarray:
+        """Evaluate one function over the common batch: (rows, columns) or, with a batch, (N, rows, columns)."""
+        batched = [argument.shape[0] for argument in arguments if argument.ndim == 2]
+        if len(set(batched) - {1}) > 1:
+            shapes = ", ".join(str(argument.shape) for argument in arguments)
+            raise ShapeError(f"{name}: batch lengths differ, shapes {shapes}")
+        count = max(batched, default=1)
+        columns = [np.broadcast_to(np.atleast_2d(argument), (count, argument.shape[-1])).T for argument in arguments]
+        function = self.functions[name]
+        values = function(*columns)
+        values = np.asarray(values[output] if isinstance(values, tuple) else values, dtype=float)
+        rows = values.shape[0]
+        stacked = values.reshape(rows, count, -1).transpose(1, 0, 2)
+        return stacked if batched else stacked[0]
+
+
+def _rows(name: str, value: ArrayLike, width: int) -> np.ndarray:
+    array = np.asarray(value, dtype=float)
+    if array.ndim not in (1, 2) or array.shape[-1] != width:
+        raise ShapeError(f"{name} must have shape ({width},) or (N, {width}), got {array.shape}")
+    if not np.isfinite(array).all():
+        place = tuple(int(index) for index in np.argwhere(~np.isfinite(array))[0])
+        raise ShapeError(f"{name}{list(place)} is {array[place]}, must be finite")
+    return array
