@@ -1,0 +1,208 @@
+"""The command ``cmmsim``: a whole run, or its stages one by one."""
+
+import tomllib
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table as RichTable
+
+from identify import tables
+from identify.errors import IdentifyError, ScenarioError
+from identify.progress import Progress, RichProgress, SilentProgress
+from identify.run_folder import RunFolder, new_run_folder
+from identify.scenario import Scenario, load_scenario, scenario_names
+
+HELP = """
+Identify a parallel robot from rendered stereo images, and prove how good the result is.
+
+A simulated stereo camera measures the pose of a simulated robot, a visual servo moves it along an exciting
+trajectory, and its dynamic parameters are estimated from the record. Unseen trajectories judge them.
+
+\b
+Examples:
+  cmmsim run quick                       a one-minute run into runs/quick-0
+  cmmsim run                             the paper's experiment into runs/paper-0
+  cmmsim run paper --seed 7 --out mine   other noise and trajectories, into mine
+  cmmsim run quick --set timing.latency_s=0.0167 --set pose_method=planes
+
+\b
+The stages alone, each reading what the one before wrote:
+  cmmsim excite quick --out mine         scenario.toml, trajectories.json
+  cmmsim record --out mine               experiment.nc
+  cmmsim identify --out mine             result.json
+  cmmsim validate --out mine             validation.nc, model.nc, result.json
+  cmmsim report --out mine               report.html, figures/*.png
+"""
+
+app = typer.Typer(
+    name="cmmsim", help=HELP, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None
+)
+
+ScenarioArgument = Annotated[
+    str, typer.Argument(help=f"Built-in scenario ({', '.join(scenario_names())}) or path of a TOML file.")
+]
+NewFolder = Annotated[
+    Path | None, typer.Option("--out", help="Output folder, new or empty.", show_default="runs/SCENARIO-SEED")
+]
+RunFolderOption = Annotated[Path, typer.Option("--out", help="Folder of the run, as the stage before left it.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness: trajectories and sensor noise.")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Replace a value of the scenario: timing.frame_rate_hz=30."),
+]
+Workers = Annotated[
+    int | None, typer.Option("--workers", min=1, help="Processes that render.", show_default="one a core")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary.")]
+
+
+def main() -> None:
+    """Run the command; a known error is one line on standard error and exit status 1."""
+    try:
+        app()
+    except known_errors() as error:
+        typer.echo(f"error: {' '.join(str(error).split())}", err=True)
+        raise SystemExit(1) from None
+
+
+def known_errors() -> tuple[type[Exception], ...]:
+    """The errors of all three packages that a user can cause or meet."""
+    from cmmsim.errors import CmmError, OpenGLMissingError
+    from dynamics.errors import DynamicsError
+
+    return IdentifyError, CmmError, OpenGLMissingError, DynamicsError
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"cmmsim {metadata.version('cmmsim')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def run(
+    scenario: ScenarioArgument = "paper",
+    out: NewFolder = None,
+    seed: Seed = 0,
+    settings: Settings = None,
+    workers: Workers = None,
+    quiet: Quiet = False,
+) -> None:
+    """Do the whole experiment: excite, record, identify, validate, report."""
+    chosen = _scenario(scenario, settings)
+    folder = new_run_folder(out or Path("runs") / f"{chosen.name}-{seed}")
+    _pipeline().run(chosen, seed, folder.path, _progress(quiet), workers)
+    if not quiet:
+        print_summary(folder)
+
+
+@app.command()
+def excite(
+    scenario: ScenarioArgument = "paper",
+    out: NewFolder = None,
+    seed: Seed = 0,
+    settings: Settings = None,
+    quiet: Quiet = False,
+) -> None:
+    """Choose the exciting trajectory and the unseen ones: writes scenario.toml and trajectories.json."""
+    chosen = _scenario(scenario, settings)
+    folder = new_run_folder(out or Path("runs") / f"{chosen.name}-{seed}")
+    _pipeline().excite(chosen, seed, folder.path, _progress(quiet))
+
+
+@app.command()
+def record(out: RunFolderOption, workers: Workers = None, quiet: Quiet = False) -> None:
+    """Run the plant with images in the loop on the exciting trajectory: writes experiment.nc."""
+    RunFolder(out).require("scenario.toml", "trajectories.json")
+    _pipeline().record(out, _progress(quiet), workers)
+
+
+@app.command()
+def identify(out: RunFolderOption, quiet: Quiet = False) -> None:
+    """Estimate the parameters from the record: writes result.json."""
+    RunFolder(out).require("scenario.toml", "trajectories.json", "experiment.nc")
+    _pipeline().identify(out, _progress(quiet))
+
+
+@app.command()
+def validate(out: RunFolderOption, workers: Workers = None, quiet: Quiet = False) -> None:
+    """Judge the identified model on unseen trajectories: writes validation.nc and completes result.json."""
+    RunFolder(out).require("scenario.toml", "trajectories.json", "experiment.nc", "result.json")
+    _pipeline().validate(out, _progress(quiet), workers)
+
+
+@app.command()
+def report(out: RunFolderOption, quiet: Quiet = False) -> None:
+    """Draw the figures and write report.html, one file that opens offline."""
+    RunFolder(out).require("result.json", "experiment.nc", "validation.nc", "model.nc")
+    _pipeline().report(out, _progress(quiet))
+    if not quiet:
+        print_summary(RunFolder(out))
+
+
+def parse_settings(settings: list[str] | None) -> dict[str, Any]:
+    """Overrides from ``KEY=VALUE`` texts; a value is TOML, and what is no TOML is a string.
+
+    Raises:
+        ScenarioError: a text without ``=``.
+    """
+    overrides = {}
+    for text in settings or []:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            raise ScenarioError(f"--set {text!r} is not of the form KEY=VALUE, such as timing.frame_rate_hz=30")
+        overrides[key.strip()] = _toml_or_text(value.strip())
+    return overrides
+
+
+def print_summary(folder: RunFolder) -> None:
+    """Print the goals of a run with their values, and where its report is."""
+    from identify.result_file import load_result
+
+    table = tables.goals_table(load_result(folder.result))
+    shown = RichTable(title=table.title, caption=table.note, show_edge=False)
+    for name in table.header:
+        shown.add_column(name)
+    for row in table.rows:
+        shown.add_row(*row)
+    console = Console()
+    console.print(shown)
+    console.print(f"report: {folder.report}", highlight=False, soft_wrap=True)
+
+
+def _toml_or_text(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _scenario(name: str, settings: list[str] | None) -> Scenario:
+    return load_scenario(name).with_overrides(parse_settings(settings))
+
+
+def _progress(quiet: bool) -> Progress:
+    return SilentProgress() if quiet else RichProgress()
+
+
+def _pipeline() -> Any:
+    """The stages, imported late: ``cmmsim --help`` must not wait for CasADi and OpenGL."""
+    from identify import pipeline
+
+    return pipeline
+
+
+if __name__ == "__main__":
+    main()

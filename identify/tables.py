@@ -1,0 +1,148 @@
+"""Tables like the paper's 2, 3 and 4 beside the paper's own figures, as rows of text with units in the header."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from identify import paper_results
+from identify.goals import check_goals
+from identify.result_file import AXES, rms_row
+
+AXIS_UNITS = ("um", "um", "um", "urad", "urad", "urad")
+AXIS_HEADER = tuple(f"{axis} [{unit}]" for axis, unit in zip(AXES, AXIS_UNITS, strict=True))
+
+
+@dataclass(frozen=True)
+class Table:
+    """A titled table of text; ``note`` says what the reader must know to read it."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+
+    def markdown(self) -> str:
+        """The table as Markdown, numbers aligned to the right."""
+        lines = [self.header, ("---",) + ("--:",) * (len(self.header) - 1), *self.rows]
+        return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def goals_table(result: dict[str, Any]) -> Table:
+    """Every goal with its value, its limit and whether it is met."""
+    rows = tuple(
+        (
+            goal.name,
+            f"{number(goal.value)} {goal.unit}".strip(),
+            f"{'≤' if goal.relation == '<=' else '≥'} {number(goal.limit)} {goal.unit}".strip(),
+            "met" if goal.passed else "MISSED",
+            goal.detail,
+        )
+        for goal in check_goals(result)
+    )
+    return Table("Goals", ("goal", "value", "limit", "", "what"), rows, "Accuracy: RMS of the worst axis and run.")
+
+
+def parameter_table(result: dict[str, Any], identifiable_only: bool = False) -> Table:
+    """Parameters, like table 2: starting guess, truth, estimate and standard deviation."""
+    rows = []
+    for name, p in result["identification"]["parameters"].items():
+        if not p["identifiable"] and identifiable_only:
+            continue
+        shown = (number(p["estimate"]), number(p["std"]), _percent(p)) if p["identifiable"] else ("-", "-", "-")
+        remark = "" if p["identifiable"] else "not identifiable"
+        rows.append((name, parameter_unit(name), number(p["initial"]), number(p["true"]), *shown, remark))
+    anchor = result["identification"]["scale_anchor"]
+    return Table(
+        "Parameters (like the paper's table 2)",
+        ("parameter", "unit", "initial", "true", "estimate", "std", "error [%]", ""),
+        tuple(rows),
+        f"The overall scale is fixed by: {anchor}. A parameter that no motion shows has no estimate.",
+    )
+
+
+def excitation_error_table(result: dict[str, Any]) -> Table:
+    """Model against measurement on the exciting trajectory before and after identification, like table 3."""
+    before, after = _rms(rms_row(result.get("before"))), _rms(rms_row(result.get("after")))
+    rows = tuple(
+        (f"{axis} [{unit}]", b, a, number(pb), number(pa))
+        for axis, unit, b, a, pb, pa in zip(
+            AXES, AXIS_UNITS, before, after, paper_results.BEFORE, paper_results.AFTER, strict=True
+        )
+    )
+    return Table(
+        "RMS of model against measurement, exciting trajectory (like the paper's table 3)",
+        ("component", "before", "after", "paper before", "paper after"),
+        rows,
+        "diverged: the starting model is unstable.",
+    )
+
+
+def validation_table(result: dict[str, Any]) -> Table:
+    """Models against measurement and truth on the unseen trajectories, like table 4, and the paper's rows."""
+    rows: list[tuple[str, ...]] = []
+    for number_, run in enumerate(result.get("validation", []), start=1):
+        rows.append((f"{number_} true", *_rms(rms_row(run["true"]))))
+        rows.append((f"{number_} measured", *_rms(rms_row(run["measured"]))))
+        initial = run.get("initial", {}).get("true")
+        if initial:
+            rows.append((f"{number_} starting model, true", *_rms(rms_row(initial))))
+    rows += [(f"paper {n} measured", *map(number, row)) for n, row in enumerate(paper_results.VALIDATION, start=1)]
+    return Table(
+        "RMS on unseen trajectories (like the paper's table 4)",
+        ("run", *AXIS_HEADER),
+        tuple(rows),
+        "true: identified model against the true plant; measured: against what the sensor saw of it.",
+    )
+
+
+def sensor_table(result: dict[str, Any]) -> Table:
+    """Measured pose against truth."""
+    sensor = result["sensor"]
+    return Table(
+        "Sensor: RMS of measured pose against truth",
+        ("frames", "lost", "stereo frames a second", *AXIS_HEADER),
+        (
+            (
+                str(sensor["frames"]),
+                str(sensor["lost_frames"]),
+                number(sensor.get("stereo_frames_per_second")),
+                *_rms(rms_row(sensor)),
+            ),
+        ),
+    )
+
+
+def seconds_table(result: dict[str, Any]) -> Table:
+    """Time of each stage."""
+    rows = tuple((name, number(value)) for name, value in result.get("seconds", {}).items())
+    return Table("Time of the stages", ("stage", "seconds"), rows)
+
+
+def parameter_unit(name: str) -> str:
+    """Unit of a parameter by its name; empty for a name of no known kind."""
+    units = {
+        "mass": "kg",
+        "coulomb": "N m",
+        "viscous": "N m s/rad",
+        "lp": "N m/rad",
+        "li": "N m/(rad s)",
+        "ld": "N m s/rad",
+    }
+    kind = name.rpartition(".")[2]
+    return "kg m²" if kind.startswith("I") else units.get(kind, "")
+
+
+def number(value: float | None) -> str:
+    """A number with four significant digits; a dash for one that does not exist."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:.4g}"
+
+
+def _rms(values: list[float]) -> list[str]:
+    return [number(value) if math.isfinite(value) else "diverged" for value in values]
+
+
+def _percent(parameter: dict[str, Any]) -> str:
+    true, estimate = parameter["true"], parameter["estimate"]
+    if not true or estimate is None:
+        return "-"
+    return f"{100 * (estimate - true) / abs(true):+.2f}"
