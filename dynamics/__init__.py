@@ -1,1 +1,12 @@
-"""Dynamics of parallel robots: kinematics, virtual-work dynamics, joint PID, visual servo and closed loop."""
+"""Dynamics of parallel robots: kinematics, virtual-work dynamics, joint PID, visual servo and closed loop.
+
+Conventions: SI units and rad; pose [x y z alpha beta gamma] with R = Rx(alpha) Ry(beta) Rz(gamma); twist [h_dot, omega]
+in base-frame axes. The crank is what the paper calls the wrench.
+"""
+
+from dynamics import closed_loop
+from dynamics.errors import DynamicsError
+from dynamics.robot import Robot, load_robot
+from dynamics.robot_file import built_in_robots
+
+__all__ = ["DynamicsError", "Robot", "built_in_robots", "closed_loop", "load_robot"]

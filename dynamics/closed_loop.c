@@ -19,6 +19,7 @@
 #define LD 66
 #define MAX_EVENTS_PER_SEGMENT 400
 #define MAX_DELAY 64
+#define NO_MARGIN 1e-12 /* rad/s, or share of the breakaway torque */
 
 enum { OK = 0, LEFT_REACH = 1, TOO_MANY_EVENTS = 2, SENSOR_FAILED = 3, OUT_OF_MEMORY = 4 };
 
@@ -408,22 +409,34 @@ static void stop_joints(evaluation *e, state *s, const int *list, int count) {
         for (int j = 0; j < N; j++) s->rate[j] -= e->inverse_rows[list[k]][j] * impulse[k];
 }
 
-/* Largest step in (0, h] at the end of which the modes still hold, to rounding: regula falsi (Illinois). */
+static int trial_margin(context *c, const state *s, double t, double h, state *out, evaluation *end, double *margin) {
+    int ignored, status = rk4(c, s, t, h, out);
+    if (status == OK) status = evaluate(c, out, t + h, end);
+    if (status == OK) *margin = mode_margin(c, end, &ignored);
+    return status;
+}
+
+/* The step in (0, h] at which the modes stop holding, to rounding: regula falsi (Illinois) on the margin. A joint that
+ * has just started from rest has no margin yet: then the bracket is found by halving; *held tells whether there is one. */
 static int locate_event(context *c, const state *s, double t, double h, double margin_at_h, double *step, state *out,
-                        evaluation *end, int *joint) {
-    double low = 0, high = h, at_low = 0, at_high = margin_at_h;
-    int ignored, side = 0;
-    at_low = fmax(mode_margin(c, &c->stage[0], &ignored), 1e-14);
-    for (int iteration = 0; iteration < 80 && high - low > 1e-15 + 1e-13 * h; iteration++) {
+                        evaluation *end, int *held) {
+    int joint, side = 0, status;
+    double low = 0, high = h, at_high = margin_at_h, at_low = mode_margin(c, &c->stage[0], &joint), margin;
+    for (int halving = 0; at_low < NO_MARGIN && halving < 40; halving++) {
+        status = trial_margin(c, s, t, high / 2, out, end, &margin);
+        if (status != OK) return status;
+        if (margin > 0) { low = high / 2; at_low = margin; break; }
+        high /= 2; at_high = margin;
+    }
+    *held = at_low > 0;
+    for (int iteration = 0; *held && iteration < 80 && high - low > 1e-15 + 1e-13 * h; iteration++) {
         double middle = (low * at_high - high * at_low) / (at_high - at_low);
         if (iteration > 40 || !(middle > low && middle < high)) middle = 0.5 * (low + high);
-        int status = rk4(c, s, t, middle, out);
-        if (status == OK) status = evaluate(c, out, t + middle, end);
+        status = trial_margin(c, s, t, middle, out, end, &margin);
         if (status != OK) return status;
-        double margin = mode_margin(c, end, &ignored);
-        if (fabs(margin) < 1e-14) { low = high = middle; break; }
-        if (margin < 0) {
+        if (margin <= 0) {
             high = middle; at_high = margin;
+            if (margin == 0) break;
             if (side < 0) at_low /= 2;
             side = -1;
         } else {
@@ -433,10 +446,7 @@ static int locate_event(context *c, const state *s, double t, double h, double m
         }
     }
     *step = high;
-    int status = rk4(c, s, t, high, out);
-    if (status == OK) status = evaluate(c, out, t + high, end);
-    mode_margin(c, end, joint);
-    return status;
+    return trial_margin(c, s, t, high, out, end, &margin);
 }
 
 /* The jump of the sensitivities where a slipping joint comes to rest: its velocity zero fixes the event time. */
@@ -456,7 +466,10 @@ static void saltation(context *c, const evaluation *before, const evaluation *af
     }
 }
 
-static int handle_event(context *c, state *s, double t, evaluation *end, int joint) {
+/* `held` is 0 where a joint that starts from rest turns back at once: it sticks. */
+static int handle_event(context *c, state *s, double t, evaluation *end, int held) {
+    int joint;
+    mode_margin(c, end, &joint);
     if (c->mode[joint] == 0) {
         c->mode[joint] = end->stick_force[joint] > 0 ? 1 : -1;
         return evaluate(c, s, t, &c->stage[0]);
@@ -468,7 +481,7 @@ static int handle_event(context *c, state *s, double t, evaluation *end, int joi
     stop_joints(end, s, list, count);
     int status = evaluate_terms(c, s, t, end);
     if (status != OK) return status;
-    decide_modes(c, end, list, count);
+    if (held) decide_modes(c, end, list, count);
     status = evaluate(c, s, t, &c->stage[0]);
     if (status == OK && c->p->sensitivities) saltation(c, &before, &c->stage[0], s, joint);
     return status;
@@ -495,17 +508,17 @@ static int segment(context *c, state *s, double duration, int steps) {
             if (status == OK) status = evaluate(c, &next, t + h, &end);
             if (status != OK) break;
             double margin = mode_margin(c, &end, &joint);
-            int event = margin < 0;
+            int event = margin < 0, held = 1;
             if (event) {
                 if (++events > MAX_EVENTS_PER_SEGMENT) return TOO_MANY_EVENTS;
-                status = locate_event(c, s, t, h, margin, &h, &next, &end, &joint);
+                status = locate_event(c, s, t, h, margin, &h, &next, &end, &held);
                 if (status != OK) break;
                 c->events++;
             }
             if (c->p->sensitivities) rk4_tangent(c, h);
             *s = next;
             t = event ? t + h : target;
-            if (event) status = handle_event(c, s, t, &end, joint);
+            if (event) status = handle_event(c, s, t, &end, held);
             else {
                 stop_joints(&end, s, list, stuck_joints(c->mode, list));
                 for (int i = 0; i < N; i++)
@@ -531,7 +544,7 @@ static void servo_update(context *c, servo *v, int k, const double *measured, co
     evaluation e;
     for (int i = 0; i < N; i++) {
         double error = p->reference[N * k + i] - measured[i];
-        double rate = k == 0 ? 0 : (measured[i] - v->previous_measured[i]) / v->elapsed;
+        double rate = (measured[i] - v->previous_measured[i]) / v->elapsed;
         v->integral[i] += period * error;
         demand[i] = p->kp * error + p->kd * (p->reference_rate[N * k + i] - rate) + p->ki * v->integral[i];
     }
@@ -548,7 +561,7 @@ static void servo_update(context *c, servo *v, int k, const double *measured, co
         for (int i = 0; i < N; i++)
             for (int n = 0; n < NP; n++) {
                 double d = d_measured[i * NP + n];
-                double d_rate = k == 0 ? 0 : (d - v->d_previous[i][n]) / v->elapsed;
+                double d_rate = (d - v->d_previous[i][n]) / v->elapsed;
                 v->d_integral[i][n] -= period * d;
                 d_demand[i][n] = -p->kp * d - p->kd * d_rate + p->ki * v->d_integral[i][n];
                 v->d_previous[i][n] = d;
@@ -604,6 +617,12 @@ static int frame_command(context *c, servo *v, int k, const state *s, measure_fn
     return OK;
 }
 
+static int record_torque(context *c, const state *s, double *torque) {
+    int status = evaluate_terms(c, s, 0, &c->stage[0]);
+    if (status == OK) memcpy(torque, c->stage[0].torque, sizeof(vec));
+    return status;
+}
+
 static int run_frames(context *c, servo *v, issued *ring, state *s, measure_fn measure, trajectory *out) {
     const problem *p = c->p;
     int whole = (int)floor(p->latency / p->frame_period + 1e-9), status = OK;
@@ -621,16 +640,13 @@ static int run_frames(context *c, servo *v, issued *ring, state *s, measure_fn m
         if (p->sensitivities) memcpy(slot->tangent, v->d_command, sizeof(rows));
         if (rest > 0) {
             apply_command(c, ring, k - whole - 1);
-            status = segment(c, s, rest, steps_in(p, rest));
-            memcpy(out->torque + N * k, c->stage[0].torque, sizeof(vec));
+            status = record_torque(c, s, out->torque + N * k);
+            if (status == OK) status = segment(c, s, rest, steps_in(p, rest));
             if (status != OK) return status;
         }
         apply_command(c, ring, k - whole);
-        if (rest == 0) {
-            status = evaluate_terms(c, s, 0, &c->stage[0]);
-            if (status != OK) return status;
-            memcpy(out->torque + N * k, c->stage[0].torque, sizeof(vec));
-        }
+        if (rest == 0) status = record_torque(c, s, out->torque + N * k);
+        if (status != OK) return status;
         if (k + 1 == p->frames) break;
         status = segment(c, s, p->frame_period - rest, steps_in(p, p->frame_period - rest));
         if (status != OK) return status;
@@ -669,6 +685,7 @@ CASADI_SYMBOL_EXPORT int closed_loop_run(const problem *p, measure_fn measure, t
         memcpy(s.integral, p->integral, sizeof(vec));
         memcpy(v->integral, p->servo_integral, sizeof(vec));
         memcpy(v->last_command, p->command, sizeof(vec));
+        memcpy(v->previous_measured, p->pose, sizeof(vec));
         if (p->integral_sensitivity) memcpy(c->x.z, p->integral_sensitivity, sizeof c->x.z);
         for (int k = 0; k < MAX_DELAY; k++) memcpy(ring[k].value, p->command, sizeof(vec));
         status = run_frames(c, v, ring, &s, measure, out);

@@ -1,0 +1,177 @@
+"""Binding of the compiled closed loop (`closed_loop.c`) by ctypes."""
+
+import ctypes
+from ctypes import CFUNCTYPE, POINTER, Structure, byref, c_byte, c_double, c_int
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from dynamics import model
+from dynamics.compilation import load_library, open_library
+from dynamics.errors import SimulationError
+from dynamics.geometry import Rss6Geometry
+from dynamics.loop_types import (
+    PARAMETER_COUNT,
+    ClosedLoopRun,
+    LoopSettings,
+    PoseSensor,
+    Reference,
+    StartState,
+    failure,
+)
+
+FAILURES = {
+    1: "the robot left the reachable set (the loop is unstable)",
+    2: "more stick-slip events than a frame can hold",
+    4: "out of memory",
+}
+SENSOR_FAILED = 3
+
+_Measure = CFUNCTYPE(c_int, c_int, POINTER(c_double), POINTER(c_double))
+_DoublePointer = POINTER(c_double)
+
+
+class _Problem(Structure):
+    _fields_ = [
+        *[(name, c_int) for name in ("frames", "steps_per_frame", "linear_hold", "smoothed", "sensitivities")],
+        *[(name, c_double) for name in ("frame_period", "latency", "smoothing_velocity")],
+        ("rigid", c_double * 52),
+        ("coulomb", c_double * 6),
+        ("viscous", c_double * 6),
+        *[(name, c_double) for name in ("lp", "li", "ld", "kp", "kd", "ki")],
+        *[(name, c_double * 6) for name in ("pose", "command", "integral", "servo_integral")],
+        *[(n, _DoublePointer) for n in ("integral_sensitivity", "reference", "reference_rate", "logged_commands")],
+    ]
+
+
+class _Trajectory(Structure):
+    _fields_ = [
+        *[(name, _DoublePointer) for name in ("pose", "rate", "torque", "command", "measured")],
+        ("measured_ok", POINTER(c_byte)),
+        ("pose_sensitivity", _DoublePointer),
+        ("events", c_int),
+        ("failed_frame", c_int),
+    ]
+
+
+
+@cache
+def _library_at(path: Path) -> ctypes.CDLL:
+    opened = open_library(path)
+    opened.closed_loop_run.argtypes = [POINTER(_Problem), _Measure, POINTER(_Trajectory)]
+    opened.closed_loop_run.restype = c_int
+    return opened
+
+
+def library(geometry: Rss6Geometry) -> ctypes.CDLL | None:
+    """The compiled loop of a robot, compiled on first use; None without a C compiler."""
+    path = load_library("closed_loop", geometry, model.motion_functions, "closed_loop.c")
+    return _library_at(path) if path else None
+
+
+def run(
+    library: ctypes.CDLL,
+    parameters: np.ndarray,
+    reference: Reference,
+    settings: LoopSettings,
+    start: StartState,
+    sensor: PoseSensor | None,
+    sensitivities: bool,
+    commands: np.ndarray | None,
+) -> ClosedLoopRun:
+    """See `closed_loop.simulate`; arguments are already checked."""
+    frames = len(reference.poses)
+    period = 1.0 / settings.timing.frame_rate_hz
+    arrays = {name: np.zeros((frames, 6)) for name in ("pose", "rate", "torque", "command", "measured")}
+    measured_ok = np.zeros(frames, dtype=np.int8)
+    sensitivity = np.zeros((frames, 6, PARAMETER_COUNT)) if sensitivities else None
+    problem = _problem(parameters, reference, settings, start, sensitivities, commands)
+    trajectory = _Trajectory(
+        **{name: _pointer(array) for name, array in arrays.items()},
+        measured_ok=measured_ok.ctypes.data_as(POINTER(c_byte)),
+        pose_sensitivity=_pointer(sensitivity),
+    )
+    callback, raised = _callback(sensor, period)
+    status = library.closed_loop_run(byref(problem), callback, byref(trajectory))
+    if status == SENSOR_FAILED:
+        raise raised[0] if raised else SimulationError("the pose sensor failed without an error")
+    if status:
+        raise failure(FAILURES[status], trajectory.failed_frame, period)
+    return ClosedLoopRun(
+        time=np.arange(frames) * period,
+        pose=arrays["pose"],
+        pose_rate=arrays["rate"],
+        torque=arrays["torque"],
+        command=arrays["command"],
+        measured=arrays["measured"],
+        measured_ok=measured_ok.astype(bool),
+        pose_sensitivity=sensitivity,
+        events=trajectory.events,
+    )
+
+
+def _problem(
+    parameters: np.ndarray,
+    reference: Reference,
+    settings: LoopSettings,
+    start: StartState,
+    sensitivities: bool,
+    commands: np.ndarray | None,
+) -> _Problem:
+    """The C struct. It borrows the arrays' memory: the caller keeps them alive during the call."""
+    servo, timing, friction = settings.servo, settings.timing, settings.friction
+    problem = _Problem(
+        frames=len(reference.poses),
+        steps_per_frame=settings.steps_per_frame,
+        linear_hold=timing.hold == "linear",
+        smoothed=friction.smoothed,
+        sensitivities=sensitivities,
+        frame_period=1.0 / timing.frame_rate_hz,
+        latency=timing.latency_s,
+        smoothing_velocity=friction.smoothing_velocity or 0.0,
+        lp=parameters[64],
+        li=parameters[65],
+        ld=parameters[66],
+        kp=servo.kp,
+        kd=servo.kd,
+        ki=servo.ki,
+        integral_sensitivity=_pointer(start.joint_integral_sensitivity),
+        reference=_pointer(reference.poses),
+        reference_rate=_pointer(reference.rates),
+        logged_commands=_pointer(commands),
+    )
+    problem.rigid[:] = parameters[:52]
+    problem.coulomb[:] = parameters[52:58]
+    problem.viscous[:] = parameters[58:64]
+    problem.pose[:] = reference.poses[0]
+    problem.command[:] = start.command
+    problem.integral[:] = start.joint_integral
+    problem.servo_integral[:] = start.servo_integral
+    return problem
+
+
+def _pointer(array: np.ndarray | None) -> "ctypes._Pointer[c_double] | None":
+    return None if array is None else array.ctypes.data_as(_DoublePointer)
+
+
+def _callback(sensor: PoseSensor | None, period: float) -> tuple[_Measure, list[BaseException]]:
+    """The sensor as a C callback; what it raises is kept for the caller, since C cannot pass it on."""
+    raised: list[BaseException] = []
+    if sensor is None:
+        return _Measure(), raised
+
+    def measure(frame: int, pose: "ctypes._Pointer[c_double]", measured: "ctypes._Pointer[c_double]") -> int:
+        try:
+            result = sensor(frame, frame * period, np.array(pose[:6]))
+        except BaseException as error:  # noqa: BLE001  KeyboardInterrupt must cross the C frame too
+            raised.append(error)
+            return -1
+        if result is None:
+            measured[:6] = [float("nan")] * 6
+            return 0
+        for index in range(6):
+            measured[index] = result[index]
+        return 1
+
+    return _Measure(measure), raised

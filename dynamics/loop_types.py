@@ -1,0 +1,140 @@
+"""What goes into a closed-loop run and what comes out: settings, reference, start state, result."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from dynamics.errors import SimulationError
+from dynamics.parameters import PARAMETER_NAMES
+
+PARAMETER_COUNT = len(PARAMETER_NAMES) + 3
+MAX_DELAY_FRAMES = 60
+
+# (frame index, time s, true pose (6,)) -> measured pose (6,), or None when the measurement is lost.
+PoseSensor = Callable[[int, float, np.ndarray], np.ndarray | None]
+
+
+@dataclass(frozen=True)
+class ServoGains:
+    """Visual servo gains of eq. 30: kp (1), kd (s), ki (1/s)."""
+
+    kp: float
+    kd: float
+    ki: float
+
+
+@dataclass(frozen=True)
+class FrameTiming:
+    """Frame rate (Hz), latency from exposure to command (s), and the hold of the joint command between frames.
+
+    hold "zero": the command jumps to its new value; "linear": it ramps there over one frame. In both the joint PID
+    takes the difference of the last two commands over the frame period for U_dot.
+    """
+
+    frame_rate_hz: float
+    latency_s: float = 0.0
+    hold: Literal["zero", "linear"] = "zero"
+
+    def __post_init__(self) -> None:
+        if not self.frame_rate_hz > 0:
+            raise SimulationError(f"frame rate is {self.frame_rate_hz} Hz, must be > 0")
+        if not 0 <= self.latency_s * self.frame_rate_hz <= MAX_DELAY_FRAMES:
+            raise SimulationError(
+                f"latency is {self.latency_s} s, must be >= 0 and at most {MAX_DELAY_FRAMES} frames "
+                f"({MAX_DELAY_FRAMES / self.frame_rate_hz:.3g} s)"
+            )
+        if self.hold not in ("zero", "linear"):
+            raise SimulationError(f"unknown hold `{self.hold}`; valid: zero, linear")
+
+
+@dataclass(frozen=True)
+class FrictionLaw:
+    """Joint friction: "coulomb_viscous" sticks and slips exactly as in eq. 24; "smoothed" replaces the sign by
+    tanh(theta_dot / smoothing_velocity), in rad/s."""
+
+    name: Literal["coulomb_viscous", "smoothed"] = "coulomb_viscous"
+    smoothing_velocity: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.name not in ("coulomb_viscous", "smoothed"):
+            raise SimulationError(f"unknown friction law `{self.name}`; valid: coulomb_viscous, smoothed")
+        if self.name == "smoothed" and not (self.smoothing_velocity or 0) > 0:
+            raise SimulationError(f"smoothed friction needs smoothing_velocity > 0 rad/s, got {self.smoothing_velocity}")
+
+    @property
+    def smoothed(self) -> bool:
+        """Whether the sign function is replaced."""
+        return self.name == "smoothed"
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """What the loop is made of besides the robot: servo, timing, friction law, Runge-Kutta steps per frame."""
+
+    servo: ServoGains
+    timing: FrameTiming
+    friction: FrictionLaw = FrictionLaw()
+    steps_per_frame: int = 4
+
+    def __post_init__(self) -> None:
+        if self.steps_per_frame < 1:
+            raise SimulationError(f"steps_per_frame is {self.steps_per_frame}, must be >= 1")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Desired motion at the frame times: poses (frames, 6) and pose rates (frames, 6)."""
+
+    poses: np.ndarray
+    rates: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in ("poses", "rates"):
+            array = np.ascontiguousarray(getattr(self, name), dtype=float)
+            if array.ndim != 2 or array.shape[1] != 6 or len(array) < 2 or not np.isfinite(array).all():
+                raise SimulationError(f"reference {name} must be finite with shape (frames >= 2, 6), got {array.shape}")
+            object.__setattr__(self, name, array)
+        if self.poses.shape != self.rates.shape:
+            raise SimulationError(f"reference poses {self.poses.shape} and rates {self.rates.shape} differ in shape")
+
+
+@dataclass(frozen=True)
+class StartState:
+    """Equilibrium at the first reference pose: command = crank angles (6,), joint PID integral (6,) with its
+    derivative with respect to the 67 parameters (6, 67), and servo integral (6,)."""
+
+    command: np.ndarray
+    joint_integral: np.ndarray
+    joint_integral_sensitivity: np.ndarray
+    servo_integral: np.ndarray
+
+
+@dataclass(frozen=True)
+class ClosedLoopRun:
+    """A run, one row a frame: time (s), true pose and pose rate, actuator torque (N m), command (rad), measured pose,
+    whether the measurement was good; pose_sensitivity (frames, 6, 67) or None; number of stick-slip events."""
+
+    time: np.ndarray
+    pose: np.ndarray
+    pose_rate: np.ndarray
+    torque: np.ndarray
+    command: np.ndarray
+    measured: np.ndarray
+    measured_ok: np.ndarray
+    pose_sensitivity: np.ndarray | None
+    events: int
+
+
+class LoopFailure(SimulationError):
+    """A run that ended early; `frame` says where."""
+
+    def __init__(self, message: str, frame: int) -> None:
+        super().__init__(message)
+        self.frame = frame
+
+
+def failure(reason: str, frame: int, period: float) -> LoopFailure:
+    """The error of a run that ended early, the same on both paths."""
+    return LoopFailure(f"closed loop stopped at frame {frame} (t = {frame * period:.3f} s): {reason}", frame)
