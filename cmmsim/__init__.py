@@ -1,0 +1,30 @@
+"""Synthetic stereo optical CMM: renders a posed platform with stickers, and measures its pose from the images."""
+
+from .camera import PinholeCamera
+from .errors import (
+    CmmError,
+    LostError,
+    OpenGLMissingError,
+    SensorFileError,
+    ShapeError,
+    TeachingError,
+    UnknownBodyError,
+    UnknownOptionError,
+    UnknownSensorError,
+)
+from .estimator import PoseEstimator, measure_frame
+from .images import StereoFrame
+from .measurement import Measurement
+from .pose import pose_to_transform, transform_to_pose
+from .scene import rod, rod_transform
+from .sensor import Sensor, load_sensor
+from .sensor_file import built_in_names
+from .stereo_rig import StereoRig
+from .taught import Taught
+
+__all__ = [
+    "CmmError", "LostError", "Measurement", "OpenGLMissingError", "PinholeCamera", "PoseEstimator", "Sensor",
+    "SensorFileError", "ShapeError", "StereoFrame", "StereoRig", "Taught", "TeachingError", "UnknownBodyError",
+    "UnknownOptionError", "UnknownSensorError", "built_in_names", "load_sensor", "measure_frame", "pose_to_transform",
+    "rod", "rod_transform", "transform_to_pose",
+]

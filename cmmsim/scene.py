@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 from scipy.spatial import HalfspaceIntersection
 
 from .marked_body import MarkedBody
@@ -13,7 +14,8 @@ from .pose import Array
 from .sensor_file import Body, Stickers, unit
 
 SUNK = 0.0003  # m the solid surface lies below the sticker planes
-POLYGON_SIDES = 96
+RING_SUNK = 0.0001  # m the dark ring lies below its sticker
+DISC_SIDES, RING_SIDES = 64, 16
 
 
 @dataclass(frozen=True)
@@ -86,17 +88,28 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
 
 
 def _sticker_patch(place: Array, axes: Array, stickers: Stickers) -> Patch:
-    """A bright disc and, in the same plane and with the same edge, its dark ring."""
-    angles = 2.0 * np.pi * np.arange(POLYGON_SIDES) / POLYGON_SIDES
-    circle = np.column_stack([np.cos(angles), np.sin(angles)]) @ axes.T
-    # the polygon has the area of the circle
-    fill = np.sqrt(2.0 * np.pi / (POLYGON_SIDES * np.sin(2.0 * np.pi / POLYGON_SIDES)))
-    edge = place + fill * stickers.radius * circle
-    vertices = np.concatenate([edge, edge, place + stickers.ring_radius * circle])
-    n = POLYGON_SIDES
-    k, following = np.arange(n), np.roll(np.arange(n), -1)
-    disc = np.column_stack([np.zeros(n - 2, dtype=int), k[1:-1], k[2:]])
-    ring = np.concatenate([np.column_stack([n + k, 2 * n + k, n + following]),
-                           np.column_stack([n + following, 2 * n + k, 2 * n + following])])
-    levels = np.repeat([stickers.sticker_level / 255.0, stickers.ring_level / 255.0], [n, 2 * n])
-    return Patch(vertices, np.concatenate([disc, ring]), levels)
+    """A bright disc, and RING_SUNK below it a dark one that shows as a ring."""
+    vertices, faces, levels, first = [], [], [], 0
+    for sides, radius, sunk, level in ((DISC_SIDES, stickers.radius, 0.0, stickers.sticker_level),
+                                       (RING_SIDES, stickers.ring_radius, RING_SUNK, stickers.ring_level)):
+        angles = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
+        fill = np.sqrt(2.0 * np.pi / (sides * np.sin(2.0 * np.pi / sides)))  # the polygon has the circle's area
+        circle = fill * radius * np.column_stack([np.cos(angles), np.sin(angles)]) @ axes.T
+        vertices.append(place + circle - sunk * np.cross(axes[:, 0], axes[:, 1]))
+        faces.append(first + _balanced_triangles(sides))
+        levels.append(np.full(sides, level / 255.0))
+        first += sides
+    return Patch(np.concatenate(vertices), np.concatenate(faces), np.concatenate(levels))
+
+
+def _balanced_triangles(sides: int) -> NDArray[np.int_]:
+    """Triangles (sides - 2, 3) of a convex polygon, large ones inside: faster to draw than a fan of slivers."""
+    triangles: list[tuple[int, int, int]] = []
+    arcs = [(0, sides - 1)]
+    while arcs:
+        start, end = arcs.pop()
+        if end - start >= 2:
+            middle = (start + end) // 2
+            triangles.append((start, middle, end))
+            arcs += [(start, middle), (middle, end)]
+    return np.array(triangles)

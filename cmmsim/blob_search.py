@@ -1,0 +1,45 @@
+"""Search for stickers in whole grey images, with no knowledge of where they are."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .ellipse_fit import EllipseFits, FitLimits, fit_ellipses
+from .images import FrameImages, StereoFrame
+from .noise import CameraNoise
+from .pose import Array
+
+SMALLEST_AREA_PX, LARGEST_AREA_PX = 8, 400
+LARGEST_SIDE_PX = 24
+BRIGHT_SHARE = 1e-4  # share of the image's pixels that are taken as the brightest
+SMALLEST_STEP = 40.0  # grey values between the ground and the brightest pixels
+
+
+def find_blobs(image: NDArray[np.uint8]) -> Array:
+    """Rough centres (n, 2) px of compact bright spots of an image (height, width)."""
+    counts = np.bincount(image.ravel(), minlength=256)
+    from_top = np.cumsum(counts[::-1])
+    bright = 255 - int(np.searchsorted(from_top, max(1.0, BRIGHT_SHARE * image.size)))
+    ground = int(np.searchsorted(np.cumsum(counts), 0.5 * image.size))
+    if bright - ground < SMALLEST_STEP:
+        return np.zeros((0, 2))
+    mask = (image > 0.5 * (bright + ground)).astype(np.uint8)
+    _, _, stats, centres = cv2.connectedComponentsWithStats(mask)
+    area, sides = stats[1:, cv2.CC_STAT_AREA], stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
+    keep = (area >= SMALLEST_AREA_PX) & (area <= LARGEST_AREA_PX) & (sides.max(axis=1) <= LARGEST_SIDE_PX)
+    keep &= area > 0.4 * sides.prod(axis=1)
+    return centres[1:][keep]
+
+
+def find_ellipses(frame: StereoFrame, noise: CameraNoise, window_size: int, fit_size: int,
+                  limits: FitLimits) -> tuple[EllipseFits, EllipseFits]:
+    """Ellipses fitted to all bright spots of the left and of the right image; only good ones."""
+    found = []
+    for image in (frame.left, frame.right):
+        corners = np.rint(find_blobs(image) - 0.5 * (window_size - 1)).astype(int)
+        windows = FrameImages(StereoFrame(image, image)).windows(np.stack([corners, corners]), window_size)[0]
+        fits = fit_ellipses(windows, corners, noise, fit_size, limits)
+        found.append(EllipseFits(*(getattr(fits, name)[fits.good] for name in EllipseFits.__dataclass_fields__)))
+    return found[0], found[1]

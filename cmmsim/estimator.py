@@ -1,0 +1,85 @@
+"""From one stereo frame to a measurement (paper eq. 27 and 28). Knows nothing of true poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .blob_search import find_ellipses
+from .errors import LostError, UnknownOptionError
+from .images import FrameImages, StereoFrame, StereoImages
+from .labelling import find_layout
+from .marked_body import MarkedBody
+from .matching import candidate_pairs
+from .measurement import Measurement, lost_measurement
+from .noise import CameraNoise
+from .observation import DetectionSettings, StickerObservation, observe
+from .pose import Array, compose_covariance, pose_covariance, transform_to_pose
+from .pose_methods import METHODS, Solution, by_planes, by_registration
+from .stereo_rig import StereoRig
+from .taught import Taught
+
+NOMINAL_TOLERANCE = 0.003  # m: nominal places are known to about a millimetre
+TAUGHT_TOLERANCE = 0.0005  # m: taught places are known to microns, points in a whole image to tenths of a millimetre
+FEWEST_NOMINAL, FEWEST_TAUGHT = 6, 4
+SEARCH_WINDOW_PX = 24
+
+
+@dataclass(frozen=True)
+class PoseEstimator:
+    """Everything that turns images into poses: the known rig, noise, sticker bodies and what was taught."""
+
+    rig: StereoRig
+    noise: CameraNoise
+    settings: DetectionSettings
+    platform: MarkedBody
+    taught: Taught
+    method: str = "registration"
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise UnknownOptionError("method", self.method, METHODS)
+
+    def locate(self, images: StereoImages) -> Array:
+        """Rough camera_from_platform (4,4) from whole images, without prior. Raises LostError."""
+        points = points_in_frame(images.full(), self.rig, self.noise, self.settings)
+        places = self.taught.platform_places
+        return find_layout(places, points, TAUGHT_TOLERANCE, FEWEST_TAUGHT, "platform")[0]
+
+    def measure(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
+        """Measurement near an expected camera_from_platform (4,4), and the measured one. Raises LostError."""
+        seen = observe(images, self.rig, self.noise, self.settings, expected, self.taught.platform_places,
+                       self.platform.sticker_normals)
+        camera_from_platform, covariance, used = self._solve(seen, expected)
+        base_from_platform = self.taught.base_from_camera @ camera_from_platform
+        spread = compose_covariance(self.taught.base_from_camera, covariance)
+        measurement = Measurement(
+            transform_to_pose(base_from_platform), pose_covariance(base_from_platform, spread), used.points,
+            used.covariances, used.left_pixels, used.right_pixels, self.platform.sticker_ids[used.index], True)
+        return measurement, camera_from_platform
+
+    def _solve(self, seen: StickerObservation, expected: Array) -> Solution:
+        if self.method == "planes":
+            return by_planes(seen, self.platform, self.platform.normals @ expected[:3, :3].T)
+        return by_registration(seen, self.platform, self.taught.platform_places)
+
+
+def measure_frame(frame: StereoFrame, estimator: PoseEstimator, expected: Array | None = None) -> Measurement:
+    """Measure a stereo frame from any source.
+
+    ``expected`` (4,4) is a rough camera_from_platform; without it the stickers are searched in the whole images.
+    """
+    images = FrameImages(frame)
+    try:
+        return estimator.measure(images, estimator.locate(images) if expected is None else expected)[0]
+    except LostError as error:
+        return lost_measurement(str(error))
+
+
+def points_in_frame(frame: StereoFrame, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings) -> Array:
+    """Points (m,3) in the camera frame that may be stickers; true and false pairings together."""
+    left, right = find_ellipses(frame, noise, SEARCH_WINDOW_PX, settings.fit_size, settings.limits)
+    if not len(left.centres) or not len(right.centres):
+        raise LostError(f"{len(left.centres)} bright spots in the left image and {len(right.centres)} in the right, "
+                        f"at least {FEWEST_TAUGHT} in each needed")
+    return candidate_pairs(rig, left.centres, right.centres)[1]
+

@@ -1,0 +1,58 @@
+"""Images as the estimator gets them: whole stereo frames, or windows read out of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import ShapeError
+
+Windows = NDArray[np.uint8] | NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StereoFrame:
+    """left and right: grey images (height, width) uint8 taken at the same time."""
+
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        for name in ("left", "right"):
+            image = getattr(self, name)
+            if image.ndim != 2 or image.dtype != np.uint8:
+                raise ShapeError(f"the {name} image must be (height, width) uint8, got {image.shape} {image.dtype}")
+
+
+class StereoImages(Protocol):
+    """One exposure of two cameras that can be read whole or in parts."""
+
+    def full(self) -> StereoFrame:
+        """Both whole images."""
+
+    def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
+        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x, y)."""
+
+
+class FrameImages:
+    """Windows cut out of a stereo frame; outside of the image they repeat its edge."""
+
+    def __init__(self, frame: StereoFrame) -> None:
+        self._frame = frame
+
+    def full(self) -> StereoFrame:
+        """Both whole images."""
+        return self._frame
+
+    def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
+        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x, y)."""
+        ticks = np.arange(size)
+        cut = []
+        for image, first in zip((self._frame.left, self._frame.right), corners, strict=True):
+            rows = np.clip(first[:, 1, None] + ticks, 0, image.shape[0] - 1)
+            columns = np.clip(first[:, 0, None] + ticks, 0, image.shape[1] - 1)
+            cut.append(image[rows[:, :, None], columns[:, None, :]])
+        return np.stack(cut)

@@ -1,0 +1,73 @@
+"""Stickers of one body, observed near where they are expected: windows, fits, triangulation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .eccentricity import eccentricity
+from .ellipse_fit import FitLimits, fit_ellipses
+from .images import StereoImages
+from .noise import CameraNoise
+from .pose import Array, apply
+from .stereo_rig import StereoRig
+from .triangulation import triangulate
+
+LARGEST_RAY_GAP = 25.0  # squared distance of two rays in units of its noise, one degree of freedom: five sigma
+GRAZING = 0.15  # cosine between a sticker's normal and the view below which it is not looked for
+
+
+@dataclass(frozen=True)
+class DetectionSettings:
+    """window_size and fit_size px; radius of a sticker m; limits of a good fit."""
+
+    window_size: int = 18
+    fit_size: int = 16
+    radius: float = 0.003
+    limits: FitLimits = FitLimits()
+
+
+@dataclass(frozen=True)
+class StickerObservation:
+    """k stickers seen by both cameras.
+
+    index (k,) into the body's stickers; left_pixels and right_pixels (k,2) of the sticker centres (eccentricity
+    removed); points (k,3) and covariances (k,3,3) in the camera frame, m.
+    """
+
+    index: NDArray[np.int_]
+    left_pixels: Array
+    right_pixels: Array
+    points: Array
+    covariances: Array
+
+    def selected(self, keep: NDArray[np.bool_]) -> StickerObservation:
+        """The observation with only some of its stickers."""
+        return StickerObservation(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+
+
+def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings,
+            camera_from_body: Array, places: Array, normals: Array) -> StickerObservation:
+    """Observe stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose of the body."""
+    centres = [apply(move @ camera_from_body, places) for move in rig.from_camera]
+    turned = [normals @ (move @ camera_from_body)[:3, :3].T for move in rig.from_camera]
+    pixels, valid = rig.project(apply(camera_from_body, places))
+    facing = np.stack([-np.einsum("ni,ni->n", c, t) > GRAZING * np.linalg.norm(c, axis=1)
+                       for c, t in zip(centres, turned, strict=True)])
+    index = np.flatnonzero(np.all(valid & facing, axis=0))
+    corners = np.rint(pixels[:, index] - 0.5 * (settings.window_size - 1)).astype(int)
+    if len(index) == 0:
+        return StickerObservation(index, *np.zeros((2, 0, 2)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    windows = images.windows(corners, settings.window_size)
+    fits = fit_ellipses(windows.reshape(-1, *windows.shape[2:]), corners.reshape(-1, 2), noise, settings.fit_size,
+                        settings.limits)
+    left, right = fits.centres.reshape(2, -1, 2) - np.stack(
+        [eccentricity(c[index], t[index], settings.radius, camera.focal_px)
+         for c, t, camera in zip(centres, turned, rig.cameras, strict=True)])
+    spread = fits.covariances.reshape(2, -1, 2, 2)
+    good = np.all(fits.good.reshape(2, -1), axis=0)
+    seen = triangulate(rig, left, right, spread[0], spread[1])
+    return StickerObservation(index, left, right, seen.points, seen.covariances).selected(
+        good & (seen.ray_gap < LARGEST_RAY_GAP))

@@ -1,0 +1,151 @@
+"""The synthetic sensor: true scene and cameras on one side, estimator and tracker on the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike
+
+from .camera import PinholeCamera
+from .ellipse_fit import FitLimits
+from .errors import ShapeError, UnknownBodyError, UnknownOptionError
+from .estimator import PoseEstimator
+from .images import StereoFrame
+from .marked_body import marked_body
+from .measurement import Measurement
+from .noise import CameraNoise
+from .observation import DetectionSettings
+from .pose import Array, pose_to_transform
+from .pose_methods import METHODS
+from .scene import Patch, mesh_patch, scene_body
+from .sensor_file import SensorFile, Timing, read_sensor_file
+from .stereo_rig import toed_in_rig
+from .taught import Taught
+from .teaching import Progress, Teacher
+from .tracking import Tracker
+from .views import Drawable
+from .virtual_camera import VirtualStereoCamera
+
+TEACHING_STREAM, RUN_STREAM = 0, 1
+
+
+class Sensor:
+    """A stereo optical CMM that looks at a posed platform.
+
+    It teaches itself on first use, or takes what another sensor of the same file was taught.
+    """
+
+    def __init__(self, file: SensorFile, seed: int = 0, method: str = "registration", taught: Taught | None = None,
+                 progress: Progress | None = None) -> None:
+        if method not in METHODS:
+            raise UnknownOptionError("method", method, METHODS)
+        if taught is not None and taught.sensor_name != file.name:
+            raise ShapeError(f"taught belongs to sensor {taught.sensor_name!r}, not to {file.name!r}")
+        self._file, self._seed, self._progress = file, seed, progress
+        self.method = method
+        middle = (0.5 * (file.rig.width - 1), 0.5 * (file.rig.height - 1))
+        camera = PinholeCamera(file.rig.focal_px, *middle, file.rig.width, file.rig.height)
+        self.rig, self._camera_from_base = toed_in_rig(camera, file.rig.baseline, np.array(file.rig.position),
+                                                       np.array(file.rig.target))
+        figures = file.camera.model_dump()
+        self.noise = CameraNoise(**{("enabled" if k == "noise" else k): v for k, v in figures.items()})
+        self.settings = DetectionSettings(radius=file.stickers.radius, limits=FitLimits())
+        self.platform, self.base = marked_body("platform", file.platform), marked_body("base", file.base)
+        self._scene = [scene_body(body, section, file.stickers, stream) for stream, (body, section)
+                       in enumerate(((self.platform, file.platform), (self.base, file.base)))]
+        self._obstacles: dict[str, Patch] = {}
+        self._camera = self._build_camera()
+        self._taught, self._tracker = taught, None if taught is None else self._new_tracker(taught)
+        self.start_run(seed)
+
+    @property
+    def name(self) -> str:
+        """Name of the sensor file."""
+        return self._file.name
+
+    @property
+    def timing(self) -> Timing:
+        """Frame rate, exposure and latency as the file states them."""
+        return self._file.timing
+
+    @property
+    def home(self) -> Array:
+        """Pose (6,) of the platform at teaching."""
+        return np.array(self._file.platform.home)
+
+    @property
+    def taught(self) -> Taught:
+        """What teaching found; teaches on first use."""
+        return self.teach()
+
+    @property
+    def estimator(self) -> PoseEstimator:
+        """The part that turns images into poses; also for images from elsewhere, see measure_frame."""
+        return PoseEstimator(self.rig, self.noise, self.settings, self.platform, self.taught, self.method)
+
+    def teach(self, progress: Progress | None = None) -> Taught:
+        """Teach the frames of base and platform if that has not been done; ``progress(done, total)`` is called."""
+        if self._taught is None:
+            teacher = Teacher(self._camera, self.rig, self.noise, self.settings, self.platform, self.base)
+            rng = np.random.default_rng([self._seed, TEACHING_STREAM])
+            self._taught = teacher.teach(self.name, self.home, rng, progress or self._progress)
+        return self._taught
+
+    def start_run(self, seed: int) -> None:
+        """Begin a new run: a new noise generator, and the next measurement searches the whole images."""
+        self._rng = np.random.default_rng([seed, RUN_STREAM])
+        if self._tracker is not None:
+            self._tracker.forget()
+
+    def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
+        """Register further rigid bodies (meshes in m) that may hide stickers; they are drawn where ``obstacles`` says."""
+        level = self._file.stickers.obstacle_level / 255.0
+        self._obstacles.update({name: mesh_patch(mesh, level) for name, mesh in meshes.items()})
+        self._camera = self._build_camera()
+
+    def capture(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None) -> StereoFrame:
+        """Both whole images with the platform at ``pose`` (6,); obstacles: name -> base_from_body (4,4)."""
+        return self._camera.look(*self._checked(pose, obstacles)).full()
+
+    def measure(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None) -> Measurement:
+        """Measure the platform that stands at ``pose`` (6,); the pose goes to the renderer only."""
+        images = self._camera.look(*self._checked(pose, obstacles))
+        if self._tracker is None:
+            self._tracker = self._new_tracker(self.taught)
+        return self._tracker.measure(images)
+
+    def _new_tracker(self, taught: Taught) -> Tracker:
+        return Tracker(PoseEstimator(self.rig, self.noise, self.settings, self.platform, taught, self.method))
+
+    def _build_camera(self) -> VirtualStereoCamera:
+        """Stickers are drawn first: what they hide need not be drawn."""
+        patches = [p for body in self._scene for p in body.stickers] + [body.solid for body in self._scene]
+        owners = [k for k, body in enumerate(self._scene) for _ in body.stickers] + [0, 1]
+        owners += range(2, 2 + len(self._obstacles))
+        return VirtualStereoCamera(self.rig, self._camera_from_base, Drawable([*patches, *self._obstacles.values()],
+                                                                              owners),
+                                   self.noise, list(self._obstacles), self._file.stickers.background_level / 255.0)
+
+    def _checked(self, pose: ArrayLike,
+                 obstacles: Mapping[str, Array] | None) -> tuple[Array, np.random.Generator, Mapping[str, Array]]:
+        pose_to_transform(pose)  # raises for anything but six finite numbers
+        for name, place in (obstacles or {}).items():
+            if name not in self._obstacles:
+                raise UnknownBodyError(name, self._obstacles)
+            if np.shape(place) != (4, 4) or not np.all(np.isfinite(place)):
+                raise ShapeError(f"obstacle {name!r}: base_from_body must be (4,4) and finite, got {np.shape(place)}")
+        return np.asarray(pose, dtype=float), self._rng, obstacles or {}
+
+
+def load_sensor(name: str | Path, seed: int = 0, method: str = "registration", taught: Taught | None = None,
+                progress: Progress | None = None) -> Sensor:
+    """Sensor of a built-in name or of a TOML file.
+
+    Parameters: seed of teaching and of the first run's noise; method "registration" or "planes"; taught: the result of
+    an earlier teaching of the same sensor; progress(done, total), called while teaching.
+    Raises UnknownSensorError, SensorFileError, UnknownOptionError.
+    """
+    return Sensor(read_sensor_file(name), seed, method, taught, progress)
