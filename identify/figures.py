@@ -63,7 +63,7 @@ def fit_figure(
 
 def validation_figure(validation: list[dict[str, Any]]) -> Figure:
     """RMS of the identified model on each unseen trajectory, against truth and measurement, with the goals."""
-    figure = _figure(10, 7)
+    figure = _figure(11, 7)
     panels = figure.subplots(2, 1, sharex=True)
     runs = np.arange(1, len(validation) + 1)
     for axes, first, limit, unit in ((panels[0], 0, VALIDATION_UM, "um"), (panels[1], 3, VALIDATION_URAD, "urad")):
@@ -73,9 +73,8 @@ def validation_figure(validation: list[dict[str, Any]]) -> Figure:
             bars = axes.bar(runs + 0.25 * (i - 1), true, 0.22, label=f"{COMPONENTS[first + i]}, against truth")
             axes.plot(runs + 0.25 * (i - 1), measured, "_", color=bars.patches[0].get_facecolor(), markersize=12)
         axes.axhline(limit, color="black", linestyle="--", linewidth=1, label=f"goal {limit:g} {unit}")
-        axes.set_yscale("log")
         axes.set_ylabel(f"RMS [{unit}]")
-        axes.legend(fontsize="small", ncols=4, loc="lower center")
+        axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
         axes.grid(alpha=0.3, axis="y")
     panels[0].set_title("Identified model on unseen trajectories (dashes: against measurement)")
     panels[1].set_xlabel("unseen trajectory")
@@ -148,7 +147,7 @@ def _error_panel(
 
 def _rms_text(measured: Array, initial: Array | None, identified: Array, i: int) -> str:
     def rms(model: Array) -> str:
-        value = rms_row(rms_figures(measured - model))[i]
+        value = rms_row(rms_figures(measured - model, np.isfinite(measured).all(axis=1)))[i]
         return f"{value:.3g} {'um' if i < 3 else 'urad'}" if np.isfinite(value) else "diverged"
 
     before = "" if initial is None else f"{rms(initial)} → "

@@ -36,14 +36,16 @@ def load_result(path: Path | str) -> dict[str, Any]:
     return result
 
 
-def rms_figures(errors: Any) -> dict[str, list[float]]:
-    """Root mean square of pose errors (N, 6) [m, rad] as a result holds it, in um and urad; rows with NaN left out.
+def rms_figures(errors: Any, counted: Any = None) -> dict[str, list[float]]:
+    """Root mean square of pose errors (N, 6) [m, rad] as a result holds it, in um and urad.
 
-    All figures are NaN when nothing is left.
+    ``counted`` (N,) bool names the rows that count, such as the frames that were not lost (default all). All figures
+    are NaN when none does, or when one of those that count is not finite: a model that diverged has no error.
     """
     rows = np.asarray(errors, dtype=float)
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    rms = 1e6 * np.sqrt(np.mean(rows**2, axis=0)) if len(rows) else np.full(6, np.nan)
+    rows = rows if counted is None else rows[np.asarray(counted, dtype=bool)]
+    usable = len(rows) > 0 and bool(np.isfinite(rows).all())
+    rms = 1e6 * np.sqrt(np.mean(rows**2, axis=0)) if usable else np.full(6, np.nan)
     return {"position_rms_um": rms[:3].tolist(), "orientation_rms_urad": rms[3:].tolist()}
 
 

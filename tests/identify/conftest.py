@@ -1,0 +1,155 @@
+"""A small run with known errors, and a robot simple enough to be worked out by hand."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from dynamics.errors import DynamicsError
+from identify.model_runs import build_model_run, write_model_runs
+from identify.recording import build_record, write, write_runs
+from identify.result_file import rms_figures, save_result
+from identify.run_folder import RunFolder
+from identify.scenario import load_scenario
+from identify.truth import build_truth
+
+HOME = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
+
+
+@dataclass
+class DiagonalRobot:
+    """Crank angle i is 50 rad/m or 10 rad/rad times component i from home; the regressor is diagonal.
+
+    Parameters: six masses, a copy of the first (only their sum shows), and one that never shows.
+    """
+
+    name: str = "diagonal"
+    travel_limit: float = 0.9948
+    reach_m: float = 1.0
+    home_pose: np.ndarray = field(default_factory=HOME.copy)
+
+    def inverse_kinematics(self, pose):
+        offset = np.asarray(pose) - self.home_pose
+        if np.abs(offset[:, 0]).max() > self.reach_m:
+            raise DynamicsError(f"leg 1 cannot reach x = {np.abs(offset[:, 0]).max():.3f} m")
+        return offset * [50.0, 50.0, 50.0, 10.0, 10.0, 10.0]
+
+    def twist(self, pose, pose_rate):
+        return pose_rate
+
+    def twist_dot(self, pose, pose_rate, pose_acceleration):
+        return pose_acceleration
+
+    def regressor(self, pose, twist, twist_dot):
+        rows = np.zeros((len(pose), 6, 8))
+        rows[:, range(6), range(6)] = twist_dot
+        rows[:, 0, 6] = twist_dot[:, 0]
+        return rows
+
+
+@pytest.fixture
+def diagonal_robot():
+    return DiagonalRobot()
+
+
+def make_record(samples=120, seed=0, **changes):
+    """A record of ``samples`` frames at 60 Hz with measurements 20 um and 80 urad off the reference."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(samples) / 60.0
+    reference = HOME + 0.005 * np.sin(2 * np.pi * 0.5 * time)[:, None] * [1, 1, 1, 4, 4, 4]
+    sigma = np.repeat([20e-6, 80e-6], 3)
+    values = {
+        "time": time,
+        "reference_pose": reference,
+        "reference_rate": np.gradient(reference, time, axis=0),
+        "measured_pose": reference + sigma * rng.standard_normal((samples, 6)),
+        "measured_covariance": np.broadcast_to(np.diag(sigma**2), (samples, 6, 6)),
+        "measured_ok": np.ones(samples, dtype=bool),
+        "command": np.zeros((samples, 6)),
+        "scenario_toml": load_scenario("quick").to_toml(),
+        "robot": "rss6",
+        "seed": seed,
+        "frame_rate_hz": 60.0,
+    }
+    return build_record(**(values | changes))
+
+
+def make_truth(samples=120, names=("platform.mass", "joint1.coulomb"), values=(23.5, 0.104), **changes):
+    time = np.arange(samples) / 60.0
+    pose = HOME + 0.005 * np.sin(2 * np.pi * 0.5 * time)[:, None] * [1, 1, 1, 4, 4, 4]
+    given = {
+        "time": time,
+        "pose": pose,
+        "joint_angle": np.zeros((samples, 6)),
+        "joint_velocity": np.zeros((samples, 6)),
+        "joint_torque": np.zeros((samples, 6)),
+        "parameter_names": list(names),
+        "parameters": list(values),
+    }
+    return build_truth(**(given | changes))
+
+
+def make_result():
+    """A result with round numbers; every goal is met."""
+    six = [1e-6, 2e-6, 3e-6, 10e-6, 15e-6, 20e-6]
+    model_error = rms_figures(np.array([six, six]))
+    parameters = {
+        "platform.mass": parameter(24.0, 23.5, 23.5, 0.0),
+        "link1.Ixx": parameter(5.23e-4, 6.3e-4, None, None, identifiable=False),
+        "joint1.coulomb": parameter(0.0, 0.104, 0.105, 0.001),
+        "joint1.viscous": parameter(0.0, 0.148, 0.146, 0.002),
+        "joint_pid.lp": parameter(10.0, 10.5, 10.49, 0.02),
+    }
+    return {
+        "scenario": "quick",
+        "seed": 0,
+        "versions": {"cmmsim": "0.1.0"},
+        "seconds": {"excite": 1.0, "record": 30.0},
+        "sensor": {"frames": 120, "lost_frames": 0, "stereo_frames_per_second": 20.0,
+                   "position_rms_um": [5.0, 6.0, 7.0], "orientation_rms_urad": [30.0, 40.0, 50.0]},
+        "identification": {"scale_anchor": "platform_mass", "iterations": 5, "stop_reason": "tolerance",
+                           "base_rank": 4, "parameters": parameters},
+        "before": {"position_rms_um": [None] * 3, "orientation_rms_urad": [None] * 3},
+        "after": {"position_rms_um": [20.0, 21.0, 22.0], "orientation_rms_urad": [80.0, 81.0, 82.0]},
+        "validation": [{"true": model_error, "measured": rms_figures(10 * np.array([six]))} for _ in range(2)],
+    }
+
+
+def parameter(initial, true, estimate, std, identifiable=True):
+    return {"initial": initial, "true": true, "estimate": estimate, "std": std, "identifiable": identifiable}
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    """A finished run up to the report; the starting model diverges on the first unseen trajectory."""
+    run = RunFolder(tmp_path / "run")
+    run.path.mkdir()
+    record, truth = make_record(), make_truth()
+    pose = make_truth()
+    identified = np.hstack([pose["position"].values, pose["orientation"].values]) + 1e-6
+    initial = identified + 1e-4
+    diverging = initial.copy()
+    diverging[40:] = np.inf
+    write(run.experiment, record, truth)
+    write_runs(run.validation, [(make_record(seed=1), truth), (make_record(seed=2), truth)])
+    time = record["time"].values
+    models = [build_model_run(time, p, identified) for p in (initial, diverging, initial)]
+    write_model_runs(run.model, models[0], models[1:])
+    save_result(run.result, make_result())
+    run.scenario.write_text(load_scenario("quick").to_toml(), encoding="utf-8")
+    return run
+
+
+@pytest.fixture(name="make_record")
+def _make_record():
+    return make_record
+
+
+@pytest.fixture(name="make_truth")
+def _make_truth():
+    return make_truth
+
+
+@pytest.fixture(name="result")
+def _result():
+    return make_result()

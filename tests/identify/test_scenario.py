@@ -1,0 +1,133 @@
+import tomllib
+
+import pytest
+
+from identify.errors import ScenarioError
+from identify.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
+
+
+def refusal(overrides, name="paper"):
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(name).with_overrides(overrides)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_paper_scenario_has_the_papers_numbers():
+    paper = load_scenario("paper")
+    assert (paper.servo.kp, paper.servo.kd, paper.servo.ki) == (0.3, 0.001, 2.4)
+    assert (paper.excitation.fundamental_hz, paper.excitation.harmonics) == (0.1, 5)
+    assert (paper.timing.frame_rate_hz, paper.timing.latency_s) == (60.0, 0.0)
+    assert (paper.excitation.duration_s, paper.validation.count, paper.validation.duration_s) == (20.0, 10, 10.0)
+    assert paper.filter.order == 8
+
+
+def test_quick_scenario_differs_only_in_length():
+    paper, quick = load_scenario("paper").model_dump(), load_scenario("quick").model_dump()
+    for key in ("name", "description"):
+        paper.pop(key), quick.pop(key)
+    sections = [section for section in paper if isinstance(paper[section], dict)]
+    differing = {f"{s}.{k}" for s in sections for k in paper[s] if paper[s][k] != quick[s][k]}
+    assert differing == {"excitation.duration_s", "excitation.candidates", "validation.count", "validation.duration_s"}
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_resolved_toml_names_every_value_and_reads_back_equal(name):
+    scenario = load_scenario(name).with_overrides(
+        {"description": 'quotes " and \\ and é', "plant.friction": "smoothed", "plant.smoothing_velocity_rad_s": 1e-3}
+    )
+    text = scenario.to_toml()
+    assert scenario_from_toml(text) == scenario
+    assert tomllib.loads(text) == scenario.model_dump(exclude_none=True)
+
+
+def test_scenario_from_a_file(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('name = "mine"\n[timing]\nframe_rate_hz = 120\n', encoding="utf-8")
+    assert load_scenario(path).timing.frames(0.5) == 60
+
+
+def test_unknown_scenario_lists_the_built_in_names():
+    with pytest.raises(ScenarioError, match=r"'nope' is neither built in \(paper, quick\) nor a file"):
+        load_scenario("nope")
+
+
+def test_file_that_is_no_toml_is_named(tmp_path):
+    path = tmp_path / "bad.toml"
+    path.write_text("name = ", encoding="utf-8")
+    with pytest.raises(ScenarioError, match=r"bad\.toml is not valid TOML"):
+        load_scenario(path)
+
+
+def test_unknown_key_lists_the_valid_names():
+    assert "unknown key 'timing.frame_rat'; valid names in [timing]: frame_rate_hz, latency_s, hold" in refusal(
+        {"timing.frame_rat": 3.0}
+    )
+    assert "unknown key 'camera'" in refusal({"camera.gain": 3.0})
+
+
+@pytest.mark.parametrize(
+    ("overrides", "evidence"),
+    [
+        ({"timing.frame_rate_hz": "60 Hz"}, ["timing.frame_rate_hz", "'60 Hz'", "[Hz]"]),
+        ({"timing.latency_s": -0.1}, ["timing.latency_s", "-0.1", "[s]"]),
+        ({"excitation.harmonics": 1}, ["excitation.harmonics", "1", "2"]),
+        ({"excitation.harmonics": 5.5}, ["excitation.harmonics", "5.5"]),
+        ({"timing.hold": "cubic"}, ["cubic", "zero", "linear"]),
+        ({"servo.kp": float("nan")}, ["servo.kp", "nan"]),
+        ({"timing": 3}, ["timing", "3"]),
+        ({"robot.name": "x"}, ["robot.name", "not a section"]),
+        ({"name": "a/b"}, ["name", "a/b"]),
+    ],
+)
+def test_wrong_value_is_named_with_key_value_and_unit(overrides, evidence):
+    message = refusal(overrides)
+    assert all(part in message for part in evidence), message
+
+
+def test_cutoff_at_nyquist_names_both_numbers():
+    message = refusal({"filter.cutoff_hz": 30.0})
+    assert "30 Hz" in message
+    assert "60 Hz" in message
+    assert "Nyquist" in message
+    assert load_scenario("paper").with_overrides({"filter.cutoff_hz": 29.9}).filter.cutoff_hz == 29.9
+
+
+def test_papers_filter_needs_more_than_120_frames_a_second():
+    assert "Nyquist" in refusal({"filter.cutoff_hz": 60.0, "timing.frame_rate_hz": 120.0})
+    assert load_scenario("paper").with_overrides({"filter.cutoff_hz": 60.0, "timing.frame_rate_hz": 125.0})
+
+
+def test_cutoff_that_removes_the_excitation_is_refused():
+    assert "highest harmonic is 0.5 Hz" in refusal({"filter.cutoff_hz": 0.4})
+
+
+def test_duration_must_be_whole_frames():
+    message = refusal({"validation.duration_s": 5.01})
+    assert "300.6 frames" in message
+    assert "60 Hz" in message
+
+
+def test_smoothed_friction_needs_its_velocity_and_the_exact_law_has_none():
+    assert "smoothing_velocity_rad_s" in refusal({"plant.friction": "smoothed"})
+    assert "smoothing_velocity_rad_s" in refusal({"model.smoothing_velocity_rad_s": 0.001})
+    both = {"model.friction": "smoothed", "model.smoothing_velocity_rad_s": 0.001}
+    assert load_scenario("paper").with_overrides(both).model.friction == "smoothed"
+
+
+def test_all_wrong_entries_are_named_at_once():
+    message = refusal({"timing.latency_s": -1.0, "servo.kq": 1.0})
+    assert "timing.latency_s" in message
+    assert "servo.kq" in message
+
+
+def test_scenarios_cannot_be_changed_in_place():
+    with pytest.raises(ValueError, match="frozen"):
+        load_scenario("paper").timing.latency_s = 1.0
+
+
+def test_every_number_has_a_unit():
+    for section in (f.annotation for f in Scenario.model_fields.values() if hasattr(f.annotation, "model_fields")):
+        for name, entry in section.model_fields.items():
+            if entry.annotation in (int, float, float | None) and name != "count":
+                assert entry.json_schema_extra["unit"], f"{section.__name__}.{name}"
