@@ -1,10 +1,16 @@
 import numpy as np
 import pytest
 
+from dynamics import load_robot
 from identify.errors import TrajectoryError
-from identify.excitation import design_trajectories, observability_indices
+from identify.excitation import (
+    NULL_TOLERANCE,
+    design_trajectories,
+    observability_indices,
+    stacked_regressor,
+)
 from identify.scenario import load_scenario
-from identify.trajectory import random_trajectory
+from identify.trajectory import check_travel, random_trajectory
 from identify.trajectory_file import load_trajectories, save_trajectories
 
 QUICK = load_scenario("quick").with_overrides({"excitation.travel_margin_rad": 0.0})
@@ -96,3 +102,14 @@ def test_damaged_file_is_named(tmp_path, diagonal_robot, damage):
 def test_missing_file_is_named(tmp_path):
     with pytest.raises(TrajectoryError, match=r"nothing\.json"):
         load_trajectories(tmp_path / "nothing.json")
+
+
+def test_reference_robot_separates_excited_from_null_directions():
+    """No judgement hangs on NULL_TOLERANCE: between the two kinds lie more than six decades."""
+    robot = load_robot("rss6")
+    design = design_trajectories(robot, QUICK, seed=0)
+    singular = np.linalg.svd(stacked_regressor(robot, design.excitation, 10.0), compute_uv=False)
+    excited = int((singular > NULL_TOLERANCE * singular[0]).sum())
+    assert singular[excited - 1] / singular[excited] > 1e6
+    assert 30 <= excited < 64
+    assert check_travel(robot, design.excitation, np.arange(600) / 60) < robot.travel_limit
