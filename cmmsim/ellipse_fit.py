@@ -18,6 +18,7 @@ from .pose import Array
 
 RING_REACH = 2.4  # pixels beyond this many sticker radii may lie outside the dark ring and are left out
 SMALLEST_RADIUS_PX = 0.8
+CORE_SHARE = 0.4  # a pixel with this share of the contrast belongs to the bright spot when the fit starts
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ def _moments(windows: Array) -> tuple[Array, Array, Array, Array, Array]:
     ground = flat[:, flat.shape[1] // 3]
     contrast = np.maximum(flat[:, -6] - ground, 1.0)
     share = (windows - ground[:, None, None]) / contrast[:, None, None]
-    share = np.where(share > 0.2, np.minimum(share, 1.0), 0.0)
+    share = np.where(share > CORE_SHARE, np.minimum(share, 1.0), 0.0)
     area = np.maximum(share.sum(axis=(1, 2)), 1e-6)
     ticks = np.arange(size, dtype=float)
     x = (share.sum(axis=1) @ ticks) / area

@@ -15,18 +15,19 @@ from .pose import Array, apply
 from .stereo_rig import StereoRig
 from .triangulation import triangulate
 
-LARGEST_RAY_GAP = 25.0  # squared distance of two rays in units of its noise, one degree of freedom: five sigma
 GRAZING = 0.15  # cosine between a sticker's normal and the view below which it is not looked for
 
 
 @dataclass(frozen=True)
 class DetectionSettings:
-    """window_size and fit_size px; radius of a sticker m; limits of a good fit."""
+    """window_size and fit_size px; radius of a sticker m; limits of a good fit; largest_ray_gap: squared distance of
+    the two rays of a sticker in units of its noise (one degree of freedom, so 25 is five sigma)."""
 
     window_size: int = 18
     fit_size: int = 16
     radius: float = 0.003
     limits: FitLimits = FitLimits()
+    largest_ray_gap: float = 25.0
 
 
 @dataclass(frozen=True)
@@ -70,4 +71,4 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
     good = np.all(fits.good.reshape(2, -1), axis=0)
     seen = triangulate(rig, left, right, spread[0], spread[1])
     return StickerObservation(index, left, right, seen.points, seen.covariances).selected(
-        good & (seen.ray_gap < LARGEST_RAY_GAP))
+        good & (seen.ray_gap < settings.largest_ray_gap))

@@ -29,6 +29,7 @@ from .virtual_camera import Quality, VirtualStereoCamera
 Progress = Callable[[int, int], None]
 SHIFT, TURN = 0.008, 0.03  # m, rad: reach of the teaching path about home
 CYCLES = np.array([1, 2, 3, 3, 1, 2])
+LARGEST_GAP = 1e-4  # m: in averaged exposures a whole sticker is within a few microns of its place
 PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
 
 
@@ -37,8 +38,8 @@ class TeachingPlan:
     """How much is looked at: base quality; platform poses and quality at each; window sizes px."""
 
     base: Quality = Quality(supersampling=32, exposures=4000)
-    platform: Quality = Quality(supersampling=8, exposures=25)
-    poses: int = 64
+    platform: Quality = Quality(supersampling=8, exposures=30)
+    poses: int = 80
     base_window: int = 20
 
 
@@ -82,7 +83,7 @@ class Teacher:
                  quality: Quality, window_size: int) -> StickerObservation:
         """All stickers of a body from averaged exposures. Raises LostError when one is missing."""
         limits = replace(self.settings.limits, frames=quality.exposures, largest_misfit=np.inf)
-        settings = replace(self.settings, window_size=window_size, limits=limits)
+        settings = replace(self.settings, window_size=window_size, limits=limits, largest_ray_gap=np.inf)
         seen = observe(self.camera.look(pose, rng, quality=quality), self.rig, self.noise, settings, expected, places,
                        body.sticker_normals)
         if len(seen.index) < len(places):
@@ -101,10 +102,18 @@ class Teacher:
                 body_from_camera = invert(by_planes(seen[0], self.platform, _towards(self.platform, rough))[0])
                 places = apply(body_from_camera, seen[0].points)
             now = register(places, seen[-1].points, seen[-1].covariances).transform
+            self._require_rigid(places, now, seen[-1])
             step = invert(last) @ now if k else step
             last = now
             report(k + 1)
         return seen
+
+    def _require_rigid(self, places: Array, camera_from_body: Array, seen: StickerObservation) -> None:
+        """Raise LostError when a sticker has moved against the others: it is partly hidden."""
+        gaps = np.linalg.norm(apply(camera_from_body, places) - seen.points, axis=1)
+        if gaps.max() > LARGEST_GAP:
+            raise LostError(f"{self.platform.name}: sticker {self.platform.sticker_ids[gaps.argmax()]} is "
+                            f"{gaps.max() * 1e6:.0f} um off its place, at most {LARGEST_GAP * 1e6:.0f} um; is it hidden?")
 
     def _platform_places(self, seen: list[StickerObservation]) -> tuple[Array, Array, Array]:
         """Sticker places (n,3), their covariances (n,3,3) and the covariance (6,6) of the platform frame."""
