@@ -31,7 +31,10 @@ ATTEMPTS = 50
 class RegressorRobot(TravelLimitedRobot, Protocol):
     """What the design of an exciting trajectory needs to know of a robot."""
 
-    home_pose: Any
+    @property
+    def home_pose(self) -> Any:
+        """Pose (6,) [m, rad] at which every trajectory starts."""
+        ...
 
     def twist(self, pose: Any, pose_rate: Any) -> Any:
         """Twists (N, 6) [m/s, rad/s] from poses and pose rates (N, 6)."""

@@ -22,8 +22,15 @@ from identify.errors import TrajectoryError
 class TravelLimitedRobot(Protocol):
     """What a trajectory needs to know of a robot."""
 
-    name: str
-    travel_limit: float
+    @property
+    def name(self) -> str:
+        """Name for messages."""
+        ...
+
+    @property
+    def travel_limit(self) -> float:
+        """Largest crank angle [rad]."""
+        ...
 
     def inverse_kinematics(self, pose: Any) -> Any:
         """Joint angles [rad], (N, 6), of poses (N, 6)."""
