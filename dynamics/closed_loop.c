@@ -21,7 +21,8 @@
 #define MAX_DELAY 64
 #define NO_MARGIN 1e-12 /* rad/s, or share of the breakaway torque */
 
-enum { OK = 0, LEFT_REACH = 1, TOO_MANY_EVENTS = 2, SENSOR_FAILED = 3, OUT_OF_MEMORY = 4 };
+enum { OK = 0, LEFT_REACH = 1, TOO_MANY_EVENTS = 2, SENSOR_FAILED = 3, OUT_OF_MEMORY = 4, MEASURED_OUT_OF_REACH = 5 };
+enum { SENSOR_RAISED = 0, MEASURED = 1, LOST = 2 }; /* what the sensor returns */
 
 typedef double vec[N];
 typedef double rows[N][NP];
@@ -603,8 +604,9 @@ static int frame_command(context *c, servo *v, int k, const state *s, measure_fn
     int good = 1;
     memcpy(measured, s->pose, sizeof measured);
     if (measure) {
-        good = measure(k, s->pose, measured);
-        if (good < 0) return SENSOR_FAILED;
+        int answer = measure(k, s->pose, measured);
+        if (answer != MEASURED && answer != LOST) return SENSOR_FAILED;
+        good = answer == MEASURED;
     }
     v->elapsed += p->frame_period;
     memcpy(out->measured + N * k, measured, sizeof measured);
@@ -614,6 +616,8 @@ static int frame_command(context *c, servo *v, int k, const state *s, measure_fn
     else if (good)
         servo_update(c, v, k, measured, &c->x.q[0][0]);
     memcpy(out->command + N * k, v->last_command, sizeof(vec));
+    for (int i = 0; i < N; i++)
+        if (!isfinite(v->last_command[i])) return MEASURED_OUT_OF_REACH;
     return OK;
 }
 

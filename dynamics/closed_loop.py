@@ -97,5 +97,6 @@ def _check_loop_parameters(parameters: np.ndarray) -> np.ndarray:
     check_parameters(parameters[:64])
     for name, value in zip(("lp", "li", "ld"), parameters[64:], strict=True):
         if not np.isfinite(value) or value < 0 or (name == "li" and value == 0):
-            raise SimulationError(f"joint_pid.{name} is {value}, must be finite and {'> 0' if name == 'li' else '>= 0'}")
+            limit = "> 0" if name == "li" else ">= 0"
+            raise SimulationError(f"joint_pid.{name} is {value}, must be finite and {limit}")
     return parameters

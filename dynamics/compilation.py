@@ -1,13 +1,15 @@
 """C code from CasADi functions, compiled once and kept in the user's cache folder.
 
 The cache key is the content: package sources, robot geometry, CasADi version, compiler and flags. Without a C compiler
-`load_library` returns None after one warning line, and callers use CasADi's virtual machine.
+that works and a folder to write to, `load_library` returns None after one warning line, and callers use CasADi's
+virtual machine.
 """
 
 import ctypes
 import hashlib
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -28,7 +30,7 @@ FLAGS = ("-O2", "-ftree-vectorize", "-fPIC", "-shared", "-ffp-contract=off", "-f
 
 
 class CompilerWarning(UserWarning):
-    """Said once when no C compiler is found."""
+    """Said once when nothing can be compiled."""
 
 
 def cache_folder() -> Path:
@@ -42,35 +44,48 @@ def load_library(
 ) -> Path | None:
     """Path of a shared library with the functions that `build(geometry)` returns, and the C file `driver` if named.
 
-    Compiles on first use (some seconds). Returns None without a compiler. Raises DynamicsError with the compiler's
-    words when compiling fails.
+    Compiles on first use (some seconds). Returns None where nothing can be compiled. Raises DynamicsError with the
+    compiler's words when it works but refuses the generated code.
     """
     compiler = find_compiler()
     if compiler is None:
         return None
     library = cache_folder() / f"{name}-{_key(name, geometry, compiler)}.so"
     if not library.exists():
-        library.parent.mkdir(parents=True, exist_ok=True)
-        _compile(compiler, _source(build(geometry), driver), library)
+        if not can_compile(compiler, library.parent):
+            return None
+        complaint = _compile(compiler, _source(build(geometry), driver), library.parent, library)
+        if complaint:
+            raise DynamicsError(f"{compiler[0]} failed on the generated code of the robot: {complaint}")
     return library
 
 
 @cache
-def find_compiler() -> str | None:
-    """Path of the C compiler ($CC, cc, gcc or clang), or None with one warning. CC=none turns compiling off."""
+def find_compiler() -> tuple[str, ...] | None:
+    """The C compiler ($CC, cc, gcc or clang) and its own arguments, or None with one warning. CC=none: no compiling."""
     wanted = os.environ.get("CC")
     names = [wanted] if wanted else ["cc", "gcc", "clang"]
     for candidate in names:
-        found = shutil.which(candidate)
+        program, *arguments = shlex.split(candidate) or [""]
+        found = shutil.which(program)
         if found:
-            return found
-    warnings.warn(
-        f"no C compiler found (looked for {', '.join(names)}): using CasADi's virtual machine, some 50 times slower; "
-        "on Debian: apt-get install gcc libc6-dev",
-        CompilerWarning,
-        stacklevel=3,
-    )
+            return (found, *arguments)
+    _warn(f"no C compiler found (looked for {', '.join(names)}); on Debian: apt-get install gcc libc6-dev")
     return None
+
+
+@cache
+def can_compile(compiler: tuple[str, ...], folder: Path) -> bool:
+    """Whether a trial program compiles and `folder` can be written to; one warning says why not."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        complaint = _compile(compiler, "#include <math.h>\n#include <stdlib.h>\n#include <string.h>\n", folder)
+    except OSError as error:
+        _warn(f"cannot compile into {folder} ({error.strerror}); name another folder with CMMSIM_CACHE")
+        return False
+    if complaint:
+        _warn(f"the C compiler {compiler[0]} does not work ({complaint}); on Debian: apt-get install gcc libc6-dev")
+    return not complaint
 
 
 def open_library(path: Path) -> ctypes.CDLL:
@@ -82,6 +97,11 @@ def open_library(path: Path) -> ctypes.CDLL:
         raise DynamicsError(f"compiled robot {path} could not be loaded and was removed; run again: {error}") from error
 
 
+def _warn(reason: str) -> None:
+    text = f"{reason}: using CasADi's virtual machine, some 50 times slower"
+    warnings.warn(text, CompilerWarning, stacklevel=4)
+
+
 @cache
 def _package_digest() -> bytes:
     digest = hashlib.sha256()
@@ -91,12 +111,16 @@ def _package_digest() -> bytes:
     return digest.digest()
 
 
-def _key(name: str, geometry: Rss6Geometry, compiler: str) -> str:
-    digest = hashlib.sha256(_package_digest())
-    for value in vars(geometry).values():
-        digest.update(value.tobytes() if hasattr(value, "tobytes") else repr(value).encode())
-    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
-    digest.update("|".join([name, ca.__version__, platform.machine(), version, *FLAGS]).encode())
+@cache
+def _compiler_version(compiler: tuple[str, ...]) -> str:
+    done = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=False)
+    return " ".join(compiler[1:]) + done.stdout
+
+
+def _key(name: str, geometry: Rss6Geometry, compiler: tuple[str, ...]) -> str:
+    digest = hashlib.sha256(_package_digest() + geometry.digest)
+    parts = [name, ca.CasadiMeta.version(), platform.machine(), _compiler_version(compiler), *FLAGS]
+    digest.update("|".join(parts).encode())
     return digest.hexdigest()[:24]
 
 
@@ -108,14 +132,19 @@ def _source(functions: list[ca.Function], driver: str | None) -> str:
     return text + ((resources.files("dynamics") / driver).read_text(encoding="utf-8") if driver else "")
 
 
-def _compile(compiler: str, source: str, library: Path) -> None:
-    """Compile next to the target under a temporary name, then rename: a broken run leaves nothing behind."""
-    with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-        code, built = Path(folder) / "robot.c", Path(folder) / "robot.so"
+def _compile(compiler: tuple[str, ...], source: str, folder: Path, library: Path | None = None) -> str:
+    """Compile in `folder`, keep the result as `library` if named; returns the compiler's complaint or nothing.
+
+    The file is built in a folder of its own and then renamed: a run that breaks off, or another process that compiles
+    the same robot, never leaves half a library.
+    """
+    with tempfile.TemporaryDirectory(dir=folder) as workplace:
+        code, built = Path(workplace) / "robot.c", Path(workplace) / "robot.so"
         code.write_text(source, encoding="utf-8")
-        command = [compiler, *FLAGS, str(code), "-o", str(built), "-lm"]
+        command = [*compiler, *FLAGS, str(code), "-o", str(built), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            lines = done.stderr.strip().splitlines() or ["no message"]
-            raise DynamicsError(f"{compiler} failed on the generated code of the robot: {lines[0]}")
-        os.replace(built, library)
+            return (done.stderr.strip().splitlines() or ["no message"])[0]
+        if library:
+            built.replace(library)
+    return ""

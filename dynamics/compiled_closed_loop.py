@@ -12,12 +12,14 @@ from dynamics.compilation import load_library, open_library
 from dynamics.errors import SimulationError
 from dynamics.geometry import Rss6Geometry
 from dynamics.loop_types import (
+    MEASURED_OUT_OF_REACH,
     PARAMETER_COUNT,
     ClosedLoopRun,
     LoopSettings,
     PoseSensor,
     Reference,
     StartState,
+    checked_measurement,
     failure,
 )
 
@@ -25,8 +27,11 @@ FAILURES = {
     1: "the robot left the reachable set (the loop is unstable)",
     2: "more stick-slip events than a frame can hold",
     4: "out of memory",
+    5: MEASURED_OUT_OF_REACH,
 }
 SENSOR_FAILED = 3
+# What the sensor callback returns. An error that escapes it makes ctypes return 0.
+SENSOR_RAISED, MEASURED, LOST = 0, 1, 2
 
 _Measure = CFUNCTYPE(c_int, c_int, POINTER(c_double), POINTER(c_double))
 _DoublePointer = POINTER(c_double)
@@ -155,7 +160,7 @@ def _pointer(array: np.ndarray | None) -> "ctypes._Pointer[c_double] | None":
     return None if array is None else array.ctypes.data_as(_DoublePointer)
 
 
-def _callback(sensor: PoseSensor | None, period: float) -> tuple[_Measure, list[BaseException]]:
+def _callback(sensor: PoseSensor | None, period: float) -> tuple["ctypes._CFunctionType", list[BaseException]]:
     """The sensor as a C callback; what it raises is kept for the caller, since C cannot pass it on."""
     raised: list[BaseException] = []
     if sensor is None:
@@ -163,15 +168,12 @@ def _callback(sensor: PoseSensor | None, period: float) -> tuple[_Measure, list[
 
     def measure(frame: int, pose: "ctypes._Pointer[c_double]", measured: "ctypes._Pointer[c_double]") -> int:
         try:
-            result = sensor(frame, frame * period, np.array(pose[:6]))
-        except BaseException as error:  # noqa: BLE001  KeyboardInterrupt must cross the C frame too
+            result = checked_measurement(sensor(frame, frame * period, np.array([pose[i] for i in range(6)])), frame)
+            for index in range(6):
+                measured[index] = np.nan if result is None else result[index]
+            return MEASURED if result is not None else LOST
+        except BaseException as error:  # KeyboardInterrupt must cross the C frame too
             raised.append(error)
-            return -1
-        if result is None:
-            measured[:6] = [float("nan")] * 6
-            return 0
-        for index in range(6):
-            measured[index] = result[index]
-        return 1
+            return SENSOR_RAISED
 
     return _Measure(measure), raised

@@ -15,9 +15,13 @@ MAX_ITERATIONS = 50
 class InverseKinematics(Protocol):
     """What Newton's method needs of a robot."""
 
-    def inverse_kinematics(self, pose: np.ndarray) -> np.ndarray: ...
+    def inverse_kinematics(self, pose: np.ndarray) -> np.ndarray:
+        """Crank angles (6,) at a pose (6,); raises UnreachablePoseError."""
+        ...
 
-    def pose_jacobian(self, pose: np.ndarray) -> np.ndarray: ...
+    def pose_jacobian(self, pose: np.ndarray) -> np.ndarray:
+        """d(crank angles)/d(pose) (6, 6)."""
+        ...
 
 
 def solve(robot: InverseKinematics, theta: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -37,8 +41,7 @@ def _newton(robot: InverseKinematics, theta: np.ndarray, start: np.ndarray) -> n
     for _ in range(MAX_ITERATIONS):
         if np.abs(residual).max() < ANGLE_TOLERANCE:
             return pose
-        step = np.linalg.solve(robot.pose_jacobian(pose), residual)
-        better = _damped(robot, theta, pose, step, residual)
+        better = _damped(robot, theta, pose, _newton_step(robot, pose, residual), residual)
         if better is None:
             break
         pose, residual = better
@@ -48,6 +51,16 @@ def _newton(robot: InverseKinematics, theta: np.ndarray, start: np.ndarray) -> n
         f"forward kinematics stopped at a residual of {np.abs(residual).max():.3g} rad, limit {ROUNDING_TOLERANCE:.0e} "
         f"rad, for crank angles {np.array2string(theta, precision=4)}"
     )
+
+
+def _newton_step(robot: InverseKinematics, pose: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    try:
+        return np.linalg.solve(robot.pose_jacobian(pose), residual)
+    except np.linalg.LinAlgError:
+        raise ConvergenceError(
+            f"forward kinematics met a singular pose {np.array2string(pose, precision=4)} with a residual of "
+            f"{np.abs(residual).max():.3g} rad, limit {ROUNDING_TOLERANCE:.0e} rad"
+        ) from None
 
 
 def _damped(

@@ -1,6 +1,8 @@
 """Geometry of a 6-RSS robot: six cranks (R) on the base, six links between two spherical joints (S) each."""
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 
@@ -9,7 +11,7 @@ from dynamics.errors import RobotFileError
 LEGS = 6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rss6Geometry:
     """Where the joints sit and how the legs reach. All lengths in m, all vectors in base axes unless named otherwise.
 
@@ -17,7 +19,7 @@ class Rss6Geometry:
     crank_axes: s, unit (6, 3); crank_zero_directions: unit vector from B to the tip T at angle zero (6, 3);
     crank_length, link_length: scalars; home_pose (6,); travel_limit: largest |theta| in rad; gravity (3,) in m/s^2.
     Raises RobotFileError when a vector is not a unit vector, a crank direction is not normal to its axis,
-    or a length is not positive.
+    or a length is not positive. Two geometries are equal when all their numbers are.
     """
 
     base_joints: np.ndarray
@@ -39,9 +41,23 @@ class Rss6Geometry:
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         for name in ("crank_length", "link_length", "travel_limit"):
-            if not getattr(self, name) > 0:
-                raise RobotFileError(f"{name} must be positive, got {getattr(self, name)}")
+            if not 0 < getattr(self, name) < np.inf:
+                raise RobotFileError(f"{name} must be positive and finite, got {getattr(self, name)}")
         self._check_directions()
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Fingerprint of all numbers; the key of what is built from a geometry."""
+        content = hashlib.sha256()
+        for field in fields(self):
+            content.update(np.asarray(getattr(self, field.name), dtype=float).tobytes())
+        return content.digest()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Rss6Geometry) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
 
     def _check_directions(self) -> None:
         for leg in range(LEGS):

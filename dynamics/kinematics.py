@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from dynamics.errors import RobotFileError
 from dynamics.geometry import LEGS, Rss6Geometry
 from dynamics.rotation import rotation_matrix
 
@@ -44,7 +45,7 @@ def leg_to(geometry: Rss6Geometry, leg: int, joint_position: ca.SX) -> LegVector
     sine = (across * chord + along * root) / square
     crank = geometry.crank_length * (cosine * zero + sine * np.cross(axis, zero))
     link = joint_position - geometry.base_joints[leg] - crank
-    return LegVectors(ca.atan2(sine, cosine), ca.DM(axis), crank, link)
+    return LegVectors(ca.atan2(sine, cosine), ca.SX(axis), crank, link)
 
 
 def reach_margin(geometry: Rss6Geometry, pose: ca.SX) -> ca.SX:
@@ -58,15 +59,31 @@ def reach_margin(geometry: Rss6Geometry, pose: ca.SX) -> ca.SX:
 
 def home_branch(geometry: Rss6Geometry, leg: int) -> float:
     """+1 or -1: which of the two crank solutions is the one assembled at home (theta nearest to zero there)."""
-    home = ca.DM(geometry.home_pose)
-    joint = home[0:3] + rotation_matrix(home[3:6]) @ geometry.platform_joints[leg]
-    along, across, chord = (float(value) for value in _chord(geometry, leg, joint))
+    along, across, chord = _home_chord(geometry, leg)
     root = np.sqrt(max(along**2 + across**2 - chord**2, 0.0))
     angles = {
         sign: abs(np.arctan2(across * chord + sign * along * root, along * chord - sign * across * root))
         for sign in (1.0, -1.0)
     }
     return min(angles, key=angles.__getitem__)
+
+
+def check_home(geometry: Rss6Geometry) -> None:
+    """Raise RobotFileError, naming the leg, where the home pose is out of reach."""
+    for leg in range(LEGS):
+        along, across, chord = _home_chord(geometry, leg)
+        if not chord**2 < along**2 + across**2:
+            raise RobotFileError(
+                f"leg {leg + 1} cannot reach the home pose: reach margin "
+                f"{1 - chord**2 / max(along**2 + across**2, 1e-300):.3g}, must be > 0"
+            )
+
+
+def _home_chord(geometry: Rss6Geometry, leg: int) -> tuple[float, float, float]:
+    home = ca.SX(geometry.home_pose)
+    joint = home[0:3] + rotation_matrix(home[3:6]) @ geometry.platform_joints[leg]
+    along, across, chord = (float(value) for value in _chord(geometry, leg, joint))
+    return along, across, chord
 
 
 def _chord(geometry: Rss6Geometry, leg: int, joint_position: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:

@@ -5,12 +5,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from dynamics.errors import SimulationError
 from dynamics.parameters import PARAMETER_NAMES
 
 PARAMETER_COUNT = len(PARAMETER_NAMES) + 3
 MAX_DELAY_FRAMES = 60
+MEASURED_OUT_OF_REACH = "the measured pose is out of reach, so that the servo has no command"
 
 # (frame index, time s, true pose (6,)) -> measured pose (6,), or None when the measurement is lost.
 PoseSensor = Callable[[int, float, np.ndarray], np.ndarray | None]
@@ -23,6 +25,11 @@ class ServoGains:
     kp: float
     kd: float
     ki: float
+
+    def __post_init__(self) -> None:
+        for name in ("kp", "kd", "ki"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise SimulationError(f"servo gain {name} is {getattr(self, name)}, must be finite and >= 0")
 
 
 @dataclass(frozen=True)
@@ -38,8 +45,8 @@ class FrameTiming:
     hold: Literal["zero", "linear"] = "zero"
 
     def __post_init__(self) -> None:
-        if not self.frame_rate_hz > 0:
-            raise SimulationError(f"frame rate is {self.frame_rate_hz} Hz, must be > 0")
+        if not 0 < self.frame_rate_hz < np.inf:
+            raise SimulationError(f"frame rate is {self.frame_rate_hz} Hz, must be finite and > 0")
         if not 0 <= self.latency_s * self.frame_rate_hz <= MAX_DELAY_FRAMES:
             raise SimulationError(
                 f"latency is {self.latency_s} s, must be >= 0 and at most {MAX_DELAY_FRAMES} frames "
@@ -61,7 +68,7 @@ class FrictionLaw:
         if self.name not in ("coulomb_viscous", "smoothed"):
             raise SimulationError(f"unknown friction law `{self.name}`; valid: coulomb_viscous, smoothed")
         if self.name == "smoothed" and not (self.smoothing_velocity or 0) > 0:
-            raise SimulationError(f"smoothed friction needs smoothing_velocity > 0 rad/s, got {self.smoothing_velocity}")
+            raise SimulationError(f"smoothing_velocity is {self.smoothing_velocity} rad/s, must be > 0 if smoothed")
 
     @property
     def smoothed(self) -> bool:
@@ -79,8 +86,8 @@ class LoopSettings:
     steps_per_frame: int = 4
 
     def __post_init__(self) -> None:
-        if self.steps_per_frame < 1:
-            raise SimulationError(f"steps_per_frame is {self.steps_per_frame}, must be >= 1")
+        if self.steps_per_frame < 1 or self.steps_per_frame != int(self.steps_per_frame):
+            raise SimulationError(f"steps_per_frame is {self.steps_per_frame}, must be a whole number >= 1")
 
 
 @dataclass(frozen=True)
@@ -125,6 +132,19 @@ class ClosedLoopRun:
     measured_ok: np.ndarray
     pose_sensitivity: np.ndarray | None
     events: int
+
+
+def checked_measurement(measured: ArrayLike | None, frame: int) -> np.ndarray | None:
+    """What a pose sensor returned, as (6,) floats or None. Raises SimulationError for anything else."""
+    if measured is None:
+        return None
+    array = np.asarray(measured, dtype=float)
+    if array.shape != (6,) or not np.isfinite(array).all():
+        raise SimulationError(
+            f"the pose sensor returned {np.array2string(array, precision=6)} at frame {frame}, "
+            "must be 6 finite numbers, or None for a lost measurement"
+        )
+    return array
 
 
 class LoopFailure(SimulationError):

@@ -74,6 +74,11 @@ def dynamic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
     ]
 
 
+def robot_functions(geometry: Rss6Geometry) -> list[ca.Function]:
+    """All that `Robot` evaluates; their names are FUNCTION_NAMES."""
+    return kinematic_functions(geometry) + dynamic_functions(geometry)
+
+
 def motion_functions(geometry: Rss6Geometry) -> list[ca.Function]:
     """What the closed-loop integrator evaluates (see `pose_space_motion`)."""
     return [equation_of_motion(geometry), motion_derivatives(geometry), rate_map_derivative(geometry)]

@@ -48,10 +48,12 @@ def check_parameters(values: np.ndarray) -> np.ndarray:
     values = np.asarray(values, dtype=float)
     if values.shape != (len(PARAMETER_NAMES),):
         raise ParameterError(f"parameters must have shape ({len(PARAMETER_NAMES)},), got {values.shape}")
-    for name, value in zip(PARAMETER_NAMES, values, strict=True):
-        if not np.isfinite(value) or value < 0 or (value == 0 and name == "platform.mass"):
-            limit = "> 0" if name == "platform.mass" else ">= 0"
-            raise ParameterError(f"{name} = {value:g} {unit_of(name)} is not allowed, must be finite and {limit}")
+    allowed = (values >= 0) & (values < np.inf)
+    allowed[0] &= values[0] > 0
+    if not allowed.all():
+        index = int(np.argmin(allowed))
+        name, limit = PARAMETER_NAMES[index], ">= 0" if index else "> 0"
+        raise ParameterError(f"{name} = {values[index]:g} {unit_of(name)} is not allowed, must be finite and {limit}")
     return values
 
 

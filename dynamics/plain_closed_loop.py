@@ -1,19 +1,22 @@
 """The frame loop in plain Python on CasADi's virtual machine: the twin of `run_frames` in `closed_loop.c`."""
 
-from functools import cache
+from functools import lru_cache
 from math import ceil, floor
 
 import casadi as ca
 import numpy as np
 
 from dynamics import model
+from dynamics.geometry import Rss6Geometry
 from dynamics.loop_types import (
+    MEASURED_OUT_OF_REACH,
     PARAMETER_COUNT,
     ClosedLoopRun,
     LoopSettings,
     PoseSensor,
     Reference,
     StartState,
+    checked_measurement,
     failure,
 )
 from dynamics.robot import Robot
@@ -23,9 +26,9 @@ from dynamics.visual_servo import VisualServo
 Issued = tuple[np.ndarray, np.ndarray]
 
 
-@cache
-def _functions(robot: Robot) -> dict[str, ca.Function]:
-    built = model.motion_functions(robot.geometry) + model.kinematic_functions(robot.geometry)
+@lru_cache(maxsize=16)
+def _functions(geometry: Rss6Geometry) -> dict[str, ca.Function]:
+    built = model.motion_functions(geometry) + model.kinematic_functions(geometry)
     return {function.name(): function for function in built}
 
 
@@ -41,12 +44,13 @@ def run(
 ) -> ClosedLoopRun:
     """See `closed_loop.simulate`; arguments are already checked."""
     period, frames = 1.0 / settings.timing.frame_rate_hz, len(reference.poses)
-    functions = _functions(robot)
+    functions = _functions(robot.geometry)
     motion = StickSlipMotion(functions, parameters, settings.friction, sensitivities)
     servo = VisualServo(functions, settings.servo, period, reference.poses[0], start.servo_integral)
     state = State(reference.poses[0], np.zeros(6), start.joint_integral)
     if sensitivities:
-        motion.tangent = State(*np.zeros((2, 6, PARAMETER_COUNT)), start.joint_integral_sensitivity)
+        rest = np.zeros((6, PARAMETER_COUNT))
+        motion.tangent = State(rest, rest, start.joint_integral_sensitivity)
     result = _empty(frames, period, sensitivities)
     issued: list[Issued] = [(start.command, np.zeros((6, PARAMETER_COUNT)))]
     for frame in range(frames):
@@ -54,7 +58,9 @@ def run(
         d_pose = motion.tangent.pose if motion.tangent is not None else None
         if result.pose_sensitivity is not None:
             result.pose_sensitivity[frame] = d_pose
-        measured = state.pose if sensor is None else sensor(frame, frame * period, state.pose.copy())
+        measured: np.ndarray | None = state.pose
+        if sensor is not None:
+            measured = checked_measurement(sensor(frame, frame * period, state.pose.copy()), frame)
         servo.next_frame()
         result.measured_ok[frame] = measured is not None
         result.measured[frame] = np.nan if measured is None else measured
@@ -63,8 +69,10 @@ def run(
         elif measured is None:
             issued.append(issued[-1])
         else:
-            issued.append(_servo_command(servo, frame, reference, np.asarray(measured, dtype=float), d_pose))
+            issued.append(_servo_command(servo, frame, reference, measured, d_pose))
         result.command[frame] = issued[-1][0]
+        if not np.isfinite(issued[-1][0]).all():
+            raise failure(MEASURED_OUT_OF_REACH, frame, period)
         try:
             state = _frame(motion, state, issued, frame, settings, result)
         except MotionStopped as reason:
@@ -115,7 +123,8 @@ def _steps(settings: LoopSettings, frames: float) -> int:
 def _command(issued: list[Issued], number: int, settings: LoopSettings) -> Command:
     """Command `number` (from frame 0 on) acting on the joints; before frame 0 the start command."""
     (value, d_value), (before, d_before) = (issued[max(0, number + 1)], issued[max(0, number)])
-    rate, d_rate = (value - before) * settings.timing.frame_rate_hz, (d_value - d_before) * settings.timing.frame_rate_hz
+    frame_rate = settings.timing.frame_rate_hz
+    rate, d_rate = (value - before) * frame_rate, (d_value - d_before) * frame_rate
     if settings.timing.hold == "linear":
         return Command(before, rate, rate, d_before, d_rate, d_rate)
     return Command(value, np.zeros(6), rate, d_value, np.zeros_like(d_rate), d_rate)

@@ -104,7 +104,7 @@ def _leg_derivatives(
     ]
     values = [joints.position[leg], joints.velocity[leg], joints.acceleration[leg]]
     columns, force, *rows = ca.substitute(ca.cse(expressions), inputs, values)
-    return _LegDerivatives(columns, force, tuple(rows[0:3]), tuple(rows[3:6]))
+    return _LegDerivatives(columns, force, (rows[0], rows[1], rows[2]), (rows[3], rows[4], rows[5]))
 
 
 def _by_pose(rows: tuple[ca.SX, ca.SX, ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:

@@ -1,7 +1,6 @@
 """A robot as its users call it: kinematics and dynamics on NumPy arrays, one pose or a batch of them."""
 
-from collections.abc import Callable
-from functools import cached_property
+from functools import lru_cache
 from pathlib import Path
 
 import casadi as ca
@@ -9,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dynamics import forward_kinematics, model
-from dynamics.compilation import load_library
+from dynamics.compilation import load_library, open_library
 from dynamics.errors import ShapeError, SingularPoseError, UnreachablePoseError
-from dynamics.geometry import LEGS
+from dynamics.geometry import LEGS, Rss6Geometry
 from dynamics.parameters import PARAMETER_NAMES, check_parameters
 from dynamics.robot_file import ParameterSet, RobotDescription, read_robot_file
 
@@ -140,17 +139,10 @@ class Robot:
             f"reach margin {margin[index, leg]:.3g}, must be > 0"
         )
 
-    @cached_property
-    def functions(self) -> dict[str, Callable]:
+    @property
+    def functions(self) -> dict[str, ca.Function]:
         """CasADi functions by name: compiled where a C compiler is at hand, else for CasADi's virtual machine."""
-
-        def build(geometry: object) -> list[ca.Function]:
-            return model.kinematic_functions(self.geometry) + model.dynamic_functions(self.geometry)
-
-        library = load_library("functions", self.geometry, build)
-        if library is None:
-            return {function.name(): function for function in build(self.geometry)}
-        return {name: ca.external(name, str(library)) for name in model.FUNCTION_NAMES}
+        return _functions(self.geometry)
 
     def _poses(self, pose: ArrayLike) -> np.ndarray:
         poses = _rows("pose", pose, 6)
@@ -192,8 +184,21 @@ class Robot:
         return stacked if batched else stacked[0]
 
 
+@lru_cache(maxsize=16)
+def _functions(geometry: Rss6Geometry) -> dict[str, ca.Function]:
+    """One set for all robots of a geometry; not kept in the robot, so that robots can be pickled."""
+    library = load_library("functions", geometry, model.robot_functions)
+    if library is None:
+        return {function.name(): function for function in model.robot_functions(geometry)}
+    open_library(library)
+    return {name: ca.external(name, str(library)) for name in model.FUNCTION_NAMES}
+
+
 def _rows(name: str, value: ArrayLike, width: int) -> np.ndarray:
-    array = np.asarray(value, dtype=float)
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise ShapeError(f"{name} must be numbers of shape ({width},) or (N, {width}), got {value!r:.60}") from None
     if array.ndim not in (1, 2) or array.shape[-1] != width:
         raise ShapeError(f"{name} must have shape ({width},) or (N, {width}), got {array.shape}")
     if not np.isfinite(array).all():

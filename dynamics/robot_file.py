@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from dynamics.errors import RobotFileError
+from dynamics.errors import DynamicsError, RobotFileError
 from dynamics.geometry import LEGS, Rss6Geometry
+from dynamics.kinematics import check_home
 from dynamics.parameters import check_parameters
 
 _PerLeg = float | list[float]
@@ -18,6 +19,14 @@ _PerLeg = float | list[float]
 
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _know_every_key(cls, values: object) -> object:
+        unknown = sorted(set(values) - set(cls.model_fields)) if isinstance(values, dict) else []
+        if unknown:
+            raise ValueError(f"unknown key {', '.join(unknown)}; valid: {', '.join(cls.model_fields)}")
+        return values
 
 
 class _Legs(_Strict):
@@ -67,7 +76,7 @@ class _RobotFile(_Strict):
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """One named set: dynamic parameters (64,) in the order of `parameters.PARAMETER_NAMES` and joint PID [lp, li, ld]."""
+    """One named set: dynamic parameters (64,) in the order of `PARAMETER_NAMES`, and joint PID [lp, li, ld] (3,)."""
 
     dynamic: np.ndarray
     joint_pid: np.ndarray
@@ -106,18 +115,34 @@ def read_robot_file(name_or_path: str | Path) -> RobotDescription:
         raise RobotFileError(f"robot file {source} is not valid TOML: {error}") from error
     except ValidationError as error:
         raise RobotFileError(f"robot file {source}: {_one_line(error)}") from error
+    try:
+        geometry = _geometry(content)
+        sets = {name: _parameter_set(name, values) for name, values in content.parameters.items()}
+    except DynamicsError as error:
+        raise RobotFileError(f"robot file {source}: {error}") from error
+    if "initial" not in sets:
+        raise RobotFileError(f"robot file {source} needs a parameter set `initial`; it has {sorted(sets) or 'none'}")
+    return RobotDescription(content.name, geometry, sets)
+
+
+def _geometry(content: _RobotFile) -> Rss6Geometry:
     geometry = Rss6Geometry(
-        **{name: np.array(value) for name, value in content.legs.model_dump().items() if isinstance(value, list)},
+        **{name: _vectors(name, value) for name, value in content.legs.model_dump().items() if isinstance(value, list)},
         crank_length=content.legs.crank_length,
         link_length=content.legs.link_length,
         home_pose=np.array(content.home_pose),
         travel_limit=content.travel_limit,
         gravity=np.array(content.gravity),
     )
-    sets = {name: _parameter_set(name, values) for name, values in content.parameters.items()}
-    if "initial" not in sets:
-        raise RobotFileError(f"robot file {source} needs a parameter set `initial`; it has {sorted(sets) or 'none'}")
-    return RobotDescription(content.name, geometry, sets)
+    check_home(geometry)
+    return geometry
+
+
+def _vectors(name: str, rows: list[list[float]]) -> np.ndarray:
+    for leg, row in enumerate(rows):
+        if len(row) != 3:
+            raise RobotFileError(f"legs.{name} of leg {leg + 1} needs 3 numbers, got {len(row)}")
+    return np.array(rows)
 
 
 def _read_text(name_or_path: str | Path) -> tuple[str, str]:
@@ -125,17 +150,21 @@ def _read_text(name_or_path: str | Path) -> tuple[str, str]:
     if path.suffix == ".toml" or path.is_file():
         try:
             return str(path), path.read_text(encoding="utf-8")
-        except OSError as error:
-            raise RobotFileError(f"cannot read robot file {path}: {error.strerror}") from error
+        except (OSError, UnicodeDecodeError) as error:
+            raise RobotFileError(f"cannot read robot file {path}: {error}") from error
     if str(name_or_path) not in built_in_robots():
-        valid = ", ".join(built_in_robots())
-        raise RobotFileError(f"unknown robot `{name_or_path}`; built-in robots: {valid}; or give the path of a .toml file")
+        valid = f"built-in robots: {', '.join(built_in_robots())}; or give the path of a .toml file"
+        raise RobotFileError(f"unknown robot `{name_or_path}`; {valid}")
     entry = resources.files("dynamics") / "robots" / f"{name_or_path}.toml"
     return str(name_or_path), entry.read_text(encoding="utf-8")
 
 
 def _one_line(error: ValidationError) -> str:
-    return "; ".join(f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors())
+    lines = []
+    for item in error.errors():
+        place = ".".join(map(str, item["loc"]))
+        lines.append(f"{place}: {item['msg']}" if place else item["msg"])
+    return "; ".join(lines)
 
 
 def _parameter_set(name: str, values: _ParameterSet) -> ParameterSet:
