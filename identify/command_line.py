@@ -9,7 +9,6 @@ import typer
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from identify import tables
 from identify.errors import IdentifyError, ScenarioError
 from identify.progress import Progress, RichProgress, SilentProgress
 from identify.run_folder import RunFolder, new_run_folder
@@ -63,17 +62,21 @@ def main() -> None:
     """Run the command; a known error is one line on standard error and exit status 1."""
     try:
         app()
-    except known_errors() as error:
+    except Exception as error:
+        if not is_known(error):
+            raise
         typer.echo(f"error: {' '.join(str(error).split())}", err=True)
         raise SystemExit(1) from None
 
 
-def known_errors() -> tuple[type[Exception], ...]:
-    """The errors of all three packages that a user can cause or meet."""
+def is_known(error: Exception) -> bool:
+    """Whether an error is one that a user can cause or meet, of any of the three packages."""
+    if isinstance(error, IdentifyError):
+        return True
     from cmmsim.errors import CmmError, OpenGLMissingError
     from dynamics.errors import DynamicsError
 
-    return IdentifyError, CmmError, OpenGLMissingError, DynamicsError
+    return isinstance(error, (CmmError, OpenGLMissingError, DynamicsError))
 
 
 def _print_version(wanted: bool) -> None:
@@ -170,8 +173,9 @@ def parse_settings(settings: list[str] | None) -> dict[str, Any]:
 def print_summary(folder: RunFolder) -> None:
     """Print the goals of a run with their values, and where its report is."""
     from identify.result_file import load_result
+    from identify.tables import goals_table
 
-    table = tables.goals_table(load_result(folder.result))
+    table = goals_table(load_result(folder.result))
     shown = RichTable(title=table.title, caption=table.note, show_edge=False)
     for name in table.header:
         shown.add_column(name)

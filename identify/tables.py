@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from dynamics.parameters import unit_of
 from identify import paper_results
 from identify.goals import check_goals
 from identify.result_file import AXES, rms_row
@@ -50,7 +51,7 @@ def parameter_table(result: dict[str, Any], identifiable_only: bool = False) -> 
             continue
         shown = (number(p["estimate"]), number(p["std"]), _percent(p)) if p["identifiable"] else ("-", "-", "-")
         remark = "" if p["identifiable"] else "not identifiable"
-        rows.append((name, parameter_unit(name), number(p["initial"]), number(p["true"]), *shown, remark))
+        rows.append((name, unit_of(name), number(p["initial"]), number(p["true"]), *shown, remark))
     anchor = result["identification"]["scale_anchor"]
     return Table(
         "Parameters (like the paper's table 2)",
@@ -116,20 +117,6 @@ def seconds_table(result: dict[str, Any]) -> Table:
     """Time of each stage."""
     rows = tuple((name, number(value)) for name, value in result.get("seconds", {}).items())
     return Table("Time of the stages", ("stage", "seconds"), rows)
-
-
-def parameter_unit(name: str) -> str:
-    """Unit of a parameter by its name; empty for a name of no known kind."""
-    units = {
-        "mass": "kg",
-        "coulomb": "N m",
-        "viscous": "N m s/rad",
-        "lp": "N m/rad",
-        "li": "N m/(rad s)",
-        "ld": "N m s/rad",
-    }
-    kind = name.rpartition(".")[2]
-    return "kg m²" if kind.startswith("I") else units.get(kind, "")
 
 
 def number(value: float | None) -> str:

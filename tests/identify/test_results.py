@@ -14,7 +14,6 @@ from identify.tables import (
     excitation_error_table,
     goals_table,
     parameter_table,
-    parameter_unit,
     sensor_table,
     validation_table,
 )
@@ -130,12 +129,6 @@ def test_parameter_that_is_not_identifiable_has_no_number(result):
     assert rows["link1.Ixx"][4:] == ("-", "-", "-", "not identifiable")
     assert rows["joint1.coulomb"][1:] == ("N m", "0", "0.104", "0.105", "0.001", "+0.96", "")
     assert "link1.Ixx" not in {row[0] for row in parameter_table(result, identifiable_only=True).rows}
-
-
-def test_every_kind_of_parameter_has_a_unit():
-    names = ["platform.mass", "crank1.Izz", "joint2.coulomb", "joint2.viscous", "joint_pid.lp", "joint_pid.li"]
-    units = ["kg", "kg m²", "N m", "N m s/rad", "N m/rad", "N m/(rad s)"]
-    assert [parameter_unit(name) for name in names] == units
 
 
 def test_markdown_has_one_cell_for_each_column(result):
