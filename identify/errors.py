@@ -23,3 +23,7 @@ class RecordError(IdentifyError):
 
 class OutputFolderError(IdentifyError):
     """A run folder that already holds something, or lacks what an earlier stage writes."""
+
+
+class EstimationError(IdentifyError):
+    """A record from which no parameters can be estimated."""

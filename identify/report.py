@@ -15,11 +15,13 @@ from identify.atomic import write_text
 from identify.errors import RecordError
 from identify.goals import check_goals
 from identify.model_runs import EXCITATION, read_model_runs
+from identify.paper_results import INDEX_BEST, INDEX_FIRST
 from identify.progress import Progress, SilentProgress
 from identify.recording import poses, read, read_runs, run_name
 from identify.result_file import load_result
 from identify.run_folder import RunFolder
 from identify.tables import Table
+from identify.trajectory_file import TrajectorySet, load_trajectories
 from identify.truth import read_truth_runs, true_poses
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -27,13 +29,15 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 @dataclass(frozen=True)
 class ReportData:
-    """All that a report shows: the result, the records, the truth of the validation runs and the models' runs."""
+    """All that a report shows: the result, the records, the truth of the validation runs, the models' runs
+    and, where they are there, the trajectories."""
 
     result: dict[str, Any]
     experiment: xr.Dataset
     validation: list[xr.Dataset]
     validation_truth: list[xr.Dataset]
     models: Mapping[str, xr.Dataset]
+    trajectories: TrajectorySet | None = None
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,7 @@ def read_report_data(run: RunFolder) -> ReportData:
         validation=read_runs(run.validation),
         validation_truth=read_truth_runs(run.validation),
         models=read_model_runs(run.model),
+        trajectories=load_trajectories(run.trajectories) if run.trajectories.is_file() else None,
     )
     records = {EXCITATION: data.experiment}
     records |= {run_name(number): record for number, record in enumerate(data.validation, start=1)}
@@ -148,7 +153,7 @@ def excitation_section(data: ReportData) -> Section:
     time = data.experiment["time"].values
     return Section(
         "Excitation and fit",
-        "Measured pose as black dots, starting model green, identified model blue.",
+        f"Measured pose as black dots, starting model green, identified model blue. {_index_text(data.trajectories)}",
         (tables.excitation_error_table(data.result),),
         (
             report_plots.trajectory_plot(time, poses(data.experiment, "reference")),
@@ -219,6 +224,16 @@ def _model_poses(data: ReportData, name: str) -> tuple[Array | None, Array]:
     run = data.models[name]
     initial = poses(run, "initial")
     return (initial if np.isfinite(initial).any() else None), poses(run, "identified")
+
+
+def _index_text(trajectories: TrajectorySet | None) -> str:
+    if trajectories is None:
+        return ""
+    return (
+        f"Observability index (eq. 39): {trajectories.first_index:.3g} of the first candidate, "
+        f"{trajectories.median_index:.3g} of the middle one, {trajectories.observability_index:.3g} of the best, which "
+        f"is used. The paper, on its own geometry: from {INDEX_FIRST:g} to {INDEX_BEST:g} by a genetic algorithm."
+    )
 
 
 def _split_toml(text: str) -> list[tuple[str, str, str]]:

@@ -1,0 +1,124 @@
+"""Bounded Gauss-Newton with a trust region for nonlinear least squares (eq. 32-35).
+
+Minimises |r(p)|^2 with r' = J. The paper's update (eq. 33, with the residual in place of its square) solves the linear
+problem without limits; here the step stays inside the parameters' bounds and inside a box that shrinks when the model
+of the cost was wrong, which keeps it from stalling near unstable loops.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from identify.arrays import Array
+
+SHRINK, GROW = 0.25, 2.0
+POOR, GOOD = 0.25, 0.75
+SMALLEST_RADIUS = 1e-10
+
+
+class Problem(Protocol):
+    """What the solver minimises."""
+
+    def cost(self, parameters: Array) -> float:
+        """|r|^2; infinite where the model cannot run."""
+        ...
+
+    def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
+        """|r|^2, and a factor R (p, p) with a vector d (p,): |r + J step|^2 = |d + R step|^2 + constant."""
+        ...
+
+
+@dataclass(frozen=True)
+class StopCriteria:
+    """Eq. 35: tol1 on the relative change of the cost, tol2 on the relative change of every parameter."""
+
+    cost_tolerance: float
+    parameter_tolerance: float
+    max_iterations: int
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Parameters (p,), factor R (p, p) of J^T J there, cost after each iteration, evaluations and why it stopped."""
+
+    parameters: Array
+    factor: Array
+    costs: tuple[float, ...]
+    evaluations: int
+    stop_reason: str
+
+    @property
+    def iterations(self) -> int:
+        """Steps taken."""
+        return len(self.costs) - 1
+
+
+def minimise(
+    problem: Problem,
+    start: Array,
+    lower: Array,
+    scale: Array,
+    criteria: StopCriteria,
+    on_iteration: Callable[[int, float], None] = lambda iteration, cost: None,
+) -> Solution:
+    """Minimise from `start` (p,) with p >= lower; `scale` (p,) is the size of a large change of each parameter."""
+    parameters, radius = start.copy(), 1.0
+    cost, factor, residual = problem.linearise(parameters)
+    costs, evaluations, reason = [cost], 1, ""
+    while not reason:
+        if len(costs) > criteria.max_iterations:
+            reason = f"stopped after max_iterations = {criteria.max_iterations}"
+            break
+        step, predicted = _box_step(factor, residual, parameters, lower, scale, radius)
+        evaluations += 1
+        new_cost = problem.cost(parameters + step) if predicted > 0 else cost
+        ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
+        largest = float(np.abs(step / scale).max())
+        radius = _new_radius(radius, ratio, largest)
+        if ratio > 0:
+            change = _relative_change(step, parameters, scale)
+            reason = _converged(cost, new_cost, change, criteria)
+            parameters = np.maximum(parameters + step, lower)
+            cost, factor, residual = problem.linearise(parameters)
+            evaluations += 1
+            costs.append(cost)
+            on_iteration(len(costs) - 1, cost)
+        elif radius < SMALLEST_RADIUS or predicted <= criteria.cost_tolerance * cost:
+            reason = f"no step lowers the cost: predicted gain {predicted:.3g} of {cost:.6g}"
+    return Solution(parameters, factor, tuple(costs), evaluations, reason)
+
+
+def _box_step(
+    factor: Array, residual: Array, parameters: Array, lower: Array, scale: Array, radius: float
+) -> tuple[Array, float]:
+    """Minimiser of the linearised cost in the box, and the gain it predicts."""
+    low = np.maximum((lower - parameters) / scale, -radius)
+    scaled = factor * scale
+    solved = lsq_linear(scaled, -residual, bounds=(np.minimum(low, -1e-15), np.full(len(scale), radius)), method="bvls")
+    gain = residual @ residual - np.sum((residual + scaled @ solved.x) ** 2)
+    return solved.x * scale, float(gain)
+
+
+def _new_radius(radius: float, ratio: float, largest: float) -> float:
+    if ratio < POOR:
+        return SHRINK * largest
+    if ratio > GOOD and largest > 0.9 * radius:
+        return GROW * radius
+    return radius
+
+
+def _relative_change(step: Array, parameters: Array, scale: Array) -> float:
+    """max |step_i / p_i| of eq. 35; a parameter at zero counts by its size."""
+    return float(np.max(np.abs(step) / np.maximum(np.abs(parameters), 1e-3 * scale)))
+
+
+def _converged(cost: float, new_cost: float, change: float, criteria: StopCriteria) -> str:
+    gain = (cost - new_cost) / cost
+    if gain <= criteria.cost_tolerance:
+        return f"cost changed by {gain:.2e} <= tol1 = {criteria.cost_tolerance:g} (eq. 35)"
+    if change <= criteria.parameter_tolerance:
+        return f"parameters changed by {change:.2e} <= tol2 = {criteria.parameter_tolerance:g} (eq. 35)"
+    return ""

@@ -1,0 +1,38 @@
+"""From scenario and trajectory to the closed loop that plant and model both run."""
+
+import numpy as np
+
+from dynamics.closed_loop import FrameTiming, FrictionLaw, LoopSettings, Reference, ServoGains
+from identify.arrays import Array
+from identify.scenario import Model, Plant, Scenario
+from identify.trajectory import FourierTrajectory
+
+
+def plant_settings(scenario: Scenario) -> LoopSettings:
+    """The loop around the simulated real robot."""
+    return _settings(scenario, scenario.plant)
+
+
+def model_settings(scenario: Scenario) -> LoopSettings:
+    """The loop around the estimator's model: the same servo and timing, its own friction law and steps."""
+    return _settings(scenario, scenario.model)
+
+
+def frame_times(scenario: Scenario, duration_s: float) -> Array:
+    """Instants of exposure (N,) [s] of a run: whole frames, the end of the run excluded."""
+    return np.arange(scenario.timing.frames(duration_s)) * scenario.timing.frame_period_s
+
+
+def reference_motion(trajectory: FourierTrajectory, times: Array) -> Reference:
+    """Desired poses and pose rates at the frames."""
+    return Reference(trajectory.pose(times), trajectory.pose_rate(times))
+
+
+def _settings(scenario: Scenario, side: Plant | Model) -> LoopSettings:
+    servo, timing = scenario.servo, scenario.timing
+    return LoopSettings(
+        servo=ServoGains(servo.kp, servo.kd, servo.ki),
+        timing=FrameTiming(timing.frame_rate_hz, timing.latency_s, timing.hold),
+        friction=FrictionLaw(side.friction, side.smoothing_velocity_rad_s),
+        steps_per_frame=side.steps_per_frame,
+    )

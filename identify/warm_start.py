@@ -1,0 +1,102 @@
+"""Linear warm start: the closed-loop equation is linear in everything unknown, so one fit starts the search close by.
+
+With the logged commands U and the crank angles theta of the measured poses, at every instant
+
+    J_ad^-T Gamma(pose, twist, twist_dot) Xi - lp (U - theta) - ld (U_dot - theta_dot) - li integral(U - theta) = z
+
+with z the torque the integrators held at the start (6,). Poses are filtered and differentiated. Each row is the balance
+of one joint, whose dry friction is known only while it slips: rows of joints near rest are left out. The equation is
+homogeneous: the scale anchor, and weakly the starting guess, decide the common factor.
+"""
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+from scipy.optimize import lsq_linear
+
+from dynamics import Robot
+from identify.arrays import Array
+from identify.filtering import filtered_derivatives, zero_phase_filter
+from identify.loop_parameters import NAMES, StartingGuess, index_of
+from identify.scale_anchor import ScaleAnchor
+from identify.scenario import Filter, Timing
+
+EDGE_FRACTION = 0.02
+"""Share of the record left out at either end, where filtered derivatives are poor."""
+
+SLIPPING_SHARE = 0.5
+"""A joint counts as slipping above this share of its RMS velocity."""
+
+
+def linear_warm_start(
+    robot: Robot,
+    measured: Array,
+    commands: Array,
+    timing: Timing,
+    filtering: Filter,
+    guess: StartingGuess,
+    anchor: ScaleAnchor,
+) -> Array:
+    """Parameters (67,) fitted to measured poses (N, 6) without gaps and commands (N, 6) at the frames.
+
+    The residual's size is estimated from the fit itself, so that the starting guess counts as much as it should.
+    """
+    columns = regression_columns(robot, measured, commands, timing, filtering)
+    lower = np.concatenate([np.zeros(len(NAMES)), np.full(6, -np.inf)])
+    noise = 0.1
+    for _ in range(3):
+        solution = _fit(columns, noise, guess, anchor, lower)
+        noise = max(float(np.sqrt(np.mean((columns @ solution) ** 2))), 1e-9)
+    return np.maximum(solution[: len(NAMES)], 0.0)
+
+
+def regression_columns(robot: Robot, measured: Array, commands: Array, timing: Timing, filtering: Filter) -> Array:
+    """Homogeneous regression (rows, 73): 64 dynamic parameters, lp, li, ld, and the six starting torques; N m."""
+    rate_hz = timing.frame_rate_hz
+    pose, pose_rate, acceleration = filtered_derivatives(measured, rate_hz, filtering.cutoff_hz, filtering.order)
+    twist, twist_dot = robot.twist(pose, pose_rate), robot.twist_dot(pose, pose_rate, acceleration)
+    regressor = robot.regressor(pose, twist, twist_dot)
+    torque_map = np.linalg.inv(robot.joint_jacobian(pose)).transpose(0, 2, 1)
+    angle = robot.inverse_kinematics(pose)
+    velocity = np.einsum("nij,nj->ni", robot.joint_jacobian(pose), twist)
+    command, command_rate, integral = _effective_command(commands, timing, filtering)
+    angle_integral = _running_integral(angle, rate_hz)
+    count = len(measured)
+    start = np.broadcast_to(-np.eye(6), (count, 6, 6))
+    pid = -np.stack([command - angle, integral - angle_integral, command_rate - velocity], axis=2)
+    columns = np.concatenate([torque_map @ regressor, pid, start], axis=2)
+    slipping = np.abs(velocity) > SLIPPING_SHARE * velocity.std(axis=0)
+    edge = max(1, round(EDGE_FRACTION * count))
+    slipping[:edge] = slipping[count - edge :] = False
+    return columns[slipping]
+
+
+def _effective_command(commands: Array, timing: Timing, filtering: Filter) -> tuple[Array, Array, Array]:
+    """Filtered command as the joints feel it, its rate as the joint PID sees it, and its integral, at the frames.
+
+    A held command lags by half a frame, a ramped one by a whole frame; U_dot is the difference of two commands, held.
+    """
+    rate_hz, period = timing.frame_rate_hz, timing.frame_period_s
+    smooth = zero_phase_filter(commands, rate_hz, filtering.cutoff_hz, filtering.order)
+    times = np.arange(len(commands)) * period
+    spline = make_interp_spline(times, smooth, k=5)
+    lag = timing.latency_s + (period if timing.hold == "linear" else period / 2)
+    felt = spline(np.clip(times - lag, 0.0, None))
+    rate = spline(np.clip(times - timing.latency_s - period, 0.0, None), nu=1)
+    return felt, rate, _running_integral(felt, rate_hz)
+
+
+def _running_integral(samples: Array, rate_hz: float) -> Array:
+    spline = make_interp_spline(np.arange(len(samples)) / rate_hz, samples, k=5)
+    integral = spline.antiderivative()
+    return integral(np.arange(len(samples)) / rate_hz)
+
+
+def _fit(columns: Array, noise: float, guess: StartingGuess, anchor: ScaleAnchor, lower: Array) -> Array:
+    size = columns.shape[1]
+    prior = np.eye(len(NAMES), size) / guess.std[:, None]
+    weighed = np.eye(1, size, index_of(anchor.parameter)) / anchor.std
+    matrix = np.vstack([np.linalg.qr(columns / noise, mode="r"), prior, weighed])
+    right = np.concatenate([np.zeros(size), guess.values / guess.std, [anchor.value / anchor.std]])
+    scale = np.concatenate([guess.std, np.ones(6)])
+    solved = lsq_linear(matrix * scale, right, bounds=(lower / scale, np.inf), method="bvls")
+    return np.asarray(solved.x * scale, dtype=float)
