@@ -6,8 +6,6 @@ image, whose centre is f (D13/D33, D23/D33); the centre itself projects to f (X/
 
 from __future__ import annotations
 
-import numpy as np
-
 from .pose import Array
 
 

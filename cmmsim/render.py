@@ -55,7 +55,7 @@ def _shared_atlas() -> _Atlas:
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     if not hasattr(np, "infty"):
-        np.infty = np.inf  # type: ignore[attr-defined]  # pyrender 0.1.45 uses this name, numpy 2 removed it
+        np.inf = np.inf  # type: ignore[attr-defined]  # pyrender 0.1.45 uses this name, numpy 2 removed it
     try:
         import pyrender
 

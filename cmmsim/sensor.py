@@ -50,6 +50,7 @@ class Sensor:
         camera = PinholeCamera(file.rig.focal_px, *middle, file.rig.width, file.rig.height)
         self.rig, self._camera_from_base = toed_in_rig(camera, file.rig.baseline, np.array(file.rig.position),
                                                        np.array(file.rig.target))
+        self._true_rig = self.rig
         figures = file.camera.model_dump()
         self.noise = CameraNoise(**{("enabled" if k == "noise" else k): v for k, v in figures.items()})
         self.settings = DetectionSettings(radius=file.stickers.radius, limits=FitLimits())
@@ -106,6 +107,11 @@ class Sensor:
         self._obstacles.update({name: mesh_patch(mesh, level) for name, mesh in meshes.items()})
         self._camera = self._build_camera()
 
+    def shift_camera(self, side: int, shift_px: tuple[float, float]) -> None:
+        """Move the true principal point of one camera (0 left, 1 right) by (x, y) px; the estimator is not told."""
+        self._true_rig = self._true_rig.shifted(side, shift_px)
+        self._camera = self._build_camera()
+
     def capture(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None) -> StereoFrame:
         """Both whole images with the platform at ``pose`` (6,); obstacles: name -> base_from_body (4,4)."""
         return self._camera.look(*self._checked(pose, obstacles)).full()
@@ -125,7 +131,7 @@ class Sensor:
         patches = [p for body in self._scene for p in body.stickers] + [body.solid for body in self._scene]
         owners = [k for k, body in enumerate(self._scene) for _ in body.stickers] + [0, 1]
         owners += range(2, 2 + len(self._obstacles))
-        return VirtualStereoCamera(self.rig, self._camera_from_base, Drawable([*patches, *self._obstacles.values()],
+        return VirtualStereoCamera(self._true_rig, self._camera_from_base, Drawable([*patches, *self._obstacles.values()],
                                                                               owners),
                                    self.noise, list(self._obstacles), self._file.stickers.background_level / 255.0)
 

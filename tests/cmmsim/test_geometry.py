@@ -1,0 +1,152 @@
+"""Poses, cameras, triangulation, plane frames and registration against closed forms and scipy."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from cmmsim import pose as p
+from cmmsim.camera import PinholeCamera
+from cmmsim.eccentricity import eccentricity
+from cmmsim.errors import LostError, ShapeError
+from cmmsim.plane_frame import fit_plane, frame_from_planes, frame_of_points
+from cmmsim.registration import register
+from cmmsim.stereo_rig import toed_in_rig
+from cmmsim.triangulation import triangulate
+
+ANGLE = st.floats(-1.4, 1.4)
+CAMERA = PinholeCamera(2300.0, 1023.5, 767.5, 2048, 1536)
+
+
+@pytest.fixture
+def rig():
+    return toed_in_rig(CAMERA, 1.0, np.array([1.44, 0.0, 1.28]), np.array([0.3, 0.0, 0.18]))
+
+
+@given(ANGLE, ANGLE, ANGLE)
+def test_rotation_is_the_paper_order_and_round_trips(alpha, beta, gamma):
+    pose = np.array([0.1, -0.2, 0.3, alpha, beta, gamma])
+    transform = p.pose_to_transform(pose)
+    expected = Rotation.from_euler("XYZ", [alpha, beta, gamma]).as_matrix()
+    np.testing.assert_allclose(transform[:3, :3], expected, atol=1e-14)
+    np.testing.assert_allclose(p.transform_to_pose(transform), pose, atol=1e-12)
+
+
+@given(st.floats(0.0, 2.5), ANGLE, ANGLE)
+def test_rotation_vector_round_trips(size, azimuth, elevation):
+    vector = size * np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
+                              np.sin(elevation)])
+    rotation = p.rotation_exp(vector)
+    np.testing.assert_allclose(rotation, Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(p.rotation_log(rotation), vector, atol=1e-8)
+
+
+def test_euler_rates_match_finite_differences():
+    pose = np.array([0.0, 0.0, 0.0, 0.4, -0.7, 1.1])
+    matrix = p.euler_rates_matrix(pose)
+    for k in range(3):
+        step = np.zeros(6)
+        step[3 + k] = 1e-6
+        turn = Rotation.from_matrix(p.pose_to_transform(pose + step)[:3, :3]
+                                    @ p.pose_to_transform(pose - step)[:3, :3].T)
+        np.testing.assert_allclose(turn.as_rotvec() / 2e-6, matrix[:, k], atol=1e-7)
+
+
+@pytest.mark.parametrize("bad", [[1, 2, 3], [0, 0, 0, 0, 0, np.nan], np.zeros((1, 6))])
+def test_pose_of_wrong_shape_is_refused(bad):
+    with pytest.raises(ShapeError, match="six finite numbers"):
+        p.pose_to_transform(bad)
+
+
+def test_projection_jacobian_matches_finite_differences():
+    points = np.random.default_rng(0).uniform([-0.3, -0.3, 1.2], [0.3, 0.3, 2.0], (20, 3))
+    jacobian = CAMERA.projection_jacobian(points)
+    for k in range(3):
+        step = 1e-6 * np.eye(3)[k]
+        numeric = (CAMERA.project(points + step)[0] - CAMERA.project(points - step)[0]) / 2e-6
+        np.testing.assert_allclose(jacobian[..., k], numeric, rtol=1e-6, atol=1e-4)
+
+
+def test_noise_free_triangulation_returns_the_points(rig):
+    stereo, camera_from_base = rig
+    points = np.random.default_rng(1).uniform([0.0, -0.2, 0.1], [0.6, 0.2, 0.4], (50, 3))
+    in_camera = p.apply(camera_from_base, points)
+    pixels, valid = stereo.project(in_camera)
+    assert valid.all()
+    spread = np.broadcast_to(1e-4 * np.eye(2), (50, 2, 2))
+    found = triangulate(stereo, pixels[0], pixels[1], spread, spread)
+    assert np.abs(found.points - in_camera).max() < 1e-11
+    assert found.ray_gap.max() < 1e-12
+
+
+def test_plane_frame_of_exact_points():
+    """Three planes built from a known frame give it back, seen from anywhere."""
+    rng = np.random.default_rng(2)
+    normals = np.array([[0.0, 0.0, 1.0], [0.8, 0.5, 0.3], [0.8, -0.5, 0.2]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    corner = np.array([0.19, 0.02, 0.13])
+    offsets = normals @ corner
+    own = frame_from_planes(normals, offsets)
+    np.testing.assert_allclose(own[:3, 3], corner, atol=1e-14)
+    np.testing.assert_allclose(own[:3, 2], normals[0], atol=1e-14)
+    np.testing.assert_allclose(normals[:2] @ own[:3, 0], 0.0, atol=1e-14)
+    points, index = [], np.repeat(np.arange(3), 5)
+    for normal in normals:
+        spread = rng.uniform(-0.1, 0.1, (5, 3))
+        points.append(corner + spread - np.outer(spread @ normal, normal))
+    camera_from_body = np.eye(4)
+    camera_from_body[:3, :3] = Rotation.from_rotvec([1.8, -0.9, 0.4]).as_matrix()
+    camera_from_body[:3, 3] = [0.1, -0.2, 1.7]
+    covariances = np.broadcast_to(1e-10 * np.eye(3), (15, 3, 3))
+    frame, _ = frame_of_points(p.apply(camera_from_body, np.concatenate(points)), covariances, index,
+                               normals @ camera_from_body[:3, :3].T)
+    np.testing.assert_allclose(frame, camera_from_body @ own, atol=1e-12)
+
+
+@pytest.mark.parametrize(("points", "message"), [
+    (np.eye(3)[:2], "plane B: 2 visible stickers, at least 3 needed"),
+    (np.outer(np.arange(4.0), [1.0, 2.0, 3.0]), "plane B: its 4 visible stickers lie on one line"),
+])
+def test_plane_of_too_few_stickers_is_lost(points, message):
+    with pytest.raises(LostError, match=message):
+        fit_plane(points, np.broadcast_to(np.eye(3), (len(points), 3, 3)), np.array([0.0, 0.0, 1.0]), "B")
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 10_000), st.integers(3, 18))
+def test_registration_finds_a_known_transform(seed, count):
+    rng = np.random.default_rng(seed)
+    source = rng.uniform(-0.2, 0.2, (count, 3))
+    rotation, shift = Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3)
+    spread = rng.normal(size=(count, 3, 3))
+    covariances = spread @ spread.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    if np.linalg.svd(source - source.mean(axis=0), compute_uv=False)[1] < 0.02:
+        return
+    found = register(source, source @ rotation.T + shift, covariances)
+    np.testing.assert_allclose(found.transform[:3, :3], rotation, atol=1e-9)
+    np.testing.assert_allclose(found.transform[:3, 3], shift, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_registration_of_a_line_is_lost(count):
+    line = np.outer(np.arange(float(count)), [0.1, 0.05, 0.0])
+    with pytest.raises(LostError, match=f"{count} visible stickers"):
+        register(line, line, np.broadcast_to(np.eye(3), (count, 3, 3)))
+
+
+def test_eccentricity_matches_the_projected_circle():
+    """The projected boundary of a large tilted circle is fitted with a general conic; its centre is the oracle."""
+    centre, normal, radius = np.array([0.2, -0.1, 1.1]), np.array([0.5, 0.3, -0.8]), 0.05
+    normal /= np.linalg.norm(normal)
+    u = np.cross(normal, [0.0, 0.0, 1.0])
+    u /= np.linalg.norm(u)
+    angle = np.linspace(0.0, 2.0 * np.pi, 50, endpoint=False)[:, None]
+    pixels = CAMERA.project(centre + radius * (np.cos(angle) * u + np.sin(angle) * np.cross(normal, u)))[0]
+    middle = pixels.mean(axis=0)
+    x, y = ((pixels - middle) / 100.0).T
+    a, b, c, d, e = np.linalg.lstsq(np.column_stack([x * x, x * y, y * y, x, y]), np.ones(50), rcond=None)[0]
+    conic_centre = middle + 100.0 * np.linalg.solve([[2 * a, b], [b, 2 * c]], [-d, -e])
+    predicted = eccentricity(centre[None], normal[None], radius, CAMERA.focal_px)[0]
+    assert np.linalg.norm(predicted) > 0.3
+    np.testing.assert_allclose(conic_centre - CAMERA.project(centre)[0], predicted, atol=1e-7)
