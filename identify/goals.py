@@ -78,7 +78,8 @@ def _time(result: dict[str, Any]) -> list[Goal]:
     limit, seconds = SECONDS.get(str(result.get("scenario"))), result.get("seconds")
     if limit is None or not seconds:
         return []
-    total = sum(value for name, value in seconds.items() if name != "total" and value is not None)
+    stages = [value for name, value in seconds.items() if name != "total" and "." not in name and value is not None]
+    total = seconds.get("total") or sum(stages)
     return [Goal("whole run", float(total), "<=", limit, "s", "all stages so far, compiling included")]
 
 

@@ -57,8 +57,8 @@ def parameter_table(result: dict[str, Any], identifiable_only: bool = False) -> 
         "Parameters (like the paper's table 2)",
         ("parameter", "unit", "initial", "true", "estimate", "std", "error [%]", ""),
         tuple(rows),
-        f"The overall scale is fixed by: {anchor}. A parameter that no motion shows has no estimate. With the scenario's "
-        "default parameter sets, initial and true are the two columns of the paper's table 2.",
+        f"The overall scale is fixed by: {anchor}. A parameter that no motion shows has no estimate. "
+        "With the scenario's default parameter sets, initial and true are the two columns of the paper's table 2.",
     )
 
 

@@ -7,9 +7,12 @@ from matplotlib.image import imread
 
 from identify import figures
 from identify.errors import OutputFolderError, RecordError
+from identify.excitation import design_trajectories
 from identify.model_runs import build_model_run, write_model_runs
 from identify.report import SECTIONS, write_report
 from identify.result_file import load_result, save_result
+from identify.scenario import load_scenario
+from identify.trajectory_file import save_trajectories
 
 FIGURES = {"excitation", "fit_excitation", "fit_validation", "validation_errors", "parameters"}
 
@@ -49,6 +52,14 @@ def test_report_shows_goals_parameters_and_the_papers_numbers(run_folder):
     for shown in ("All 8 goals are met.", "joint1.coulomb", "not identifiable", "1260", "1411", "platform_mass",
                   "timing.frame_rate_hz", "diverged", "stopped by: tolerance"):
         assert shown in text, shown
+
+
+def test_report_states_the_observability_index(run_folder, diagonal_robot):
+    chosen = design_trajectories(diagonal_robot, load_scenario("quick"), seed=0)
+    save_trajectories(run_folder.trajectories, chosen)
+    text = write_report(run_folder.path).read_text(encoding="utf-8")
+    assert f"{chosen.observability_index:.3g} of the best" in text
+    assert "from 0.38 to 1.345" in text
 
 
 def test_report_names_what_is_missed_and_escapes_text(run_folder):

@@ -81,6 +81,13 @@ def test_each_goal_is_missed_alone(result, change, missed):
     assert [name for name, goal in goals(result).items() if not goal.passed] == [missed]
 
 
+def test_parts_of_a_stage_are_not_counted_twice(result):
+    result["seconds"] = {"record": 30.0, "identify": 20.0, "identify.search": 15.0, "validate": None}
+    assert goals(result)["whole run"].value == 50.0
+    result["seconds"]["total"] = 52.0
+    assert goals(result)["whole run"].value == 52.0
+
+
 def test_missed_parameter_is_named(result):
     result["identification"]["parameters"]["joint1.viscous"]["estimate"] = 0.3
     assert "joint1.viscous" in goals(result)["friction and PID outside"].detail
