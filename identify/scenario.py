@@ -102,7 +102,9 @@ class Filter(_Section):
 class Identification(_Section):
     """Output-error estimation and its stop criteria (eq. 35)."""
 
-    scale_anchor: Literal["platform_mass"] = Field("platform_mass", description="what fixes the overall scale of the parameters")
+    scale_anchor: Literal["platform_mass"] = Field(
+        "platform_mass", description="what fixes the overall scale of the parameters"
+    )
     anchor_std: float | None = _quantity(None, "unit of the anchor", "standard deviation of the anchor", gt=0)
     start_std: float = _quantity(1.0, "1", "standard deviation of the starting guess, relative to each value", gt=0)
     max_iterations: int = _quantity(30, "1", "iterations at most", ge=1, le=1000)
