@@ -1,0 +1,152 @@
+"""The experiment: the true plant runs a trajectory with the images in the loop, and what is seen is recorded.
+
+Random streams of one seed: (0) exciting trajectories, (1) unseen trajectories, (2) the sensor's teaching, (3) the scale
+anchor, (4, run) the sensor's noise in each run.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+import xarray as xr
+
+import cmmsim
+from dynamics import Robot, load_robot
+from dynamics.closed_loop import ClosedLoopRun, Reference, simulate
+from identify import recording
+from identify.excitation import design_trajectories
+from identify.loop_parameters import NAMES, index_of, starting_guess
+from identify.loop_setup import frame_times, plant_settings, reference_motion
+from identify.progress import Advance, Progress, SilentProgress
+from identify.scale_anchor import ANCHORED_PARAMETER, ScaleAnchor, anchor_std, store_anchor
+from identify.scenario import Scenario
+from identify.sensor_in_loop import SensorInLoop, make_sensor
+from identify.trajectory import FourierTrajectory, check_travel
+from identify.truth import build_truth
+
+TEACHING, ANCHOR, NOISE = 2, 3, 4
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One run: what the experimenter sees, and the truth."""
+
+    record: xr.Dataset
+    truth: xr.Dataset
+
+
+def run_experiment(
+    scenario: Scenario, seed: int = 0, path: Path | str | None = None, progress: Progress | None = None
+) -> xr.Dataset:
+    """Choose the exciting trajectory, run it with images in the loop, and return the record.
+
+    Record and truth are also written as netCDF: to `path`, or to the user's cache folder; attribute `path` says where
+    (`identify.truth.read_truth(path)` opens the truth).
+    Raises ScenarioError, TrajectoryError, cmmsim.CmmError, dynamics.DynamicsError.
+    """
+    progress = progress or SilentProgress()
+    robot = load_robot(scenario.robot)
+    trajectories = design_trajectories(robot, scenario, seed, progress)
+    sensor = taught_sensor(scenario, robot, seed, progress)
+    times = frame_times(scenario, scenario.excitation.duration_s)
+    with progress.stage("record", len(times)) as advance:
+        experiment = run_plant(scenario, robot, sensor, trajectories.excitation, times, seed, 0, advance)
+    target = Path(path) if path else _default_path(scenario, seed)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    recording.write(target, experiment.record, experiment.truth)
+    return experiment.record.assign_attrs(path=str(target))
+
+
+def taught_sensor(scenario: Scenario, robot: Robot, seed: int, progress: Progress) -> cmmsim.Sensor:
+    """The scenario's sensor with its frames taught."""
+    sensor = make_sensor(scenario, robot, stream_seed(seed, TEACHING))
+    with progress.stage("teach the sensor", 100) as advance:
+        shown = 0
+
+        def report(done: int, total: int) -> None:
+            nonlocal shown
+            advance(100 * done // total - shown)
+            shown = 100 * done // total
+
+        sensor.teach(report)
+    return sensor
+
+
+def run_plant(
+    scenario: Scenario,
+    robot: Robot,
+    sensor: cmmsim.Sensor,
+    trajectory: FourierTrajectory,
+    times: np.ndarray,
+    seed: int,
+    run: int,
+    advance: Advance = lambda n=1: None,
+) -> Experiment:
+    """Run the plant along a trajectory at the frames `times` (N,) [s]; `run` numbers the runs of one seed (0: excitation).
+
+    Raises TrajectoryError before the run when the trajectory leaves the travel, LoopFailure when the loop is unstable.
+    """
+    check_travel(robot, trajectory, times)
+    reference = reference_motion(trajectory, times)
+    parameters = true_parameters(robot, scenario)
+    eye = SensorInLoop(sensor, robot, stream_seed(seed, NOISE, run), advance)
+    done = simulate(robot, parameters, reference, plant_settings(scenario), eye)
+    record = _record(scenario, robot, reference, done, eye, seed)
+    store_anchor(record, _measured_anchor(scenario, parameters, seed))
+    return Experiment(record, _truth(robot, done, parameters))
+
+
+def true_parameters(robot: Robot, scenario: Scenario) -> np.ndarray:
+    """The plant's parameters (67,). Raises ScenarioError for an unknown set (with the valid names)."""
+    return starting_guess(robot, scenario.plant.parameters, 1.0).values
+
+
+def stream_seed(seed: int, *stream: int) -> int:
+    """Seed of one independent random stream of a run's seed."""
+    return int(np.random.SeedSequence(seed, spawn_key=stream).generate_state(1)[0])
+
+
+def _record(
+    scenario: Scenario, robot: Robot, reference: Reference, run: ClosedLoopRun, eye: SensorInLoop, seed: int
+) -> xr.Dataset:
+    record = recording.build_record(
+        time=run.time,
+        reference_pose=reference.poses,
+        reference_rate=reference.rates,
+        measured_pose=run.measured,
+        measured_covariance=np.array(eye.covariances),
+        measured_ok=run.measured_ok,
+        command=run.command,
+        scenario_toml=scenario.to_toml(),
+        robot=robot.name,
+        seed=seed,
+        frame_rate_hz=scenario.timing.frame_rate_hz,
+    )
+    return record.assign_attrs(sensor_seconds=eye.seconds, lost_frames="; ".join(eye.lost[:20]))
+
+
+def _truth(robot: Robot, run: ClosedLoopRun, parameters: np.ndarray) -> xr.Dataset:
+    jacobian = robot.pose_jacobian(run.pose)
+    return build_truth(
+        time=run.time,
+        pose=run.pose,
+        joint_angle=robot.inverse_kinematics(run.pose),
+        joint_velocity=np.einsum("nij,nj->ni", jacobian, run.pose_rate),
+        joint_torque=run.torque,
+        parameter_names=list(NAMES),
+        parameters=parameters,
+    )
+
+
+def _measured_anchor(scenario: Scenario, parameters: np.ndarray, seed: int) -> ScaleAnchor:
+    """The anchor as measured on the real robot: the true value with the instrument's error."""
+    name = scenario.identification.scale_anchor
+    std = anchor_std(name, scenario.identification.anchor_std)
+    error = std * np.random.default_rng(stream_seed(seed, ANCHOR)).standard_normal()
+    parameter = ANCHORED_PARAMETER[name]
+    return ScaleAnchor(name, parameter, float(parameters[index_of(parameter)] + error), std)
+
+
+def _default_path(scenario: Scenario, seed: int) -> Path:
+    return Path(platformdirs.user_cache_dir("cmmsim")) / "records" / f"{scenario.name}-{seed}.nc"

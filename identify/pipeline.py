@@ -1,0 +1,153 @@
+"""The stages of a run, each reading what the one before wrote into the run folder."""
+
+import os
+import time
+from pathlib import Path
+
+import cmmsim
+from dynamics import Robot, load_robot
+from dynamics.closed_loop import Reference
+from identify import estimation, recording
+from identify.arrays import Array
+from identify.atomic import write_text
+from identify.excitation import design_trajectories
+from identify.experiment import run_plant, taught_sensor
+from identify.loop_setup import frame_times, reference_motion
+from identify.model_runs import build_model_run, write_model_runs
+from identify.progress import Progress
+from identify.report import write_report
+from identify.result_file import load_result, rms_figures, save_result
+from identify.run_folder import RunFolder
+from identify.run_result import identification_entry, parameter_vector, sensor_entry, validation_entry
+from identify.scenario import Scenario, load_scenario
+from identify.trajectory import FourierTrajectory
+from identify.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
+from identify.truth import read_truth, true_parameters
+from identify.validation import model_run, run_unseen
+from identify.versions import versions
+
+
+def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:
+    """All stages: excite, record, identify, validate, report."""
+    began = time.perf_counter()
+    excite(scenario, seed, folder, progress)
+    excited = time.perf_counter() - began
+    taught = record(folder, progress, workers)
+    identify(folder, progress)
+    validate(folder, progress, workers, taught)
+    report(folder, progress)
+    _add_seconds(RunFolder(folder), excite=excited, total=time.perf_counter() - began)
+
+
+def excite(scenario: Scenario, seed: int, folder: Path, progress: Progress) -> None:
+    """Choose the trajectories; writes scenario.toml and trajectories.json."""
+    robot = load_robot(scenario.robot)
+    trajectories = design_trajectories(robot, scenario, seed, progress)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(RunFolder(folder).scenario, scenario.to_toml())
+    save_trajectories(RunFolder(folder).trajectories, trajectories)
+
+
+def record(folder: Path, progress: Progress, workers: int | None = None) -> cmmsim.Taught:
+    """Run the plant on the exciting trajectory; writes experiment.nc. Returns what the sensor was taught."""
+    run_folder, scenario, trajectories, robot = _open(folder)
+    began = time.perf_counter()
+    sensor = taught_sensor(scenario, robot, trajectories.seed, progress)
+    times = frame_times(scenario, scenario.excitation.duration_s)
+    with progress.stage("record", len(times)) as advance:
+        arguments = (trajectories.excitation, times, trajectories.seed, 0, advance)
+        experiment = run_plant(scenario, robot, sensor, *arguments)
+    stored = experiment.record.assign_attrs(record_seconds=time.perf_counter() - began)
+    recording.write(run_folder.experiment, stored, experiment.truth)
+    return sensor.taught
+
+
+def identify(folder: Path, progress: Progress) -> None:
+    """Estimate the parameters from the record; writes result.json (without the truth)."""
+    run_folder, scenario, trajectories, robot = _open(folder)
+    began = time.perf_counter()
+    seen = recording.read(run_folder.experiment)
+    result = estimation.identify(seen, robot, scenario, progress)
+    measured = recording.poses(seen, "measured")
+    reference = _reference(trajectories.excitation, scenario, scenario.excitation.duration_s)
+    before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))
+    seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
+    save_result(
+        run_folder.result,
+        {
+            "scenario": scenario.name,
+            "seed": trajectories.seed,
+            "versions": versions(),
+            "seconds": {
+                "record": seen.attrs.get("record_seconds"),
+                "identify": time.perf_counter() - began,
+                **seconds,
+            },
+            "identification": identification_entry(result),
+            "before": rms_figures(before - measured),
+            "after": rms_figures(after - measured),
+        },
+    )
+
+
+def validate(
+    folder: Path, progress: Progress, workers: int | None = None, taught: cmmsim.Taught | None = None
+) -> None:
+    """Run plant and models on the unseen trajectories and open the truth: validation.nc, model.nc, result.json."""
+    run_folder, scenario, trajectories, robot = _open(folder)
+    began = time.perf_counter()
+    result = load_result(run_folder.result)
+    taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
+    count = workers or os.cpu_count() or 1
+    runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, count, progress)
+    recording.write_runs(run_folder.validation, [(unseen.record, unseen.truth) for unseen in runs])
+    identification = result["identification"]
+    models = [parameter_vector(identification, column) for column in ("initial", "estimate")]
+    excited = _model_poses(robot, scenario, models, trajectories.excitation, scenario.excitation.duration_s)
+    unseen_poses = [
+        _model_poses(robot, scenario, models, path, scenario.validation.duration_s) for path in trajectories.validation
+    ]
+    excitation_time = frame_times(scenario, scenario.excitation.duration_s)
+    time_ = frame_times(scenario, scenario.validation.duration_s)
+    drawn = [build_model_run(time_, *poses) for poses in unseen_poses]
+    write_model_runs(run_folder.model, build_model_run(excitation_time, *excited), drawn)
+    excitation_truth = read_truth(run_folder.experiment)
+    pairs = [(recording.read(run_folder.experiment), excitation_truth), *((run.record, run.truth) for run in runs)]
+    result["sensor"] = sensor_entry(pairs)
+    result["validation"] = [
+        validation_entry(*pair, *poses) for pair, poses in zip(pairs[1:], unseen_poses, strict=True)
+    ]
+    for name, value in true_parameters(excitation_truth).items():
+        identification["parameters"][name]["true"] = value
+    result["seconds"]["validate"] = time.perf_counter() - began
+    save_result(run_folder.result, result)
+
+
+def report(folder: Path, progress: Progress) -> None:
+    """Draw the figures and write report.html."""
+    began = time.perf_counter()
+    write_report(folder, progress)
+    _add_seconds(RunFolder(folder), report=time.perf_counter() - began)
+
+
+def _open(folder: Path) -> tuple[RunFolder, Scenario, TrajectorySet, Robot]:
+    run_folder = RunFolder(folder)
+    scenario = load_scenario(run_folder.scenario)
+    return run_folder, scenario, load_trajectories(run_folder.trajectories), load_robot(scenario.robot)
+
+
+def _reference(trajectory: FourierTrajectory, scenario: Scenario, duration_s: float) -> Reference:
+    return reference_motion(trajectory, frame_times(scenario, duration_s))
+
+
+def _model_poses(
+    robot: Robot, scenario: Scenario, models: list[Array], trajectory: FourierTrajectory, duration_s: float
+) -> list[Array]:
+    reference = _reference(trajectory, scenario, duration_s)
+    return [model_run(robot, scenario, parameters, reference) for parameters in models]
+
+
+def _add_seconds(run_folder: RunFolder, **seconds: float) -> None:
+    result = load_result(run_folder.result)
+    result["seconds"].update(seconds)
+    save_result(run_folder.result, result)

@@ -1,0 +1,47 @@
+"""The rendering stereo sensor as the pose sensor of the closed loop: it measures, and remembers what it said."""
+
+import time
+
+import numpy as np
+
+import cmmsim
+from dynamics import Robot
+from identify.arrays import Array
+from identify.progress import Advance
+from identify.robot_bodies import robot_meshes, robot_transforms
+from identify.scenario import Scenario
+
+
+def make_sensor(scenario: Scenario, robot: Robot, seed: int, taught: cmmsim.Taught | None = None) -> cmmsim.Sensor:
+    """The scenario's sensor with the robot's cranks and links in its view. One a process: it owns the renderer."""
+    sensor = cmmsim.load_sensor(scenario.sensor, seed=seed, method=scenario.pose_method, taught=taught)
+    sensor.add_bodies(robot_meshes(robot))
+    return sensor
+
+
+class SensorInLoop:
+    """Callable for `closed_loop.simulate`: a measured pose (6,) a frame, or None where the sensor lost the platform.
+
+    Keeps the covariances (6, 6) of every frame (NaN where lost), the reasons of lost frames, and the seconds spent on
+    rendering and measuring.
+    """
+
+    def __init__(self, sensor: cmmsim.Sensor, robot: Robot, seed: int, advance: Advance = lambda n=1: None) -> None:
+        self._sensor, self._robot, self._advance = sensor, robot, advance
+        self.covariances: list[Array] = []
+        self.lost: list[str] = []
+        self.seconds = 0.0
+        sensor.start_run(seed)
+
+    def __call__(self, frame: int, t: float, pose: Array) -> Array | None:
+        """Measure the platform at its true pose; only the renderer sees that pose."""
+        bodies = robot_transforms(self._robot, pose)
+        began = time.perf_counter()
+        measured = self._sensor.measure(pose, bodies)
+        self.seconds += time.perf_counter() - began
+        self._advance()
+        self.covariances.append(measured.covariance if measured.ok else np.full((6, 6), np.nan))
+        if not measured.ok:
+            self.lost.append(f"frame {frame} (t = {t:.3f} s): {measured.reason}")
+            return None
+        return np.asarray(measured.pose, dtype=float)

@@ -1,0 +1,122 @@
+"""Validation: plant and models run trajectories the estimator never saw (section 4.3)."""
+
+import multiprocessing
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.sharedctypes import Synchronized
+
+import numpy as np
+
+import cmmsim
+from dynamics import DynamicsError, Robot, load_robot
+from dynamics.closed_loop import Reference, simulate
+from identify.arrays import Array
+from identify.experiment import Experiment, run_plant
+from identify.loop_setup import frame_times, model_settings
+from identify.progress import Advance, Progress
+from identify.scenario import Scenario
+from identify.sensor_in_loop import make_sensor
+from identify.trajectory import FourierTrajectory
+
+POLL_S = 0.2
+
+
+@dataclass(frozen=True)
+class PlantRuns:
+    """What a worker process needs to run the plant: all of it can be pickled."""
+
+    scenario: Scenario
+    seed: int
+    taught: cmmsim.Taught
+
+
+def run_unseen(
+    scenario: Scenario,
+    trajectories: tuple[FourierTrajectory, ...],
+    seed: int,
+    taught: cmmsim.Taught,
+    workers: int,
+    progress: Progress,
+) -> list[Experiment]:
+    """Run the plant with images in the loop on every trajectory, in `workers` processes; results do not depend on them.
+
+    Every run has its own noise stream, and all share what the sensor was taught.
+    """
+    runs = PlantRuns(scenario, seed, taught)
+    numbers = range(1, len(trajectories) + 1)
+    frames = len(frame_times(scenario, scenario.validation.duration_s)) * len(trajectories)
+    with progress.stage("validate", frames) as advance:
+        if workers == 1 or len(trajectories) == 1:
+            worker = _Worker(runs)
+            return [worker.run(number, path, advance) for number, path in zip(numbers, trajectories, strict=True)]
+        context = multiprocessing.get_context("spawn")
+        counter: Synchronized[int] = context.Value("q", 0)
+        with (
+            _followed(counter, advance),
+            ProcessPoolExecutor(workers, context, _start_worker, (runs, counter)) as pool,
+        ):
+            return list(pool.map(_run_in_worker, numbers, trajectories))
+
+
+def model_run(robot: Robot, scenario: Scenario, parameters: Array, reference: Reference) -> Array:
+    """Poses (N, 6) of the model on a reference; NaN throughout when its loop is unstable."""
+    try:
+        return simulate(robot, parameters, reference, model_settings(scenario)).pose
+    except DynamicsError:
+        return np.full_like(reference.poses, np.nan)
+
+
+class _Worker:
+    """One process's robot and sensor; the renderer lives as long as the process."""
+
+    def __init__(self, runs: PlantRuns) -> None:
+        self._runs = runs
+        self._robot = load_robot(runs.scenario.robot)
+        self._sensor = make_sensor(runs.scenario, self._robot, runs.seed, runs.taught)
+
+    def run(self, number: int, trajectory: FourierTrajectory, advance: Advance) -> Experiment:
+        scenario = self._runs.scenario
+        times = frame_times(scenario, scenario.validation.duration_s)
+        return run_plant(scenario, self._robot, self._sensor, trajectory, times, self._runs.seed, number, advance)
+
+
+_worker: _Worker
+_counter: "Synchronized[int]"
+
+
+def _start_worker(runs: PlantRuns, counter: "Synchronized[int]") -> None:
+    global _worker, _counter
+    _worker, _counter = _Worker(runs), counter
+
+
+def _run_in_worker(number: int, trajectory: FourierTrajectory) -> Experiment:
+    def advance(n: int = 1) -> None:
+        with _counter.get_lock():
+            _counter.value += n
+
+    return _worker.run(number, trajectory, advance)
+
+
+@contextmanager
+def _followed(counter: "Synchronized[int]", advance: Advance) -> Iterator[None]:
+    """Pass what the workers have counted on to the progress bar until the context ends."""
+    done, ended = 0, threading.Event()
+
+    def follow() -> None:
+        nonlocal done
+        while not ended.wait(POLL_S):
+            now = counter.value
+            advance(now - done)
+            done = now
+
+    thread = threading.Thread(target=follow, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        advance(counter.value - done)
