@@ -9,7 +9,7 @@ from identify import figures
 from identify.errors import OutputFolderError, RecordError
 from identify.excitation import design_trajectories
 from identify.model_runs import build_model_run, write_model_runs
-from identify.report import SECTIONS, write_report
+from identify.report import SECTIONS, read_report_data, render, write_report
 from identify.result_file import load_result, save_result
 from identify.scenario import load_scenario
 from identify.trajectory_file import save_trajectories
@@ -35,7 +35,7 @@ class Structure(HTMLParser):
             self.open.pop()
 
 
-def test_report_is_one_file_that_opens_offline(run_folder):
+def test_report_is_one_file_that_opens_offline_beside_its_figures(run_folder):
     path = write_report(run_folder.path)
     text = path.read_text(encoding="utf-8")
     structure = Structure(text)
@@ -45,10 +45,21 @@ def test_report_is_one_file_that_opens_offline(run_folder):
     assert text.count("Copyright 2012") <= 2, "plotly's JavaScript stands in it once"
     assert 4e6 < path.stat().st_size < 9e6
     assert text.count("Plotly.newPlot(") >= 5
+    check_figures(run_folder.figures)
+
+
+def check_figures(folder):
+    """Five readable images with something on them."""
+    paths = {p.stem: p for p in folder.iterdir()}
+    assert set(paths) == FIGURES
+    for path in paths.values():
+        image = imread(path)
+        assert min(image.shape[:2]) > 500
+        assert image[..., :3].std() > 0.02
 
 
 def test_report_shows_goals_parameters_and_the_papers_numbers(run_folder):
-    text = write_report(run_folder.path).read_text(encoding="utf-8")
+    text = render(read_report_data(run_folder))
     for shown in ("All 8 goals are met.", "joint1.coulomb", "not identifiable", "1260", "1411", "platform_mass",
                   "timing.frame_rate_hz", "diverged", "stopped by: tolerance"):
         assert shown in text, shown
@@ -57,7 +68,7 @@ def test_report_shows_goals_parameters_and_the_papers_numbers(run_folder):
 def test_report_states_the_observability_index(run_folder, diagonal_robot):
     chosen = design_trajectories(diagonal_robot, load_scenario("quick"), seed=0)
     save_trajectories(run_folder.trajectories, chosen)
-    text = write_report(run_folder.path).read_text(encoding="utf-8")
+    text = render(read_report_data(run_folder))
     assert f"{chosen.observability_index:.3g} of the best" in text
     assert "from 0.38 to 1.345" in text
 
@@ -67,19 +78,9 @@ def test_report_names_what_is_missed_and_escapes_text(run_folder):
     result["sensor"]["lost_frames"] = 2
     result["identification"]["stop_reason"] = "<b>cost & step</b>"
     save_result(run_folder.result, result)
-    text = write_report(run_folder.path).read_text(encoding="utf-8")
+    text = render(read_report_data(run_folder))
     assert "Missed: lost frames." in text
     assert "&lt;b&gt;cost &amp; step&lt;/b&gt;" in text
-
-
-def test_figures_are_readable_images_with_something_on_them(run_folder):
-    write_report(run_folder.path)
-    paths = {p.stem: p for p in run_folder.figures.iterdir()}
-    assert set(paths) == FIGURES
-    for path in paths.values():
-        image = imread(path)
-        assert min(image.shape[:2]) > 500
-        assert image[..., :3].std() > 0.02
 
 
 def test_every_axis_has_a_unit_and_every_panel_its_letter(run_folder, result):
