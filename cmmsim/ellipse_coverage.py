@@ -26,7 +26,7 @@ def coverage(centres: Array, shapes: Array, size: int) -> tuple[Array, Array]:
     Parameters: centres (n, 2) px, where (0, 0) is the middle of the window's first pixel; shapes (n, 2, 2) px,
     symmetric and positive definite; size: window side in px.
     """
-    inverse = np.linalg.inv(shapes)
+    inverse = np.asarray(np.linalg.inv(shapes), dtype=np.float64)
     ticks = np.arange(size + 1) - 0.5
     along = np.arange(size) - 0.5
     across_x = _Sides(inverse, along[None, :] - centres[:, :1], ticks[None, :] - centres[:, 1:], axis=0)

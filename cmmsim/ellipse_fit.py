@@ -51,7 +51,7 @@ class FitLimits:
 
 
 def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                 limits: FitLimits | None = None, iterations: int = 4) -> EllipseFits:
+                 limits: FitLimits | None = None, iterations: int = 3) -> EllipseFits:
     """Fit one ellipse in each window.
 
     Parameters: windows (n, h, h) grey values; corners (n, 2) the full-image pixel (x, y) of each window's first pixel;
@@ -98,7 +98,7 @@ def _shape(parameters: Array) -> Array:
 
 
 def _moments(windows: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Ground and contrast (n,), area in px (n,), centroid (n,2) and spread (n,2,2) of the bright spot of each window."""
+    """Ground and contrast (n,), area px (n,), centroid (n,2) and spread (n,2,2) of each window's bright spot."""
     n, size, _ = windows.shape
     flat = np.sort(windows.reshape(n, -1), axis=1)
     ground = flat[:, flat.shape[1] // 3]

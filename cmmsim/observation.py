@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ class DetectionSettings:
     window_size: int = 18
     fit_size: int = 16
     radius: float = 0.003
-    limits: FitLimits = FitLimits()
+    limits: FitLimits = field(default_factory=FitLimits)
     largest_ray_gap: float = 25.0
 
 
@@ -46,7 +46,8 @@ class StickerObservation:
 
     def selected(self, keep: NDArray[np.bool_]) -> StickerObservation:
         """The observation with only some of its stickers."""
-        return StickerObservation(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+        return StickerObservation(self.index[keep], self.left_pixels[keep], self.right_pixels[keep],
+                                  self.points[keep], self.covariances[keep])
 
 
 def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings,
@@ -60,7 +61,7 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
     index = np.flatnonzero(np.all(valid & facing, axis=0))
     corners = np.rint(pixels[:, index] - 0.5 * (settings.window_size - 1)).astype(int)
     if len(index) == 0:
-        return StickerObservation(index, *np.zeros((2, 0, 2)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        return StickerObservation(index, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     windows = images.windows(corners, settings.window_size)
     fits = fit_ellipses(windows.reshape(-1, *windows.shape[2:]), corners.reshape(-1, 2), noise, settings.fit_size,
                         settings.limits)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import LostError
 from .pose import Array, rotation_log
@@ -72,7 +73,8 @@ def frame_from_planes(normals: Array, offsets: Array) -> Array:
     return frame
 
 
-def frame_of_points(points: Array, covariances: Array, plane_index: Array, towards: Array) -> tuple[Array, Array]:
+def frame_of_points(points: Array, covariances: Array, plane_index: NDArray[np.int_],
+                    towards: Array) -> tuple[Array, Array]:
     """Frame (4,4) of the planes through measured stickers, and the covariance (6,6) of its small error [dt, dphi].
 
     Parameters: points (n,3) and covariances (n,3,3); plane_index (n,) 0, 1, 2 for A, B, C; towards (3,3) rough normals

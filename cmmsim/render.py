@@ -2,7 +2,7 @@
 
 pyrender supplies the OpenGL context, the mesh buffers, the flat shader and the four-sample frame buffer. Each window
 is drawn into its own cell of one large frame buffer with its own projection, drawn larger by the supersampling factor,
-and averaged in linear light. A cell draws only the patches whose bounding sphere reaches into it. Projection and
+and averaged in linear light. A cell draws only the patches whose bounding box reaches into it. Projection and
 camera_from_body are multiplied in double precision, so that the shader sees one well-scaled matrix.
 """
 
@@ -54,8 +54,6 @@ def _shared_atlas() -> _Atlas:
     """The one renderer of this process; making another would leak memory."""
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
-    if not hasattr(np, "infty"):
-        np.inf = np.inf  # type: ignore[attr-defined]  # pyrender 0.1.45 uses this name, numpy 2 removed it
     try:
         import pyrender
 

@@ -10,7 +10,6 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from .camera import PinholeCamera
-from .ellipse_fit import FitLimits
 from .errors import ShapeError, UnknownBodyError, UnknownOptionError
 from .estimator import PoseEstimator
 from .images import StereoFrame
@@ -53,7 +52,7 @@ class Sensor:
         self._true_rig = self.rig
         figures = file.camera.model_dump()
         self.noise = CameraNoise(**{("enabled" if k == "noise" else k): v for k, v in figures.items()})
-        self.settings = DetectionSettings(radius=file.stickers.radius, limits=FitLimits())
+        self.settings = DetectionSettings(radius=file.stickers.radius)
         self.platform, self.base = marked_body("platform", file.platform), marked_body("base", file.base)
         self._scene = [scene_body(body, section, file.stickers, stream) for stream, (body, section)
                        in enumerate(((self.platform, file.platform), (self.base, file.base)))]
@@ -102,7 +101,7 @@ class Sensor:
             self._tracker.forget()
 
     def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
-        """Register further rigid bodies (meshes in m) that may hide stickers; they are drawn where ``obstacles`` says."""
+        """Register further rigid bodies (meshes in m) that may hide stickers; drawn where ``obstacles`` says."""
         level = self._file.stickers.obstacle_level / 255.0
         self._obstacles.update({name: mesh_patch(mesh, level) for name, mesh in meshes.items()})
         self._camera = self._build_camera()
@@ -131,9 +130,9 @@ class Sensor:
         patches = [p for body in self._scene for p in body.stickers] + [body.solid for body in self._scene]
         owners = [k for k, body in enumerate(self._scene) for _ in body.stickers] + [0, 1]
         owners += range(2, 2 + len(self._obstacles))
-        return VirtualStereoCamera(self._true_rig, self._camera_from_base, Drawable([*patches, *self._obstacles.values()],
-                                                                              owners),
-                                   self.noise, list(self._obstacles), self._file.stickers.background_level / 255.0)
+        drawable = Drawable([*patches, *self._obstacles.values()], owners)
+        return VirtualStereoCamera(self._true_rig, self._camera_from_base, drawable, self.noise, list(self._obstacles),
+                                   self._file.stickers.background_level / 255.0)
 
     def _checked(self, pose: ArrayLike,
                  obstacles: Mapping[str, Array] | None) -> tuple[Array, np.random.Generator, Mapping[str, Array]]:

@@ -9,7 +9,7 @@ the image formation's own error averages out as well.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -37,8 +37,8 @@ PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
 class TeachingPlan:
     """How much is looked at: base quality; platform poses and quality at each; window sizes px."""
 
-    base: Quality = Quality(supersampling=32, exposures=4000)
-    platform: Quality = Quality(supersampling=8, exposures=30)
+    base: Quality = field(default_factory=lambda: Quality(supersampling=32, exposures=4000))
+    platform: Quality = field(default_factory=lambda: Quality(supersampling=8, exposures=30))
     poses: int = 80
     base_window: int = 20
 
@@ -53,7 +53,7 @@ class Teacher:
     settings: DetectionSettings
     platform: MarkedBody
     base: MarkedBody
-    plan: TeachingPlan = TeachingPlan()
+    plan: TeachingPlan = field(default_factory=TeachingPlan)
 
     def teach(self, sensor_name: str, home: Array, rng: np.random.Generator,
               progress: Progress | None = None) -> Taught:
@@ -112,8 +112,9 @@ class Teacher:
         """Raise LostError when a sticker has moved against the others: it is partly hidden."""
         gaps = np.linalg.norm(apply(camera_from_body, places) - seen.points, axis=1)
         if gaps.max() > LARGEST_GAP:
-            raise LostError(f"{self.platform.name}: sticker {self.platform.sticker_ids[gaps.argmax()]} is "
-                            f"{gaps.max() * 1e6:.0f} um off its place, at most {LARGEST_GAP * 1e6:.0f} um; is it hidden?")
+            worst = self.platform.sticker_ids[gaps.argmax()]
+            raise LostError(f"{self.platform.name}: sticker {worst} is {gaps.max() * 1e6:.0f} um off its place, "
+                            f"at most {LARGEST_GAP * 1e6:.0f} um; it may be partly hidden")
 
     def _platform_places(self, seen: list[StickerObservation]) -> tuple[Array, Array, Array]:
         """Sticker places (n,3), their covariances (n,3,3) and the covariance (6,6) of the platform frame."""
@@ -149,5 +150,5 @@ def _mean_constellation(reference: Array, seen: list[StickerObservation]) -> tup
         weight = np.linalg.inv(turn @ observation.covariances @ turn.T)
         information += weight
         weighted += np.einsum("nij,nj->ni", weight, apply(to_reference, observation.points))
-    covariances = np.linalg.inv(information)
+    covariances = np.asarray(np.linalg.inv(information), dtype=np.float64)
     return np.einsum("nij,nj->ni", covariances, weighted), covariances

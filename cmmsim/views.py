@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,26 +41,36 @@ class View:
 
 
 class Drawable:
-    """Patches of several bodies: which body each belongs to, and its bounding sphere."""
+    """Patches of several bodies: which body each belongs to, and the corners (n,8,3) of its bounding box, m."""
 
     def __init__(self, patches: Sequence[Patch], body_index: Sequence[int]) -> None:
         self.patches = tuple(patches)
         self.body_index = np.array(body_index, dtype=int)
-        self.centres = np.array([0.5 * (p.vertices.min(axis=0) + p.vertices.max(axis=0)) for p in patches])
-        self.radii = np.array([np.linalg.norm(p.vertices - c, axis=1).max()
-                               for p, c in zip(patches, self.centres, strict=True)])
+        self.corners = np.array([list(product(*zip(p.vertices.min(axis=0), p.vertices.max(axis=0), strict=True)))
+                                 for p in patches])
 
     def reaching(self, views: Sequence[View]) -> NDArray[np.bool_]:
-        """Whether the bounding sphere of each patch reaches into each window (n views, n patches)."""
-        moves = np.stack([v.camera_from_bodies for v in views])[:, self.body_index]
-        centres = np.einsum("vpij,pj->vpi", moves[..., :3, :3], self.centres) + moves[..., :3, 3]
-        depth = centres[..., 2]
-        nearest = depth - self.radii
-        focal = np.array([v.camera.focal_px for v in views])[:, None]
-        middle = np.array([[v.camera.centre_x_px, v.camera.centre_y_px] for v in views])
-        corners, sizes = (np.array([getattr(v, name) for v in views], dtype=float) for name in ("corner", "size"))
-        pixels = focal[..., None] * centres[..., :2] / np.maximum(depth, NEAR)[..., None] + (middle - corners)[:, None]
-        # off the axis a sphere's image is larger than focal * radius / depth; 1.5 covers angles to 48 degrees
-        reach = (1.5 * focal * self.radii / np.maximum(nearest, NEAR) + 1.0)[..., None]
-        inside = np.all((pixels > -reach) & (pixels < sizes[:, None] + reach), axis=-1)
-        return ((nearest <= NEAR) & (depth > -self.radii)) | (inside & (depth > 0.0))
+        """Which patches may show in each window (n views, n patches): bounding boxes against windows."""
+        extents: dict[tuple[int, int], tuple[Array, Array]] = {}
+        result = np.empty((len(views), len(self.patches)), dtype=bool)
+        for k, view in enumerate(views):
+            key = id(view.camera), id(view.camera_from_bodies)
+            if key not in extents:
+                extents[key] = self._extents(view)
+            lowest, highest = extents[key]
+            first = np.array(view.corner) - 0.5
+            result[k] = ((highest >= first) & (lowest <= first + view.size)).all(axis=1)
+        return result
+
+    def _extents(self, view: View) -> tuple[Array, Array]:
+        """Smallest and largest pixel (n,2) of each patch's bounding box; a box not wholly ahead may show anywhere."""
+        moves = view.camera_from_bodies[self.body_index]
+        corners = np.einsum("pij,pcj->pci", moves[:, :3, :3], self.corners) + moves[:, None, :3, 3]
+        depth = corners[..., 2]
+        pixels = view.camera.project(np.where(depth[..., None] > NEAR, corners, [0.0, 0.0, 1.0]))[0]
+        lowest, highest = pixels.min(axis=1), pixels.max(axis=1)
+        crossing = depth.min(axis=1) <= NEAR
+        lowest[crossing], highest[crossing] = -np.inf, np.inf
+        behind = depth.max(axis=1) <= 0.0
+        lowest[behind], highest[behind] = np.inf, -np.inf
+        return lowest, highest

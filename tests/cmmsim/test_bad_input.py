@@ -18,7 +18,7 @@ def write(tmp_path, text):
 
 
 def test_unknown_sensor_names_the_valid_ones():
-    with pytest.raises(cmmsim.UnknownSensorError, match="'ctrak'.*ctrack780"):
+    with pytest.raises(cmmsim.UnknownSensorError, match=r"'ctrak'.*ctrack780"):
         cmmsim.load_sensor("ctrak")
 
 
@@ -55,7 +55,7 @@ def test_bad_pose(sensor, pose):
 
 def test_bad_obstacles(sensor):
     sensor.add_bodies({"crank1": rod(0.06, 0.01)})
-    with pytest.raises(cmmsim.UnknownBodyError, match="'crank9'.*crank1"):
+    with pytest.raises(cmmsim.UnknownBodyError, match=r"'crank9'.*crank1"):
         sensor.measure(sensor.home, obstacles={"crank9": np.eye(4)})
     with pytest.raises(cmmsim.ShapeError, match=r"crank1.*\(4,4\)"):
         sensor.measure(sensor.home, obstacles={"crank1": np.eye(3)})

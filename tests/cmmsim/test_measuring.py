@@ -25,9 +25,10 @@ def box_before(sensor, centre, size, share=0.25):
 
 def test_first_frame_without_prior_finds_all_ids(sensor):
     """Each measured point lies where the sticker of that name truly is."""
-    pose = sensor.home + [0.009, -0.008, 0.007, 0.03, -0.035, 0.03]
+    pose = [*sensor.home, 0.009, -0.008, 0.007, 0.03, -0.035, 0.03]
     m = sensor.measure(pose)
-    assert m.ok and m.reason == ""
+    assert m.ok
+    assert m.reason == ""
     np.testing.assert_array_equal(m.target_ids, sensor.platform.sticker_ids)
     truth = apply(sensor._camera_from_base @ pose_to_transform(pose), sensor._scene[0].sticker_places)
     assert np.linalg.norm(m.points - truth, axis=1).max() < 1e-4
@@ -118,8 +119,10 @@ def test_hidden_plane_is_lost_by_name_and_found_again(taught):
     sensor.add_bodies({"box": mesh})
     assert sensor.measure(sensor.home).ok
     m = sensor.measure(sensor.home, obstacles={"box": place})
-    assert not m.ok and np.isnan(m.pose).all()
-    assert m.reason.startswith("plane B") and "at least 3 needed" in m.reason
+    assert not m.ok
+    assert np.isnan(m.pose).all()
+    assert m.reason.startswith("plane B")
+    assert "at least 3 needed" in m.reason
     assert sensor.measure(sensor.home).ok
 
 
@@ -129,7 +132,8 @@ def test_partly_hidden_platform_is_measured_with_what_is_left(taught):
     sensor.add_bodies({"box": mesh})
     for _ in range(3):
         m = sensor.measure(sensor.home, obstacles={"box": place})
-    assert m.ok and 3 <= len(m.target_ids) < 18
+    assert m.ok
+    assert 3 <= len(m.target_ids) < 18
     error = m.pose - sensor.home
     assert error @ np.linalg.solve(m.covariance, error) < 40.0
 
@@ -141,7 +145,10 @@ def test_fully_hidden_platform_is_lost_with_a_reason(taught):
     assert sensor.measure(sensor.home).ok
     for _ in range(2):  # once lost by the tracker, once by the search of the whole image
         m = sensor.measure(sensor.home, obstacles={"wall": place})
-        assert not m.ok and m.reason and np.isnan(m.pose).all() and len(m.points) == 0
+        assert not m.ok
+        assert m.reason
+        assert np.isnan(m.pose).all()
+        assert len(m.points) == 0
     assert sensor.measure(sensor.home).ok
 
 
@@ -160,13 +167,14 @@ def test_jumps_are_lost_or_measured_never_wrong(sensor):
 
 def test_measure_frame_on_captured_images(sensor):
     """The same images handed over as arrays give a pose without any renderer."""
-    pose = sensor.home + [0.004, 0.003, -0.005, 0.01, 0.02, -0.015]
+    pose = [*sensor.home, 0.004, 0.003, -0.005, 0.01, 0.02, -0.015]
     m = cmmsim.measure_frame(sensor.capture(pose), sensor.estimator)
     assert m.ok
     assert np.all(np.abs(m.pose - pose) * AXES < [20, 20, 20, 100, 100, 100])
     dark = np.zeros((1536, 2048), dtype=np.uint8)
     m = cmmsim.measure_frame(cmmsim.StereoFrame(dark, dark), sensor.estimator)
-    assert not m.ok and "bright spots" in m.reason
+    assert not m.ok
+    assert "bright spots" in m.reason
 
 
 def test_taught_travels_to_another_process(sensor, taught):
@@ -180,7 +188,8 @@ def test_teaching_is_repeatable_and_unbiased(seed, moving_path):
     sensor = cmmsim.load_sensor("ctrack780", seed=seed)
     steps: list[tuple[int, int]] = []
     sensor.teach(lambda done, total: steps.append((done, total)))
-    assert steps[0][0] == 0 and steps[-1][0] == steps[-1][1]
+    assert steps[0][0] == 0
+    assert steps[-1][0] == steps[-1][1]
     path = moving_path(600)
     errors = np.array([sensor.measure(pose).pose for pose in path]) - path
     assert np.all(np.isfinite(errors))
