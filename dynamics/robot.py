@@ -82,8 +82,12 @@ class Robot:
         return self._call("twist_dot", *[_rows(name, value, 6) for name, value in arguments])[..., 0]
 
     def pose_rate(self, pose: ArrayLike, twist: ArrayLike) -> np.ndarray:
-        """Pose rates (6,) of a twist (6,); the inverse of `twist`."""
-        return self._call("pose_rate", _rows("pose", pose, 6), _rows("twist", twist, 6))[..., 0]
+        """Pose rates (6,) of a twist (6,); the inverse of `twist`. Euler rates have no value at beta = +-pi/2."""
+        poses = _rows("pose", pose, 6)
+        turned = np.abs(np.cos(poses[..., 4]))
+        if not (turned > 1 / CONDITION_LIMIT).all():
+            raise SingularPoseError(f"Euler rates are singular at beta = +-pi/2: |cos(beta)| is {turned.min():.3g}")
+        return self._call("pose_rate", poses, _rows("twist", twist, 6))[..., 0]
 
     def mass_matrix(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
         """M (6, 6) of eq. 23."""
@@ -174,13 +178,14 @@ class Robot:
         if len(set(batched) - {1}) > 1:
             shapes = ", ".join(str(argument.shape) for argument in arguments)
             raise ShapeError(f"{name}: batch lengths differ, shapes {shapes}")
-        count = max(batched, default=1)
-        columns = [np.broadcast_to(np.atleast_2d(argument), (count, argument.shape[-1])).T for argument in arguments]
         function = self.functions[name]
-        values = function(*columns)
+        if 0 in batched:
+            return np.zeros((0, *function.size_out(output)))
+        values = function(*[argument.T for argument in arguments])
         values = np.asarray(values[output] if isinstance(values, tuple) else values, dtype=float)
-        rows = values.shape[0]
-        stacked = values.reshape(rows, count, -1).transpose(1, 0, 2)
+        if output == 0 and not np.isfinite(values).all():
+            raise SingularPoseError(f"{name} is not finite for {_shown(arguments)}: singular pose or mass matrix")
+        stacked = values.reshape(values.shape[0], max(batched, default=1), -1).transpose(1, 0, 2)
         return stacked if batched else stacked[0]
 
 
@@ -192,6 +197,10 @@ def _functions(geometry: Rss6Geometry) -> dict[str, ca.Function]:
         return {function.name(): function for function in model.robot_functions(geometry)}
     open_library(library)
     return {name: ca.external(name, str(library)) for name in model.FUNCTION_NAMES}
+
+
+def _shown(arguments: tuple[np.ndarray, ...]) -> str:
+    return ", ".join(np.array2string(argument, precision=6, threshold=12) for argument in arguments)
 
 
 def _rows(name: str, value: ArrayLike, width: int) -> np.ndarray:

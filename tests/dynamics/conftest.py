@@ -1,0 +1,163 @@
+"""What the tests of the dynamics share: the robot, random states, and oracles that do not use the package."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import dynamics
+from dynamics import closed_loop
+
+BOX = np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])
+
+
+@pytest.fixture(scope="session")
+def robot() -> dynamics.Robot:
+    return dynamics.load_robot("rss6")
+
+
+@pytest.fixture(scope="session")
+def identified(robot: dynamics.Robot) -> np.ndarray:
+    """The 67 parameters of Table 2, with friction."""
+    return robot.parameter_sets["identified"].vector
+
+
+@dataclass(frozen=True)
+class States:
+    """Random poses in the box, with twists and twist rates, (N, 6) each."""
+
+    pose: np.ndarray
+    twist: np.ndarray
+    twist_dot: np.ndarray
+
+
+@pytest.fixture
+def states(robot: dynamics.Robot) -> States:
+    rng = np.random.default_rng(7)
+    scale = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
+    pose = robot.home_pose + BOX * rng.uniform(-1, 1, (100, 6))
+    return States(pose, scale * rng.standard_normal((100, 6)), 10 * scale * rng.standard_normal((100, 6)))
+
+
+def base_from_platform(pose: np.ndarray) -> np.ndarray:
+    """R = Rx(alpha) Ry(beta) Rz(gamma) from scipy, intrinsic axes."""
+    return Rotation.from_euler("XYZ", pose[3:6]).as_matrix()
+
+
+@dataclass(frozen=True)
+class Legs:
+    """Crank tips T, platform joints A (6, 3) and crank axes, from crank angles and the geometry alone."""
+
+    tip: np.ndarray
+    joint: np.ndarray
+    crank: np.ndarray
+
+
+@pytest.fixture(scope="session")
+def legs_at(robot: dynamics.Robot) -> Callable[[np.ndarray], Legs]:
+    """Where the legs are at a pose, for the crank angles the robot gives."""
+
+    def place(pose: np.ndarray) -> Legs:
+        g = robot.geometry
+        theta = robot.inverse_kinematics(pose)[:, None]
+        crank = g.crank_length * (
+            np.cos(theta) * g.crank_zero_directions
+            + np.sin(theta) * np.cross(g.crank_axes, g.crank_zero_directions)
+        )
+        joint = pose[:3] + g.platform_joints @ base_from_platform(pose).T
+        return Legs(g.base_joints + crank, joint, crank)
+
+    return place
+
+
+def derivative(function: Callable[[float], np.ndarray], h: float = 1e-3) -> np.ndarray:
+    """First derivative at 0 by the seven-point stencil, error O(h^6)."""
+    weights = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
+    return sum(w * (function(n * h) - function(-n * h)) for n, w in weights.items()) / h
+
+
+def second_derivative(function: Callable[[float], np.ndarray], h: float = 1e-3) -> np.ndarray:
+    """Second derivative at 0 by the seven-point stencil, error O(h^6)."""
+    weights = {1: 3 / 2, 2: -3 / 20, 3: 1 / 90}
+    around = sum(w * (function(n * h) + function(-n * h)) for n, w in weights.items())
+    return (around - 49 / 18 * function(0.0)) / h**2
+
+
+@dataclass(frozen=True)
+class Numerics:
+    """Oracles as one fixture, since test modules do not import each other."""
+
+    derivative: Callable[..., np.ndarray] = staticmethod(derivative)
+    second_derivative: Callable[..., np.ndarray] = staticmethod(second_derivative)
+    base_from_platform: Callable[[np.ndarray], np.ndarray] = staticmethod(base_from_platform)
+
+
+@pytest.fixture(scope="session")
+def numerics() -> Numerics:
+    return Numerics()
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A smooth motion through the box, with its exact derivatives; amplitudes (6,), frequencies (6,) in rad/s."""
+
+    home: np.ndarray
+    amplitude: np.ndarray
+    frequency: np.ndarray
+    phase: np.ndarray
+
+    def pose(self, t: float) -> np.ndarray:
+        return self.home + self.amplitude * np.sin(self.frequency * t + self.phase)
+
+    def rate(self, t: float) -> np.ndarray:
+        return self.amplitude * self.frequency * np.cos(self.frequency * t + self.phase)
+
+    def acceleration(self, t: float) -> np.ndarray:
+        return -self.amplitude * self.frequency**2 * np.sin(self.frequency * t + self.phase)
+
+
+@pytest.fixture
+def motion(robot: dynamics.Robot) -> Motion:
+    rng = np.random.default_rng(11)
+    return Motion(robot.home_pose, BOX * rng.uniform(0.5, 1, 6), rng.uniform(4, 9, 6), rng.uniform(0, 6, 6))
+
+
+def reference(robot: dynamics.Robot, frames: int, rate_hz: float = 60.0, scale: float = 1.0) -> closed_loop.Reference:
+    """A smooth motion that starts at rest at home: sines under an envelope."""
+    t = np.arange(frames)[:, None] / rate_hz
+    amplitude = scale * np.array([6e-3, 5e-3, 4e-3, 0.02, 0.015, 0.02])
+    frequency = 2 * np.pi * np.array([0.9, 1.2, 1.5, 1.05, 1.35, 0.75])
+    envelope, slope = 1 - np.exp(-((t / 0.4) ** 3)), 3 * t**2 / 0.4**3 * np.exp(-((t / 0.4) ** 3))
+    wave, wave_rate = np.sin(frequency * t), frequency * np.cos(frequency * t)
+    return closed_loop.Reference(
+        robot.home_pose + amplitude * envelope * wave, amplitude * (envelope * wave_rate + slope * wave)
+    )
+
+
+@pytest.fixture(scope="session")
+def make_reference(robot: dynamics.Robot) -> Callable[..., closed_loop.Reference]:
+    return lambda frames, rate_hz=60.0, scale=1.0: reference(robot, frames, rate_hz, scale)
+
+
+@pytest.fixture(scope="session")
+def make_settings() -> Callable[..., closed_loop.LoopSettings]:
+    """Loop settings with the paper's servo gains; 60 Hz, no delay, zero hold, exact friction unless told otherwise."""
+
+    def make(
+        rate_hz: float = 60.0,
+        latency_s: float = 0.0,
+        hold: str = "zero",
+        smoothing_velocity: float | None = None,
+        steps: int = 4,
+    ) -> closed_loop.LoopSettings:
+        name = "smoothed" if smoothing_velocity else "coulomb_viscous"
+        return closed_loop.LoopSettings(
+            closed_loop.ServoGains(kp=0.3, kd=0.001, ki=2.4),
+            closed_loop.FrameTiming(rate_hz, latency_s, hold),
+            closed_loop.FrictionLaw(name, smoothing_velocity),
+            steps,
+        )
+
+    return make
