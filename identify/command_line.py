@@ -177,12 +177,15 @@ def print_summary(folder: RunFolder) -> None:
 
     table = goals_table(load_result(folder.result))
     shown = RichTable(title=table.title, caption=table.note, show_edge=False)
-    for name in table.header:
-        shown.add_column(name)
+    for name in table.header[:4]:
+        shown.add_column(name, no_wrap=True)
     for row in table.rows:
-        shown.add_row(*row)
+        shown.add_row(*row[:4])
     console = Console()
     console.print(shown)
+    for goal, *_, met, detail in table.rows:
+        if met != "met":
+            console.print(f"missed: {goal}: {detail}", highlight=False, soft_wrap=True)
     console.print(f"report: {folder.report}", highlight=False, soft_wrap=True)
 
 

@@ -124,8 +124,9 @@ def _fit_panel(axes: Axes, time: Array, measured: Array, initial: Array | None, 
     bottom, top = axes.get_ylim()
     if initial is not None:
         axes.plot(time, 1e3 * initial[:, i], color=INITIAL, linewidth=1, label="starting model")
-        reach = top - bottom
-        axes.set_ylim(bottom - reach / 2, top + reach / 2)
+        half = (top - bottom) / 2  # an unstable starting model must not hide the rest
+        low, high = axes.get_ylim()
+        axes.set_ylim(max(low, bottom - half), min(high, top + half))
     axes.plot(time, 1e3 * identified[:, i], color=IDENTIFIED, linewidth=1, label="identified model")
     axes.set_title(f"{LETTERS[i]} {COMPONENTS[i]}")
     axes.set_ylabel(f"{COMPONENTS[i]} [{unit}]")

@@ -85,9 +85,8 @@ def validation_table(result: dict[str, Any]) -> Table:
     for number_, run in enumerate(result.get("validation", []), start=1):
         rows.append((f"{number_} true", *_rms(rms_row(run["true"]))))
         rows.append((f"{number_} measured", *_rms(rms_row(run["measured"]))))
-        initial = run.get("initial", {}).get("true")
-        if initial:
-            rows.append((f"{number_} starting model, true", *_rms(rms_row(initial))))
+        if "initial_true" in run:
+            rows.append((f"{number_} starting model, true", *_rms(rms_row(run["initial_true"]))))
     rows += [(f"paper {n} measured", *map(number, row)) for n, row in enumerate(paper_results.VALIDATION, start=1)]
     return Table(
         "RMS on unseen trajectories (like the paper's table 4)",

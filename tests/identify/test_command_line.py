@@ -6,6 +6,7 @@ import pytest
 
 from identify import command_line
 from identify.errors import OutputFolderError, ScenarioError
+from identify.result_file import load_result, save_result
 from identify.run_folder import RunFolder, new_run_folder
 
 
@@ -68,6 +69,16 @@ def test_summary_after_a_report_shows_goals_and_where_the_report_is(calls, run_f
     assert "unseen position" in shown
     assert "urad" in shown
     assert str(run_folder.report) in shown
+
+
+def test_summary_explains_what_was_missed(calls, run_folder, capsys):
+    result = load_result(run_folder.result)
+    result["identification"]["parameters"]["joint1.viscous"]["estimate"] = 0.3
+    save_result(run_folder.result, result)
+    command("report", "--out", run_folder.path)
+    assert "missed: friction and PID outside: of 3 within 5 % of truth or 3 std; outside: joint1.viscous" in (
+        capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize(

@@ -127,7 +127,7 @@ def test_tables_show_our_numbers_beside_the_papers(result):
 
 
 def test_starting_models_figures_stand_beside_the_identified_ones(result):
-    result["validation"][0]["initial"] = {"true": {"position_rms_um": [None] * 3, "orientation_rms_urad": [None] * 3}}
+    result["validation"][0]["initial_true"] = {"position_rms_um": [None] * 3, "orientation_rms_urad": [None] * 3}
     assert validation_table(result).rows[2] == ("1 starting model, true", *["diverged"] * 6)
 
 
