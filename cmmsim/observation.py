@@ -23,8 +23,8 @@ class DetectionSettings:
     """window_size and fit_size px; radius of a sticker m; limits of a good fit; largest_ray_gap: squared distance of
     the two rays of a sticker in units of its noise (one degree of freedom, so 25 is five sigma)."""
 
-    window_size: int = 18
-    fit_size: int = 16
+    window_size: int = 16
+    fit_size: int = 14
     radius: float = 0.003
     limits: FitLimits = field(default_factory=FitLimits)
     largest_ray_gap: float = 25.0

@@ -1,7 +1,12 @@
 """The whole chain from images to poses against the true poses, which only the renderer is given."""
 
+import os
 import pickle
+import resource
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +30,7 @@ def box_before(sensor, centre, size, share=0.25):
 
 def test_first_frame_without_prior_finds_all_ids(sensor):
     """Each measured point lies where the sticker of that name truly is."""
-    pose = [*sensor.home, 0.009, -0.008, 0.007, 0.03, -0.035, 0.03]
+    pose = sensor.home + np.array([0.009, -0.008, 0.007, 0.03, -0.035, 0.03])
     m = sensor.measure(pose)
     assert m.ok
     assert m.reason == ""
@@ -167,7 +172,7 @@ def test_jumps_are_lost_or_measured_never_wrong(sensor):
 
 def test_measure_frame_on_captured_images(sensor):
     """The same images handed over as arrays give a pose without any renderer."""
-    pose = [*sensor.home, 0.004, 0.003, -0.005, 0.01, 0.02, -0.015]
+    pose = sensor.home + np.array([0.004, 0.003, -0.005, 0.01, 0.02, -0.015])
     m = cmmsim.measure_frame(sensor.capture(pose), sensor.estimator)
     assert m.ok
     assert np.all(np.abs(m.pose - pose) * AXES < [20, 20, 20, 100, 100, 100])
@@ -180,6 +185,21 @@ def test_measure_frame_on_captured_images(sensor):
 def test_taught_travels_to_another_process(sensor, taught):
     again = cmmsim.load_sensor("ctrack780", seed=0, taught=pickle.loads(pickle.dumps(taught)))
     np.testing.assert_array_equal(sensor.measure(sensor.home).pose, again.measure(again.home).pose)
+
+
+@pytest.mark.slow
+def test_another_process_measures_the_same(sensor, taught, moving_path, tmp_path):
+    path = moving_path(5)
+    (tmp_path / "given.pickle").write_bytes(pickle.dumps((taught, path)))
+    program = (
+        "import pickle, numpy as np, cmmsim\n"
+        "taught, path = pickle.load(open('given.pickle', 'rb'))\n"
+        "sensor = cmmsim.load_sensor('ctrack780', seed=0, taught=taught)\n"
+        "np.save('poses.npy', [sensor.measure(pose).pose for pose in path])\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(cmmsim.__file__).parents[1])}
+    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=environment, check=True)
+    np.testing.assert_array_equal(np.load(tmp_path / "poses.npy"), [sensor.measure(pose).pose for pose in path])
 
 
 @pytest.mark.slow
@@ -209,3 +229,16 @@ def test_speed_of_rendering_and_measuring(sensor, moving_path):
             sensor.measure(pose)
         rates.append(len(path) / (time.perf_counter() - start))
     assert max(rates) > 15.0, rates
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow(sensor, moving_path):
+    """Resident memory after 3,000 frames against that after 200."""
+    path = moving_path(200)
+    sizes = []
+    for _ in range(15):
+        for pose in path:
+            sensor.measure(pose)
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        sizes.append(pages * resource.getpagesize() / 2**20)
+    assert sizes[-1] - sizes[0] < 5.0, sizes  # MiB

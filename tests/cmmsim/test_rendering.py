@@ -27,11 +27,11 @@ def centre_errors(sensor, pose, supersampling):
         pixels = camera.project(points)[0]
         bias = eccentricity(points, body.sticker_normals @ (move @ base_from_platform)[:3, :3].T, 0.003, 2300.0)
         windows_of.append(pixels + bias)
-        corners.append(np.rint(pixels - 8.5).astype(int))
+        corners.append(np.rint(pixels - 7.5).astype(int))
     placed = [np.stack([m @ base_from_platform, m]) for m in moves]
-    radiance = sensor._camera.radiance(placed, np.stack(corners), 18, supersampling)
+    radiance = sensor._camera.radiance(placed, np.stack(corners), 16, supersampling)
     for windows, corner, expected in zip(radiance, corners, windows_of, strict=True):
-        fits = fit_ellipses(NOISE.mean_grey(windows), corner, NOISE, 16)
+        fits = fit_ellipses(NOISE.mean_grey(windows), corner, NOISE, 14)
         assert fits.good.all()
         errors.append(fits.centres - expected)
     return np.concatenate(errors)
