@@ -199,6 +199,7 @@ static void accelerate(const context *c, evaluation *e) {
         e->net_torque[i] -= force[s];
         for (int j = 0; j < N; j++) e->acceleration[j] -= e->inverse_rows[i][j] * force[s];
     }
+    if (count == N) memset(e->acceleration, 0, sizeof e->acceleration); /* rounding must not make it creep */
 }
 
 static int evaluate(context *c, const state *s, double t, evaluation *e) {

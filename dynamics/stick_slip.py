@@ -142,7 +142,8 @@ class StickSlipMotion:
             force = np.linalg.solve(compliance, at.jacobian[stuck] @ free + at.bias_acceleration[stuck])
             at.stick_force[stuck] = force
             at.net_torque[stuck] -= force
-            free = free - response @ force
+            # A robot that stands still stands still: rounding must not make it creep.
+            free = free - response @ force if len(stuck) < 6 else np.zeros(6)
         at.acceleration = free
         return at
 
