@@ -21,13 +21,15 @@ GRAZING = 0.15  # cosine between a sticker's normal and the view below which it 
 @dataclass(frozen=True)
 class DetectionSettings:
     """window_size and fit_size px; radius of a sticker m; limits of a good fit; largest_ray_gap: squared distance of
-    the two rays of a sticker in units of its noise (one degree of freedom, so 25 is five sigma)."""
+    the two rays of a sticker in units of its noise (one degree of freedom, so 25 is five sigma); centre_error_px: rms
+    error of a centre that is not noise, such as the image formation's own; it is added to the noise's covariance."""
 
     window_size: int = 16
     fit_size: int = 14
     radius: float = 0.003
     limits: FitLimits = field(default_factory=FitLimits)
     largest_ray_gap: float = 25.0
+    centre_error_px: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
     left, right = fits.centres.reshape(2, -1, 2) - np.stack(
         [eccentricity(c[index], t[index], settings.radius, camera.focal_px)
          for c, t, camera in zip(centres, turned, rig.cameras, strict=True)])
-    spread = fits.covariances.reshape(2, -1, 2, 2)
+    spread = fits.covariances.reshape(2, -1, 2, 2) + settings.centre_error_px**2 * np.eye(2)
     good = np.all(fits.good.reshape(2, -1), axis=0)
     seen = triangulate(rig, left, right, spread[0], spread[1])
     return StickerObservation(index, left, right, seen.points, seen.covariances).selected(

@@ -26,7 +26,7 @@ from .taught import Taught
 from .teaching import Progress, Teacher
 from .tracking import Tracker
 from .views import Drawable
-from .virtual_camera import VirtualStereoCamera
+from .virtual_camera import Quality, VirtualStereoCamera
 
 TEACHING_STREAM, RUN_STREAM = 0, 1
 
@@ -52,7 +52,7 @@ class Sensor:
         self._true_rig = self.rig
         figures = file.camera.model_dump()
         self.noise = CameraNoise(**{("enabled" if k == "noise" else k): v for k, v in figures.items()})
-        self.settings = DetectionSettings(radius=file.stickers.radius)
+        self.settings = DetectionSettings(radius=file.stickers.radius, centre_error_px=Quality().centre_error_px)
         self.platform, self.base = marked_body("platform", file.platform), marked_body("base", file.base)
         self._scene = [scene_body(body, section, file.stickers, stream) for stream, (body, section)
                        in enumerate(((self.platform, file.platform), (self.base, file.base)))]

@@ -38,8 +38,8 @@ class TeachingPlan:
     """How much is looked at: base quality; platform poses and quality at each; window sizes px."""
 
     base: Quality = field(default_factory=lambda: Quality(supersampling=32, exposures=4000))
-    platform: Quality = field(default_factory=lambda: Quality(supersampling=8, exposures=30))
-    poses: int = 80
+    platform: Quality = field(default_factory=lambda: Quality(supersampling=12, exposures=30))
+    poses: int = 64
     base_window: int = 20
 
 
@@ -83,7 +83,8 @@ class Teacher:
                  quality: Quality, window_size: int) -> StickerObservation:
         """All stickers of a body from averaged exposures. Raises LostError when one is missing."""
         limits = replace(self.settings.limits, frames=quality.exposures, largest_misfit=np.inf)
-        settings = replace(self.settings, window_size=window_size, limits=limits, largest_ray_gap=np.inf)
+        settings = replace(self.settings, window_size=window_size, limits=limits, largest_ray_gap=np.inf,
+                           centre_error_px=quality.centre_error_px)
         seen = observe(self.camera.look(pose, rng, quality=quality), self.rig, self.noise, settings, expected, places,
                        body.sticker_normals)
         if len(seen.index) < len(places):
