@@ -89,14 +89,14 @@ def second_derivative(function: Callable[[float], np.ndarray], h: float = 1e-3) 
 class Numerics:
     """Oracles as one fixture, since test modules do not import each other."""
 
-    derivative: Callable[..., np.ndarray] = staticmethod(derivative)
-    second_derivative: Callable[..., np.ndarray] = staticmethod(second_derivative)
-    base_from_platform: Callable[[np.ndarray], np.ndarray] = staticmethod(base_from_platform)
+    derivative: Callable[..., np.ndarray]
+    second_derivative: Callable[..., np.ndarray]
+    base_from_platform: Callable[[np.ndarray], np.ndarray]
 
 
 @pytest.fixture(scope="session")
 def numerics() -> Numerics:
-    return Numerics()
+    return Numerics(derivative, second_derivative, base_from_platform)
 
 
 @dataclass(frozen=True)

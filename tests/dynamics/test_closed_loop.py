@@ -120,7 +120,7 @@ def test_commands_arrive_after_the_latency(robot, identified, make_settings):
 
 def test_run_starts_in_equilibrium(robot, identified, make_settings):
     """With the reference at rest, away from home, nothing moves and the torque holds the weight exactly."""
-    pose = robot.home_pose + [0.005, -0.004, 0.006, 0.02, -0.01, 0.03]
+    pose = robot.home_pose + np.array([0.005, -0.004, 0.006, 0.02, -0.01, 0.03])
     poses = np.tile(pose, (60, 1))
     settings, reference = make_settings(), closed_loop.Reference(poses, 0 * poses)
     run = closed_loop.simulate(robot, identified, reference, settings)
@@ -154,7 +154,9 @@ class Unplugged(Exception):
 
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("error", [Unplugged("cable"), KeyboardInterrupt()], ids=["exception", "interrupt"])
-def test_errors_of_the_sensor_reach_the_caller_unchanged(robot, identified, make_reference, make_settings, compiled, error):
+def test_errors_of_the_sensor_reach_the_caller_unchanged(
+    robot, identified, make_reference, make_settings, compiled, error
+):
     """The very exception object that the sensor raised comes out, and the sensor is not called again."""
     calls = []
 

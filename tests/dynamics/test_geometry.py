@@ -25,7 +25,7 @@ def test_the_file_holds_the_constructed_robot(robot):
     """Joints, cranks, link length and base radius agree with the construction from radii and angles to 1e-14 m."""
     joints, tips, side = _constructed()
     g = robot.geometry
-    link = joints + [0, 0, 0.200] - tips
+    link = joints + np.array([0, 0, 0.200]) - tips
     along = side[:, None] * np.column_stack([-link[:, 1], link[:, 0], np.zeros(6)])
     along /= np.linalg.norm(link[:, :2], axis=1, keepdims=True)
     np.testing.assert_allclose(g.platform_joints, joints, atol=1e-14)

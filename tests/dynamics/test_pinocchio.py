@@ -40,8 +40,8 @@ class ClosedChain:
         self.data = self.model.createData()
         self.constraint_data = pin.StdVec_RigidConstraintData()
         self.constraint_data.extend([constraint.createData() for constraint in self.constraints])
-        own = (self.constraints, self.constraint_data) if int(pin.__version__.split(".")[0]) >= 4 else (self.constraints,)
-        pin.initConstraintDynamics(self.model, self.data, *own)
+        later = (self.constraint_data,) if int(pin.__version__.split(".")[0]) >= 4 else ()
+        pin.initConstraintDynamics(self.model, self.data, self.constraints, *later)
 
     def _body(self, parent, joint, place, body, centre):
         number = self.model.addJoint(parent, joint, place, f"body{body}")

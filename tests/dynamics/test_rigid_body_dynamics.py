@@ -114,7 +114,8 @@ def test_mass_matrix_gives_the_kinetic_energy_of_the_13_bodies(robot, legs_at, m
     for t in (0.1, 0.5, 1.3):
         kinetic, _ = _energies(robot, legs_at, numerics, lambda d, t=t: motion.pose(t + d), parameters)
         twist = robot.twist(motion.pose(t), motion.rate(t))
-        np.testing.assert_allclose(twist @ robot.mass_matrix(motion.pose(t), parameters) @ twist / 2, kinetic, rtol=1e-9)
+        mass = robot.mass_matrix(motion.pose(t), parameters)
+        np.testing.assert_allclose(twist @ mass @ twist / 2, kinetic, rtol=1e-9)
 
 
 def test_gravity_wrench_is_the_gradient_of_the_height_energy(robot, legs_at, motion, numerics, parameters):

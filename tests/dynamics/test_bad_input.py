@@ -1,0 +1,280 @@
+"""Bad input ends in an error that holds the value, the limit and the leg or name; never in a NaN."""
+
+import tomllib
+from importlib import resources
+
+import numpy as np
+import pytest
+
+import dynamics
+from dynamics import closed_loop, parameters
+from dynamics.errors import (
+    DynamicsError,
+    ParameterError,
+    RobotFileError,
+    ShapeError,
+    SimulationError,
+    SingularPoseError,
+    UnreachablePoseError,
+)
+
+RSS6 = (resources.files("dynamics") / "robots" / "rss6.toml").read_text(encoding="utf-8")
+FIRST_JOINT = "[0.33383501391252074, -0.0784425512051534, 0.0]"
+
+
+@pytest.fixture
+def load(tmp_path):
+    """The robot of rss6.toml with passages of the file replaced."""
+
+    def changed(replacements):
+        text = RSS6
+        for old, new in replacements.items():
+            assert old in text
+            text = text.replace(old, new, 1)
+        path = tmp_path / "changed.toml"
+        path.write_text(text, encoding="utf-8")
+        return dynamics.load_robot(path)
+
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        ([0, 0, 0.2, 0, 0], r"pose must have shape \(6,\) or \(N, 6\), got \(5,\)"),
+        (np.zeros((2, 3, 6)), r"got \(2, 3, 6\)"),
+        (np.zeros((6, 1)), r"got \(6, 1\)"),
+        (0.2, r"got \(\)"),
+        ([0, 0, np.nan, 0, 0, 0], r"pose\[2\] is nan, must be finite"),
+        ([[0, 0, 0.2, 0, 0, 0], [0, 0, 0.2, 0, np.inf, 0]], r"pose\[1, 4\] is inf"),
+        ("home", "must be numbers"),
+        ([[1, 2], [3]], "must be numbers"),
+    ],
+)
+def test_poses_of_wrong_shape_or_not_finite(robot, pose, message):
+    """Shape and place are named; nothing is transposed or padded to fit."""
+    with pytest.raises(ShapeError, match=message):
+        robot.inverse_kinematics(pose)
+
+
+def test_every_argument_of_every_method_is_checked(robot):
+    """Each array argument of each method refuses a NaN by its own name."""
+    home, rest, bad = robot.home_pose, np.zeros(6), np.full(6, np.nan)
+    calls = {
+        "twist": (robot.coriolis_matrix, robot.friction_wrench, robot.regressor, robot.inverse_dynamics),
+        "twist_dot": (robot.regressor, robot.inverse_dynamics),
+    }
+    for name, methods in calls.items():
+        for method in methods:
+            count = {"coriolis_matrix": 1, "friction_wrench": 1}.get(method.__name__, 2)
+            arguments = [rest] * count
+            arguments[1 if name == "twist_dot" else 0] = bad
+            with pytest.raises(ShapeError, match=rf"{name}\[0\] is nan"):
+                method(home, *arguments)
+    with pytest.raises(ShapeError, match=r"torque\[0\] is nan"):
+        robot.forward_dynamics(home, rest, bad)
+    with pytest.raises(ShapeError, match=r"theta\[0\] is nan"):
+        robot.forward_kinematics(bad)
+    with pytest.raises(ShapeError, match="initial_pose"):
+        robot.forward_kinematics(rest, [1.0])
+
+
+def test_batches_of_different_length(robot):
+    """Lengths that do not match are named with the function; 1 is no licence to broadcast anything else."""
+    with pytest.raises(ShapeError, match=r"coriolis_matrix: batch lengths differ, shapes \(3, 6\), \(2, 6\)"):
+        robot.coriolis_matrix(np.tile(robot.home_pose, (3, 1)), np.zeros((2, 6)))
+
+
+@pytest.mark.parametrize(
+    ("index", "value", "message"),
+    [
+        (0, 0.0, r"platform.mass = 0 kg is not allowed, must be finite and > 0"),
+        (0, -1.0, r"platform.mass = -1 kg"),
+        (8, -0.5, r"crank2.mass = -0.5 kg is not allowed, must be finite and >= 0"),
+        (29, np.nan, r"link1.Ixx = nan kg m\^2"),
+        (54, -0.1, r"joint3.coulomb = -0.1 N m is"),
+        (63, np.inf, r"joint6.viscous = inf N m s/rad"),
+    ],
+)
+def test_parameters_outside_their_range(robot, index, value, message):
+    """The parameter is named with its value, unit and limit, alone and in a batch."""
+    values = robot.nominal_parameters.copy()
+    values[index] = value
+    with pytest.raises(ParameterError, match=message):
+        robot.mass_matrix(robot.home_pose, values)
+    with pytest.raises(ParameterError, match=message):
+        robot.mass_matrix(robot.home_pose, np.array([robot.nominal_parameters, values]))
+
+
+def test_parameters_of_wrong_number(robot):
+    """67 values (with the joint PID) where 64 are wanted are an error, not cut off."""
+    with pytest.raises(ParameterError, match=r"shape \(64,\), got \(67,\)"):
+        robot.mass_matrix(robot.home_pose, np.ones(67))
+
+
+def test_bodies_without_inertia_give_an_error_and_no_nan(robot):
+    """Only a mass and no inertia anywhere: M is singular, and forward dynamics says so."""
+    values = np.zeros(64)
+    values[0] = 24.0
+    with pytest.raises(SingularPoseError, match="forward_dynamics is not finite"):
+        robot.forward_dynamics(robot.home_pose, np.zeros(6), np.ones(6), values)
+
+
+def test_poses_out_of_reach(robot):
+    """Leg, pose, row and margin are named, in every method that needs the legs."""
+    far = robot.home_pose + np.array([0.2, 0, 0, 0, 0, 0])
+    with pytest.raises(UnreachablePoseError, match=r"leg \d cannot reach pose \[0.2 .*reach margin -.*must be > 0"):
+        robot.inverse_kinematics(far)
+    with pytest.raises(UnreachablePoseError, match=r"\(row 1\)"):
+        robot.mass_matrix([robot.home_pose, far])
+    for method in (robot.joint_jacobian, robot.pose_jacobian, robot.mass_matrix, robot.gravity_wrench):
+        with pytest.raises(UnreachablePoseError):
+            method(far)
+
+
+def test_singular_poses(load, monkeypatch):
+    """A robot whose links all lie in the plane of the platform carries no vertical force: condition and limit named."""
+    monkeypatch.setattr("dynamics.robot.load_library", lambda *_: None)  # one robot is not worth compiling
+    legs = tomllib.loads(RSS6)["legs"]
+    tips = np.array(legs["base_joints"]) + 0.06 * np.array(legs["crank_zero_directions"])
+    flat = np.linalg.norm(np.array(legs["platform_joints"]) - tips, axis=1)[0]
+    robot = load(
+        {
+            "home_pose = [0.0, 0.0, 0.2,": "home_pose = [0.0, 0.0, 0.0,",
+            "link_length = 0.30133373938841": f"link_length = {flat:.17g}",
+        }
+    )
+    with pytest.raises(SingularPoseError, match=r"singular at pose \[0. 0. 0. .*condition of J_ad .*limit 1e\+10"):
+        robot.forward_dynamics(robot.home_pose, np.zeros(6), np.zeros(6))
+    with pytest.raises(SingularPoseError):
+        robot.inverse_dynamics([robot.home_pose, robot.home_pose], np.zeros(6), np.zeros(6))
+
+
+def test_euler_angles_at_their_singularity(robot):
+    """Pose rates have no value at beta = pi/2."""
+    with pytest.raises(SingularPoseError, match=r"beta = \+-pi/2"):
+        robot.pose_rate([0, 0, 0.2, 0, np.pi / 2, 0], np.ones(6))
+
+
+def test_unknown_robot_lists_the_known_ones(tmp_path):
+    """The valid names are in the message, and a missing file is named by its path."""
+    with pytest.raises(RobotFileError, match=r"unknown robot `rss7`; built-in robots: rss6; or give the path"):
+        dynamics.load_robot("rss7")
+    with pytest.raises(RobotFileError, match=r"cannot read robot file .*none\.toml"):
+        dynamics.load_robot(tmp_path / "none.toml")
+    assert dynamics.built_in_robots() == ["rss6"]
+
+
+def test_a_file_by_path_is_the_same_robot(load, robot):
+    """A copy of the built-in file gives an equal geometry and equal parameters."""
+    copy = load({})
+    assert copy.geometry == robot.geometry
+    np.testing.assert_array_equal(copy.nominal_parameters, robot.nominal_parameters)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('name = "rss6"', 'name = "rss6"\ncolour = "red"', "unknown key colour; valid: name, family, home_pose"),
+        ("crank_length = 0.06", "crank_lenght = 0.06", "legs: .*unknown key crank_lenght; valid: crank_length"),
+        ("crank_length = 0.06\n", "", "legs.crank_length: Field required"),
+        ("mass = 24.0, ", "mass = 24.0, weight = 1, ", "initial.platform: .*unknown key weight; valid: mass"),
+        ('family = "rss6"', 'family = "delta"', "family: Input should be 'rss6'"),
+        ("link_length = 0.30133373938841", "link_length = -0.3", "link_length must be positive and finite, got -0.3"),
+        ("link_length = 0.30133373938841", "link_length = nan", "link_length must be positive and finite, got nan"),
+        ("link_length = 0.30133373938841", "link_length = 0.1", "leg 1 cannot reach the home pose: reach margin -"),
+        ("link_length = 0.30133373938841", 'link_length = "long"', "legs.link_length: Input should be a valid number"),
+        (f"    {FIRST_JOINT},\n", "", r"base_joints must be .*\(6, 3\), got shape \(5, 3\)"),
+        (FIRST_JOINT, "[0.33, -0.07]", "base_joints of leg 1 needs 3 numbers, got 2"),
+        ("    [0.0, 0.0, 1.0],\n", "    [0.0, 0.0, 2.0],\n", "crank_axes of leg 1 has length 2, must be 1"),
+        ("    [0.0, 0.0, 1.0],\n", "    [0.0, 0.6, 0.8],\n", "leg 1 must be normal to its crank axis; .*limit 1e-9"),
+        ("mass = [0.671, ", "mass = [", r"crank.mass needs one value or 6 values, got 5"),
+        ("crank = { mass = 0.685", "crank = { mass = -0.685", r"crank1.mass = -0.685 kg is not allowed"),
+        ("home_pose = [0.0, ", "home_pose = [", r"home_pose must be finite with shape \(6,\)"),
+        ("[parameters.initial]", "[parameters.first]", "needs a parameter set `initial`; it has .*first"),
+        ('name = "rss6"', "name = ", "is not valid TOML"),
+    ],
+)
+def test_robot_files_that_make_no_robot(load, old, new, message):
+    """Unknown keys list the valid ones; places, counts, values and legs are named; the file is named first."""
+    with pytest.raises(RobotFileError, match=rf"robot file .*changed.toml.*{message}"):
+        load({old: new})
+
+
+def test_binary_files_are_no_robot_files(tmp_path):
+    """A file that is not text is an error of the robot file, not of the decoder."""
+    path = tmp_path / "picture.toml"
+    path.write_bytes(b"\x89PNG\xff\xfe")
+    with pytest.raises(RobotFileError, match="cannot read robot file"):
+        dynamics.load_robot(path)
+
+
+def _timing(**changes):
+    return lambda: closed_loop.FrameTiming(**{"frame_rate_hz": 60.0, **changes})
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (_timing(frame_rate_hz=0.0), "frame rate is 0.0 Hz, must be finite and > 0"),
+        (_timing(frame_rate_hz=np.inf), "frame rate is inf"),
+        (_timing(latency_s=-0.01), "latency is -0.01 s, must be >= 0 and at most 60 frames"),
+        (_timing(latency_s=2.0), r"at most 60 frames \(1 s\)"),
+        (_timing(latency_s=np.nan), "latency is nan"),
+        (_timing(hold="cubic"), "unknown hold `cubic`; valid: zero, linear"),
+        (lambda: closed_loop.FrictionLaw("stribek"), "unknown friction law `stribek`; valid: coulomb_viscous, sm"),
+        (lambda: closed_loop.FrictionLaw("smoothed"), "smoothing_velocity is None rad/s, must be > 0"),
+        (lambda: closed_loop.FrictionLaw("smoothed", 0.0), "smoothing_velocity is 0.0 rad/s"),
+        (lambda: closed_loop.ServoGains(0.3, np.nan, 2.4), "servo gain kd is nan, must be finite and >= 0"),
+        (lambda: closed_loop.Reference(np.zeros((5, 6)), np.zeros((4, 6))), r"\(5, 6\) and rates \(4, 6\) differ"),
+        (lambda: closed_loop.Reference(np.zeros((5, 7)), np.zeros((5, 7))), r"reference poses must be .*got \(5, 7\)"),
+        (lambda: closed_loop.Reference(np.full((5, 6), np.nan), np.zeros((5, 6))), "reference poses must be finite"),
+    ],
+)
+def test_settings_of_the_loop(build, message):
+    """Each setting refuses what it cannot be, with the value and the limit or the valid names."""
+    with pytest.raises(SimulationError, match=message):
+        build()
+
+
+@pytest.mark.parametrize("steps", [0, -1, 2.5])
+def test_steps_per_frame(make_settings, steps):
+    """Steps per frame are whole and positive."""
+    with pytest.raises(SimulationError, match=r"steps_per_frame is .* must be a whole number >= 1"):
+        make_settings(steps=steps)
+
+
+def test_arguments_of_simulate(robot, identified, make_reference, make_settings):
+    """Parameters, gains, commands, start pose and the ideal sensor for sensitivities are checked before the run."""
+    reference, settings = make_reference(5), make_settings()
+
+    def run(values=identified, reference=reference, **options):
+        return closed_loop.simulate(robot, values, reference, settings, **options)
+
+    with pytest.raises(SimulationError, match=r"shape \(67,\), got \(64,\)"):
+        run(identified[:64])
+    for index, message in ((64, "lp is -1.0"), (65, "li is 0.0, must be finite and > 0"), (66, "ld is nan")):
+        values = identified.copy()
+        values[index] = float(message.split(" is ")[1].split(",")[0])
+        with pytest.raises(SimulationError, match=f"joint_pid.{message}"):
+            run(values)
+    values = identified.copy()
+    values[12] = -1
+    with pytest.raises(ParameterError, match=r"crank3\.mass = -1 kg"):
+        run(values)
+    with pytest.raises(SimulationError, match=r"commands must be finite with shape \(5, 6\), got \(4, 6\)"):
+        run(commands=np.zeros((4, 6)))
+    with pytest.raises(SimulationError, match="sensitivities need the ideal sensor"):
+        run(sensor=lambda frame, time, pose: pose, sensitivities=True)
+    far = closed_loop.Reference(reference.poses + 0.2, reference.rates)
+    with pytest.raises(UnreachablePoseError, match="leg 1 cannot reach"):
+        run(reference=far)
+
+
+def test_inertias_no_body_can_have_are_named(robot, identified):
+    """Cranks and links of Table 1 break Ix + Iy >= Iz (the data stay as published); the platform does not."""
+    lines = parameters.inertia_warnings(robot.nominal_parameters)
+    assert len(lines) == 12
+    assert lines[0].startswith("crank1: largest inertia 0.000605 kg m^2 exceeds")
+    assert not any(line.startswith("platform") for line in lines)
+    assert issubclass(RobotFileError, DynamicsError)
