@@ -418,6 +418,26 @@ static int trial_margin(context *c, const state *s, double t, double h, state *o
     return status;
 }
 
+/* Modes that hold at both ends of a step may break in between (a joint that reverses twice). The stages give a hint;
+ * where a step of half the length confirms it, that becomes the step: returns whether it did. */
+static int breaks_halfway(context *c, const state *s, double t, double *h, state *out, evaluation *end, double *margin,
+                          int *status) {
+    int joint;
+    state half;
+    evaluation half_end;
+    if (mode_margin(c, &c->stage[1], &joint) >= 0 && mode_margin(c, &c->stage[2], &joint) >= 0) return 0;
+    *status = trial_margin(c, s, t, *h / 2, &half, &half_end, margin);
+    if (*status != OK) return 0;
+    if (*margin >= 0) { /* a false alarm: restore the stages of the whole step */
+        *status = rk4(c, s, t, *h, out);
+        return 0;
+    }
+    *h /= 2;
+    *out = half;
+    *end = half_end;
+    return 1;
+}
+
 /* The step in (0, h] at which the modes stop holding, to rounding: regula falsi (Illinois) on the margin. A joint that
  * has just started from rest has no margin yet: then the bracket is found by halving; *held tells whether there is one. */
 static int locate_event(context *c, const state *s, double t, double h, double margin_at_h, double *step, state *out,
@@ -510,7 +530,8 @@ static int segment(context *c, state *s, double duration, int steps) {
             if (status == OK) status = evaluate(c, &next, t + h, &end);
             if (status != OK) break;
             double margin = mode_margin(c, &end, &joint);
-            int event = margin < 0, held = 1;
+            int held = 1, event = margin < 0 || breaks_halfway(c, s, t, &h, &next, &end, &margin, &status);
+            if (status != OK) break;
             if (event) {
                 if (++events > MAX_EVENTS_PER_SEGMENT) return TOO_MANY_EVENTS;
                 status = locate_event(c, s, t, h, margin, &h, &next, &end, &held);

@@ -103,6 +103,9 @@ class StickSlipMotion:
             while now.time < target:
                 h = target - now.time
                 stages, end = self._trial(now, command, h)
+                if self._margin(end)[0] >= 0 and self._hinted(stages):
+                    halfway = self._trial(now, command, h / 2)[1]
+                    h, end = (h / 2, halfway) if self._margin(halfway)[0] < 0 else (h, end)
                 if self._margin(end)[0] >= 0:
                     self._advance_tangent(stages, command, h)
                     stopped = self._stop_joints(end, np.flatnonzero(self.mode == 0))
@@ -188,6 +191,10 @@ class StickSlipMotion:
         margins = np.where(self._has_events, np.minimum(margins, 1.0), 1.0)
         joint = int(np.argmin(margins))
         return float(margins[joint]), joint
+
+    def _hinted(self, stages: list[Evaluation]) -> bool:
+        """Whether modes that hold at both ends of a step may have been broken in between (a joint reversing twice)."""
+        return any(self._margin(stage)[0] < 0 for stage in stages[1:3])
 
     def _slope(self, at: Evaluation, command: Command) -> State:
         return State(at.state.rate, at.acceleration, command.value + command.slope * at.time - at.angle)
