@@ -38,6 +38,7 @@ typedef struct {
     const double *reference;            /* (frames, 6) */
     const double *reference_rate;       /* (frames, 6) */
     const double *logged_commands;      /* (frames, 6), or NULL: the servo computes them */
+    const signed char *lost;            /* (frames) 1 where the ideal sensor measures nothing, or NULL */
 } problem;
 
 typedef struct {
@@ -629,6 +630,9 @@ static int frame_command(context *c, servo *v, int k, const state *s, measure_fn
         int answer = measure(k, s->pose, measured);
         if (answer != MEASURED && answer != LOST) return SENSOR_FAILED;
         good = answer == MEASURED;
+    } else if (p->lost && p->lost[k]) {
+        good = 0;
+        for (int i = 0; i < N; i++) measured[i] = NAN;
     }
     v->elapsed += p->frame_period;
     memcpy(out->measured + N * k, measured, sizeof measured);

@@ -50,12 +50,14 @@ def simulate(
     *,
     sensitivities: bool = False,
     commands: np.ndarray | None = None,
+    lost: np.ndarray | None = None,
     compiled: bool | None = None,
 ) -> ClosedLoopRun:
     """Run the closed loop for parameters (67,): the 64 dynamic ones, then lp, li, ld.
 
     sensor: None for the ideal one. sensitivities: also derivatives of the poses with respect to all parameters
     (ideal sensor or logged commands only). commands (frames, 6): drive the joints with these instead of the servo's.
+    lost (frames,) bool: frames at which the ideal sensor measures nothing, so that a model loses what its plant lost.
     compiled: None takes the compiled path when a C compiler is at hand; False forces the plain path.
     Raises LoopFailure when the robot leaves the reachable set (an unstable loop), ParameterError, SimulationError.
     """
@@ -66,9 +68,15 @@ def simulate(
         commands = np.ascontiguousarray(commands, dtype=float)
         if commands.shape != reference.poses.shape or not np.isfinite(commands).all():
             raise SimulationError(f"commands must be finite with shape {reference.poses.shape}, got {commands.shape}")
+    if lost is not None:
+        lost = np.ascontiguousarray(lost, dtype=np.int8)
+        if lost.shape != (len(reference.poses),) or sensor is not None:
+            raise SimulationError(
+                f"lost must have shape ({len(reference.poses)},) and goes with the ideal sensor only, got {lost.shape}"
+            )
     library = compiled_closed_loop.library(robot.geometry) if compiled in (None, True) else None
     start = equilibrium(robot, parameters, reference.poses[0], settings.servo)
-    arguments = (parameters, reference, settings, start, sensor, sensitivities, commands)
+    arguments = (parameters, reference, settings, start, sensor, sensitivities, commands, lost)
     if library is not None:
         return compiled_closed_loop.run(library, *arguments)
     if compiled:

@@ -47,6 +47,7 @@ class _Problem(Structure):
         *[(name, c_double) for name in ("lp", "li", "ld", "kp", "kd", "ki")],
         *[(name, c_double * 6) for name in ("pose", "command", "integral", "servo_integral")],
         *[(n, _DoublePointer) for n in ("integral_sensitivity", "reference", "reference_rate", "logged_commands")],
+        ("lost", POINTER(c_byte)),
     ]
 
 
@@ -84,6 +85,7 @@ def run(
     sensor: PoseSensor | None,
     sensitivities: bool,
     commands: np.ndarray | None,
+    lost: np.ndarray | None,
 ) -> ClosedLoopRun:
     """See `closed_loop.simulate`; arguments are already checked."""
     frames = len(reference.poses)
@@ -91,7 +93,7 @@ def run(
     arrays = {name: np.zeros((frames, 6)) for name in ("pose", "rate", "torque", "command", "measured")}
     measured_ok = np.zeros(frames, dtype=np.int8)
     sensitivity = np.zeros((frames, 6, PARAMETER_COUNT)) if sensitivities else None
-    problem = _problem(parameters, reference, settings, start, sensitivities, commands)
+    problem = _problem(parameters, reference, settings, start, sensitivities, commands, lost)
     trajectory = _Trajectory(
         **{name: _pointer(array) for name, array in arrays.items()},
         measured_ok=measured_ok.ctypes.data_as(POINTER(c_byte)),
@@ -123,6 +125,7 @@ def _problem(
     start: StartState,
     sensitivities: bool,
     commands: np.ndarray | None,
+    lost: np.ndarray | None,
 ) -> _Problem:
     """The C struct. It borrows the arrays' memory: the caller keeps them alive during the call."""
     servo, timing, friction = settings.servo, settings.timing, settings.friction
@@ -145,6 +148,7 @@ def _problem(
         reference=_pointer(reference.poses),
         reference_rate=_pointer(reference.rates),
         logged_commands=_pointer(commands),
+        lost=None if lost is None else lost.ctypes.data_as(POINTER(c_byte)),
     )
     problem.rigid[:] = parameters[:52]
     problem.coulomb[:] = parameters[52:58]

@@ -41,6 +41,7 @@ def run(
     sensor: PoseSensor | None,
     sensitivities: bool,
     commands: np.ndarray | None,
+    lost: np.ndarray | None,
 ) -> ClosedLoopRun:
     """See `closed_loop.simulate`; arguments are already checked."""
     period, frames = 1.0 / settings.timing.frame_rate_hz, len(reference.poses)
@@ -61,6 +62,8 @@ def run(
         measured: np.ndarray | None = state.pose
         if sensor is not None:
             measured = checked_measurement(sensor(frame, frame * period, state.pose.copy()), frame)
+        elif lost is not None and lost[frame]:
+            measured = None
         servo.next_frame()
         result.measured_ok[frame] = measured is not None
         result.measured[frame] = np.nan if measured is None else measured

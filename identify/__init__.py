@@ -1,12 +1,27 @@
 """Identification of parallel robots from images: excitation, experiment, estimation, validation, reports.
 
-The one place where robots (`dynamics`) and the optical sensor (`cmmsim`) meet.
+The one place where robots (`dynamics`) and the optical sensor (`cmmsim`) meet. Names are imported on first use: CasADi
+and OpenGL take seconds to load, and `cmmsim --help` must not wait for them.
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from identify.errors import IdentifyError
-from identify.estimation import IdentificationResult, identify
-from identify.experiment import run_experiment
-from identify.scenario import Scenario, load_scenario, scenario_names
+
+if TYPE_CHECKING:
+    from identify.estimation import IdentificationResult, identify
+    from identify.experiment import run_experiment
+    from identify.scenario import Scenario, load_scenario, scenario_names
+
+_HOME = {
+    "IdentificationResult": "identify.estimation",
+    "identify": "identify.estimation",
+    "run_experiment": "identify.experiment",
+    "Scenario": "identify.scenario",
+    "load_scenario": "identify.scenario",
+    "scenario_names": "identify.scenario",
+}
 
 __all__ = [
     "IdentificationResult",
@@ -17,3 +32,9 @@ __all__ = [
     "run_experiment",
     "scenario_names",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+    return getattr(import_module(_HOME[name]), name)

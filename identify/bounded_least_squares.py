@@ -77,10 +77,12 @@ def minimise(
         new_cost = problem.cost(parameters + step) if predicted > 0 else cost
         ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
         largest = float(np.abs(step / scale).max())
-        radius = _new_radius(radius, ratio, largest)
+        tried, radius = radius, _new_radius(radius, ratio, largest)
         if ratio > 0:
-            change = _relative_change(step, parameters, scale)
-            reason = _converged(cost, new_cost, change, criteria)
+            # A step cut short by the trust region says nothing about convergence.
+            if largest < 0.9 * tried:
+                change = _relative_change(step, parameters, scale)
+                reason = _converged(cost, new_cost, change, criteria)
             parameters = np.maximum(parameters + step, lower)
             cost, factor, residual = problem.linearise(parameters)
             evaluations += 1

@@ -1,4 +1,7 @@
-"""Identification of one record: warm start, output error, uncertainty, identifiability.
+"""Identification of one record: linear warm start, output error, uncertainty, identifiability.
+
+The search goes from the linear warm start through the command-driven output error, which has few local minima, to the
+closed-loop output error, whose stick-slip events make narrow ones.
 
 Sees the record, the robot's geometry and starting guess, and the scenario's model side; never the sensor, the plant's
 settings or the truth.
@@ -9,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from dynamics import DynamicsError, Robot
 from dynamics.closed_loop import Reference
@@ -17,17 +21,26 @@ from identify.arrays import Array
 from identify.base_parameters import base_rank
 from identify.bounded_least_squares import Solution, StopCriteria, minimise
 from identify.errors import EstimationError
+from identify.estimate_covariance import DRAWS, Uncertainty, estimate_uncertainty
 from identify.loop_parameters import NAMES, StartingGuess, starting_guess
 from identify.loop_setup import model_settings
 from identify.output_error import OutputErrorProblem
-from identify.progress import Progress, SilentProgress
+from identify.progress import Advance, Progress, SilentProgress
 from identify.recording import poses
-from identify.residual_covariance import parameter_covariance
 from identify.scale_anchor import ScaleAnchor, read_anchor
 from identify.scenario import Scenario
 
 IDENTIFIABLE_SHARE = 0.5
 """A parameter counts as identified when the record at least halves the standard deviation of the starting guess."""
+
+MISFIT_STDS = 5.0
+"""Standard deviations from the expected residual beyond which a warning is given."""
+
+SMALLEST_SHARE = 1e-3
+"""Lower bound of platform mass and integral gain, as a share of the starting guess."""
+
+UNCERTAINTY_STREAM = 5
+"""Random stream of the repeated experiments, beside those of the experiment."""
 
 MINIMUM_GOOD_SHARE = 0.5
 """Share of frames that must have been measured."""
@@ -38,8 +51,8 @@ class IdentificationResult:
     """What one record says about the 67 parameters, in the order of `names`; SI.
 
     initial, warm_start, estimate, std (67,), covariance (67, 67); identifiable (67,) bool; base_rank: independent
-    dynamic parameter groups the trajectory excites; costs: after each iteration; noise_ratio: mean squared whitened
-    residual, 1 where the sensor's noise explains everything.
+    dynamic parameter groups the trajectory excites; iterations, stop_reason, costs: of the last search; noise_ratio:
+    mean squared whitened residual, to compare with expected_noise_ratio, what the sensor's noise alone would leave.
     """
 
     names: tuple[str, ...]
@@ -48,7 +61,7 @@ class IdentificationResult:
     estimate: Array
     std: Array
     covariance: Array
-    identifiable: Array
+    identifiable: NDArray[np.bool_]
     scale_anchor: ScaleAnchor
     base_rank: int
     iterations: int
@@ -56,6 +69,8 @@ class IdentificationResult:
     stop_reason: str
     costs: tuple[float, ...]
     noise_ratio: float
+    expected_noise_ratio: float
+    warnings: tuple[str, ...]
     seconds: dict[str, float]
 
 
@@ -71,18 +86,35 @@ def identify(
     progress = progress or SilentProgress()
     settings = scenario.identification
     problem = output_error_problem(record, robot, scenario)
-    with progress.stage("identify", settings.max_iterations) as advance:
-        began = time.perf_counter()
-        warm = _warm_start(problem, record, scenario)
-        start = _best_start(problem, warm)
-        warmed = time.perf_counter()
-        criteria = StopCriteria(settings.cost_tolerance, settings.parameter_tolerance, settings.max_iterations)
-        lower = np.zeros(len(NAMES))
-        lower[NAMES.index("platform.mass")] = 1e-3 * problem.guess.values[0]
-        lower[NAMES.index("joint_pid.li")] = 1e-3 * problem.guess.values[-2]
-        solution = minimise(problem, start, lower, problem.guess.std, criteria, lambda i, cost: advance())
-        ended = time.perf_counter()
-    return _result(problem, warm, solution, robot, scenario, {"warm_start": warmed - began, "search": ended - warmed})
+    began = time.perf_counter()
+    warm = _warm_start(problem, record, scenario)
+    warmed = time.perf_counter()
+    with progress.stage("identify", 2 * settings.max_iterations) as advance:
+        driven = problem.driven_by(record["command"].values)
+        solution = search(driven, _best_start(driven, warm), scenario, advance)
+        if settings.method == "closed_loop":
+            solution = search(problem, _best_start(problem, solution.parameters), scenario, advance)
+    searched = time.perf_counter()
+    final = problem if settings.method == "closed_loop" else driven
+    rng = np.random.default_rng([int(record.attrs["seed"]), UNCERTAINTY_STREAM])
+    with progress.stage("uncertainty", DRAWS) as advance:
+        uncertainty = estimate_uncertainty(final, solution.parameters, rng, advance)
+    ended = time.perf_counter()
+    seconds = {"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched}
+    rank = base_rank(robot, problem.reference, scenario.timing.frame_rate_hz, settings.qr_threshold)
+    return _result(final, warm, solution, uncertainty, rank, seconds)
+
+
+def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance) -> Solution:
+    """Minimise one output-error problem from parameters (67,); masses and gains stay positive."""
+    settings = scenario.identification
+    criteria = StopCriteria(settings.cost_tolerance, settings.parameter_tolerance, settings.max_iterations)
+    lower = np.zeros(len(NAMES))
+    for name in ("platform.mass", "joint_pid.li"):
+        lower[NAMES.index(name)] = SMALLEST_SHARE * problem.guess.values[NAMES.index(name)]
+    solution = minimise(problem, start, lower, problem.guess.std, criteria, lambda i, cost: advance())
+    advance(settings.max_iterations - solution.iterations)
+    return solution
 
 
 def output_error_problem(record: xr.Dataset, robot: Robot, scenario: Scenario) -> OutputErrorProblem:
@@ -116,7 +148,8 @@ def _check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
         raise EstimationError(f"the record is of robot {record.attrs.get('robot')!r}, not of {robot.name!r}")
     rate = float(record.attrs.get("frame_rate_hz", 0.0))
     if abs(rate - scenario.timing.frame_rate_hz) > 1e-9 * rate:
-        raise EstimationError(f"the record has {rate:g} frames a second, the scenario {scenario.timing.frame_rate_hz:g}")
+        wanted = scenario.timing.frame_rate_hz
+        raise EstimationError(f"the record has {rate:g} frames a second, the scenario {wanted:g}")
 
 
 def _warm_start(problem: OutputErrorProblem, record: xr.Dataset, scenario: Scenario) -> Array:
@@ -156,29 +189,39 @@ def _result(
     problem: OutputErrorProblem,
     warm: Array,
     solution: Solution,
-    robot: Robot,
-    scenario: Scenario,
+    uncertainty: Uncertainty,
+    rank: int,
     seconds: dict[str, float],
 ) -> IdentificationResult:
-    began = time.perf_counter()
-    residual, jacobian = problem.residuals(solution.parameters)
-    covariance = parameter_covariance(solution.factor, residual, jacobian, scenario.timing.frame_rate_hz)
-    std = np.sqrt(np.diag(covariance))
-    seconds["uncertainty"] = time.perf_counter() - began
+    std = np.sqrt(np.diag(uncertainty.covariance))
+    noise_ratio = float(np.mean(problem.whiten(problem.model_poses(solution.parameters) - problem.measured) ** 2))
     return IdentificationResult(
         names=NAMES,
         initial=problem.guess.values,
         warm_start=warm,
         estimate=solution.parameters,
         std=std,
-        covariance=covariance,
+        covariance=uncertainty.covariance,
         identifiable=std < IDENTIFIABLE_SHARE * problem.guess.std,
         scale_anchor=problem.anchor,
-        base_rank=base_rank(robot, problem.reference, scenario),
+        base_rank=rank,
         iterations=solution.iterations,
         evaluations=solution.evaluations,
         stop_reason=solution.stop_reason,
         costs=solution.costs,
-        noise_ratio=float(np.mean(residual**2)),
+        noise_ratio=noise_ratio,
+        expected_noise_ratio=uncertainty.expected_noise_ratio,
+        warnings=_warnings(noise_ratio, uncertainty),
         seconds=seconds,
+    )
+
+
+def _warnings(noise_ratio: float, uncertainty: Uncertainty) -> tuple[str, ...]:
+    """A misfit that the sensor's noise does not explain: a local minimum, or a model that is wrong."""
+    expected, spread = uncertainty.expected_noise_ratio, uncertainty.noise_ratio_std
+    if abs(noise_ratio - expected) <= MISFIT_STDS * spread:
+        return ()
+    return (
+        f"the model misses the record by {noise_ratio:.3f} times the noise variance, noise alone gives {expected:.3f} "
+        f"± {spread:.3f}: the model or the stated covariance is wrong, and the intervals are too",
     )

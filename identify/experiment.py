@@ -83,7 +83,7 @@ def run_plant(
     run: int,
     advance: Advance = lambda n=1: None,
 ) -> Experiment:
-    """Run the plant along a trajectory at the frames `times` (N,) [s]; `run` numbers the runs of one seed (0: excitation).
+    """Run the plant along a trajectory at the frames `times` (N,) [s]; `run`: number of the run (0: excitation).
 
     Raises TrajectoryError before the run when the trajectory leaves the travel, LoopFailure when the loop is unstable.
     """

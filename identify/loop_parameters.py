@@ -11,10 +11,6 @@ from identify.errors import ScenarioError
 
 NAMES: tuple[str, ...] = PARAMETER_NAMES + JOINT_PID_NAMES
 
-TYPICAL_FRICTION = {"coulomb": 0.1, "viscous": 0.1}
-"""Sizes [N m, N m s/rad] where the specification gives no friction: about 1/30 of the reference robot's holding torque."""
-
-
 @dataclass(frozen=True)
 class StartingGuess:
     """What is known before the experiment: values (67,) and their standard deviations (67,), SI."""
@@ -24,7 +20,7 @@ class StartingGuess:
 
 
 def starting_guess(robot: Robot, set_name: str, relative_std: float) -> StartingGuess:
-    """The named parameter set of the robot file, uncertain by a fraction of each value's size.
+    """The named parameter set of the robot file, uncertain by a fraction of each parameter's size.
 
     Raises:
         ScenarioError: no such set (with the valid names).
@@ -32,15 +28,18 @@ def starting_guess(robot: Robot, set_name: str, relative_std: float) -> Starting
     if set_name not in robot.parameter_sets:
         valid = ", ".join(sorted(robot.parameter_sets))
         raise ScenarioError(f"robot {robot.name} has no parameter set {set_name!r}; it has {valid}")
-    values = robot.parameter_sets[set_name].vector
-    return StartingGuess(values, relative_std * typical_sizes(values))
+    chosen = robot.parameter_sets[set_name]
+    holding_torque = float(np.abs(robot.static_torque(robot.home_pose, chosen.dynamic)).mean())
+    return StartingGuess(chosen.vector, relative_std * typical_sizes(chosen.vector, holding_torque))
 
 
-def typical_sizes(values: Array) -> Array:
-    """Size (67,) of each parameter, its own value or, where that is zero, the typical one of its kind."""
-    kinds = [name.rsplit(".", 1)[1] for name in NAMES]
-    fallback = np.array([TYPICAL_FRICTION.get(kind, 1.0) for kind in kinds])
-    return np.where(values > 0, values, fallback)
+def typical_sizes(values: Array, holding_torque: float) -> Array:
+    """Size (67,) of each parameter: its own value, and for friction [N m, N m s/rad] the holding torque [N m].
+
+    A specification says little about friction; a joint that rubs more than it carries would be called broken.
+    """
+    friction = np.array([name.startswith("joint") and "joint_pid" not in name for name in NAMES])
+    return np.where(friction, holding_torque, np.where(values > 0, values, 1.0))
 
 
 def index_of(name: str) -> int:

@@ -20,7 +20,7 @@ def model_settings(scenario: Scenario) -> LoopSettings:
 
 def frame_times(scenario: Scenario, duration_s: float) -> Array:
     """Instants of exposure (N,) [s] of a run: whole frames, the end of the run excluded."""
-    return np.arange(scenario.timing.frames(duration_s)) * scenario.timing.frame_period_s
+    return np.arange(scenario.timing.frames(duration_s), dtype=float) * scenario.timing.frame_period_s
 
 
 def reference_motion(trajectory: FourierTrajectory, times: Array) -> Reference:

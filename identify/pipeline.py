@@ -68,7 +68,7 @@ def identify(folder: Path, progress: Progress) -> None:
     began = time.perf_counter()
     seen = recording.read(run_folder.experiment)
     result = estimation.identify(seen, robot, scenario, progress)
-    measured = recording.poses(seen, "measured")
+    measured, ok = recording.poses(seen, "measured"), seen["measured_ok"].values.astype(bool)
     reference = _reference(trajectories.excitation, scenario, scenario.excitation.duration_s)
     before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))
     seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
@@ -84,8 +84,8 @@ def identify(folder: Path, progress: Progress) -> None:
                 **seconds,
             },
             "identification": identification_entry(result),
-            "before": rms_figures(before - measured),
-            "after": rms_figures(after - measured),
+            "before": rms_figures(before - measured, ok),
+            "after": rms_figures(after - measured, ok),
         },
     )
 

@@ -25,6 +25,8 @@ def identification_entry(result: IdentificationResult) -> dict[str, Any]:
         "stop_reason": result.stop_reason,
         "costs": list(result.costs),
         "noise_ratio": result.noise_ratio,
+        "expected_noise_ratio": result.expected_noise_ratio,
+        "warnings": list(result.warnings),
         "base_rank": result.base_rank,
         "parameters": {
             name: {
@@ -55,16 +57,17 @@ def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:
         "frames": len(ok),
         "lost_frames": int(np.sum(~ok)),
         "stereo_frames_per_second": len(ok) / seconds,
-        **rms_figures(errors[ok]),
+        **rms_figures(errors, ok),
     }
 
 
 def validation_entry(record: xr.Dataset, truth: xr.Dataset, initial: Array, identified: Array) -> dict[str, Any]:
     """One unseen run: both models (N, 6) against the measured and against the true plant pose."""
+    ok = record["measured_ok"].values.astype(bool)
     measured, true = recording.poses(record, "measured"), true_poses(truth)
     return {
-        "measured": rms_figures(identified - measured),
+        "measured": rms_figures(identified - measured, ok),
         "true": rms_figures(identified - true),
-        "initial_measured": rms_figures(initial - measured),
+        "initial_measured": rms_figures(initial - measured, ok),
         "initial_true": rms_figures(initial - true),
     }

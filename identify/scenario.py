@@ -102,6 +102,9 @@ class Filter(_Section):
 class Identification(_Section):
     """Output-error estimation and its stop criteria (eq. 35)."""
 
+    method: Literal["closed_loop", "command_driven"] = Field(
+        "closed_loop", description="the model closes its own loop (the paper), or gets the logged commands"
+    )
     scale_anchor: Literal["platform_mass"] = Field(
         "platform_mass", description="what fixes the overall scale of the parameters"
     )
@@ -110,7 +113,7 @@ class Identification(_Section):
     max_iterations: int = _quantity(30, "1", "iterations at most", ge=1, le=1000)
     cost_tolerance: float = _quantity(1e-6, "1", "tol1 of eq. 35, relative change of the cost", gt=0, lt=1)
     parameter_tolerance: float = _quantity(1e-3, "1", "tol2 of eq. 35, relative change of a parameter", gt=0, lt=1)
-    qr_threshold: float = _quantity(1e-3, "1", "relative threshold of a direction that can be identified", gt=0, lt=1)
+    qr_threshold: float = _quantity(1e-3, "1", "entries of R below it count as zero in base_rank (section 4.2)", gt=0)
 
 
 class Validation(_Section):

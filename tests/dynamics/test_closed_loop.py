@@ -82,6 +82,30 @@ def test_compiled_run_equals_plain_run_with_lost_frames(robot, identified, make_
     np.testing.assert_allclose(run.command[0], robot.inverse_kinematics(robot.home_pose), atol=1e-15)
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+def test_ideal_sensor_with_lost_frames_is_a_sensor_that_loses_them(
+    robot, identified, make_reference, make_settings, compiled
+):
+    """A mask of lost frames does what a perfect sensor that answers None does; sensitivities then still come."""
+    settings, reference, lost = make_settings(latency_s=0.4 * PERIOD), make_reference(24), {0, 5, 9, 10}
+    mask = np.isin(np.arange(24), list(lost))
+    masked = closed_loop.simulate(robot, identified, reference, settings, lost=mask, compiled=compiled)
+    sensed = closed_loop.simulate(robot, identified, reference, settings, _sensor(lost, bias=0.0), compiled=compiled)
+    assert np.array_equal(masked.pose, sensed.pose)
+    assert np.array_equal(masked.command, sensed.command)
+    with_tangents = closed_loop.simulate(
+        robot, identified, reference, settings, lost=mask, sensitivities=True, compiled=compiled
+    )
+    step = np.zeros(67)
+    step[52] = 1e-5
+    ahead, behind = (
+        closed_loop.simulate(robot, identified + sign * step, reference, settings, lost=mask, compiled=compiled).pose
+        for sign in (1, -1)
+    )
+    expected = (ahead - behind) / 2e-5
+    assert np.abs(with_tangents.pose_sensitivity[:, :, 52] - expected).max() < 1e-3 * np.abs(expected).max()
+
+
 def test_compiled_run_equals_plain_run_with_logged_commands(robot, identified, make_reference, make_settings):
     """Driven by recorded commands, with sensitivities (the servo's share is then absent)."""
     settings, reference = make_settings(), make_reference(24)

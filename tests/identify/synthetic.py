@@ -1,0 +1,63 @@
+"""Records of the reference robot with drawn measurement noise instead of images: fast, and with known statistics."""
+
+from functools import cache
+
+import numpy as np
+
+from dynamics import Robot, load_robot
+from dynamics.closed_loop import simulate
+from identify.loop_setup import frame_times, plant_settings, reference_motion
+from identify.recording import build_record
+from identify.scale_anchor import ScaleAnchor, store_anchor
+from identify.scenario import load_scenario
+from identify.trajectory import random_trajectory
+
+SIGMA = np.repeat([5e-6, 30e-6], 3)
+
+
+@cache
+def rss6() -> Robot:
+    return load_robot("rss6")
+
+
+def truth():
+    return rss6().parameter_sets["identified"].vector
+
+
+def trajectory(seed):
+    return random_trajectory(np.random.default_rng(seed), rss6().home_pose, 0.1, 5, 0.010, 0.04)
+
+
+def run_plant(scenario, seed, sigma=SIGMA, lost=(), parameters=None, duration_s=10.0, trajectory_seed=0):
+    """(record, run of the plant) with Gaussian noise of `sigma` (6,) and the frames `lost` not measured."""
+    rng = np.random.default_rng(seed)
+    parameters = truth() if parameters is None else parameters
+    times = frame_times(scenario, duration_s)
+    reference = reference_motion(trajectory(trajectory_seed), times)
+
+    def sensor(frame, t, pose):
+        noise = sigma * rng.standard_normal(6)
+        return None if frame in lost else pose + noise
+
+    run = simulate(rss6(), parameters, reference, plant_settings(scenario), sensor)
+    covariance = np.broadcast_to(np.diag(np.maximum(sigma, 1e-9) ** 2), (len(times), 6, 6)).copy()
+    covariance[~run.measured_ok] = np.nan
+    record = build_record(
+        time=times,
+        reference_pose=reference.poses,
+        reference_rate=reference.rates,
+        measured_pose=run.measured,
+        measured_covariance=covariance,
+        measured_ok=run.measured_ok,
+        command=run.command,
+        scenario_toml=scenario.to_toml(),
+        robot="rss6",
+        seed=seed,
+        frame_rate_hz=scenario.timing.frame_rate_hz,
+    )
+    store_anchor(record, ScaleAnchor("platform_mass", "platform.mass", parameters[0], 0.005))
+    return record, run
+
+
+def quick(**overrides):
+    return load_scenario("quick").with_overrides(overrides)

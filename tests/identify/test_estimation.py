@@ -1,0 +1,184 @@
+"""The estimator against known truth, on records with drawn noise (images are in test_experiment)."""
+
+import numpy as np
+import pytest
+
+from dynamics.closed_loop import equilibrium, simulate
+from identify.errors import EstimationError, RecordError
+from identify.estimation import identify, output_error_problem
+from identify.loop_parameters import NAMES, starting_guess
+from identify.loop_setup import model_settings, plant_settings
+from identify.scale_anchor import read_anchor
+from identify.warm_start import linear_warm_start, regression_columns
+from tests.identify.synthetic import quick, rss6, run_plant, truth
+
+FRICTION_AND_PID = [i for i, name in enumerate(NAMES) if name.startswith("joint")]
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return quick()
+
+
+@pytest.fixture(scope="module")
+def noisy(scenario):
+    record, _ = run_plant(scenario, seed=1)
+    return record, identify(record, rss6(), scenario)
+
+
+def unseen_error(scenario, parameters, seed=7):
+    """RMS (6,) of a model against the noise-free plant on a trajectory it has not seen."""
+    record, run = run_plant(scenario, seed=0, sigma=np.zeros(6), trajectory_seed=seed)
+    problem = output_error_problem(record, rss6(), scenario)
+    return np.sqrt(np.mean((problem.model_poses(parameters) - run.pose) ** 2, axis=0))
+
+
+def test_warm_start_equation_holds_for_the_true_parameters(scenario):
+    """Without dry friction the regression times the truth vanishes against the torques in it."""
+    parameters = truth()
+    parameters[52:58] = 0
+    _, run = run_plant(scenario, 0, np.zeros(6), parameters=parameters)
+    columns = regression_columns(rss6(), run.pose, run.command, scenario.timing, scenario.filter)
+    start = equilibrium(rss6(), parameters, run.pose[0], plant_settings(scenario).servo)
+    unknowns = np.concatenate([parameters, start.joint_integral * parameters[65]])
+    balance = columns @ unknowns
+    assert np.sqrt(np.mean(balance**2)) < 1e-3 * np.sqrt(np.mean((columns[:, 64:67] @ parameters[64:]) ** 2))
+
+
+def test_warm_start_is_ten_times_closer_than_the_starting_guess(scenario):
+    record, run = run_plant(scenario, seed=1)
+    guess = starting_guess(rss6(), "initial", 1.0)
+    warm = linear_warm_start(
+        rss6(), run.measured, run.command, scenario.timing, scenario.filter, guess, read_anchor(record)
+    )
+    before, after = unseen_error(scenario, guess.values), unseen_error(scenario, warm)
+    assert np.all(after < before / 10), (before, after)
+
+
+def test_friction_and_gains_are_within_three_standard_deviations(noisy):
+    _, result = noisy
+    deviation = (result.estimate - truth())[FRICTION_AND_PID] / result.std[FRICTION_AND_PID]
+    assert np.all(np.abs(deviation) < 3), dict(zip(np.array(NAMES)[FRICTION_AND_PID], deviation, strict=True))
+    assert np.all(result.identifiable[FRICTION_AND_PID])
+
+
+def test_unseen_motion_is_predicted_to_micrometres(scenario, noisy):
+    _, result = noisy
+    error = unseen_error(scenario, result.estimate)
+    assert np.all(error[:3] < 3e-6), error
+    assert np.all(error[3:] < 15e-6), error
+
+
+def test_what_leaves_no_trace_is_not_called_identified(noisy):
+    """Crank Ixx, Iyy and link Izz do no work (design of the robot), so no record can tell them."""
+    _, result = noisy
+    for name in ("crank1.Ixx", "crank4.Iyy", "link2.Izz"):
+        index = NAMES.index(name)
+        assert not result.identifiable[index]
+        assert result.estimate[index] == pytest.approx(result.initial[index], rel=1e-6)
+
+
+def test_noise_is_explained(noisy):
+    """Residuals are the sensor's noise, and what the servo made of it: as the repeated experiments predict."""
+    _, result = noisy
+    assert 0.9 < result.noise_ratio < 1.2
+    assert result.noise_ratio == pytest.approx(result.expected_noise_ratio, abs=0.1)
+    assert result.warnings == ()
+
+
+def test_a_misfit_that_noise_does_not_explain_is_said(scenario):
+    """A plant with smoothed friction is not what the model believes: the residuals tell."""
+    other = quick(**{"plant.friction": "smoothed", "plant.smoothing_velocity_rad_s": 0.05, "plant.steps_per_frame": 16})
+    record, _ = run_plant(other, seed=1)
+    result = identify(record, rss6(), scenario.with_overrides({"identification.max_iterations": 4}))
+    assert len(result.warnings) == 1
+    assert "noise alone" in result.warnings[0]
+
+
+def test_the_command_driven_model_explains_the_noise_fully(scenario):
+    """Driven by the logged commands, the model follows what the servo made of the noise: residuals are white."""
+    driven = scenario.with_overrides({"identification.method": "command_driven"})
+    record, _ = run_plant(driven, seed=1)
+    result = identify(record, rss6(), driven)
+    count = 6 * 600
+    assert abs(result.noise_ratio - 1) < 5 * np.sqrt(2 / count)
+    deviation = (result.estimate - truth())[FRICTION_AND_PID] / result.std[FRICTION_AND_PID]
+    assert np.all(np.abs(deviation) < 3.5), deviation
+
+
+def test_without_noise_the_truth_is_an_optimum(scenario):
+    """The gradient of the data's cost vanishes at the truth when plant and model integrate alike."""
+    alike = quick(**{"plant.steps_per_frame": 4})
+    record, _ = run_plant(alike, 0, np.zeros(6))
+    problem = output_error_problem(record, rss6(), alike)
+    residual, _ = problem.residuals(truth())
+    assert np.abs(residual * 1e-9).max() < 1e-12  # residuals are in units of the stated 1e-9 m and rad
+
+
+def test_the_scale_follows_the_anchor(scenario):
+    """Poses leave a common factor free: an anchor 10 % higher gives all friction and gains 10 % higher."""
+    record, _ = run_plant(scenario, seed=1)
+    raised = record.copy(deep=True)
+    raised.attrs["scale_anchor_value"] *= 1.1
+    one, two = identify(record, rss6(), scenario), identify(raised, rss6(), scenario)
+    ratio = two.estimate[FRICTION_AND_PID] / one.estimate[FRICTION_AND_PID]
+    assert np.allclose(ratio, 1.1, rtol=0.03), ratio
+
+
+def test_the_plant_section_of_the_scenario_is_not_read(scenario, noisy):
+    """Truth may not leak: another plant in the scenario changes nothing in the estimate."""
+    record, result = noisy
+    other = scenario.with_overrides({"plant.parameters": "initial", "plant.steps_per_frame": 1})
+    assert np.array_equal(identify(record, rss6(), other).estimate, result.estimate)
+
+
+def test_lost_frames_are_left_out_and_do_not_spoil_the_estimate(scenario):
+    lost = set(range(200, 215)) | {300, 420}
+    record, _ = run_plant(scenario, seed=2, lost=lost)
+    result = identify(record, rss6(), scenario)
+    error = unseen_error(scenario, result.estimate)
+    assert np.all(error[:3] < 5e-6), error
+    assert np.all(error[3:] < 25e-6), error
+
+
+def test_the_search_is_not_caught_by_the_stick_slip_minimum_near_the_warm_start(scenario):
+    """From this record's warm start the closed-loop cost alone stalls at 1.33 times the noise."""
+    record, _ = run_plant(scenario, seed=10, trajectory_seed=2)
+    assert identify(record, rss6(), scenario).noise_ratio < 1.1
+
+
+def test_sensitivities_in_the_residuals_match_finite_differences(scenario):
+    record, _ = run_plant(scenario, seed=1)
+    problem = output_error_problem(record, rss6(), scenario)
+    _, jacobian = problem.residuals(truth())
+    for name in ("platform.Ixx", "joint2.viscous", "joint_pid.ld"):
+        index = NAMES.index(name)
+        step = np.zeros(67)
+        step[index] = 1e-5 * truth()[index]
+        difference = problem.model_poses(truth() + step) - problem.model_poses(truth() - step)
+        expected = problem.whiten(difference) / (2 * step[index])
+        assert np.abs(jacobian[:, :, index] - expected).max() < 2e-3 * np.abs(expected).max(), name
+
+
+def test_records_that_do_not_fit_are_refused(scenario):
+    record, _ = run_plant(scenario, seed=1)
+    with pytest.raises(EstimationError, match=r"other.*rss6"):
+        identify(record.assign_attrs(robot="other"), rss6(), scenario)
+    with pytest.raises(EstimationError, match=r"60 frames a second, the scenario 30"):
+        identify(record, rss6(), quick(**{"timing.frame_rate_hz": 30.0}))
+    without = record.copy()
+    del without.attrs["scale_anchor"]
+    with pytest.raises(RecordError, match=r"no scale anchor.*platform_mass"):
+        identify(without, rss6(), scenario)
+    dark = record.copy(deep=True)
+    dark["measured_ok"][:400] = 0
+    with pytest.raises(EstimationError, match="200 of 600 frames"):
+        identify(dark, rss6(), scenario)
+
+
+def test_simulate_agrees_with_the_model_of_the_problem(scenario):
+    """The estimator's model is the closed loop itself with the ideal sensor, nothing else."""
+    record, _ = run_plant(scenario, seed=1)
+    problem = output_error_problem(record, rss6(), scenario)
+    run = simulate(rss6(), truth(), problem.reference, model_settings(scenario))
+    assert np.array_equal(problem.model_poses(truth()), run.pose)
