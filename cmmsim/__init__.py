@@ -16,6 +16,7 @@ from .estimator import PoseEstimator, measure_frame
 from .images import StereoFrame
 from .measurement import Measurement
 from .pose import pose_to_transform, transform_to_pose
+from .render import require_opengl
 from .scene import rod, rod_transform
 from .sensor import Sensor, load_sensor
 from .sensor_file import built_in_names
@@ -26,5 +27,5 @@ __all__ = [
     "CmmError", "LostError", "Measurement", "OpenGLMissingError", "PinholeCamera", "PoseEstimator", "Sensor",
     "SensorFileError", "ShapeError", "StereoFrame", "StereoRig", "Taught", "TeachingError", "UnknownBodyError",
     "UnknownOptionError", "UnknownSensorError", "built_in_names", "load_sensor", "measure_frame", "pose_to_transform",
-    "rod", "rod_transform", "transform_to_pose",
+    "require_opengl", "rod", "rod_transform", "transform_to_pose",
 ]

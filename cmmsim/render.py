@@ -49,6 +49,11 @@ def render_windows(drawable: Drawable, views: Sequence[View], supersampling: int
     return np.concatenate(windows)
 
 
+def require_opengl() -> None:
+    """Raise OpenGLMissingError, naming the packages to install, where nothing can be rendered."""
+    _shared_atlas()
+
+
 @lru_cache(maxsize=1)
 def _shared_atlas() -> _Atlas:
     """The one renderer of this process; making another would leak memory."""

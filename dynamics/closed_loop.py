@@ -37,6 +37,7 @@ __all__ = [
     "ServoGains",
     "StartState",
     "equilibrium",
+    "prepare",
     "simulate",
 ]
 
@@ -82,6 +83,11 @@ def simulate(
     if compiled:
         raise SimulationError("compiled=True, but no C compiler was found")
     return plain_closed_loop.run(robot, *arguments)
+
+
+def prepare(robot: Robot) -> bool:
+    """Compile the loop of a robot if that has not been done; False where no C compiler is at hand."""
+    return compiled_closed_loop.library(robot.geometry) is not None
 
 
 def equilibrium(robot: Robot, parameters: np.ndarray, pose: np.ndarray, servo: ServoGains) -> StartState:

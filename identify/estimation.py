@@ -159,7 +159,7 @@ def _warm_start(problem: OutputErrorProblem, record: xr.Dataset, scenario: Scena
     return warm_start.linear_warm_start(problem.robot, measured, commands, *arguments)
 
 
-def _without_gaps(measured: Array, ok: Array) -> Array:
+def _without_gaps(measured: Array, ok: NDArray[np.bool_]) -> Array:
     """Measured poses with lost frames interpolated in time; for the linear fit only."""
     frames = np.arange(len(ok))
     return np.column_stack([np.interp(frames, frames[ok], column[ok]) for column in measured.T])

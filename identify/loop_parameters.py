@@ -25,12 +25,17 @@ def starting_guess(robot: Robot, set_name: str, relative_std: float) -> Starting
     Raises:
         ScenarioError: no such set (with the valid names).
     """
-    if set_name not in robot.parameter_sets:
-        valid = ", ".join(sorted(robot.parameter_sets))
-        raise ScenarioError(f"robot {robot.name} has no parameter set {set_name!r}; it has {valid}")
+    check_parameter_set(robot, set_name)
     chosen = robot.parameter_sets[set_name]
     holding_torque = float(np.abs(robot.static_torque(robot.home_pose, chosen.dynamic)).mean())
     return StartingGuess(chosen.vector, relative_std * typical_sizes(chosen.vector, holding_torque))
+
+
+def check_parameter_set(robot: Robot, set_name: str) -> None:
+    """Raise ScenarioError, with the valid names, when the robot file has no such parameter set."""
+    if set_name not in robot.parameter_sets:
+        valid = ", ".join(sorted(robot.parameter_sets))
+        raise ScenarioError(f"robot {robot.name} has no parameter set {set_name!r}; it has {valid}")
 
 
 def typical_sizes(values: Array, holding_torque: float) -> Array:

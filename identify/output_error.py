@@ -1,8 +1,8 @@
 """Output error: measured poses against those of the model under the same excitation (eq. 32, figure 3).
 
 Two ways to drive the model. Closed loop, as in the paper: the model has the servo around it and follows the reference
-with an ideal sensor of the same sampling, delay and hold, that loses the same frames. Command driven: the joints get the logged commands, so the
-model feels what the sensor's noise did to the plant.
+with an ideal sensor of the same sampling, delay and hold, which loses the frames that the real one lost. Command
+driven: the joints get the logged commands, so the model feels what the sensor's noise did to the plant.
 
 The residuals are the pose differences whitened by the sensor's covariance, and one row for each thing known beside the
 poses: the starting guess, with its standard deviations, and the scale anchor.
@@ -11,6 +11,7 @@ poses: the starting guess, with its standard deviations, and the scale anchor.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynamics import DynamicsError, Robot
 from dynamics.closed_loop import ClosedLoopRun, LoopSettings, Reference, simulate
@@ -31,7 +32,7 @@ class OutputErrorProblem:
     settings: LoopSettings
     reference: Reference
     measured: Array
-    ok: Array
+    ok: NDArray[np.bool_]
     covariance: Array
     guess: StartingGuess
     anchor: ScaleAnchor

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import cmmsim
 from dynamics import Robot, load_robot
-from dynamics.closed_loop import Reference
+from dynamics.closed_loop import Reference, prepare
 from identify import estimation, recording
 from identify.arrays import Array
 from identify.atomic import write_text
 from identify.excitation import design_trajectories
 from identify.experiment import run_plant, taught_sensor
+from identify.loop_parameters import check_parameter_set
 from identify.loop_setup import frame_times, reference_motion
 from identify.model_runs import build_model_run, write_model_runs
 from identify.progress import Progress
@@ -20,6 +21,7 @@ from identify.result_file import load_result, rms_figures, save_result
 from identify.run_folder import RunFolder
 from identify.run_result import identification_entry, parameter_vector, sensor_entry, validation_entry
 from identify.scenario import Scenario, load_scenario
+from identify.sensor_in_loop import make_sensor
 from identify.trajectory import FourierTrajectory
 from identify.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
 from identify.truth import read_truth, true_parameters
@@ -28,8 +30,10 @@ from identify.versions import versions
 
 
 def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:
-    """All stages: excite, record, identify, validate, report."""
+    """All stages: excite, record, identify, validate, report. A sensor that cannot work is refused before any file."""
     began = time.perf_counter()
+    make_sensor(scenario, load_robot(scenario.robot), seed)
+    cmmsim.require_opengl()
     excite(scenario, seed, folder, progress)
     excited = time.perf_counter() - began
     taught = record(folder, progress, workers)
@@ -42,6 +46,13 @@ def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers
 def excite(scenario: Scenario, seed: int, folder: Path, progress: Progress) -> None:
     """Choose the trajectories; writes scenario.toml and trajectories.json."""
     robot = load_robot(scenario.robot)
+    for name in (scenario.plant.parameters, scenario.model.start_parameters):
+        check_parameter_set(robot, name)
+    with progress.stage("compile the robot", 2) as advance:
+        _ = robot.functions
+        advance()
+        prepare(robot)
+        advance()
     trajectories = design_trajectories(robot, scenario, seed, progress)
     folder.mkdir(parents=True, exist_ok=True)
     write_text(RunFolder(folder).scenario, scenario.to_toml())
