@@ -21,6 +21,7 @@
 #define MAX_DELAY 64
 #define NO_MARGIN 1e-12 /* rad/s, or share of the breakaway torque */
 
+enum { COULOMB_VISCOUS = 0, SMOOTHED = 1, STRIBECK = 2 };
 enum { OK = 0, LEFT_REACH = 1, TOO_MANY_EVENTS = 2, SENSOR_FAILED = 3, OUT_OF_MEMORY = 4, MEASURED_OUT_OF_REACH = 5 };
 enum { SENSOR_RAISED = 0, MEASURED = 1, LOST = 2 }; /* what the sensor returns */
 
@@ -28,8 +29,8 @@ typedef double vec[N];
 typedef double rows[N][NP];
 
 typedef struct {
-    int frames, steps_per_frame, linear_hold, smoothed, sensitivities;
-    double frame_period, latency, smoothing_velocity;
+    int frames, steps_per_frame, linear_hold, law, sensitivities;
+    double frame_period, latency, smoothing_velocity, static_level, stribeck_velocity;
     double rigid[NRIGID];
     vec coulomb, viscous;
     double lp, li, ld, kp, kd, ki;
@@ -139,11 +140,34 @@ static void solve_stuck(double compliance[N][N], const int *list, int count, dou
     }
 }
 
-static int needs_event(const problem *p, int i) { return !p->smoothed && p->coulomb[i] > 0; }
+static int needs_event(const problem *p, int i) { return p->law != SMOOTHED && p->coulomb[i] > 0; }
+
+/* Dry friction over Coulomb torque of a joint that slips towards `mode`, and its derivative: see friction.py. */
+static double dry_level(const problem *p, double velocity, int mode) {
+    if (p->law == SMOOTHED) return tanh(velocity / p->smoothing_velocity);
+    if (p->law == STRIBECK) {
+        double ratio = velocity / p->stribeck_velocity;
+        return mode * (1 + (p->static_level - 1) * exp(-ratio * ratio));
+    }
+    return mode;
+}
+
+static double dry_slope(const problem *p, double velocity, int mode) {
+    if (p->law == SMOOTHED) {
+        double dry = tanh(velocity / p->smoothing_velocity);
+        return (1 - dry * dry) / p->smoothing_velocity;
+    }
+    if (p->law == STRIBECK) {
+        double ratio = velocity / p->stribeck_velocity;
+        return -2 * mode * (p->static_level - 1) * ratio / p->stribeck_velocity * exp(-ratio * ratio);
+    }
+    return 0;
+}
+
+static double breakaway(const problem *p, int i) { return p->static_level * p->coulomb[i]; }
 
 static double slip_friction(const problem *p, const evaluation *e, int i, int mode) {
-    double dry = p->smoothed ? tanh(e->velocity[i] / p->smoothing_velocity) : mode;
-    return p->coulomb[i] * dry + p->viscous[i] * e->velocity[i];
+    return p->coulomb[i] * dry_level(p, e->velocity[i], mode) + p->viscous[i] * e->velocity[i];
 }
 
 /* Everything at one state that does not depend on the stick modes. */
@@ -233,7 +257,7 @@ static void decide_modes(context *c, evaluation *e, const int *list, int count) 
             int i = list[s];
             double acceleration = dot_row(e->jacobian, i, right) + e->bias_acceleration[i];
             for (int r = 0; r < count; r++) acceleration -= e->compliance[i][list[r]] * force[list[r]];
-            double wanted = force[i] + acceleration / e->compliance[i][i], limit = c->p->coulomb[i];
+            double wanted = force[i] + acceleration / e->compliance[i][i], limit = breakaway(c->p, i);
             wanted = wanted > limit ? limit : wanted < -limit ? -limit : wanted;
             change = fmax(change, fabs(wanted - force[i]));
             force[i] = wanted;
@@ -242,7 +266,7 @@ static void decide_modes(context *c, evaluation *e, const int *list, int count) 
     }
     for (int s = 0; s < count; s++) {
         int i = list[s];
-        double limit = c->p->coulomb[i];
+        double limit = breakaway(c->p, i);
         c->mode[i] = fabs(force[i]) < limit ? 0 : force[i] >= 0 ? 1 : -1;
     }
 }
@@ -303,10 +327,7 @@ static void torque_tangent(const context *c, int stage, rows angle, rows velocit
         double error = c->u.value[i] + c->u.slope[i] * t - e->angle[i];
         double damping = p->ld;
         if (c->mode[i]) damping += p->viscous[i];
-        if (p->smoothed) {
-            double dry = tanh(e->velocity[i] / p->smoothing_velocity);
-            damping += p->coulomb[i] * (1 - dry * dry) / p->smoothing_velocity;
-        }
+        if (c->mode[i]) damping += p->coulomb[i] * dry_slope(p, e->velocity[i], c->mode[i]);
         for (int k = 0; k < NP; k++)
             out[i][k] = p->lp * (c->du_value[i][k] + t * c->du_slope[i][k] - angle[i][k]) + p->ld * c->du_rate[i][k]
                       - damping * velocity[i][k] + p->li * x->z[i][k];
@@ -314,7 +335,7 @@ static void torque_tangent(const context *c, int stage, rows angle, rows velocit
         out[i][LI] += integral[i];
         out[i][LD] += c->u.rate[i] - e->velocity[i];
         if (c->mode[i]) {
-            out[i][COULOMB + i] -= p->smoothed ? tanh(e->velocity[i] / p->smoothing_velocity) : c->mode[i];
+            out[i][COULOMB + i] -= dry_level(p, e->velocity[i], c->mode[i]);
             out[i][VISCOUS + i] -= e->velocity[i];
         }
     }
@@ -394,7 +415,7 @@ static double mode_margin(const context *c, const evaluation *e, int *joint) {
     for (int i = 0; i < N; i++) {
         if (!needs_event(c->p, i)) continue;
         double margin = c->mode[i] ? c->mode[i] * e->velocity[i]
-                                   : (c->p->coulomb[i] - fabs(e->stick_force[i])) / c->p->coulomb[i];
+                                   : 1 - fabs(e->stick_force[i]) / breakaway(c->p, i);
         if (margin < least) { least = margin; *joint = i; }
     }
     return least;

@@ -30,6 +30,8 @@ FAILURES = {
     5: MEASURED_OUT_OF_REACH,
 }
 SENSOR_FAILED = 3
+LAWS = ("coulomb_viscous", "smoothed", "stribeck")
+_TIMES_AND_FRICTION = ("frame_period", "latency", "smoothing_velocity", "static_level", "stribeck_velocity")
 # What the sensor callback returns. An error that escapes it makes ctypes return 0.
 SENSOR_RAISED, MEASURED, LOST = 0, 1, 2
 
@@ -39,8 +41,8 @@ _DoublePointer = POINTER(c_double)
 
 class _Problem(Structure):
     _fields_ = [
-        *[(name, c_int) for name in ("frames", "steps_per_frame", "linear_hold", "smoothed", "sensitivities")],
-        *[(name, c_double) for name in ("frame_period", "latency", "smoothing_velocity")],
+        *[(name, c_int) for name in ("frames", "steps_per_frame", "linear_hold", "law", "sensitivities")],
+        *[(name, c_double) for name in _TIMES_AND_FRICTION],
         ("rigid", c_double * 52),
         ("coulomb", c_double * 6),
         ("viscous", c_double * 6),
@@ -133,11 +135,13 @@ def _problem(
         frames=len(reference.poses),
         steps_per_frame=settings.steps_per_frame,
         linear_hold=timing.hold == "linear",
-        smoothed=friction.smoothed,
+        law=LAWS.index(friction.name),
         sensitivities=sensitivities,
         frame_period=1.0 / timing.frame_rate_hz,
         latency=timing.latency_s,
         smoothing_velocity=friction.smoothing_velocity or 0.0,
+        static_level=friction.static_level,
+        stribeck_velocity=friction.stribeck_velocity or 0.0,
         lp=parameters[64],
         li=parameters[65],
         ld=parameters[66],

@@ -1,13 +1,14 @@
 """What goes into a closed-loop run and what comes out: settings, reference, start state, result."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dynamics.errors import SimulationError
+from dynamics.friction import FrictionLaw
 from dynamics.parameters import PARAMETER_NAMES
 
 PARAMETER_COUNT = len(PARAMETER_NAMES) + 3
@@ -57,32 +58,12 @@ class FrameTiming:
 
 
 @dataclass(frozen=True)
-class FrictionLaw:
-    """Joint friction: "coulomb_viscous" sticks and slips exactly as in eq. 24; "smoothed" replaces the sign by
-    tanh(theta_dot / smoothing_velocity), in rad/s."""
-
-    name: Literal["coulomb_viscous", "smoothed"] = "coulomb_viscous"
-    smoothing_velocity: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.name not in ("coulomb_viscous", "smoothed"):
-            raise SimulationError(f"unknown friction law `{self.name}`; valid: coulomb_viscous, smoothed")
-        if self.name == "smoothed" and not (self.smoothing_velocity or 0) > 0:
-            raise SimulationError(f"smoothing_velocity is {self.smoothing_velocity} rad/s, must be > 0 if smoothed")
-
-    @property
-    def smoothed(self) -> bool:
-        """Whether the sign function is replaced."""
-        return self.name == "smoothed"
-
-
-@dataclass(frozen=True)
 class LoopSettings:
     """What the loop is made of besides the robot: servo, timing, friction law, Runge-Kutta steps per frame."""
 
     servo: ServoGains
     timing: FrameTiming
-    friction: FrictionLaw = FrictionLaw()
+    friction: FrictionLaw = field(default_factory=FrictionLaw)
     steps_per_frame: int = 4
 
     def __post_init__(self) -> None:

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from dynamics.loop_types import PARAMETER_COUNT, FrictionLaw
+from dynamics.friction import FrictionLaw
+from dynamics.loop_types import PARAMETER_COUNT
 from dynamics.parameters import COULOMB, RIGID_BODY, VISCOUS
 
 LP, LI, LD = 64, 65, 66
@@ -82,7 +83,8 @@ class StickSlipMotion:
         self._coulomb, self._viscous = parameters[COULOMB], parameters[VISCOUS]
         self._lp, self._li, self._ld = parameters[64:]
         self._friction = friction
-        self._has_events = np.logical_and(self._coulomb > 0, not friction.smoothed)
+        self._breakaway = friction.static_level * self._coulomb
+        self._has_events = np.logical_and(self._coulomb > 0, friction.sticks)
         self.mode = np.zeros(6, dtype=int)
         self.events = 0
         self.tangent = State(*np.zeros((3, 6, PARAMETER_COUNT))) if sensitivities else None
@@ -151,8 +153,7 @@ class StickSlipMotion:
         return at
 
     def _slip_friction(self, at: Evaluation) -> np.ndarray:
-        dry = np.tanh(at.velocity / self._friction.smoothing_velocity) if self._friction.smoothed else self.mode
-        return self._coulomb * dry + self._viscous * at.velocity
+        return self._coulomb * self._friction.dry_level(at.velocity, self.mode) + self._viscous * at.velocity
 
     @staticmethod
     def _compliance(at: Evaluation, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -173,7 +174,7 @@ class StickSlipMotion:
         free = np.linalg.solve(at.mass, at.jacobian.T @ (at.torque - slip) - at.bias)
         compliance, _ = self._compliance(at, joints)
         push = at.jacobian[joints] @ free + at.bias_acceleration[joints]
-        limit, force = self._coulomb[joints], np.zeros(len(joints))
+        limit, force = self._breakaway[joints], np.zeros(len(joints))
         for _ in range(1000):
             before = force.copy()
             for k in range(len(joints)):
@@ -186,7 +187,7 @@ class StickSlipMotion:
     def _margin(self, at: Evaluation) -> tuple[float, int]:
         """How far the modes are from being broken (>= 0 while they hold), and the joint that is closest."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            reserve = (self._coulomb - np.abs(at.stick_force)) / self._coulomb
+            reserve = (self._breakaway - np.abs(at.stick_force)) / self._breakaway
         margins = np.where(self.mode != 0, self.mode * at.velocity, reserve)
         margins = np.where(self._has_events, np.minimum(margins, 1.0), 1.0)
         joint = int(np.argmin(margins))
@@ -320,10 +321,8 @@ class StickSlipMotion:
         """Derivative (6, 67) of the net joint torque, for stuck joints without the force that holds them."""
         slipping = self.mode != 0
         damping = self._ld + np.where(slipping, self._viscous, 0.0)
-        dry = self.mode.astype(float)
-        if self._friction.smoothed:
-            dry = np.tanh(at.velocity / self._friction.smoothing_velocity)
-            damping = damping + self._coulomb * (1 - dry**2) / self._friction.smoothing_velocity
+        dry = self._friction.dry_level(at.velocity, self.mode)
+        damping = damping + np.where(slipping, self._coulomb * self._friction.dry_slope(at.velocity, self.mode), 0.0)
         d_error = command.d_value + at.time * command.d_slope - d_angle
         result = self._lp * d_error + self._ld * command.d_rate - damping[:, None] * d_velocity + self._li * x.integral
         joints = np.arange(6)

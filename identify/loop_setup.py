@@ -33,6 +33,8 @@ def _settings(scenario: Scenario, side: Plant | Model) -> LoopSettings:
     return LoopSettings(
         servo=ServoGains(servo.kp, servo.kd, servo.ki),
         timing=FrameTiming(timing.frame_rate_hz, timing.latency_s, timing.hold),
-        friction=FrictionLaw(side.friction, side.smoothing_velocity_rad_s),
+        friction=FrictionLaw(
+            side.friction, side.smoothing_velocity_rad_s, side.static_ratio, side.stribeck_velocity_rad_s
+        ),
         steps_per_frame=side.steps_per_frame,
     )

@@ -15,8 +15,16 @@ from identify.scenario_text import one_line, to_toml
 
 BUILT_IN = Path(__file__).parent / "scenarios"
 
-FrictionLaw = Literal["coulomb_viscous", "smoothed"]
-"""``coulomb_viscous``: the exact law with stick and slip (eq. 24); ``smoothed``: tanh(theta_dot / v_s)."""
+FrictionName = Literal["coulomb_viscous", "smoothed", "stribeck"]
+"""``coulomb_viscous``: the exact law with stick and slip (eq. 24); ``smoothed``: tanh(theta_dot / v_s);
+``stribeck``: exact, with a breakaway torque above the Coulomb torque."""
+
+FRICTION_CONSTANTS = {
+    "coulomb_viscous": (),
+    "smoothed": ("smoothing_velocity_rad_s",),
+    "stribeck": ("static_ratio", "stribeck_velocity_rad_s"),
+}
+"""The constants each law needs; it takes no others."""
 
 
 def _quantity(default: Any, unit: str, what: str, **limits: Any) -> Any:
@@ -53,16 +61,20 @@ class Servo(_Section):
 
 
 class _Friction(_Section):
-    friction: FrictionLaw = Field("coulomb_viscous", description="friction law of the joints")
-    smoothing_velocity_rad_s: float | None = _quantity(None, "rad/s", "v_s of the smoothed law", gt=0)
+    friction: FrictionName = Field("coulomb_viscous", description="friction law of the joints")
+    smoothing_velocity_rad_s: float | None = _quantity(None, "rad/s", "v_s of the law smoothed", gt=0)
+    static_ratio: float | None = _quantity(None, "1", "breakaway over Coulomb torque of the law stribeck", ge=1)
+    stribeck_velocity_rad_s: float | None = _quantity(None, "rad/s", "velocity at which the excess fades", gt=0)
 
     @model_validator(mode="after")
-    def _smoothing_only_where_smoothed(self) -> "_Friction":
-        if (self.friction == "smoothed") != (self.smoothing_velocity_rad_s is not None):
-            raise ValueError(
-                f"friction = {self.friction!r} with smoothing_velocity_rad_s = {self.smoothing_velocity_rad_s}: "
-                "the smoothed law needs a smoothing velocity [rad/s] and the other law has none"
-            )
+    def _constants_fit_the_law(self) -> "_Friction":
+        for law, constants in FRICTION_CONSTANTS.items():
+            for name in constants:
+                if (law == self.friction) != (getattr(self, name) is not None):
+                    raise ValueError(
+                        f"friction = {self.friction!r} with {name} = {getattr(self, name)}: the law {law} needs "
+                        f"{' and '.join(constants)}, and no other law has them"
+                    )
         return self
 
 

@@ -151,12 +151,13 @@ def make_settings() -> Callable[..., closed_loop.LoopSettings]:
         hold: str = "zero",
         smoothing_velocity: float | None = None,
         steps: int = 4,
+        friction: closed_loop.FrictionLaw | None = None,
     ) -> closed_loop.LoopSettings:
         name = "smoothed" if smoothing_velocity else "coulomb_viscous"
         return closed_loop.LoopSettings(
             closed_loop.ServoGains(kp=0.3, kd=0.001, ki=2.4),
             closed_loop.FrameTiming(rate_hz, latency_s, hold),
-            closed_loop.FrictionLaw(name, smoothing_velocity),
+            friction or closed_loop.FrictionLaw(name, smoothing_velocity),
             steps,
         )
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dynamics import closed_loop
+from dynamics.friction import FrictionLaw
 
 
 def _difference(run, parameters, index, step):
@@ -22,6 +23,11 @@ CASES = {
     "exact friction": ({"steps": 16}, range(67), 1e-6),
     "four steps a frame": ({"steps": 4}, range(0, 67, 3), 1e-3),
     "linear hold, 1.3 frames of delay": ({"steps": 16, "hold": "linear", "latency_s": 1.3 / 60}, range(1, 67, 3), 1e-6),
+    "Stribeck friction": (
+        {"steps": 16, "friction": FrictionLaw("stribeck", static_ratio=1.3, stribeck_velocity=0.1)},
+        range(1, 67, 3),
+        1e-5,
+    ),
     "smoothed friction": ({"steps": 16, "smoothing_velocity": 0.02}, range(2, 67, 3), 2e-3),
     "smoothed friction, fine": ({"steps": 64, "smoothing_velocity": 0.05}, range(2, 67, 6), 1e-6),
 }
