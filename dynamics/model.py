@@ -2,6 +2,7 @@
 
 import casadi as ca
 
+from dynamics.expressions import function
 from dynamics.geometry import Rss6Geometry
 from dynamics.jacobians import joint_jacobian, pose_jacobian
 from dynamics.kinematics import leg_vectors, reach_margin
@@ -42,12 +43,12 @@ def kinematic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
     to_twist = pose_rate_to_twist(pose)
     angles = ca.vertcat(*[leg.angle for leg in legs])
     return [
-        ca.Function("inverse_kinematics", [pose], [angles, reach_margin(geometry, pose)]),
-        ca.Function("joint_jacobian", [pose], [joint_jacobian(geometry, pose)]),
-        ca.Function("pose_jacobian", [pose], [pose_jacobian(geometry, pose)]),
-        ca.Function("twist", [pose, rate], [to_twist @ rate]),
-        ca.Function("twist_dot", [pose, rate, acceleration], [to_twist @ acceleration + twist_bias(pose, rate)]),
-        ca.Function("pose_rate", [pose, twist], [ca.solve(to_twist, twist)]),
+        function("inverse_kinematics", [pose], [angles, reach_margin(geometry, pose)]),
+        function("joint_jacobian", [pose], [joint_jacobian(geometry, pose)]),
+        function("pose_jacobian", [pose], [pose_jacobian(geometry, pose)]),
+        function("twist", [pose, rate], [to_twist @ rate]),
+        function("twist_dot", [pose, rate, acceleration], [to_twist @ acceleration + twist_bias(pose, rate)]),
+        function("pose_rate", [pose, twist], [ca.solve(to_twist, twist)]),
     ]
 
 
@@ -64,13 +65,13 @@ def dynamic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
     mass = mass_matrix(geometry, pose, rigid)
     regressor = ca.horzcat(rigid_body_regressor(geometry, pose, twist, twist_dot), friction_columns)
     return [
-        ca.Function("mass_matrix", [pose, xi], [ca.densify(mass)]),
-        ca.Function("coriolis_matrix", [pose, twist, xi], [ca.densify(coriolis_matrix(geometry, pose, twist, rigid))]),
-        ca.Function("gravity_wrench", [pose, xi], [ca.densify(gravity_wrench(geometry, pose, rigid))]),
-        ca.Function("friction_wrench", [pose, twist, xi], [friction]),
-        ca.Function("regressor", [pose, twist, twist_dot], [ca.densify(regressor)]),
-        ca.Function("inverse_dynamics", [pose, twist, twist_dot, xi], [ca.solve(jacobian.T, wrench)]),
-        ca.Function("forward_dynamics", [pose, twist, torque, xi], [_ldl_solve(mass, jacobian.T @ torque - bias)]),
+        function("mass_matrix", [pose, xi], [mass]),
+        function("coriolis_matrix", [pose, twist, xi], [coriolis_matrix(geometry, pose, twist, rigid)]),
+        function("gravity_wrench", [pose, xi], [gravity_wrench(geometry, pose, rigid)]),
+        function("friction_wrench", [pose, twist, xi], [friction]),
+        function("regressor", [pose, twist, twist_dot], [regressor]),
+        function("inverse_dynamics", [pose, twist, twist_dot, xi], [ca.solve(jacobian.T, wrench)]),
+        function("forward_dynamics", [pose, twist, torque, xi], [_ldl_solve(mass, jacobian.T @ torque - bias)]),
     ]
 
 

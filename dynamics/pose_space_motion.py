@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from dynamics.expressions import function
 from dynamics.geometry import LEGS, Rss6Geometry
 from dynamics.kinematics import leg_to
 from dynamics.leg_dynamics import leg_columns, leg_mass, leg_motion, torque_to_force
@@ -40,7 +41,7 @@ def equation_of_motion(geometry: Rss6Geometry) -> ca.Function:
         crank_accelerations.append(motion.crank_acceleration)
         angles.append(vectors.angle)
     outputs = [mass, bias, ca.vertcat(*rows), ca.vertcat(*crank_accelerations), ca.vertcat(*angles)]
-    return _dense("equation_of_motion", [pose, rate, rigid], outputs)
+    return function("equation_of_motion", [pose, rate, rigid], outputs)
 
 
 def motion_derivatives(geometry: Rss6Geometry) -> ca.Function:
@@ -68,7 +69,7 @@ def motion_derivatives(geometry: Rss6Geometry) -> ca.Function:
         links.append(gradient.T @ local.columns[:, 4:8])
     columns = ca.horzcat(platform, *cranks, *links)
     outputs = [by_pose, by_rate, columns, ca.vertcat(*crank_by_pose), ca.vertcat(*crank_by_rate)]
-    return _dense("motion_derivatives", [pose, rate, acceleration, torque, rigid], outputs)
+    return function("motion_derivatives", [pose, rate, acceleration, torque, rigid], outputs)
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ def rate_map_derivative(geometry: Rss6Geometry) -> ca.Function:
         at_joint = ca.substitute(gradient, position, joints.position[leg])
         along = joints.velocity[leg].T @ curvature @ joints.gradient[leg]
         rows.append(at_joint.T @ joints.gradient_rate[leg] + along)
-    return _dense("rate_map_derivative", [pose, rate], [ca.vertcat(*rows)])
+    return function("rate_map_derivative", [pose, rate], [ca.vertcat(*rows)])
 
 
 def _platform_columns(geometry: Rss6Geometry, pose: ca.SX, rate: ca.SX, acceleration: ca.SX) -> ca.SX:
@@ -147,7 +148,3 @@ def _platform_mass(pose: ca.SX, platform: ca.SX) -> ca.SX:
     to_twist = pose_rate_to_twist(pose)
     at_origin = ca.diagcat(platform[0] * ca.SX.eye(3), frame @ ca.diag(platform[1:4]) @ frame.T)
     return to_twist.T @ at_origin @ to_twist
-
-
-def _dense(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
-    return ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs]))
