@@ -1,8 +1,10 @@
-"""The paper's Jacobians (eq. 7-16 and 29), in CasADi. All map the twist [h_dot, omega] (6,), base axes.
+"""The paper's Jacobians (eq. 7-16 and 29), in CasADi. All but J_theta map the twist [h_dot, omega] (6,), base axes.
 
 J_a1, J_a2, J_ad: crank angle rates; J_a = [J_au; s J_ad]: crank centre of mass velocity and angular velocity;
 J_b = [J_bu; J_bd]: link centre of mass velocity and angular velocity; J_theta: crank angle rates from pose rates.
-Centres of mass lie at mid-length.
+J_e (eq. 2) is `rotation.euler_rate_jacobian`. Centres of mass lie at mid-length: c_w = w / 2, c_l = l / 2. The vector
+a from the platform origin to joint A is in base axes throughout (eq. 3 and 5 need R a, though the text defines a in
+platform axes).
 """
 
 import casadi as ca
@@ -27,6 +29,13 @@ def joint_row(leg: LegVectors, arm: ca.SX) -> ca.SX:
     return link_row(leg, arm) / crank_leverage(leg)
 
 
+def loop_jacobians(geometry: Rss6Geometry, pose: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Diagonal of J_a1 (6,), m^2, and J_a2 (6, 6), m and m^2: diag(J_a1) theta_dot = J_a2 twist (eq. 7)."""
+    legs, arms = leg_vectors(geometry, pose), platform_arms(geometry, pose)
+    rows = [link_row(leg, arm) for leg, arm in zip(legs, arms, strict=True)]
+    return ca.vertcat(*[crank_leverage(leg) for leg in legs]), ca.vertcat(*rows)
+
+
 def joint_jacobian(geometry: Rss6Geometry, pose: ca.SX) -> ca.SX:
     """J_ad (6, 6): theta_dot = J_ad twist (eq. 8)."""
     legs, arms = leg_vectors(geometry, pose), platform_arms(geometry, pose)
@@ -38,15 +47,28 @@ def pose_jacobian(geometry: Rss6Geometry, pose: ca.SX) -> ca.SX:
     return joint_jacobian(geometry, pose) @ pose_rate_to_twist(pose)
 
 
+def crank_centre_rows(leg: LegVectors, arm: ca.SX) -> ca.SX:
+    """J_au (3, 6): velocity of the crank's centre of mass (eq. 9)."""
+    return ca.cross(leg.axis, leg.crank / 2) @ joint_row(leg, arm)
+
+
 def crank_jacobian(leg: LegVectors, arm: ca.SX) -> ca.SX:
-    """J_a (6, 6): twist of the crank's centre of mass (eq. 9 and 10)."""
-    row = joint_row(leg, arm)
-    return ca.vertcat(ca.cross(leg.axis, leg.crank / 2) @ row, leg.axis @ row)
+    """J_a (6, 6): twist of the crank's centre of mass (eq. 10)."""
+    return ca.vertcat(crank_centre_rows(leg, arm), leg.axis @ joint_row(leg, arm))
+
+
+def link_angular_rows(leg: LegVectors, arm: ca.SX) -> ca.SX:
+    """J_bd (3, 6): angular velocity of the link, which does not spin about its own axis (eq. 13)."""
+    link, tip_row = ca.skew(leg.link), ca.skew(leg.crank) @ leg.axis @ joint_row(leg, arm)
+    return (ca.horzcat(link, -link @ ca.skew(arm)) + link @ tip_row) / ca.dot(leg.link, leg.link)
+
+
+def link_centre_rows(leg: LegVectors, arm: ca.SX) -> ca.SX:
+    """J_bu (3, 6): velocity of the link's centre of mass (eq. 15)."""
+    tip_row = ca.skew(leg.crank) @ leg.axis @ joint_row(leg, arm)
+    return -tip_row - ca.skew(leg.link / 2) @ link_angular_rows(leg, arm)
 
 
 def link_jacobian(leg: LegVectors, arm: ca.SX) -> ca.SX:
-    """J_b (6, 6): twist of the link's centre of mass (eq. 13, 15 and 16)."""
-    link, tip_row = ca.skew(leg.link), ca.skew(leg.crank) @ leg.axis @ joint_row(leg, arm)
-    angular = (ca.horzcat(link, -link @ ca.skew(arm)) + link @ tip_row) / ca.dot(leg.link, leg.link)
-    linear = -tip_row - ca.skew(leg.link / 2) @ angular
-    return ca.vertcat(linear, angular)
+    """J_b (6, 6): twist of the link's centre of mass (eq. 16)."""
+    return ca.vertcat(link_centre_rows(leg, arm), link_angular_rows(leg, arm))

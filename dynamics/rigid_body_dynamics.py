@@ -1,16 +1,17 @@
 """Virtual-work dynamics of the 6-RSS robot (eq. 17-26), in CasADi. Wrenches act at the platform origin, base axes.
 
-Signs: the paper's eq. 20 carries M, C, G of the fictitious forces (negative masses); here M is positive definite and
-tau_g = M twist_dot + C twist + G + tau_f as in eq. 17.
+Signs: the paper's eq. 20 carries M, C, G of the fictitious forces (negative masses, G = +m g) into eq. 23; here M is
+positive definite, G the wrench that holds the robot up, and tau_g = M twist_dot + C twist + G + tau_f as in eq. 17.
 """
 
 import casadi as ca
 
 from dynamics.geometry import LEGS, Rss6Geometry
+from dynamics.jacobian_rates import crank_jacobian_rate, link_jacobian_rate, moving_leg
 from dynamics.jacobians import crank_jacobian, link_jacobian
 from dynamics.kinematics import LegVectors, leg_vectors, platform_arms
 from dynamics.leg_dynamics import leg_columns, leg_mass, leg_motion, link_axes
-from dynamics.rotation import pose_rate_to_twist, rotation_matrix
+from dynamics.rotation import rotation_matrix
 
 
 def rigid_body_regressor(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> ca.SX:
@@ -59,18 +60,27 @@ def mass_matrix(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
     return total
 
 
+def virtual_work_mass_matrix(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
+    """M (6, 6) as eq. 23 prints it, the sum of J^T M_body J over the bodies; thrice the operations of `mass_matrix`."""
+    total = _body_mass(rotation_matrix(pose[3:6]), rigid[0:4])
+    for index, (leg, arm) in enumerate(zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True)):
+        crank, link = crank_jacobian(leg, arm), link_jacobian(leg, arm)
+        total += crank.T @ _body_mass(_crank_frame(leg), crank_parameters(rigid, index)) @ crank
+        total += link.T @ _body_mass(_link_frame(leg), link_parameters(rigid, index)) @ link
+    return total
+
+
 def coriolis_matrix(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, rigid: ca.SX) -> ca.SX:
-    """C (6, 6) of eq. 23: C twist is the Coriolis and centrifugal wrench. Jacobian rates by automatic derivatives."""
-    pose_rate = ca.solve(pose_rate_to_twist(pose), twist)
+    """C (6, 6) of eq. 23: C twist is the Coriolis and centrifugal wrench. Jacobian rates in closed form (eq. A1-A6)."""
     total = _body_coriolis(rotation_matrix(pose[3:6]), rigid[0:4], twist[3:6])
     for index, (leg, arm) in enumerate(zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True)):
-        for jacobian, frame, parameters in (
-            (crank_jacobian(leg, arm), _crank_frame(leg), crank_parameters(rigid, index)),
-            (link_jacobian(leg, arm), _link_frame(leg), link_parameters(rigid, index)),
+        moving = moving_leg(leg, arm, twist)
+        for jacobian, rate, frame, parameters in (
+            (crank_jacobian(leg, arm), crank_jacobian_rate(moving), _crank_frame(leg), crank_parameters(rigid, index)),
+            (link_jacobian(leg, arm), link_jacobian_rate(moving), _link_frame(leg), link_parameters(rigid, index)),
         ):
-            rate = ca.jtimes(jacobian, pose, pose_rate)
-            total += jacobian.T @ _body_coriolis(frame, parameters, jacobian[3:6, :] @ twist) @ jacobian
-            total += jacobian.T @ _body_mass(frame, parameters) @ rate
+            coriolis = _body_coriolis(frame, parameters, jacobian[3:6, :] @ twist)
+            total += jacobian.T @ (coriolis @ jacobian + _body_mass(frame, parameters) @ rate)
     return total
 
 
