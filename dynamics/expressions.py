@@ -1,6 +1,7 @@
-"""From CasADi expressions to functions."""
+"""From CasADi expressions to functions, and from functions to arrays."""
 
 import casadi as ca
+import numpy as np
 
 
 def function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
@@ -9,3 +10,11 @@ def function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Functio
     Legs share rotations and lever arms: forward dynamics halves in size and time.
     """
     return ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs]))
+
+
+def evaluate(function: ca.Function, *batches: np.ndarray) -> list[np.ndarray]:
+    """All outputs (N, rows, columns) of a function over batches (N, columns) of its arguments, N >= 1; NaN included."""
+    values = function(*[batch.T for batch in batches])
+    outputs = values if isinstance(values, tuple) else (values,)
+    count = len(batches[0])
+    return [np.asarray(v, dtype=float).reshape(v.shape[0], count, -1).transpose(1, 0, 2) for v in outputs]

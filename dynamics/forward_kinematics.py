@@ -1,78 +1,102 @@
-"""Forward kinematics by Newton's method on the closed-form inverse kinematics."""
+"""Forward kinematics: Newton's method on the closure of the six loops, for all rows of a batch at once.
+
+The gaps of the loops are smooth in the pose whether or not a leg can reach it, so no step can leave their domain. A
+pose found this way may have a crank on the far side of its dead point; the closed-form inverse kinematics has the last
+word.
+"""
 
 from typing import Protocol
 
+import casadi as ca
 import numpy as np
 
-from dynamics.errors import ConvergenceError, UnreachablePoseError
+from dynamics.errors import ConvergenceError, ShapeError
+from dynamics.expressions import evaluate
 
-# Newton stops at the first; where rounding keeps it from getting there, the second still counts as solved.
-ANGLE_TOLERANCE = 1e-14
-ROUNDING_TOLERANCE = 1e-12
+# Steps smaller than the first end the iteration; the second is what counts as solved, in rad.
+STEP_TOLERANCE = 1e-12
+ANGLE_TOLERANCE = 1e-12
 MAX_ITERATIONS = 50
+HALVINGS = 20
 
 
-class InverseKinematics(Protocol):
+class LoopClosure(Protocol):
     """What Newton's method needs of a robot."""
 
-    def inverse_kinematics(self, pose: np.ndarray) -> np.ndarray:
-        """Crank angles (6,) at a pose (6,); raises UnreachablePoseError."""
-        ...
-
-    def pose_jacobian(self, pose: np.ndarray) -> np.ndarray:
-        """d(crank angles)/d(pose) (6, 6)."""
+    @property
+    def functions(self) -> dict[str, ca.Function]:
+        """CasADi functions `loop_closure` and `inverse_kinematics`."""
         ...
 
 
-def solve(robot: InverseKinematics, theta: np.ndarray, start: np.ndarray) -> np.ndarray:
+def solve(robot: LoopClosure, theta: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Pose (6,) or (N, 6) whose crank angles are theta, searched from start (6,) or (N, 6).
 
-    Raises ConvergenceError with the residual left after the last iteration.
+    Raises ConvergenceError with row, leg and residual where no pose near the start has these angles.
     """
-    if theta.ndim == 1:
-        return _newton(robot, theta, start)
-    starts = np.broadcast_to(start, (len(theta), 6))
-    return np.array([_newton(robot, row, first) for row, first in zip(theta, starts, strict=True)])
+    angles = np.atleast_2d(theta)
+    if (start.ndim == 2 and start.shape[0] not in (1, len(angles))) or start.ndim > theta.ndim:
+        raise ShapeError(f"initial_pose has shape {start.shape}, must be (6,) or that of theta {theta.shape}")
+    poses = np.array(np.broadcast_to(start, angles.shape))
+    if len(poses):
+        poses = _newton(robot, angles, poses)
+        _check_angles(robot, angles, poses)
+    return poses.reshape(theta.shape)
 
 
-def _newton(robot: InverseKinematics, theta: np.ndarray, start: np.ndarray) -> np.ndarray:
-    pose = np.array(start, dtype=float)
-    residual = theta - robot.inverse_kinematics(pose)
+def _newton(robot: LoopClosure, theta: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Newton's iteration with step halving; rows leave it when their step or what it gains is nil."""
+    active = np.arange(len(theta))
+    gaps, jacobians = evaluate(robot.functions["loop_closure"], poses, theta)
     for _ in range(MAX_ITERATIONS):
-        if np.abs(residual).max() < ANGLE_TOLERANCE:
-            return pose
-        better = _damped(robot, theta, pose, _newton_step(robot, pose, residual), residual)
-        if better is None:
+        steps = -_solve_each(jacobians, gaps)[..., 0]
+        trials, gaps, jacobians, better = _damped(robot, theta[active], poses[active], steps, gaps)
+        poses[active] = trials
+        going = better & (np.abs(steps).max(axis=1) > STEP_TOLERANCE)
+        active, gaps, jacobians = active[going], gaps[going], jacobians[going]
+        if not len(active):
             break
-        pose, residual = better
-    if np.abs(residual).max() < ROUNDING_TOLERANCE:
-        return pose
-    raise ConvergenceError(
-        f"forward kinematics stopped at a residual of {np.abs(residual).max():.3g} rad, limit {ROUNDING_TOLERANCE:.0e} "
-        f"rad, for crank angles {np.array2string(theta, precision=4)}"
-    )
-
-
-def _newton_step(robot: InverseKinematics, pose: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    try:
-        return np.linalg.solve(robot.pose_jacobian(pose), residual)
-    except np.linalg.LinAlgError:
-        raise ConvergenceError(
-            f"forward kinematics met a singular pose {np.array2string(pose, precision=4)} with a residual of "
-            f"{np.abs(residual).max():.3g} rad, limit {ROUNDING_TOLERANCE:.0e} rad"
-        ) from None
+    return poses
 
 
 def _damped(
-    robot: InverseKinematics, theta: np.ndarray, pose: np.ndarray, step: np.ndarray, residual: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """The first of the full step and its halves that stays in reach and lowers the residual; None if none does."""
-    for halving in range(30):
-        trial = pose + step / 2**halving
-        try:
-            error = theta - robot.inverse_kinematics(trial)
-        except UnreachablePoseError:
-            continue
-        if np.linalg.norm(error) < np.linalg.norm(residual):
-            return trial, error
-    return None
+    robot: LoopClosure, theta: np.ndarray, poses: np.ndarray, steps: np.ndarray, gaps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Poses, gaps and Jacobians after the first of the full step and its halves that narrows the gaps, and for which
+    rows one does; a last full step that rounding keeps from gaining is taken."""
+    before = np.linalg.norm(gaps[..., 0], axis=1)
+    scale = np.ones(len(poses))
+    small = np.abs(steps).max(axis=1) <= STEP_TOLERANCE
+    for _ in range(HALVINGS):
+        trials = poses + scale[:, None] * steps
+        new_gaps, jacobians = evaluate(robot.functions["loop_closure"], trials, theta)
+        better = (np.linalg.norm(new_gaps[..., 0], axis=1) < before) | small
+        if better.all():
+            break
+        scale[~better] /= 2
+    return np.where(better[:, None], trials, poses), new_gaps, jacobians, better
+
+
+def _solve_each(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solutions (N, 6, 1); where a matrix is singular, the shortest of least squares."""
+    try:
+        return np.linalg.solve(matrices, right)
+    except np.linalg.LinAlgError:
+        return np.linalg.pinv(matrices) @ right
+
+
+def _check_angles(robot: LoopClosure, theta: np.ndarray, poses: np.ndarray) -> None:
+    """Raise ConvergenceError unless the inverse kinematics returns the angles asked for."""
+    found = evaluate(robot.functions["inverse_kinematics"], poses)[0][..., 0]
+    residual = np.abs(theta - found)
+    if (residual < ANGLE_TOLERANCE).all():
+        return
+    row, leg = (int(value) for value in np.argwhere(~(residual < ANGLE_TOLERANCE))[0])
+    gap = np.abs(evaluate(robot.functions["loop_closure"], poses[row : row + 1], theta[row : row + 1])[0]).max()
+    closed = gap < 1e-14
+    why = "closes the legs with a crank beyond its dead point" if closed else f"leaves a gap of {gap:.3g} m^2"
+    raise ConvergenceError(
+        f"forward kinematics found no pose with crank angles {np.array2string(theta[row], precision=4)} (row {row}): "
+        f"the best {why}; crank {leg + 1} has a residual of {residual[row, leg]:.3g} rad, "
+        f"limit {ANGLE_TOLERANCE:.0e} rad"
+    )

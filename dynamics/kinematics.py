@@ -48,6 +48,21 @@ def leg_to(geometry: Rss6Geometry, leg: int, joint_position: ca.SX) -> LegVector
     return LegVectors(ca.atan2(sine, cosine), ca.SX(axis), crank, link)
 
 
+def loop_closure(geometry: Rss6Geometry, pose: ca.SX, angles: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """How far the loops of eq. 3 and 4 are from closed at a pose and crank angles chosen freely, and its derivative.
+
+    Gaps (|A - T|^2 - link_length^2) / 2 (6,) in m^2, and d(gaps)/d(pose) (6, 6): J_a2 times the matrix of eq. 29.
+    """
+    gaps = []
+    for leg, arm in enumerate(platform_arms(geometry, pose)):
+        zero, axis = geometry.crank_zero_directions[leg], geometry.crank_axes[leg]
+        crank = geometry.crank_length * (ca.cos(angles[leg]) * zero + ca.sin(angles[leg]) * np.cross(axis, zero))
+        link = pose[0:3] + arm - geometry.base_joints[leg] - crank
+        gaps.append((ca.dot(link, link) - geometry.link_length**2) / 2)
+    gap = ca.vertcat(*gaps)
+    return gap, ca.jacobian(gap, pose)
+
+
 def reach_margin(geometry: Rss6Geometry, pose: ca.SX) -> ca.SX:
     """sin^2 of the angle between crank and reach direction (6,), dimensionless; negative: out of reach."""
     rows = []

@@ -4,8 +4,8 @@ import casadi as ca
 
 from dynamics.expressions import function
 from dynamics.geometry import Rss6Geometry
-from dynamics.jacobians import joint_jacobian, pose_jacobian
-from dynamics.kinematics import leg_vectors, reach_margin
+from dynamics.jacobians import joint_jacobian, loop_jacobians, pose_jacobian
+from dynamics.kinematics import leg_vectors, loop_closure, reach_margin
 from dynamics.parameters import COULOMB, PARAMETER_NAMES, RIGID_BODY, VISCOUS
 from dynamics.pose_space_motion import equation_of_motion, motion_derivatives, rate_map_derivative
 from dynamics.rigid_body_dynamics import (
@@ -20,6 +20,8 @@ from dynamics.rotation import pose_rate_to_twist, twist_bias
 
 FUNCTION_NAMES = (
     "inverse_kinematics",
+    "loop_closure",
+    "loop_jacobians",
     "joint_jacobian",
     "pose_jacobian",
     "twist",
@@ -38,12 +40,14 @@ FUNCTION_NAMES = (
 def kinematic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
     """Functions of pose and its rates alone: angles, reach, Jacobians, twist conversions."""
     pose, rate, acceleration = ca.SX.sym("pose", 6), ca.SX.sym("pose_rate", 6), ca.SX.sym("pose_acceleration", 6)
-    twist = ca.SX.sym("twist", 6)
+    twist, theta = ca.SX.sym("twist", 6), ca.SX.sym("theta", 6)
     legs = leg_vectors(geometry, pose)
     to_twist = pose_rate_to_twist(pose)
     angles = ca.vertcat(*[leg.angle for leg in legs])
     return [
         function("inverse_kinematics", [pose], [angles, reach_margin(geometry, pose)]),
+        function("loop_closure", [pose, theta], list(loop_closure(geometry, pose, theta))),
+        function("loop_jacobians", [pose], list(loop_jacobians(geometry, pose))),
         function("joint_jacobian", [pose], [joint_jacobian(geometry, pose)]),
         function("pose_jacobian", [pose], [pose_jacobian(geometry, pose)]),
         function("twist", [pose, rate], [to_twist @ rate]),

@@ -1,6 +1,7 @@
 """Jacobians and twists against numerical differentiation."""
 
 import contextlib
+import itertools
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dynamics.errors import ConvergenceError, UnreachablePoseError
+from dynamics.errors import ConvergenceError, ShapeError, UnreachablePoseError
 
 
 def _vector(matrix):
@@ -86,6 +87,67 @@ def test_forward_kinematics_solves_or_says_that_it_cannot(robot, theta):
     except ConvergenceError:
         return
     np.testing.assert_allclose(robot.inverse_kinematics(pose), theta, atol=1e-12)
+
+
+def followed_from_home(geometry, theta, steps=40):
+    """Oracle: poses (N, 6) reached from home while all cranks turn evenly, loops kept closed in base axes by scipy's
+    rotations; and the smallest determinant of J_a2 on the way, as a share of that at home."""
+    across = np.cross(geometry.crank_axes, geometry.crank_zero_directions)
+    places = np.tile(geometry.home_pose[:3], (len(theta), 1))
+    turns = Rotation.from_euler("XYZ", np.tile(geometry.home_pose[3:], (len(theta), 1)))
+    least, at_home = np.inf, None
+    for share in np.linspace(0, 1, steps + 1):
+        cosine, sine = np.cos(share * theta)[..., None], np.sin(share * theta)[..., None]
+        tips = geometry.base_joints + geometry.crank_length * (cosine * geometry.crank_zero_directions + sine * across)
+        for _ in range(4):
+            arms = np.einsum("nij,lj->nli", turns.as_matrix(), geometry.platform_joints)
+            links = places[:, None] + arms - tips
+            gaps = (np.sum(links**2, axis=2) - geometry.link_length**2) / 2
+            rows = np.concatenate([links, np.cross(arms, links)], axis=2)
+            step = -np.linalg.solve(rows, gaps[..., None])[..., 0]
+            places, turns = places + step[:, :3], Rotation.from_rotvec(step[:, 3:]) * turns
+        determinants = np.linalg.det(rows)
+        at_home = determinants if at_home is None else at_home
+        least = np.minimum(least, determinants / at_home)
+    return np.hstack([places, turns.as_euler("XYZ")]), least
+
+
+def test_every_joint_vector_within_travel_has_one_pose_that_newton_finds_from_home(robot):
+    """All 729 combinations of -limit, 0, +limit and 1500 random ones: the pose is the one reached by turning the cranks
+    evenly from home (1e-12), no singularity is met on the way, and the angles come back to 1e-12 rad."""
+    rng, limit = np.random.default_rng(5), robot.travel_limit
+    corners = limit * np.array(list(itertools.product([-1, 0, 1], repeat=6)))
+    theta = np.concatenate([corners, rng.uniform(-limit, limit, (1500, 6))])
+    expected, least = followed_from_home(robot.geometry, theta)
+    assert least.min() > 0.2
+    found = robot.forward_kinematics(theta)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(robot.inverse_kinematics(found), theta, atol=1e-12)
+
+
+def test_a_crank_beyond_its_dead_point_is_not_passed_off_as_a_solution(robot):
+    """Far beyond the travel the legs can close with a crank on its other side, where the closed form never is."""
+    theta = [1.2393, -1.4656, -0.0294, 1.3016, 0.6802, 0.0804]
+    with pytest.raises(ConvergenceError, match=r"\(row 0\): the best closes .* with a crank beyond its dead point"):
+        robot.forward_kinematics(theta)
+
+
+def test_rows_that_have_no_pose_are_named(robot):
+    """One impossible row in a batch names itself, its crank and its residual."""
+    with pytest.raises(ConvergenceError, match=r"\(row 1\): .*crank \d has a residual of .* rad, limit 1e-12 rad"):
+        robot.forward_kinematics([np.zeros(6), [3.0, -3.0, 3.0, -3.0, 3.0, -3.0], np.zeros(6)])
+
+
+def test_forward_kinematics_starts_where_it_is_told(robot, states):
+    """A start for each row, one for all, and a start out of reach lead to the same poses; other shapes are refused."""
+    theta = robot.inverse_kinematics(states.pose)
+    for start in (states.pose, states.pose[::-1], robot.home_pose, robot.home_pose + 0.3 * np.eye(6)[0]):
+        np.testing.assert_allclose(robot.forward_kinematics(theta, start), states.pose, atol=1e-12)
+    with pytest.raises(ShapeError, match=r"initial_pose has shape \(3, 6\)"):
+        robot.forward_kinematics(theta, states.pose[:3])
+    with pytest.raises(ShapeError, match=r"initial_pose has shape \(100, 6\)"):
+        robot.forward_kinematics(theta[0], states.pose)
+    assert robot.forward_kinematics(np.zeros((0, 6))).shape == (0, 6)
 
 
 def test_impossible_angles_are_refused(robot):
