@@ -9,6 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table as RichTable
 
+from identify.engine_commands import export, verify_model
 from identify.errors import IdentifyError, ScenarioError
 from identify.progress import Progress, RichProgress, SilentProgress
 from identify.run_folder import RunFolder, new_run_folder
@@ -34,6 +35,11 @@ The stages alone, each reading what the one before wrote:
   cmmsim identify --out mine             result.json
   cmmsim validate --out mine             validation.nc, model.nc, result.json
   cmmsim report --out mine               report.html, figures/*.png
+
+\b
+The model in other engines:
+  cmmsim export mjcf rss6 --parameters mine/result.json
+  cmmsim verify-model                    MuJoCo against this model, figure8.png
 """
 
 app = typer.Typer(
@@ -153,6 +159,10 @@ def report(out: RunFolderOption, quiet: Quiet = False) -> None:
     _pipeline().report(out, _progress(quiet))
     if not quiet:
         print_summary(RunFolder(out))
+
+
+app.command("verify-model")(verify_model)
+app.add_typer(export, name="export")
 
 
 def parse_settings(settings: list[str] | None) -> dict[str, Any]:

@@ -27,3 +27,7 @@ class OutputFolderError(IdentifyError):
 
 class EstimationError(IdentifyError):
     """A record from which no parameters can be estimated."""
+
+
+class VerificationError(IdentifyError):
+    """A model that differs from an independent engine by more than the goal."""

@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("cmmsim", "dynamics", "identify")
 ESTIMATOR = ("identify/warm_start.py", "identify/output_error.py", "identify/estimation.py")
-HEAVY = {"pyrender": {"cmmsim/render.py"}, "dask": set(), "rerun": set()}
+HEAVY = {"pyrender": {"cmmsim/render.py"}, "mujoco": {"dynamics/mujoco_engine.py"}, "dask": set(), "rerun": set()}
 
 
 def imports(path: Path) -> set[str]:
