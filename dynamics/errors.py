@@ -21,6 +21,10 @@ class UnreachablePoseError(DynamicsError):
     """A pose that a leg cannot reach."""
 
 
+class TravelError(DynamicsError):
+    """A crank angle beyond the travel limit."""
+
+
 class SingularPoseError(DynamicsError):
     """A pose at which a Jacobian cannot be inverted."""
 

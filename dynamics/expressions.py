@@ -13,7 +13,9 @@ def function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Functio
 
 
 def evaluate(function: ca.Function, *batches: np.ndarray) -> list[np.ndarray]:
-    """All outputs (N, rows, columns) of a function over batches (N, columns) of its arguments, N >= 1; NaN included."""
+    """All outputs (N, rows, columns) of a function over batches (N, columns) of its arguments, NaN included."""
+    if not len(batches[0]):
+        return [np.zeros((0, *function.size_out(index))) for index in range(function.n_out())]
     values = function(*[batch.T for batch in batches])
     outputs = values if isinstance(values, tuple) else (values,)
     count = len(batches[0])

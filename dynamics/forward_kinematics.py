@@ -38,9 +38,8 @@ def solve(robot: LoopClosure, theta: np.ndarray, start: np.ndarray) -> np.ndarra
     if (start.ndim == 2 and start.shape[0] not in (1, len(angles))) or start.ndim > theta.ndim:
         raise ShapeError(f"initial_pose has shape {start.shape}, must be (6,) or that of theta {theta.shape}")
     poses = np.array(np.broadcast_to(start, angles.shape))
-    if len(poses):
-        poses = _newton(robot, angles, poses)
-        _check_angles(robot, angles, poses)
+    poses = _newton(robot, angles, poses)
+    _check_angles(robot, angles, poses)
     return poses.reshape(theta.shape)
 
 

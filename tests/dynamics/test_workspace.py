@@ -1,0 +1,157 @@
+"""Travel, reach and singularity measures, against geometry worked out leg by leg without the package's Jacobians."""
+
+import tomllib
+from importlib import resources
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import dynamics
+from dynamics import workspace
+from dynamics.errors import ShapeError, SingularPoseError, TravelError, UnreachablePoseError
+
+
+def test_leverage_is_the_sine_between_crank_plane_and_link(robot, states, legs_at):
+    """|(w x l) . s| / (|w| |l|) from the joints' places; its zero is the reach margin's zero."""
+    measures = workspace.measure(robot, states.pose)
+    for pose, leverage, margin in zip(states.pose[:20], measures.leverage, measures.reach_margin, strict=False):
+        legs = legs_at(pose)
+        link = legs.joint - legs.tip
+        sine = np.abs(np.cross(legs.crank, link)[:, 2]) / (0.06 * robot.geometry.link_length)
+        np.testing.assert_allclose(leverage, sine, atol=1e-12)
+        reach = (legs.joint - legs.tip + legs.crank)[:, :2]
+        across = np.cross(np.pad(legs.crank[:, :2], ((0, 0), (0, 1))), np.pad(reach, ((0, 0), (0, 1))))[:, 2]
+        np.testing.assert_allclose(margin, (across / (0.06 * np.linalg.norm(reach, axis=1))) ** 2, atol=1e-12)
+
+
+def test_condition_of_the_platform_side_from_forces(robot, states, legs_at):
+    """The wrench of unit forces along the links, torques over 0.2 m, has that condition number (virtual work)."""
+    assert workspace.characteristic_length(robot.geometry) == pytest.approx(0.2, abs=1e-12)
+    measures = workspace.measure(robot, states.pose)
+    for row, pose in enumerate(states.pose[:20]):
+        legs = legs_at(pose)
+        along = (legs.joint - legs.tip) / robot.geometry.link_length
+        wrench = np.hstack([along, np.cross(legs.joint - pose[:3], along) / 0.2])
+        assert measures.platform_condition[row] == pytest.approx(np.linalg.cond(wrench), rel=1e-9)
+        scaled = robot.joint_jacobian(pose) / [1, 1, 1, 0.2, 0.2, 0.2]
+        assert measures.joint_condition[row] == pytest.approx(np.linalg.cond(scaled), rel=1e-9)
+
+
+def test_travel_distance_and_share_are_those_of_the_inverse_kinematics(robot, states):
+    theta = robot.inverse_kinematics(states.pose)
+    measures = workspace.measure(robot, states.pose)
+    np.testing.assert_allclose(measures.travel_distance, 0.9948 - np.abs(theta), atol=1e-15)
+    np.testing.assert_allclose(measures.travel_share, np.abs(theta).max(axis=1) / 0.9948, atol=1e-15)
+    assert measures.reachable.all()
+
+
+def test_conditions_do_not_depend_on_the_place_of_the_base(robot, monkeypatch):
+    """A robot moved, turned about z and measured in a platform frame of the same origin has the same conditions."""
+    monkeypatch.setattr("dynamics.robot.load_library", lambda *_: None)  # one robot is not worth compiling
+    turn, shift = Rotation.from_euler("z", 0.7), np.array([1.0, 2.0, 3.0])
+    geometry = robot.geometry
+    moved = type(geometry)(
+        geometry.base_joints @ turn.as_matrix().T + shift,
+        geometry.platform_joints,
+        geometry.crank_axes,
+        geometry.crank_zero_directions @ turn.as_matrix().T,
+        geometry.crank_length,
+        geometry.link_length,
+        np.concatenate([turn.as_matrix() @ geometry.home_pose[:3] + shift, [0, 0, 0.7]]),
+        geometry.travel_limit,
+        geometry.gravity,
+    )
+    other = dynamics.load_robot("rss6")
+    other.geometry = moved
+    here, there = workspace.measure(robot, robot.home_pose), workspace.measure(other, moved.home_pose)
+    np.testing.assert_allclose(there.platform_condition, here.platform_condition, rtol=1e-9)
+    np.testing.assert_allclose(there.leverage, here.leverage, atol=1e-9)
+
+
+def test_the_whole_travel_of_the_reference_robot_is_regular(robot):
+    """5000 joint vectors within travel: leverage stays above 0.09 and the conditions below 5 and 10."""
+    theta = np.random.default_rng(1).uniform(-1, 1, (5000, 6)) * robot.travel_limit
+    measures = workspace.measure(robot, robot.forward_kinematics(theta))
+    assert measures.leverage.min() > 0.09
+    assert measures.platform_condition.max() < 5
+    assert measures.joint_condition.max() < 10
+    assert measures.travel_distance.min() > -1e-9
+
+
+def test_poses_out_of_reach_are_nan_and_only_they(robot):
+    poses = np.array([robot.home_pose, robot.home_pose + 0.2 * np.eye(6)[0], robot.home_pose])
+    measures = workspace.measure(robot, poses)
+    np.testing.assert_array_equal(measures.reachable, [True, False, True])
+    for values in (measures.theta, measures.leverage):
+        np.testing.assert_array_equal(np.isnan(values).all(axis=1), [False, True, False])
+    for values in (measures.platform_condition, measures.joint_condition, measures.travel_share):
+        np.testing.assert_array_equal(np.isnan(values), [False, True, False])
+    assert measures.reach_margin[1].min() < 0
+    assert workspace.measure(robot, np.zeros((0, 6))).theta.shape == (0, 6)
+
+
+def along_x(robot, largest, count=41):
+    return robot.home_pose + np.linspace(0, largest, count)[:, None] * np.eye(6)[0]
+
+
+def test_the_worst_of_a_good_motion_comes_with_its_time_and_leg(robot):
+    """Largest |theta| and least leverage of a straight line are found where the measures have them."""
+    poses, times = along_x(robot, 0.02), np.linspace(0, 2, 41)
+    worst = workspace.check_motion(robot, poses, times)
+    theta = np.abs(robot.inverse_kinematics(poses))
+    assert worst.travel.value == theta.max()
+    assert (worst.travel.time, worst.travel.limit) == (2.0, 0.9948)
+    assert worst.travel.leg == np.argmax(theta[-1]) + 1
+    measures = workspace.measure(robot, poses)
+    assert worst.leverage.value == measures.leverage.min()
+    assert worst.condition.value == measures.platform_condition.max()
+    assert worst.condition.leg is None
+    assert np.isnan(workspace.check_motion(robot, poses[0]).reach.time)
+
+
+def test_a_bad_motion_is_refused_with_time_leg_value_and_limit(robot):
+    times = np.linspace(0, 2, 41)
+    with pytest.raises(TravelError, match=r"\|theta\| in rad of leg \d of rss6 is 1\.\d+ at t = 2 s, limit 0\.9948"):
+        workspace.check_motion(robot, along_x(robot, 0.06), times)
+    with pytest.raises(TravelError, match=r"at row 40, limit 0\.1948"):
+        workspace.check_motion(robot, along_x(robot, 0.02), travel_margin=0.8)
+    with pytest.raises(UnreachablePoseError, match=r"reach margin of leg \d of rss6 is -.* at t = 2 s, must be > 0"):
+        workspace.check_motion(robot, along_x(robot, 0.3), times)
+    with pytest.raises(SingularPoseError, match=r"leverage \(J_a1\) of leg \d of rss6 is 0\.\d+ .*must be >= 0\.9"):
+        workspace.check_motion(robot, along_x(robot, 0.02), times, least_leverage=0.9)
+    with pytest.raises(SingularPoseError, match=r"condition of J_a2 of rss6 is 1\.\d+ .*limit 1\.2"):
+        workspace.check_motion(robot, along_x(robot, 0.02), times, most_condition=1.2)
+
+
+def test_a_platform_that_moves_with_locked_cranks_is_found(tmp_path, monkeypatch):
+    """Links in the plane of the platform carry no vertical force: the condition of J_a2 says so, leverage does not."""
+    monkeypatch.setattr("dynamics.robot.load_library", lambda *_: None)  # one robot is not worth compiling
+    text = (resources.files("dynamics") / "robots" / "rss6.toml").read_text(encoding="utf-8")
+    legs = tomllib.loads(text)["legs"]
+    tips = np.array(legs["base_joints"]) + 0.06 * np.array(legs["crank_zero_directions"])
+    flat = np.linalg.norm(np.array(legs["platform_joints"]) - tips, axis=1)[0]
+    text = text.replace("home_pose = [0.0, 0.0, 0.2,", "home_pose = [0.0, 0.0, 0.0,")
+    text = text.replace("link_length = 0.30133373938841", f"link_length = {flat:.17g}")
+    (tmp_path / "flat.toml").write_text(text, encoding="utf-8")
+    robot = dynamics.load_robot(tmp_path / "flat.toml")
+    measures = workspace.measure(robot, robot.home_pose)
+    assert measures.platform_condition[0] > 1e12
+    assert measures.leverage.min() > 0.5
+    with pytest.raises(SingularPoseError, match=r"condition of J_a2 .*limit 20"):
+        workspace.check_motion(robot, robot.home_pose)
+
+
+@pytest.mark.parametrize(
+    ("pose", "times", "message"),
+    [
+        (np.zeros(5), None, r"shape \(6,\) or \(N, 6\), got \(5,\)"),
+        (np.full((2, 6), np.nan), None, r"pose\[0, 0\] is nan"),
+        ("home", None, "must be numbers"),
+        (np.zeros((0, 6)), None, "at least one pose"),
+        (np.zeros((3, 6)), np.zeros(2), r"as many times, got 3 and \(2,\)"),
+    ],
+)
+def test_bad_arrays_are_refused(robot, pose, times, message):
+    with pytest.raises(ShapeError, match=message):
+        workspace.check_motion(robot, pose, times)
