@@ -17,6 +17,7 @@ from dynamics.loop_types import (
     FrameTiming,
     FrictionLaw,
     LoopFailure,
+    LoopProblem,
     LoopSettings,
     PoseSensor,
     Reference,
@@ -77,12 +78,12 @@ def simulate(
             )
     library = compiled_closed_loop.library(robot.geometry) if compiled in (None, True) else None
     start = equilibrium(robot, parameters, reference.poses[0], settings.servo)
-    arguments = (parameters, reference, settings, start, sensor, sensitivities, commands, lost)
+    problem = LoopProblem(parameters, reference, settings, start, sensor, sensitivities, commands, lost)
     if library is not None:
-        return compiled_closed_loop.run(library, *arguments)
+        return compiled_closed_loop.run(library, problem)
     if compiled:
         raise SimulationError("compiled=True, but no C compiler was found")
-    return plain_closed_loop.run(robot, *arguments)
+    return plain_closed_loop.run(robot, problem)
 
 
 def prepare(robot: Robot) -> bool:

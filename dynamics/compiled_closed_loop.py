@@ -15,10 +15,8 @@ from dynamics.loop_types import (
     MEASURED_OUT_OF_REACH,
     PARAMETER_COUNT,
     ClosedLoopRun,
-    LoopSettings,
+    LoopProblem,
     PoseSensor,
-    Reference,
-    StartState,
     checked_measurement,
     failure,
 )
@@ -78,31 +76,20 @@ def library(geometry: Rss6Geometry) -> ctypes.CDLL | None:
     return _library_at(path) if path else None
 
 
-def run(
-    library: ctypes.CDLL,
-    parameters: np.ndarray,
-    reference: Reference,
-    settings: LoopSettings,
-    start: StartState,
-    sensor: PoseSensor | None,
-    sensitivities: bool,
-    commands: np.ndarray | None,
-    lost: np.ndarray | None,
-) -> ClosedLoopRun:
-    """See `closed_loop.simulate`; arguments are already checked."""
-    frames = len(reference.poses)
-    period = 1.0 / settings.timing.frame_rate_hz
+def run(library: ctypes.CDLL, problem: LoopProblem) -> ClosedLoopRun:
+    """Do one run with the compiled loop; see `closed_loop.simulate`."""
+    frames, period = problem.frames, problem.period
     arrays = {name: np.zeros((frames, 6)) for name in ("pose", "rate", "torque", "command", "measured")}
     measured_ok = np.zeros(frames, dtype=np.int8)
-    sensitivity = np.zeros((frames, 6, PARAMETER_COUNT)) if sensitivities else None
-    problem = _problem(parameters, reference, settings, start, sensitivities, commands, lost)
+    sensitivity = np.zeros((frames, 6, PARAMETER_COUNT)) if problem.sensitivities else None
+    struct = _struct(problem)
     trajectory = _Trajectory(
         **{name: _pointer(array) for name, array in arrays.items()},
         measured_ok=measured_ok.ctypes.data_as(POINTER(c_byte)),
         pose_sensitivity=_pointer(sensitivity),
     )
-    callback, raised = _callback(sensor, period)
-    status = library.closed_loop_run(byref(problem), callback, byref(trajectory))
+    callback, raised = _callback(problem.sensor, period)
+    status = library.closed_loop_run(byref(struct), callback, byref(trajectory))
     if status == SENSOR_FAILED:
         raise raised[0] if raised else SimulationError("the pose sensor failed without an error")
     if status:
@@ -120,24 +107,17 @@ def run(
     )
 
 
-def _problem(
-    parameters: np.ndarray,
-    reference: Reference,
-    settings: LoopSettings,
-    start: StartState,
-    sensitivities: bool,
-    commands: np.ndarray | None,
-    lost: np.ndarray | None,
-) -> _Problem:
-    """The C struct. It borrows the arrays' memory: the caller keeps them alive during the call."""
-    servo, timing, friction = settings.servo, settings.timing, settings.friction
-    problem = _Problem(
-        frames=len(reference.poses),
-        steps_per_frame=settings.steps_per_frame,
+def _struct(problem: LoopProblem) -> _Problem:
+    """The C struct. It borrows the arrays' memory: the problem keeps them alive during the call."""
+    servo, timing, friction = problem.settings.servo, problem.settings.timing, problem.settings.friction
+    parameters, start, lost = problem.parameters, problem.start, problem.lost
+    struct = _Problem(
+        frames=problem.frames,
+        steps_per_frame=problem.settings.steps_per_frame,
         linear_hold=timing.hold == "linear",
         law=LAWS.index(friction.name),
-        sensitivities=sensitivities,
-        frame_period=1.0 / timing.frame_rate_hz,
+        sensitivities=problem.sensitivities,
+        frame_period=problem.period,
         latency=timing.latency_s,
         smoothing_velocity=friction.smoothing_velocity or 0.0,
         static_level=friction.static_level,
@@ -149,19 +129,19 @@ def _problem(
         kd=servo.kd,
         ki=servo.ki,
         integral_sensitivity=_pointer(start.joint_integral_sensitivity),
-        reference=_pointer(reference.poses),
-        reference_rate=_pointer(reference.rates),
-        logged_commands=_pointer(commands),
+        reference=_pointer(problem.reference.poses),
+        reference_rate=_pointer(problem.reference.rates),
+        logged_commands=_pointer(problem.commands),
         lost=None if lost is None else lost.ctypes.data_as(POINTER(c_byte)),
     )
-    problem.rigid[:] = parameters[:52]
-    problem.coulomb[:] = parameters[52:58]
-    problem.viscous[:] = parameters[58:64]
-    problem.pose[:] = reference.poses[0]
-    problem.command[:] = start.command
-    problem.integral[:] = start.joint_integral
-    problem.servo_integral[:] = start.servo_integral
-    return problem
+    struct.rigid[:] = parameters[:52]
+    struct.coulomb[:] = parameters[52:58]
+    struct.viscous[:] = parameters[58:64]
+    struct.pose[:] = problem.reference.poses[0]
+    struct.command[:] = start.command
+    struct.integral[:] = start.joint_integral
+    struct.servo_integral[:] = start.servo_integral
+    return struct
 
 
 def _pointer(array: np.ndarray | None) -> "ctypes._Pointer[c_double] | None":

@@ -100,6 +100,30 @@ class StartState:
 
 
 @dataclass(frozen=True)
+class LoopProblem:
+    """One run to be done, checked: what `closed_loop.simulate` was given, and the state it starts from."""
+
+    parameters: np.ndarray
+    reference: Reference
+    settings: LoopSettings
+    start: StartState
+    sensor: PoseSensor | None
+    sensitivities: bool
+    commands: np.ndarray | None
+    lost: np.ndarray | None
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.reference.poses)
+
+    @property
+    def period(self) -> float:
+        """Time between two frames, s."""
+        return 1.0 / self.settings.timing.frame_rate_hz
+
+
+@dataclass(frozen=True)
 class ClosedLoopRun:
     """A run, one row a frame: time (s), true pose and pose rate, actuator torque (N m), command (rad), measured pose,
     whether the measurement was good; pose_sensitivity (frames, 6, 67) or None; number of stick-slip events."""

@@ -12,10 +12,9 @@ from dynamics.loop_types import (
     MEASURED_OUT_OF_REACH,
     PARAMETER_COUNT,
     ClosedLoopRun,
+    LoopProblem,
     LoopSettings,
-    PoseSensor,
     Reference,
-    StartState,
     checked_measurement,
     failure,
 )
@@ -32,43 +31,26 @@ def _functions(geometry: Rss6Geometry) -> dict[str, ca.Function]:
     return {function.name(): function for function in built}
 
 
-def run(
-    robot: Robot,
-    parameters: np.ndarray,
-    reference: Reference,
-    settings: LoopSettings,
-    start: StartState,
-    sensor: PoseSensor | None,
-    sensitivities: bool,
-    commands: np.ndarray | None,
-    lost: np.ndarray | None,
-) -> ClosedLoopRun:
-    """See `closed_loop.simulate`; arguments are already checked."""
-    period, frames = 1.0 / settings.timing.frame_rate_hz, len(reference.poses)
+def run(robot: Robot, problem: LoopProblem) -> ClosedLoopRun:
+    """Do one run in plain Python; see `closed_loop.simulate`."""
     functions = _functions(robot.geometry)
-    motion = StickSlipMotion(functions, parameters, settings.friction, sensitivities)
+    reference, settings, period, start = problem.reference, problem.settings, problem.period, problem.start
+    motion = StickSlipMotion(functions, problem.parameters, settings.friction, problem.sensitivities)
     servo = VisualServo(functions, settings.servo, period, reference.poses[0], start.servo_integral)
     state = State(reference.poses[0], np.zeros(6), start.joint_integral)
-    if sensitivities:
-        rest = np.zeros((6, PARAMETER_COUNT))
+    rest = np.zeros((6, PARAMETER_COUNT))
+    if problem.sensitivities:
         motion.tangent = State(rest, rest, start.joint_integral_sensitivity)
-    result = _empty(frames, period, sensitivities)
-    issued: list[Issued] = [(start.command, np.zeros((6, PARAMETER_COUNT)))]
-    for frame in range(frames):
-        result.pose[frame], result.pose_rate[frame] = state.pose, state.rate
-        d_pose = motion.tangent.pose if motion.tangent is not None else None
-        if result.pose_sensitivity is not None:
-            result.pose_sensitivity[frame] = d_pose
-        measured: np.ndarray | None = state.pose
-        if sensor is not None:
-            measured = checked_measurement(sensor(frame, frame * period, state.pose.copy()), frame)
-        elif lost is not None and lost[frame]:
-            measured = None
+    result = _empty(problem.frames, period, problem.sensitivities)
+    issued: list[Issued] = [(start.command, rest)]
+    for frame in range(problem.frames):
+        d_pose = _record_state(result, frame, state, motion)
+        measured = _measure(problem, frame, state.pose)
         servo.next_frame()
         result.measured_ok[frame] = measured is not None
         result.measured[frame] = np.nan if measured is None else measured
-        if commands is not None:
-            issued.append((commands[frame], np.zeros((6, PARAMETER_COUNT))))
+        if problem.commands is not None:
+            issued.append((problem.commands[frame], rest))
         elif measured is None:
             issued.append(issued[-1])
         else:
@@ -81,6 +63,22 @@ def run(
         except MotionStopped as reason:
             raise failure(str(reason), frame, period) from None
     return _with_events(result, motion.events)
+
+
+def _record_state(result: ClosedLoopRun, frame: int, state: State, motion: StickSlipMotion) -> np.ndarray | None:
+    """Write the state at a frame into the result; returns the sensitivity of the pose, if there is one."""
+    result.pose[frame], result.pose_rate[frame] = state.pose, state.rate
+    if motion.tangent is None or result.pose_sensitivity is None:
+        return None
+    result.pose_sensitivity[frame] = motion.tangent.pose
+    return motion.tangent.pose
+
+
+def _measure(problem: LoopProblem, frame: int, pose: np.ndarray) -> np.ndarray | None:
+    """What the sensor says of a pose (6,), or None where the frame is lost."""
+    if problem.sensor is not None:
+        return checked_measurement(problem.sensor(frame, frame * problem.period, pose.copy()), frame)
+    return None if problem.lost is not None and problem.lost[frame] else pose
 
 
 def _servo_command(
