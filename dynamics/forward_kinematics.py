@@ -38,9 +38,19 @@ def solve(robot: LoopClosure, theta: np.ndarray, start: np.ndarray) -> np.ndarra
     if (start.ndim == 2 and start.shape[0] not in (1, len(angles))) or start.ndim > theta.ndim:
         raise ShapeError(f"initial_pose has shape {start.shape}, must be (6,) or that of theta {theta.shape}")
     poses = np.array(np.broadcast_to(start, angles.shape))
-    poses = _newton(robot, angles, poses)
-    _check_angles(robot, angles, poses)
+    poses, residual = search(robot, angles, poses)
+    _check(robot, angles, poses, residual)
     return poses.reshape(theta.shape)
+
+
+def search(robot: LoopClosure, theta: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Best poses (N, 6) for crank angles (N, 6) from starts (N, 6), and what the angles there lack of those, (N, 6).
+
+    A row is solved where all its residuals are below ANGLE_TOLERANCE; they are NaN where a leg cannot reach.
+    """
+    poses = _newton(robot, theta, np.array(start))
+    found = evaluate(robot.functions["inverse_kinematics"], poses)[0][..., 0]
+    return poses, np.abs(theta - found)
 
 
 def _newton(robot: LoopClosure, theta: np.ndarray, poses: np.ndarray) -> np.ndarray:
@@ -84,10 +94,7 @@ def _solve_each(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
         return np.linalg.pinv(matrices) @ right
 
 
-def _check_angles(robot: LoopClosure, theta: np.ndarray, poses: np.ndarray) -> None:
-    """Raise ConvergenceError unless the inverse kinematics returns the angles asked for."""
-    found = evaluate(robot.functions["inverse_kinematics"], poses)[0][..., 0]
-    residual = np.abs(theta - found)
+def _check(robot: LoopClosure, theta: np.ndarray, poses: np.ndarray, residual: np.ndarray) -> None:
     if (residual < ANGLE_TOLERANCE).all():
         return
     row, leg = (int(value) for value in np.argwhere(~(residual < ANGLE_TOLERANCE))[0])

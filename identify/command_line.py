@@ -14,6 +14,7 @@ from identify.errors import IdentifyError, ScenarioError
 from identify.progress import Progress, RichProgress, SilentProgress
 from identify.run_folder import RunFolder, new_run_folder
 from identify.scenario import Scenario, load_scenario, scenario_names
+from identify.workspace_command import workspace
 
 HELP = """
 Identify a parallel robot from rendered stereo images, and prove how good the result is.
@@ -40,6 +41,10 @@ The stages alone, each reading what the one before wrote:
 The model in other engines:
   cmmsim export mjcf rss6 --parameters mine/result.json
   cmmsim verify-model                    MuJoCo against this model, figure8.png
+
+\b
+Where the robot can go:
+  cmmsim workspace rss6                  maps of travel, reach and conditioning
 """
 
 app = typer.Typer(
@@ -163,6 +168,7 @@ def report(out: RunFolderOption, quiet: Quiet = False) -> None:
 
 app.command("verify-model")(verify_model)
 app.add_typer(export, name="export")
+app.command()(workspace)
 
 
 def parse_settings(settings: list[str] | None) -> dict[str, Any]:

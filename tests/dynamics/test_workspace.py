@@ -116,7 +116,9 @@ def test_a_bad_motion_is_refused_with_time_leg_value_and_limit(robot):
         workspace.check_motion(robot, along_x(robot, 0.06), times)
     with pytest.raises(TravelError, match=r"at row 40, limit 0\.1948"):
         workspace.check_motion(robot, along_x(robot, 0.02), travel_margin=0.8)
-    with pytest.raises(UnreachablePoseError, match=r"reach margin of leg \d of rss6 is -.* at t = 2 s, must be > 0"):
+    with pytest.raises(
+        UnreachablePoseError, match=r"reach margin of leg \d of rss6 is -.* at t = 1\.\d+ s, must be > 0"
+    ):
         workspace.check_motion(robot, along_x(robot, 0.3), times)
     with pytest.raises(SingularPoseError, match=r"leverage \(J_a1\) of leg \d of rss6 is 0\.\d+ .*must be >= 0\.9"):
         workspace.check_motion(robot, along_x(robot, 0.02), times, least_leverage=0.9)
