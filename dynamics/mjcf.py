@@ -26,6 +26,9 @@ from dynamics.parameters import COULOMB, VISCOUS, check_parameters
 from dynamics.physical_inertia import BodyInertias, physical_inertias
 from dynamics.robot import Robot
 
+# MuJoCo silently lowers larger ones.
+MAX_IMPEDANCE = 0.9999
+
 CHANGED_INERTIAS = (
     "Inertias that no rigid body has were changed to the nearest that MuJoCo accepts. Cranks turn about z alone and",
     "links do not spin, so a crank's Ixx, Iyy and a link's Izz do not alter the motion; other changes do.",
@@ -39,14 +42,14 @@ class MjcfSolver:
     timestep_s: the springs must be resolved by the step, so stiff loops ask for short steps; at 0.25 ms the loops of
     rss6 stay closed to some nanometres in the motions of `cmmsim verify-model`.
     time_constant_steps: time constant of a loop's spring in steps; 2 is the shortest that MuJoCo allows.
-    impedance: share of a loop force that the solver enforces; 0.9999 is the largest that MuJoCo takes.
+    impedance: share of a loop force that the solver enforces at once; the springs bring the rest.
     integrator: implicitfast takes joint damping implicitly, so that any viscous friction is stable, at one evaluation
     a step; RK4 is of fourth order, for comparisons with other engines, at four.
     """
 
     timestep_s: float = 2.5e-4
     time_constant_steps: float = 2.0
-    impedance: float = 0.9999
+    impedance: float = MAX_IMPEDANCE
     integrator: Literal["implicitfast", "RK4"] = "implicitfast"
 
     def __post_init__(self) -> None:
@@ -54,6 +57,10 @@ class MjcfSolver:
             raise DynamicsError(f"timestep is {self.timestep_s} s, must be finite and > 0")
         if not 2 <= self.time_constant_steps < np.inf:
             raise DynamicsError(f"time constant is {self.time_constant_steps} steps, must be finite and >= 2")
+        if not 0 < self.impedance <= MAX_IMPEDANCE:
+            raise DynamicsError(f"impedance is {self.impedance}, must be > 0 and <= {MAX_IMPEDANCE}")
+        if self.integrator not in ("implicitfast", "RK4"):
+            raise DynamicsError(f"unknown integrator `{self.integrator}`; valid: implicitfast, RK4")
 
 
 def mjcf_text(

@@ -56,6 +56,7 @@ def mjcf(
     """Write the robot as MJCF, a closed chain that MuJoCo loads."""
     from dynamics import load_robot
     from dynamics.mjcf import mjcf_text
+    from dynamics.physical_inertia import physical_inertias
     from identify.parameter_choice import choose_parameters
 
     with _progress(quiet).stage("export", 1) as advance:
@@ -67,7 +68,9 @@ def mjcf(
         _write(path, text)
         advance()
     if not quiet:
-        Console().print(f"model: {path}", highlight=False, soft_wrap=True)
+        changes = physical_inertias(chosen.values, allow_changes=True).changes
+        for line in [*(f"changed {change}" for change in changes.split("; ") if change), f"model: {path}"]:
+            Console().print(line, highlight=False, soft_wrap=True)
 
 
 def verify_model(

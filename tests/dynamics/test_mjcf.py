@@ -1,0 +1,282 @@
+"""The exported MJCF against the robot: bodies, home, accelerations and motion in MuJoCo; inertias that no body has."""
+
+import sys
+from xml.etree import ElementTree as Xml
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from dynamics.errors import DynamicsError, ParameterError
+from dynamics.geometry import Rss6Geometry
+from dynamics.mjcf import MjcfSolver, mjcf_text
+from dynamics.mujoco_engine import MujocoMissingError, MujocoRobot
+from dynamics.parameters import BODY_NAMES, COULOMB, RIGID_BODY, VISCOUS
+from dynamics.physical_inertia import UnphysicalInertiaError, physical_inertias
+from dynamics.robot import Robot
+from dynamics.robot_file import RobotDescription
+
+moments = st.floats(0, 1) | st.sampled_from([0.0, 1e-12, 1e-6])
+
+
+@pytest.fixture
+def mujoco():
+    return pytest.importorskip("mujoco")
+
+
+def exported(robot, parameters=None, **options):
+    return MujocoRobot(robot, mjcf_text(robot, parameters, allow_unphysical_inertia=True, **options))
+
+
+def movable(robot, name):
+    """A parameter set whose export moves as the set itself does: the platform of Table 2 is no rigid body's."""
+    values = robot.parameter_sets[name].dynamic.copy()
+    values[3] = min(values[3], values[1] + values[2])
+    return values
+
+
+@pytest.fixture
+def physical(robot):
+    """Parameters of Table 2 with other numbers in every body, all of which rigid bodies can have."""
+    values = robot.parameter_sets["identified"].dynamic.copy()
+    rng = np.random.default_rng(2)
+    bodies = values[RIGID_BODY].reshape(-1, 4)
+    bodies[:, 1:] = bodies[:, 3:] * rng.uniform(0.6, 1.0, (13, 3))
+    return values
+
+
+def test_bodies_friction_and_gravity_are_exactly_the_parameters(mujoco, robot, physical):
+    model = MujocoRobot(robot, mjcf_text(robot, physical)).model
+    for body, row in zip(BODY_NAMES, physical[RIGID_BODY].reshape(-1, 4), strict=True):
+        assert model.body(body).mass[0] == row[0]
+        np.testing.assert_array_equal(model.body(body).inertia, row[1:])
+    for leg in range(6):
+        joint = model.joint(f"joint{leg + 1}")
+        assert joint.damping[0] == physical[VISCOUS][leg]
+        assert joint.frictionloss[0] == physical[COULOMB][leg]
+    np.testing.assert_array_equal(model.opt.gravity, robot.geometry.gravity)
+    assert not model.geom_contype.any()
+    assert (model.nv, model.nu, model.neq) == (30, 6, 6)
+
+
+def test_dry_friction_can_be_left_out(mujoco, robot, physical):
+    model = MujocoRobot(robot, mjcf_text(robot, physical, coulomb=False)).model
+    assert not model.dof_frictionloss.any()
+    assert model.joint("joint1").damping[0] == physical[VISCOUS][0]
+
+
+def test_keyframe_is_the_home_pose_with_closed_loops(mujoco, robot):
+    engine = exported(robot)
+    mujoco.mj_resetDataKeyframe(engine.model, engine.data, engine.model.key("home").id)
+    np.testing.assert_allclose(engine.pose, robot.home_pose, atol=1e-15)
+    np.testing.assert_allclose(engine.crank_angle, robot.inverse_kinematics(robot.home_pose), atol=1e-15)
+    assert engine.closure_error < 1e-14
+
+
+def test_frames_of_cranks_and_links_are_those_of_the_conventions(mujoco, robot, states, legs_at):
+    engine = exported(robot)
+    for pose in states.pose[:10]:
+        engine.put(pose, np.zeros(6))
+        legs = legs_at(pose)
+        for leg in range(6):
+            axis, link = robot.geometry.crank_axes[leg], legs.joint[leg] - legs.tip[leg]
+            crank_frame = engine.data.body(f"crank{leg + 1}").xmat.reshape(3, 3)
+            link_frame = engine.data.body(f"link{leg + 1}").xmat.reshape(3, 3)
+            np.testing.assert_allclose(crank_frame[:, 2], axis, atol=1e-12)
+            np.testing.assert_allclose(crank_frame[:, 0], legs.crank[leg] / robot.geometry.crank_length, atol=1e-12)
+            np.testing.assert_allclose(link_frame[:, 2], link / robot.geometry.link_length, atol=1e-12)
+            across = np.cross(axis, link)
+            np.testing.assert_allclose(link_frame[:, 0], across / np.linalg.norm(across), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["initial", "identified"])
+def test_accelerations_differ_by_the_softness_of_the_loops_alone(mujoco, robot, states, name):
+    """At rest, under random torques: 1 - impedance is the share of the loop forces that MuJoCo leaves out."""
+    values = movable(robot, name)
+    values[COULOMB] = 0.0
+    torques = 5 * np.random.default_rng(5).standard_normal((30, 6))
+    rest = np.zeros((30, 6))
+    ours = robot.forward_dynamics(states.pose[:30], rest, torques, values)
+    worst = {}
+    for impedance in (0.999, 0.9999):
+        engine, errors = exported(robot, values, solver=MjcfSolver(impedance=impedance)), []
+        for pose, torque, acceleration in zip(states.pose[:30], torques, ours, strict=True):
+            engine.put(pose, np.zeros(6))
+            assert engine.closure_error < 1e-14
+            errors.append(np.abs(engine.twist_dot(torque) - acceleration).max() / np.abs(acceleration).max())
+        worst[impedance] = max(errors)
+    assert worst[0.9999] < 3e-4
+    assert worst[0.999] / worst[0.9999] == pytest.approx(10, rel=0.1)
+
+
+@pytest.mark.parametrize(("name", "friction"), [("initial", False), ("identified", True)])
+def test_motion_from_a_moving_state_agrees(mujoco, robot, states, name, friction):
+    """20 ms under constant torques, friction included: positions to 20 nm and angles to 0.2 urad (MuJoCo 3.3; 4.0 is closer)."""
+    values = movable(robot, name)
+    engine = exported(robot, values, solver=MjcfSolver(1e-4, integrator="RK4"))
+    rng = np.random.default_rng(6)
+    compared = 0
+    for pose, twist in zip(states.pose[:12], states.twist[:12], strict=True):
+        torque = robot.static_torque(pose, values) + rng.standard_normal(6)
+        path, reverses = runge_kutta(robot, pose, twist, torque, values)
+        if friction and reverses:
+            continue  # a joint that stops sticks, in MuJoCo softly: another test's subject
+        compared += 1
+        engine.put(pose, twist)
+        for _ in range(200):
+            engine.step(torque)
+        difference = np.abs(engine.pose - path)
+        assert difference[:3].max() < 20e-9
+        assert difference[3:].max() < 200e-9
+        assert np.abs(engine.pose - pose).max() > 1e-3
+    assert compared >= 3
+
+
+def runge_kutta(robot, pose, twist, torque, values, steps=20, h=1e-3):
+    """Pose after some steps of the classical method on `Robot`, and whether a joint reversed."""
+
+    def slope(state):
+        return np.concatenate(
+            [robot.pose_rate(state[:6], state[6:]), robot.forward_dynamics(state[:6], state[6:], torque, values)]
+        )
+
+    state = np.concatenate([pose, twist])
+    before = np.sign(robot.joint_jacobian(pose) @ twist)
+    reverses = False
+    for _ in range(steps):
+        k1 = slope(state)
+        k2 = slope(state + h / 2 * k1)
+        k3 = slope(state + h / 2 * k2)
+        k4 = slope(state + h * k3)
+        state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        reverses |= bool((np.sign(robot.joint_jacobian(state[:6]) @ state[6:]) != before).any())
+    return state[:6], reverses
+
+
+def test_resting_robot_stays_in_its_dry_friction(mujoco, robot):
+    """Half the breakaway torque on every crank for 1 s: MuJoCo's stiff dry friction creeps by less than 0.1 um."""
+    values = robot.parameter_sets["identified"].dynamic
+    engine = exported(robot, values)
+    engine.put(robot.home_pose, np.zeros(6))
+    torque = robot.static_torque(robot.home_pose, values) + 0.5 * values[COULOMB]
+    for _ in range(round(1 / engine.timestep)):
+        engine.step(torque)
+    assert np.abs(engine.pose - robot.home_pose)[:3].max() < 1e-7
+
+
+@pytest.mark.slow
+def test_robot_with_tilted_cranks_agrees_too(mujoco, robot, states):
+    """The whole reference robot turned by 40 degrees under the same gravity: no axis is along z any more."""
+    g, turn = robot.geometry, Rotation.from_rotvec([0.5, 0.4, 0.3]).as_matrix()
+    turned_home = Rotation.from_matrix(turn) * Rotation.from_euler("XYZ", g.home_pose[3:])
+    geometry = Rss6Geometry(
+        g.base_joints @ turn.T, g.platform_joints, g.crank_axes @ turn.T, g.crank_zero_directions @ turn.T,
+        g.crank_length, g.link_length, np.concatenate([turn @ g.home_pose[:3], turned_home.as_euler("XYZ")]),
+        g.travel_limit, g.gravity,
+    )
+    tilted = Robot(RobotDescription("tilted", geometry, robot.parameter_sets))
+    engine = exported(tilted)
+    rng = np.random.default_rng(3)
+    for offset in 0.2 * (states.pose[:10] - robot.home_pose):
+        pose, torque = tilted.home_pose + offset, 5 * rng.standard_normal(6)
+        engine.put(pose, np.zeros(6))
+        assert engine.closure_error < 1e-14
+        ours = tilted.forward_dynamics(pose, np.zeros(6), torque)
+        assert np.abs(engine.twist_dot(torque) - ours).max() < 5e-4 * np.abs(ours).max()
+
+
+def test_inertias_that_no_body_has_are_refused_by_name_and_value(robot):
+    with pytest.raises(UnphysicalInertiaError) as caught:
+        mjcf_text(robot)
+    text = str(caught.value)
+    assert "crank1, crank2, crank3, crank4, crank5, crank6: Izz 0.000605 > Ixx 0.000229 + Iyy 0.000229" in text
+    assert "link6: Izz 0.00213 > Ixx 0.000523 + Iyy 0.000523" in text
+    assert "--allow-unphysical-inertia" in text
+    assert isinstance(caught.value, DynamicsError)
+
+
+def test_file_says_which_inertias_were_changed_and_that_the_motion_does_not_feel_it(robot, states):
+    text = mjcf_text(robot, allow_unphysical_inertia=True)
+    assert "link5, link6: Izz 0.00213 to 0.001046" in text
+    assert "do not alter the motion" in text
+    changed = robot.nominal_parameters.copy()
+    changed[RIGID_BODY] = physical_inertias(changed, allow_changes=True).values.ravel()
+    assert not np.array_equal(changed, robot.nominal_parameters)
+    torques = np.ones((100, 6))
+    np.testing.assert_allclose(
+        robot.forward_dynamics(states.pose, states.twist, torques, changed),
+        robot.forward_dynamics(states.pose, states.twist, torques),
+        rtol=1e-11,
+    )
+
+
+@given(st.lists(moments, min_size=52, max_size=52))
+def test_changed_inertias_are_physical_and_keep_what_the_motion_feels(numbers):
+    given_ = np.array(numbers)
+    before, after = given_.reshape(13, 4), physical_inertias(given_, allow_changes=True).values
+    assert (after > 0).all()
+    x, y, z = after[:, 1:].T
+    assert (x + y >= z).all()
+    assert (y + z >= x).all()
+    assert (z + x >= y).all()
+    floor = np.maximum(before, 1e-12)
+    np.testing.assert_array_equal(after[:, 0], floor[:, 0])
+    np.testing.assert_array_equal(after[1:7, 3], floor[1:7, 3])
+    np.testing.assert_array_equal(after[7:, 1:3], floor[7:, 1:3])
+
+
+def test_platform_gets_the_nearest_moments():
+    """Against a dense sample of moments that a body can have, none is nearer."""
+    values = np.full(52, 0.1)
+    values[:4] = [24, 0.1, 0.15, 0.4]
+    changed = physical_inertias(values, allow_changes=True).values[0, 1:]
+    sample = np.random.default_rng(1).uniform(0, 0.5, (200_000, 3))
+    possible = sample[2 * sample.max(axis=1) <= sample.sum(axis=1)]
+    nearest = np.linalg.norm(possible - values[1:4], axis=1).min()
+    assert np.linalg.norm(changed - values[1:4]) <= nearest
+    np.testing.assert_allclose(changed, [0.15, 0.2, 0.35], rtol=1e-12)
+
+
+def test_mujoco_accepts_what_was_changed(mujoco, robot):
+    rng = np.random.default_rng(4)
+    values = robot.nominal_parameters.copy()
+    for _ in range(20):
+        values[RIGID_BODY] = rng.uniform(0, 1, 52) * rng.integers(0, 2, 52)
+        values[0] = 24.0
+        exported(robot, values)
+
+
+def test_comments_stay_valid_whatever_the_source_is_called(robot):
+    text = mjcf_text(robot, allow_unphysical_inertia=True, source="a--b---c & <d>")
+    assert Xml.fromstring(text).get("model") == "rss6"
+
+
+@pytest.mark.parametrize(
+    ("options", "evidence"),
+    [
+        ({"timestep_s": 0.0}, "timestep is 0.0 s"),
+        ({"timestep_s": float("nan")}, "must be finite"),
+        ({"time_constant_steps": 1.0}, "1.0 steps"),
+        ({"impedance": 1.0}, "impedance is 1.0"),
+        ({"integrator": "midpoint"}, "valid: implicitfast, RK4"),
+    ],
+)
+def test_solver_settings_that_mujoco_would_bend_are_refused(options, evidence):
+    with pytest.raises(DynamicsError, match=evidence):
+        MjcfSolver(**options)
+
+
+@pytest.mark.parametrize(("change", "evidence"), [((5, np.nan), "crank1.Ixx = nan"), ((0, 0.0), "platform.mass = 0")])
+def test_bad_parameters_are_named(robot, change, evidence):
+    values = robot.nominal_parameters.copy()
+    values[change[0]] = change[1]
+    with pytest.raises(ParameterError, match=evidence):
+        mjcf_text(robot, values, allow_unphysical_inertia=True)
+
+
+def test_without_mujoco_one_line_names_the_extra(robot, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(MujocoMissingError, match=r"pip install cmmsim\[mujoco\]"):
+        exported(robot)

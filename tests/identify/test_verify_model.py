@@ -1,0 +1,221 @@
+"""The paper's figure-7 loop on both engines, its verdict and figure, and the commands around other engines."""
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dynamics
+from dynamics.parameters import PARAMETER_NAMES
+from identify import command_line
+from identify.errors import RecordError, ScenarioError, TrajectoryError
+from identify.figure7_loop import EngineRuns, compare_engines, exciting_trajectory
+from identify.model_verification import judge
+from identify.parameter_choice import choose_parameters
+from identify.result_file import load_result, save_result
+from identify.trajectory import check_travel
+from identify.verification_figure import figure_8
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return dynamics.load_robot("rss6")
+
+
+@pytest.fixture(scope="module")
+def initial(robot):
+    return robot.parameter_sets["initial"].vector
+
+
+@pytest.fixture(scope="module")
+def short_run(robot, initial):
+    pytest.importorskip("mujoco")
+    return compare_engines(robot, initial, initial, 3.0)
+
+
+@pytest.fixture
+def made_runs():
+    """Runs over 4 s that differ by known amounts: 5 um at first, 2 um and 3 urad from 1 s on."""
+    time = np.linspace(0, 4, 9)
+    poses, torques = np.zeros((9, 6)), np.zeros((9, 6))
+    other = np.zeros((9, 6))
+    other[:2, 0], other[2:, 1], other[2:, 4] = 3e-6, 2e-6, -3e-6
+    other[:2, 2] = 4e-6
+    reference = np.full((9, 6), [1e-3, 0, 0, 0, 0, 2e-3])
+    return EngineRuns(time, reference, poses, other, torques, torques - 0.5, time * 1e-9, time * 1e-3, "4.0.0")
+
+
+def command(*arguments):
+    """Exit status of the command in this process."""
+    old, sys.argv = sys.argv, ["cmmsim", *map(str, arguments)]
+    try:
+        command_line.main()
+    except SystemExit as exit_:
+        return exit_.code or 0
+    finally:
+        sys.argv = old
+    return 0
+
+
+def test_verdict_takes_lengths_before_and_after_settling(made_runs):
+    verdict = judge(made_runs)
+    assert verdict.position_max_um == pytest.approx(5)
+    assert verdict.position_steady_um == pytest.approx(2)
+    assert verdict.angle_steady_urad == pytest.approx(3)
+    assert verdict.torque_max_nm == pytest.approx(0.5)
+    assert verdict.closure_max_um == pytest.approx(4e-3)
+    assert verdict.spin_max_rad_s == pytest.approx(4e-3)
+    assert (verdict.tracking_max_um, verdict.tracking_max_urad) == (pytest.approx(1e3), pytest.approx(2e3))
+    assert verdict.met
+
+
+@pytest.mark.parametrize("column", [0, 5])
+def test_verdict_misses_where_position_or_angle_exceeds_its_goal(made_runs, column):
+    beyond = made_runs.mujoco_pose.copy()
+    beyond[-1, column] = 21e-6
+    assert not judge(replace(made_runs, mujoco_pose=beyond)).met
+
+
+def test_engines_agree_to_nanometres_under_the_papers_pid(short_run):
+    """Ten thousand times below the goals, while the soft PID leaves both a millimetre from the reference."""
+    verdict = judge(short_run)
+    assert verdict.position_max_um < 0.01
+    assert verdict.angle_max_urad < 0.01
+    assert verdict.torque_max_nm < 1e-5
+    assert verdict.closure_max_um < 0.01
+    assert verdict.spin_max_rad_s < 1e-6
+    assert verdict.tracking_max_um > 500
+
+
+@pytest.mark.parametrize(("name", "factor"), [("platform.mass", 1.01), ("link1.mass", 1.01), ("platform.Ixx", 1.05)])
+def test_a_wrong_parameter_in_one_engine_is_seen(robot, initial, short_run, name, factor):
+    other = initial.copy()
+    other[PARAMETER_NAMES.index(name)] *= factor
+    verdict, right = judge(compare_engines(robot, initial, other, 3.0)), judge(short_run)
+    assert verdict.angle_max_urad > 500 * right.angle_max_urad
+    assert verdict.angle_max_urad > 1
+
+
+def test_exciting_trajectory_starts_at_home_at_rest_and_stays_inside_the_travel(robot):
+    trajectory = exciting_trajectory(robot)
+    np.testing.assert_allclose(trajectory.pose(0.0), robot.home_pose, atol=1e-12)
+    np.testing.assert_allclose(trajectory.pose_rate(0.0), 0, atol=1e-12)
+    check_travel(robot, trajectory, np.linspace(0, 10, 5000))
+
+
+def test_robot_without_room_for_the_trajectory_is_refused_with_evidence(diagonal_robot):
+    diagonal_robot.travel_limit = 0.2
+    with pytest.raises(TrajectoryError, match=r"none of 200 exciting .*travel limit 0\.2000 rad"):
+        exciting_trajectory(diagonal_robot)
+
+
+def test_figure_has_units_goals_and_the_closure_error(made_runs):
+    figure = figure_8(made_runs)
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert labels == ["position error [um]", "angle error [urad]", "gap [um]"]
+    assert "steady 2 um (goal 10 um" in figure.axes[0].get_title()
+    np.testing.assert_allclose(figure.axes[0].lines[1].get_ydata(), 1e6 * made_runs.difference[:, 1])
+    assert "time [s]" in figure.axes[2].get_xlabel()
+
+
+@pytest.mark.slow
+def test_command_verifies_the_reference_robot(capfd, tmp_path):
+    pytest.importorskip("mujoco")
+    assert command("verify-model", "--out", tmp_path / "new") == 0
+    entry = load_result(tmp_path / "new" / "verification.json")
+    assert entry["met"]
+    assert entry["difference"]["position_steady_um"] < 0.01
+    assert entry["difference"]["angle_steady_urad"] < 0.01
+    assert entry["mujoco"]["inertias_changed"].startswith("crank1")
+    assert (tmp_path / "new" / "figure8.png").read_bytes().startswith(b"\x89PNG")
+    said = capfd.readouterr()
+    assert "MuJoCo's loop closure" in said.out
+    assert "MuJoCo: 2001 of 2001" in said.err
+
+
+def test_command_fails_in_one_line_where_a_goal_is_missed(made_runs, monkeypatch, capfd, tmp_path):
+    from identify import model_verification
+
+    off = replace(made_runs, mujoco_pose=made_runs.mujoco_pose + 1e-4)
+    monkeypatch.setattr(model_verification, "verify", lambda *_: off)
+    assert command("verify-model", "--out", tmp_path / "new", "--quiet") == 1
+    said = capfd.readouterr().err
+    assert said.startswith("error: model and MuJoCo differ by 174 um and 171 urad, more than 10 um and 20 urad")
+    assert said.count("\n") == 1
+    assert json.loads((tmp_path / "new" / "verification.json").read_text())["met"] is False
+
+
+@pytest.mark.parametrize(
+    ("arguments", "evidence"),
+    [
+        (("verify-model", "--out", "new"), "pip install cmmsim[mujoco]"),
+        (("verify-model", "nope"), "unknown robot `nope`"),
+        (("export", "mjcf", "rss6"), "crank1, crank2, crank3, crank4, crank5, crank6: Izz 0.000605 > Ixx 0.000229 + "),
+        (("export", "mjcf", "rss6", "--parameters", "nope"), "'nope' is neither a parameter set of robot rss6 (iden"),
+        (("export", "mjcf", "rss6", "--allow-unphysical-inertia", "--out", "."), "cannot write ."),
+    ],
+)
+def test_what_cannot_be_done_is_one_line_and_leaves_nothing(monkeypatch, capfd, tmp_path, arguments, evidence):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    monkeypatch.chdir(tmp_path)
+    assert command(*arguments, "--quiet") == 1
+    said = capfd.readouterr().err
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+    assert evidence in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_verification_does_not_write_into_a_folder_that_holds_something(capfd, tmp_path):
+    (tmp_path / "mine").touch()
+    assert command("verify-model", "--out", tmp_path) == 1
+    assert "is not empty" in capfd.readouterr().err
+
+
+def test_export_writes_the_estimates_of_a_run_and_says_what_it_changed(robot, capfd, tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    values = dict(zip(PARAMETER_NAMES, robot.parameter_sets["identified"].dynamic.tolist(), strict=True))
+    values["platform.mass"] = 23.456
+    save_result(tmp_path / "result.json", made_result(values))
+    out = tmp_path / "model.xml"
+    out.write_text("an older one")
+    options = ("--parameters", tmp_path / "result.json", "--allow-unphysical-inertia", "--out", out)
+    assert command("export", "mjcf", "rss6", *options) == 0
+    model = mujoco.MjModel.from_xml_path(str(out))
+    assert model.body("platform").mass[0] == 23.456
+    assert model.joint("joint4").damping[0] == 0.854
+    assert "changed platform: Ixx 0.161 -> 0.171667" in capfd.readouterr().out
+    assert {path.name for path in tmp_path.iterdir()} == {"result.json", "model.xml"}
+
+
+def test_export_names_the_file_after_the_robot(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert command("export", "mjcf", "rss6", "--allow-unphysical-inertia", "--quiet") == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["rss6.xml"]
+
+
+def made_result(values):
+    return {"identification": {"parameters": {name: {"estimate": value} for name, value in values.items()}}}
+
+
+def test_parameters_default_to_the_nominal_set(robot):
+    np.testing.assert_array_equal(choose_parameters(robot).values, robot.nominal_parameters)
+    with pytest.raises(ScenarioError, match=r"\(identified, initial\)"):
+        choose_parameters(robot, "other")
+
+
+@pytest.mark.parametrize(
+    ("result", "evidence"),
+    [
+        ({}, "no identification.parameters"),
+        ({"identification": []}, "no identification.parameters"),
+        (made_result(dict.fromkeys(PARAMETER_NAMES[3:], 1.0)), "estimate of platform.mass, platform.Ixx, platform.Iyy"),
+        (made_result(dict.fromkeys(PARAMETER_NAMES, None)), "platform.mass, platform.Ixx, platform.Iyy and 61 more"),
+    ],
+)
+def test_result_without_estimates_is_refused(robot, tmp_path, result, evidence):
+    save_result(tmp_path / "result.json", result)
+    with pytest.raises(RecordError, match=evidence):
+        choose_parameters(robot, str(tmp_path / "result.json"))
