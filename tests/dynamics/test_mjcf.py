@@ -113,7 +113,7 @@ def test_accelerations_differ_by_the_softness_of_the_loops_alone(mujoco, robot, 
 
 @pytest.mark.parametrize(("name", "friction"), [("initial", False), ("identified", True)])
 def test_motion_from_a_moving_state_agrees(mujoco, robot, states, name, friction):
-    """20 ms under constant torques, friction included: positions to 20 nm and angles to 0.2 urad (MuJoCo 3.3; 4.0 is closer)."""
+    """20 ms under constant torques, friction included: to 20 nm and 0.2 urad (of MuJoCo 3.3; 4.0 is closer)."""
     values = movable(robot, name)
     engine = exported(robot, values, solver=MjcfSolver(1e-4, integrator="RK4"))
     rng = np.random.default_rng(6)
