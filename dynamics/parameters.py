@@ -4,6 +4,7 @@ The paper calls the driven arm of a leg its wrench; here it is the crank.
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from dynamics.errors import ParameterError
 from dynamics.geometry import LEGS
@@ -43,18 +44,21 @@ def unit_of(name: str) -> str:
     return UNITS[name.rsplit(".", 1)[1]]
 
 
-def check_parameters(values: np.ndarray) -> np.ndarray:
+def check_parameters(values: ArrayLike) -> np.ndarray:
     """Return values as a float array (64,); raise ParameterError on a wrong shape, NaN, or a negative entry."""
-    values = np.asarray(values, dtype=float)
-    if values.shape != (len(PARAMETER_NAMES),):
-        raise ParameterError(f"parameters must have shape ({len(PARAMETER_NAMES)},), got {values.shape}")
-    allowed = (values >= 0) & (values < np.inf)
-    allowed[0] &= values[0] > 0
+    try:
+        array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise ParameterError(f"parameters must be {len(PARAMETER_NAMES)} numbers, got {values!r:.60}") from None
+    if array.shape != (len(PARAMETER_NAMES),):
+        raise ParameterError(f"parameters must have shape ({len(PARAMETER_NAMES)},), got {array.shape}")
+    allowed = (array >= 0) & (array < np.inf)
+    allowed[0] &= array[0] > 0
     if not allowed.all():
         index = int(np.argmin(allowed))
         name, limit = PARAMETER_NAMES[index], ">= 0" if index else "> 0"
-        raise ParameterError(f"{name} = {values[index]:g} {unit_of(name)} is not allowed, must be finite and {limit}")
-    return values
+        raise ParameterError(f"{name} = {array[index]:g} {unit_of(name)} is not allowed, must be finite and {limit}")
+    return array
 
 
 def inertia_warnings(values: np.ndarray) -> list[str]:

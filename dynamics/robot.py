@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dynamics import forward_kinematics, model
+from dynamics.arrays import rows
 from dynamics.compilation import load_library, open_library
 from dynamics.errors import ShapeError, SingularPoseError, UnreachablePoseError
 from dynamics.geometry import LEGS, Rss6Geometry
@@ -60,8 +61,8 @@ class Robot:
 
         Raises ConvergenceError, naming the residual, when no pose near the start has these angles.
         """
-        theta = _rows("theta", theta, LEGS)
-        start = self.home_pose if initial_pose is None else _rows("initial_pose", initial_pose, 6)
+        theta = rows("theta", theta, LEGS)
+        start = self.home_pose if initial_pose is None else rows("initial_pose", initial_pose, 6)
         return forward_kinematics.solve(self, theta, start)
 
     def joint_jacobian(self, pose: ArrayLike) -> np.ndarray:
@@ -74,20 +75,20 @@ class Robot:
 
     def twist(self, pose: ArrayLike, pose_rate: ArrayLike) -> np.ndarray:
         """Twist (6,) of pose rates (6,) (eq. 2)."""
-        return self._call("twist", _rows("pose", pose, 6), _rows("pose_rate", pose_rate, 6))[..., 0]
+        return self._call("twist", rows("pose", pose, 6), rows("pose_rate", pose_rate, 6))[..., 0]
 
     def twist_dot(self, pose: ArrayLike, pose_rate: ArrayLike, pose_acceleration: ArrayLike) -> np.ndarray:
         """Twist rate (6,) of pose rates and accelerations (6,) (eq. 38)."""
         arguments = (("pose", pose), ("pose_rate", pose_rate), ("pose_acceleration", pose_acceleration))
-        return self._call("twist_dot", *[_rows(name, value, 6) for name, value in arguments])[..., 0]
+        return self._call("twist_dot", *[rows(name, value, 6) for name, value in arguments])[..., 0]
 
     def pose_rate(self, pose: ArrayLike, twist: ArrayLike) -> np.ndarray:
         """Pose rates (6,) of a twist (6,); the inverse of `twist`. Euler rates have no value at beta = +-pi/2."""
-        poses = _rows("pose", pose, 6)
+        poses = rows("pose", pose, 6)
         turned = np.abs(np.cos(poses[..., 4]))
         if not (turned > 1 / CONDITION_LIMIT).all():
             raise SingularPoseError(f"Euler rates are singular at beta = +-pi/2: |cos(beta)| is {turned.min():.3g}")
-        return self._call("pose_rate", poses, _rows("twist", twist, 6))[..., 0]
+        return self._call("pose_rate", poses, rows("twist", twist, 6))[..., 0]
 
     def mass_matrix(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
         """M (6, 6) of eq. 23."""
@@ -95,7 +96,7 @@ class Robot:
 
     def coriolis_matrix(self, pose: ArrayLike, twist: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
         """C (6, 6) of eq. 23."""
-        twist = _rows("twist", twist, 6)
+        twist = rows("twist", twist, 6)
         return self._call("coriolis_matrix", self._poses(pose), twist, self._parameters(parameters))
 
     def gravity_wrench(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
@@ -104,35 +105,36 @@ class Robot:
 
     def friction_wrench(self, pose: ArrayLike, twist: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
         """tau_f (6,) of eq. 24, N and N m, with the exact sign function (zero at rest)."""
-        twist = _rows("twist", twist, 6)
+        twist = rows("twist", twist, 6)
         return self._call("friction_wrench", self._poses(pose), twist, self._parameters(parameters))[..., 0]
 
     def regressor(self, pose: ArrayLike, twist: ArrayLike, twist_dot: ArrayLike) -> np.ndarray:
         """Gamma (6, 64): tau_g = Gamma parameters (eq. 25)."""
-        return self._call("regressor", self._poses(pose), _rows("twist", twist, 6), _rows("twist_dot", twist_dot, 6))
+        return self._call("regressor", self._poses(pose), rows("twist", twist, 6), rows("twist_dot", twist_dot, 6))
 
     def inverse_dynamics(
         self, pose: ArrayLike, twist: ArrayLike, twist_dot: ArrayLike, parameters: ArrayLike | None = None
     ) -> np.ndarray:
         """Actuator torques (6,), N m, of a motion (eq. 17 and 23)."""
-        motion = (_rows("twist", twist, 6), _rows("twist_dot", twist_dot, 6))
+        motion = (rows("twist", twist, 6), rows("twist_dot", twist_dot, 6))
         return self._call("inverse_dynamics", self._regular(pose), *motion, self._parameters(parameters))[..., 0]
 
     def forward_dynamics(
         self, pose: ArrayLike, twist: ArrayLike, torque: ArrayLike, parameters: ArrayLike | None = None
     ) -> np.ndarray:
         """twist_dot (6,) under actuator torques (6,), with the exact sign function in the friction (eq. 40)."""
-        state = (self._regular(pose), _rows("twist", twist, 6), _rows("torque", torque, 6))
+        state = (self._regular(pose), rows("twist", twist, 6), rows("torque", torque, 6))
         return self._call("forward_dynamics", *state, self._parameters(parameters))[..., 0]
 
     def static_torque(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
         """Actuator torques (6,), N m, that hold the robot at rest without help from friction."""
-        rest = np.zeros_like(np.asarray(pose, dtype=float))
-        return self.inverse_dynamics(pose, rest, rest, parameters)
+        poses = rows("pose", pose, 6)
+        rest = np.zeros_like(poses)
+        return self.inverse_dynamics(poses, rest, rest, parameters)
 
     def check_reach(self, pose: ArrayLike) -> None:
         """Raise UnreachablePoseError, naming leg and pose, where a leg cannot reach."""
-        poses = np.atleast_2d(_rows("pose", pose, 6))
+        poses = np.atleast_2d(rows("pose", pose, 6))
         margin = np.atleast_2d(self._call("inverse_kinematics", poses, output=1)[..., 0])
         if (margin > 0).all():
             return
@@ -149,7 +151,7 @@ class Robot:
         return _functions(self.geometry)
 
     def _poses(self, pose: ArrayLike) -> np.ndarray:
-        poses = _rows("pose", pose, 6)
+        poses = rows("pose", pose, 6)
         self.check_reach(poses)
         return poses
 
@@ -167,7 +169,10 @@ class Robot:
     def _parameters(self, parameters: ArrayLike | None) -> np.ndarray:
         if parameters is None:
             return self.nominal_parameters
-        values = np.asarray(parameters, dtype=float)
+        try:
+            values = np.asarray(parameters, dtype=float)
+        except (TypeError, ValueError):
+            return check_parameters(parameters)  # says what is wrong with them
         for row in np.atleast_2d(values):
             check_parameters(row)
         return values
@@ -201,16 +206,3 @@ def _functions(geometry: Rss6Geometry) -> dict[str, ca.Function]:
 
 def _shown(arguments: tuple[np.ndarray, ...]) -> str:
     return ", ".join(np.array2string(argument, precision=6, threshold=12) for argument in arguments)
-
-
-def _rows(name: str, value: ArrayLike, width: int) -> np.ndarray:
-    try:
-        array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise ShapeError(f"{name} must be numbers of shape ({width},) or (N, {width}), got {value!r:.60}") from None
-    if array.ndim not in (1, 2) or array.shape[-1] != width:
-        raise ShapeError(f"{name} must have shape ({width},) or (N, {width}), got {array.shape}")
-    if not np.isfinite(array).all():
-        place = tuple(int(index) for index in np.argwhere(~np.isfinite(array))[0])
-        raise ShapeError(f"{name}{list(place)} is {array[place]}, must be finite")
-    return array

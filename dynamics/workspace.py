@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dynamics.arrays import rows
 from dynamics.errors import DynamicsError, ShapeError, SingularPoseError, TravelError, UnreachablePoseError
 from dynamics.expressions import evaluate
 from dynamics.geometry import Rss6Geometry
@@ -93,17 +94,17 @@ def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
 
     Raises ShapeError for another shape or for entries that are not finite.
     """
-    poses = _checked_poses(pose)
+    poses = np.atleast_2d(rows("pose", pose, 6))
     geometry = robot.geometry
     theta, margin = (part[..., 0] for part in evaluate(robot.functions["inverse_kinematics"], poses))
     leverages, link_rows = evaluate(robot.functions["loop_jacobians"], poses)
     leverage = np.abs(leverages[..., 0]) / (geometry.crank_length * geometry.link_length)
-    rows = link_rows / (geometry.link_length * np.repeat([1.0, characteristic_length(geometry)], 3))
+    scaled = link_rows / (geometry.link_length * np.repeat([1.0, characteristic_length(geometry)], 3))
     reachable = (margin > 0).all(axis=1)
     theta[~reachable], leverage[~reachable] = np.nan, np.nan
     platform, joint = np.full(len(poses), np.nan), np.full(len(poses), np.nan)
-    platform[reachable] = np.linalg.cond(rows[reachable])
-    joint[reachable] = np.linalg.cond(rows[reachable] / leverage[reachable, :, None])
+    platform[reachable] = np.linalg.cond(scaled[reachable])
+    joint[reachable] = np.linalg.cond(scaled[reachable] / leverage[reachable, :, None])
     return WorkspaceMeasures(theta, margin, leverage, platform, joint, robot.travel_limit)
 
 
@@ -122,8 +123,8 @@ def check_motion(
     `travel_margin` (rad); SingularPoseError for a leverage below `least_leverage` (J_a1) or a condition number of the
     scaled J_a2 above `most_condition`; ShapeError for poses or times of the wrong shape.
     """
-    poses = _checked_poses(pose)
-    moments = np.full(len(poses), np.nan) if times is None else np.atleast_1d(np.asarray(times, dtype=float))
+    poses = np.atleast_2d(rows("pose", pose, 6))
+    moments = np.full(len(poses), np.nan) if times is None else rows("times", times, len(poses))
     if not len(poses) or moments.shape != (len(poses),):
         raise ShapeError(f"a motion needs at least one pose and as many times, got {len(poses)} and {moments.shape}")
     measures = measure(robot, poses)
@@ -156,16 +157,3 @@ def _broken(
         f"{quantity}{who} of {robot.name} is {worst.value:.4g} at {when}, {relation}{worst.limit:.4g} "
         f"(pose {np.array2string(poses[worst.row], precision=4)})"
     )
-
-
-def _checked_poses(pose: ArrayLike) -> np.ndarray:
-    try:
-        poses = np.atleast_2d(np.asarray(pose, dtype=float))
-    except (TypeError, ValueError):
-        raise ShapeError(f"pose must be numbers of shape (6,) or (N, 6), got {pose!r:.60}") from None
-    if poses.ndim != 2 or poses.shape[1] != 6:
-        raise ShapeError(f"pose must have shape (6,) or (N, 6), got {np.shape(pose)}")
-    if not np.isfinite(poses).all():
-        row, column = (int(index) for index in np.argwhere(~np.isfinite(poses))[0])
-        raise ShapeError(f"pose[{row}, {column}] is {poses[row, column]}, must be finite")
-    return poses

@@ -278,3 +278,72 @@ def test_inertias_no_body_can_have_are_named(robot, identified):
     assert lines[0].startswith("crank1: largest inertia 0.000605 kg m^2 exceeds")
     assert not any(line.startswith("platform") for line in lines)
     assert issubclass(RobotFileError, DynamicsError)
+
+
+BAD_ARRAYS = {
+    "text": "home",
+    "None in it": [None, 0, 0, 0, 0, 0],
+    "ragged": [[0.0] * 6, [0.0]],
+    "too long": np.zeros(7),
+    "transposed batch": np.zeros((6, 2)),
+    "three axes": np.zeros((1, 1, 6)),
+    "complex": np.full(6, 1j),
+    "nan": np.full(6, np.nan),
+    "inf": np.full((2, 6), -np.inf),
+    "three rows where two are": np.tile([0, 0, 0.2, 0, 0, 0], (3, 1)),
+    "too large to square": np.full(6, 1e200),
+}
+METHODS = {  # arguments after the pose, each of shape (6,) or (N, 6)
+    "inverse_kinematics": 0,
+    "forward_kinematics": 0,
+    "joint_jacobian": 0,
+    "pose_jacobian": 0,
+    "static_torque": 0,
+    "mass_matrix": 0,
+    "gravity_wrench": 0,
+    "twist": 1,
+    "pose_rate": 1,
+    "coriolis_matrix": 1,
+    "friction_wrench": 1,
+    "twist_dot": 2,
+    "regressor": 2,
+    "inverse_dynamics": 2,
+    "forward_dynamics": 2,
+}
+WITH_PARAMETERS = ("mass_matrix", "gravity_wrench", "coriolis_matrix", "friction_wrench", "static_torque")
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("bad", BAD_ARRAYS)
+def test_no_method_takes_a_bad_array_or_returns_a_nan(robot, method, bad):
+    """Every array argument in turn is replaced: the answer is an error of the package, or finite where it may be."""
+    for place in range(METHODS[method] + 1):
+        arguments = [np.tile(robot.home_pose, (2, 1)), *np.zeros((METHODS[method], 2, 6))]
+        arguments[place] = BAD_ARRAYS[bad]
+        try:
+            result = getattr(robot, method)(*arguments)
+        except DynamicsError:
+            continue
+        # Three rows alone are a batch; what is linear in a large number may still be a number.
+        assert bad in ("three rows where two are", "too large to square"), result
+        assert np.isfinite(result).all()
+
+
+@pytest.mark.parametrize("method", WITH_PARAMETERS)
+@pytest.mark.parametrize(
+    "bad",
+    ["mass", np.zeros(3), np.zeros((2, 3, 64)), np.full(64, np.nan), -np.ones(64), np.zeros(64), [1.0, [2.0]], 5.0],
+    ids=["text", "short", "three axes", "nan", "negative", "no mass", "ragged", "scalar"],
+)
+def test_no_method_takes_bad_parameters(robot, method, bad):
+    arguments = [robot.home_pose, *np.zeros((METHODS[method], 6)), bad]
+    with pytest.raises(ParameterError):
+        getattr(robot, method)(*arguments)
+
+
+def test_rows_of_parameters_must_match_the_poses(robot):
+    """Three sets for two poses are named as such; one set serves all."""
+    poses = np.tile(robot.home_pose, (2, 1))
+    with pytest.raises(ShapeError, match=r"mass_matrix: batch lengths differ, shapes \(2, 6\), \(3, 64\)"):
+        robot.mass_matrix(poses, np.tile(robot.nominal_parameters, (3, 1)))
+    assert robot.mass_matrix(poses, robot.nominal_parameters[None]).shape == (2, 6, 6)

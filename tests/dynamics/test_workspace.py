@@ -151,7 +151,7 @@ def test_a_platform_that_moves_with_locked_cranks_is_found(tmp_path, monkeypatch
         (np.full((2, 6), np.nan), None, r"pose\[0, 0\] is nan"),
         ("home", None, "must be numbers"),
         (np.zeros((0, 6)), None, "at least one pose"),
-        (np.zeros((3, 6)), np.zeros(2), r"as many times, got 3 and \(2,\)"),
+        (np.zeros((3, 6)), np.zeros(2), r"times must have shape \(3,\) .*, got \(2,\)"),
     ],
 )
 def test_bad_arrays_are_refused(robot, pose, times, message):
