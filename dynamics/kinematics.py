@@ -12,12 +12,15 @@ from dynamics.rotation import rotation_matrix
 
 @dataclass(frozen=True)
 class LegVectors:
-    """One leg, base axes, m: crank angle (rad), axis s, crank w = T - B and link l = A - T, each (3,)."""
+    """One leg, base axes, m: crank angle (rad), axis s, crank w = T - B and link l = A - T, each (3,), and their
+    lengths, which are constants of the robot."""
 
     angle: ca.SX
     axis: ca.SX
     crank: ca.SX
     link: ca.SX
+    crank_length: float
+    link_length: float
 
 
 def platform_arms(geometry: Rss6Geometry, pose: ca.SX) -> list[ca.SX]:
@@ -41,11 +44,14 @@ def leg_to(geometry: Rss6Geometry, leg: int, joint_position: ca.SX) -> LegVector
     along, across, chord = _chord(geometry, leg, joint_position)
     square = along**2 + across**2
     root = home_branch(geometry, leg) * ca.sqrt(square - chord**2)
-    cosine = (along * chord - across * root) / square
-    sine = (across * chord + along * root) / square
+    inverse = 1 / square
+    cosine = (along * chord - across * root) * inverse
+    sine = (across * chord + along * root) * inverse
     crank = geometry.crank_length * (cosine * zero + sine * np.cross(axis, zero))
     link = joint_position - geometry.base_joints[leg] - crank
-    return LegVectors(ca.atan2(sine, cosine), ca.SX(axis), crank, link)
+    return LegVectors(
+        ca.atan2(sine, cosine), ca.SX(axis), crank, link, geometry.crank_length, geometry.link_length
+    )
 
 
 def loop_closure(geometry: Rss6Geometry, pose: ca.SX, angles: ca.SX) -> tuple[ca.SX, ca.SX]:

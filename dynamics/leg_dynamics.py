@@ -29,7 +29,7 @@ class LegMotion:
 
 def torque_to_force(leg: LegVectors) -> ca.SX:
     """l / m (3,): force at A of a unit crank torque, and gradient of the crank angle with respect to A (eq. 8)."""
-    return leg.link / crank_leverage(leg)
+    return leg.link * (1 / crank_leverage(leg))
 
 
 def leg_motion(leg: LegVectors, velocity: ca.SX, acceleration: ca.SX) -> LegMotion:
@@ -39,61 +39,60 @@ def leg_motion(leg: LegVectors, velocity: ca.SX, acceleration: ca.SX) -> LegMoti
     link_rate = velocity - rate * tangent
     # l . A_ddot + |l_dot|^2 = l . w_ddot: the link keeps its length.
     stretch = ca.dot(link_rate, link_rate) + rate**2 * ca.dot(leg.link, leg.crank)
-    crank_acceleration = ca.dot(gradient, acceleration) + stretch / crank_leverage(leg)
+    crank_acceleration = ca.dot(gradient, acceleration) + stretch * (1 / crank_leverage(leg))
     tip_acceleration = crank_acceleration * tangent - rate**2 * leg.crank
     link_acceleration = acceleration - tip_acceleration
-    square = ca.dot(leg.link, leg.link)
+    per_square = 1 / leg.link_length**2
     return LegMotion(
         rate,
         crank_acceleration,
         tip_acceleration,
         link_acceleration,
-        ca.cross(leg.link, link_rate) / square,
-        ca.cross(leg.link, link_acceleration) / square,
+        ca.cross(leg.link, link_rate) * per_square,
+        ca.cross(leg.link, link_acceleration) * per_square,
     )
 
 
 def leg_columns(leg: LegVectors, motion: LegMotion, gravity: ca.DM) -> ca.SX:
-    """Force at A (3, 8) for unit crank mass, Ixx, Iyy, Izz and link mass, Ixx, Iyy, Izz."""
+    """Force at A (3, 8) for unit crank mass, Ixx, Iyy, Izz and link mass, Ixx, Iyy, Izz: the derivatives of
+    `leg_force`, which is linear in the parameters."""
+    parameters = ca.SX.sym("parameters", 8)
+    return ca.jacobian(leg_force(leg, motion, parameters[0:4], parameters[4:8], gravity), parameters)
+
+
+def leg_force(leg: LegVectors, motion: LegMotion, crank: ca.SX, link: ca.SX, gravity: ca.DM) -> ca.SX:
+    """Force at A (3,), N, that moves crank and link, for their parameters (mass, Ixx, Iyy, Izz) each (4,)."""
     gradient, tangent = torque_to_force(leg), ca.cross(leg.axis, leg.crank)
-    crank_mass = gradient * ca.dot(tangent / 2, motion.tip_acceleration / 2 - gravity)
-    pull = motion.tip_acceleration + motion.link_acceleration / 2 - gravity
-    link_mass = (pull + gradient * ca.dot(tangent, pull)) / 2
     # The crank turns about its own z alone, and a link without spin about l does no work against Izz.
-    none = ca.SX.zeros(3)
-    columns = [crank_mass, none, none, gradient * motion.crank_acceleration, link_mass]
-    lever = _spin_lever(leg)
-    for direction in link_axes(leg):
+    lever = ca.dot(tangent / 2, motion.tip_acceleration / 2 - gravity)
+    torque = crank[0] * lever + crank[3] * motion.crank_acceleration
+    pull = link[0] * (motion.tip_acceleration + motion.link_acceleration / 2 - gravity) / 2
+    moment = ca.SX.zeros(3)
+    for inertia, direction in zip((link[1], link[2]), link_axes(leg), strict=True):
         spin = ca.dot(direction, motion.angular_velocity)
-        gyroscopic = ca.cross(motion.angular_velocity, direction) * spin
-        moment = direction * ca.dot(direction, motion.angular_acceleration) + gyroscopic
-        columns.append(lever.T @ moment)
-    return ca.horzcat(*columns, none)
+        turning = ca.dot(direction, motion.angular_acceleration)
+        moment += inertia * (direction * turning + ca.cross(motion.angular_velocity, direction) * spin)
+    turn = ca.cross(moment, leg.link) * (1 / leg.link_length**2)
+    return pull + turn + gradient * (torque + ca.dot(tangent, pull - turn))
 
 
 def leg_mass(leg: LegVectors, crank: ca.SX, link: ca.SX) -> ca.SX:
     """Mass (3, 3) the leg adds at A, for crank and link parameters (mass, Ixx, Iyy, Izz) each (4,)."""
     gradient, tangent = torque_to_force(leg), ca.cross(leg.axis, leg.crank)
-    radius_square = ca.dot(leg.crank, leg.crank)
-    reflected = crank[3] + (crank[0] + link[0]) * radius_square / 4
-    mixed = gradient @ tangent.T
-    total = reflected * (gradient @ gradient.T) + link[0] / 4 * (ca.SX.eye(3) + mixed + mixed.T)
-    lever = _spin_lever(leg)
-    for inertia, direction in zip((link[1], link[2]), link_axes(leg), strict=True):
-        row = lever.T @ direction
-        total += inertia * (row @ row.T)
+    reflected = crank[3] + (crank[0] + link[0]) * (leg.crank_length**2 / 4)
+    half = gradient @ (link[0] / 4 * tangent).T
+    total = reflected * (gradient @ gradient.T) + link[0] / 4 * ca.SX.eye(3) + half + half.T
+    # Turning about x moves A along -y and the other way round, less what the crank takes up (eq. 13).
+    x, y = link_axes(leg)
+    for inertia, direction in ((link[1], y), (link[2], x)):
+        row = direction - gradient * ca.dot(tangent, direction)
+        total += (inertia * (1 / leg.link_length**2)) * (row @ row.T)
     return total
 
 
 def link_axes(leg: LegVectors) -> tuple[ca.SX, ca.SX]:
     """The link's x and y axes (3,) each: z from T to A, x = s x z normalised, y = z x x."""
-    z = leg.link / ca.norm_2(leg.link)
+    z = leg.link * (1 / leg.link_length)
     across = ca.cross(leg.axis, z)
-    x = across / ca.norm_2(across)
+    x = across * (1 / ca.norm_2(across))
     return x, ca.cross(z, x)
-
-
-def _spin_lever(leg: LegVectors) -> ca.SX:
-    """d(angular velocity of the link)/d(velocity of A) (3, 3), 1/m (eq. 13)."""
-    gradient, tangent = torque_to_force(leg), ca.cross(leg.axis, leg.crank)
-    return ca.skew(leg.link) @ (ca.SX.eye(3) - tangent @ gradient.T) / ca.dot(leg.link, leg.link)

@@ -62,20 +62,22 @@ def dynamic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
     torque, xi = ca.SX.sym("torque", 6), ca.SX.sym("parameters", len(PARAMETER_NAMES))
     rigid = xi[RIGID_BODY]
     jacobian = joint_jacobian(geometry, pose)
-    friction_columns = friction_regressor(jacobian, jacobian @ twist)
-    friction = friction_columns @ ca.vertcat(xi[COULOMB], xi[VISCOUS])
-    wrench = inertial_wrench(geometry, pose, twist, twist_dot, rigid) + friction
-    bias = inertial_wrench(geometry, pose, twist, ca.SX.zeros(6), rigid) + friction
+    velocity = jacobian @ twist
+    friction = xi[COULOMB] * ca.sign(velocity) + xi[VISCOUS] * velocity
+    inertial = inertial_wrench(geometry, pose, twist, twist_dot, rigid)
+    bias = inertial_wrench(geometry, pose, twist, ca.SX.zeros(6), rigid)
     mass = mass_matrix(geometry, pose, rigid)
-    regressor = ca.horzcat(rigid_body_regressor(geometry, pose, twist, twist_dot), friction_columns)
+    regressor = ca.horzcat(
+        rigid_body_regressor(geometry, pose, twist, twist_dot), friction_regressor(jacobian, velocity)
+    )
     return [
         function("mass_matrix", [pose, xi], [mass]),
         function("coriolis_matrix", [pose, twist, xi], [coriolis_matrix(geometry, pose, twist, rigid)]),
         function("gravity_wrench", [pose, xi], [gravity_wrench(geometry, pose, rigid)]),
-        function("friction_wrench", [pose, twist, xi], [friction]),
+        function("friction_wrench", [pose, twist, xi], [jacobian.T @ friction]),
         function("regressor", [pose, twist, twist_dot], [regressor]),
-        function("inverse_dynamics", [pose, twist, twist_dot, xi], [ca.solve(jacobian.T, wrench)]),
-        function("forward_dynamics", [pose, twist, torque, xi], [_ldl_solve(mass, jacobian.T @ torque - bias)]),
+        function("inverse_dynamics", [pose, twist, twist_dot, xi], [ca.solve(jacobian.T, inertial) + friction]),
+        function("forward_dynamics", [pose, twist, torque, xi], [_ldl_solve(mass, jacobian.T @ (torque - friction) - bias)]),
     ]
 
 

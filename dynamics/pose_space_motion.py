@@ -15,7 +15,7 @@ import casadi as ca
 from dynamics.expressions import function
 from dynamics.geometry import LEGS, Rss6Geometry
 from dynamics.kinematics import leg_to
-from dynamics.leg_dynamics import leg_columns, leg_mass, leg_motion, torque_to_force
+from dynamics.leg_dynamics import leg_columns, leg_force, leg_mass, leg_motion, torque_to_force
 from dynamics.parameters import RIGID_BODY
 from dynamics.platform_joint_motion import PlatformJointMotion
 from dynamics.rigid_body_dynamics import crank_parameters, link_parameters, platform_columns
@@ -36,7 +36,7 @@ def equation_of_motion(geometry: Rss6Geometry) -> ca.Function:
         crank, link = crank_parameters(rigid, leg), link_parameters(rigid, leg)
         gradient = joints.gradient[leg]
         mass += gradient.T @ leg_mass(vectors, crank, link) @ gradient
-        bias += gradient.T @ (leg_columns(vectors, motion, ca.DM(geometry.gravity)) @ ca.vertcat(crank, link))
+        bias += gradient.T @ leg_force(vectors, motion, crank, link, ca.DM(geometry.gravity))
         rows.append(torque_to_force(vectors).T @ gradient)
         crank_accelerations.append(motion.crank_acceleration)
         angles.append(vectors.angle)
@@ -90,7 +90,8 @@ def _leg_derivatives(
     motion = leg_motion(vectors, inputs[1], inputs[2])
     columns = leg_columns(vectors, motion, ca.DM(geometry.gravity))
     own = ca.vertcat(crank_parameters(rigid, leg), link_parameters(rigid, leg))
-    force = columns @ own - torque_to_force(vectors) * torque
+    moving = leg_force(vectors, motion, own[0:4], own[4:8], ca.DM(geometry.gravity))
+    force = moving - torque_to_force(vectors) * torque
     by_acceleration = leg_mass(vectors, own[0:4], own[4:8])
     crank = motion.crank_acceleration
     expressions = [

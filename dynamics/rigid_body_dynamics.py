@@ -10,18 +10,16 @@ from dynamics.geometry import LEGS, Rss6Geometry
 from dynamics.jacobian_rates import crank_jacobian_rate, link_jacobian_rate, moving_leg
 from dynamics.jacobians import crank_jacobian, link_jacobian
 from dynamics.kinematics import LegVectors, leg_vectors, platform_arms
-from dynamics.leg_dynamics import leg_columns, leg_mass, leg_motion, link_axes
+from dynamics.leg_dynamics import leg_columns, leg_force, leg_mass, leg_motion, link_axes
 from dynamics.rotation import rotation_matrix
 
 
 def rigid_body_regressor(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> ca.SX:
     """Columns of Gamma (6, 52) for the inertial parameters of platform, cranks and links (eq. 25)."""
-    gravity, omega, omega_dot = ca.DM(geometry.gravity), twist[3:6], twist_dot[3:6]
+    gravity = ca.DM(geometry.gravity)
     cranks, links = [], []
     for leg, arm in zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True):
-        velocity = twist[0:3] + ca.cross(omega, arm)
-        acceleration = twist_dot[0:3] + ca.cross(omega_dot, arm) + ca.cross(omega, ca.cross(omega, arm))
-        forces = leg_columns(leg, leg_motion(leg, velocity, acceleration), gravity)
+        forces = leg_columns(leg, leg_motion(leg, *joint_motion(arm, twist, twist_dot)), gravity)
         wrenches = ca.vertcat(forces, ca.skew(arm) @ forces)
         cranks.append(wrenches[:, 0:4])
         links.append(wrenches[:, 4:8])
@@ -46,8 +44,21 @@ def friction_regressor(joint_jacobian: ca.SX, joint_velocity: ca.SX) -> ca.SX:
 
 
 def inertial_wrench(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, rigid: ca.SX) -> ca.SX:
-    """M twist_dot + C twist + G (6,) for the 52 inertial parameters `rigid`; linear in them."""
-    return rigid_body_regressor(geometry, pose, twist, twist_dot) @ rigid
+    """M twist_dot + C twist + G (6,) for the 52 inertial parameters `rigid`: the regressor times them, without it."""
+    gravity = ca.DM(geometry.gravity)
+    total = platform_columns(pose, twist, twist_dot, gravity) @ rigid[0:4]
+    for index, (leg, arm) in enumerate(zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True)):
+        motion = leg_motion(leg, *joint_motion(arm, twist, twist_dot))
+        force = leg_force(leg, motion, crank_parameters(rigid, index), link_parameters(rigid, index), gravity)
+        total += ca.vertcat(force, ca.cross(arm, force))
+    return total
+
+
+def joint_motion(arm: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Velocity and acceleration (3,) of a platform joint at `arm` (3,) from the platform origin."""
+    omega, omega_dot = twist[3:6], twist_dot[3:6]
+    velocity = twist[0:3] + ca.cross(omega, arm)
+    return velocity, twist_dot[0:3] + ca.cross(omega_dot, arm) + ca.cross(omega, ca.cross(omega, arm))
 
 
 def mass_matrix(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:

@@ -6,7 +6,7 @@ import pytest
 from dynamics.batch import simulate_batch
 from dynamics.closed_loop import simulate
 from dynamics.errors import SimulationError, SingularPoseError
-from dynamics.forward_dynamics import ForwardDynamics
+from dynamics.forward_dynamics import fast_forward_dynamics
 
 
 @pytest.mark.parametrize("workers", [1, 3])
@@ -34,7 +34,7 @@ def test_lengths_that_do_not_pair_up_are_refused(robot, identified, make_referen
 
 def test_fast_forward_dynamics_is_the_robots(robot, identified):
     rng = np.random.default_rng(0)
-    fast = ForwardDynamics(robot, identified[:64])
+    fast = fast_forward_dynamics(robot, identified[:64])
     for _ in range(20):
         pose = robot.home_pose + rng.uniform(-1, 1, 6) * np.repeat([0.01, 0.04], 3)
         twist, torque = rng.standard_normal((2, 6))
@@ -43,7 +43,7 @@ def test_fast_forward_dynamics_is_the_robots(robot, identified):
 
 
 def test_fast_forward_dynamics_never_returns_nan(robot):
-    fast = ForwardDynamics(robot)
+    fast = fast_forward_dynamics(robot)
     far = robot.home_pose + np.array([0, 0, 0.5, 0, 0, 0])
     with pytest.raises(SingularPoseError, match="not finite at pose"):
         fast(far, np.zeros(6), np.zeros(6))
