@@ -67,6 +67,7 @@ def dynamic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
     inertial = inertial_wrench(geometry, pose, twist, twist_dot, rigid)
     bias = inertial_wrench(geometry, pose, twist, ca.SX.zeros(6), rigid)
     mass = mass_matrix(geometry, pose, rigid)
+    acceleration = _ldl_solve(mass, jacobian.T @ (torque - friction) - bias)
     regressor = ca.horzcat(
         rigid_body_regressor(geometry, pose, twist, twist_dot), friction_regressor(jacobian, velocity)
     )
@@ -77,7 +78,7 @@ def dynamic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
         function("friction_wrench", [pose, twist, xi], [jacobian.T @ friction]),
         function("regressor", [pose, twist, twist_dot], [regressor]),
         function("inverse_dynamics", [pose, twist, twist_dot, xi], [ca.solve(jacobian.T, inertial) + friction]),
-        function("forward_dynamics", [pose, twist, torque, xi], [_ldl_solve(mass, jacobian.T @ (torque - friction) - bias)]),
+        function("forward_dynamics", [pose, twist, torque, xi], [acceleration]),
     ]
 
 
