@@ -9,8 +9,13 @@ from .measurement import Measurement, lost_measurement
 from .pose import Array, invert
 
 
+# A tracked frame that shows less than this share of the stickers seen before is searched as a whole: most windows may
+# have been laid beside their stickers.
+EXPECTED_SHARE = 0.7
+
+
 class Tracker:
-    """Remembers the last two measured poses; after a lost frame it searches the whole images again."""
+    """Remembers the last two measured poses. A frame in which the prediction fails is searched as a whole at once."""
 
     def __init__(self, estimator: PoseEstimator) -> None:
         self._estimator = estimator
@@ -20,18 +25,34 @@ class Tracker:
         """The next frame is searched as a whole."""
         self._last: Array | None = None
         self._step_before: Array | None = None
+        self._seen = 0
 
     def measure(self, images: StereoImages) -> Measurement:
         """Measure one frame; never raises for what is in the images."""
         try:
-            expected = self._estimator.locate(images) if self._last is None else self._predicted()
-            measurement, measured = self._estimator.measure(images, expected)
+            measurement, measured = self._tracked(images) or self._found(images)
         except LostError as error:
             self.forget()
             return lost_measurement(str(error))
         self._step_before = None if self._last is None else invert(self._last) @ measured
-        self._last = measured
+        self._last, self._seen = measured, len(measurement.target_ids)
         return measurement
+
+    def _tracked(self, images: StereoImages) -> tuple[Measurement, Array] | None:
+        """The measurement in the predicted windows; None without a prediction or where it did not hold."""
+        if self._last is None:
+            return None
+        try:
+            measurement, measured = self._estimator.measure(images, self._predicted())
+        except LostError:
+            return None
+        if len(measurement.target_ids) < EXPECTED_SHARE * self._seen:
+            return None
+        return measurement, measured
+
+    def _found(self, images: StereoImages) -> tuple[Measurement, Array]:
+        """The measurement after a search of the whole images without any prior."""
+        return self._estimator.measure(images, self._estimator.locate(images))
 
     def _predicted(self) -> Array:
         """camera_from_platform (4,4) if the last movement goes on."""

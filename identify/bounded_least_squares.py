@@ -73,8 +73,9 @@ def minimise(
             reason = f"stopped after max_iterations = {criteria.max_iterations}"
             break
         step, predicted = _box_step(factor, residual, parameters, lower, scale, radius)
+        trial = np.maximum(parameters + step, lower)
         evaluations += 1
-        new_cost = problem.cost(parameters + step) if predicted > 0 else cost
+        new_cost = problem.cost(trial) if predicted > 0 else cost
         ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
         largest = float(np.abs(step / scale).max())
         tried, radius = radius, _new_radius(radius, ratio, largest)
@@ -83,7 +84,7 @@ def minimise(
             if largest < 0.9 * tried:
                 change = _relative_change(step, parameters, scale)
                 reason = _converged(cost, new_cost, change, criteria)
-            parameters = np.maximum(parameters + step, lower)
+            parameters = trial
             cost, factor, residual = problem.linearise(parameters)
             evaluations += 1
             costs.append(cost)

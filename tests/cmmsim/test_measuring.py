@@ -160,17 +160,16 @@ def test_fully_hidden_platform_is_lost_with_a_reason(taught):
     assert sensor.measure(sensor.home).ok
 
 
-def test_jumps_are_lost_or_measured_never_wrong(sensor):
+def test_unrelated_poses_are_all_measured(sensor):
+    """A jump leaves the predicted windows: the whole images of that same frame are searched, and no pose is wrong."""
     rng = np.random.default_rng(11)
-    lost = 0
-    for _ in range(25):
+    for _ in range(15):
         pose = sensor.home + rng.uniform(-1.0, 1.0, 6) * ([0.010] * 3 + [0.04] * 3)
         m = sensor.measure(pose)
-        lost += not m.ok
-        if m.ok:
-            error = m.pose - pose
-            assert error @ np.linalg.solve(m.covariance, error) < 45.0
-    assert 0 < lost < 20
+        assert m.ok, m.reason
+        assert len(m.target_ids) >= 12
+        error = m.pose - pose
+        assert error @ np.linalg.solve(m.covariance, error) < 45.0
 
 
 def test_measure_frame_on_captured_images(sensor):

@@ -1,7 +1,7 @@
 """The search is checked against scipy's own solver and against problems whose minimum is known."""
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, nnls
 
 from identify.bounded_least_squares import StopCriteria, minimise
 
@@ -46,6 +46,28 @@ def test_it_stays_inside_the_bounds_and_finds_the_constrained_minimum():
     scipys = least_squares(problem.residual, [0.5, 4.0], bounds=(lower, np.inf), xtol=1e-15, ftol=1e-15, gtol=1e-15)
     assert mine.parameters[1] >= 2.0
     assert np.allclose(mine.parameters, scipys.x, rtol=1e-5)
+
+
+def test_a_start_on_a_bound_does_not_hold_the_search_up():
+    """The model cannot run below its bounds, and a step along a bound may end below it by rounding."""
+    problem = exponential()
+    plain = problem.cost
+    problem.cost = lambda p: plain(p) if np.all(p >= 0.0) else np.inf
+    free = minimise(problem, np.array([0.0, 0.0]), np.zeros(2), np.array([0.3, 0.7]), CRITERIA)
+    assert np.allclose(free.parameters, least_squares(problem.residual, [1.0, 1.0], xtol=1e-15).x, rtol=1e-5)
+
+
+def test_parameters_held_at_their_bound_stay_there_exactly():
+    """The unconstrained minimum has a negative entry: it ends at zero, and the others still move."""
+    matrix = np.random.default_rng(2).standard_normal((30, 5))
+    target = matrix @ np.array([1.0, -2.0, 0.5, 3.0, -0.1])
+    problem = FromFunctions(lambda p: matrix @ p - target, lambda p: matrix)
+    plain = problem.cost
+    problem.cost = lambda p: plain(p) if np.all(p >= 0.0) else np.inf
+    found = minimise(problem, np.array([1.0, 0.0, 1.0, 1.0, 0.0]), np.zeros(5), np.full(5, 0.37), CRITERIA)
+    expected = nnls(matrix, target)[0]
+    assert np.allclose(found.parameters, expected, atol=1e-9)
+    assert np.all(found.parameters >= 0)
 
 
 def test_a_region_where_the_model_cannot_run_is_stepped_around():
