@@ -30,7 +30,8 @@ def fast_forward_dynamics(robot: Robot, parameters: np.ndarray | None = None) ->
         buffer.set_arg(index, memoryview(array.data))
     buffer.set_res(0, memoryview(result.data))
     values = memoryview(result.data)
-    pose_in, twist_in, torque_in = (memoryview(array.data) for array in (pose, twist, torque))
+    # Assigning to a memoryview costs half of assigning to an array, and refuses other shapes and types.
+    pose_in, twist_in, torque_in = (_writable(array) for array in (pose, twist, torque))
 
     def forward_dynamics(at_pose: np.ndarray, at_twist: np.ndarray, at_torque: np.ndarray) -> np.ndarray:
         pose_in[:] = at_pose
@@ -47,3 +48,7 @@ def fast_forward_dynamics(robot: Robot, parameters: np.ndarray | None = None) ->
     # The buffer must live as long as the function that evaluates it.
     forward_dynamics.buffer = buffer  # type: ignore[attr-defined]
     return forward_dynamics
+
+
+def _writable(array: np.ndarray) -> Any:
+    return memoryview(array.data)

@@ -1,6 +1,7 @@
 """The command ``cmmsim``: a whole run, or its stages one by one."""
 
 import tomllib
+import warnings
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -71,13 +72,22 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars and no su
 
 def main() -> None:
     """Run the command; a known error is one line on standard error and exit status 1."""
+    warnings.showwarning = _show_warning
     try:
         app()
+    except KeyboardInterrupt:
+        typer.echo("aborted", err=True)
+        raise SystemExit(130) from None
     except Exception as error:
         if not is_known(error):
             raise
         typer.echo(f"error: {' '.join(str(error).split())}", err=True)
         raise SystemExit(1) from None
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
+    """A warning as one line, without the place in the code that gave it."""
+    typer.echo(f"warning: {' '.join(str(message).split())}", err=True)
 
 
 def is_known(error: Exception) -> bool:

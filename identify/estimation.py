@@ -28,7 +28,7 @@ from identify.output_error import OutputErrorProblem
 from identify.progress import Advance, Progress, SilentProgress
 from identify.recording import poses
 from identify.scale_anchor import ScaleAnchor, read_anchor
-from identify.scenario import Scenario
+from identify.scenario import Scenario, scenario_from_toml
 
 IDENTIFIABLE_SHARE = 0.5
 """A parameter counts as identified when the record at least halves the standard deviation of the starting guess."""
@@ -51,8 +51,10 @@ class IdentificationResult:
     """What one record says about the 67 parameters, in the order of `names`; SI.
 
     initial, warm_start, estimate, std (67,), covariance (67, 67); identifiable (67,) bool; base_rank: independent
-    dynamic parameter groups the trajectory excites; iterations, stop_reason, costs: of the last search; noise_ratio:
-    mean squared whitened residual, to compare with expected_noise_ratio, what the sensor's noise alone would leave.
+    dynamic parameter groups the trajectory excites; iterations and evaluations: of all searches; stop_reason: of the
+    last; costs: after each iteration, one tuple a search (command driven, then closed loop where asked for);
+    noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what the sensor's noise alone
+    would leave.
     """
 
     names: tuple[str, ...]
@@ -67,7 +69,7 @@ class IdentificationResult:
     iterations: int
     evaluations: int
     stop_reason: str
-    costs: tuple[float, ...]
+    costs: tuple[tuple[float, ...], ...]
     noise_ratio: float
     expected_noise_ratio: float
     warnings: tuple[str, ...]
@@ -89,20 +91,21 @@ def identify(
     began = time.perf_counter()
     warm = _warm_start(problem, record, scenario)
     warmed = time.perf_counter()
-    with progress.stage("identify", 2 * settings.max_iterations) as advance:
+    count = 2 if settings.method == "closed_loop" else 1
+    with progress.stage("identify", count * settings.max_iterations) as advance:
         driven = problem.driven_by(record["command"].values)
-        solution = search(driven, _best_start(driven, warm), scenario, advance)
+        searches = [search(driven, _best_start(driven, warm), scenario, advance)]
         if settings.method == "closed_loop":
-            solution = search(problem, _best_start(problem, solution.parameters), scenario, advance)
+            searches.append(search(problem, _best_start(problem, searches[0].parameters), scenario, advance))
     searched = time.perf_counter()
     final = problem if settings.method == "closed_loop" else driven
     rng = np.random.default_rng([int(record.attrs["seed"]), UNCERTAINTY_STREAM])
     with progress.stage("uncertainty", DRAWS) as advance:
-        uncertainty = estimate_uncertainty(final, solution.parameters, rng, advance)
+        uncertainty = estimate_uncertainty(final, searches[-1].parameters, rng, advance)
     ended = time.perf_counter()
     seconds = {"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched}
     rank = base_rank(robot, problem.reference, scenario.timing.frame_rate_hz, settings.qr_threshold)
-    return _result(final, warm, solution, uncertainty, rank, seconds)
+    return _result(final, warm, searches, uncertainty, rank, seconds)
 
 
 def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance) -> Solution:
@@ -130,11 +133,10 @@ def output_error_problem(record: xr.Dataset, robot: Robot, scenario: Scenario) -
         raise EstimationError(
             f"only {ok.sum()} of {len(ok)} frames were measured; at least {MINIMUM_GOOD_SHARE:.0%} are needed"
         )
-    rates = np.hstack([record["reference_velocity"].values, record["reference_orientation_rate"].values])
     return OutputErrorProblem(
         robot=robot,
         settings=model_settings(scenario),
-        reference=Reference(poses(record, "reference"), rates),
+        reference=recorded_reference(record),
         measured=poses(record, "measured"),
         ok=ok,
         covariance=record["measured_covariance"].values[ok].mean(axis=0),
@@ -143,13 +145,24 @@ def output_error_problem(record: xr.Dataset, robot: Robot, scenario: Scenario) -
     )
 
 
+def recorded_reference(record: xr.Dataset) -> Reference:
+    """Reference motion of a record."""
+    rates = np.hstack([record["reference_velocity"].values, record["reference_orientation_rate"].values])
+    return Reference(poses(record, "reference"), rates)
+
+
 def _check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
+    """The record must be of this robot, and made with the timing and the servo that the model is to have."""
     if record.attrs.get("robot") != robot.name:
         raise EstimationError(f"the record is of robot {record.attrs.get('robot')!r}, not of {robot.name!r}")
-    rate = float(record.attrs.get("frame_rate_hz", 0.0))
-    if abs(rate - scenario.timing.frame_rate_hz) > 1e-9 * rate:
-        wanted = scenario.timing.frame_rate_hz
-        raise EstimationError(f"the record has {rate:g} frames a second, the scenario {wanted:g}")
+    recorded = scenario_from_toml(str(record.attrs.get("scenario", "")), "scenario in the record")
+    for section in ("timing", "servo"):
+        theirs, ours = getattr(recorded, section).model_dump(), getattr(scenario, section).model_dump()
+        for key, value in theirs.items():
+            if value != ours[key]:
+                raise EstimationError(
+                    f"the record was made with {section}.{key} = {value!r}, the scenario says {ours[key]!r}"
+                )
 
 
 def _warm_start(problem: OutputErrorProblem, record: xr.Dataset, scenario: Scenario) -> Array:
@@ -188,11 +201,12 @@ def _why(problem: OutputErrorProblem, parameters: Array) -> str:
 def _result(
     problem: OutputErrorProblem,
     warm: Array,
-    solution: Solution,
+    searches: list[Solution],
     uncertainty: Uncertainty,
     rank: int,
     seconds: dict[str, float],
 ) -> IdentificationResult:
+    solution = searches[-1]
     std = np.sqrt(np.diag(uncertainty.covariance))
     noise_ratio = float(np.mean(problem.whiten(problem.model_poses(solution.parameters) - problem.measured) ** 2))
     return IdentificationResult(
@@ -205,10 +219,10 @@ def _result(
         identifiable=std < IDENTIFIABLE_SHARE * problem.guess.std,
         scale_anchor=problem.anchor,
         base_rank=rank,
-        iterations=solution.iterations,
-        evaluations=solution.evaluations,
+        iterations=sum(one.iterations for one in searches),
+        evaluations=sum(one.evaluations for one in searches),
         stop_reason=solution.stop_reason,
-        costs=solution.costs,
+        costs=tuple(one.costs for one in searches),
         noise_ratio=noise_ratio,
         expected_noise_ratio=uncertainty.expected_noise_ratio,
         warnings=_warnings(noise_ratio, uncertainty),

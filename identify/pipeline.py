@@ -4,16 +4,18 @@ import os
 import time
 from pathlib import Path
 
+import xarray as xr
+
 import cmmsim
 from dynamics import Robot, load_robot
-from dynamics.closed_loop import Reference, prepare
+from dynamics.closed_loop import prepare
 from identify import estimation, recording
 from identify.arrays import Array
 from identify.atomic import write_text
 from identify.excitation import design_trajectories
 from identify.experiment import run_plant, taught_sensor
 from identify.loop_parameters import check_parameter_set
-from identify.loop_setup import frame_times, reference_motion
+from identify.loop_setup import frame_times
 from identify.model_runs import build_model_run, write_model_runs
 from identify.progress import Progress
 from identify.report import write_report
@@ -21,8 +23,6 @@ from identify.result_file import load_result, rms_figures, save_result
 from identify.run_folder import RunFolder
 from identify.run_result import identification_entry, parameter_vector, sensor_entry, validation_entry
 from identify.scenario import Scenario, load_scenario
-from identify.sensor_in_loop import make_sensor
-from identify.trajectory import FourierTrajectory
 from identify.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
 from identify.truth import read_truth, true_parameters
 from identify.validation import model_run, run_unseen
@@ -32,15 +32,17 @@ from identify.versions import versions
 def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:
     """All stages: excite, record, identify, validate, report. A sensor that cannot work is refused before any file."""
     began = time.perf_counter()
-    make_sensor(scenario, load_robot(scenario.robot), seed)
-    cmmsim.require_opengl()
+    robot = load_robot(scenario.robot)
+    sensor = taught_sensor(scenario, robot, seed, progress)
+    taught_at = time.perf_counter()
     excite(scenario, seed, folder, progress)
-    excited = time.perf_counter() - began
-    taught = record(folder, progress, workers)
+    excited_at = time.perf_counter()
+    taught = record(folder, progress, workers, sensor)
     identify(folder, progress)
     validate(folder, progress, workers, taught)
     report(folder, progress)
-    _add_seconds(RunFolder(folder), excite=excited, total=time.perf_counter() - began)
+    seconds = {"teach": taught_at - began, "excite": excited_at - taught_at, "total": time.perf_counter() - began}
+    _add_seconds(RunFolder(folder), **seconds)
 
 
 def excite(scenario: Scenario, seed: int, folder: Path, progress: Progress) -> None:
@@ -59,11 +61,13 @@ def excite(scenario: Scenario, seed: int, folder: Path, progress: Progress) -> N
     save_trajectories(RunFolder(folder).trajectories, trajectories)
 
 
-def record(folder: Path, progress: Progress, workers: int | None = None) -> cmmsim.Taught:
+def record(
+    folder: Path, progress: Progress, workers: int | None = None, sensor: cmmsim.Sensor | None = None
+) -> cmmsim.Taught:
     """Run the plant on the exciting trajectory; writes experiment.nc. Returns what the sensor was taught."""
     run_folder, scenario, trajectories, robot = _open(folder)
     began = time.perf_counter()
-    sensor = taught_sensor(scenario, robot, trajectories.seed, progress)
+    sensor = sensor or taught_sensor(scenario, robot, trajectories.seed, progress)
     times = frame_times(scenario, scenario.excitation.duration_s)
     with progress.stage("record", len(times)) as advance:
         arguments = (trajectories.excitation, times, trajectories.seed, 0, advance)
@@ -80,7 +84,7 @@ def identify(folder: Path, progress: Progress) -> None:
     seen = recording.read(run_folder.experiment)
     result = estimation.identify(seen, robot, scenario, progress)
     measured, ok = recording.poses(seen, "measured"), seen["measured_ok"].values.astype(bool)
-    reference = _reference(trajectories.excitation, scenario, scenario.excitation.duration_s)
+    reference = estimation.recorded_reference(seen)
     before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))
     seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
     save_result(
@@ -108,25 +112,21 @@ def validate(
     run_folder, scenario, trajectories, robot = _open(folder)
     began = time.perf_counter()
     result = load_result(run_folder.result)
+    excitation_record, excitation_truth = recording.read(run_folder.experiment), read_truth(run_folder.experiment)
     taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
     count = workers or os.cpu_count() or 1
     runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, count, progress)
     recording.write_runs(run_folder.validation, [(unseen.record, unseen.truth) for unseen in runs])
     identification = result["identification"]
     models = [parameter_vector(identification, column) for column in ("initial", "estimate")]
-    excited = _model_poses(robot, scenario, models, trajectories.excitation, scenario.excitation.duration_s)
-    unseen_poses = [
-        _model_poses(robot, scenario, models, path, scenario.validation.duration_s) for path in trajectories.validation
-    ]
-    excitation_time = frame_times(scenario, scenario.excitation.duration_s)
-    time_ = frame_times(scenario, scenario.validation.duration_s)
-    drawn = [build_model_run(time_, *poses) for poses in unseen_poses]
-    write_model_runs(run_folder.model, build_model_run(excitation_time, *excited), drawn)
-    excitation_truth = read_truth(run_folder.experiment)
-    pairs = [(recording.read(run_folder.experiment), excitation_truth), *((run.record, run.truth) for run in runs)]
+    records = [excitation_record, *(run.record for run in runs)]
+    model_poses = [_model_poses(robot, scenario, models, seen) for seen in records]
+    drawn = [build_model_run(seen["time"].values, *pair) for seen, pair in zip(records, model_poses, strict=True)]
+    write_model_runs(run_folder.model, drawn[0], drawn[1:])
+    pairs = [(excitation_record, excitation_truth), *((run.record, run.truth) for run in runs)]
     result["sensor"] = sensor_entry(pairs)
     result["validation"] = [
-        validation_entry(*pair, *poses) for pair, poses in zip(pairs[1:], unseen_poses, strict=True)
+        validation_entry(*pair, *poses) for pair, poses in zip(pairs[1:], model_poses[1:], strict=True)
     ]
     for name, value in true_parameters(excitation_truth).items():
         identification["parameters"][name]["true"] = value
@@ -147,14 +147,9 @@ def _open(folder: Path) -> tuple[RunFolder, Scenario, TrajectorySet, Robot]:
     return run_folder, scenario, load_trajectories(run_folder.trajectories), load_robot(scenario.robot)
 
 
-def _reference(trajectory: FourierTrajectory, scenario: Scenario, duration_s: float) -> Reference:
-    return reference_motion(trajectory, frame_times(scenario, duration_s))
-
-
-def _model_poses(
-    robot: Robot, scenario: Scenario, models: list[Array], trajectory: FourierTrajectory, duration_s: float
-) -> list[Array]:
-    reference = _reference(trajectory, scenario, duration_s)
+def _model_poses(robot: Robot, scenario: Scenario, models: list[Array], record: xr.Dataset) -> list[Array]:
+    """What each model does on the reference of a record."""
+    reference = estimation.recorded_reference(record)
     return [model_run(robot, scenario, parameters, reference) for parameters in models]
 
 

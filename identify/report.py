@@ -91,7 +91,9 @@ def read_report_data(run: RunFolder) -> ReportData:
             raise RecordError(f"{run.model} does not belong to the records of {run.path}: run {name} differs")
     missing = [key for key in ("identification", "before", "after", "sensor", "validation") if key not in data.result]
     if missing:
-        raise RecordError(f"{run.result} lacks {', '.join(missing)}")
+        raise RecordError(
+            f"{run.result} lacks {', '.join(missing)}; complete it with: cmmsim validate --out {run.path}"
+        )
     return data
 
 

@@ -1,5 +1,6 @@
 """The folder of a run: which stage writes what, and what is refused."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,9 +82,12 @@ def new_run_folder(path: Path | str) -> RunFolder:
     """A folder that does not exist yet or is empty; it is not made before something is written into it.
 
     Raises:
-        OutputFolderError: something is there already.
+        OutputFolderError: something is there already, or the folder cannot be made.
     """
     folder = Path(path)
+    above = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    if above != folder and not (above.is_dir() and os.access(above, os.W_OK)):
+        raise OutputFolderError(f"output folder {folder} cannot be made: {above} is not a folder one may write to")
     if folder.exists() and not folder.is_dir():
         raise OutputFolderError(f"output folder {folder} is a file; name another with --out")
     if folder.is_dir() and any(folder.iterdir()):

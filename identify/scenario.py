@@ -11,6 +11,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from identify.errors import ScenarioError
+from identify.filtering import padding_samples
 from identify.scenario_text import one_line, to_toml
 
 BUILT_IN = Path(__file__).parent / "scenarios"
@@ -155,6 +156,7 @@ class Scenario(_Section):
     @model_validator(mode="after")
     def _fits_together(self) -> "Scenario":
         self._check_filter()
+        self._check_excitation_fits_the_filter()
         self._check_whole_frames("excitation.duration_s", self.excitation.duration_s)
         self._check_whole_frames("validation.duration_s", self.validation.duration_s)
         return self
@@ -171,6 +173,14 @@ class Scenario(_Section):
             raise ValueError(
                 f"filter.cutoff_hz = {cutoff:g} Hz would remove the excitation, "
                 f"whose highest harmonic is {highest:g} Hz"
+            )
+
+    def _check_excitation_fits_the_filter(self) -> None:
+        padding = padding_samples(self.timing.frame_rate_hz, self.filter.cutoff_hz, self.filter.order)
+        if self.timing.frames(self.excitation.duration_s) <= padding:
+            raise ValueError(
+                f"excitation.duration_s = {self.excitation.duration_s:g} s is too short for the filter, which needs "
+                f"more than {padding} frames ({padding / self.timing.frame_rate_hz:.3g} s)"
             )
 
     def _check_whole_frames(self, key: str, duration_s: float) -> None:

@@ -75,7 +75,7 @@ def excitation_error_table(result: dict[str, Any]) -> Table:
         "RMS of model against measurement, exciting trajectory (like the paper's table 3)",
         ("component", "before", "after", "paper before", "paper after"),
         rows,
-        "diverged: the starting model is unstable.",
+        "diverged: the loop of the starting model is unstable." if "diverged" in before else "",
     )
 
 

@@ -164,8 +164,10 @@ def test_records_that_do_not_fit_are_refused(scenario):
     record, _ = run_plant(scenario, seed=1)
     with pytest.raises(EstimationError, match=r"other.*rss6"):
         identify(record.assign_attrs(robot="other"), rss6(), scenario)
-    with pytest.raises(EstimationError, match=r"60 frames a second, the scenario 30"):
+    with pytest.raises(EstimationError, match=r"timing.frame_rate_hz = 60.0, the scenario says 30.0"):
         identify(record, rss6(), quick(**{"timing.frame_rate_hz": 30.0}))
+    with pytest.raises(EstimationError, match=r"servo.kp = 0.3, the scenario says 0.4"):
+        identify(record, rss6(), quick(**{"servo.kp": 0.4}))
     without = record.copy()
     del without.attrs["scale_anchor"]
     with pytest.raises(RecordError, match=r"no scale anchor.*platform_mass"):

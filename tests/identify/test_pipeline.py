@@ -109,7 +109,7 @@ def test_without_opengl_the_run_stops_with_one_line_and_leaves_nothing(tmp_path)
         (["run", "quick", "--set", "filter.cutoff_hz=30"], ["30 Hz", "60 Hz"]),
         (["run", "quick", "--set", "timing.frame_rate_hz='60 Hz'"], ["frame_rate_hz", "Hz"]),
         (["run", "quick", "--set", "excitation.position_amplitude_m=0.2"], ["leg"]),
-        (["run", "quick", "--set", "excitation.travel_margin_rad=0.5"], ["crank", "0.4948", "0.9948"]),
+        (["run", "quick", "--set", "excitation.travel_margin_rad=0.8"], ["crank", "0.1948", "0.9948"]),
         (["run", "quick", "--set", "plant.parameters=nobody"], ["nobody", "identified", "initial"]),
     ],
 )
@@ -145,6 +145,26 @@ def test_an_existing_folder_is_refused_and_untouched(tmp_path):
     assert done.returncode != 0
     assert str(tmp_path) in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_planes_and_commands_identify_too(tmp_path):
+    """Plane intersection in every frame is noisier; the command-driven search starts on a bound here."""
+    choices = ("pose_method=planes", "identification.method=command_driven", "timing.hold=linear", "validation.count=1")
+    settings = [word for choice in choices for word in ("--set", choice)]
+    done = cmmsim("run", "quick", "--out", tmp_path / "run", "--quiet", *settings)
+    assert done.returncode == 0, done.stderr
+    result = load_result(tmp_path / "run" / "result.json")
+    assert [goal for goal in accuracy_goals(result) if not goal.passed] == []
+    assert result["identification"]["iterations"] > 0
+    assert result["identification"]["noise_ratio"] == pytest.approx(1.0, abs=0.15)
+
+
+def test_an_output_folder_that_cannot_be_made_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    done = cmmsim("run", "quick", "--out", tmp_path / "file" / "out")
+    assert done.returncode != 0
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+    assert "cannot be made" in done.stderr
 
 
 def test_a_truncated_record_is_one_line(run, tmp_path):
