@@ -13,6 +13,7 @@ where v is linear along a side, so that its value at the middle of the part insi
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .pose import Array
 
@@ -27,13 +28,8 @@ def coverage(centres: Array, shapes: Array, size: int) -> tuple[Array, Array]:
     symmetric and positive definite; size: window side in px.
     """
     inverse = np.asarray(np.linalg.inv(shapes), dtype=np.float64)
-    ticks = np.arange(size + 1) - 0.5
-    along = np.arange(size) - 0.5
-    across_x = _Sides(inverse, along[None, :] - centres[:, :1], ticks[None, :] - centres[:, 1:], axis=0)
-    across_y = _Sides(inverse, ticks[None, :] - centres[:, :1], along[None, :] - centres[:, 1:], axis=1)
-    # sides along x are indexed (n, line y, pixel x), sides along y (n, pixel y, line x)
-    area = across_x.area[:, :-1] - across_x.area[:, 1:] + across_y.area[:, :, 1:] - across_y.area[:, :, :-1]
-    area *= np.linalg.det(shapes)[:, None, None]
+    across_x, across_y = _all_sides(centres, inverse, size)
+    area = _area(shapes, across_x, across_y)
     derivatives = np.empty((*area.shape, 5))
     derivatives[..., 0] = across_y.length[:, :, :-1] - across_y.length[:, :, 1:]
     derivatives[..., 1] = across_x.length[:, :-1] - across_x.length[:, 1:]
@@ -47,10 +43,29 @@ def coverage(centres: Array, shapes: Array, size: int) -> tuple[Array, Array]:
     return area, derivatives
 
 
+def covered_area(centres: Array, shapes: Array, size: int) -> Array:
+    """Coverage (n, size, size) as ``coverage`` gives it, without derivatives."""
+    return _area(shapes, *_all_sides(centres, np.asarray(np.linalg.inv(shapes)), size))
+
+
+def _all_sides(centres: Array, inverse: NDArray[np.floating], size: int) -> tuple[_Sides, _Sides]:
+    """Sides along x, indexed (n, line y, pixel x), and along y (n, pixel y, line x)."""
+    ticks = np.arange(size + 1) - 0.5
+    along = np.arange(size) - 0.5
+    return (_Sides(inverse, along[None, :] - centres[:, :1], ticks[None, :] - centres[:, 1:], axis=0),
+            _Sides(inverse, ticks[None, :] - centres[:, :1], along[None, :] - centres[:, 1:], axis=1))
+
+
+def _area(shapes: Array, across_x: _Sides, across_y: _Sides) -> Array:
+    area = across_x.area[:, :-1] - across_x.area[:, 1:] + across_y.area[:, :, 1:] - across_y.area[:, :, :-1]
+    area *= np.linalg.det(shapes)[:, None, None]
+    return area
+
+
 class _Sides:
     """All pixel sides along one axis: shared area of each (in disc units) and the part that lies inside the disc."""
 
-    def __init__(self, inverse: Array, x: Array, y: Array, axis: int) -> None:
+    def __init__(self, inverse: NDArray[np.floating], x: Array, y: Array, axis: int) -> None:
         n = len(inverse)
         self._x, self._y, self._axis = x[:, None, :], y[:, :, None], axis
         m = inverse[:, :, :, None, None]

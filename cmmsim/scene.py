@@ -19,12 +19,26 @@ DISC_SIDES, RING_SIDES = 64, 16
 
 
 @dataclass(frozen=True)
+class Disc:
+    """A flat disc: centre (3,) and radius m, outward unit normal (3,), level 0 to 1."""
+
+    centre: Array
+    normal: Array
+    radius: float
+    level: float
+
+
+@dataclass(frozen=True)
 class Patch:
-    """A piece of a body drawn as one call: vertices (n,3) m, faces (m,3), levels (n,) 0 to 1 of its vertices."""
+    """A piece of a body drawn as one call: vertices (n,3) m, faces (m,3), levels (n,) 0 to 1 of its vertices.
+
+    discs: what the mesh stands for when it is a sticker, the outer one first; empty for a solid in one level.
+    """
 
     vertices: Array
     faces: Array
     levels: Array
+    discs: tuple[Disc, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -90,16 +104,19 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
 def _sticker_patch(place: Array, axes: Array, stickers: Stickers) -> Patch:
     """A bright disc, and RING_SUNK below it a dark one that shows as a ring."""
     vertices, faces, levels, first = [], [], [], 0
+    discs: list[Disc] = []
+    normal = np.cross(axes[:, 0], axes[:, 1])
     for sides, radius, sunk, level in ((DISC_SIDES, stickers.radius, 0.0, stickers.sticker_level),
                                        (RING_SIDES, stickers.ring_radius, RING_SUNK, stickers.ring_level)):
         angles = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
         fill = np.sqrt(2.0 * np.pi / (sides * np.sin(2.0 * np.pi / sides)))  # the polygon has the circle's area
         circle = fill * radius * np.column_stack([np.cos(angles), np.sin(angles)]) @ axes.T
-        vertices.append(place + circle - sunk * np.cross(axes[:, 0], axes[:, 1]))
+        vertices.append(place - sunk * normal + circle)
+        discs.insert(0, Disc(place - sunk * normal, normal, radius, level / 255.0))
         faces.append(first + _balanced_triangles(sides))
         levels.append(np.full(sides, level / 255.0))
         first += sides
-    return Patch(np.concatenate(vertices), np.concatenate(faces), np.concatenate(levels))
+    return Patch(np.concatenate(vertices), np.concatenate(faces), np.concatenate(levels), tuple(discs))
 
 
 def _balanced_triangles(sides: int) -> NDArray[np.int_]:

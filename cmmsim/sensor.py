@@ -19,6 +19,7 @@ from .noise import CameraNoise
 from .observation import DetectionSettings
 from .pose import Array, pose_to_transform
 from .pose_methods import METHODS
+from .renderers import choose_renderer
 from .scene import Patch, mesh_patch, scene_body
 from .sensor_file import SensorFile, Timing, read_sensor_file
 from .stereo_rig import toed_in_rig
@@ -38,7 +39,7 @@ class Sensor:
     """
 
     def __init__(self, file: SensorFile, seed: int = 0, method: str = "registration", taught: Taught | None = None,
-                 progress: Progress | None = None) -> None:
+                 progress: Progress | None = None, renderer: str | None = None) -> None:
         if method not in METHODS:
             raise UnknownOptionError("method", method, METHODS)
         if taught is not None and taught.sensor_name != file.name:
@@ -52,7 +53,9 @@ class Sensor:
         self._true_rig = self.rig
         figures = file.camera.model_dump()
         self.noise = CameraNoise(**{("enabled" if k == "noise" else k): v for k, v in figures.items()})
-        self.settings = DetectionSettings(radius=file.stickers.radius, centre_error_px=Quality().centre_error_px)
+        self._renderer = choose_renderer(renderer or file.renderer)
+        centre_error = self._renderer.centre_error_px(Quality().supersampling)
+        self.settings = DetectionSettings(radius=file.stickers.radius, centre_error_px=centre_error)
         self.platform, self.base = marked_body("platform", file.platform), marked_body("base", file.base)
         self._scene = [scene_body(body, section, file.stickers, stream) for stream, (body, section)
                        in enumerate(((self.platform, file.platform), (self.base, file.base)))]
@@ -65,6 +68,11 @@ class Sensor:
     def name(self) -> str:
         """Name of the sensor file."""
         return self._file.name
+
+    @property
+    def renderer(self) -> str:
+        """Name of the renderer that draws."""
+        return self._renderer.name
 
     @property
     def timing(self) -> Timing:
@@ -131,8 +139,8 @@ class Sensor:
         owners = [k for k, body in enumerate(self._scene) for _ in body.stickers] + [0, 1]
         owners += range(2, 2 + len(self._obstacles))
         drawable = Drawable([*patches, *self._obstacles.values()], owners)
-        return VirtualStereoCamera(self._true_rig, self._camera_from_base, drawable, self.noise, list(self._obstacles),
-                                   self._file.stickers.background_level / 255.0)
+        return VirtualStereoCamera(self._true_rig, self._camera_from_base, drawable, self.noise, self._renderer,
+                                   list(self._obstacles), self._file.stickers.background_level / 255.0)
 
     def _checked(self, pose: ArrayLike,
                  obstacles: Mapping[str, Array] | None) -> tuple[Array, np.random.Generator, Mapping[str, Array]]:
@@ -146,11 +154,12 @@ class Sensor:
 
 
 def load_sensor(name: str | Path, seed: int = 0, method: str = "registration", taught: Taught | None = None,
-                progress: Progress | None = None) -> Sensor:
+                progress: Progress | None = None, renderer: str | None = None) -> Sensor:
     """Sensor of a built-in name or of a TOML file.
 
     Parameters: seed of teaching and of the first run's noise; method "registration" or "planes"; taught: the result of
-    an earlier teaching of the same sensor; progress(done, total), called while teaching.
+    an earlier teaching of the same sensor; progress(done, total), called while teaching; renderer: "pyrender",
+    "analytic" or "auto" instead of what the file says.
     Raises UnknownSensorError, SensorFileError, UnknownOptionError.
     """
-    return Sensor(read_sensor_file(name), seed, method, taught, progress)
+    return Sensor(read_sensor_file(name), seed, method, taught, progress, renderer)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -103,9 +103,10 @@ class Platform(Body):
 
 
 class SensorFile(_Section):
-    """A whole sensor file."""
+    """A whole sensor file; renderer: which one draws, "auto" takes pyrender where OpenGL works, else analytic."""
 
     name: str
+    renderer: Literal["auto", "pyrender", "analytic"] = "auto"
     timing: Timing
     rig: Rig
     camera: Camera

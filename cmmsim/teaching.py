@@ -84,7 +84,7 @@ class Teacher:
         """All stickers of a body from averaged exposures. Raises LostError when one is missing."""
         limits = replace(self.settings.limits, frames=quality.exposures, largest_misfit=np.inf)
         settings = replace(self.settings, window_size=window_size, limits=limits, largest_ray_gap=np.inf,
-                           centre_error_px=quality.centre_error_px)
+                           centre_error_px=self.camera.centre_error_px(quality))
         seen = observe(self.camera.look(pose, rng, quality=quality), self.rig, self.noise, settings, expected, places,
                        body.sticker_normals)
         if len(seen.index) < len(places):

@@ -8,7 +8,6 @@ from .images import StereoImages
 from .measurement import Measurement, lost_measurement
 from .pose import Array, invert
 
-
 # A tracked frame that shows less than this share of the stickers seen before is searched as a whole: most windows may
 # have been laid beside their stickers.
 EXPECTED_SHARE = 0.7
