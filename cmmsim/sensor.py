@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from .noise import CameraNoise
 from .observation import DetectionSettings
 from .pose import Array, pose_to_transform
 from .pose_methods import METHODS
-from .renderers import choose_renderer
+from .renderers import RENDERER_NAMES, Renderer, choose_renderer
 from .scene import Patch, mesh_patch, scene_body
 from .sensor_file import SensorFile, Timing, read_sensor_file
 from .stereo_rig import toed_in_rig
@@ -42,6 +43,8 @@ class Sensor:
                  progress: Progress | None = None, renderer: str | None = None) -> None:
         if method not in METHODS:
             raise UnknownOptionError("method", method, METHODS)
+        if renderer is not None and renderer not in RENDERER_NAMES:
+            raise UnknownOptionError("renderer", renderer, RENDERER_NAMES)
         if taught is not None and taught.sensor_name != file.name:
             raise ShapeError(f"taught belongs to sensor {taught.sensor_name!r}, not to {file.name!r}")
         self._file, self._seed, self._progress = file, seed, progress
@@ -53,15 +56,13 @@ class Sensor:
         self._true_rig = self.rig
         figures = file.camera.model_dump()
         self.noise = CameraNoise(**{("enabled" if k == "noise" else k): v for k, v in figures.items()})
-        self._renderer = choose_renderer(renderer or file.renderer)
-        centre_error = self._renderer.centre_error_px(Quality().supersampling)
-        self.settings = DetectionSettings(radius=file.stickers.radius, centre_error_px=centre_error)
         self.platform, self.base = marked_body("platform", file.platform), marked_body("base", file.base)
         self._scene = [scene_body(body, section, file.stickers, stream) for stream, (body, section)
                        in enumerate(((self.platform, file.platform), (self.base, file.base)))]
         self._obstacles: dict[str, Patch] = {}
-        self._camera = self._build_camera()
-        self._taught, self._tracker = taught, None if taught is None else self._new_tracker(taught)
+        self._asked_renderer = renderer or file.renderer
+        self._taught = taught
+        self._tracker: Tracker | None = None
         self.start_run(seed)
 
     @property
@@ -71,8 +72,14 @@ class Sensor:
 
     @property
     def renderer(self) -> str:
-        """Name of the renderer that draws."""
+        """Name of the renderer that draws; "auto" is decided on first use."""
         return self._renderer.name
+
+    @cached_property
+    def settings(self) -> DetectionSettings:
+        """How stickers are looked for in windows."""
+        centre_error = self._renderer.centre_error_px(Quality().supersampling)
+        return DetectionSettings(radius=self._file.stickers.radius, centre_error_px=centre_error)
 
     @property
     def timing(self) -> Timing:
@@ -112,12 +119,12 @@ class Sensor:
         """Register further rigid bodies (meshes in m) that may hide stickers; drawn where ``obstacles`` says."""
         level = self._file.stickers.obstacle_level / 255.0
         self._obstacles.update({name: mesh_patch(mesh, level) for name, mesh in meshes.items()})
-        self._camera = self._build_camera()
+        self._build_again()
 
     def shift_camera(self, side: int, shift_px: tuple[float, float]) -> None:
         """Move the true principal point of one camera (0 left, 1 right) by (x, y) px; the estimator is not told."""
         self._true_rig = self._true_rig.shifted(side, shift_px)
-        self._camera = self._build_camera()
+        self._build_again()
 
     def capture(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None) -> StereoFrame:
         """Both whole images with the platform at ``pose`` (6,); obstacles: name -> base_from_body (4,4)."""
@@ -133,7 +140,16 @@ class Sensor:
     def _new_tracker(self, taught: Taught) -> Tracker:
         return Tracker(PoseEstimator(self.rig, self.noise, self.settings, self.platform, taught, self.method))
 
-    def _build_camera(self) -> VirtualStereoCamera:
+    @cached_property
+    def _renderer(self) -> Renderer:
+        return choose_renderer(self._asked_renderer)
+
+    def _build_again(self) -> None:
+        """The camera is built anew before the next picture."""
+        self.__dict__.pop("_camera", None)
+
+    @cached_property
+    def _camera(self) -> VirtualStereoCamera:
         """Stickers are drawn first: what they hide need not be drawn."""
         patches = [p for body in self._scene for p in body.stickers] + [body.solid for body in self._scene]
         owners = [k for k, body in enumerate(self._scene) for _ in body.stickers] + [0, 1]

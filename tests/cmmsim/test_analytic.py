@@ -163,10 +163,11 @@ def test_auto_falls_back_with_one_line(monkeypatch, taught):
         raise cmmsim.OpenGLMissingError(ImportError("no EGL"))
 
     monkeypatch.setattr(renderers.render, "require_opengl", missing)
+    sensor = cmmsim.load_sensor("ctrack780", taught=taught)  # says nothing before something is to be drawn
     with pytest.warns(UserWarning, match=r"^images are drawn by the analytic renderer: [^\n]*no EGL[^\n]*$") as caught:
-        sensor = cmmsim.load_sensor("ctrack780", taught=taught)
-    assert len(caught) == 1
+        assert sensor.measure(sensor.home).ok
     assert sensor.renderer == "analytic"
+    assert len(caught) == 1
     assert sensor._camera._renderer.draw is draw_windows
     with warnings.catch_warnings():
         warnings.simplefilter("error")
