@@ -15,6 +15,7 @@ from .errors import OpenGLMissingError, UnknownOptionError
 from .views import Drawable, View
 
 RENDERER_NAMES = ("analytic", "auto", "pyrender")
+_WARNED: dict[str | tuple[str, type[Warning], int], int] = {}  # what this process has said once is not said again
 
 
 class DrawWindows(Protocol):
@@ -53,6 +54,8 @@ def choose_renderer(name: str) -> Renderer:
         try:
             render.require_opengl()
         except OpenGLMissingError as error:
-            warnings.warn(f"images are drawn by the analytic renderer: {error}", stacklevel=2)
+            reason = " ".join(str(error.__cause__ or error).split())
+            text = f"images are drawn by the analytic renderer, pyrender found no OpenGL: {reason}"
+            warnings.warn_explicit(text, UserWarning, __name__, 0, registry=_WARNED)  # a place without source: one line
             return ANALYTIC
     return ANALYTIC if name == "analytic" else PYRENDER
