@@ -55,5 +55,5 @@ class OpenGLMissingError(RuntimeError):
     def __init__(self, cause: BaseException) -> None:
         super().__init__(
             "OpenGL is missing, so no images can be rendered: on Debian install the packages "
-            f"libegl1, libgl1 and libgl1-mesa-dri ({type(cause).__name__}: {cause})"
+            f"libegl1, libgl1 and libgl1-mesa-dri, or choose the renderer analytic ({type(cause).__name__}: {cause})"
         )

@@ -143,6 +143,9 @@ class Scenario(_Section):
     description: str = ""
     robot: str = Field("rss6", description="built-in robot or path of a robot file")
     sensor: str = Field("ctrack780", description="built-in sensor or path of a sensor file")
+    renderer: Literal["pyrender", "analytic", "auto"] = Field(
+        "pyrender", description="what draws the images; analytic needs no OpenGL, auto takes it where OpenGL is missing"
+    )
     pose_method: Literal["registration", "planes"] = "registration"
     timing: Timing = Timing()
     servo: Servo = Servo()

@@ -14,7 +14,9 @@ from identify.scenario import Scenario
 
 def make_sensor(scenario: Scenario, robot: Robot, seed: int, taught: cmmsim.Taught | None = None) -> cmmsim.Sensor:
     """The scenario's sensor with the robot's cranks and links in its view. One a process: it owns the renderer."""
-    sensor = cmmsim.load_sensor(scenario.sensor, seed=seed, method=scenario.pose_method, taught=taught)
+    sensor = cmmsim.load_sensor(
+        scenario.sensor, seed=seed, method=scenario.pose_method, taught=taught, renderer=scenario.renderer
+    )
     sensor.add_bodies(robot_meshes(robot))
     return sensor
 
