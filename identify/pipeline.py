@@ -9,6 +9,7 @@ import xarray as xr
 import cmmsim
 from dynamics import Robot, load_robot
 from dynamics.closed_loop import prepare
+from dynamics.workspace import check_motion
 from identify import estimation, recording
 from identify.arrays import Array
 from identify.atomic import write_text
@@ -56,6 +57,7 @@ def excite(scenario: Scenario, seed: int, folder: Path, progress: Progress) -> N
         prepare(robot)
         advance()
     trajectories = design_trajectories(robot, scenario, seed, progress)
+    _check_singularities(robot, scenario, trajectories)
     folder.mkdir(parents=True, exist_ok=True)
     write_text(RunFolder(folder).scenario, scenario.to_toml())
     save_trajectories(RunFolder(folder).trajectories, trajectories)
@@ -145,6 +147,14 @@ def _open(folder: Path) -> tuple[RunFolder, Scenario, TrajectorySet, Robot]:
     run_folder = RunFolder(folder)
     scenario = load_scenario(run_folder.scenario)
     return run_folder, scenario, load_trajectories(run_folder.trajectories), load_robot(scenario.robot)
+
+
+def _check_singularities(robot: Robot, scenario: Scenario, trajectories: TrajectorySet) -> None:
+    """Raise SingularPoseError, with time and leg, where a trajectory comes near a singularity (section 3.3)."""
+    durations = [scenario.excitation.duration_s] + [scenario.validation.duration_s] * len(trajectories.validation)
+    for trajectory, duration in zip((trajectories.excitation, *trajectories.validation), durations, strict=True):
+        times = frame_times(scenario, duration)
+        check_motion(robot, trajectory.pose(times), times)
 
 
 def _model_poses(robot: Robot, scenario: Scenario, models: list[Array], record: xr.Dataset) -> list[Array]:
