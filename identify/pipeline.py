@@ -24,6 +24,7 @@ from identify.result_file import load_result, rms_figures, save_result
 from identify.run_folder import RunFolder
 from identify.run_result import identification_entry, parameter_vector, sensor_entry, validation_entry
 from identify.scenario import Scenario, load_scenario
+from identify.sensor_in_loop import make_sensor
 from identify.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
 from identify.truth import read_truth, true_parameters
 from identify.validation import model_run, run_unseen
@@ -31,36 +32,25 @@ from identify.versions import versions
 
 
 def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:
-    """All stages: excite, record, identify, validate, report. A sensor that cannot work is refused before any file."""
+    """All stages: excite, record, identify, validate, report. What cannot work is refused before any file."""
     began = time.perf_counter()
-    robot = load_robot(scenario.robot)
-    sensor = taught_sensor(scenario, robot, seed, progress)
-    taught_at = time.perf_counter()
-    excite(scenario, seed, folder, progress)
+    _check_sensor(scenario)
+    trajectories = _designed(scenario, seed, progress)
     excited_at = time.perf_counter()
+    sensor = taught_sensor(scenario, load_robot(scenario.robot), seed, progress)
+    taught_at = time.perf_counter()
+    _write_plan(folder, scenario, trajectories)
     taught = record(folder, progress, workers, sensor)
     identify(folder, progress)
     validate(folder, progress, workers, taught)
     report(folder, progress)
-    seconds = {"teach": taught_at - began, "excite": excited_at - taught_at, "total": time.perf_counter() - began}
+    seconds = {"excite": excited_at - began, "teach": taught_at - excited_at, "total": time.perf_counter() - began}
     _add_seconds(RunFolder(folder), **seconds)
 
 
 def excite(scenario: Scenario, seed: int, folder: Path, progress: Progress) -> None:
     """Choose the trajectories; writes scenario.toml and trajectories.json."""
-    robot = load_robot(scenario.robot)
-    for name in (scenario.plant.parameters, scenario.model.start_parameters):
-        check_parameter_set(robot, name)
-    with progress.stage("compile the robot", 2) as advance:
-        _ = robot.functions
-        advance()
-        prepare(robot)
-        advance()
-    trajectories = design_trajectories(robot, scenario, seed, progress)
-    _check_singularities(robot, scenario, trajectories)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(RunFolder(folder).scenario, scenario.to_toml())
-    save_trajectories(RunFolder(folder).trajectories, trajectories)
+    _write_plan(folder, scenario, _designed(scenario, seed, progress))
 
 
 def record(
@@ -147,6 +137,34 @@ def _open(folder: Path) -> tuple[RunFolder, Scenario, TrajectorySet, Robot]:
     run_folder = RunFolder(folder)
     scenario = load_scenario(run_folder.scenario)
     return run_folder, scenario, load_trajectories(run_folder.trajectories), load_robot(scenario.robot)
+
+
+def _check_sensor(scenario: Scenario) -> None:
+    """Raise what the sensor file or a missing OpenGL would raise later, before any work is done."""
+    make_sensor(scenario, load_robot(scenario.robot), seed=0)
+    if scenario.renderer == "pyrender":
+        cmmsim.require_opengl()
+
+
+def _designed(scenario: Scenario, seed: int, progress: Progress) -> TrajectorySet:
+    """Trajectories that stay clear of limits and singularities; compiles the robot on first use."""
+    robot = load_robot(scenario.robot)
+    for name in (scenario.plant.parameters, scenario.model.start_parameters):
+        check_parameter_set(robot, name)
+    with progress.stage("compile the robot", 2) as advance:
+        _ = robot.functions
+        advance()
+        prepare(robot)
+        advance()
+    trajectories = design_trajectories(robot, scenario, seed, progress)
+    _check_singularities(robot, scenario, trajectories)
+    return trajectories
+
+
+def _write_plan(folder: Path, scenario: Scenario, trajectories: TrajectorySet) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(RunFolder(folder).scenario, scenario.to_toml())
+    save_trajectories(RunFolder(folder).trajectories, trajectories)
 
 
 def _check_singularities(robot: Robot, scenario: Scenario, trajectories: TrajectorySet) -> None:
