@@ -22,7 +22,8 @@
 #define NO_MARGIN 1e-12 /* rad/s, or share of the breakaway torque */
 
 enum { COULOMB_VISCOUS = 0, SMOOTHED = 1, STRIBECK = 2 };
-enum { OK = 0, LEFT_REACH = 1, TOO_MANY_EVENTS = 2, SENSOR_FAILED = 3, OUT_OF_MEMORY = 4, MEASURED_OUT_OF_REACH = 5 };
+enum { OK = 0, LEFT_REACH = 1, TOO_MANY_EVENTS = 2, SENSOR_FAILED = 3, OUT_OF_MEMORY = 4, MEASURED_OUT_OF_REACH = 5,
+       SINGULAR_MASS = 6 };
 enum { SENSOR_RAISED = 0, MEASURED = 1, LOST = 2 }; /* what the sensor returns */
 
 typedef double vec[N];
@@ -170,6 +171,12 @@ static double slip_friction(const problem *p, const evaluation *e, int i, int mo
     return p->coulomb[i] * dry_level(p, e->velocity[i], mode) + p->viscous[i] * e->velocity[i];
 }
 
+static int finite_mass(const double *mass) {
+    for (int i = 0; i < N * N; i++)
+        if (!isfinite(mass[i])) return 0;
+    return 1;
+}
+
 /* Everything at one state that does not depend on the stick modes. */
 static int evaluate_terms(context *c, const state *s, double t, evaluation *e) {
     const problem *p = c->p;
@@ -177,7 +184,7 @@ static int evaluate_terms(context *c, const state *s, double t, evaluation *e) {
     c->res[0] = e->mass; c->res[1] = e->bias; c->res[2] = e->jacobian;
     c->res[3] = e->bias_acceleration; c->res[4] = e->angle;
     equation_of_motion(c->arg, c->res, c->iw, c->w, 0);
-    if (!cholesky(e->mass, e->cholesky)) return LEFT_REACH;
+    if (!cholesky(e->mass, e->cholesky)) return finite_mass(e->mass) ? SINGULAR_MASS : LEFT_REACH;
     for (int i = 0; i < N; i++) {
         e->velocity[i] = dot_row(e->jacobian, i, s->rate);
         e->torque[i] = p->lp * (c->u.value[i] + c->u.slope[i] * t - e->angle[i])

@@ -94,6 +94,7 @@ def prepare(robot: Robot) -> bool:
 def equilibrium(robot: Robot, parameters: np.ndarray, pose: np.ndarray, servo: ServoGains) -> StartState:
     """State of rest at a pose (6,), friction unloaded. The holding torque is linear in the dynamic parameters."""
     li = parameters[65]
+    robot.static_torque(pose, parameters[:64])  # refuses a pose out of reach or singular, with the evidence
     angles = robot.inverse_kinematics(pose)
     rest = np.zeros(6)
     torque_map = np.linalg.solve(robot.joint_jacobian(pose).T, robot.regressor(pose, rest, rest))

@@ -14,6 +14,7 @@ from dynamics.geometry import Rss6Geometry
 from dynamics.loop_types import (
     MEASURED_OUT_OF_REACH,
     PARAMETER_COUNT,
+    SINGULAR_MASS,
     ClosedLoopRun,
     LoopProblem,
     PoseSensor,
@@ -26,6 +27,7 @@ FAILURES = {
     2: "more stick-slip events than a frame can hold",
     4: "out of memory",
     5: MEASURED_OUT_OF_REACH,
+    6: SINGULAR_MASS,
 }
 SENSOR_FAILED = 3
 LAWS = ("coulomb_viscous", "smoothed", "stribeck")

@@ -14,6 +14,7 @@ from dynamics.parameters import PARAMETER_NAMES
 PARAMETER_COUNT = len(PARAMETER_NAMES) + 3
 MAX_DELAY_FRAMES = 60
 MEASURED_OUT_OF_REACH = "the measured pose is out of reach, so that the servo has no command"
+SINGULAR_MASS = "the mass matrix is not positive definite: masses or inertias are zero or overflow"
 
 # (frame index, time s, true pose (6,)) -> measured pose (6,), or None when the measurement is lost.
 PoseSensor = Callable[[int, float, np.ndarray], np.ndarray | None]

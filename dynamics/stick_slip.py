@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from dynamics.friction import FrictionLaw
-from dynamics.loop_types import PARAMETER_COUNT
+from dynamics.loop_types import PARAMETER_COUNT, SINGULAR_MASS
 from dynamics.parameters import COULOMB, RIGID_BODY, VISCOUS
 
 LP, LI, LD = 64, 65, 66
@@ -128,6 +128,10 @@ class StickSlipMotion:
         mass, bias, jacobian, bias_acceleration, angle = (np.asarray(value, dtype=float) for value in values)
         if not np.isfinite(mass).all():
             raise MotionStopped("the robot left the reachable set (the loop is unstable)")
+        try:
+            np.linalg.cholesky(mass)
+        except np.linalg.LinAlgError:
+            raise MotionStopped(SINGULAR_MASS) from None
         angle, velocity = angle[:, 0], jacobian @ state.rate
         error = command.value + command.slope * time - angle
         torque = self._lp * error + self._ld * (command.rate - velocity) + self._li * state.integral

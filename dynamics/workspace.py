@@ -127,6 +127,8 @@ def check_motion(
     moments = np.full(len(poses), np.nan) if times is None else rows("times", times, len(poses))
     if not len(poses) or moments.shape != (len(poses),):
         raise ShapeError(f"a motion needs at least one pose and as many times, got {len(poses)} and {moments.shape}")
+    if not 0 <= travel_margin < np.inf:
+        raise TravelError(f"travel_margin is {travel_margin} rad, must be finite and >= 0")
     measures = measure(robot, poses)
 
     def extreme(values: np.ndarray, limit: float, pick: Callable[..., np.intp]) -> Extreme:
@@ -137,10 +139,10 @@ def check_motion(
     if not reach.value > 0:
         raise _broken(UnreachablePoseError, robot, poses, reach, "reach margin", "must be > ")
     travel = extreme(np.abs(measures.theta), robot.travel_limit - travel_margin, np.argmax)
-    if travel.value > travel.limit:
+    if not travel.value <= travel.limit:
         raise _broken(TravelError, robot, poses, travel, "|theta| in rad", "limit ")
     leverage = extreme(measures.leverage, least_leverage, np.argmin)
-    if leverage.value < leverage.limit:
+    if not leverage.value >= leverage.limit:
         raise _broken(SingularPoseError, robot, poses, leverage, "leverage (J_a1)", "must be >= ")
     condition = extreme(measures.platform_condition, most_condition, np.argmax)
     if not condition.value <= condition.limit:

@@ -40,7 +40,7 @@ The stages alone, each reading what the one before wrote:
 
 \b
 The model in other engines:
-  cmmsim export mjcf rss6 --parameters mine/result.json
+  cmmsim export mjcf rss6 --parameters mine/result.json --allow-unphysical-inertia
   cmmsim verify-model                    MuJoCo against this model, figure8.png
 
 \b
@@ -92,7 +92,7 @@ def _show_warning(message: Warning | str, category: type[Warning], *place: objec
 
 def is_known(error: Exception) -> bool:
     """Whether an error is one that a user can cause or meet, of any of the three packages."""
-    if isinstance(error, IdentifyError):
+    if isinstance(error, IdentifyError) or (isinstance(error, OSError) and error.filename is not None):
         return True
     from cmmsim.errors import CmmError, OpenGLMissingError
     from dynamics.errors import DynamicsError

@@ -8,7 +8,7 @@ import pytest
 
 from dynamics import closed_loop, compilation, plain_closed_loop, robot_file
 from dynamics import robot as robot_module
-from dynamics.errors import SimulationError
+from dynamics.errors import DynamicsError, SimulationError
 
 PERIOD = 1 / 60
 
@@ -294,3 +294,12 @@ def test_robots_of_equal_geometry_share_what_was_built(robot):
     assert again.functions is robot.functions
     assert again.geometry == robot.geometry
     assert plain_closed_loop._functions(again.geometry) is plain_closed_loop._functions(robot.geometry)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_singular_mass_matrix_is_said(robot, identified, make_reference, make_settings, compiled):
+    """A platform without inertia on massless legs cannot be accelerated: named as such, on both paths."""
+    parameters = identified.copy()
+    parameters[1:64] = 0
+    with pytest.raises(DynamicsError, match=r"not positive definite|singular"):
+        closed_loop.simulate(robot, parameters, make_reference(10), make_settings(), compiled=compiled)
