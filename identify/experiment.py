@@ -60,7 +60,18 @@ def run_experiment(
 
 def taught_sensor(scenario: Scenario, robot: Robot, seed: int, progress: Progress) -> cmmsim.Sensor:
     """The scenario's sensor with its frames taught."""
-    sensor = make_sensor(scenario, robot, stream_seed(seed, TEACHING))
+    sensor = untaught_sensor(scenario, robot, seed)
+    teach(sensor, progress)
+    return sensor
+
+
+def untaught_sensor(scenario: Scenario, robot: Robot, seed: int) -> cmmsim.Sensor:
+    """The scenario's sensor, its teaching seeded by the run's seed."""
+    return make_sensor(scenario, robot, stream_seed(seed, TEACHING))
+
+
+def teach(sensor: cmmsim.Sensor, progress: Progress) -> None:
+    """Teach the frames of a sensor, in hundredths of the work."""
     with progress.stage("teach the sensor", 100) as advance:
         shown = 0
 
@@ -70,7 +81,6 @@ def taught_sensor(scenario: Scenario, robot: Robot, seed: int, progress: Progres
             shown = 100 * done // total
 
         sensor.teach(report)
-    return sensor
 
 
 def run_plant(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynamics import Robot
-from dynamics.parameters import JOINT_PID_NAMES, PARAMETER_NAMES, unit_of
+from dynamics.parameters import COULOMB_NAMES, JOINT_PID_NAMES, PARAMETER_NAMES, VISCOUS_NAMES, unit_of
 from identify.arrays import Array
 from identify.errors import ScenarioError
 
@@ -43,7 +43,7 @@ def typical_sizes(values: Array, holding_torque: float) -> Array:
 
     A specification says little about friction; a joint that rubs more than it carries would be called broken.
     """
-    friction = np.array([name.startswith("joint") and "joint_pid" not in name for name in NAMES])
+    friction = np.isin(NAMES, COULOMB_NAMES + VISCOUS_NAMES)
     return np.where(friction, holding_torque, np.where(values > 0, values, 1.0))
 
 

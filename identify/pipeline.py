@@ -14,7 +14,7 @@ from identify import estimation, recording
 from identify.arrays import Array
 from identify.atomic import write_text
 from identify.excitation import design_trajectories
-from identify.experiment import run_plant, taught_sensor
+from identify.experiment import run_plant, taught_sensor, teach, untaught_sensor
 from identify.loop_parameters import check_parameter_set
 from identify.loop_setup import frame_times
 from identify.model_runs import build_model_run, write_model_runs
@@ -24,7 +24,6 @@ from identify.result_file import load_result, rms_figures, save_result
 from identify.run_folder import RunFolder
 from identify.run_result import identification_entry, parameter_vector, sensor_entry, validation_entry
 from identify.scenario import Scenario, load_scenario
-from identify.sensor_in_loop import make_sensor
 from identify.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
 from identify.truth import read_truth, true_parameters
 from identify.validation import model_run, run_unseen
@@ -34,10 +33,12 @@ from identify.versions import versions
 def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:
     """All stages: excite, record, identify, validate, report. What cannot work is refused before any file."""
     began = time.perf_counter()
-    _check_sensor(scenario)
+    sensor = untaught_sensor(scenario, load_robot(scenario.robot), seed)
+    if scenario.renderer == "pyrender":
+        cmmsim.require_opengl()
     trajectories = _designed(scenario, seed, progress)
     excited_at = time.perf_counter()
-    sensor = taught_sensor(scenario, load_robot(scenario.robot), seed, progress)
+    teach(sensor, progress)
     taught_at = time.perf_counter()
     _write_plan(folder, scenario, trajectories)
     taught = record(folder, progress, workers, sensor)
@@ -137,13 +138,6 @@ def _open(folder: Path) -> tuple[RunFolder, Scenario, TrajectorySet, Robot]:
     run_folder = RunFolder(folder)
     scenario = load_scenario(run_folder.scenario)
     return run_folder, scenario, load_trajectories(run_folder.trajectories), load_robot(scenario.robot)
-
-
-def _check_sensor(scenario: Scenario) -> None:
-    """Raise what the sensor file or a missing OpenGL would raise later, before any work is done."""
-    make_sensor(scenario, load_robot(scenario.robot), seed=0)
-    if scenario.renderer == "pyrender":
-        cmmsim.require_opengl()
 
 
 def _designed(scenario: Scenario, seed: int, progress: Progress) -> TrajectorySet:
