@@ -78,7 +78,7 @@ def simulate(
             )
     library = compiled_closed_loop.library(robot.geometry) if compiled in (None, True) else None
     start = equilibrium(robot, parameters, reference.poses[0], settings.servo)
-    problem = LoopProblem(parameters, reference, settings, start, sensor, sensitivities, commands, lost)
+    problem = LoopProblem(robot, parameters, reference, settings, start, sensor, sensitivities, commands, lost)
     if library is not None:
         return compiled_closed_loop.run(library, problem)
     if compiled:

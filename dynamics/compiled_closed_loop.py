@@ -95,7 +95,7 @@ def run(library: ctypes.CDLL, problem: LoopProblem) -> ClosedLoopRun:
     if status == SENSOR_FAILED:
         raise raised[0] if raised else SimulationError("the pose sensor failed without an error")
     if status:
-        raise failure(FAILURES[status], trajectory.failed_frame, period)
+        raise failure(FAILURES[status], trajectory.failed_frame, problem, arrays["pose"], arrays["measured"])
     return ClosedLoopRun(
         time=np.arange(frames) * period,
         pose=arrays["pose"],

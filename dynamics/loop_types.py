@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike
 from dynamics.errors import SimulationError
 from dynamics.friction import FrictionLaw
 from dynamics.parameters import PARAMETER_NAMES
+from dynamics.robot import Robot
 
 PARAMETER_COUNT = len(PARAMETER_NAMES) + 3
 MAX_DELAY_FRAMES = 60
+LEFT_REACH = "the robot left the reachable set (the loop is unstable)"
 MEASURED_OUT_OF_REACH = "the measured pose is out of reach, so that the servo has no command"
 SINGULAR_MASS = "the mass matrix is not positive definite: masses or inertias are zero or overflow"
 
@@ -104,6 +106,7 @@ class StartState:
 class LoopProblem:
     """One run to be done, checked: what `closed_loop.simulate` was given, and the state it starts from."""
 
+    robot: Robot
     parameters: np.ndarray
     reference: Reference
     settings: LoopSettings
@@ -161,6 +164,18 @@ class LoopFailure(SimulationError):
         self.frame = frame
 
 
-def failure(reason: str, frame: int, period: float) -> LoopFailure:
-    """The error of a run that ended early, the same on both paths."""
-    return LoopFailure(f"closed loop stopped at frame {frame} (t = {frame * period:.3f} s): {reason}", frame)
+def failure(reason: str, frame: int, problem: LoopProblem, pose: np.ndarray, measured: np.ndarray) -> LoopFailure:
+    """The error of a run that ended early, the same on both paths; true and measured poses (frames, 6) up to there."""
+    when = f"frame {frame} (t = {frame * problem.period:.3f} s)"
+    evidence = ""
+    if reason == MEASURED_OUT_OF_REACH:
+        evidence = f"; there {_nearest_leg(problem.robot, measured[frame])}"
+    if reason == LEFT_REACH:
+        evidence = f"; at the start of the frame {_nearest_leg(problem.robot, pose[frame])}"
+    return LoopFailure(f"closed loop stopped at {when}: {reason}{evidence}", frame)
+
+
+def _nearest_leg(robot: Robot, pose: np.ndarray) -> str:
+    margin = np.nan_to_num(robot.reach_margin(pose), nan=-np.inf)
+    leg = int(np.argmin(margin))
+    return f"leg {leg + 1} has the least reach margin, {margin[leg]:.3g}, must be > 0"

@@ -132,16 +132,20 @@ class Robot:
         rest = np.zeros_like(poses)
         return self.inverse_dynamics(poses, rest, rest, parameters)
 
-    def check_reach(self, pose: ArrayLike) -> None:
-        """Raise UnreachablePoseError, naming leg and pose, where a leg cannot reach."""
-        poses = np.atleast_2d(rows("pose", pose, 6))
-        margin = np.atleast_2d(self._call("inverse_kinematics", poses, output=1)[..., 0])
+    def reach_margin(self, pose: ArrayLike) -> np.ndarray:
+        """sin^2 of the angle between each crank and its direction of reach (6,), dimensionless; negative beyond it."""
+        return self._call("inverse_kinematics", rows("pose", pose, 6), output=1)[..., 0]
+
+    def check_reach(self, pose: ArrayLike, name: str = "pose", row: str = "row") -> None:
+        """Raise UnreachablePoseError, naming leg and pose, where a leg cannot reach; `name` and `row` are its words."""
+        poses = np.atleast_2d(rows(name, pose, 6))
+        margin = self.reach_margin(poses)
         if (margin > 0).all():
             return
         index, leg = (int(value) for value in np.argwhere(~(margin > 0))[0])
-        where = f" (row {index})" if np.ndim(pose) > 1 else ""
+        where = f" ({row} {index})" if np.ndim(pose) > 1 else ""
         raise UnreachablePoseError(
-            f"leg {leg + 1} cannot reach pose {np.array2string(poses[index], precision=6)}{where}: "
+            f"leg {leg + 1} cannot reach {name} {np.array2string(poses[index], precision=6)}{where}: "
             f"reach margin {margin[index, leg]:.3g}, must be > 0"
         )
 

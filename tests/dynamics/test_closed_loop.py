@@ -170,6 +170,33 @@ def test_unstable_loop_ends_with_frame_and_reason(robot, make_reference, make_se
     assert f"frame {caught.value.frame} " in str(caught.value)
 
 
+def _reach_margins(robot, pose, numerics):
+    """1 - cos^2 of the angle between crank and reach (6,) by the law of cosines in each crank's plane."""
+    g = robot.geometry
+    reach = pose[:3] + g.platform_joints @ numerics.base_from_platform(pose).T - g.base_joints
+    square = np.sum(reach**2, axis=1)
+    in_plane = square - np.sum(reach * g.crank_axes, axis=1) ** 2
+    return 1 - ((square + g.crank_length**2 - g.link_length**2) / (2 * g.crank_length)) ** 2 / in_plane
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_leg_nearest_its_reach_is_named_where_a_run_leaves_it(
+    robot, make_reference, make_settings, numerics, compiled
+):
+    """The same run with its last frame cut off ends well; the pose it ends at has that leg and margin."""
+    settings, reference = make_settings(29.0, latency_s=1 / 29), make_reference(580, 29.0)
+    unstable = robot.parameter_sets["initial"].vector
+    with pytest.raises(closed_loop.LoopFailure) as caught:
+        closed_loop.simulate(robot, unstable, reference, settings, compiled=compiled)
+    stop = caught.value.frame + 1
+    shorter = closed_loop.Reference(reference.poses[:stop], reference.rates[:stop])
+    margins = _reach_margins(robot, closed_loop.simulate(robot, unstable, shorter, settings).pose[-1], numerics)
+    leg, least = int(np.argmin(margins)) + 1, margins.min()
+    assert least > 0
+    evidence = f"unstable); at the start of the frame leg {leg} has the least reach margin, {least:.3g}, must be > 0"
+    assert evidence in str(caught.value)
+
+
 def test_stable_where_the_paper_is(robot, identified, make_reference, make_settings):
     """Table 2 parameters at 29 Hz with one frame of delay follow the reference within 20 mm for 20 s."""
     settings, reference = make_settings(29.0, latency_s=1 / 29), make_reference(580, 29.0, scale=0.5)
@@ -212,14 +239,20 @@ def test_wrong_measurements_are_refused(robot, identified, make_reference, make_
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-def test_measured_pose_out_of_reach_ends_the_run(robot, identified, make_reference, make_settings, compiled):
-    """A gross measurement error at frame 3 is named as such, not as instability."""
+def test_measured_pose_out_of_reach_ends_the_run(robot, identified, make_reference, make_settings, numerics, compiled):
+    """A gross measurement error at frame 3 is named as such, not as instability, with leg and margin."""
+    answers = []
 
     def sensor(frame, time, pose):
-        return pose + (frame == 3)
+        answers.append(pose + (frame == 3))
+        return answers[-1]
 
-    with pytest.raises(closed_loop.LoopFailure, match=r"frame 3 .*measured pose is out of reach"):
+    with pytest.raises(closed_loop.LoopFailure, match=r"frame 3 .*measured pose is out of reach") as caught:
         closed_loop.simulate(robot, identified, make_reference(5), make_settings(), sensor, compiled=compiled)
+    margins = _reach_margins(robot, answers[-1], numerics)
+    leg = int(np.argmin(margins))
+    assert margins[leg] < 0
+    assert f"there leg {leg + 1} has the least reach margin, {margins[leg]:.3g}, must be > 0" in str(caught.value)
 
 
 def test_runs_in_threads_equal_runs_in_turn(robot, identified, make_reference, make_settings):
