@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from .camera import PinholeCamera
 from .errors import ShapeError, UnknownBodyError, UnknownOptionError
 from .estimator import PoseEstimator
-from .images import StereoFrame
+from .images import StereoFrame, StereoImages
 from .marked_body import marked_body
 from .measurement import Measurement
 from .noise import CameraNoise
@@ -126,13 +126,17 @@ class Sensor:
         self._true_rig = self._true_rig.shifted(side, shift_px)
         self._build_again()
 
+    def look(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None) -> StereoImages:
+        """One exposure with the platform at ``pose`` (6,), drawn as far as it is read; obstacles as in ``capture``."""
+        return self._camera.look(*self._checked(pose, obstacles))
+
     def capture(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None) -> StereoFrame:
         """Both whole images with the platform at ``pose`` (6,); obstacles: name -> base_from_body (4,4)."""
-        return self._camera.look(*self._checked(pose, obstacles)).full()
+        return self.look(pose, obstacles).full()
 
     def measure(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None) -> Measurement:
         """Measure the platform that stands at ``pose`` (6,); the pose goes to the renderer only."""
-        images = self._camera.look(*self._checked(pose, obstacles))
+        images = self.look(pose, obstacles)
         if self._tracker is None:
             self._tracker = self._new_tracker(self.taught)
         return self._tracker.measure(images)
