@@ -23,11 +23,14 @@ from dynamics.errors import DynamicsError
 from dynamics.geometry import LEGS
 from dynamics.mjcf_looks import add_assets, add_base_looks, add_crank_looks, add_link_looks, add_platform_looks
 from dynamics.parameters import COULOMB, VISCOUS, check_parameters
-from dynamics.physical_inertia import BodyInertias, physical_inertias
+from dynamics.physical_inertia import BodyInertias, grouped, physical_inertias
 from dynamics.robot import Robot
 
 # MuJoCo silently lowers larger ones.
 MAX_IMPEDANCE = 0.9999
+
+# XML has no way to write these: control characters, halves of surrogate pairs (undecodable file names), non-characters.
+NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 
 CHANGED_INERTIAS = (
     "Inertias that no rigid body has were changed to the nearest that MuJoCo accepts. Cranks turn about z alone and",
@@ -80,7 +83,7 @@ def mjcf_text(
     values = check_parameters(robot.nominal_parameters if parameters is None else np.asarray(parameters, dtype=float))
     inertias = physical_inertias(values, allow_unphysical_inertia)
     frames = body_frames(robot, robot.home_pose)
-    root = Xml.Element("mujoco", model=robot.name)
+    root = Xml.Element("mujoco", model=NOT_IN_XML.sub("?", robot.name))
     _add_header(root, robot, inertias, source)
     Xml.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     _add_options(root, robot, solver or MjcfSolver())
@@ -109,7 +112,7 @@ def _add_header(root: Xml.Element, robot: Robot, inertias: BodyInertias, source:
         "Links may spin about their own axes; no force makes them as long as Ixx = Iyy.",
     ]
     if inertias.changes:
-        lines += [*CHANGED_INERTIAS, *inertias.changes.split("; ")]
+        lines += [*CHANGED_INERTIAS, *grouped(inertias.changes)]
     for line in lines:
         _add_comment(root, line.replace("->", "to"))
 
@@ -196,8 +199,8 @@ def _add_home(root: Xml.Element, robot: Robot, frames: BodyFrames) -> None:
 
 
 def _add_comment(parent: Xml.Element, text: str) -> None:
-    """Add a comment; XML allows no two hyphens side by side in it."""
-    parent.append(Xml.Comment(f" {re.sub('-(?=-)', '- ', text)} "))
+    """Add a comment; XML allows neither two hyphens side by side in it nor some characters."""
+    parent.append(Xml.Comment(f" {re.sub('-(?=-)', '- ', NOT_IN_XML.sub('?', text))} "))
 
 
 def _text(values: ArrayLike) -> str:

@@ -31,10 +31,10 @@ class UnphysicalInertiaError(ParameterError):
 @dataclass(frozen=True)
 class BodyInertias:
     """Mass (kg) and principal moments Ixx, Iyy, Izz (kg m^2) of each body, (13, 4) in the order of `BODY_NAMES`, and
-    what was changed, in words (empty: nothing)."""
+    what was changed, in words by body (empty: nothing)."""
 
     values: np.ndarray
-    changes: str
+    changes: dict[str, str]
 
 
 def physical_inertias(parameters: np.ndarray, allow_changes: bool = False) -> BodyInertias:
@@ -46,15 +46,24 @@ def physical_inertias(parameters: np.ndarray, allow_changes: bool = False) -> Bo
     broken = {body: fault for body, row in zip(BODY_NAMES, given, strict=True) if (fault := _fault(row))}
     if broken and not allow_changes:
         raise UnphysicalInertiaError(
-            f"no rigid body has these inertias [kg, kg m^2]: {_grouped(broken)}; pass allow_unphysical_inertia "
-            "(--allow-unphysical-inertia on the command line) to take the nearest ones that engines accept"
+            f"no rigid body has these inertias [kg, kg m^2]: {'; '.join(grouped(broken))}; "
+            "pass allow_unphysical_inertia (--allow-unphysical-inertia on the command line) to take the nearest ones "
+            "that engines accept"
         )
     values, changes = given.copy(), dict[str, str]()
     for index, body in enumerate(BODY_NAMES):
         if body in broken:
             values[index] = _repaired(body, given[index])
             changes[body] = _difference(given[index], values[index])
-    return BodyInertias(values, _grouped(changes))
+    return BodyInertias(values, changes)
+
+
+def grouped(texts: dict[str, str]) -> list[str]:
+    """Texts by body as lines `body, body: text`, one for all bodies that share a text, in the order of the bodies."""
+    bodies: dict[str, list[str]] = {}
+    for body, text in texts.items():
+        bodies.setdefault(text, []).append(body)
+    return [f"{', '.join(names)}: {text}" for text, names in bodies.items()]
 
 
 def _fault(row: np.ndarray) -> str:
@@ -106,11 +115,3 @@ def _nearest_moments(moments: np.ndarray) -> list[float]:
 def _difference(before: np.ndarray, after: np.ndarray) -> str:
     named = zip(("mass", *MOMENTS), before, after, strict=True)
     return ", ".join(f"{name} {old:g} -> {new:g}" for name, old, new in named if old != new)
-
-
-def _grouped(texts: dict[str, str]) -> str:
-    """`body, body: text` for bodies that share a text, in their order."""
-    bodies: dict[str, list[str]] = {}
-    for body, text in texts.items():
-        bodies.setdefault(text, []).append(body)
-    return "; ".join(f"{', '.join(names)}: {text}" for text, names in bodies.items())

@@ -1,7 +1,7 @@
 """Commands around other engines: ``cmmsim export mjcf`` and ``cmmsim verify-model``. Heavy imports are late."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -9,6 +9,10 @@ from rich.table import Table as RichTable
 
 from identify.errors import OutputFolderError, VerificationError
 from identify.progress import Progress, RichProgress, SilentProgress
+
+if TYPE_CHECKING:
+    from dynamics import Robot
+    from identify.arrays import Array
 
 EXPORT_HELP = """
 Write a robot for another engine.
@@ -56,7 +60,6 @@ def mjcf(
     """Write the robot as MJCF, a closed chain that MuJoCo loads."""
     from dynamics import load_robot
     from dynamics.mjcf import mjcf_text
-    from dynamics.physical_inertia import physical_inertias
     from identify.parameter_choice import choose_parameters
 
     with _progress(quiet).stage("export", 1) as advance:
@@ -68,9 +71,25 @@ def mjcf(
         _write(path, text)
         advance()
     if not quiet:
-        changes = physical_inertias(chosen.values, allow_changes=True).changes
-        for line in [*(f"changed {change}" for change in changes.split("; ") if change), f"model: {path}"]:
+        for line in [*_changes(chosen_robot, chosen.values), f"model: {path}"]:
             Console().print(line, highlight=False, soft_wrap=True)
+
+
+def _changes(robot: "Robot", parameters: "Array") -> list[str]:
+    """Lines: the inertias that the export changed, and by how much that changes the robot's accelerations."""
+    from dynamics.inertia_effect import acceleration_changes
+    from dynamics.physical_inertia import grouped, physical_inertias
+
+    inertias = physical_inertias(parameters, allow_changes=True)
+    if not inertias.changes:
+        return []
+    effects = acceleration_changes(robot, parameters, inertias.values)
+    said = {body: f"{change}; {_effect(effects[body])}" for body, change in inertias.changes.items()}
+    return [f"changed {line}" for line in grouped(said)]
+
+
+def _effect(change: float) -> str:
+    return f"accelerations differ by up to {100 * change:.2g} %" if change > 1e-9 else "the motion does not feel it"
 
 
 def verify_model(
@@ -130,8 +149,8 @@ def _write(path: Path, text: str) -> None:
 
     try:
         write_text(path, text)
-    except OSError as error:
-        reason = error.strerror or error
+    except (OSError, ValueError) as error:  # ValueError: a robot's name that no file can have
+        reason = (error.strerror if isinstance(error, OSError) else None) or error
         raise OutputFolderError(f"cannot write {path}: {reason}; name another file with --out") from None
 
 

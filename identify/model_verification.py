@@ -7,7 +7,7 @@ import numpy as np
 
 from dynamics import Robot
 from dynamics.parameters import COULOMB, VISCOUS
-from dynamics.physical_inertia import physical_inertias
+from dynamics.physical_inertia import grouped, physical_inertias
 from identify.arrays import Array
 from identify.figure7_loop import SOLVER, EngineRuns, compare_engines
 from identify.progress import Progress
@@ -85,7 +85,7 @@ def verification_entry(robot: Robot, runs: EngineRuns) -> dict[str, Any]:
         "mujoco": {
             "version": runs.mujoco_version,
             **asdict(SOLVER),
-            "inertias_changed": physical_inertias(chosen.dynamic, allow_changes=True).changes,
+            "inertias_changed": grouped(physical_inertias(chosen.dynamic, allow_changes=True).changes),
         },
         "difference": asdict(verdict),
         "goal": {"position_steady_um": GOAL_UM, "angle_steady_urad": GOAL_URAD},

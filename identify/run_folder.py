@@ -1,6 +1,6 @@
 """The folder of a run: which stage writes what, and what is refused."""
 
-import os
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -86,10 +86,15 @@ def new_run_folder(path: Path | str) -> RunFolder:
     """
     folder = Path(path)
     above = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
-    if above != folder and not (above.is_dir() and os.access(above, os.W_OK)):
-        raise OutputFolderError(f"output folder {folder} cannot be made: {above} is not a folder one may write to")
     if folder.exists() and not folder.is_dir():
         raise OutputFolderError(f"output folder {folder} is a file; name another with --out")
     if folder.is_dir() and any(folder.iterdir()):
         raise OutputFolderError(f"output folder {folder} is not empty; name another with --out, or remove it")
+    try:
+        # Only a trial tells: permissions do not show file systems that are read-only or kept by the kernel.
+        tempfile.TemporaryDirectory(prefix=".cmmsim-", dir=above).cleanup()
+    except OSError:
+        raise OutputFolderError(
+            f"output folder {folder} cannot be made: {above} is not a folder one may write to"
+        ) from None
     return RunFolder(folder)

@@ -35,10 +35,19 @@ class States:
 
 @pytest.fixture
 def states(robot: dynamics.Robot) -> States:
-    rng = np.random.default_rng(7)
+    return random_states(robot, 100, seed=7)
+
+
+@pytest.fixture
+def many_states(robot: dynamics.Robot) -> States:
+    return random_states(robot, 300, seed=8)
+
+
+def random_states(robot: dynamics.Robot, count: int, seed: int) -> States:
+    rng = np.random.default_rng(seed)
     scale = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
-    pose = robot.home_pose + BOX * rng.uniform(-1, 1, (100, 6))
-    return States(pose, scale * rng.standard_normal((100, 6)), 10 * scale * rng.standard_normal((100, 6)))
+    pose = robot.home_pose + BOX * rng.uniform(-1, 1, (count, 6))
+    return States(pose, scale * rng.standard_normal((count, 6)), 10 * scale * rng.standard_normal((count, 6)))
 
 
 def base_from_platform(pose: np.ndarray) -> np.ndarray:

@@ -1,6 +1,8 @@
 """The exported MJCF against the robot: bodies, home, accelerations and motion in MuJoCo; inertias that no body has."""
 
+import json
 import sys
+from pathlib import Path
 from xml.etree import ElementTree as Xml
 
 import numpy as np
@@ -11,13 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from dynamics.errors import DynamicsError, ParameterError
 from dynamics.geometry import Rss6Geometry
+from dynamics.inertia_effect import acceleration_changes, travel_states
 from dynamics.mjcf import MjcfSolver, mjcf_text
 from dynamics.mujoco_engine import MujocoMissingError, MujocoRobot
-from dynamics.parameters import BODY_NAMES, COULOMB, RIGID_BODY, VISCOUS
+from dynamics.parameters import BODY_NAMES, COULOMB, PARAMETER_NAMES, RIGID_BODY, VISCOUS
 from dynamics.physical_inertia import UnphysicalInertiaError, physical_inertias
 from dynamics.robot import Robot
 from dynamics.robot_file import RobotDescription
 
+ROOT = Path(__file__).parents[2]
 moments = st.floats(0, 1) | st.sampled_from([0.0, 1e-12, 1e-6])
 
 
@@ -109,6 +113,54 @@ def test_accelerations_differ_by_the_softness_of_the_loops_alone(mujoco, robot, 
         worst[impedance] = max(errors)
     assert worst[0.9999] < 3e-4
     assert worst[0.999] / worst[0.9999] == pytest.approx(10, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["initial", "identified", "result"])
+def test_reloaded_bodies_accelerate_as_the_robot_with_the_changed_parameters(mujoco, robot, many_states, name):
+    """With MuJoCo's bodies in loops that are closed exactly (not by its springs), moving, with friction: to 1e-9."""
+    values = quoted_estimates() if name == "result" else robot.parameter_sets[name].dynamic
+    engine = exported(robot, values)
+    changed = values.copy()
+    changed[RIGID_BODY] = physical_inertias(values, allow_changes=True).values.ravel()
+    torques = 5 * np.random.default_rng(8).standard_normal((300, 6))
+    ours = robot.forward_dynamics(many_states.pose, many_states.twist, torques, changed)
+    for pose, twist, torque, acceleration in zip(
+        many_states.pose, many_states.twist, torques, ours, strict=True
+    ):
+        theirs = acceleration_in_rigid_loops(mujoco, engine, pose, twist, torque)
+        assert np.abs(theirs - acceleration).max() <= 1e-9 * np.abs(acceleration).max()
+
+
+def acceleration_in_rigid_loops(mujoco, engine, pose, twist, torque):
+    """twist_dot of MuJoCo's bodies with the 18 loop equations solved as they stand: M a - J^T f = Q, J a = -J_dot v."""
+    engine.put(pose, twist)
+    model, data = engine.model, engine.data
+    mass, loops, drift = np.zeros((30, 30)), np.zeros((18, 30)), np.zeros((18, 30))
+    if int(mujoco.__version__.split(".")[0]) >= 4:
+        mujoco.mj_fullM(model, data, mass)
+    else:
+        mujoco.mj_fullM(model, mass, data.qM)
+    for leg in range(6):
+        rows = slice(3 * leg, 3 * leg + 3)
+        for sign, name in ((1, f"link_end{leg + 1}"), (-1, f"platform_joint{leg + 1}")):
+            site, part, rate = data.site(name), np.zeros((3, 30)), np.zeros((3, 30))
+            body = model.site_bodyid[site.id]
+            mujoco.mj_jac(model, data, part, None, site.xpos, body)
+            mujoco.mj_jacDot(model, data, rate, None, site.xpos, body)
+            loops[rows] += sign * part
+            drift[rows] += sign * rate
+    force = data.qfrc_passive - data.qfrc_bias - model.dof_frictionloss * np.sign(data.qvel)
+    force[[model.joint(f"joint{leg + 1}").dofadr[0] for leg in range(6)]] += torque
+    system = np.block([[mass, -loops.T], [loops, np.zeros((18, 18))]])
+    a = np.linalg.solve(system, np.concatenate([force, -drift @ data.qvel]))
+    platform = Rotation.from_quat(data.qpos[3:7], scalar_first=True).as_matrix()
+    return np.concatenate([a[:3], platform @ a[3:6]])
+
+
+def quoted_estimates():
+    """Estimates of the run that the README quotes, (64,)."""
+    entries = json.loads((ROOT / ".readme" / "result.json").read_text())["identification"]["parameters"]
+    return np.array([entries[name]["estimate"] for name in PARAMETER_NAMES])
 
 
 @pytest.mark.parametrize(("name", "friction"), [("initial", False), ("identified", True)])
@@ -212,6 +264,24 @@ def test_file_says_which_inertias_were_changed_and_that_the_motion_does_not_feel
     )
 
 
+def test_effect_of_a_platform_inertia_is_the_share_it_adds_where_the_legs_weigh_nothing(robot):
+    """Euler's equation: with all moments e larger, the same moment of force turns the body 1 - 1/(1 + e) less."""
+    values = np.full(64, 1e-9)
+    values[:4] = [24, 0.16, 0.16, 0.16]  # round, so that nothing else turns it
+    inertias = values[RIGID_BODY].reshape(13, 4).copy()
+    assert acceleration_changes(robot, values, inertias) == {}
+    inertias[0, 1:] *= 1.05
+    assert acceleration_changes(robot, values, inertias) == {"platform": pytest.approx(1 - 1 / 1.05, rel=1e-5)}
+
+
+def test_effect_is_measured_all_over_the_travel(robot):
+    pose, twist, torque = travel_states(robot, robot.nominal_parameters)
+    angles = np.abs(robot.inverse_kinematics(pose))
+    assert angles.max() <= robot.travel_limit
+    assert (angles.max(axis=0) > 0.8 * robot.travel_limit).all()
+    assert pose.shape == twist.shape == torque.shape == (300, 6)
+
+
 @given(st.lists(moments, min_size=52, max_size=52))
 def test_changed_inertias_are_physical_and_keep_what_the_motion_feels(numbers):
     given_ = np.array(numbers)
@@ -248,9 +318,22 @@ def test_mujoco_accepts_what_was_changed(mujoco, robot):
         exported(robot, values)
 
 
-def test_comments_stay_valid_whatever_the_source_is_called(robot):
-    text = mjcf_text(robot, allow_unphysical_inertia=True, source="a--b---c & <d>")
-    assert Xml.fromstring(text).get("model") == "rss6"
+@pytest.mark.parametrize(
+    ("source", "written"),
+    [
+        ("a--b---c & <d>-", "a- -b- - -c & <d>-"),
+        ("nul\0 escape\x1b half\udc80 none\uffff", "nul? escape? half? none?"),
+        ("Gr\u00f6\u00dfe \U0001f600\ttab", "Gr\u00f6\u00dfe \U0001f600\ttab"),
+    ],
+)
+def test_file_is_valid_xml_whatever_the_source_and_the_robot_are_called(robot, tmp_path, source, written):
+    named = Robot(RobotDescription(source, robot.geometry, robot.parameter_sets))
+    (tmp_path / "model.xml").write_text(
+        mjcf_text(named, allow_unphysical_inertia=True, source=source), encoding="utf-8"
+    )
+    root = Xml.parse(tmp_path / "model.xml", Xml.XMLParser(target=Xml.TreeBuilder(insert_comments=True))).getroot()
+    assert written in root[0].text
+    assert len(list(root.iter("body"))) == 13
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ def test_command_verifies_the_reference_robot(capfd, tmp_path):
     assert entry["met"]
     assert entry["difference"]["position_steady_um"] < 0.01
     assert entry["difference"]["angle_steady_urad"] < 0.01
-    assert entry["mujoco"]["inertias_changed"].startswith("crank1")
+    assert entry["mujoco"]["inertias_changed"][0].startswith("crank1")
     assert (tmp_path / "new" / "figure8.png").read_bytes().startswith(b"\x89PNG")
     said = capfd.readouterr()
     assert "MuJoCo's loop closure" in said.out
@@ -153,6 +153,7 @@ def test_command_fails_in_one_line_where_a_goal_is_missed(made_runs, monkeypatch
         (("verify-model", "--out", "new"), "pip install cmmsim[mujoco]"),
         (("verify-model", "nope"), "unknown robot `nope`"),
         (("export", "mjcf", "rss6"), "crank1, crank2, crank3, crank4, crank5, crank6: Izz 0.000605 > Ixx 0.000229 + "),
+        (("export", "mjcf", "rss6", "--parameters", ""), "'' is neither a parameter set of robot rss6 (identified, in"),
         (("export", "mjcf", "rss6", "--parameters", "nope"), "'nope' is neither a parameter set of robot rss6 (iden"),
         (("export", "mjcf", "rss6", "--allow-unphysical-inertia", "--out", "."), "cannot write ."),
     ],
@@ -186,7 +187,11 @@ def test_export_writes_the_estimates_of_a_run_and_says_what_it_changed(robot, ca
     model = mujoco.MjModel.from_xml_path(str(out))
     assert model.body("platform").mass[0] == 23.456
     assert model.joint("joint4").damping[0] == 0.854
-    assert "changed platform: Ixx 0.161 -> 0.171667" in capfd.readouterr().out
+    said = {line.split(": ")[0]: line for line in capfd.readouterr().out.splitlines()}
+    assert said["changed platform"].startswith("changed platform: Ixx 0.161 -> 0.171667")
+    assert said["changed platform"].endswith("; accelerations differ by up to 4.4 %")
+    assert said["changed link1"].endswith("; the motion does not feel it")
+    assert len(said) == 1 + 1 + 3 + 6  # the model; platform, three cranks and the links
     assert {path.name for path in tmp_path.iterdir()} == {"result.json", "model.xml"}
 
 
@@ -219,3 +224,44 @@ def test_result_without_estimates_is_refused(robot, tmp_path, result, evidence):
     save_result(tmp_path / "result.json", result)
     with pytest.raises(RecordError, match=evidence):
         choose_parameters(robot, str(tmp_path / "result.json"))
+
+
+@pytest.mark.parametrize(
+    ("value", "evidence"),
+    [
+        (True, "estimate of crank2.mass is true, must be a finite number"),
+        ("0.1", 'estimate of crank2.mass is "0.1", must be a finite number'),
+        ([0.1], r"estimate of crank2.mass is \[0.1\], must be"),
+        (float("nan"), "estimate of crank2.mass is NaN, must be"),
+        (float("inf"), "estimate of crank2.mass is Infinity, must be"),
+        (10**400, "estimate of crank2.mass is 10000"),
+        (-0.1, r"crank2.mass = -0.1 kg is not allowed, must be finite and >= 0"),
+    ],
+)
+def test_estimate_that_is_no_number_in_its_range_is_refused(robot, tmp_path, value, evidence):
+    values = dict.fromkeys(PARAMETER_NAMES, 1.0) | {"crank2.mass": value}
+    (tmp_path / "result.json").write_text(json.dumps(made_result(values)))
+    with pytest.raises(RecordError, match=evidence) as caught:
+        choose_parameters(robot, str(tmp_path / "result.json"))
+    assert str(caught.value).startswith(str(tmp_path / "result.json"))
+    assert len(str(caught.value)) < 200 + len(str(tmp_path))
+
+
+@pytest.mark.parametrize("command_name", ["verify-model", "workspace"])
+@pytest.mark.parametrize("folder", ["/proc/impossible", "/dev/null/impossible", "file/impossible"])
+def test_folder_that_cannot_be_made_is_refused_before_anything_is_computed(
+    monkeypatch, capfd, tmp_path, command_name, folder
+):
+    def compute(*_):
+        raise AssertionError("computed first")
+
+    monkeypatch.setattr("identify.model_verification.verify", compute)
+    monkeypatch.setattr("identify.workspace_map.map_workspace", compute)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    assert command(command_name, "--out", folder) == 1
+    said = capfd.readouterr().err
+    assert said.startswith("error: ")
+    assert "cannot be made" in said
+    assert said.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
