@@ -1,52 +1,106 @@
-"""Pinhole camera. Pixel (0, 0) is the centre of the top-left pixel; camera axes are x right, y down, z forward."""
+"""Pinhole camera with lens distortion.
+
+Pixel (0, 0) is the centre of the top-left pixel; camera axes are x right, y down, z forward. Ideal pixels are those of
+the same camera with a perfect lens: lines are straight there, and epipolar geometry and triangulation hold.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
+from .distortion import Distortion, NDArrayBool
 from .errors import CmmError
 from .pose import Array
 
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """Focal length and principal point in px, image size in px."""
+    """Focal length and principal point in px, image size in px.
+
+    focal_px is the focal length along x; aspect: the one along y divided by it; distortion of the lens.
+    """
 
     focal_px: float
     centre_x_px: float
     centre_y_px: float
     width: int
     height: int
+    aspect: float = 1.0
+    distortion: Distortion = field(default_factory=Distortion)
 
     def __post_init__(self) -> None:
-        if self.focal_px <= 0.0 or self.width < 1 or self.height < 1:
-            raise CmmError(f"camera needs a positive focal length and size, got {self}")
+        if self.focal_px <= 0.0 or self.aspect <= 0.0 or self.width < 1 or self.height < 1:
+            raise CmmError(f"camera needs a positive focal length, aspect and size, got {self}")
+
+    @property
+    def focal_lengths(self) -> Array:
+        """Focal lengths (2,) along x and y, px."""
+        return np.array([self.focal_px, self.focal_px * self.aspect])
+
+    @property
+    def centre(self) -> Array:
+        """Principal point (2,), px."""
+        return np.array([self.centre_x_px, self.centre_y_px])
 
     @property
     def matrix(self) -> Array:
         """Camera matrix K (3,3)."""
-        return np.array([[self.focal_px, 0.0, self.centre_x_px], [0.0, self.focal_px, self.centre_y_px],
-                         [0.0, 0.0, 1.0]])
+        return np.array([[self.focal_px, 0.0, self.centre_x_px],
+                         [0.0, self.focal_px * self.aspect, self.centre_y_px], [0.0, 0.0, 1.0]])
+
+    @cached_property
+    def ideal(self) -> PinholeCamera:
+        """The same camera with a perfect lens."""
+        return self if self.distortion.is_zero else replace(self, distortion=Distortion())
 
     def project(self, points: Array) -> tuple[Array, NDArrayBool]:
         """Pixels (..., 2) of points (..., 3) in camera axes, and whether each lies before the camera and inside."""
         depth = points[..., 2]
         ahead = depth > 1e-6
-        scale = self.focal_px / np.where(ahead, depth, 1.0)
-        pixels = points[..., :2] * scale[..., None] + (self.centre_x_px, self.centre_y_px)
-        inside = np.all((pixels > -0.5) & (pixels < (self.width - 0.5, self.height - 0.5)), axis=-1)
-        return pixels, ahead & inside
+        scale = self.focal_lengths / np.where(ahead, depth, 1.0)[..., None]
+        pixels = points[..., :2] * scale + (self.centre_x_px, self.centre_y_px)
+        if not self.distortion.is_zero:
+            pixels, holds = self.distort(pixels)
+            ahead &= holds
+        return pixels, ahead & self.shows(pixels)
+
+    def shows(self, pixels: Array) -> NDArrayBool:
+        """Whether pixels (..., 2) lie inside the image."""
+        return np.all((pixels > -0.5) & (pixels < (self.width - 0.5, self.height - 0.5)), axis=-1)
 
     def projection_jacobian(self, points: Array) -> Array:
         """Derivative (..., 2, 3) of the pixel by the point (..., 3) in camera axes, px/m."""
         x, y, z = np.moveaxis(points, -1, 0)
+        focal_x, focal_y = self.focal_px, self.focal_px * self.aspect
         jacobian = np.zeros((*points.shape[:-1], 2, 3))
-        jacobian[..., 0, 0] = jacobian[..., 1, 1] = self.focal_px / z
-        jacobian[..., 0, 2] = -self.focal_px * x / z**2
-        jacobian[..., 1, 2] = -self.focal_px * y / z**2
-        return jacobian
+        jacobian[..., 0, 0], jacobian[..., 1, 1] = focal_x / z, focal_y / z
+        jacobian[..., 0, 2] = -focal_x * x / z**2
+        jacobian[..., 1, 2] = -focal_y * y / z**2
+        if self.distortion.is_zero:
+            return jacobian
+        return self.distortion_jacobian(self.ideal.project(points)[0]) @ jacobian
 
+    def distort(self, ideal: Array) -> tuple[Array, NDArrayBool]:
+        """Pixels (..., 2) of the image for ideal pixels (..., 2), and whether the distortion model holds there."""
+        if self.distortion.is_zero:
+            return ideal, np.ones(ideal.shape[:-1], dtype=bool)
+        normalised = (ideal - self.centre) / self.focal_lengths
+        return self.distortion.distort(normalised) * self.focal_lengths + self.centre, self.distortion.holds(normalised)
 
-NDArrayBool = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+    def undistort(self, pixels: Array) -> tuple[Array, NDArrayBool]:
+        """Ideal pixels (..., 2) for pixels (..., 2) of the image, and whether each has one.
+
+        The values of those without one are finite and mean nothing.
+        """
+        if self.distortion.is_zero:
+            return pixels, np.ones(pixels.shape[:-1], dtype=bool)
+        normalised, found = self.distortion.undistort((pixels - self.centre) / self.focal_lengths)
+        return normalised * self.focal_lengths + self.centre, found
+
+    def distortion_jacobian(self, ideal: Array) -> Array:
+        """Derivative (..., 2, 2) of the image's pixels by the ideal ones (..., 2)."""
+        focal = self.focal_lengths
+        return self.distortion.jacobian((ideal - self.centre) / focal) * focal[:, None] / focal

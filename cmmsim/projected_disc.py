@@ -13,7 +13,7 @@ from .pose import Array
 
 
 def project_discs(camera: PinholeCamera, centres: Array, normals: Array, radii: Array) -> tuple[Array, Array]:
-    """Ellipses of n discs wholly before the camera: centres (n,2) px and shapes A (n,2,2) px, symmetric.
+    """Ellipses of n discs wholly before the camera: ideal centres (n,2) px and shapes A (n,2,2) px, symmetric.
 
     Parameters: centres (n,3) m and normals (n,3) unit, in camera axes; radii (n,) m. The ellipse is the image of the
     unit disc under x -> centre + A x.
@@ -22,8 +22,9 @@ def project_discs(camera: PinholeCamera, centres: Array, normals: Array, radii: 
     dual = centres[:, :, None] * centres[:, None, :] - radii[:, None, None] ** 2 * across
     dual = dual / dual[:, 2:, 2:]
     middle = dual[:, :2, 2]
-    squared = camera.focal_px**2 * (middle[:, :, None] * middle[:, None, :] - dual[:, :2, :2])
-    pixels = camera.focal_px * middle + (camera.centre_x_px, camera.centre_y_px)
+    focal = camera.focal_lengths
+    squared = focal[:, None] * focal * (middle[:, :, None] * middle[:, None, :] - dual[:, :2, :2])
+    pixels = focal * middle + (camera.centre_x_px, camera.centre_y_px)
     return pixels, _root(squared)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from .camera import PinholeCamera
 from .errors import ShapeError, UnknownBodyError, UnknownOptionError
 from .estimator import PoseEstimator
 from .images import StereoFrame, StereoImages
@@ -21,9 +20,9 @@ from .observation import DetectionSettings
 from .pose import Array, pose_to_transform
 from .pose_methods import METHODS
 from .renderers import RENDERER_NAMES, Renderer, choose_renderer
+from .rig_from_file import rig_from_file
 from .scene import Patch, mesh_patch, scene_body
 from .sensor_file import SensorFile, Timing, read_sensor_file
-from .stereo_rig import toed_in_rig
 from .taught import Taught
 from .teaching import Progress, Teacher
 from .tracking import Tracker
@@ -49,10 +48,7 @@ class Sensor:
             raise ShapeError(f"taught belongs to sensor {taught.sensor_name!r}, not to {file.name!r}")
         self._file, self._seed, self._progress = file, seed, progress
         self.method = method
-        middle = (0.5 * (file.rig.width - 1), 0.5 * (file.rig.height - 1))
-        camera = PinholeCamera(file.rig.focal_px, *middle, file.rig.width, file.rig.height)
-        self.rig, self._camera_from_base = toed_in_rig(camera, file.rig.baseline, np.array(file.rig.position),
-                                                       np.array(file.rig.target))
+        self.rig, self._camera_from_base = rig_from_file(file.rig)
         self._true_rig = self.rig
         figures = file.camera.model_dump()
         self.noise = CameraNoise(**{("enabled" if k == "noise" else k): v for k, v in figures.items()})

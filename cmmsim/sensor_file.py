@@ -31,8 +31,28 @@ class Timing(_Section):
     latency: NotNegative = 0.0
 
 
+class Calibrated(_Section):
+    """A camera as calibrated: focal_px along x and y and centre_px, the principal point, px; distortion k1, k2, p1, p2,
+    k3 of Brown and Conrady in OpenCV's order and meaning."""
+
+    focal_px: tuple[Positive, Positive]
+    centre_px: tuple[float, float]
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class RightFromLeft(_Section):
+    """Where the right camera stands: x_right = R(rotation_vector) x_left + translation; m and rad."""
+
+    translation: Vector3
+    rotation_vector: Vector3
+
+
 class Rig(_Section):
-    """baseline m; focal_px, width, height px; position and target m in the base frame."""
+    """baseline m; focal_px, width, height px; position (the middle of the baseline) and target m in the base frame.
+
+    left and right, where given, replace focal_px and the principal point in the middle of the image; right_from_left
+    replaces the baseline and the toe-in towards the target.
+    """
 
     baseline: Positive
     focal_px: Positive
@@ -40,6 +60,9 @@ class Rig(_Section):
     height: Annotated[int, Field(ge=64)]
     position: Vector3
     target: Vector3
+    left: Calibrated | None = None
+    right: Calibrated | None = None
+    right_from_left: RightFromLeft | None = None
 
 
 class Camera(_Section):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -34,14 +35,19 @@ class StereoRig:
         """Transforms (4,4) from the camera frame C into the axes of the left and of the right camera."""
         return np.eye(4), self.right_from_left
 
+    @cached_property
+    def ideal(self) -> StereoRig:
+        """The same rig with perfect lenses."""
+        return replace(self, left=self.left.ideal, right=self.right.ideal)
+
     @property
     def projection_matrices(self) -> tuple[Array, Array]:
-        """Projection matrices (3,4) from the camera frame C to left and right pixels."""
+        """Projection matrices (3,4) from the camera frame C to ideal left and right pixels."""
         return self.left.matrix @ np.eye(4)[:3], self.right.matrix @ self.right_from_left[:3]
 
     @property
     def fundamental(self) -> Array:
-        """Fundamental matrix F (3,3): right' F left = 0 for homogeneous pixels of the same point."""
+        """Fundamental matrix F (3,3): right' F left = 0 for homogeneous ideal pixels of the same point."""
         rotation, shift = self.right_from_left[:3, :3], self.right_from_left[:3, 3]
         essential = np.cross(np.eye(3), shift) @ rotation
         return np.linalg.inv(self.right.matrix).T @ essential @ np.linalg.inv(self.left.matrix)
@@ -71,6 +77,22 @@ def toed_in_rig(camera: PinholeCamera, baseline: float, position: Array, target:
     right_axis /= np.linalg.norm(right_axis)
     eyes = [_look_at(position + side * 0.5 * baseline * right_axis, target) for side in (-1.0, 1.0)]
     return StereoRig(camera, camera, eyes[1] @ invert(eyes[0])), eyes[0]
+
+
+def placed_rig(rig: StereoRig, position: Array, target: Array) -> Array:
+    """camera_from_base (4,4) of a rig whose baseline has its middle at ``position`` (3,) and which looks at ``target``.
+
+    The direction of view is the mean of both optical axes, made perpendicular to the baseline. A toed-in rig is put
+    where ``toed_in_rig`` puts it, as long as its baseline is horizontal there.
+    """
+    right_centre = invert(rig.right_from_left)[:3, 3]
+    x = right_centre / np.linalg.norm(right_centre)
+    y = np.cross(np.array([0.0, 0.0, 1.0]) + rig.right_from_left[2, :3], x)
+    y /= np.linalg.norm(y)
+    camera_from_middle = np.eye(4)
+    camera_from_middle[:3, :3] = np.column_stack([x, y, np.cross(x, y)])
+    camera_from_middle[:3, 3] = 0.5 * right_centre
+    return camera_from_middle @ _look_at(position, target)
 
 
 def _look_at(eye: Array, target: Array) -> Array:

@@ -18,7 +18,8 @@ NEAR, FAR = 0.2, 10.0  # m
 
 @dataclass(frozen=True)
 class View:
-    """One window: a camera, camera_from_body transforms (b,4,4), the window's first pixel (x, y) and size (w, h) px."""
+    """One window of a camera with a perfect lens: camera_from_body transforms (b,4,4), its first pixel (x, y) and its
+    size (w, h) px."""
 
     camera: PinholeCamera
     camera_from_bodies: Array
@@ -34,7 +35,7 @@ class View:
         x, y = camera.centre_x_px + 0.5 - self.corner[0], camera.centre_y_px + 0.5 - self.corner[1]
         matrix = np.zeros((4, 4))
         matrix[0, 0], matrix[0, 2] = 2.0 * camera.focal_px / width, 2.0 * x / width - 1.0
-        matrix[1, 1], matrix[1, 2] = 2.0 * camera.focal_px / height, 2.0 * y / height - 1.0
+        matrix[1, 1], matrix[1, 2] = 2.0 * camera.focal_px * camera.aspect / height, 2.0 * y / height - 1.0
         matrix[2, 2], matrix[2, 3] = (FAR + NEAR) / (FAR - NEAR), -2.0 * FAR * NEAR / (FAR - NEAR)
         matrix[3, 2] = 1.0
         return matrix
