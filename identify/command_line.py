@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table as RichTable
 
+from identify.base_parameters_command import base_parameters
 from identify.engine_commands import export, verify_model
 from identify.errors import IdentifyError, ScenarioError
 from identify.progress import Progress, RichProgress, SilentProgress
@@ -46,6 +47,10 @@ The model in other engines:
 \b
 Where the robot can go:
   cmmsim workspace rss6                  maps of travel, reach and conditioning
+
+\b
+What its motion can show:
+  cmmsim base-parameters rss6            groups of parameters that no motion can separate
 """
 
 app = typer.Typer(
@@ -179,6 +184,7 @@ def report(out: RunFolderOption, quiet: Quiet = False) -> None:
 app.command("verify-model")(verify_model)
 app.add_typer(export, name="export")
 app.command()(workspace)
+app.command()(base_parameters)
 
 
 def parse_settings(settings: list[str] | None) -> dict[str, Any]:

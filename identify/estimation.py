@@ -18,7 +18,7 @@ from dynamics import DynamicsError, Robot
 from dynamics.closed_loop import Reference
 from identify import warm_start
 from identify.arrays import Array
-from identify.base_parameters import base_rank
+from identify.base_parameters import rank_by_threshold, reference_regressor
 from identify.bounded_least_squares import Solution, StopCriteria, minimise
 from identify.errors import EstimationError
 from identify.estimate_covariance import DRAWS, Uncertainty, estimate_uncertainty
@@ -104,7 +104,8 @@ def identify(
         uncertainty = estimate_uncertainty(final, searches[-1].parameters, rng, advance)
     ended = time.perf_counter()
     seconds = {"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched}
-    rank = base_rank(robot, problem.reference, scenario.timing.frame_rate_hz, settings.qr_threshold)
+    excited = reference_regressor(robot, problem.reference, scenario.timing.frame_rate_hz)
+    rank = rank_by_threshold(excited, settings.qr_threshold)
     return _result(final, warm, searches, uncertainty, rank, seconds)
 
 
