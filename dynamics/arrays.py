@@ -1,26 +1,119 @@
-"""What users pass as numbers, turned into arrays or refused by name."""
+"""What users pass as arguments, turned into numbers and arrays, or refused with name, value and what is wanted.
+
+Nothing is transposed, padded, parsed from text, or cast from complex numbers or truth values.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from dynamics.errors import ShapeError
+from dynamics.errors import DynamicsError, ShapeError
+
+Shape = tuple[int | Literal["N"], ...]
+ErrorClass = type[DynamicsError]
 
 
-def rows(name: str, value: ArrayLike, width: int) -> np.ndarray:
-    """The value as floats of shape (width,) or (N, width), never transposed, padded or cast from complex numbers.
+def floats(
+    name: str, value: object, *shapes: Shape, error: ErrorClass = ShapeError, finite: bool = True
+) -> np.ndarray:
+    """The value as float64 of one of the shapes, in which "N" stands for any length; a float64 array is not copied.
 
-    Raises ShapeError, which names the array, its shape, or the place of an entry that is not finite.
+    Raises `error`, which names the array with what was got, or with the place of an entry that is not finite.
     """
+    wanted = " or ".join(_shape_text(shape) for shape in shapes)
     try:
         array = np.asarray(value)
-        if np.iscomplexobj(array):
-            raise TypeError
-        array = array.astype(float, copy=False)
     except (TypeError, ValueError):
-        raise ShapeError(f"{name} must be numbers of shape ({width},) or (N, {width}), got {value!r:.60}") from None
-    if array.ndim not in (1, 2) or array.shape[-1] != width:
-        raise ShapeError(f"{name} must have shape ({width},) or (N, {width}), got {array.shape}")
-    if not np.isfinite(array).all():
+        raise error(f"{name} must be numbers of shape {wanted}, got {_shown(value)}") from None
+    if array.dtype.kind not in "iuf":
+        raise error(f"{name} must be numbers of shape {wanted}, got {_shown(value)} (dtype {array.dtype})")
+    if not any(_fits(array.shape, shape) for shape in shapes):
+        raise error(f"{name} must have shape {wanted}, got {array.shape}")
+    array = array.astype(float, copy=False)
+    if finite and not np.isfinite(array).all():
         place = tuple(int(index) for index in np.argwhere(~np.isfinite(array))[0])
-        raise ShapeError(f"{name}{list(place)} is {array[place]}, must be finite")
+        raise error(f"{name}{list(place)} is {array[place]}, must be finite")
     return array
+
+
+def rows(name: str, value: object, width: int) -> np.ndarray:
+    """The value as finite floats of shape (width,) or (N, width). Raises ShapeError."""
+    return floats(name, value, (width,), ("N", width))
+
+
+def mask(name: str, value: object, length: int, error: ErrorClass) -> np.ndarray:
+    """The value as bool of shape (length,). Raises `error` for anything else, numbers included."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):
+        raise error(f"{name} must be bool of shape ({length},), got {_shown(value)}") from None
+    if array.dtype != bool or array.shape != (length,):
+        raise error(f"{name} must be bool of shape ({length},), got {array.dtype} of shape {array.shape}")
+    return array
+
+
+def real(
+    name: str,
+    value: object,
+    error: ErrorClass,
+    *,
+    least: float | None = None,
+    above: float | None = None,
+    unit: str = "",
+) -> float:
+    """The value as a finite float, >= least or > above where these are given. Raises `error`."""
+    limit = f" >= {least:g}" if least is not None else "" if above is None else f" > {above:g}"
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise error(f"{name} is {_shown(value)}{unit}, must be a number{limit}")
+    try:
+        result = float(value)
+    except OverflowError:
+        result = np.inf
+    within = (least is None or result >= least) and (above is None or result > above)
+    if not (within and np.isfinite(result)):
+        raise error(f"{name} is {result}{unit}, must be finite{' and' if limit else ''}{limit}")
+    return result
+
+
+def whole(name: str, value: object, error: ErrorClass, *, least: int, most: float = np.inf) -> int:
+    """The value as an int from least to most. Raises `error`."""
+    limit = f"a whole number >= {least}" + (f" and <= {most}" if most < np.inf else "")
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise error(f"{name} is {_shown(value)}, must be {limit}")
+    if not least <= value <= most or value % 1:
+        raise error(f"{name} is {value}, must be {limit}")
+    return int(value)
+
+
+def flag(name: str, value: object, error: ErrorClass) -> bool:
+    """The value as True or False. Raises `error` for anything else, numbers included."""
+    if not isinstance(value, bool | np.bool_):
+        raise error(f"{name} is {_shown(value)}, must be True or False")
+    return bool(value)
+
+
+def check_choice(name: str, value: object, valid: Sequence[str], error: ErrorClass) -> None:
+    """Raise `error`, which lists the valid names, unless the value is one of them."""
+    if not isinstance(value, str) or value not in valid:
+        raise error(f"unknown {name} `{value if isinstance(value, str) else _shown(value)}`; valid: {', '.join(valid)}")
+
+
+def check_type(name: str, value: object, kind: type, error: ErrorClass) -> None:
+    """Raise `error` unless the value is an instance of a class."""
+    if not isinstance(value, kind):
+        raise error(f"{name} must be of type {kind.__name__}, got {_shown(value)} of type {type(value).__name__}")
+
+
+def _fits(shape: tuple[int, ...], wanted: Shape) -> bool:
+    pairs = zip(shape, wanted, strict=False)
+    return len(shape) == len(wanted) and all(want in ("N", got) for got, want in pairs)
+
+
+def _shape_text(shape: Shape) -> str:
+    return f"({shape[0]},)" if len(shape) == 1 else f"({', '.join(map(str, shape))})"
+
+
+def _shown(value: object) -> str:
+    """The value in at most 60 characters of one line."""
+    return " ".join(repr(value).split())[:60]

@@ -6,8 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from dynamics.arrays import Shape, check_type, floats, whole
 from dynamics.closed_loop import ClosedLoopRun, LoopSettings, Reference, simulate
 from dynamics.errors import SimulationError
+from dynamics.loop_types import PARAMETER_COUNT
 from dynamics.robot import Robot
 
 
@@ -25,15 +27,26 @@ def simulate_batch(
     A single vector (67,) or a single reference serves all runs. Results are those of `simulate`, in order, and do not
     depend on `workers` (default: one a core). Raises what `simulate` raises, for the first run that fails.
     """
-    vectors = np.atleast_2d(np.asarray(parameters, dtype=float))
-    given = [references] if isinstance(references, Reference) else list(references)
+    threads = (os.cpu_count() or 1) if workers is None else whole("workers", workers, SimulationError, least=1)
+    shapes: tuple[Shape, Shape] = (PARAMETER_COUNT,), ("N", PARAMETER_COUNT)
+    vectors = np.atleast_2d(floats("loop parameters", parameters, *shapes, error=SimulationError, finite=False))
+    given = _listed(references)
     count = max(len(vectors), len(given))
-    if len(vectors) not in (1, count) or len(given) not in (1, count):
+    if not (len(vectors) in (1, count) and len(given) in (1, count)):
         raise SimulationError(f"{len(vectors)} parameter vectors and {len(given)} references do not pair up")
 
     def one(index: int) -> ClosedLoopRun:
         vector, reference = vectors[index % len(vectors)], given[index % len(given)]
         return simulate(robot, vector, reference, settings, sensitivities=sensitivities)
 
-    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(one, range(count)))
+
+
+def _listed(references: Reference | Sequence[Reference]) -> list[Reference]:
+    if isinstance(references, Reference):
+        return [references]
+    check_type("references", references, Sequence, SimulationError)
+    for index, reference in enumerate(references):
+        check_type(f"references[{index}]", reference, Reference, SimulationError)
+    return list(references)

@@ -10,6 +10,7 @@ Two implementations, tested to be equal: compiled C (`closed_loop.c`) and plain 
 import numpy as np
 
 from dynamics import compiled_closed_loop, plain_closed_loop
+from dynamics.arrays import check_type, flag, floats, mask, real
 from dynamics.errors import SimulationError
 from dynamics.loop_types import (
     PARAMETER_COUNT,
@@ -24,7 +25,7 @@ from dynamics.loop_types import (
     ServoGains,
     StartState,
 )
-from dynamics.parameters import check_parameters
+from dynamics.parameters import JOINT_PID_NAMES, check_parameters
 from dynamics.robot import Robot
 
 __all__ = [
@@ -58,27 +59,29 @@ def simulate(
     """Run the closed loop for parameters (67,): the 64 dynamic ones, then lp, li, ld.
 
     sensor: None for the ideal one. sensitivities: also derivatives of the poses with respect to all parameters
-    (ideal sensor or logged commands only). commands (frames, 6): drive the joints with these instead of the servo's.
+    (ideal sensor only). commands (frames, 6): drive the joints with these instead of the servo's; what is measured is
+    then recorded and steers nothing.
     lost (frames,) bool: frames at which the ideal sensor measures nothing, so that a model loses what its plant lost.
     compiled: None takes the compiled path when a C compiler is at hand; False forces the plain path.
-    Raises LoopFailure when the robot leaves the reachable set (an unstable loop), ParameterError, SimulationError.
+    Raises LoopFailure when the robot leaves the reachable set (an unstable loop); and before the run
+    UnreachablePoseError where the reference does, ParameterError, SimulationError, SingularPoseError.
     """
-    parameters = _check_loop_parameters(parameters)
-    if sensitivities and sensor is not None:
+    _check_kinds(robot, reference, settings, sensor)
+    sensitivities = flag("sensitivities", sensitivities, SimulationError)
+    compiled = None if compiled is None else flag("compiled", compiled, SimulationError)
+    if sensor is not None and sensitivities:
         raise SimulationError("sensitivities need the ideal sensor: pass sensor=None")
+    if sensor is not None and lost is not None:
+        raise SimulationError("lost is for the ideal sensor: a sensor returns None at the frames that it loses")
     if commands is not None:
-        commands = np.ascontiguousarray(commands, dtype=float)
-        if commands.shape != reference.poses.shape or not np.isfinite(commands).all():
-            raise SimulationError(f"commands must be finite with shape {reference.poses.shape}, got {commands.shape}")
+        commands = np.ascontiguousarray(floats("commands", commands, reference.poses.shape, error=SimulationError))
     if lost is not None:
-        lost = np.ascontiguousarray(lost, dtype=np.int8)
-        if lost.shape != (len(reference.poses),) or sensor is not None:
-            raise SimulationError(
-                f"lost must have shape ({len(reference.poses)},) and goes with the ideal sensor only, got {lost.shape}"
-            )
-    library = compiled_closed_loop.library(robot.geometry) if compiled in (None, True) else None
+        lost = mask("lost", lost, len(reference.poses), SimulationError).astype(np.int8)
+    robot.check_reach(reference.poses, "reference pose", "frame")
     start = equilibrium(robot, parameters, reference.poses[0], settings.servo)
+    parameters = _check_loop_parameters(parameters)
     problem = LoopProblem(robot, parameters, reference, settings, start, sensor, sensitivities, commands, lost)
+    library = compiled_closed_loop.library(robot.geometry) if compiled in (None, True) else None
     if library is not None:
         return compiled_closed_loop.run(library, problem)
     if compiled:
@@ -88,15 +91,22 @@ def simulate(
 
 def prepare(robot: Robot) -> bool:
     """Compile the loop of a robot if that has not been done; False where no C compiler is at hand."""
+    check_type("robot", robot, Robot, SimulationError)
     return compiled_closed_loop.library(robot.geometry) is not None
 
 
 def equilibrium(robot: Robot, parameters: np.ndarray, pose: np.ndarray, servo: ServoGains) -> StartState:
-    """State of rest at a pose (6,), friction unloaded. The holding torque is linear in the dynamic parameters."""
-    li = parameters[65]
+    """State of rest at a pose (6,), friction unloaded, for parameters (67,).
+
+    The holding torque is linear in the dynamic parameters. Raises what `simulate` raises before a run.
+    """
+    check_type("robot", robot, Robot, SimulationError)
+    check_type("servo", servo, ServoGains, SimulationError)
+    parameters, pose = _check_loop_parameters(parameters), floats("pose", pose, (6,))
+    li, rest = parameters[65], np.zeros(6)
     robot.static_torque(pose, parameters[:64])  # refuses a pose out of reach or singular, with the evidence
+    robot.pose_rate(pose, rest)  # refuses Euler angles at their singularity
     angles = robot.inverse_kinematics(pose)
-    rest = np.zeros(6)
     torque_map = np.linalg.solve(robot.joint_jacobian(pose).T, robot.regressor(pose, rest, rest))
     integral = torque_map @ parameters[:64] / li
     sensitivity = np.zeros((6, PARAMETER_COUNT))
@@ -107,12 +117,18 @@ def equilibrium(robot: Robot, parameters: np.ndarray, pose: np.ndarray, servo: S
 
 
 def _check_loop_parameters(parameters: np.ndarray) -> np.ndarray:
-    parameters = np.ascontiguousarray(parameters, dtype=float)
-    if parameters.shape != (PARAMETER_COUNT,):
-        raise SimulationError(f"loop parameters must have shape ({PARAMETER_COUNT},), got {parameters.shape}")
-    check_parameters(parameters[:64])
-    for name, value in zip(("lp", "li", "ld"), parameters[64:], strict=True):
-        if not np.isfinite(value) or value < 0 or (name == "li" and value == 0):
-            limit = "> 0" if name == "li" else ">= 0"
-            raise SimulationError(f"joint_pid.{name} is {value}, must be finite and {limit}")
-    return parameters
+    values = floats("loop parameters", parameters, (PARAMETER_COUNT,), error=SimulationError, finite=False)
+    check_parameters(values[:64])
+    lp, li, ld = JOINT_PID_NAMES
+    for name, value in ((lp, values[64]), (ld, values[66])):
+        real(name, value, SimulationError, least=0)
+    real(li, values[65], SimulationError, above=0)
+    return values
+
+
+def _check_kinds(robot: Robot, reference: Reference, settings: LoopSettings, sensor: PoseSensor | None) -> None:
+    for name, value, kind in (("robot", robot, Robot), ("reference", reference, Reference)):
+        check_type(name, value, kind, SimulationError)
+    check_type("settings", settings, LoopSettings, SimulationError)
+    if sensor is not None and not callable(sensor):
+        raise SimulationError(f"sensor must be a function of frame, time and pose, or None, got {sensor!r:.60}")

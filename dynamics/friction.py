@@ -5,6 +5,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from dynamics.arrays import check_choice, real
 from dynamics.errors import SimulationError
 
 LawName = Literal["coulomb_viscous", "smoothed", "stribeck"]
@@ -27,18 +28,19 @@ class FrictionLaw:
     stribeck_velocity: float | None = None
 
     def __post_init__(self) -> None:
-        if self.name not in get_args(LawName):
-            raise SimulationError(f"unknown friction law `{self.name}`; valid: {', '.join(get_args(LawName))}")
-        self._check("smoothing_velocity", "smoothed", 0.0, " rad/s", "> 0")
-        self._check("stribeck_velocity", "stribeck", 0.0, " rad/s", "> 0")
-        self._check("static_ratio", "stribeck", np.nextafter(1.0, 0.0), "", ">= 1")
+        check_choice("friction law", self.name, get_args(LawName), SimulationError)
+        self._check("smoothing_velocity", "smoothed", above=0, unit=" rad/s")
+        self._check("stribeck_velocity", "stribeck", above=0, unit=" rad/s")
+        self._check("static_ratio", "stribeck", least=1)
 
-    def _check(self, constant: str, law: str, above: float, unit: str, limit: str) -> None:
+    def _check(
+        self, constant: str, law: str, *, above: float | None = None, least: float | None = None, unit: str = ""
+    ) -> None:
         value = getattr(self, constant)
-        if self.name != law and value is not None:
-            raise SimulationError(f"{constant} = {value} belongs to the law `{law}`, not to `{self.name}`")
-        if self.name == law and not (value is not None and np.isfinite(value) and value > above):
-            raise SimulationError(f"{constant} is {value}{unit}, must be {limit} for the law `{law}`")
+        if self.name == law:
+            real(f"{constant} of the law `{law}`", value, SimulationError, above=above, least=least, unit=unit)
+        elif value is not None:
+            raise SimulationError(f"{constant} = {value!r:.60} belongs to the law `{law}`, not to `{self.name}`")
 
     @property
     def sticks(self) -> bool:

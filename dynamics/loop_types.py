@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from dynamics.arrays import check_choice, check_type, floats, real, whole
 from dynamics.errors import SimulationError
 from dynamics.friction import FrictionLaw
 from dynamics.parameters import PARAMETER_NAMES
@@ -14,9 +14,12 @@ from dynamics.robot import Robot
 
 PARAMETER_COUNT = len(PARAMETER_NAMES) + 3
 MAX_DELAY_FRAMES = 60
+MAX_STEPS_PER_FRAME = 10_000
 LEFT_REACH = "the robot left the reachable set (the loop is unstable)"
 MEASURED_OUT_OF_REACH = "the measured pose is out of reach, so that the servo has no command"
 SINGULAR_MASS = "the mass matrix is not positive definite: masses or inertias are zero or overflow"
+
+Hold = Literal["zero", "linear"]
 
 # (frame index, time s, true pose (6,)) -> measured pose (6,), or None when the measurement is lost.
 PoseSensor = Callable[[int, float, np.ndarray], np.ndarray | None]
@@ -32,8 +35,7 @@ class ServoGains:
 
     def __post_init__(self) -> None:
         for name in ("kp", "kd", "ki"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise SimulationError(f"servo gain {name} is {getattr(self, name)}, must be finite and >= 0")
+            real(f"servo gain {name}", getattr(self, name), SimulationError, least=0)
 
 
 @dataclass(frozen=True)
@@ -46,18 +48,17 @@ class FrameTiming:
 
     frame_rate_hz: float
     latency_s: float = 0.0
-    hold: Literal["zero", "linear"] = "zero"
+    hold: Hold = "zero"
 
     def __post_init__(self) -> None:
-        if not 0 < self.frame_rate_hz < np.inf:
-            raise SimulationError(f"frame rate is {self.frame_rate_hz} Hz, must be finite and > 0")
+        real("frame rate", self.frame_rate_hz, SimulationError, above=0, unit=" Hz")
+        real("latency", self.latency_s, SimulationError, unit=" s")
         if not 0 <= self.latency_s * self.frame_rate_hz <= MAX_DELAY_FRAMES:
             raise SimulationError(
                 f"latency is {self.latency_s} s, must be >= 0 and at most {MAX_DELAY_FRAMES} frames "
                 f"({MAX_DELAY_FRAMES / self.frame_rate_hz:.3g} s)"
             )
-        if self.hold not in ("zero", "linear"):
-            raise SimulationError(f"unknown hold `{self.hold}`; valid: zero, linear")
+        check_choice("hold", self.hold, get_args(Hold), SimulationError)
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,10 @@ class LoopSettings:
     steps_per_frame: int = 4
 
     def __post_init__(self) -> None:
-        if self.steps_per_frame < 1 or self.steps_per_frame != int(self.steps_per_frame):
-            raise SimulationError(f"steps_per_frame is {self.steps_per_frame}, must be a whole number >= 1")
+        for name, kind in (("servo", ServoGains), ("timing", FrameTiming), ("friction", FrictionLaw)):
+            check_type(name, getattr(self, name), kind, SimulationError)
+        steps = whole("steps_per_frame", self.steps_per_frame, SimulationError, least=1, most=MAX_STEPS_PER_FRAME)
+        object.__setattr__(self, "steps_per_frame", steps)
 
 
 @dataclass(frozen=True)
@@ -83,10 +86,10 @@ class Reference:
 
     def __post_init__(self) -> None:
         for name in ("poses", "rates"):
-            array = np.ascontiguousarray(getattr(self, name), dtype=float)
-            if array.ndim != 2 or array.shape[1] != 6 or len(array) < 2 or not np.isfinite(array).all():
-                raise SimulationError(f"reference {name} must be finite with shape (frames >= 2, 6), got {array.shape}")
-            object.__setattr__(self, name, array)
+            array = floats(f"reference {name}", getattr(self, name), ("N", 6), error=SimulationError)
+            if len(array) < 2:
+                raise SimulationError(f"reference {name} must have at least 2 frames, got {len(array)}")
+            object.__setattr__(self, name, np.ascontiguousarray(array))
         if self.poses.shape != self.rates.shape:
             raise SimulationError(f"reference poses {self.poses.shape} and rates {self.rates.shape} differ in shape")
 
@@ -143,17 +146,11 @@ class ClosedLoopRun:
     events: int
 
 
-def checked_measurement(measured: ArrayLike | None, frame: int) -> np.ndarray | None:
-    """What a pose sensor returned, as (6,) floats or None. Raises SimulationError for anything else."""
+def checked_measurement(measured: object, frame: int) -> np.ndarray | None:
+    """What a pose sensor returned, as (6,) floats or None for a lost measurement. Raises SimulationError otherwise."""
     if measured is None:
         return None
-    array = np.asarray(measured, dtype=float)
-    if array.shape != (6,) or not np.isfinite(array).all():
-        raise SimulationError(
-            f"the pose sensor returned {np.array2string(array, precision=6)} at frame {frame}, "
-            "must be 6 finite numbers, or None for a lost measurement"
-        )
-    return array
+    return floats(f"what the pose sensor returned at frame {frame}", measured, (6,), error=SimulationError)
 
 
 class LoopFailure(SimulationError):
@@ -176,6 +173,6 @@ def failure(reason: str, frame: int, problem: LoopProblem, pose: np.ndarray, mea
 
 
 def _nearest_leg(robot: Robot, pose: np.ndarray) -> str:
-    margin = np.nan_to_num(robot.reach_margin(pose), nan=-np.inf)
+    margin = robot.reach_margin(pose)
     leg = int(np.argmin(margin))
     return f"leg {leg + 1} has the least reach margin, {margin[leg]:.3g}, must be > 0"

@@ -11,13 +11,14 @@ adds none.
 
 import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 from xml.etree import ElementTree as Xml
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from dynamics.arrays import check_choice, check_type, flag, real
 from dynamics.body_frames import BodyFrames, body_frames, crank_rotations
 from dynamics.errors import DynamicsError
 from dynamics.geometry import LEGS
@@ -31,6 +32,8 @@ MAX_IMPEDANCE = 0.9999
 
 # XML has no way to write these: control characters, halves of surrogate pairs (undecodable file names), non-characters.
 NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
+
+Integrator = Literal["implicitfast", "RK4"]
 
 CHANGED_INERTIAS = (
     "Inertias that no rigid body has were changed to the nearest that MuJoCo accepts. Cranks turn about z alone and",
@@ -53,17 +56,14 @@ class MjcfSolver:
     timestep_s: float = 2.5e-4
     time_constant_steps: float = 2.0
     impedance: float = MAX_IMPEDANCE
-    integrator: Literal["implicitfast", "RK4"] = "implicitfast"
+    integrator: Integrator = "implicitfast"
 
     def __post_init__(self) -> None:
-        if not 0 < self.timestep_s < np.inf:
-            raise DynamicsError(f"timestep is {self.timestep_s} s, must be finite and > 0")
-        if not 2 <= self.time_constant_steps < np.inf:
-            raise DynamicsError(f"time constant is {self.time_constant_steps} steps, must be finite and >= 2")
-        if not 0 < self.impedance <= MAX_IMPEDANCE:
+        real("timestep", self.timestep_s, DynamicsError, above=0, unit=" s")
+        real("time constant", self.time_constant_steps, DynamicsError, least=2, unit=" steps")
+        if real("impedance", self.impedance, DynamicsError, above=0) > MAX_IMPEDANCE:
             raise DynamicsError(f"impedance is {self.impedance}, must be > 0 and <= {MAX_IMPEDANCE}")
-        if self.integrator not in ("implicitfast", "RK4"):
-            raise DynamicsError(f"unknown integrator `{self.integrator}`; valid: implicitfast, RK4")
+        check_choice("integrator", self.integrator, get_args(Integrator), DynamicsError)
 
 
 def mjcf_text(
@@ -80,13 +80,19 @@ def mjcf_text(
     coulomb: write the dry friction; without it the joints only damp. Raises ParameterError, and its subclass
     UnphysicalInertiaError where a body breaks Ix + Iy >= Iz and `allow_unphysical_inertia` is False.
     """
-    values = check_parameters(robot.nominal_parameters if parameters is None else np.asarray(parameters, dtype=float))
+    check_type("robot", robot, Robot, DynamicsError)
+    check_type("source", source, str, DynamicsError)
+    solver = MjcfSolver() if solver is None else solver
+    check_type("solver", solver, MjcfSolver, DynamicsError)
+    values = check_parameters(robot.nominal_parameters if parameters is None else parameters)
+    allow_unphysical_inertia = flag("allow_unphysical_inertia", allow_unphysical_inertia, DynamicsError)
+    coulomb = flag("coulomb", coulomb, DynamicsError)
     inertias = physical_inertias(values, allow_unphysical_inertia)
     frames = body_frames(robot, robot.home_pose)
     root = Xml.Element("mujoco", model=NOT_IN_XML.sub("?", robot.name))
     _add_header(root, robot, inertias, source)
     Xml.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
-    _add_options(root, robot, solver or MjcfSolver())
+    _add_options(root, robot, solver)
     add_assets(root)
     world = Xml.SubElement(root, "worldbody")
     add_base_looks(world, robot.geometry)

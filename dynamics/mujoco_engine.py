@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dynamics.arrays import check_type, floats, real
 from dynamics.body_frames import body_frames, link_angular_velocities
 from dynamics.errors import DynamicsError
 from dynamics.geometry import LEGS
@@ -39,6 +40,8 @@ class MujocoRobot:
     """A robot exported by `mjcf_text`, loaded. Poses, twists and crank angles are those of `Robot`."""
 
     def __init__(self, robot: Robot, text: str) -> None:
+        check_type("robot", robot, Robot, MujocoError)
+        check_type("text", text, str, MujocoError)
         self._mujoco = import_mujoco()
         self._robot = robot
         try:
@@ -46,11 +49,14 @@ class MujocoRobot:
         except ValueError as error:
             raise MujocoError(f"MuJoCo refuses the model of {robot.name}: {error}") from error
         self.data = self._mujoco.MjData(self.model)
-        joints = [self.model.joint(f"joint{number}") for number in range(1, LEGS + 1)]
+        try:
+            joints = [self.model.joint(f"joint{leg}") for leg in range(1, LEGS + 1)]
+            self._ends = [self.model.site(f"link_end{leg}").id for leg in range(1, LEGS + 1)]
+            self._joints = [self.model.site(f"platform_joint{leg}").id for leg in range(1, LEGS + 1)]
+        except KeyError as error:
+            raise MujocoError(f"the model is no export of {robot.name}: {error.args[0]}") from None
         self._angle = np.array([joint.qposadr[0] for joint in joints])
         self._rate = np.array([joint.dofadr[0] for joint in joints])
-        self._ends = [self.model.site(f"link_end{number}").id for number in range(1, LEGS + 1)]
-        self._joints = [self.model.site(f"platform_joint{number}").id for number in range(1, LEGS + 1)]
 
     @property
     def timestep(self) -> float:
@@ -89,8 +95,8 @@ class MujocoRobot:
     def link_spin(self) -> float:
         """Largest angular velocity of a link about its own axis, rad/s."""
         spins = []
-        for number in range(1, LEGS + 1):
-            body = self.model.body(f"link{number}").id
+        for leg in range(1, LEGS + 1):
+            body = self.model.body(f"link{leg}").id
             turn = np.zeros(6)
             self._mujoco.mj_objectVelocity(self.model, self.data, self._mujoco.mjtObj.mjOBJ_XBODY, body, turn, 1)
             spins.append(abs(turn[2]))
@@ -98,6 +104,7 @@ class MujocoRobot:
 
     def put(self, pose: np.ndarray, twist: np.ndarray) -> None:
         """Put all bodies where the robot has them at a pose (6,) moving with a twist (6,)."""
+        pose, twist = floats("pose", pose, (6,)), floats("twist", twist, (6,))
         frames = body_frames(self._robot, pose)
         link_omega = link_angular_velocities(self._robot, frames, pose, twist)
         rate = self._robot.joint_jacobian(pose) @ twist
@@ -117,7 +124,7 @@ class MujocoRobot:
 
     def twist_dot(self, torque: np.ndarray) -> np.ndarray:
         """Acceleration [h_ddot, omega_dot] (6,), base axes, under crank torques (6,) in the present state."""
-        self.data.ctrl[:] = torque
+        self.data.ctrl[:] = floats("torque", torque, (LEGS,))
         self._mujoco.mj_forward(self.model, self.data)
         platform = Rotation.from_quat(self.data.qpos[3:7], scalar_first=True).as_matrix()
         return np.concatenate([self.data.qacc[:3], platform @ self.data.qacc[3:6]])
@@ -125,11 +132,13 @@ class MujocoRobot:
     def feed_back(self, stiffness: float, damping: float) -> None:
         """Let every motor add -stiffness angle - damping rate to its control, evaluated inside MuJoCo's integrator."""
         self.model.actuator_biastype[:] = self._mujoco.mjtBias.mjBIAS_AFFINE
+        stiffness = real("stiffness", stiffness, MujocoError, least=0)
+        damping = real("damping", damping, MujocoError, least=0)
         self.model.actuator_biasprm[:, :3] = [0.0, -stiffness, -damping]
 
     def step(self, control: np.ndarray) -> None:
         """One step under a control (6,), N m."""
-        self.data.ctrl[:] = control
+        self.data.ctrl[:] = floats("control", control, (LEGS,))
         self._mujoco.mj_step(self.model, self.data)
 
     def stepper(self) -> Callable[[], None]:

@@ -6,6 +6,7 @@ The paper calls the driven arm of a leg its wrench; here it is the crank.
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dynamics.arrays import floats
 from dynamics.errors import ParameterError
 from dynamics.geometry import LEGS
 
@@ -46,26 +47,23 @@ def unit_of(name: str) -> str:
 
 def check_parameters(values: ArrayLike) -> np.ndarray:
     """Return values as a float array (64,); raise ParameterError on a wrong shape, NaN, or a negative entry."""
-    try:
-        array = np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        raise ParameterError(f"parameters must be {len(PARAMETER_NAMES)} numbers, got {values!r:.60}") from None
-    if array.shape != (len(PARAMETER_NAMES),):
-        raise ParameterError(f"parameters must have shape ({len(PARAMETER_NAMES)},), got {array.shape}")
-    allowed = (array >= 0) & (array < np.inf)
-    allowed[0] &= array[0] > 0
-    if not allowed.all():
-        index = int(np.argmin(allowed))
-        name, limit = PARAMETER_NAMES[index], ">= 0" if index else "> 0"
-        raise ParameterError(f"{name} = {array[index]:g} {unit_of(name)} is not allowed, must be finite and {limit}")
+    array = floats("parameters", values, (len(PARAMETER_NAMES),), error=ParameterError, finite=False)
+    check_ranges(array)
     return array
 
 
-def inertia_warnings(values: np.ndarray) -> list[str]:
-    """Bodies whose principal inertias break the triangle inequality I_x + I_y >= I_z (in any order), one line each."""
-    lines = []
-    for index, body in enumerate(BODY_NAMES):
-        moments = np.asarray(values, dtype=float)[4 * index + 1 : 4 * index + 4]
-        if 2 * moments.max() > moments.sum() * (1 + 1e-12):
-            lines.append(f"{body}: largest inertia {moments.max():.3g} kg m^2 exceeds the sum of the other two")
-    return lines
+def check_ranges(parameters: np.ndarray) -> None:
+    """Raise ParameterError where one of parameters (64,) or (N, 64) is NaN, infinite, negative, or no platform mass.
+
+    The error names the parameter with its value, unit and limit, and its row in a batch.
+    """
+    allowed = (parameters >= 0) & (parameters < np.inf)
+    allowed[..., 0] &= parameters[..., 0] > 0
+    if allowed.all():
+        return
+    place = tuple(int(index) for index in np.argwhere(~allowed)[0])
+    name, limit = PARAMETER_NAMES[place[-1]], ">= 0" if place[-1] else "> 0"
+    where = f" (row {place[0]})" if len(place) > 1 else ""
+    raise ParameterError(
+        f"{name} = {parameters[place]:g} {unit_of(name)} is not allowed, must be finite and {limit}{where}"
+    )

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dynamics import forward_kinematics, model
-from dynamics.arrays import rows
+from dynamics.arrays import check_type, floats, rows
 from dynamics.compilation import load_library, open_library
-from dynamics.errors import ShapeError, SingularPoseError, UnreachablePoseError
+from dynamics.errors import ParameterError, RobotFileError, ShapeError, SingularPoseError, UnreachablePoseError
 from dynamics.geometry import LEGS, Rss6Geometry
-from dynamics.parameters import PARAMETER_NAMES, check_parameters
+from dynamics.parameters import PARAMETER_NAMES, check_ranges
 from dynamics.robot_file import ParameterSet, RobotDescription, read_robot_file
 
 # Below this the solution of M a = f loses all digits; a healthy robot is near 1e2 (poses in m and rad).
@@ -35,6 +35,7 @@ class Robot:
     """
 
     def __init__(self, description: RobotDescription) -> None:
+        check_type("description", description, RobotDescription, RobotFileError)
         self.name = description.name
         self.geometry = description.geometry
         self.parameter_sets: dict[str, ParameterSet] = description.parameter_sets
@@ -133,8 +134,12 @@ class Robot:
         return self.inverse_dynamics(poses, rest, rest, parameters)
 
     def reach_margin(self, pose: ArrayLike) -> np.ndarray:
-        """sin^2 of the angle between each crank and its direction of reach (6,), dimensionless; negative beyond it."""
-        return self._call("inverse_kinematics", rows("pose", pose, 6), output=1)[..., 0]
+        """sin^2 of the angle between each crank and its direction of reach (6,), dimensionless; negative beyond it.
+
+        It falls without limit as the leg's target moves away, and is -inf where squares overflow.
+        """
+        margin = self._call("inverse_kinematics", rows("pose", pose, 6), output=1)[..., 0]
+        return np.where(np.isnan(margin), -np.inf, margin)
 
     def check_reach(self, pose: ArrayLike, name: str = "pose", row: str = "row") -> None:
         """Raise UnreachablePoseError, naming leg and pose, where a leg cannot reach; `name` and `row` are its words."""
@@ -173,12 +178,9 @@ class Robot:
     def _parameters(self, parameters: ArrayLike | None) -> np.ndarray:
         if parameters is None:
             return self.nominal_parameters
-        try:
-            values = np.asarray(parameters, dtype=float)
-        except (TypeError, ValueError):
-            return check_parameters(parameters)  # says what is wrong with them
-        for row in np.atleast_2d(values):
-            check_parameters(row)
+        count = len(PARAMETER_NAMES)
+        values = floats("parameters", parameters, (count,), ("N", count), error=ParameterError, finite=False)
+        check_ranges(values)
         return values
 
     def _call(self, name: str, *arguments: np.ndarray, output: int = 0) -> np.ndarray:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dynamics.arrays import rows
+from dynamics.arrays import check_type, floats, real, rows
 from dynamics.errors import DynamicsError, ShapeError, SingularPoseError, TravelError, UnreachablePoseError
 from dynamics.expressions import evaluate
 from dynamics.geometry import Rss6Geometry
@@ -94,6 +94,7 @@ def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
 
     Raises ShapeError for another shape or for entries that are not finite.
     """
+    check_type("robot", robot, Robot, DynamicsError)
     poses = np.atleast_2d(rows("pose", pose, 6))
     geometry = robot.geometry
     theta, margin = (part[..., 0] for part in evaluate(robot.functions["inverse_kinematics"], poses))
@@ -121,14 +122,15 @@ def check_motion(
 
     Raises, with time (or row), leg, value and limit: UnreachablePoseError; TravelError beyond the travel limit less
     `travel_margin` (rad); SingularPoseError for a leverage below `least_leverage` (J_a1) or a condition number of the
-    scaled J_a2 above `most_condition`; ShapeError for poses or times of the wrong shape.
+    scaled J_a2 above `most_condition`; ShapeError for poses or times of the wrong shape, or times that do not increase.
     """
     poses = np.atleast_2d(rows("pose", pose, 6))
-    moments = np.full(len(poses), np.nan) if times is None else rows("times", times, len(poses))
-    if not len(poses) or moments.shape != (len(poses),):
-        raise ShapeError(f"a motion needs at least one pose and as many times, got {len(poses)} and {moments.shape}")
-    if not 0 <= travel_margin < np.inf:
-        raise TravelError(f"travel_margin is {travel_margin} rad, must be finite and >= 0")
+    if not len(poses):
+        raise ShapeError("a motion needs at least one pose, got none")
+    moments = np.full(len(poses), np.nan) if times is None else _increasing(times, len(poses))
+    travel_margin = real("travel_margin", travel_margin, TravelError, least=0, unit=" rad")
+    least_leverage = real("least_leverage", least_leverage, DynamicsError, least=0)
+    most_condition = real("most_condition", most_condition, DynamicsError, least=1)
     measures = measure(robot, poses)
 
     def extreme(values: np.ndarray, limit: float, pick: Callable[..., np.intp]) -> Extreme:
@@ -148,6 +150,15 @@ def check_motion(
     if not condition.value <= condition.limit:
         raise _broken(SingularPoseError, robot, poses, condition, "condition of J_a2", "limit ")
     return MotionExtremes(reach, travel, leverage, condition)
+
+
+def _increasing(times: ArrayLike, count: int) -> np.ndarray:
+    moments = floats("times", times, (count,))
+    back = np.flatnonzero(np.diff(moments) <= 0)
+    if len(back):
+        row = int(back[0]) + 1
+        raise ShapeError(f"times must increase, but times[{row}] = {moments[row]} s follows {moments[row - 1]} s")
+    return moments
 
 
 def _broken(

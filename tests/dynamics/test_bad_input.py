@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 
 import dynamics
-from dynamics import closed_loop, parameters
+from dynamics import mujoco_engine
 from dynamics.errors import (
     DynamicsError,
     ParameterError,
     RobotFileError,
     ShapeError,
-    SimulationError,
     SingularPoseError,
     UnreachablePoseError,
 )
+from dynamics.forward_dynamics import fast_forward_dynamics
+from dynamics.mjcf import mjcf_text
 
 RSS6 = (resources.files("dynamics") / "robots" / "rss6.toml").read_text(encoding="utf-8")
 FIRST_JOINT = "[0.33383501391252074, -0.0784425512051534, 0.0]"
@@ -102,13 +103,13 @@ def test_parameters_outside_their_range(robot, index, value, message):
     values[index] = value
     with pytest.raises(ParameterError, match=message):
         robot.mass_matrix(robot.home_pose, values)
-    with pytest.raises(ParameterError, match=message):
+    with pytest.raises(ParameterError, match=rf"{message}.*\(row 1\)"):
         robot.mass_matrix(robot.home_pose, np.array([robot.nominal_parameters, values]))
 
 
 def test_parameters_of_wrong_number(robot):
     """67 values (with the joint PID) where 64 are wanted are an error, not cut off."""
-    with pytest.raises(ParameterError, match=r"shape \(64,\), got \(67,\)"):
+    with pytest.raises(ParameterError, match=r"shape \(64,\) or \(N, 64\), got \(67,\)"):
         robot.mass_matrix(robot.home_pose, np.ones(67))
 
 
@@ -132,22 +133,38 @@ def test_poses_out_of_reach(robot):
             method(far)
 
 
-def test_singular_poses(load, monkeypatch):
-    """A robot whose links all lie in the plane of the platform carries no vertical force: condition and limit named."""
+@pytest.fixture
+def flat_robot(load, monkeypatch):
+    """A robot whose links all lie in the plane of the platform: they carry no vertical force, J_a2 is singular."""
     monkeypatch.setattr("dynamics.robot.load_library", lambda *_: None)  # one robot is not worth compiling
     legs = tomllib.loads(RSS6)["legs"]
     tips = np.array(legs["base_joints"]) + 0.06 * np.array(legs["crank_zero_directions"])
     flat = np.linalg.norm(np.array(legs["platform_joints"]) - tips, axis=1)[0]
-    robot = load(
+    return load(
         {
             "home_pose = [0.0, 0.0, 0.2,": "home_pose = [0.0, 0.0, 0.0,",
             "link_length = 0.30133373938841": f"link_length = {flat:.17g}",
         }
     )
+
+
+def test_singular_poses(flat_robot):
+    """Where the links carry no vertical force the robot refuses, naming condition and limit."""
+    robot = flat_robot
     with pytest.raises(SingularPoseError, match=r"singular at pose \[0. 0. 0. .*condition of J_ad .*limit 1e\+10"):
         robot.forward_dynamics(robot.home_pose, np.zeros(6), np.zeros(6))
     with pytest.raises(SingularPoseError):
         robot.inverse_dynamics([robot.home_pose, robot.home_pose], np.zeros(6), np.zeros(6))
+
+
+def test_the_fast_forward_dynamics_solves_equation_40_where_the_links_carry_no_vertical_force(flat_robot):
+    """M is regular there: the platform falls freely, whatever the torques."""
+    pose, rest, torque = flat_robot.home_pose, np.zeros(6), np.linspace(-1, 1, 6)
+    wrench = flat_robot.joint_jacobian(pose).T @ torque - flat_robot.gravity_wrench(pose)
+    expected = np.linalg.solve(flat_robot.mass_matrix(pose), wrench)
+    found = fast_forward_dynamics(flat_robot)(pose, rest, torque)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    assert found[2] < -9.0
 
 
 def test_euler_angles_at_their_singularity(robot):
@@ -209,77 +226,6 @@ def test_binary_files_are_no_robot_files(tmp_path):
         dynamics.load_robot(path)
 
 
-def _timing(**changes):
-    return lambda: closed_loop.FrameTiming(**{"frame_rate_hz": 60.0, **changes})
-
-
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (_timing(frame_rate_hz=0.0), "frame rate is 0.0 Hz, must be finite and > 0"),
-        (_timing(frame_rate_hz=np.inf), "frame rate is inf"),
-        (_timing(latency_s=-0.01), "latency is -0.01 s, must be >= 0 and at most 60 frames"),
-        (_timing(latency_s=2.0), r"at most 60 frames \(1 s\)"),
-        (_timing(latency_s=np.nan), "latency is nan"),
-        (_timing(hold="cubic"), "unknown hold `cubic`; valid: zero, linear"),
-        (lambda: closed_loop.FrictionLaw("stribek"), "unknown friction law `stribek`; valid: coulomb_viscous, sm"),
-        (lambda: closed_loop.FrictionLaw("smoothed"), "smoothing_velocity is None rad/s, must be > 0"),
-        (lambda: closed_loop.FrictionLaw("smoothed", 0.0), "smoothing_velocity is 0.0 rad/s"),
-        (lambda: closed_loop.ServoGains(0.3, np.nan, 2.4), "servo gain kd is nan, must be finite and >= 0"),
-        (lambda: closed_loop.Reference(np.zeros((5, 6)), np.zeros((4, 6))), r"\(5, 6\) and rates \(4, 6\) differ"),
-        (lambda: closed_loop.Reference(np.zeros((5, 7)), np.zeros((5, 7))), r"reference poses must be .*got \(5, 7\)"),
-        (lambda: closed_loop.Reference(np.full((5, 6), np.nan), np.zeros((5, 6))), "reference poses must be finite"),
-    ],
-)
-def test_settings_of_the_loop(build, message):
-    """Each setting refuses what it cannot be, with the value and the limit or the valid names."""
-    with pytest.raises(SimulationError, match=message):
-        build()
-
-
-@pytest.mark.parametrize("steps", [0, -1, 2.5])
-def test_steps_per_frame(make_settings, steps):
-    """Steps per frame are whole and positive."""
-    with pytest.raises(SimulationError, match=r"steps_per_frame is .* must be a whole number >= 1"):
-        make_settings(steps=steps)
-
-
-def test_arguments_of_simulate(robot, identified, make_reference, make_settings):
-    """Parameters, gains, commands, start pose and the ideal sensor for sensitivities are checked before the run."""
-    reference, settings = make_reference(5), make_settings()
-
-    def run(values=identified, reference=reference, **options):
-        return closed_loop.simulate(robot, values, reference, settings, **options)
-
-    with pytest.raises(SimulationError, match=r"shape \(67,\), got \(64,\)"):
-        run(identified[:64])
-    for index, message in ((64, "lp is -1.0"), (65, "li is 0.0, must be finite and > 0"), (66, "ld is nan")):
-        values = identified.copy()
-        values[index] = float(message.split(" is ")[1].split(",")[0])
-        with pytest.raises(SimulationError, match=f"joint_pid.{message}"):
-            run(values)
-    values = identified.copy()
-    values[12] = -1
-    with pytest.raises(ParameterError, match=r"crank3\.mass = -1 kg"):
-        run(values)
-    with pytest.raises(SimulationError, match=r"commands must be finite with shape \(5, 6\), got \(4, 6\)"):
-        run(commands=np.zeros((4, 6)))
-    with pytest.raises(SimulationError, match="sensitivities need the ideal sensor"):
-        run(sensor=lambda frame, time, pose: pose, sensitivities=True)
-    far = closed_loop.Reference(reference.poses + 0.2, reference.rates)
-    with pytest.raises(UnreachablePoseError, match="leg 1 cannot reach"):
-        run(reference=far)
-
-
-def test_inertias_no_body_can_have_are_named(robot, identified):
-    """Cranks and links of Table 1 break Ix + Iy >= Iz (the data stay as published); the platform does not."""
-    lines = parameters.inertia_warnings(robot.nominal_parameters)
-    assert len(lines) == 12
-    assert lines[0].startswith("crank1: largest inertia 0.000605 kg m^2 exceeds")
-    assert not any(line.startswith("platform") for line in lines)
-    assert issubclass(RobotFileError, DynamicsError)
-
-
 BAD_ARRAYS = {
     "text": "home",
     "None in it": [None, 0, 0, 0, 0, 0],
@@ -288,6 +234,11 @@ BAD_ARRAYS = {
     "transposed batch": np.zeros((6, 2)),
     "three axes": np.zeros((1, 1, 6)),
     "complex": np.full(6, 1j),
+    "complex without imaginary part": np.zeros(6, dtype=complex),
+    "truth values": np.zeros(6, dtype=bool),
+    "numbers as text": ["0"] * 6,
+    "None": None,
+    "dictionary": {"x": 0.0},
     "nan": np.full(6, np.nan),
     "inf": np.full((2, 6), -np.inf),
     "three rows where two are": np.tile([0, 0, 0.2, 0, 0, 0], (3, 1)),
@@ -299,6 +250,7 @@ METHODS = {  # arguments after the pose, each of shape (6,) or (N, 6)
     "joint_jacobian": 0,
     "pose_jacobian": 0,
     "static_torque": 0,
+    "reach_margin": 0,
     "mass_matrix": 0,
     "gravity_wrench": 0,
     "twist": 1,
@@ -326,18 +278,32 @@ def test_no_method_takes_a_bad_array_or_returns_a_nan(robot, method, bad):
             continue
         # Three rows alone are a batch; what is linear in a large number may still be a number.
         assert bad in ("three rows where two are", "too large to square"), result
-        assert np.isfinite(result).all()
+        assert not np.isnan(result).any()
 
 
 @pytest.mark.parametrize("method", WITH_PARAMETERS)
 @pytest.mark.parametrize(
-    "bad",
-    ["mass", np.zeros(3), np.zeros((2, 3, 64)), np.full(64, np.nan), -np.ones(64), np.zeros(64), [1.0, [2.0]], 5.0],
-    ids=["text", "short", "three axes", "nan", "negative", "no mass", "ragged", "scalar"],
+    ("bad", "words"),
+    [
+        ("mass", r"must be numbers of shape \(64,\) or \(N, 64\), got 'mass'"),
+        (["1"] * 64, "must be numbers .*dtype <U1"),
+        (np.zeros(3), r"got \(3,\)"),
+        (np.zeros((2, 3, 64)), r"got \(2, 3, 64\)"),
+        (np.zeros((0, 3)), r"got \(0, 3\)"),
+        (np.full(64, np.nan), "platform.mass = nan kg"),
+        (-np.ones(64), "platform.mass = -1 kg"),
+        (np.zeros(64), "platform.mass = 0 kg"),
+        ([1.0, [2.0]], "must be numbers"),
+        (5.0, r"got \(\)"),
+        (np.ones(64) * (1 + 0.5j), "must be numbers .*dtype complex128"),
+        (np.ones(64, dtype=bool), "must be numbers .*dtype bool"),
+        ([None] * 64, "must be numbers .*dtype object"),
+    ],
+    ids=lambda value: value[:20] if isinstance(value, str) else "",
 )
-def test_no_method_takes_bad_parameters(robot, method, bad):
+def test_no_method_takes_bad_parameters(robot, method, bad, words):
     arguments = [robot.home_pose, *np.zeros((METHODS[method], 6)), bad]
-    with pytest.raises(ParameterError):
+    with pytest.raises(ParameterError, match=words):
         getattr(robot, method)(*arguments)
 
 
@@ -347,3 +313,60 @@ def test_rows_of_parameters_must_match_the_poses(robot):
     with pytest.raises(ShapeError, match=r"mass_matrix: batch lengths differ, shapes \(2, 6\), \(3, 64\)"):
         robot.mass_matrix(poses, np.tile(robot.nominal_parameters, (3, 1)))
     assert robot.mass_matrix(poses, robot.nominal_parameters[None]).shape == (2, 6, 6)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        ({"robot": "rss6"}, DynamicsError, "robot must be of type Robot, got 'rss6'"),
+        ({"parameters": "initial"}, ParameterError, r"parameters must be numbers of shape \(64,\), got 'initial'"),
+        ({"parameters": np.ones(64) + 1j}, ParameterError, "must be numbers .*dtype complex128"),
+        ({"parameters": np.ones(67)}, ParameterError, r"must have shape \(64,\), got \(67,\)"),
+        ({"solver": "RK4"}, DynamicsError, "solver must be of type MjcfSolver, got 'RK4'"),
+        ({"coulomb": 1}, DynamicsError, "coulomb is 1, must be True or False"),
+        ({"allow_unphysical_inertia": "yes"}, DynamicsError, "allow_unphysical_inertia is 'yes', must be True or"),
+        ({"source": None}, DynamicsError, "source must be of type str, got None"),
+    ],
+)
+def test_no_model_is_exported_from_bad_input(robot, change, error, words):
+    with pytest.raises(error, match=words):
+        mjcf_text(**{"robot": robot, "allow_unphysical_inertia": True, **change})
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda engine: engine.put("home", np.zeros(6)), "pose must be numbers"),
+        (lambda engine: engine.put(np.zeros((1, 6)), np.zeros(6)), r"pose must have shape \(6,\), got \(1, 6\)"),
+        (lambda engine: engine.put(np.zeros(6), None), "twist must be numbers"),
+        (lambda engine: engine.twist_dot(1.0), r"torque must have shape \(6,\), got \(\)"),
+        (lambda engine: engine.step(np.full(6, np.nan)), r"control\[0\] is nan, must be finite"),
+        (lambda engine: engine.step(np.zeros(5)), r"control must have shape \(6,\), got \(5,\)"),
+        (lambda engine: engine.feed_back("stiff", 1.0), "stiffness is 'stiff', must be a number"),
+        (lambda engine: engine.feed_back(1.0, -1.0), "damping is -1.0, must be finite and >= 0"),
+    ],
+)
+def test_the_engine_takes_no_bad_input(robot, call, words):
+    pytest.importorskip("mujoco")
+    engine = mujoco_engine.MujocoRobot(robot, mjcf_text(robot, allow_unphysical_inertia=True))
+    with pytest.raises(DynamicsError, match=words):
+        call(engine)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "text must be of type str, got None"),
+        ("no model", "MuJoCo refuses the model of rss6"),
+        ("<mujoco/>", "the model is no export of rss6: .*joint1"),
+    ],
+)
+def test_the_engine_takes_no_other_model(robot, text, words):
+    pytest.importorskip("mujoco")
+    with pytest.raises(mujoco_engine.MujocoError, match=words):
+        mujoco_engine.MujocoRobot(robot, text)
+
+
+def test_a_robot_is_made_from_a_description():
+    with pytest.raises(RobotFileError, match="description must be of type RobotDescription, got 'rss6' of type str"):
+        dynamics.Robot("rss6")

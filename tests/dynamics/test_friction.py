@@ -73,8 +73,16 @@ def test_one_joint_breaks_away_at_the_static_torque(pull, moves):
 @pytest.mark.parametrize(
     ("build", "words"),
     [
-        (lambda: FrictionLaw("stribeck"), "stribeck_velocity is None rad/s, must be > 0"),
-        (lambda: FrictionLaw("stribeck", static_ratio=0.9, stribeck_velocity=0.1), "static_ratio is 0.9, must be >= 1"),
+        (lambda: FrictionLaw("stribeck"), "stribeck_velocity of .* is None rad/s, must be a number > 0"),
+        (lambda: FrictionLaw("stribeck", static_ratio=0.9, stribeck_velocity=0.1), "static_ratio .* is 0.9, .* >= 1"),
+        (lambda: FrictionLaw("stribeck", static_ratio=np.inf, stribeck_velocity=0.1), "is inf, must be finite and >="),
+        (lambda: FrictionLaw("smoothed", "0.1"), "`smoothed` is '0.1' rad/s, must be a number > 0"),
+        (lambda: FrictionLaw("smoothed", True), "is True rad/s, must be a number"),
+        (lambda: FrictionLaw("smoothed", 0.1j), "is 0.1j rad/s, must be a number"),
+        (lambda: FrictionLaw("smoothed", np.array([0.1, 0.2])), r"is array\(\[0.1, 0.2\]\) rad/s, must be a number"),
+        (lambda: FrictionLaw(smoothing_velocity="0.1"), "smoothing_velocity = '0.1' belongs to the law `smoothed`"),
+        (lambda: FrictionLaw(None), "unknown friction law `None`; valid: coulomb_viscous"),
+        (lambda: FrictionLaw(["smoothed"], 0.1), "unknown friction law `\\['smoothed'\\]`"),
         (lambda: FrictionLaw(static_ratio=1.2), "belongs to the law `stribeck`, not to `coulomb_viscous`"),
         (lambda: FrictionLaw("coulomb"), "valid: coulomb_viscous, smoothed, stribeck"),
     ],

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import dynamics
 from dynamics import workspace
-from dynamics.errors import ShapeError, SingularPoseError, TravelError, UnreachablePoseError
+from dynamics.errors import DynamicsError, ShapeError, SingularPoseError, TravelError, UnreachablePoseError
 
 
 def test_leverage_is_the_sine_between_crank_plane_and_link(robot, states, legs_at):
@@ -151,9 +151,36 @@ def test_a_platform_that_moves_with_locked_cranks_is_found(tmp_path, monkeypatch
         (np.full((2, 6), np.nan), None, r"pose\[0, 0\] is nan"),
         ("home", None, "must be numbers"),
         (np.zeros((0, 6)), None, "at least one pose"),
-        (np.zeros((3, 6)), np.zeros(2), r"times must have shape \(3,\) .*, got \(2,\)"),
+        (np.zeros((3, 6)), np.zeros(2), r"times must have shape \(3,\), got \(2,\)"),
+        (np.zeros((3, 6)), "now", "times must be numbers of shape"),
+        (np.zeros((3, 6)), [0.0, np.nan, 1.0], r"times\[1\] is nan"),
+        (np.zeros((3, 6)), [0.0, 0.2, 0.1], r"times must increase, but times\[2\] = 0.1 s follows 0.2 s"),
+        (np.zeros((3, 6)), [0.0, 0.0, 0.1], r"times must increase, but times\[1\] = 0.0 s follows 0.0 s"),
+        (np.full((2, 6), 1j), None, "pose must be numbers of shape .*complex128"),
+        ([[0.0] * 6, [0.0]], None, "pose must be numbers"),
     ],
 )
 def test_bad_arrays_are_refused(robot, pose, times, message):
     with pytest.raises(ShapeError, match=message):
         workspace.check_motion(robot, pose, times)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"travel_margin": -0.1}, TravelError, "travel_margin is -0.1 rad, must be finite and >= 0"),
+        ({"travel_margin": "0.1"}, TravelError, "travel_margin is '0.1' rad, must be a number >= 0"),
+        ({"least_leverage": np.nan}, DynamicsError, "least_leverage is nan, must be finite and >= 0"),
+        ({"least_leverage": None}, DynamicsError, "least_leverage is None, must be a number"),
+        ({"most_condition": 0.5}, DynamicsError, "most_condition is 0.5, must be finite and >= 1"),
+        ({"most_condition": 20j}, DynamicsError, "most_condition is 20j, must be a number"),
+    ],
+)
+def test_limits_that_are_none_are_refused(robot, options, error, message):
+    with pytest.raises(error, match=message):
+        workspace.check_motion(robot, robot.home_pose, **options)
+
+
+def test_only_a_robot_has_a_workspace():
+    with pytest.raises(DynamicsError, match="robot must be of type Robot, got 'rss6' of type str"):
+        workspace.measure("rss6", np.zeros(6))
