@@ -4,7 +4,6 @@ import os
 import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,15 @@ import pytest
 import dynamics
 from dynamics import closed_loop, compilation
 from dynamics.batch import simulate_batch
+from tests.benchmarks.timing import (
+    FREE,
+    WHOLE_SECOND_CORE,
+    OtherLoad,
+    fastest,
+    judge,
+    second_core_gain,
+    seconds,
+)
 
 pytestmark = pytest.mark.slow
 SECONDS, RATE = 20.0, 60.0
@@ -43,65 +51,70 @@ def loop():
     return run
 
 
-def _best(function, repeats):
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        seconds.append(time.perf_counter() - start)
-    return min(seconds)
-
-
-def test_closed_loop_against_real_time(benchmark, loop):
-    """Goal 300 times real time on one idle core; asserted at 100, so that a busy machine does not fail it."""
-    benchmark.pedantic(loop, rounds=10, warmup_rounds=1)
-    ratio = SECONDS / (benchmark.stats.stats.min if benchmark.stats else _best(loop, 5))
+def test_closed_loop_against_real_time(benchmark, loop, quote):
+    """At least 300 times real time on one core."""
+    with OtherLoad() as load:
+        best = fastest({"run": loop}, 20)["run"]
+    benchmark.pedantic(loop, rounds=5)
+    ratio = SECONDS / best
     benchmark.extra_info["times_real_time"] = round(ratio)
-    assert ratio >= 100
+    judge(ratio >= 300, f"{ratio:.0f} times real time, goal 300", load)
+    quote(times_real_time=ratio)
 
 
-def test_sensitivities_against_the_plain_run(benchmark, loop):
+def test_sensitivities_against_the_plain_run(benchmark, loop, quote):
     """All 67 sensitivities of a run cost at most 15 plain runs (finite differences would cost 67 or more)."""
-    benchmark.pedantic(loop, args=(True,), rounds=3, warmup_rounds=1)
-    own = benchmark.stats.stats.min if benchmark.stats else _best(lambda: loop(True), 3)
-    ratio = own / _best(loop, 10)
+    with OtherLoad() as load:
+        best = fastest({"plain": loop, "all": lambda: loop(True)}, 8)
+    benchmark.pedantic(loop, args=(True,), rounds=3)
+    ratio = best["all"] / best["plain"]
     benchmark.extra_info["plain_runs"] = round(ratio, 1)
-    assert ratio <= 15
+    judge(ratio <= 15, f"sensitivities cost {ratio:.1f} plain runs, goal 15", load)
+    quote(sensitivities_plain_runs=ratio)
 
 
-def test_a_batch_uses_all_cores(benchmark, loop):
-    """Goal on two idle cores: 1.8 times one core; asserted at 1.2, and not at all where others take a core."""
-    if (os.cpu_count() or 1) < 2:
+def test_a_batch_uses_both_cores(benchmark, loop, quote):
+    """At least 1.8 times one core on two, where a calibration loop shows that the second one is whole and free."""
+    if len(os.sched_getaffinity(0)) < 2:
         pytest.skip("needs two cores")
-    busy = os.getloadavg()[0] > 0.6 * (os.cpu_count() or 1)
     robot, parameters, reference, settings = loop.parts
+    vectors = np.tile(parameters, (24, 1))
 
     def batch(workers):
-        return simulate_batch(robot, np.tile(parameters, (24, 1)), reference, settings, workers=workers)
+        return lambda: simulate_batch(robot, vectors, reference, settings, workers=workers)
 
-    ratios = []
-    for _ in range(5):
-        one, two = _best(lambda: batch(1), 1), _best(lambda: batch(2), 1)
-        ratios.append(one / two)
-    benchmark.extra_info["times_one_core"] = round(float(np.median(ratios)), 2)
-    benchmark.pedantic(batch, args=(2,), rounds=2)
-    assert busy or max(ratios) >= 1.2
+    with OtherLoad() as load:
+        gains = [second_core_gain()]
+        rounds = []
+        for _ in range(5):
+            rounds.append(fastest({"one": batch(1), "two": batch(2)}, 1))
+            gains.append(second_core_gain())
+    benchmark.pedantic(batch(2), rounds=2)
+    ratio = min(best["one"] for best in rounds) / min(best["two"] for best in rounds)
+    benchmark.extra_info["times_one_core"] = round(ratio, 2)
+    disturbed = load.more_than(FREE / 2)
+    if float(np.median(gains)) < WHOLE_SECOND_CORE:
+        disturbed = f"a calibration loop gains {np.median(gains):.2f} < {WHOLE_SECOND_CORE} from the second core"
+    judge(ratio >= 1.8, f"two cores are {ratio:.2f} times one, goal 1.8", load, disturbed)
+    quote(two_cores_gain=ratio)
 
 
-def test_everything_compiles_within_twenty_seconds_and_only_once(benchmark, tmp_path, monkeypatch):
+def test_everything_compiles_within_twenty_seconds_and_only_once(benchmark, tmp_path, monkeypatch, quote):
     """Both libraries into an empty cache; a second process finds them and compiles nothing."""
     if compilation.find_compiler() is None:
         pytest.skip("needs a C compiler")
     monkeypatch.setenv("CMMSIM_CACHE", str(tmp_path))
     command = [sys.executable, "-c", "import dynamics as d; r = d.load_robot('rss6'); r.functions;"
                " d.closed_loop.prepare(r)"]
-    first = _best(lambda: subprocess.run(command, check=True), 1)
+    with OtherLoad() as load:
+        first = seconds(lambda: subprocess.run(command, check=True))
     stamps = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
     benchmark.pedantic(subprocess.run, args=(command,), kwargs={"check": True}, rounds=1)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == stamps
     assert len(stamps) == 2
     benchmark.extra_info["first_use_s"] = round(first, 1)
-    assert first <= 20 * max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+    judge(first <= 20, f"first use took {first:.1f} s, goal 20 s", load)
+    quote(first_compilation_s=first)
 
 
 def test_memory_does_not_grow_over_ten_thousand_runs(loop):
