@@ -143,7 +143,8 @@ def reference_regressor(robot: Robot, reference: Reference, rate_hz: float) -> A
 
 def _pivots(columns: Array, preference: Array) -> tuple[Array, tuple[float, float]]:
     """Indices of independent columns, and the remainders on both sides of the limit."""
-    left, chosen, smallest = columns.copy(), [], 1.0
+    left, smallest = columns.copy(), 1.0
+    chosen: list[int] = []
     while True:
         lengths = np.linalg.norm(left, axis=0)
         longest = float(lengths.max())

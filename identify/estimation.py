@@ -18,10 +18,11 @@ from dynamics import DynamicsError, Robot
 from dynamics.closed_loop import Reference
 from identify import warm_start
 from identify.arrays import Array
-from identify.base_parameters import rank_by_threshold, reference_regressor
+from identify.base_parameters import base_parameters, rank_by_threshold, reference_regressor, structural_regressor
 from identify.bounded_least_squares import Solution, StopCriteria, minimise
 from identify.errors import EstimationError
 from identify.estimate_covariance import DRAWS, Uncertainty, estimate_uncertainty
+from identify.group_estimates import IDENTIFIABLE_SHARE, GroupEstimates, group_estimates
 from identify.loop_parameters import NAMES, StartingGuess, starting_guess
 from identify.loop_setup import model_settings
 from identify.output_error import OutputErrorProblem
@@ -29,9 +30,6 @@ from identify.progress import Advance, Progress, SilentProgress
 from identify.recording import poses
 from identify.scale_anchor import ScaleAnchor, read_anchor
 from identify.scenario import Scenario, scenario_from_toml
-
-IDENTIFIABLE_SHARE = 0.5
-"""A parameter counts as identified when the record at least halves the standard deviation of the starting guess."""
 
 MISFIT_STDS = 5.0
 """Standard deviations from the expected residual beyond which a warning is given."""
@@ -50,11 +48,11 @@ MINIMUM_GOOD_SHARE = 0.5
 class IdentificationResult:
     """What one record says about the 67 parameters, in the order of `names`; SI.
 
-    initial, warm_start, estimate, std (67,), covariance (67, 67); identifiable (67,) bool; base_rank: independent
-    dynamic parameter groups the trajectory excites; iterations and evaluations: of all searches; stop_reason: of the
-    last; costs: after each iteration, one tuple a search (command driven, then closed loop where asked for);
-    noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what the sensor's noise alone
-    would leave.
+    initial, warm_start, estimate, std (67,), covariance (67, 67); identifiable (67,) bool; groups: the same of the base
+    parameters; base_rank: independent groups that the trajectory excites by the paper's rule; iterations and
+    evaluations: of all searches; stop_reason: of the last; costs: after each iteration, one tuple a search (command
+    driven, then closed loop where asked for); noise_ratio: mean squared whitened residual, to compare with
+    expected_noise_ratio, what the sensor's noise alone would leave.
     """
 
     names: tuple[str, ...]
@@ -64,6 +62,7 @@ class IdentificationResult:
     std: Array
     covariance: Array
     identifiable: NDArray[np.bool_]
+    groups: GroupEstimates
     scale_anchor: ScaleAnchor
     base_rank: int
     iterations: int
@@ -106,7 +105,10 @@ def identify(
     seconds = {"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched}
     excited = reference_regressor(robot, problem.reference, scenario.timing.frame_rate_hz)
     rank = rank_by_threshold(excited, settings.qr_threshold)
-    return _result(final, warm, searches, uncertainty, rank, seconds)
+    groups = group_estimates(
+        base_parameters(structural_regressor(robot)), problem.guess, searches[-1].parameters, uncertainty.covariance
+    )
+    return _result(final, warm, searches, uncertainty, groups, rank, seconds)
 
 
 def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance) -> Solution:
@@ -204,6 +206,7 @@ def _result(
     warm: Array,
     searches: list[Solution],
     uncertainty: Uncertainty,
+    groups: GroupEstimates,
     rank: int,
     seconds: dict[str, float],
 ) -> IdentificationResult:
@@ -218,6 +221,7 @@ def _result(
         std=std,
         covariance=uncertainty.covariance,
         identifiable=std < IDENTIFIABLE_SHARE * problem.guess.std,
+        groups=groups,
         scale_anchor=problem.anchor,
         base_rank=rank,
         iterations=sum(one.iterations for one in searches),

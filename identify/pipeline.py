@@ -22,7 +22,7 @@ from identify.progress import Progress
 from identify.report import write_report
 from identify.result_file import load_result, rms_figures, save_result
 from identify.run_folder import RunFolder
-from identify.run_result import identification_entry, parameter_vector, sensor_entry, validation_entry
+from identify.run_result import add_truth, identification_entry, parameter_vector, sensor_entry, validation_entry
 from identify.scenario import Scenario, load_scenario
 from identify.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
 from identify.truth import read_truth, true_parameters
@@ -121,8 +121,7 @@ def validate(
     result["validation"] = [
         validation_entry(*pair, *poses) for pair, poses in zip(pairs[1:], model_poses[1:], strict=True)
     ]
-    for name, value in true_parameters(excitation_truth).items():
-        identification["parameters"][name]["true"] = value
+    add_truth(identification, true_parameters(excitation_truth))
     result["seconds"]["validate"] = time.perf_counter() - began
     save_result(run_folder.result, result)
 

@@ -167,16 +167,20 @@ def excitation_section(data: ReportData) -> Section:
 def identification_section(data: ReportData) -> Section:
     """The parameters, what stopped the search and what it warns of."""
     identification = data.result["identification"]
-    parameters = identification["parameters"]
+    parameters, groups = identification["parameters"], identification.get("groups", {})
     count = sum(bool(p["identifiable"]) for p in parameters.values())
     text = (
         f"{identification['iterations']} iterations, stopped by: {identification['stop_reason']}. "
-        f"{count} of {len(parameters)} parameters identifiable, base rank {identification['base_rank']}."
+        f"{count} of {len(parameters)} parameters identifiable, "
+        f"{sum(bool(g['identifiable']) for g in groups.values())} of {len(groups)} groups."
     )
     warnings = identification.get("warnings", [])
     text += f" Warnings: {'; '.join(warnings)}." if warnings else ""
     return Section(
-        "Parameters", text, (tables.parameter_table(data.result),), (report_plots.parameter_plot(parameters),)
+        "Parameters",
+        text,
+        (tables.parameter_table(data.result), tables.group_table(data.result)),
+        (report_plots.parameter_plot(parameters),),
     )
 
 

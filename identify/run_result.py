@@ -41,7 +41,31 @@ def identification_entry(result: IdentificationResult) -> dict[str, Any]:
             }
             for index, name in enumerate(result.names)
         },
+        "groups": {
+            name: {
+                "expression": result.groups.expressions[index],
+                "coefficients": _coefficients(result.groups.combinations[index], result.names),
+                "initial": result.groups.initial[index],
+                "true": None,
+                "estimate": result.groups.estimate[index],
+                "std": result.groups.std[index],
+                "identifiable": bool(result.groups.identifiable[index]),
+            }
+            for index, name in enumerate(result.groups.names)
+        },
     }
+
+
+def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
+    """Enter the true parameters, and the true values of their groups, into an identification entry."""
+    for name, value in truth.items():
+        identification["parameters"][name]["true"] = value
+    for group in identification.get("groups", {}).values():
+        group["true"] = sum(weight * truth[name] for name, weight in group["coefficients"].items())
+
+
+def _coefficients(row: Array, names: tuple[str, ...]) -> dict[str, float]:
+    return {names[k]: float(row[k]) for k in np.flatnonzero(row)}
 
 
 def parameter_vector(identification: dict[str, Any], column: str) -> Array:

@@ -10,6 +10,7 @@ from identify.goals import check_goals
 from identify.result_file import AXES, rms_row
 
 AXIS_UNITS = ("um", "um", "um", "urad", "urad", "urad")
+NOT_SHOWN = "not identifiable"
 AXIS_HEADER = tuple(f"{axis} [{unit}]" for axis, unit in zip(AXES, AXIS_UNITS, strict=True))
 
 
@@ -49,9 +50,8 @@ def parameter_table(result: dict[str, Any], identifiable_only: bool = False) -> 
     for name, p in result["identification"]["parameters"].items():
         if not p["identifiable"] and identifiable_only:
             continue
-        shown = (number(p["estimate"]), number(p["std"]), _percent(p)) if p["identifiable"] else ("-", "-", "-")
-        remark = "" if p["identifiable"] else "not identifiable"
-        rows.append((name, unit_of(name), number(p["initial"]), number(p["true"]), *shown, remark))
+        remark = "" if p["identifiable"] else NOT_SHOWN
+        rows.append((name, unit_of(name), number(p["initial"]), number(p["true"]), *_shown(p), remark))
     anchor = result["identification"]["scale_anchor"]
     return Table(
         "Parameters (like the paper's table 2)",
@@ -59,6 +59,21 @@ def parameter_table(result: dict[str, Any], identifiable_only: bool = False) -> 
         tuple(rows),
         f"The overall scale is fixed by: {anchor}. A parameter that no motion shows has no estimate. "
         "With the scenario's default parameter sets, initial and true are the two columns of the paper's table 2.",
+    )
+
+
+def group_table(result: dict[str, Any]) -> Table:
+    """Base parameters: the combinations of parameters that motion can show, with truth, estimate and deviation."""
+    rows = tuple(
+        (g["expression"], number(g["initial"]), number(g["true"]), *_shown(g), "" if g["identifiable"] else NOT_SHOWN)
+        for g in result["identification"].get("groups", {}).values()
+        if len(g["coefficients"]) > 1
+    )
+    return Table(
+        "Groups of parameters that no motion can separate",
+        ("group", "initial", "true", "estimate", "std", "error [%]", ""),
+        rows,
+        "In the SI unit of the first parameter of each sum. A group may be known where none of its members is.",
     )
 
 
@@ -126,6 +141,13 @@ def number(value: float | None) -> str:
 
 def _rms(values: list[float]) -> list[str]:
     return [number(value) if math.isfinite(value) else "diverged" for value in values]
+
+
+def _shown(entry: dict[str, Any]) -> tuple[str, str, str]:
+    """Estimate, standard deviation and error; dashes for what is not identified, so that nobody quotes it."""
+    if not entry["identifiable"]:
+        return "-", "-", "-"
+    return number(entry["estimate"]), number(entry["std"]), _percent(entry)
 
 
 def _percent(parameter: dict[str, Any]) -> str:

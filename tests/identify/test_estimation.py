@@ -69,6 +69,19 @@ def test_unseen_motion_is_predicted_to_micrometres(scenario, noisy):
     assert np.all(error[3:] < 15e-6), error
 
 
+def test_groups_are_known_where_their_members_are_not(noisy):
+    """The intervals of the identified groups hold the truth, and there are more of them than of lone parameters."""
+    _, result = noisy
+    groups = result.groups
+    true = groups.combinations @ truth()[:64]
+    known = groups.identifiable
+    assert 20 <= known.sum() < len(known)
+    assert np.all(np.abs((groups.estimate - true)[known]) < 4 * groups.std[known])
+    crank = groups.names.index("crank5.Izz +")
+    assert groups.identifiable[crank]
+    assert not result.identifiable[NAMES.index("crank5.mass")]
+
+
 def test_what_leaves_no_trace_is_not_called_identified(noisy):
     """Crank Ixx, Iyy and link Izz do no work (design of the robot), so no record can tell them."""
     _, result = noisy
