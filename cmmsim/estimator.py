@@ -81,5 +81,7 @@ def points_in_frame(frame: StereoFrame, rig: StereoRig, noise: CameraNoise, sett
     if not len(left.centres) or not len(right.centres):
         raise LostError(f"{len(left.centres)} bright spots in the left image and {len(right.centres)} in the right, "
                         f"at least {FEWEST_TAUGHT} in each needed")
-    return candidate_pairs(rig, left.centres, right.centres)[1]
+    ideal = [pixels[found] for pixels, found in (camera.undistort(side.centres) for camera, side
+                                                 in zip(rig.cameras, (left, right), strict=True))]
+    return candidate_pairs(rig.ideal, *ideal)[1]
 

@@ -14,7 +14,7 @@ NEAREST, FURTHEST = 0.3, 6.0  # m
 
 
 def epipolar_distance(rig: StereoRig, left: Array, right: Array) -> Array:
-    """Distance (n, m) px of each right pixel (m, 2) from the epipolar line of each left pixel (n, 2)."""
+    """Distance (n, m) of each right pixel (m, 2) from the epipolar line of each left pixel (n, 2), ideal px."""
     lines = np.column_stack([left, np.ones(len(left))]) @ rig.fundamental.T
     lines /= np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
     return np.abs(lines @ np.column_stack([right, np.ones(len(right))]).T)
@@ -23,7 +23,8 @@ def epipolar_distance(rig: StereoRig, left: Array, right: Array) -> Array:
 def candidate_pairs(rig: StereoRig, left: Array, right: Array) -> tuple[NDArray[np.int_], Array]:
     """All pairs (m, 2) of left and right spots that may be one point, and their points (m, 3) in the camera frame.
 
-    A spot may appear in several pairs; the known layout decides later which of them is true.
+    Parameters: left (k, 2) and right (l, 2) in ideal px. A spot may appear in several pairs; the known layout decides
+    later which of them is true.
     """
     pairs = np.argwhere(epipolar_distance(rig, left, right) < LINE_TOLERANCE_PX)
     points = linear_triangulation(rig, left[pairs[:, 0]], right[pairs[:, 1]])

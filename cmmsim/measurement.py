@@ -17,8 +17,8 @@ class Measurement:
 
     pose (6,) m, rad and covariance (6,6): observation noise only, the error of teaching is the same in every frame
     and stands in ``Taught.calibration_covariance``. points (n,3) and point_covariances (n,3,3) in the camera frame, m;
-    left_pixels and right_pixels (n,2) sticker centres; target_ids (n,) such as "A1". When nothing could be measured
-    ok is False, reason says why, and pose and covariance are NaN.
+    left_pixels and right_pixels (n,2) sticker centres in the images as they are, distorted; target_ids (n,) such as
+    "A1". When nothing could be measured ok is False, reason says why, and pose and covariance are NaN.
     """
 
     pose: Array

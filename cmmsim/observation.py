@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from .eccentricity import eccentricity
+from .eccentricity import centre_offset
 from .ellipse_fit import FitLimits, fit_ellipses
 from .images import StereoImages
 from .noise import CameraNoise
@@ -36,8 +36,8 @@ class DetectionSettings:
 class StickerObservation:
     """k stickers seen by both cameras.
 
-    index (k,) into the body's stickers; left_pixels and right_pixels (k,2) of the sticker centres (eccentricity
-    removed); points (k,3) and covariances (k,3,3) in the camera frame, m.
+    index (k,) into the body's stickers; left_pixels and right_pixels (k,2) of the sticker centres in the images as they
+    are, distorted (eccentricity removed); points (k,3) and covariances (k,3,3) in the camera frame, m.
     """
 
     index: NDArray[np.int_]
@@ -67,11 +67,12 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
     windows = images.windows(corners, settings.window_size)
     fits = fit_ellipses(windows.reshape(-1, *windows.shape[2:]), corners.reshape(-1, 2), noise, settings.fit_size,
                         settings.limits)
-    left, right = fits.centres.reshape(2, -1, 2) - np.stack(
-        [eccentricity(c[index], t[index], settings.radius, camera.focal_px)
-         for c, t, camera in zip(centres, turned, rig.cameras, strict=True)])
+    seen_at = fits.centres.reshape(2, -1, 2) - np.stack(
+        [centre_offset(camera, c[index], t[index], settings.radius)
+         for camera, c, t in zip(rig.cameras, centres, turned, strict=True)])
     spread = fits.covariances.reshape(2, -1, 2, 2) + settings.centre_error_px**2 * np.eye(2)
-    good = np.all(fits.good.reshape(2, -1), axis=0)
-    seen = triangulate(rig, left, right, spread[0], spread[1])
-    return StickerObservation(index, left, right, seen.points, seen.covariances).selected(
+    ideal, ideal_spread, found = rig.undistort(seen_at, spread)
+    good = np.all(fits.good.reshape(2, -1) & found, axis=0)
+    seen = triangulate(rig.ideal, *ideal, *ideal_spread)
+    return StickerObservation(index, seen_at[0], seen_at[1], seen.points, seen.covariances).selected(
         good & (seen.ray_gap < settings.largest_ray_gap))

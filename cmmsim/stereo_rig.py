@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from .camera import PinholeCamera
+from .distortion import NDArrayBool
 from .errors import ShapeError
 from .pose import Array, apply, invert
 
@@ -38,7 +39,8 @@ class StereoRig:
     @cached_property
     def ideal(self) -> StereoRig:
         """The same rig with perfect lenses."""
-        return replace(self, left=self.left.ideal, right=self.right.ideal)
+        perfect = all(camera.distortion.is_zero for camera in self.cameras)
+        return self if perfect else replace(self, left=self.left.ideal, right=self.right.ideal)
 
     @property
     def projection_matrices(self) -> tuple[Array, Array]:
@@ -57,6 +59,19 @@ class StereoRig:
         seen = [camera.project(apply(move, points))
                 for camera, move in zip(self.cameras, self.from_camera, strict=True)]
         return np.stack([s[0] for s in seen]), np.stack([s[1] for s in seen])
+
+    def undistort(self, pixels: Array, covariances: Array) -> tuple[Array, Array, NDArrayBool]:
+        """Ideal pixels (2, n, 2) and their covariances (2, n, 2, 2) px² for those of the left and right image.
+
+        Also whether each pixel has an ideal one (2, n); the values of those without one are finite and mean nothing.
+        """
+        if self.ideal is self:
+            return pixels, covariances, np.ones(pixels.shape[:2], dtype=bool)
+        ideal, found = (np.stack(values) for values in zip(
+            *(camera.undistort(side) for camera, side in zip(self.cameras, pixels, strict=True)), strict=True))
+        jacobian = np.stack([c.distortion_jacobian(side) for c, side in zip(self.cameras, ideal, strict=True)])
+        inverse = np.linalg.inv(np.where(found[..., None, None], jacobian, np.eye(2)))
+        return ideal, inverse @ covariances @ inverse.swapaxes(-1, -2), found
 
     def shifted(self, side: int, shift_px: tuple[float, float]) -> StereoRig:
         """The rig with the principal point of camera ``side`` (0 left, 1 right) moved by (x, y) px."""
