@@ -25,9 +25,11 @@ def floats(
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):
-        raise error(f"{name} must be numbers of shape {wanted}, got {_shown(value)}") from None
+        raise error(f"{name} must be numbers of shape {wanted}, got {shown(value)}") from None
+    if np.ma.is_masked(value):
+        raise error(f"{name} must be numbers of shape {wanted}, got masked entries")
     if array.dtype.kind not in "iuf":
-        raise error(f"{name} must be numbers of shape {wanted}, got {_shown(value)} (dtype {array.dtype})")
+        raise error(f"{name} must be numbers of shape {wanted}, got {shown(value)} (dtype {array.dtype})")
     if not any(_fits(array.shape, shape) for shape in shapes):
         raise error(f"{name} must have shape {wanted}, got {array.shape}")
     array = array.astype(float, copy=False)
@@ -47,7 +49,7 @@ def mask(name: str, value: object, length: int, error: ErrorClass) -> np.ndarray
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):
-        raise error(f"{name} must be bool of shape ({length},), got {_shown(value)}") from None
+        raise error(f"{name} must be bool of shape ({length},), got {shown(value)}") from None
     if array.dtype != bool or array.shape != (length,):
         raise error(f"{name} must be bool of shape ({length},), got {array.dtype} of shape {array.shape}")
     return array
@@ -65,7 +67,7 @@ def real(
     """The value as a finite float, >= least or > above where these are given. Raises `error`."""
     limit = f" >= {least:g}" if least is not None else "" if above is None else f" > {above:g}"
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        raise error(f"{name} is {_shown(value)}{unit}, must be a number{limit}")
+        raise error(f"{name} is {shown(value)}{unit}, must be a number{limit}")
     try:
         result = float(value)
     except OverflowError:
@@ -80,7 +82,7 @@ def whole(name: str, value: object, error: ErrorClass, *, least: int, most: floa
     """The value as an int from least to most. Raises `error`."""
     limit = f"a whole number >= {least}" + (f" and <= {most}" if most < np.inf else "")
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        raise error(f"{name} is {_shown(value)}, must be {limit}")
+        raise error(f"{name} is {shown(value)}, must be {limit}")
     if not least <= value <= most or value % 1:
         raise error(f"{name} is {value}, must be {limit}")
     return int(value)
@@ -89,20 +91,30 @@ def whole(name: str, value: object, error: ErrorClass, *, least: int, most: floa
 def flag(name: str, value: object, error: ErrorClass) -> bool:
     """The value as True or False. Raises `error` for anything else, numbers included."""
     if not isinstance(value, bool | np.bool_):
-        raise error(f"{name} is {_shown(value)}, must be True or False")
+        raise error(f"{name} is {shown(value)}, must be True or False")
     return bool(value)
 
 
 def check_choice(name: str, value: object, valid: Sequence[str], error: ErrorClass) -> None:
     """Raise `error`, which lists the valid names, unless the value is one of them."""
     if not isinstance(value, str) or value not in valid:
-        raise error(f"unknown {name} `{value if isinstance(value, str) else _shown(value)}`; valid: {', '.join(valid)}")
+        raise error(f"unknown {name} `{value if isinstance(value, str) else shown(value)}`; valid: {', '.join(valid)}")
 
 
 def check_type(name: str, value: object, kind: type, error: ErrorClass) -> None:
     """Raise `error` unless the value is an instance of a class."""
     if not isinstance(value, kind):
-        raise error(f"{name} must be of type {kind.__name__}, got {_shown(value)} of type {type(value).__name__}")
+        raise error(f"{name} must be of type {kind.__name__}, got {shown(value)} of type {type(value).__name__}")
+
+
+def row_text(row: np.ndarray, precision: int = 6) -> str:
+    """A short array on one line, for messages."""
+    return np.array2string(row, precision=precision, threshold=12, max_line_width=400)
+
+
+def shown(value: object) -> str:
+    """The value in at most 60 characters of one line."""
+    return " ".join(repr(value).split())[:60]
 
 
 def _fits(shape: tuple[int, ...], wanted: Shape) -> bool:
@@ -112,8 +124,3 @@ def _fits(shape: tuple[int, ...], wanted: Shape) -> bool:
 
 def _shape_text(shape: Shape) -> str:
     return f"({shape[0]},)" if len(shape) == 1 else f"({', '.join(map(str, shape))})"
-
-
-def _shown(value: object) -> str:
-    """The value in at most 60 characters of one line."""
-    return " ".join(repr(value).split())[:60]

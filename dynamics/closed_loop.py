@@ -10,7 +10,7 @@ Two implementations, tested to be equal: compiled C (`closed_loop.c`) and plain 
 import numpy as np
 
 from dynamics import compiled_closed_loop, plain_closed_loop
-from dynamics.arrays import check_type, flag, floats, mask, real
+from dynamics.arrays import check_type, flag, floats, mask, real, shown
 from dynamics.errors import SimulationError
 from dynamics.loop_types import (
     PARAMETER_COUNT,
@@ -131,4 +131,4 @@ def _check_kinds(robot: Robot, reference: Reference, settings: LoopSettings, sen
         check_type(name, value, kind, SimulationError)
     check_type("settings", settings, LoopSettings, SimulationError)
     if sensor is not None and not callable(sensor):
-        raise SimulationError(f"sensor must be a function of frame, time and pose, or None, got {sensor!r:.60}")
+        raise SimulationError(f"sensor must be a function of frame, time and pose, or None, got {shown(sensor)}")

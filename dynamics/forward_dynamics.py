@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from dynamics.arrays import check_type, floats
+from dynamics.arrays import check_type, floats, shown
 from dynamics.errors import DynamicsError, ShapeError, SingularPoseError
 from dynamics.parameters import check_parameters
 from dynamics.robot import Robot
@@ -63,7 +63,7 @@ def _refusal(**inputs: Any) -> ShapeError:
     """The error for inputs of which one is no float64 array (6,)."""
     for name, value in inputs.items():
         if floats(name, value, (6,), finite=False) is not value:
-            return ShapeError(f"{name} must be a float64 array of shape (6,), got {value!r:.60}")
+            return ShapeError(f"{name} must be a float64 array of shape (6,), got {shown(value)}")
     return ShapeError(f"{', '.join(inputs)} must be float64 arrays of shape (6,)")
 
 

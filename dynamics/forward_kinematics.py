@@ -10,6 +10,7 @@ from typing import Protocol
 import casadi as ca
 import numpy as np
 
+from dynamics.arrays import row_text
 from dynamics.errors import ConvergenceError, ShapeError
 from dynamics.expressions import evaluate
 
@@ -87,11 +88,14 @@ def _damped(
 
 
 def _solve_each(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solutions (N, 6, 1); where a matrix is singular, the shortest of least squares."""
+    """Solutions (N, 6, 1); the shortest of least squares where a matrix is singular, NaN where one has overflowed."""
     try:
         return np.linalg.solve(matrices, right)
     except np.linalg.LinAlgError:
-        return np.linalg.pinv(matrices) @ right
+        finite = np.isfinite(matrices).all(axis=(1, 2))
+        solutions = np.full(right.shape, np.nan)
+        solutions[finite] = np.linalg.pinv(matrices[finite]) @ right[finite]
+        return solutions
 
 
 def _check(robot: LoopClosure, theta: np.ndarray, poses: np.ndarray, residual: np.ndarray) -> None:
@@ -102,7 +106,7 @@ def _check(robot: LoopClosure, theta: np.ndarray, poses: np.ndarray, residual: n
     closed = gap < 1e-14
     why = "closes the legs with a crank beyond its dead point" if closed else f"leaves a gap of {gap:.3g} m^2"
     raise ConvergenceError(
-        f"forward kinematics found no pose with crank angles {np.array2string(theta[row], precision=4)} (row {row}): "
+        f"forward kinematics found no pose with crank angles {row_text(theta[row], 4)} (row {row}): "
         f"the best {why}; crank {leg + 1} has a residual of {residual[row, leg]:.3g} rad, "
         f"limit {ANGLE_TOLERANCE:.0e} rad"
     )

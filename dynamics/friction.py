@@ -5,7 +5,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from dynamics.arrays import check_choice, real
+from dynamics.arrays import check_choice, real, shown
 from dynamics.errors import SimulationError
 
 LawName = Literal["coulomb_viscous", "smoothed", "stribeck"]
@@ -40,7 +40,7 @@ class FrictionLaw:
         if self.name == law:
             real(f"{constant} of the law `{law}`", value, SimulationError, above=above, least=least, unit=unit)
         elif value is not None:
-            raise SimulationError(f"{constant} = {value!r:.60} belongs to the law `{law}`, not to `{self.name}`")
+            raise SimulationError(f"{constant} = {shown(value)} belongs to the law `{law}`, not to `{self.name}`")
 
     @property
     def sticks(self) -> bool:

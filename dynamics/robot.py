@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dynamics import forward_kinematics, model
-from dynamics.arrays import check_type, floats, rows
+from dynamics.arrays import check_type, floats, row_text, rows
 from dynamics.compilation import load_library, open_library
 from dynamics.errors import ParameterError, RobotFileError, ShapeError, SingularPoseError, UnreachablePoseError
 from dynamics.geometry import LEGS, Rss6Geometry
@@ -150,7 +150,7 @@ class Robot:
         index, leg = (int(value) for value in np.argwhere(~(margin > 0))[0])
         where = f" ({row} {index})" if np.ndim(pose) > 1 else ""
         raise UnreachablePoseError(
-            f"leg {leg + 1} cannot reach {name} {np.array2string(poses[index], precision=6)}{where}: "
+            f"leg {leg + 1} cannot reach {name} {row_text(poses[index])}{where}: "
             f"reach margin {margin[index, leg]:.3g}, must be > 0"
         )
 
@@ -170,7 +170,7 @@ class Robot:
         if not (condition < CONDITION_LIMIT).all():
             index = int(np.argmax(~(condition < CONDITION_LIMIT)))
             raise SingularPoseError(
-                f"the robot is singular at pose {np.array2string(np.atleast_2d(poses)[index], precision=6)}: "
+                f"the robot is singular at pose {row_text(np.atleast_2d(poses)[index])}: "
                 f"condition of J_ad {condition[index]:.3g}, limit {CONDITION_LIMIT:.0e}"
             )
         return poses
@@ -211,4 +211,4 @@ def _functions(geometry: Rss6Geometry) -> dict[str, ca.Function]:
 
 
 def _shown(arguments: tuple[np.ndarray, ...]) -> str:
-    return ", ".join(np.array2string(argument, precision=6, threshold=12) for argument in arguments)
+    return ", ".join(row_text(argument) for argument in arguments)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dynamics.arrays import check_type, floats, real, rows
+from dynamics.arrays import check_type, floats, real, row_text, rows
 from dynamics.errors import DynamicsError, ShapeError, SingularPoseError, TravelError, UnreachablePoseError
 from dynamics.expressions import evaluate
 from dynamics.geometry import Rss6Geometry
@@ -99,13 +99,14 @@ def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
     geometry = robot.geometry
     theta, margin = (part[..., 0] for part in evaluate(robot.functions["inverse_kinematics"], poses))
     leverages, link_rows = evaluate(robot.functions["loop_jacobians"], poses)
-    leverage = np.abs(leverages[..., 0]) / (geometry.crank_length * geometry.link_length)
-    scaled = link_rows / (geometry.link_length * np.repeat([1.0, characteristic_length(geometry)], 3))
+    margin[np.isnan(margin)] = -np.inf  # squares have overflowed
     reachable = (margin > 0).all(axis=1)
-    theta[~reachable], leverage[~reachable] = np.nan, np.nan
-    platform, joint = np.full(len(poses), np.nan), np.full(len(poses), np.nan)
-    platform[reachable] = np.linalg.cond(scaled[reachable])
-    joint[reachable] = np.linalg.cond(scaled[reachable] / leverage[reachable, :, None])
+    theta[~reachable] = np.nan
+    leverage, platform, joint = (np.full(shape, np.nan) for shape in (theta.shape, len(poses), len(poses)))
+    leverage[reachable] = np.abs(leverages[reachable, :, 0]) / (geometry.crank_length * geometry.link_length)
+    scaled = link_rows[reachable] / (geometry.link_length * np.repeat([1.0, characteristic_length(geometry)], 3))
+    platform[reachable] = np.linalg.cond(scaled)
+    joint[reachable] = np.linalg.cond(scaled / leverage[reachable, :, None])
     return WorkspaceMeasures(theta, margin, leverage, platform, joint, robot.travel_limit)
 
 
@@ -168,5 +169,5 @@ def _broken(
     who = f" of leg {worst.leg}" if worst.leg else ""
     return kind(
         f"{quantity}{who} of {robot.name} is {worst.value:.4g} at {when}, {relation}{worst.limit:.4g} "
-        f"(pose {np.array2string(poses[worst.row], precision=4)})"
+        f"(pose {row_text(poses[worst.row], 4)})"
     )

@@ -9,6 +9,7 @@ import pytest
 import dynamics
 from dynamics import mujoco_engine
 from dynamics.errors import (
+    ConvergenceError,
     DynamicsError,
     ParameterError,
     RobotFileError,
@@ -167,6 +168,19 @@ def test_the_fast_forward_dynamics_solves_equation_40_where_the_links_carry_no_v
     assert found[2] < -9.0
 
 
+def test_a_start_beyond_all_numbers_does_not_converge(robot):
+    """Newton's method from a pose whose squares overflow ends in its own error."""
+    with pytest.raises(ConvergenceError, match="forward kinematics found no pose with crank angles"):
+        robot.forward_kinematics(np.zeros(6), np.full(6, 1e308))
+
+
+def test_errors_are_one_line_whatever_the_numbers(robot):
+    """Long numbers do not break the line of a pose."""
+    pose = np.array([1.234567e-300, 1.234567e200, -1.234567e-200, 1.234567e-100, -1.234567e100, 1.234567e-10])
+    with pytest.raises(UnreachablePoseError, match=r"^leg 1 cannot reach pose \[[^\n]*$"):
+        robot.inverse_kinematics(pose)
+
+
 def test_euler_angles_at_their_singularity(robot):
     """Pose rates have no value at beta = pi/2."""
     with pytest.raises(SingularPoseError, match=r"beta = \+-pi/2"):
@@ -238,6 +252,7 @@ BAD_ARRAYS = {
     "truth values": np.zeros(6, dtype=bool),
     "numbers as text": ["0"] * 6,
     "None": None,
+    "masked": np.ma.masked_equal([0, 0, 0.2, 0, 0, 0], 0.2),
     "dictionary": {"x": 0.0},
     "nan": np.full(6, np.nan),
     "inf": np.full((2, 6), -np.inf),

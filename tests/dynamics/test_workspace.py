@@ -91,6 +91,17 @@ def test_poses_out_of_reach_are_nan_and_only_they(robot):
     assert workspace.measure(robot, np.zeros((0, 6))).theta.shape == (0, 6)
 
 
+def test_poses_beyond_all_numbers_are_out_of_reach(robot, recwarn):
+    """Where squares overflow the reach margin is -inf, the rest NaN, and NumPy has nothing to warn of."""
+    measures = workspace.measure(robot, np.array([np.full(6, 1e308), robot.home_pose]))
+    np.testing.assert_array_equal(measures.reachable, [False, True])
+    assert measures.reach_margin[0].max() == -np.inf
+    assert np.isnan(measures.leverage[0]).all()
+    with pytest.raises(UnreachablePoseError, match="reach margin of leg 1 of rss6 is -inf"):
+        workspace.check_motion(robot, np.full(6, 1e308))
+    assert not recwarn.list
+
+
 def along_x(robot, largest, count=41):
     return robot.home_pose + np.linspace(0, largest, count)[:, None] * np.eye(6)[0]
 
