@@ -14,6 +14,13 @@ from cmmsim.sensor_file import read_sensor_file
 FILE = read_sensor_file("ctrack780")
 SCENE = scene_of(FILE)
 LIMIT = 1.3  # of the bound
+SIGMAS = 4.0  # so wide an interval misses once in 16,000 times
+
+
+def wide_interval(score):
+    """The ratio's interval of four sigma."""
+    reach = SIGMAS / 3.92 * (score.ratio_high - score.ratio_low)
+    return score.ratio - reach, score.ratio + reach
 
 
 @pytest.fixture(scope="module")
@@ -38,17 +45,18 @@ def test_all_detectors_and_both_peers_compete(at_work):
 def test_default_detector_is_the_closest_to_the_bound_at_the_working_point(at_work):
     default = at_work[DEFAULT_DETECTOR]
     assert min(at_work.values(), key=lambda score: score.ratio) is default
-    assert default.ratio_high <= LIMIT
+    assert wide_interval(default)[1] <= LIMIT
     assert default.lost == 0.0
 
 
 def test_unbiased_detector_does_not_beat_the_bound(at_work):
     default = at_work[DEFAULT_DETECTOR]
     assert default.bias_px < 0.01 * default.bound_px
-    assert default.ratio_high >= 1.0
+    assert wide_interval(default)[1] >= 1.0
 
 
-def test_interval_holds_the_ratio_in_95_of_100_repetitions(at_work):
+@pytest.mark.slow
+def test_interval_holds_the_ratio_in_95_of_100_repetitions():
     """Against the ratio of many draws; 60 repetitions of 100 draws make 95 % uncertain by 3 %."""
     best = [DETECTORS["dual_conic"]]
     true = compete(SCENE, [working_point(FILE)], 4000, np.random.default_rng(1), best)[0].ratio
@@ -71,18 +79,17 @@ def test_one_draw_is_refused():
 
 @pytest.mark.slow
 def test_default_detector_stays_at_the_bound_over_all_conditions(capsys):
-    """Radius 2.5 to 10 px, noise 0.2 to 5 %, tilt 0 to 60 degrees; intervals of 95 % made those of five sigma."""
-    conditions = [Condition(radius, np.radians(tilt), noise) for radius in (2.5, 5.0, 10.0) for tilt in (0.0, 30.0, 60.0)
-                  for noise in (0.002, 0.01, 0.05)]
+    """Radius 2.5 to 10 px, noise 0.2 to 5 %, tilt 0 to 60 degrees."""
+    conditions = [Condition(radius, np.radians(tilt), noise) for radius in (2.5, 5.0, 10.0)
+                  for tilt in (0.0, 30.0, 60.0) for noise in (0.002, 0.01, 0.05)]
     scores = compete(SCENE, conditions, 400, np.random.default_rng(5))
-    lines = [f"  {s.condition.radius_px:5.1f} px {np.degrees(s.condition.tilt):3.0f} deg {100 * s.condition.noise:4.1f} % "
-             f"{s.detector:<19} bound {s.bound_px:.5f} rms {s.rms_px:.5f} px, ratio {s.ratio:7.3f} "
-             f"[{s.ratio_low:.3f}, {s.ratio_high:.3f}], bias {s.bias_px:.5f}, lost {s.lost:.1%}" for s in scores]
+    lines = [f"  {s.condition.radius_px:5.1f} px {np.degrees(s.condition.tilt):3.0f} deg "
+             f"{100 * s.condition.noise:4.1f} % {s.detector:<19} bound {s.bound_px:.5f} rms {s.rms_px:.5f} px, "
+             f"ratio {s.ratio:7.3f} [{s.ratio_low:.3f}, {s.ratio_high:.3f}], bias {s.bias_px:.5f}, "
+             f"lost {s.lost:.1%}" for s in scores]
     with capsys.disabled():
         sys.stdout.write("\n".join(["\ndetectors:", *lines, ""]))
     for score in (s for s in scores if s.detector == DEFAULT_DETECTOR):
-        reach = 5.0 * (score.ratio_high - score.ratio_low) / 3.92
-        assert score.ratio - reach <= LIMIT, score
-        assert score.ratio < LIMIT + reach, score
-        assert score.ratio + reach >= 1.0, score
+        assert wide_interval(score)[1] <= LIMIT, score
+        assert wide_interval(score)[1] >= 1.0, score
         assert score.lost <= 0.01, score

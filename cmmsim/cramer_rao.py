@@ -1,0 +1,148 @@
+"""The Cramer-Rao bound: how well a disc's centre can be known at all from the grey values of its image.
+
+Mean grey value of a pixel: ground + contrast * its share of light, the exact coverage by the ellipse blurred by a
+Gaussian point spread. Unknown are the centre, the shape, contrast and ground. The grey value is the mean plus normal
+noise, whose variance depends on the mean, rounded and clipped; the Fisher information of such a number is summed over
+the numbers that may come out. Where the noise is below half a grey value, it depends on where the mean lies between two
+numbers, and no estimator is unbiased at each single place of a centre. So it is averaged over one grey value: the bound
+holds on average over places that are not known beforehand. With more noise the average changes nothing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import ndtr
+
+from .ellipse_coverage import coverage, covered_area
+from .errors import CmmError
+from .noise import CameraNoise
+from .pose import Array
+
+PARTS = 3.0  # parts of a pixel to one standard deviation of the point spread: their covered shares are blurred
+NARROWEST_PX = 0.05
+REACH = 6.0  # standard deviations within which noise and point spread are followed
+TABLE_STEPS = 64  # tabulated informations in one grey value
+DARKEST, BRIGHTEST = 0, 255
+
+
+def light_shares(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> Array:
+    """Share of light (n, size, size), 0 to 1, of each pixel.
+
+    Parameters: centres (n,2) px, (0, 0) is the middle of the window's first pixel; shapes (n,2,2) px, symmetric and
+    positive definite; psf_px: sigma of the point spread. Raises CmmError for one too narrow to be sampled.
+    """
+    if psf_px == 0.0:
+        return covered_area(centres, shapes, size)
+    fine = _FineGrid(size, psf_px)
+    return fine.blurred(covered_area(*fine.ellipses(centres, shapes), fine.count))
+
+
+def light_share_derivatives(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> tuple[Array, Array]:
+    """Shares as of ``light_shares`` and derivatives (n, size, size, 5) by [c_x, c_y, A_xx, A_xy, A_yy]."""
+    if psf_px == 0.0:
+        return coverage(centres, shapes, size)
+    fine = _FineGrid(size, psf_px)
+    area, derivatives = coverage(*fine.ellipses(centres, shapes), fine.count)
+    blurred = [fine.blurred(derivatives[..., k]) for k in range(5)]
+    return fine.blurred(area), fine.parts * np.stack(blurred, axis=-1)
+
+
+class _FineGrid:
+    """A window of ``count`` parts of pixels a side, wide enough for all light that reaches ``size`` pixels.
+
+    A part counts as a point in its middle; its own extent is taken off the point spread instead.
+    """
+
+    def __init__(self, size: int, psf_px: float) -> None:
+        if psf_px < NARROWEST_PX:
+            raise CmmError(f"a point spread of {psf_px:g} px cannot be drawn, only 0 or at least {NARROWEST_PX:g} px")
+        self.parts = max(2, int(np.ceil(PARTS / psf_px)))
+        self._margin = int(np.ceil(REACH * psf_px))
+        self.count = (size + 2 * self._margin) * self.parts
+        middles = (np.arange(self.count) + 0.5) / self.parts - 0.5 - self._margin
+        rest = np.sqrt(psf_px**2 - 1.0 / (12.0 * self.parts**2))
+        reached = ndtr((np.arange(size + 1)[:, None] - 0.5 - middles) / rest)
+        self._weights = np.asarray(reached[1:] - reached[:-1], dtype=float) / self.parts
+
+    def ellipses(self, centres: Array, shapes: Array) -> tuple[Array, Array]:
+        """Centres and shapes in parts, from the middle of the grid's first part."""
+        return (centres + self._margin + 0.5) * self.parts - 0.5, self.parts * shapes
+
+    def blurred(self, values: Array) -> Array:
+        """Light (n, size, size) of the pixels from that (n, count, count) of the parts."""
+        return self._weights @ values @ self._weights.T
+
+
+def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
+    """Fisher information about its mean that one rounded and clipped grey value holds, per grey value squared.
+
+    Raises CmmError for a camera without noise: what it shows is certain, so there is no bound.
+    """
+    mean_grey = np.asarray(mean_grey, dtype=float)
+    variance, slope = _analog_variance(mean_grey, noise)
+    deviation = np.sqrt(variance)
+    reach = int(np.ceil(REACH * deviation.max())) + 1
+    numbers = np.rint(mean_grey)[..., None] + np.arange(-reach, reach + 1)
+    low = np.where(numbers <= DARKEST, -np.inf, (numbers - 0.5 - mean_grey[..., None]) / deviation[..., None])
+    high = np.where(numbers >= BRIGHTEST, np.inf, (numbers + 0.5 - mean_grey[..., None]) / deviation[..., None])
+    possible = (numbers >= DARKEST) & (numbers <= BRIGHTEST)
+    # the upper tail is taken from above, where differences of numbers close to one would lose all digits
+    probability = np.where(low > 0.0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low))
+    change = -(_rise(high, slope, variance) - _rise(low, slope, variance)) / deviation[..., None]
+    usable = possible & (probability > 1e-30)
+    return np.sum(np.where(usable, change**2 / np.where(usable, probability, 1.0), 0.0), axis=-1)
+
+
+def cramer_rao_bound(centres: Array, shapes: Array, size: int, contrast: float, ground: float, noise: CameraNoise,
+                     psf_px: float = 0.0) -> Array:
+    """Smallest covariance (n,2,2) px² of an unbiased centre, from windows of ``size`` px; contrast, ground grey values.
+
+    Other parameters as of ``light_shares``. Raises CmmError.
+    """
+    shares, derivatives = light_share_derivatives(centres, shapes, size, psf_px)
+    information = np.interp(ground + contrast * shares, *_information_table(ground, ground + contrast, noise))
+    jacobian = np.concatenate([contrast * derivatives, shares[..., None], np.ones_like(shares)[..., None]], axis=-1)
+    fisher = np.einsum("nyxi,nyxj,nyx->nij", jacobian, jacobian, information, optimize=True)
+    return np.linalg.inv(fisher)[:, :2, :2]
+
+
+def edge_bound(shapes: Array, contrast: float, deviation: float, psf_px: float = 0.0) -> Array:
+    """Closed-form approximation (n,2,2) px² of the bound: a smooth edge in white noise, nothing but the centre unknown.
+
+    An edge of width s = sqrt(psf² + 1/12) carries contrast² / (2 sqrt(pi) s deviation²) of information a px of its
+    length about a shift across it. For a circle: sigma_x = deviation / contrast * sqrt(2 s / (sqrt(pi) r)).
+    """
+    width = np.sqrt(psf_px**2 + 1.0 / 12.0)
+    angles = 2.0 * np.pi * np.arange(256) / 256
+    around = np.stack([np.cos(angles), np.sin(angles)])
+    across = np.linalg.inv(shapes) @ around  # normals of the rim at A (cos, sin), not of length one
+    along = np.linalg.norm(shapes @ np.stack([-np.sin(angles), np.cos(angles)]), axis=1) * (2.0 * np.pi / 256)
+    across = across / np.linalg.norm(across, axis=1, keepdims=True)
+    spread = np.einsum("nik,njk,nk->nij", across, across, along)
+    return np.linalg.inv(spread) * (2.0 * np.sqrt(np.pi) * width * (deviation / contrast) ** 2)
+
+
+def _information_table(lowest: float, highest: float, noise: CameraNoise) -> tuple[Array, Array]:
+    """Means that reach from ``lowest`` to ``highest``, and the information at each, averaged over one grey value."""
+    count = int(np.ceil((highest - lowest + 2.0) * TABLE_STEPS)) + 1
+    means = lowest - 1.5 + np.arange(count + TABLE_STEPS) / TABLE_STEPS
+    window = np.full(TABLE_STEPS + 1, 1.0 / TABLE_STEPS)
+    window[[0, -1]] *= 0.5
+    averaged = np.convolve(grey_value_information(means, noise), window, mode="valid")
+    return means[TABLE_STEPS // 2:][:count], averaged
+
+
+def _analog_variance(mean_grey: Array, noise: CameraNoise) -> tuple[Array, Array]:
+    """Variance before rounding, and its derivative by the mean."""
+    variance = noise.variance(mean_grey) - 1.0 / 12.0
+    if not noise.enabled or variance.min() <= 0.0:
+        raise CmmError(f"without noise there is no Cramer-Rao bound, got {noise}")
+    step = 0.5
+    return variance, (noise.variance(mean_grey + step) - noise.variance(mean_grey - step)) / (2.0 * step)
+
+
+def _rise(limit: Array, slope: Array, variance: Array) -> Array:
+    """Deviation times the derivative of -ndtr(limit) by the mean, which shifts and widens the noise."""
+    finite = np.where(np.isfinite(limit), limit, 0.0)
+    density = np.where(np.isfinite(limit), np.exp(-0.5 * finite**2) / np.sqrt(2.0 * np.pi), 0.0)
+    return density * (1.0 + 0.5 * finite * (slope / np.sqrt(variance))[..., None])

@@ -1,0 +1,28 @@
+"""What a detector hands back for a stack of windows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .pose import Array
+
+
+@dataclass(frozen=True)
+class DetectedCentres:
+    """Ellipse centres in n windows, in full-image px.
+
+    centres (n,2); covariances (n,2,2) px², what the pixel noise does to the centres to first order; good (n,) whether
+    the window holds one whole bright spot. Values of windows that are not good are finite but mean nothing.
+    """
+
+    centres: Array
+    covariances: Array
+    good: NDArray[np.bool_]
+
+
+def no_centres() -> DetectedCentres:
+    """The result for no windows."""
+    return DetectedCentres(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, dtype=bool))

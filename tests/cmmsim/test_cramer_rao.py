@@ -1,0 +1,110 @@
+"""The Cramer-Rao bound against differentiated images, sampled discs, tables of probabilities and its known limit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.stats import norm
+
+from cmmsim import cramer_rao
+from cmmsim.cramer_rao import cramer_rao_bound, edge_bound, grey_value_information, light_shares
+from cmmsim.ellipse_coverage import SHAPE_BASIS
+from cmmsim.errors import CmmError
+from cmmsim.noise import CameraNoise
+
+NOISE = CameraNoise(electrons_at_white=1600.0, gain=0.13, dark_noise=26.0, full_well=1800.0, black_level=16.0)
+WHITE = CameraNoise(electrons_at_white=1e7, gain=2e-5, dark_noise=2e5, full_well=2e7, black_level=16.0)  # 4 grey values
+CONTRAST, GROUND, SIZE = 180.0, 22.0, 14
+CENTRES = np.array([[6.31, 6.74], [6.5, 6.02]])
+SHAPES = np.array([[[3.6, 0.5], [0.5, 2.4]], [[2.5, 0.0], [0.0, 2.5]]])
+
+
+@pytest.mark.parametrize("psf_px", [0.0, 0.3, 0.6, 1.0])
+def test_light_shares_match_a_sampled_and_filtered_disc(psf_px):
+    fine, margin = 31, 4
+    ticks = (np.arange((SIZE + 2 * margin) * fine) + 0.5) / fine - 0.5 - margin
+    x, y = np.meshgrid(ticks - CENTRES[0, 0], ticks - CENTRES[0, 1])
+    unit = np.einsum("ij,jyx->iyx", np.linalg.inv(SHAPES[0]), np.stack([x, y]))
+    disc = ((unit**2).sum(axis=0) < 1.0).astype(float)
+    blurred = gaussian_filter(disc, psf_px * fine, truncate=5.0) if psf_px else disc
+    sampled = blurred.reshape(SIZE + 2 * margin, fine, -1, fine).mean(axis=(1, 3))[margin:-margin, margin:-margin]
+    error = sampled - light_shares(CENTRES, SHAPES, SIZE, psf_px)[0]
+    assert np.abs(error).max() < 0.008  # the sampled edge is off by up to half a sample
+    assert np.abs(error.mean()) < 1e-4
+
+
+@pytest.mark.parametrize("psf_px", [0.0, 0.6])
+def test_bound_is_that_of_numerically_differentiated_images(psf_px):
+    """Fisher information of normal grey values with mean m and variance v(m), differentiated by all 7 unknowns."""
+    step = 1e-5
+    for centre, shape in zip(CENTRES, SHAPES, strict=True):
+
+        def image(p):
+            share = light_shares(p[None, :2], np.tensordot(p[2:5], SHAPE_BASIS, 1)[None], SIZE, psf_px)
+            return (p[6] + p[5] * share).ravel()
+
+        start = np.array([*centre, shape[0, 0], shape[0, 1], shape[1, 1], CONTRAST, GROUND])
+        changes = [image(start + step * e) - image(start - step * e) for e in np.eye(7)]
+        jacobian = np.stack(changes, axis=1) / (2.0 * step)
+        variance = NOISE.variance(image(start))
+        information = 1.0 / variance + 0.5 * (NOISE.gain / variance) ** 2  # the variance grows by K a grey value
+        expected = np.linalg.inv(jacobian.T @ (information[:, None] * jacobian))[:2, :2]
+        bound = cramer_rao_bound(centre[None], shape[None], SIZE, CONTRAST, GROUND, NOISE, psf_px)[0]
+        np.testing.assert_allclose(bound, expected, rtol=1e-4, atol=1e-4 * expected.trace())
+
+
+def test_derivatives_of_blurred_shares_are_those_of_the_shares():
+    shares, derivatives = cramer_rao.light_share_derivatives(CENTRES, SHAPES, SIZE, 0.6)
+    np.testing.assert_allclose(shares, light_shares(CENTRES, SHAPES, SIZE, 0.6), atol=1e-12)
+    for k in range(5):
+        move, turn = 1e-5 * np.eye(5)[k, :2], 1e-5 * np.tensordot(np.eye(5)[k, 2:], SHAPE_BASIS, 1)
+        ahead, behind = (light_shares(CENTRES + s * move, SHAPES + s * turn, SIZE, 0.6) for s in (1.0, -1.0))
+        np.testing.assert_allclose(derivatives[..., k], (ahead - behind) / 2e-5, atol=1e-6)
+
+
+def test_information_of_a_rounded_number_is_that_of_its_probabilities():
+    """Probabilities of all 256 grey values, differentiated numerically; with little noise rounding decides."""
+    for noise in (NOISE, replace(NOISE, electrons_at_white=5e4, gain=0.13 / 31, dark_noise=100.0, full_well=6e4)):
+        for mean in (22.0, 22.37, 22.5, 120.2, 254.9):
+
+            def probabilities(mean, noise=noise):
+                edges = np.concatenate([[-np.inf], np.arange(255) + 0.5, [np.inf]])
+                return np.diff(norm.cdf(edges, mean, np.sqrt(noise.variance(mean) - 1.0 / 12.0)))
+
+            slope = (probabilities(mean + 1e-4) - probabilities(mean - 1e-4)) / 2e-4
+            likely = probabilities(mean) > 1e-10
+            expected = np.sum(slope[likely] ** 2 / probabilities(mean)[likely])
+            assert grey_value_information(np.array([mean]), noise)[0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_coarse_noise_makes_rounding_one_more_variance():
+    means = np.linspace(60.0, 180.0, 25)
+    variance = NOISE.variance(means)
+    np.testing.assert_allclose(grey_value_information(means, NOISE),
+                               1.0 / variance + 0.5 * (NOISE.gain / variance) ** 2, rtol=1e-4)
+
+
+@pytest.mark.parametrize("half_axes", [(20.0, 20.0), (24.0, 12.0)])
+def test_large_blurred_disc_reaches_the_closed_form_of_an_edge(half_axes):
+    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
+    centre, shape = np.array([[29.7, 30.2]]), (turn @ np.diag(half_axes) @ turn.T)[None]
+    deviation = float(np.sqrt(WHITE.variance(np.array(GROUND + 0.5 * CONTRAST))))
+    exact = cramer_rao_bound(centre, shape, 60, CONTRAST, GROUND, WHITE, 1.0)[0]
+    closed = edge_bound(shape, CONTRAST, deviation, 1.0)[0]
+    np.testing.assert_allclose(closed, exact, rtol=0.02, atol=0.02 * exact[0, 0])
+
+
+def test_closed_form_of_a_circle():
+    radius, width = 5.0, np.sqrt(0.6**2 + 1.0 / 12.0)
+    expected = 0.005 * np.sqrt(2.0 * width / (np.sqrt(np.pi) * radius))
+    bound = edge_bound(radius * np.eye(2)[None], 100.0, 0.5, 0.6)[0]
+    np.testing.assert_allclose(np.sqrt(np.diag(bound)), expected, rtol=1e-12)
+    assert expected == pytest.approx(0.0019, abs=5e-5)
+
+
+def test_no_noise_and_a_point_spread_that_cannot_be_sampled_are_refused():
+    with pytest.raises(CmmError, match="no Cramer-Rao bound"):
+        grey_value_information(np.array([100.0]), replace(NOISE, enabled=False))
+    with pytest.raises(CmmError, match=r"0\.02 px cannot be drawn, only 0 or at least 0\.05 px"):
+        light_shares(CENTRES, SHAPES, SIZE, 0.02)

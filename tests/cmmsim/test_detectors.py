@@ -1,0 +1,129 @@
+"""One contract for all detectors, their stated covariance and bias against sampling, and the eccentricity of discs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cmmsim.detectors import DEFAULT_DETECTOR, DETECTORS, find_detector
+from cmmsim.drawn_discs import Condition, draw_discs, random_ellipses, scene_of
+from cmmsim.ellipse_fit import FitLimits
+from cmmsim.errors import CmmError, UnknownOptionError
+from cmmsim.sensor_file import read_sensor_file
+
+SCENE = scene_of(read_sensor_file("ctrack780"))
+SIZE, FIT = 18, 14
+EVERY = pytest.mark.parametrize("detector", DETECTORS.values(), ids=list(DETECTORS))
+NO_LIMIT = FitLimits(largest_misfit=np.inf)
+
+
+def drawn(condition, count, seed, size=SIZE):
+    """True centres, windows without noise and with it, and the noise."""
+    scene, rng = SCENE.with_noise(condition.noise), np.random.default_rng(seed)
+    centres, shapes = random_ellipses(condition, scene.focal_px, size, count, rng)
+    radiance = draw_discs(scene, centres, shapes, size, condition.psf_px)
+    return centres, scene.noise.mean_grey(radiance), scene.noise.expose(radiance, rng), scene.noise
+
+
+def corners(count):
+    return np.zeros((count, 2), dtype=int)
+
+
+def test_names():
+    assert [d.name for d in DETECTORS.values()] == ["maximum_likelihood", "dual_conic", "grey_centroid"]
+    assert find_detector(DEFAULT_DETECTOR).bias_px == 0.0
+    with pytest.raises(UnknownOptionError, match="'hough': valid are dual_conic, grey_centroid, maximum_likelihood"):
+        find_detector("hough")
+
+
+@EVERY
+def test_no_windows_no_centres(detector):
+    found = detector.detect(np.zeros((0, SIZE, SIZE)), corners(0), SCENE.noise, FIT)
+    assert (found.centres.shape, found.covariances.shape, found.good.shape) == ((0, 2), (0, 2, 2), (0,))
+
+
+@EVERY
+@pytest.mark.parametrize("condition", [Condition(3.8, 0.8, 0.027), Condition(5.0, 0.0, 0.01),
+                                       Condition(3.0, 0.5, 0.05)], ids=["working", "round", "noisy"])
+def test_covariance_is_that_of_sampled_noise(detector, condition):
+    """Normalised squared error of what the noise does to a centre: 2 within 12 %, where 800 draws allow some 7 %."""
+    _, clean, noisy, noise = drawn(condition, 800, 1)
+    found, without = (detector.detect(w, corners(800), noise, FIT, NO_LIMIT, condition.psf_px) for w in (noisy, clean))
+    assert found.good.all()
+    change = found.centres - without.centres
+    squared = np.einsum("ni,nij,nj->n", change, np.linalg.inv(found.covariances), change)
+    assert squared.mean() == pytest.approx(2.0, rel=0.12)
+    assert np.abs(change.mean(axis=0)).max() < 4.0 * change.std() / np.sqrt(800)
+
+
+@EVERY
+def test_averaged_exposures_divide_the_covariance(detector):
+    _, clean, _, noise = drawn(Condition(3.8, 0.8, 0.027), 5, 2)
+    one, many = (detector.detect(clean, corners(5), noise, FIT, FitLimits(frames=n)) for n in (1, 50))
+    np.testing.assert_allclose(many.covariances, one.covariances / 50.0, rtol=1e-6)
+
+
+@EVERY
+def test_bias_is_as_stated(detector):
+    """Without noise, sharp, at the radius and tilt that the stated figure is for."""
+    centres, clean, _, noise = drawn(Condition(3.8, np.pi / 4.0, 0.027), 600, 3)
+    error = detector.detect(clean, corners(600), noise, FIT).centres - centres
+    rms = np.sqrt(np.mean(error**2))
+    assert rms == pytest.approx(detector.bias_px, rel=0.1, abs=1e-5)
+    assert np.abs(error.mean(axis=0)).max() < 5.0 * rms / np.sqrt(600) + 1e-6  # over all places in a pixel it cancels
+
+
+@EVERY
+def test_moved_and_mirrored_windows_give_moved_and_mirrored_centres(detector):
+    _, _, noisy, noise = drawn(Condition(3.8, 0.8, 0.027), 20, 4)
+    found = detector.detect(noisy, corners(20), noise, FIT)
+    moved = detector.detect(noisy, corners(20) + np.array([100, 7]), noise, FIT)
+    np.testing.assert_allclose(moved.centres, found.centres + np.array([100, 7]), atol=1e-9)
+    mirrored = detector.detect(np.ascontiguousarray(noisy.transpose(0, 2, 1)), corners(20), noise, FIT)
+    np.testing.assert_allclose(mirrored.centres, found.centres[:, ::-1], atol=1e-6)
+    np.testing.assert_allclose(mirrored.covariances, found.covariances[:, ::-1, ::-1], rtol=1e-4, atol=1e-9)
+
+
+@EVERY
+def test_what_lies_beyond_the_dark_ring_does_not_matter(detector):
+    """A lighter ground beyond the ring in one corner of the window, as the body shows beside a tilted sticker."""
+    condition = Condition(3.8, 0.0, 0.027)
+    centres, clean, _, noise = drawn(condition, 60, 5)
+    ticks = np.arange(SIZE)
+    away = np.hypot(ticks - centres[:, :1, None], ticks[:, None] - centres[:, 1:, None])
+    beside = (away > 2.5 * condition.radius_px) & (ticks > 9)
+    lit = np.where(beside, clean + 22.0, clean)
+    assert beside.any(axis=(1, 2)).all()
+    found, without = (detector.detect(w, corners(60), noise, FIT).centres for w in (lit, clean))
+    assert np.abs(found - without).max() < 0.002
+
+
+@EVERY
+def test_empty_dim_and_cut_spots_are_not_good(detector):
+    _, clean, noisy, noise = drawn(Condition(3.8, 0.8, 0.027), 4, 6)
+    ground = np.rint(clean.min()).astype(np.uint8)
+    bad = noisy.copy()
+    bad[0] = ground
+    bad[1] = np.rint(ground + 0.15 * (clean[1] - ground))
+    bad[2] = np.roll(noisy[2], 8, axis=1)
+    bad[2, :, :4] = ground  # half of the spot is beyond the window's right side
+    found = detector.detect(bad, corners(4), noise, FIT)
+    assert found.good.tolist() == [False, False, False, True]
+    assert np.all(np.isfinite(found.centres))
+    assert np.all(np.isfinite(found.covariances))
+
+
+def test_conditions_that_cannot_be_drawn_are_refused():
+    with pytest.raises(CmmError, match=r"radius_px=0\.5"):
+        Condition(0.5, 0.0, 0.02)
+    with pytest.raises(CmmError, match=r"0\.10% of the contrast is less than that of rounding, 0\.16%"):
+        SCENE.with_noise(0.001)
+
+
+def test_scene_with_other_noise_keeps_contrast_and_ground():
+    quieter = SCENE.with_noise(0.005)
+    assert quieter.edge_noise == pytest.approx(0.005, rel=1e-9)
+    assert (quieter.ground, quieter.contrast) == pytest.approx((SCENE.ground, SCENE.contrast), rel=1e-12)
+    shot = [replace(s.noise, dark_noise=0.0).variance(s.ground + s.contrast) - 1.0 / 12.0 for s in (SCENE, quieter)]
+    both = [s.noise.variance(s.ground + s.contrast) - 1.0 / 12.0 for s in (SCENE, quieter)]
+    assert shot[0] / both[0] == pytest.approx(shot[1] / both[1], rel=1e-9)  # shot and dark noise in the same proportion
