@@ -1,8 +1,8 @@
 """Maximum-likelihood fit of a bright ellipse on a dark ground to the grey values of many windows at once.
 
-Model of a pixel: ground + contrast * (exact share of the pixel covered by the ellipse). Gauss-Newton on the seven
-parameters [c_x, c_y, A_xx, A_xy, A_yy, contrast, ground], weighted by the camera's noise variance at the fitted grey
-value. The inverse of the normal matrix is the covariance of the parameters.
+Model of a pixel: ground + contrast * (exact share of the pixel covered by the ellipse, blurred by the point spread).
+Gauss-Newton on the seven parameters [c_x, c_y, A_xx, A_xy, A_yy, contrast, ground], weighted by the camera's noise
+variance at the fitted grey value. The inverse of the normal matrix is the covariance of the parameters.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .blurred_coverage import blurred_coverage, require_psf
 from .ellipse_coverage import coverage
 from .noise import CameraNoise
 from .pose import Array
@@ -51,12 +52,14 @@ class FitLimits:
 
 
 def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                 limits: FitLimits | None = None, iterations: int = 3) -> EllipseFits:
+                 limits: FitLimits | None = None, iterations: int = 3, psf_px: float = 0.0) -> EllipseFits:
     """Fit one ellipse in each window.
 
     Parameters: windows (n, h, h) grey values; corners (n, 2) the full-image pixel (x, y) of each window's first pixel;
-    noise: the camera's noise; fit_size: side in px of the part around the bright spot that is fitted.
+    noise: the camera's noise; fit_size: side in px of the part around the bright spot that is fitted; psf_px:
+    sigma of the Gaussian point spread that blurs the ellipse. Raises CmmError for one too narrow to be followed.
     """
+    require_psf(psf_px)
     limits = limits or FitLimits()
     if len(windows) == 0:
         return _none_found()
@@ -64,7 +67,8 @@ def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNo
     parameters = _start(inner)
     mask = _ring_mask(parameters, fit_size)
     for step in range(iterations + 1):
-        radiance_share, derivatives = coverage(parameters[:, :2], _shape(parameters), fit_size)
+        ellipses = parameters[:, :2], _shape(parameters), fit_size
+        radiance_share, derivatives = coverage(*ellipses) if psf_px == 0.0 else blurred_coverage(*ellipses, psf_px)
         contrast, ground = parameters[:, 5, None, None], parameters[:, 6, None, None]
         mean = ground + contrast * radiance_share
         weights = mask * limits.frames / noise.variance(mean)
