@@ -1,10 +1,10 @@
 """The sampled closed loop: visual servo (eq. 30) around joint PID (eq. 31) around the robot (eq. 40).
 
 Every frame the pose is measured, by the sensor that the caller passes or by an ideal one; the servo turns it into a
-command after the latency, and the command is held until the next. The run starts at rest at the first reference pose,
-in equilibrium: integrators hold what keeps the robot there. One function serves plant and model.
+command after the latency, and the command is held until the next. Unless a start is given the run starts at rest at the
+first reference pose, in equilibrium: integrators hold what keeps the robot there. One function serves plant and model.
 
-Two implementations, tested to be equal: compiled C (`closed_loop.c`) and plain Python (`plain_closed_loop.py`).
+Two implementations, tested to be equal: compiled C (see `closed_loop.h`) and plain Python (`plain_closed_loop.py`).
 """
 
 import numpy as np
@@ -51,23 +51,27 @@ def simulate(
     settings: LoopSettings,
     sensor: PoseSensor | None = None,
     *,
+    start: StartState | None = None,
     sensitivities: bool = False,
+    start_sensitivities: bool = False,
     commands: np.ndarray | None = None,
     lost: np.ndarray | None = None,
     compiled: bool | None = None,
 ) -> ClosedLoopRun:
     """Run the closed loop for parameters (67,): the 64 dynamic ones, then lp, li, ld.
 
-    sensor: None for the ideal one. sensitivities: also derivatives of the poses with respect to all parameters
-    (ideal sensor only). commands (frames, 6): drive the joints with these instead of the servo's; what is measured is
-    then recorded and steers nothing.
+    sensor: None for the ideal one. start: None for the equilibrium at the first reference pose, which moves with the
+    parameters. sensitivities: also derivatives of the poses with respect to all parameters; start_sensitivities: those
+    and the ones with respect to the start (ideal sensor only). commands (frames, 6): drive the joints with these
+    instead of the servo's; what is measured is then recorded and steers nothing.
     lost (frames,) bool: frames at which the ideal sensor measures nothing, so that a model loses what its plant lost.
     compiled: None takes the compiled path when a C compiler is at hand; False forces the plain path.
     Raises LoopFailure when the robot leaves the reachable set (an unstable loop); and before the run
-    UnreachablePoseError where the reference does, ParameterError, SimulationError, SingularPoseError.
+    UnreachablePoseError where reference or start do, ParameterError, SimulationError, SingularPoseError.
     """
     _check_kinds(robot, reference, settings, sensor)
-    sensitivities = flag("sensitivities", sensitivities, SimulationError)
+    start_sensitivities = flag("start_sensitivities", start_sensitivities, SimulationError)
+    sensitivities = flag("sensitivities", sensitivities, SimulationError) or start_sensitivities
     compiled = None if compiled is None else flag("compiled", compiled, SimulationError)
     if sensor is not None and sensitivities:
         raise SimulationError("sensitivities need the ideal sensor: pass sensor=None")
@@ -78,9 +82,15 @@ def simulate(
     if lost is not None:
         lost = mask("lost", lost, len(reference.poses), SimulationError).astype(np.int8)
     robot.check_reach(reference.poses, "reference pose", "frame")
-    start = equilibrium(robot, parameters, reference.poses[0], settings.servo)
     parameters = _check_loop_parameters(parameters)
-    problem = LoopProblem(robot, parameters, reference, settings, start, sensor, sensitivities, commands, lost)
+    if start is None:
+        start = equilibrium(robot, parameters, reference.poses[0], settings.servo)
+    else:
+        check_type("start", start, StartState, SimulationError)
+        _check_start_pose(robot, parameters, start.pose)
+    problem = LoopProblem(
+        robot, parameters, reference, settings, start, sensor, sensitivities, start_sensitivities, commands, lost
+    )
     library = compiled_closed_loop.library(robot.geometry) if compiled in (None, True) else None
     if library is not None:
         return compiled_closed_loop.run(library, problem)
@@ -104,8 +114,7 @@ def equilibrium(robot: Robot, parameters: np.ndarray, pose: np.ndarray, servo: S
     check_type("servo", servo, ServoGains, SimulationError)
     parameters, pose = _check_loop_parameters(parameters), floats("pose", pose, (6,))
     li, rest = parameters[65], np.zeros(6)
-    robot.static_torque(pose, parameters[:64])  # refuses a pose out of reach or singular, with the evidence
-    robot.pose_rate(pose, rest)  # refuses Euler angles at their singularity
+    _check_start_pose(robot, parameters, pose)
     angles = robot.inverse_kinematics(pose)
     torque_map = np.linalg.solve(robot.joint_jacobian(pose).T, robot.regressor(pose, rest, rest))
     integral = torque_map @ parameters[:64] / li
@@ -113,7 +122,7 @@ def equilibrium(robot: Robot, parameters: np.ndarray, pose: np.ndarray, servo: S
     sensitivity[:, :64] = torque_map / li
     sensitivity[:, 65] = -integral / li
     servo_integral = np.linalg.solve(robot.pose_jacobian(pose), angles) / servo.ki if servo.ki else np.zeros(6)
-    return StartState(angles, integral, sensitivity, servo_integral)
+    return StartState(pose, rest, integral, servo_integral, angles[None], pose, sensitivity)
 
 
 def _check_loop_parameters(parameters: np.ndarray) -> np.ndarray:
@@ -124,6 +133,11 @@ def _check_loop_parameters(parameters: np.ndarray) -> np.ndarray:
         real(name, value, SimulationError, least=0)
     real(li, values[65], SimulationError, above=0)
     return values
+
+
+def _check_start_pose(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> None:
+    robot.static_torque(pose, parameters[:64])  # refuses a pose out of reach or singular, with the evidence
+    robot.pose_rate(pose, np.zeros(6))  # refuses Euler angles at their singularity
 
 
 def _check_kinds(robot: Robot, reference: Reference, settings: LoopSettings, sensor: PoseSensor | None) -> None:

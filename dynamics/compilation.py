@@ -40,9 +40,12 @@ def cache_folder() -> Path:
 
 
 def load_library(
-    name: str, geometry: Rss6Geometry, build: Callable[[Rss6Geometry], list[ca.Function]], driver: str | None = None
+    name: str,
+    geometry: Rss6Geometry,
+    build: Callable[[Rss6Geometry], list[ca.Function]],
+    drivers: tuple[str, ...] = (),
 ) -> Path | None:
-    """Path of a shared library with the functions that `build(geometry)` returns, and the C file `driver` if named.
+    """Path of a shared library with the functions that `build(geometry)` returns, followed by the C files `drivers`.
 
     Compiles on first use (some seconds). Returns None where nothing can be compiled. Raises DynamicsError with the
     compiler's words when it works but refuses the generated code.
@@ -54,7 +57,7 @@ def load_library(
     if not library.exists():
         if not can_compile(compiler, library.parent):
             return None
-        complaint = _compile(compiler, _source(build(geometry), driver), library.parent, library)
+        complaint = _compile(compiler, _source(build(geometry), drivers), library.parent, library)
         if complaint:
             raise DynamicsError(f"{compiler[0]} failed on the generated code of the robot: {complaint}")
     return library
@@ -106,7 +109,7 @@ def _warn(reason: str) -> None:
 def _package_digest() -> bytes:
     digest = hashlib.sha256()
     for entry in sorted(resources.files("dynamics").iterdir(), key=lambda item: item.name):
-        if entry.name.endswith((".py", ".c")):
+        if entry.name.endswith((".py", ".c", ".h")):
             digest.update(entry.name.encode() + entry.read_bytes())
     return digest.digest()
 
@@ -124,12 +127,12 @@ def _key(name: str, geometry: Rss6Geometry, compiler: tuple[str, ...]) -> str:
     return digest.hexdigest()[:24]
 
 
-def _source(functions: list[ca.Function], driver: str | None) -> str:
+def _source(functions: list[ca.Function], drivers: tuple[str, ...]) -> str:
     generator = ca.CodeGenerator("robot.c")
     for function in functions:
         generator.add(function)
-    text = generator.dump()
-    return text + ((resources.files("dynamics") / driver).read_text(encoding="utf-8") if driver else "")
+    own = [(resources.files("dynamics") / driver).read_text(encoding="utf-8") for driver in drivers]
+    return "".join([generator.dump(), *own])
 
 
 def _compile(compiler: tuple[str, ...], source: str, folder: Path, library: Path | None = None) -> str:

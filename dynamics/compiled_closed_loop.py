@@ -1,4 +1,4 @@
-"""Binding of the compiled closed loop (`closed_loop.c`) by ctypes."""
+"""Binding of the compiled closed loop (C files, see `closed_loop.h`) by ctypes."""
 
 import ctypes
 from ctypes import CFUNCTYPE, POINTER, Structure, byref, c_byte, c_double, c_int
@@ -15,6 +15,7 @@ from dynamics.loop_types import (
     MEASURED_OUT_OF_REACH,
     PARAMETER_COUNT,
     SINGULAR_MASS,
+    START_COUNT,
     ClosedLoopRun,
     LoopProblem,
     PoseSensor,
@@ -30,10 +31,19 @@ FAILURES = {
     6: SINGULAR_MASS,
 }
 SENSOR_FAILED = 3
+SOURCES = (
+    "closed_loop.h",
+    "joint_modes.c",
+    "step_sensitivity.c",
+    "stick_slip.c",
+    "visual_servo.c",
+    "closed_loop.c",
+)
 LAWS = ("coulomb_viscous", "smoothed", "stribeck")
 _TIMES_AND_FRICTION = ("frame_period", "latency", "smoothing_velocity", "static_level", "stribeck_velocity")
 # What the sensor callback returns. An error that escapes it makes ctypes return 0.
 SENSOR_RAISED, MEASURED, LOST = 0, 1, 2
+_RECORDS = ("pose", "pose_rate", "torque", "command", "measured", "joint_integral", "servo_integral")  # (frames, 6)
 
 _Measure = CFUNCTYPE(c_int, c_int, POINTER(c_double), POINTER(c_double))
 _DoublePointer = POINTER(c_double)
@@ -41,23 +51,26 @@ _DoublePointer = POINTER(c_double)
 
 class _Problem(Structure):
     _fields_ = [
-        *[(name, c_int) for name in ("frames", "steps_per_frame", "linear_hold", "law", "sensitivities")],
+        *[(name, c_int) for name in ("frames", "steps_per_frame", "linear_hold", "law")],
+        *[(name, c_int) for name in ("sensitivities", "start_sensitivities", "commands_before")],
         *[(name, c_double) for name in _TIMES_AND_FRICTION],
         ("rigid", c_double * 52),
         ("coulomb", c_double * 6),
         ("viscous", c_double * 6),
         *[(name, c_double) for name in ("lp", "li", "ld", "kp", "kd", "ki")],
-        *[(name, c_double * 6) for name in ("pose", "command", "integral", "servo_integral")],
-        *[(n, _DoublePointer) for n in ("integral_sensitivity", "reference", "reference_rate", "logged_commands")],
+        *[(name, c_double * 6) for name in ("pose", "rate", "integral", "servo_integral", "last_measured")],
+        *[(name, _DoublePointer) for name in ("start_commands", "integral_sensitivity")],
+        *[(name, _DoublePointer) for name in ("reference", "reference_rate", "logged_commands")],
         ("lost", POINTER(c_byte)),
     ]
 
 
 class _Trajectory(Structure):
     _fields_ = [
-        *[(name, _DoublePointer) for name in ("pose", "rate", "torque", "command", "measured")],
+        *[(name, _DoublePointer) for name in _RECORDS],
         ("measured_ok", POINTER(c_byte)),
         ("pose_sensitivity", _DoublePointer),
+        ("start_sensitivity", _DoublePointer),
         ("events", c_int),
         ("failed_frame", c_int),
     ]
@@ -74,21 +87,23 @@ def _library_at(path: Path) -> ctypes.CDLL:
 
 def library(geometry: Rss6Geometry) -> ctypes.CDLL | None:
     """The compiled loop of a robot, compiled on first use; None without a C compiler."""
-    path = load_library("closed_loop", geometry, model.motion_functions, "closed_loop.c")
+    path = load_library("closed_loop", geometry, model.motion_functions, SOURCES)
     return _library_at(path) if path else None
 
 
 def run(library: ctypes.CDLL, problem: LoopProblem) -> ClosedLoopRun:
     """Do one run with the compiled loop; see `closed_loop.simulate`."""
     frames, period = problem.frames, problem.period
-    arrays = {name: np.zeros((frames, 6)) for name in ("pose", "rate", "torque", "command", "measured")}
+    arrays = {name: np.zeros((frames, 6)) for name in _RECORDS}
     measured_ok = np.zeros(frames, dtype=np.int8)
     sensitivity = np.zeros((frames, 6, PARAMETER_COUNT)) if problem.sensitivities else None
+    by_start = np.zeros((frames, 6, START_COUNT)) if problem.start_sensitivities else None
     struct = _struct(problem)
     trajectory = _Trajectory(
         **{name: _pointer(array) for name, array in arrays.items()},
         measured_ok=measured_ok.ctypes.data_as(POINTER(c_byte)),
         pose_sensitivity=_pointer(sensitivity),
+        start_sensitivity=_pointer(by_start),
     )
     callback, raised = _callback(problem.sensor, period)
     status = library.closed_loop_run(byref(struct), callback, byref(trajectory))
@@ -98,14 +113,12 @@ def run(library: ctypes.CDLL, problem: LoopProblem) -> ClosedLoopRun:
         raise failure(FAILURES[status], trajectory.failed_frame, problem, arrays["pose"], arrays["measured"])
     return ClosedLoopRun(
         time=np.arange(frames) * period,
-        pose=arrays["pose"],
-        pose_rate=arrays["rate"],
-        torque=arrays["torque"],
-        command=arrays["command"],
-        measured=arrays["measured"],
+        **arrays,
         measured_ok=measured_ok.astype(bool),
         pose_sensitivity=sensitivity,
+        start_sensitivity=by_start,
         events=trajectory.events,
+        start=problem.start,
     )
 
 
@@ -119,6 +132,8 @@ def _struct(problem: LoopProblem) -> _Problem:
         linear_hold=timing.hold == "linear",
         law=LAWS.index(friction.name),
         sensitivities=problem.sensitivities,
+        start_sensitivities=problem.start_sensitivities,
+        commands_before=len(start.commands),
         frame_period=problem.period,
         latency=timing.latency_s,
         smoothing_velocity=friction.smoothing_velocity or 0.0,
@@ -130,6 +145,7 @@ def _struct(problem: LoopProblem) -> _Problem:
         kp=servo.kp,
         kd=servo.kd,
         ki=servo.ki,
+        start_commands=_pointer(start.commands),
         integral_sensitivity=_pointer(start.joint_integral_sensitivity),
         reference=_pointer(problem.reference.poses),
         reference_rate=_pointer(problem.reference.rates),
@@ -139,10 +155,11 @@ def _struct(problem: LoopProblem) -> _Problem:
     struct.rigid[:] = parameters[:52]
     struct.coulomb[:] = parameters[52:58]
     struct.viscous[:] = parameters[58:64]
-    struct.pose[:] = problem.reference.poses[0]
-    struct.command[:] = start.command
+    struct.pose[:] = start.pose
+    struct.rate[:] = start.pose_rate
     struct.integral[:] = start.joint_integral
     struct.servo_integral[:] = start.servo_integral
+    struct.last_measured[:] = start.last_measured
     return struct
 
 

@@ -6,13 +6,15 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from dynamics.arrays import check_choice, check_type, floats, real, whole
+from dynamics.arrays import Shape, check_choice, check_type, floats, real, whole
 from dynamics.errors import SimulationError
 from dynamics.friction import FrictionLaw
 from dynamics.parameters import PARAMETER_NAMES
 from dynamics.robot import Robot
 
 PARAMETER_COUNT = len(PARAMETER_NAMES) + 3
+LENGTH = PARAMETER_COUNT  # sensitivities inside a run: the column of the length of the present step, then the start
+START_COUNT = 24  # pose, pose rate, joint PID integral, servo integral
 MAX_DELAY_FRAMES = 60
 MAX_STEPS_PER_FRAME = 10_000
 LEFT_REACH = "the robot left the reachable set (the loop is unstable)"
@@ -96,13 +98,30 @@ class Reference:
 
 @dataclass(frozen=True)
 class StartState:
-    """Equilibrium at the first reference pose: command = crank angles (6,), joint PID integral (6,) with its
-    derivative with respect to the 67 parameters (6, 67), and servo integral (6,)."""
+    """State of the loop at the first frame, before that frame is measured.
 
-    command: np.ndarray
+    pose (6,) and pose rate (6,); joint PID integral (6,), rad s; servo integral (6,), m s and rad s. These 24, in this
+    order, are what start_sensitivity differentiates by. commands (n, 6): the commands issued before, rad, oldest first
+    (the first one also acted before), and last_measured (6,): the pose measured one frame before; both are records.
+    joint_integral_sensitivity (6, 67): how the joint PID integral follows the parameters; zero where it is just given.
+    Raises SimulationError for a wrong shape or a number that is not finite.
+    """
+
+    pose: np.ndarray
+    pose_rate: np.ndarray
     joint_integral: np.ndarray
-    joint_integral_sensitivity: np.ndarray
     servo_integral: np.ndarray
+    commands: np.ndarray
+    last_measured: np.ndarray
+    joint_integral_sensitivity: np.ndarray = field(default_factory=lambda: np.zeros((6, PARAMETER_COUNT)))
+
+    def __post_init__(self) -> None:
+        shapes: dict[str, Shape] = {"commands": ("N", 6), "joint_integral_sensitivity": (6, PARAMETER_COUNT)}
+        for name in self.__dataclass_fields__:
+            array = floats(f"start {name}", getattr(self, name), shapes.get(name, (6,)), error=SimulationError)
+            object.__setattr__(self, name, np.ascontiguousarray(array))
+        if not len(self.commands):
+            raise SimulationError("start commands must have at least 1 row, got 0")
 
 
 @dataclass(frozen=True)
@@ -116,6 +135,7 @@ class LoopProblem:
     start: StartState
     sensor: PoseSensor | None
     sensitivities: bool
+    start_sensitivities: bool
     commands: np.ndarray | None
     lost: np.ndarray | None
 
@@ -133,7 +153,9 @@ class LoopProblem:
 @dataclass(frozen=True)
 class ClosedLoopRun:
     """A run, one row a frame: time (s), true pose and pose rate, actuator torque (N m), command (rad), measured pose,
-    whether the measurement was good; pose_sensitivity (frames, 6, 67) or None; number of stick-slip events."""
+    whether the measurement was good; joint PID integral (rad s) and servo integral (m s, rad s) as the frame begins;
+    derivatives of the poses by the parameters (frames, 6, 67) and by the start (frames, 6, 24; see StartState), or
+    None; number of stick-slip events; the start."""
 
     time: np.ndarray
     pose: np.ndarray
@@ -142,8 +164,32 @@ class ClosedLoopRun:
     command: np.ndarray
     measured: np.ndarray
     measured_ok: np.ndarray
+    joint_integral: np.ndarray
+    servo_integral: np.ndarray
     pose_sensitivity: np.ndarray | None
+    start_sensitivity: np.ndarray | None
     events: int
+    start: StartState
+
+    def state_at(self, frame: int) -> StartState:
+        """The state at a frame: a run that starts from it repeats the rest of this one.
+
+        Raises SimulationError for a frame that the run does not have, or that follows a lost measurement.
+        """
+        frame = whole("frame", frame, SimulationError, least=0, most=len(self.time) - 1)
+        if frame == 0:
+            return self.start
+        if not self.measured_ok[frame - 1]:
+            raise SimulationError(f"frame {frame} follows a lost measurement: the servo's last one is older")
+        commands = np.vstack([self.start.commands, self.command[:frame]])[-MAX_DELAY_FRAMES - 2 :]
+        return StartState(
+            self.pose[frame],
+            self.pose_rate[frame],
+            self.joint_integral[frame],
+            self.servo_integral[frame],
+            commands,
+            self.measured[frame - 1],
+        )
 
 
 def checked_measurement(measured: object, frame: int) -> np.ndarray | None:

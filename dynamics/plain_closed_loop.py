@@ -1,5 +1,6 @@
-"""The frame loop in plain Python on CasADi's virtual machine: the twin of `run_frames` in `closed_loop.c`."""
+"""The frame loop in plain Python on CasADi's virtual machine: the twin of `closed_loop.c`."""
 
+from dataclasses import replace
 from functools import lru_cache
 from math import ceil, floor
 
@@ -9,8 +10,10 @@ import numpy as np
 from dynamics import model
 from dynamics.geometry import Rss6Geometry
 from dynamics.loop_types import (
+    LENGTH,
     MEASURED_OUT_OF_REACH,
     PARAMETER_COUNT,
+    START_COUNT,
     ClosedLoopRun,
     LoopProblem,
     LoopSettings,
@@ -35,16 +38,21 @@ def run(robot: Robot, problem: LoopProblem) -> ClosedLoopRun:
     """Do one run in plain Python; see `closed_loop.simulate`."""
     functions = _functions(robot.geometry)
     reference, settings, period, start = problem.reference, problem.settings, problem.period, problem.start
-    motion = StickSlipMotion(functions, problem.parameters, settings.friction, problem.sensitivities)
-    servo = VisualServo(functions, settings.servo, period, reference.poses[0], start.servo_integral)
-    state = State(reference.poses[0], np.zeros(6), start.joint_integral)
-    rest = np.zeros((6, PARAMETER_COUNT))
-    if problem.sensitivities:
-        motion.tangent = State(rest, rest, start.joint_integral_sensitivity)
-    result = _empty(problem.frames, period, problem.sensitivities)
-    issued: list[Issued] = [(start.command, rest)]
+    tangent, d_servo_integral = _start_tangent(problem)
+    rest = np.zeros_like(d_servo_integral)
+    motion = StickSlipMotion(
+        functions, problem.parameters, settings.friction, tangent if problem.sensitivities else None
+    )
+    servo = VisualServo(
+        functions, settings.servo, period, start.last_measured, start.servo_integral, d_servo_integral
+    )
+    state = State(start.pose, start.pose_rate, start.joint_integral)
+    result = _empty(problem)
+    issued: list[Issued] = [(command, rest) for command in start.commands]
+    motion.start_from(state)
     for frame in range(problem.frames):
         d_pose = _record_state(result, frame, state, motion)
+        result.servo_integral[frame] = servo.integral
         measured = _measure(problem, frame, state.pose)
         servo.next_frame()
         result.measured_ok[frame] = measured is not None
@@ -59,18 +67,21 @@ def run(robot: Robot, problem: LoopProblem) -> ClosedLoopRun:
         if not np.isfinite(issued[-1][0]).all():
             raise failure(MEASURED_OUT_OF_REACH, frame, problem, result.pose, result.measured)
         try:
-            state = _frame(motion, state, issued, frame, settings, result)
+            state = _frame(motion, state, issued, frame, problem, result)
         except MotionStopped as reason:
             raise failure(str(reason), frame, problem, result.pose, result.measured) from None
-    return _with_events(result, motion.events)
+    return replace(result, events=motion.events)
 
 
 def _record_state(result: ClosedLoopRun, frame: int, state: State, motion: StickSlipMotion) -> np.ndarray | None:
     """Write the state at a frame into the result; returns the sensitivity of the pose, if there is one."""
     result.pose[frame], result.pose_rate[frame] = state.pose, state.rate
+    result.joint_integral[frame] = state.integral
     if motion.tangent is None or result.pose_sensitivity is None:
         return None
-    result.pose_sensitivity[frame] = motion.tangent.pose
+    result.pose_sensitivity[frame] = motion.tangent.pose[:, :PARAMETER_COUNT]
+    if result.start_sensitivity is not None:
+        result.start_sensitivity[frame] = motion.tangent.pose[:, LENGTH + 1 :]
     return motion.tangent.pose
 
 
@@ -85,7 +96,7 @@ def _servo_command(
     servo: VisualServo, frame: int, reference: Reference, measured: np.ndarray, d_pose: np.ndarray | None
 ) -> Issued:
     command, demand = servo.command(frame, reference, measured)
-    tangent = np.zeros((6, PARAMETER_COUNT)) if d_pose is None else servo.command_tangent(measured, demand, d_pose)
+    tangent = np.zeros((6, 1)) if d_pose is None else servo.command_tangent(measured, demand, d_pose)
     servo.measured_now()
     return command, tangent
 
@@ -95,48 +106,68 @@ def _frame(
     state: State,
     issued: list[Issued],
     frame: int,
-    settings: LoopSettings,
+    problem: LoopProblem,
     result: ClosedLoopRun,
 ) -> State:
     """Integrate from one frame to the next, changing the command when the newest one arrives."""
-    timing = settings.timing
-    period = 1.0 / timing.frame_rate_hz
+    timing, period = problem.settings.timing, problem.period
     whole = floor(timing.latency_s / period + 1e-9)
     rest = timing.latency_s - whole * period
     arrival = rest if rest >= 1e-12 else 0.0
     last = frame + 1 == len(result.time)
     if arrival:
-        before = _command(issued, frame - whole - 1, settings)
+        before = _command(issued, frame - whole - 1, problem)
         result.torque[frame] = motion.torque_at(state, before)
-        state = motion.segment(state, before, arrival, _steps(settings, arrival * timing.frame_rate_hz))
-    now = _command(issued, frame - whole, settings)
+        state = motion.segment(state, before, arrival, _steps(problem.settings, arrival * timing.frame_rate_hz))
+    now = _command(issued, frame - whole, problem)
     if not arrival:
         result.torque[frame] = motion.torque_at(state, now)
     if last:
         return state
-    return motion.segment(state, now, period - arrival, _steps(settings, 1 - arrival * timing.frame_rate_hz))
+    return motion.segment(state, now, period - arrival, _steps(problem.settings, 1 - arrival * timing.frame_rate_hz))
 
 
 def _steps(settings: LoopSettings, frames: float) -> int:
     return max(1, ceil(frames * settings.steps_per_frame - 1e-9))
 
 
-def _command(issued: list[Issued], number: int, settings: LoopSettings) -> Command:
-    """Command `number` (from frame 0 on) acting on the joints; before frame 0 the start command."""
-    (value, d_value), (before, d_before) = (issued[max(0, number + 1)], issued[max(0, number)])
-    frame_rate = settings.timing.frame_rate_hz
+def _command(issued: list[Issued], number: int, problem: LoopProblem) -> Command:
+    """Command `number` (from frame 0 on) acting on the joints; before frame 0 those of the start."""
+    first = len(problem.start.commands)
+    (value, d_value), (before, d_before) = (issued[max(0, first + number - n)] for n in (0, 1))
+    frame_rate = problem.settings.timing.frame_rate_hz
     rate, d_rate = (value - before) * frame_rate, (d_value - d_before) * frame_rate
-    if settings.timing.hold == "linear":
+    if problem.settings.timing.hold == "linear":
         return Command(before, rate, rate, d_before, d_rate, d_rate)
     return Command(value, np.zeros(6), rate, d_value, np.zeros_like(d_rate), d_rate)
 
 
-def _empty(frames: int, period: float, sensitivities: bool) -> ClosedLoopRun:
-    pose, rate, torque, command, measured = np.zeros((5, frames, 6))
-    tangent = np.zeros((frames, 6, PARAMETER_COUNT)) if sensitivities else None
-    ok = np.zeros(frames, dtype=bool)
-    return ClosedLoopRun(np.arange(frames) * period, pose, rate, torque, command, measured, ok, tangent, 0)
+def _start_tangent(problem: LoopProblem) -> tuple[State, np.ndarray]:
+    """Derivatives of the first state, and of the servo integral, with the columns of `step_sensitivity`."""
+    columns = LENGTH + 1 + (START_COUNT if problem.start_sensitivities else 0)
+    pose, rate, integral, servo_integral = np.zeros((4, 6, columns))
+    integral[:, :PARAMETER_COUNT] = problem.start.joint_integral_sensitivity
+    if problem.start_sensitivities:
+        for block, rows in enumerate((pose, rate, integral, servo_integral)):
+            rows[:, LENGTH + 1 + 6 * block :][:, :6] = np.eye(6)
+    return State(pose, rate, integral), servo_integral
 
 
-def _with_events(run: ClosedLoopRun, events: int) -> ClosedLoopRun:
-    return ClosedLoopRun(**{**vars(run), "events": events})
+def _empty(problem: LoopProblem) -> ClosedLoopRun:
+    frames = problem.frames
+    pose, rate, torque, command, measured, joint_integral, servo_integral = np.zeros((7, frames, 6))
+    return ClosedLoopRun(
+        time=np.arange(frames) * problem.period,
+        pose=pose,
+        pose_rate=rate,
+        torque=torque,
+        command=command,
+        measured=measured,
+        measured_ok=np.zeros(frames, dtype=bool),
+        joint_integral=joint_integral,
+        servo_integral=servo_integral,
+        pose_sensitivity=np.zeros((frames, 6, PARAMETER_COUNT)) if problem.sensitivities else None,
+        start_sensitivity=np.zeros((frames, 6, START_COUNT)) if problem.start_sensitivities else None,
+        events=0,
+        start=problem.start,
+    )

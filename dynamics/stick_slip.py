@@ -1,82 +1,43 @@
-"""Motion with dry joint friction over a span of constant command: the plain twin of the middle of `closed_loop.c`.
+"""Motion with dry joint friction over a span of constant command: the plain twin of `stick_slip.c`.
 
 Each joint either slips one way (mode +1 or -1) or is stuck (mode 0) and then carries the friction torque that keeps its
 acceleration zero. Between mode changes the motion is smooth and classical Runge-Kutta integrates it. A mode ends where
 a slipping joint comes to rest or a stuck joint reaches its breakaway torque (eq. 24); the step is cut there, to
-rounding. At rest, which joints stick is a box-constrained problem in the friction torques. Sensitivities go through
-steps by implicit differentiation and through events by their saltation: the velocity zero fixes the event time.
+rounding. At rest, which joints stick is a box-constrained problem in the friction torques. Sensitivities follow every
+step: see `step_sensitivity`.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 
 from dynamics.friction import FrictionLaw
-from dynamics.loop_types import PARAMETER_COUNT, SINGULAR_MASS
+from dynamics.loop_motion import Command, Evaluation, State, compliance
+from dynamics.loop_types import LEFT_REACH, SINGULAR_MASS
 from dynamics.parameters import COULOMB, RIGID_BODY, VISCOUS
+from dynamics.step_sensitivity import FRACTION, WEIGHT, StepSensitivity
 
-LP, LI, LD = 64, 65, 66
 MAX_EVENTS_PER_SEGMENT = 400
 NO_MARGIN = 1e-12  # rad/s, or share of the breakaway torque
-_FRACTION = (0.0, 0.5, 0.5, 1.0)
-_WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 
 
 class MotionStopped(Exception):
     """Integration cannot go on; the text is the reason."""
 
 
-@dataclass(frozen=True)
-class Command:
-    """U(t) = value + slope t (6,), rad, and U_dot as the joint PID sees it; with their derivatives (6, 67)."""
-
-    value: np.ndarray
-    slope: np.ndarray
-    rate: np.ndarray
-    d_value: np.ndarray
-    d_slope: np.ndarray
-    d_rate: np.ndarray
-
-
-@dataclass(frozen=True)
-class State:
-    """Pose, pose rate and joint PID integral, (6,) each."""
-
-    pose: np.ndarray
-    rate: np.ndarray
-    integral: np.ndarray
-
-    def moved(self, slope: "State", h: float) -> "State":
-        """The state after a time h at a constant slope."""
-        return State(
-            self.pose + h * slope.pose, self.rate + h * slope.rate, self.integral + h * slope.integral
-        )
-
-
-@dataclass
-class Evaluation:
-    """The equation of motion at one state: see `pose_space_motion`; torques in N m, one entry a joint."""
-
-    state: State
-    time: float
-    mass: np.ndarray
-    bias: np.ndarray
-    jacobian: np.ndarray
-    bias_acceleration: np.ndarray
-    angle: np.ndarray
-    velocity: np.ndarray
-    torque: np.ndarray
-    net_torque: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    stick_force: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    acceleration: np.ndarray = field(default_factory=lambda: np.zeros(6))
-
-
 class StickSlipMotion:
-    """Integrates one robot with parameters (67,) under a friction law; keeps modes, and sensitivities if wanted."""
+    """Integrates one robot with parameters (67,) under a friction law; keeps modes and sensitivities.
+
+    tangent: derivatives of the first state (see `step_sensitivity`), or None where no sensitivities are wanted.
+    """
 
     def __init__(
-        self, functions: dict[str, ca.Function], parameters: np.ndarray, friction: FrictionLaw, sensitivities: bool
+        self,
+        functions: dict[str, ca.Function],
+        parameters: np.ndarray,
+        friction: FrictionLaw,
+        tangent: State | None = None,
     ) -> None:
         self._functions = functions
         self._rigid = parameters[RIGID_BODY]
@@ -87,7 +48,21 @@ class StickSlipMotion:
         self._has_events = np.logical_and(self._coulomb > 0, friction.sticks)
         self.mode = np.zeros(6, dtype=int)
         self.events = 0
-        self.tangent = State(*np.zeros((3, 6, PARAMETER_COUNT))) if sensitivities else None
+        self._sensitivity = None
+        if tangent is not None:
+            self._sensitivity = StepSensitivity(functions, parameters, friction, tangent)
+        self._unmoved = True
+
+    @property
+    def tangent(self) -> State | None:
+        """Derivatives of the present state, (6, columns) each."""
+        return self._sensitivity.tangent if self._sensitivity else None
+
+    def start_from(self, state: State) -> None:
+        """Take the modes from the velocities of a state: joints slower than NO_MARGIN are at rest."""
+        values = self._functions["equation_of_motion"](state.pose, state.rate, self._rigid)
+        velocity = np.asarray(values[2], dtype=float) @ state.rate
+        self.mode = np.where(np.abs(velocity) <= NO_MARGIN, 0, np.where(velocity > 0, 1, -1))
 
     def torque_at(self, state: State, command: Command) -> np.ndarray:
         """Actuator torques (6,) of the joint PID (eq. 31), N m."""
@@ -99,6 +74,10 @@ class StickSlipMotion:
         self._follow_frictionless(start)
         self._decide_modes(start, np.flatnonzero(self.mode == 0))
         now = self._evaluate(state, 0.0, command)
+        if self._sensitivity and self._unmoved:  # a start moved at joints that stick loses their velocities at once
+            stuck = np.flatnonzero(self.mode == 0)
+            self._sensitivity.stop(now, stuck, state.rate, np.zeros(len(stuck)))
+        self._unmoved = False
         events = 0
         for n in range(1, steps + 1):
             target = duration * n / steps
@@ -109,7 +88,8 @@ class StickSlipMotion:
                     halfway = self._trial(now, command, h / 2)[1]
                     h, end = (h / 2, halfway) if self._margin(halfway)[0] < 0 else (h, end)
                 if self._margin(end)[0] >= 0:
-                    self._advance_tangent(stages, command, h)
+                    if self._sensitivity:
+                        self._sensitivity.step(stages, end, command, self.mode)
                     stopped = self._stop_joints(end, np.flatnonzero(self.mode == 0))
                     self._follow_frictionless(end)
                     now = self._evaluate(stopped, target, command)
@@ -117,8 +97,11 @@ class StickSlipMotion:
                 events += 1
                 if events > MAX_EVENTS_PER_SEGMENT:
                     raise MotionStopped("more stick-slip events than a frame can hold")
-                h, stages, end, held = self._locate_event(now, command, h, end)
-                self._advance_tangent(stages, command, h)
+                stages, end, held = self._locate_event(now, command, h, end)
+                if self._sensitivity and held:
+                    self._sensitivity.cut_step(stages, end, command, self.mode, self._margin(end)[1])
+                elif self._sensitivity:
+                    self._sensitivity.fixed_step(stages, end, command, self.mode)
                 now = self._after_event(end, command, held)
                 self.events += 1
         return now.state
@@ -127,7 +110,7 @@ class StickSlipMotion:
         values = self._functions["equation_of_motion"](state.pose, state.rate, self._rigid)
         mass, bias, jacobian, bias_acceleration, angle = (np.asarray(value, dtype=float) for value in values)
         if not np.isfinite(mass).all():
-            raise MotionStopped("the robot left the reachable set (the loop is unstable)")
+            raise MotionStopped(LEFT_REACH)
         try:
             np.linalg.cholesky(mass)
         except np.linalg.LinAlgError:
@@ -136,7 +119,7 @@ class StickSlipMotion:
         error = command.value + command.slope * time - angle
         torque = self._lp * error + self._ld * (command.rate - velocity) + self._li * state.integral
         return Evaluation(
-            state, time, mass, bias[:, 0], jacobian, bias_acceleration[:, 0], angle, velocity, torque
+            state, time, mass, bias[:, 0], jacobian, bias_acceleration[:, 0], error, velocity, torque
         )
 
     def _evaluate(self, state: State, time: float, command: Command) -> Evaluation:
@@ -147,8 +130,8 @@ class StickSlipMotion:
         free = np.linalg.solve(at.mass, at.jacobian.T @ at.net_torque - at.bias)
         stuck = np.flatnonzero(~slipping)
         if len(stuck):
-            compliance, response = self._compliance(at, stuck)
-            force = np.linalg.solve(compliance, at.jacobian[stuck] @ free + at.bias_acceleration[stuck])
+            matrix, response = compliance(at, stuck)
+            force = np.linalg.solve(matrix, at.jacobian[stuck] @ free + at.bias_acceleration[stuck])
             at.stick_force[stuck] = force
             at.net_torque[stuck] -= force
             # A robot that stands still stands still: rounding must not make it creep.
@@ -158,12 +141,6 @@ class StickSlipMotion:
 
     def _slip_friction(self, at: Evaluation) -> np.ndarray:
         return self._coulomb * self._friction.dry_level(at.velocity, self.mode) + self._viscous * at.velocity
-
-    @staticmethod
-    def _compliance(at: Evaluation, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """J M^-1 J^T (n, n) of some joints, and M^-1 J^T (6, n)."""
-        response = np.linalg.solve(at.mass, at.jacobian[joints].T)
-        return at.jacobian[joints] @ response, response
 
     def _follow_frictionless(self, at: Evaluation) -> None:
         """Joints without dry friction have no modes to break: they slip the way they move."""
@@ -176,13 +153,13 @@ class StickSlipMotion:
         slip = self._slip_friction(at)
         slip[joints] = 0.0
         free = np.linalg.solve(at.mass, at.jacobian.T @ (at.torque - slip) - at.bias)
-        compliance, _ = self._compliance(at, joints)
+        matrix, _ = compliance(at, joints)
         push = at.jacobian[joints] @ free + at.bias_acceleration[joints]
         limit, force = self._breakaway[joints], np.zeros(len(joints))
         for _ in range(1000):
             before = force.copy()
             for k in range(len(joints)):
-                wanted = force[k] + (push[k] - compliance[k] @ force) / compliance[k, k]
+                wanted = force[k] + (push[k] - matrix[k] @ force) / matrix[k, k]
                 force[k] = min(max(wanted, -limit[k]), limit[k])
             if np.abs(force - before).max() < 1e-15:
                 break
@@ -201,23 +178,20 @@ class StickSlipMotion:
         """Whether modes that hold at both ends of a step may have been broken in between (a joint reversing twice)."""
         return any(self._margin(stage)[0] < 0 for stage in stages[1:3])
 
-    def _slope(self, at: Evaluation, command: Command) -> State:
-        return State(at.state.rate, at.acceleration, command.value + command.slope * at.time - at.angle)
-
     def _trial(self, now: Evaluation, command: Command, h: float) -> tuple[list[Evaluation], Evaluation]:
         """One Runge-Kutta step with fixed modes: its four stages, and the evaluation at its end."""
         stages = [now]
-        for fraction in _FRACTION[1:]:
-            state = now.state.moved(self._slope(stages[-1], command), fraction * h)
+        for fraction in FRACTION[1:]:
+            state = now.state.moved(_slope(stages[-1]), fraction * h)
             stages.append(self._evaluate(state, now.time + fraction * h, command))
         state = now.state
-        for weight, stage in zip(_WEIGHT, stages, strict=True):
-            state = state.moved(self._slope(stage, command), weight * h)
+        for weight, stage in zip(WEIGHT, stages, strict=True):
+            state = state.moved(_slope(stage), weight * h)
         return stages, self._evaluate(state, now.time + h, command)
 
     def _locate_event(
         self, now: Evaluation, command: Command, h: float, end: Evaluation
-    ) -> tuple[float, list[Evaluation], Evaluation, bool]:
+    ) -> tuple[list[Evaluation], Evaluation, bool]:
         """The step in (0, h] at which the modes stop holding: regula falsi (Illinois) on the margin.
 
         A joint that has just started from rest has no margin yet: then the bracket is found by halving, and the last
@@ -251,17 +225,18 @@ class StickSlipMotion:
                 low, at_low = middle, margin
                 at_high = at_high / 2 if side > 0 else at_high
                 side = 1
-        return (high, *self._trial(now, command, high), held)
+        return (*self._trial(now, command, high), held)
 
     def _stop_joints(self, at: Evaluation, joints: np.ndarray) -> State:
         """The state with the velocities of some joints taken out, as an impulse at them would."""
-        if len(joints) == 6:
-            return replace(at.state, rate=np.zeros(6))
         if not len(joints):
             return at.state
-        compliance, response = self._compliance(at, joints)
-        impulse = np.linalg.solve(compliance, at.jacobian[joints] @ at.state.rate)
-        return replace(at.state, rate=at.state.rate - response @ impulse)
+        matrix, response = compliance(at, joints)
+        impulse = np.linalg.solve(matrix, at.jacobian[joints] @ at.state.rate)
+        rate = at.state.rate - response @ impulse if len(joints) < 6 else np.zeros(6)
+        if self._sensitivity:
+            self._sensitivity.stop(at, joints, rate, impulse)
+        return replace(at.state, rate=rate)
 
     def _after_event(self, end: Evaluation, command: Command, held: bool) -> Evaluation:
         """Change the modes; `held` is False where a joint that starts from rest turns back at once: it sticks."""
@@ -274,65 +249,8 @@ class StickSlipMotion:
         state = self._stop_joints(end, joints)
         if held:
             self._decide_modes(self._terms(state, end.time, command), joints)
-        after = self._evaluate(state, end.time, command)
-        self._saltation(end, after, joint)
-        return after
+        return self._evaluate(state, end.time, command)
 
-    def _saltation(self, before: Evaluation, after: Evaluation, joint: int) -> None:
-        if self.tangent is None:
-            return
-        approach = before.jacobian[joint] @ before.acceleration + before.bias_acceleration[joint]
-        if abs(approach) < 1e-9:
-            return
-        by_pose = np.asarray(self._functions["rate_map_derivative"](after.state.pose, after.state.rate), dtype=float)
-        velocity = by_pose[joint] @ self.tangent.pose + before.jacobian[joint] @ self.tangent.rate
-        jump = np.outer(after.acceleration - before.acceleration, velocity / approach)
-        self.tangent = replace(self.tangent, rate=self.tangent.rate + jump)
 
-    def _advance_tangent(self, stages: list[Evaluation], command: Command, h: float) -> None:
-        if self.tangent is None:
-            return
-        slopes: list[State] = []
-        for fraction, stage in zip(_FRACTION, stages, strict=True):
-            at = self.tangent.moved(slopes[-1], fraction * h) if slopes else self.tangent
-            slopes.append(self._tangent_slope(stage, command, at))
-        for weight, slope in zip(_WEIGHT, slopes, strict=True):
-            self.tangent = self.tangent.moved(slope, weight * h)
-
-    def _tangent_slope(self, at: Evaluation, command: Command, x: State) -> State:
-        """Time derivative of the sensitivities: the equation of motion differentiated implicitly."""
-        values = self._functions["motion_derivatives"](
-            at.state.pose, at.state.rate, at.acceleration, at.net_torque, self._rigid
-        )
-        by_pose, by_rate, columns, crank_by_pose, crank_by_rate = (np.asarray(v, dtype=float) for v in values)
-        d_angle = at.jacobian @ x.pose
-        d_velocity = crank_by_rate @ x.pose / 2 + at.jacobian @ x.rate
-        d_torque = self._torque_tangent(at, command, x, d_angle, d_velocity)
-        slipping = self.mode != 0
-        right = at.jacobian[slipping].T @ d_torque[slipping] - by_pose @ x.pose - by_rate @ x.rate
-        right[:, RIGID_BODY] -= columns
-        d_acceleration = np.linalg.solve(at.mass, right)
-        stuck = np.flatnonzero(~slipping)
-        if len(stuck):
-            compliance, response = self._compliance(at, stuck)
-            drift = crank_by_pose @ x.pose + crank_by_rate @ x.rate + at.jacobian @ d_acceleration
-            d_acceleration -= response @ np.linalg.solve(compliance, drift[stuck])
-        return State(x.rate, d_acceleration, command.d_value + at.time * command.d_slope - d_angle)
-
-    def _torque_tangent(
-        self, at: Evaluation, command: Command, x: State, d_angle: np.ndarray, d_velocity: np.ndarray
-    ) -> np.ndarray:
-        """Derivative (6, 67) of the net joint torque, for stuck joints without the force that holds them."""
-        slipping = self.mode != 0
-        damping = self._ld + np.where(slipping, self._viscous, 0.0)
-        dry = self._friction.dry_level(at.velocity, self.mode)
-        damping = damping + np.where(slipping, self._coulomb * self._friction.dry_slope(at.velocity, self.mode), 0.0)
-        d_error = command.d_value + at.time * command.d_slope - d_angle
-        result = self._lp * d_error + self._ld * command.d_rate - damping[:, None] * d_velocity + self._li * x.integral
-        joints = np.arange(6)
-        result[:, LP] += command.value + command.slope * at.time - at.angle
-        result[:, LI] += at.state.integral
-        result[:, LD] += command.rate - at.velocity
-        result[joints, COULOMB.start + joints] -= np.where(slipping, dry, 0.0)
-        result[joints, VISCOUS.start + joints] -= np.where(slipping, at.velocity, 0.0)
-        return result
+def _slope(at: Evaluation) -> State:
+    return State(at.state.rate, at.acceleration, at.error)

@@ -1,15 +1,15 @@
-"""The visual servo of eq. 30, sampled at the frames: the plain twin of `servo_update` in `closed_loop.c`."""
+"""The visual servo of eq. 30, sampled at the frames: the plain twin of `visual_servo.c`."""
 
 import casadi as ca
 import numpy as np
 
-from dynamics.loop_types import PARAMETER_COUNT, Reference, ServoGains
+from dynamics.loop_types import Reference, ServoGains
 
 
 class VisualServo:
     """U = J_theta [kp e + kd e_dot + ki integral(e)], the error e taken at the time of exposure.
 
-    The pose rate is the difference of the last two good measurements (before the first: the start pose, at rest); the
+    The pose rate is the difference of the last two good measurements (before the first: what the start names); the
     integral is the sum of the errors times the frame period. Lost frames leave both alone.
     """
 
@@ -18,16 +18,22 @@ class VisualServo:
         functions: dict[str, ca.Function],
         gains: ServoGains,
         period: float,
-        start_pose: np.ndarray,
+        last_measured: np.ndarray,
         integral: np.ndarray,
+        d_integral: np.ndarray,
     ) -> None:
         self._functions = functions
         self._gains = gains
         self._period = period
         self._integral = integral.copy()
-        self._previous = start_pose
-        self._d_integral, self._d_previous = np.zeros((2, 6, PARAMETER_COUNT))
+        self._previous = last_measured
+        self._d_integral, self._d_previous = d_integral.copy(), np.zeros_like(d_integral)
         self._elapsed = 0.0
+
+    @property
+    def integral(self) -> np.ndarray:
+        """Sum of the errors times the frame period (6,), m s and rad s."""
+        return self._integral.copy()
 
     def next_frame(self) -> None:
         """Let one frame period pass."""
@@ -45,7 +51,7 @@ class VisualServo:
         return jacobian @ demand, demand
 
     def command_tangent(self, measured: np.ndarray, demand: np.ndarray, d_measured: np.ndarray) -> np.ndarray:
-        """Derivative (6, 67) of the command, given that of the measurement (6, 67)."""
+        """Derivative (6, columns) of the command, given that of the measurement; see `step_sensitivity`."""
         gains = self._gains
         self._d_integral -= self._period * d_measured
         d_rate = (d_measured - self._d_previous) / self._elapsed

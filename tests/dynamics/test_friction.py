@@ -34,7 +34,7 @@ def test_stribeck_goes_from_breakaway_to_coulomb():
 def _joint(law):
     parameters = np.zeros(67)
     parameters[0], parameters[52:58], parameters[64] = MASS, COULOMB, STIFFNESS
-    return StickSlipMotion(_one_joint_functions(), parameters, law, sensitivities=False)
+    return StickSlipMotion(_one_joint_functions(), parameters, law)
 
 
 def _first_half_swing(x0, time):

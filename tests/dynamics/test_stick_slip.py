@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from dynamics import closed_loop, model
-from dynamics.loop_types import PARAMETER_COUNT, FrictionLaw
-from dynamics.stick_slip import Command, State, StickSlipMotion
+from dynamics.loop_motion import Command, State
+from dynamics.loop_types import LENGTH, FrictionLaw
+from dynamics.stick_slip import StickSlipMotion
 
 MASS, STIFFNESS, COULOMB = 0.8, 20.0, 1.0
 FREQUENCY = np.sqrt(STIFFNESS / MASS)
+BY_START = LENGTH + 1  # the column of the start position, behind those of the parameters and of the step
+COLUMNS = LENGTH + 2
 
 
 def _one_joint_functions():
@@ -29,17 +32,14 @@ def _one_joint_functions():
     }
 
 
-def _one_joint(sensitivities=False):
-    parameters = np.zeros(PARAMETER_COUNT)
+def _one_joint(tangent=None):
+    parameters = np.zeros(67)
     parameters[0], parameters[52:58], parameters[64] = MASS, COULOMB, STIFFNESS
-    motion = StickSlipMotion(_one_joint_functions(), parameters, FrictionLaw(), sensitivities)
-    if sensitivities:
-        motion.tangent = State(*np.zeros((3, 6, PARAMETER_COUNT)))
-    return motion
+    return StickSlipMotion(_one_joint_functions(), parameters, FrictionLaw(), tangent)
 
 
 def _command(slope=0.0):
-    rows = np.zeros((6, PARAMETER_COUNT))
+    rows = np.zeros((6, COLUMNS))
     ramp = np.array([slope, 0, 0, 0, 0, 0])
     return Command(np.zeros(6), ramp, np.zeros(6), rows, rows, rows)
 
@@ -91,7 +91,7 @@ def test_a_joint_that_stops_and_goes_on_within_one_step_is_noticed():
     """Velocity 0.04 - 2 t + 20 t^2 without friction's hold would dip below zero and be positive again at t = 0.1:
     one step over it finds both events, the stop and the breakaway, as fifty steps do."""
     start = State(np.zeros(6), 0.04 * np.eye(6)[0], np.zeros(6))
-    rows, unit = np.zeros((6, PARAMETER_COUNT)), np.eye(6)[0]
+    rows, unit = np.zeros((6, COLUMNS)), np.eye(6)[0]
     pull = Command((COULOMB - 2 * MASS) / STIFFNESS * unit, 40 * MASS / STIFFNESS * unit, np.zeros(6), rows, rows, rows)
     ends = []
     for steps in (1, 50):
@@ -104,19 +104,24 @@ def test_a_joint_that_stops_and_goes_on_within_one_step_is_noticed():
 
 @pytest.mark.parametrize("half_swings", [0.6, 1.5, 2.6, 5.0])
 def test_one_joint_sensitivities_are_derivatives_of_the_closed_form(half_swings):
-    """Through reversals and the final stop: d(position) by spring, dry friction and mass against the closed form."""
+    """Through reversals and the final stop: d(position) by spring, dry friction, mass and start position against the
+    closed form; once the mass is stuck for good, where it started counts still, with the sign of the last swing."""
     x0, time = 0.33, half_swings * np.pi / FREQUENCY
-    motion = _one_joint(sensitivities=True)
-    motion.segment(_displaced(x0), _command(), time, round(400 * half_swings))
-    by_stiffness, by_coulomb, by_mass = motion.tangent.pose[0, [64, 52, 0]]
+    tangent = State(*np.zeros((3, 6, COLUMNS)))
+    tangent.pose[0, BY_START] = 1
+    motion = _one_joint(tangent)
+    motion.segment(_displaced(x0), _command(), time, round(200 * half_swings))
+    by_stiffness, by_coulomb, by_mass, by_start = motion.tangent.pose[0, [64, 52, 0, BY_START]]
     h = 1e-5
     for ours, values in (
         (by_stiffness, {"k": STIFFNESS}),
         (by_coulomb, {"fc": COULOMB}),
         (by_mass, {"mass": MASS}),
+        (by_start, {"x0": x0}),
     ):
         ((name, value),) = values.items()
-        exact = (_oscillator(time, x0, **{name: value + h}) - _oscillator(time, x0, **{name: value - h})) / (2 * h)
+        above, below = (_oscillator(time, **{"x0": x0, name: value + side * h}) for side in (1, -1))
+        exact = (above - below) / (2 * h)
         np.testing.assert_allclose(ours, exact, atol=1e-8, err_msg=name)
 
 
@@ -149,9 +154,9 @@ def test_sticking_joints_are_those_of_the_friction_problem(robot, identified):
         mass, bias, jacobian, drift, angle = (np.asarray(value, dtype=float) for value in values)
         torque = np.linalg.solve(jacobian.T, bias[:, 0]) + 2 * identified[52:58] * rng.standard_normal(6)
         modes, acceleration = _friction_at_rest(mass, bias[:, 0], jacobian, drift[:, 0], torque, identified[52:58])
-        motion = StickSlipMotion(functions, identified, FrictionLaw(), False)
+        motion = StickSlipMotion(functions, identified, FrictionLaw())
         integral = (torque) / identified[65]
-        rows = np.zeros((6, PARAMETER_COUNT))
+        rows = np.zeros((6, COLUMNS))
         end = motion.segment(
             State(pose, rest, integral), Command(angle[:, 0], rest, rest, rows, rows, rows), 1e-6, 1
         )

@@ -1,0 +1,98 @@
+/* Constants and types of the compiled closed loop: the twin of plain_closed_loop.py, stick_slip.py, step_sensitivity.py
+ * and visual_servo.py, which explain the method and are tested to be equal. After this file come, in one unit with the C
+ * code that CasADi generates for equation_of_motion, motion_derivatives and rate_map_derivative (column-major matrices):
+ * joint_modes.c, step_sensitivity.c, stick_slip.c, visual_servo.c, closed_loop.c.
+ */
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define N 6
+#define NRIGID 52
+#define NP 67
+#define LENGTH 67 /* the column of the step's length */
+#define START 68  /* the columns of the start state: pose, pose rate, joint PID integral, servo integral */
+#define NSTART 24
+#define WIDTH 92  /* without the start state the first 68 columns are used: both are multiples of 4 */
+#define NSTATE 18
+#define COULOMB 52
+#define VISCOUS 58
+#define LP 64
+#define LI 65
+#define LD 66
+#define MAX_EVENTS_PER_SEGMENT 400
+#define MAX_DELAY 64
+#define NO_MARGIN 1e-12  /* rad/s, or share of the breakaway torque */
+#define NO_APPROACH 1e-9 /* rad/s^2 or N m/s: an event so slow has no derivative */
+
+enum { COULOMB_VISCOUS = 0, SMOOTHED = 1, STRIBECK = 2 };
+enum { OK = 0, LEFT_REACH = 1, TOO_MANY_EVENTS = 2, SENSOR_FAILED = 3, OUT_OF_MEMORY = 4, MEASURED_OUT_OF_REACH = 5,
+       SINGULAR_MASS = 6 };
+enum { SENSOR_RAISED = 0, MEASURED = 1, LOST = 2 }; /* what the sensor returns */
+
+typedef double vec[N];
+typedef double row[WIDTH];
+typedef row rows[N];
+
+typedef struct {
+    int frames, steps_per_frame, linear_hold, law, sensitivities, start_sensitivities, commands_before;
+    double frame_period, latency, smoothing_velocity, static_level, stribeck_velocity;
+    double rigid[NRIGID];
+    vec coulomb, viscous;
+    double lp, li, ld, kp, kd, ki;
+    vec pose, rate, integral, servo_integral, last_measured;
+    const double *start_commands;       /* (commands_before, 6), oldest first; the first also acted earlier */
+    const double *integral_sensitivity; /* (6, NP) or NULL */
+    const double *reference;            /* (frames, 6) */
+    const double *reference_rate;       /* (frames, 6) */
+    const double *logged_commands;      /* (frames, 6), or NULL: the servo computes them */
+    const signed char *lost;            /* (frames) 1 where the ideal sensor measures nothing, or NULL */
+} problem;
+
+typedef struct {
+    double *pose, *rate, *torque, *command, *measured, *integral, *servo_integral; /* (frames, 6) */
+    signed char *measured_ok;                          /* (frames) */
+    double *pose_sensitivity;                          /* (frames, 6, NP) or NULL */
+    double *start_sensitivity;                         /* (frames, 6, NSTART) or NULL */
+    int events, failed_frame;
+} trajectory;
+
+typedef int (*measure_fn)(int frame, const double *pose, double *measured);
+
+typedef struct { vec pose, rate, integral; } state;
+
+typedef struct { vec value, slope, rate; } command; /* U(t) = value + slope t; U_dot as the joint PID sees it */
+
+typedef struct {
+    double mass[N * N], jacobian[N * N], cholesky[N][N];
+    vec bias, bias_acceleration, angle, error;
+    vec velocity, torque, net_torque, stick_force, acceleration;
+    vec inverse_rows[N];       /* M^-1 J^T, column i for joint i */
+    double compliance[N][N];   /* J M^-1 J^T */
+} evaluation;
+
+/* Derivatives of a state. */
+typedef union {
+    row all[NSTATE];
+    struct { rows q, v, z; };
+} tangent;
+
+typedef struct {
+    const problem *p;
+    int mode[N]; /* 0: stuck, +1 or -1: slipping that way */
+    command u;
+    rows du_value, du_slope, du_rate;
+    state stage_state[4];
+    evaluation stage[4];
+    double stage_time[4];
+    int width;              /* columns of the sensitivities in use */
+    tangent x, k[4], trial;
+    row d_time, d_length;   /* of the time at which the present step starts, and of its length */
+    int time_moves, length_moves; /* whether they are not zero */
+    int start_moves;        /* until the modes of the start are decided */
+    int events;
+    const double **arg;
+    double **res;
+    casadi_int *iw;
+    double *w;
+} context;

@@ -1,0 +1,206 @@
+/* The equation of motion for given stick modes of the joints, and which modes hold: see stick_slip.py. */
+
+static double dot_row(const double *matrix, int row, const double *v) {
+    double sum = 0;
+    for (int j = 0; j < N; j++) sum += matrix[row + N * j] * v[j];
+    return sum;
+}
+
+static int cholesky(const double *a, double l[N][N]) {
+    for (int i = 0; i < N; i++)
+        for (int j = 0; j <= i; j++) {
+            double sum = a[i + N * j];
+            for (int k = 0; k < j; k++) sum -= l[i][k] * l[j][k];
+            if (i == j) {
+                if (!(sum > 0)) return 0;
+                l[i][i] = sqrt(sum);
+            } else
+                l[i][j] = sum / l[j][j];
+        }
+    return 1;
+}
+
+static void cholesky_solve(const double l[N][N], int n, double *b) {
+    for (int i = 0; i < n; i++) {
+        for (int k = 0; k < i; k++) b[i] -= l[i][k] * b[k];
+        b[i] /= l[i][i];
+    }
+    for (int i = n - 1; i >= 0; i--) {
+        for (int k = i + 1; k < n; k++) b[i] -= l[k][i] * b[k];
+        b[i] /= l[i][i];
+    }
+}
+
+static int stuck_joints(const int *mode, int *list) {
+    int count = 0;
+    for (int i = 0; i < N; i++)
+        if (mode[i] == 0) list[count++] = i;
+    return count;
+}
+
+/* Cholesky factor of compliance[list][list], size count. */
+static void factor_stuck(const double compliance[N][N], const int *list, int count, double l[N][N]) {
+    for (int i = 0; i < count; i++)
+        for (int j = 0; j <= i; j++) {
+            double sum = compliance[list[i]][list[j]];
+            for (int k = 0; k < j; k++) sum -= l[i][k] * l[j][k];
+            l[i][j] = i == j ? sqrt(sum) : sum / l[j][j];
+        }
+}
+
+/* Solve the symmetric positive definite system compliance[list][list] f = b in place, size count. */
+static void solve_stuck(const double compliance[N][N], const int *list, int count, double *b) {
+    double l[N][N];
+    factor_stuck(compliance, list, count, l);
+    cholesky_solve(l, count, b);
+}
+
+static int needs_event(const problem *p, int i) { return p->law != SMOOTHED && p->coulomb[i] > 0; }
+
+/* Dry friction over Coulomb torque of a joint that slips towards `mode`, and its derivative: see friction.py. */
+static double dry_level(const problem *p, double velocity, int mode) {
+    if (p->law == SMOOTHED) return tanh(velocity / p->smoothing_velocity);
+    if (p->law == STRIBECK) {
+        double ratio = velocity / p->stribeck_velocity;
+        return mode * (1 + (p->static_level - 1) * exp(-ratio * ratio));
+    }
+    return mode;
+}
+
+static double dry_slope(const problem *p, double velocity, int mode) {
+    if (p->law == SMOOTHED) {
+        double dry = tanh(velocity / p->smoothing_velocity);
+        return (1 - dry * dry) / p->smoothing_velocity;
+    }
+    if (p->law == STRIBECK) {
+        double ratio = velocity / p->stribeck_velocity;
+        return -2 * mode * (p->static_level - 1) * ratio / p->stribeck_velocity * exp(-ratio * ratio);
+    }
+    return 0;
+}
+
+static double breakaway(const problem *p, int i) { return p->static_level * p->coulomb[i]; }
+
+static double slip_friction(const problem *p, const evaluation *e, int i, int mode) {
+    return p->coulomb[i] * dry_level(p, e->velocity[i], mode) + p->viscous[i] * e->velocity[i];
+}
+
+static int finite_mass(const double *mass) {
+    for (int i = 0; i < N * N; i++)
+        if (!isfinite(mass[i])) return 0;
+    return 1;
+}
+
+/* Everything at one state that does not depend on the stick modes. */
+static int evaluate_terms(context *c, const state *s, double t, evaluation *e) {
+    const problem *p = c->p;
+    c->arg[0] = s->pose; c->arg[1] = s->rate; c->arg[2] = p->rigid;
+    c->res[0] = e->mass; c->res[1] = e->bias; c->res[2] = e->jacobian;
+    c->res[3] = e->bias_acceleration; c->res[4] = e->angle;
+    equation_of_motion(c->arg, c->res, c->iw, c->w, 0);
+    if (!cholesky(e->mass, e->cholesky)) return finite_mass(e->mass) ? SINGULAR_MASS : LEFT_REACH;
+    for (int i = 0; i < N; i++) {
+        e->velocity[i] = dot_row(e->jacobian, i, s->rate);
+        e->error[i] = c->u.value[i] + c->u.slope[i] * t - e->angle[i];
+        e->torque[i] = p->lp * e->error[i] + p->ld * (c->u.rate[i] - e->velocity[i]) + p->li * s->integral[i];
+    }
+    return OK;
+}
+
+static void evaluate_compliance(evaluation *e, const int *list, int count) {
+    for (int s = 0; s < count; s++) {
+        int i = list[s];
+        for (int j = 0; j < N; j++) e->inverse_rows[i][j] = e->jacobian[i + N * j];
+        cholesky_solve(e->cholesky, N, e->inverse_rows[i]);
+        for (int r = 0; r <= s; r++) {
+            int j = list[r];
+            e->compliance[i][j] = e->compliance[j][i] = dot_row(e->jacobian, j, e->inverse_rows[i]);
+        }
+    }
+}
+
+/* Acceleration for given modes; stuck joints get the friction torque that keeps their acceleration at zero. */
+static void accelerate(const context *c, evaluation *e) {
+    vec right;
+    int list[N], count = stuck_joints(c->mode, list);
+    for (int i = 0; i < N; i++) {
+        e->stick_force[i] = 0;
+        e->net_torque[i] = e->torque[i] - (c->mode[i] ? slip_friction(c->p, e, i, c->mode[i]) : 0);
+    }
+    for (int j = 0; j < N; j++) {
+        right[j] = -e->bias[j];
+        for (int i = 0; i < N; i++) right[j] += e->jacobian[i + N * j] * e->net_torque[i];
+    }
+    cholesky_solve(e->cholesky, N, right);
+    memcpy(e->acceleration, right, sizeof right);
+    if (!count) return;
+    double force[N];
+    evaluate_compliance(e, list, count);
+    for (int s = 0; s < count; s++)
+        force[s] = dot_row(e->jacobian, list[s], right) + e->bias_acceleration[list[s]];
+    solve_stuck(e->compliance, list, count, force);
+    for (int s = 0; s < count; s++) {
+        int i = list[s];
+        e->stick_force[i] = force[s];
+        e->net_torque[i] -= force[s];
+        for (int j = 0; j < N; j++) e->acceleration[j] -= e->inverse_rows[i][j] * force[s];
+    }
+    if (count == N) memset(e->acceleration, 0, sizeof e->acceleration); /* rounding must not make it creep */
+}
+
+static int evaluate(context *c, const state *s, double t, evaluation *e) {
+    int status = evaluate_terms(c, s, t, e);
+    if (status == OK) accelerate(c, e);
+    return status;
+}
+
+/* Which of the joints at rest stick, and which way the others start: box-constrained friction by Gauss-Seidel. */
+static void decide_modes(context *c, evaluation *e, const int *list, int count) {
+    vec force = {0};
+    if (!count) return;
+    for (int s = 0; s < count; s++) c->mode[list[s]] = 1;
+    evaluate_compliance(e, list, count);
+    vec right;
+    for (int i = 0; i < N; i++) e->net_torque[i] = e->torque[i];
+    for (int i = 0; i < N; i++) {
+        int at_rest = 0;
+        for (int s = 0; s < count; s++) at_rest |= list[s] == i;
+        if (!at_rest) e->net_torque[i] -= slip_friction(c->p, e, i, c->mode[i]);
+    }
+    for (int j = 0; j < N; j++) {
+        right[j] = -e->bias[j];
+        for (int i = 0; i < N; i++) right[j] += e->jacobian[i + N * j] * e->net_torque[i];
+    }
+    cholesky_solve(e->cholesky, N, right);
+    for (int sweep = 0; sweep < 1000; sweep++) {
+        double change = 0;
+        for (int s = 0; s < count; s++) {
+            int i = list[s];
+            double acceleration = dot_row(e->jacobian, i, right) + e->bias_acceleration[i];
+            for (int r = 0; r < count; r++) acceleration -= e->compliance[i][list[r]] * force[list[r]];
+            double wanted = force[i] + acceleration / e->compliance[i][i], limit = breakaway(c->p, i);
+            wanted = wanted > limit ? limit : wanted < -limit ? -limit : wanted;
+            change = fmax(change, fabs(wanted - force[i]));
+            force[i] = wanted;
+        }
+        if (change < 1e-15) break;
+    }
+    for (int s = 0; s < count; s++) {
+        int i = list[s];
+        double limit = breakaway(c->p, i);
+        c->mode[i] = fabs(force[i]) < limit ? 0 : force[i] >= 0 ? 1 : -1;
+    }
+}
+
+/* How far the modes are from being broken: >= 0 while they hold. Returns the joint closest to an event. */
+static double mode_margin(const context *c, const evaluation *e, int *joint) {
+    double least = 1;
+    *joint = -1;
+    for (int i = 0; i < N; i++) {
+        if (!needs_event(c->p, i)) continue;
+        double margin = c->mode[i] ? c->mode[i] * e->velocity[i]
+                                   : 1 - fabs(e->stick_force[i]) / breakaway(c->p, i);
+        if (margin < least) { least = margin; *joint = i; }
+    }
+    return least;
+}
