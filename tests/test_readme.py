@@ -1,10 +1,15 @@
 """The README is true: its figures are those of the run it quotes, its commands and files exist."""
 
 import re
+import shlex
+import shutil
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from identify import command_line
 from identify.command_line import app
 from identify.goals import check_goals
 from identify.result_file import load_result
@@ -28,6 +33,67 @@ def test_the_quoted_run_is_the_paper_scenario_and_meets_every_goal(result):
     assert result["scenario"] == "paper"
     assert len(result["validation"]) == 10
     assert [goal for goal in check_goals(result) if not goal.passed] == []
+
+
+@pytest.fixture(scope="module")
+def dynamics_figures():
+    return load_result(ROOT / ".readme" / "dynamics.json")
+
+
+def test_the_table_of_the_dynamics_is_the_measured_one(dynamics_figures):
+    found, versions = dynamics_figures["figures"], dynamics_figures["versions"]
+    rows = {
+        "forward dynamics against Pinocchio's closed chain, relative": f"{found['pinocchio_relative_difference']:.0e}",
+        "the paper's figure-7 loop against MuJoCo (`cmmsim verify-model`), steady": (
+            f"{found['mujoco_position_steady_um']:.1g} um, {found['mujoco_angle_steady_urad']:.1g} urad"
+        ),
+        "forward dynamics against `constraintDynamics`": f"{found['forward_dynamics_over_pinocchio']:.1f} times faster",
+        "forward dynamics against MuJoCo's `mj_step`": f"{found['forward_dynamics_over_mj_step']:.1f} times faster",
+        "closed loop with exact stick-slip friction, 60 Hz frames": f"{found['times_real_time']:.0f} times real time",
+        "all 67 sensitivities of a run": f"{found['sensitivities_plain_runs']:.1f} plain runs",
+        "a batch of runs on two cores": f"{found['two_cores_gain']:.2f} times faster than on one",
+        "compiling everything, at first use": f"{found['first_compilation_s']:.0f} s",
+        "order of the stick-slip integrator": f"{found['integrator_order']:.1f}",
+    }
+    wanted = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
+    assert wanted in README, f"the README wants these rows:\n{wanted}"
+    said = f"measured {dynamics_figures['date']} with Pinocchio {versions['pin']} and MuJoCo {versions['mujoco']}"
+    assert said in " ".join(README.split()), f"the README wants: {said}"
+
+
+def test_the_dynamics_reach_their_goals(dynamics_figures):
+    found = dynamics_figures["figures"]
+    assert found["pinocchio_relative_difference"] <= 1e-9
+    assert found["mujoco_position_steady_um"] <= 10
+    assert found["mujoco_angle_steady_urad"] <= 20
+    assert min(found["forward_dynamics_over_pinocchio"], found["forward_dynamics_over_mj_step"]) >= 8
+    assert found["times_real_time"] >= 300
+    assert found["sensitivities_plain_runs"] <= 15
+    assert found["two_cores_gain"] >= 1.8
+    assert found["first_compilation_s"] <= 20
+
+
+def test_its_export_command_writes_what_mujoco_loads(monkeypatch, capfd, tmp_path):
+    """The very line, with the quoted run where the README says that runs are; and what it says of the change."""
+    mujoco = pytest.importorskip("mujoco")
+    line = " ".join(re.findall(r"`(cmmsim export mjcf [^`]+)`", README)[0].split())
+    assert "--parameters runs/paper-0/result.json" in line
+    monkeypatch.chdir(tmp_path)
+    Path("runs/paper-0").mkdir(parents=True)
+    shutil.copy(ROOT / ".readme" / "result.json", "runs/paper-0")
+    monkeypatch.setattr(sys, "argv", shlex.split(line))
+    with pytest.raises(SystemExit) as ended:
+        command_line.main()
+    assert not ended.value.code
+    said = capfd.readouterr().out
+    changes = [float(value) for value in re.findall(r"accelerations differ by up to ([\d.]+) %", said)]
+    assert len(changes) == 1, "one body alone alters the motion"
+    assert f"changes accelerations by up to {changes[0]:.1f} %" in " ".join(README.split())
+    model = mujoco.MjModel.from_xml_path("rss6.xml")
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    assert model.nbody == 14
+    assert np.isfinite(data.qacc).all()
 
 
 def test_every_linked_file_exists():

@@ -3,8 +3,8 @@
     pytest tests/benchmarks -m slow --dynamics-figures .readme/dynamics.json
 
 measures them again, on a machine with nothing else to do. The file is written when every figure was measured and its
-goal reached; otherwise it stays as it was. Then the README's table of the dynamics takes the new figures over: the tests
-of the README print the rows that are missing.
+goal reached; otherwise it stays as it was. The README's table then takes the new figures over: `pytest
+tests/test_readme.py` prints the rows that it wants.
 """
 
 import json
