@@ -13,13 +13,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtr
 
+from .blurred_coverage import require_psf
 from .ellipse_coverage import coverage, covered_area
 from .errors import CmmError
 from .noise import CameraNoise
 from .pose import Array
 
 PARTS = 3.0  # parts of a pixel to one standard deviation of the point spread: their covered shares are blurred
-NARROWEST_PX = 0.05
 REACH = 6.0  # standard deviations within which noise and point spread are followed
 TABLE_STEPS = 64  # tabulated informations in one grey value
 DARKEST, BRIGHTEST = 0, 255
@@ -54,8 +54,7 @@ class _FineGrid:
     """
 
     def __init__(self, size: int, psf_px: float) -> None:
-        if psf_px < NARROWEST_PX:
-            raise CmmError(f"a point spread of {psf_px:g} px cannot be drawn, only 0 or at least {NARROWEST_PX:g} px")
+        require_psf(psf_px)
         self.parts = max(2, int(np.ceil(PARTS / psf_px)))
         self._margin = int(np.ceil(REACH * psf_px))
         self.count = (size + 2 * self._margin) * self.parts

@@ -55,10 +55,11 @@ def compete(scene: Scene, conditions: Sequence[Condition], draws: int, rng: np.r
     """
     if draws < 2:
         raise CmmError(f"a leaderboard needs at least 2 draws, got {draws}")
+    scenes = [scene.with_noise(condition.noise) for condition in conditions]  # refused before any work is done
     scores: list[Score] = []
     chosen = detectors or [*DETECTORS.values(), *PEERS]
-    for k, condition in enumerate(conditions):
-        scores += _round(scene.with_noise(condition.noise), condition, draws, rng, chosen)
+    for k, (lit, condition) in enumerate(zip(scenes, conditions, strict=True)):
+        scores += _round(lit, condition, draws, rng, chosen)
         report(k + 1, len(conditions))
     return scores
 

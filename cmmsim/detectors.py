@@ -42,7 +42,7 @@ class Detector:
 def detect_by_maximum_likelihood(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
                                  limits: FitLimits | None = None, psf_px: float = 0.0) -> DetectedCentres:
     """Centres of the maximum-likelihood fit of a blurred ellipse. Parameters as of ``DetectWindows``."""
-    fits = fit_ellipses(windows, corners, noise, fit_size, limits)
+    fits = fit_ellipses(windows, corners, noise, fit_size, limits, psf_px=psf_px)
     return DetectedCentres(fits.centres, fits.covariances, fits.good)
 
 

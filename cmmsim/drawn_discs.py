@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .blurred_coverage import require_psf
 from .camera import PinholeCamera
 from .cramer_rao import light_shares
 from .errors import CmmError
@@ -35,9 +36,10 @@ class Condition:
     psf_px: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (self.radius_px >= 1.0 and 0.0 <= self.tilt <= 1.4 and 0.0 < self.noise < 1.0 and self.psf_px >= 0.0):
-            raise CmmError("a condition needs radius >= 1 px, tilt 0 to 1.4 rad (80 degrees), noise between 0 and 1 of "
-                           f"the contrast and no negative point spread, got {self}")
+        require_psf(self.psf_px)
+        if not (self.radius_px >= 1.0 and 0.0 <= self.tilt <= 1.4 and 0.0 < self.noise < 1.0):
+            raise CmmError("a condition needs radius >= 1 px, tilt 0 to 1.4 rad (80 degrees) and noise between 0 and 1 "
+                           f"of the contrast, got {self}")
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 
 from identify.base_parameters_command import base_parameters
+from identify.detectors_command import detectors
 from identify.engine_commands import export, verify_model
 from identify.errors import IdentifyError, ScenarioError
 from identify.progress import Progress, RichProgress, SilentProgress
@@ -43,6 +44,10 @@ The stages alone, each reading what the one before wrote:
 The model in other engines:
   cmmsim export mjcf rss6 --parameters mine/result.json --allow-unphysical-inertia
   cmmsim verify-model                    MuJoCo against this model, figure8.png
+
+\b
+How well the stickers are found:
+  cmmsim detectors                       detectors beside the Cramer-Rao bound
 
 \b
 Where the robot can go:
@@ -183,6 +188,7 @@ def report(out: RunFolderOption, quiet: Quiet = False) -> None:
 
 app.command("verify-model")(verify_model)
 app.add_typer(export, name="export")
+app.command()(detectors)
 app.command()(workspace)
 app.command()(base_parameters)
 

@@ -106,5 +106,5 @@ def test_closed_form_of_a_circle():
 def test_no_noise_and_a_point_spread_that_cannot_be_sampled_are_refused():
     with pytest.raises(CmmError, match="no Cramer-Rao bound"):
         grey_value_information(np.array([100.0]), replace(NOISE, enabled=False))
-    with pytest.raises(CmmError, match=r"0\.02 px cannot be drawn, only 0 or at least 0\.05 px"):
+    with pytest.raises(CmmError, match=r"0\.02 px cannot be fitted, only 0 or at least 0\.05 px"):
         light_shares(CENTRES, SHAPES, SIZE, 0.02)
