@@ -1,4 +1,4 @@
-"""Sensitivities over the steps of the plain integrator: the exact derivative of what `stick_slip` computes; twin in C.
+"""Sensitivities over the steps of `stick_slip`, the exact derivative of what it computes: twin of `step_sensitivity.c`.
 
 Derivatives are rows over columns: the 67 parameters, the length of the present step, and the start state if wanted. A
 Runge-Kutta step is differentiated stage by stage, the equation of motion at each implicitly. A step that an event cuts
