@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from .detectors import DEFAULT_DETECTOR, find_detector
 from .eccentricity import centre_offset
-from .ellipse_fit import FitLimits, fit_ellipses
+from .ellipse_fit import FitLimits
 from .images import StereoImages
 from .noise import CameraNoise
 from .pose import Array, apply
@@ -22,7 +23,8 @@ GRAZING = 0.15  # cosine between a sticker's normal and the view below which it 
 class DetectionSettings:
     """window_size and fit_size px; radius of a sticker m; limits of a good fit; largest_ray_gap: squared distance of
     the two rays of a sticker in units of its noise (one degree of freedom, so 25 is five sigma); centre_error_px: rms
-    error of a centre that is not noise, such as the image formation's own; it is added to the noise's covariance."""
+    error of a centre that is not noise, such as the image formation's own; it is added to the noise's covariance, as
+    is the detector's; detector: name of the one that is taken."""
 
     window_size: int = 16
     fit_size: int = 14
@@ -30,6 +32,7 @@ class DetectionSettings:
     limits: FitLimits = field(default_factory=FitLimits)
     largest_ray_gap: float = 25.0
     centre_error_px: float = 0.0
+    detector: str = DEFAULT_DETECTOR
 
 
 @dataclass(frozen=True)
@@ -65,12 +68,14 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
     if len(index) == 0:
         return StickerObservation(index, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     windows = images.windows(corners, settings.window_size)
-    fits = fit_ellipses(windows.reshape(-1, *windows.shape[2:]), corners.reshape(-1, 2), noise, settings.fit_size,
-                        settings.limits)
+    detector = find_detector(settings.detector)
+    fits = detector.detect(windows.reshape(-1, *windows.shape[2:]), corners.reshape(-1, 2), noise, settings.fit_size,
+                           settings.limits)
     seen_at = fits.centres.reshape(2, -1, 2) - np.stack(
         [centre_offset(camera, c[index], t[index], settings.radius)
          for camera, c, t in zip(rig.cameras, centres, turned, strict=True)])
-    spread = fits.covariances.reshape(2, -1, 2, 2) + settings.centre_error_px**2 * np.eye(2)
+    systematic = settings.centre_error_px**2 + detector.bias_px**2
+    spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
     ideal, ideal_spread, found = rig.undistort(seen_at, spread)
     good = np.all(fits.good.reshape(2, -1) & found, axis=0)
     seen = triangulate(rig.ideal, *ideal, *ideal_spread)

@@ -75,7 +75,8 @@ class Sensor:
     def settings(self) -> DetectionSettings:
         """How stickers are looked for in windows."""
         centre_error = self._renderer.centre_error_px(Quality().supersampling)
-        return DetectionSettings(radius=self._file.stickers.radius, centre_error_px=centre_error)
+        return DetectionSettings(radius=self._file.stickers.radius, detector=self._file.detection.detector,
+                                 centre_error_px=centre_error)
 
     @property
     def timing(self) -> Timing:

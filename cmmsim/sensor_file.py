@@ -76,6 +76,12 @@ class Camera(_Section):
     noise: bool = True
 
 
+class Detection(_Section):
+    """detector: which one finds the centres of stickers in windows."""
+
+    detector: Literal["maximum_likelihood", "dual_conic", "grey_centroid"] = "maximum_likelihood"
+
+
 class Stickers(_Section):
     """Radii and placement distances m; levels of 255."""
 
@@ -133,6 +139,7 @@ class SensorFile(_Section):
     timing: Timing
     rig: Rig
     camera: Camera
+    detection: Detection = Field(default_factory=Detection)
     stickers: Stickers
     platform: Platform
     base: Body

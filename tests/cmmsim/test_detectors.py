@@ -1,6 +1,8 @@
 """One contract for all detectors, their stated covariance and bias against sampling, and the eccentricity of discs."""
 
 from dataclasses import replace
+from importlib import resources
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -8,8 +10,9 @@ import pytest
 from cmmsim.detectors import DEFAULT_DETECTOR, DETECTORS, find_detector
 from cmmsim.drawn_discs import Condition, draw_discs, random_ellipses, scene_of
 from cmmsim.ellipse_fit import FitLimits
-from cmmsim.errors import CmmError, UnknownOptionError
-from cmmsim.sensor_file import read_sensor_file
+from cmmsim.errors import CmmError, SensorFileError, UnknownOptionError
+from cmmsim.sensor import Sensor
+from cmmsim.sensor_file import Detection, SensorFile, read_sensor_file
 
 SCENE = scene_of(read_sensor_file("ctrack780"))
 SIZE, FIT = 18, 14
@@ -128,3 +131,26 @@ def test_scene_with_other_noise_keeps_contrast_and_ground():
     shot = [replace(s.noise, dark_noise=0.0).variance(s.ground + s.contrast) - 1.0 / 12.0 for s in (SCENE, quieter)]
     both = [s.noise.variance(s.ground + s.contrast) - 1.0 / 12.0 for s in (SCENE, quieter)]
     assert shot[0] / both[0] == pytest.approx(shot[1] / both[1], rel=1e-9)  # shot and dark noise in the same proportion
+
+
+@pytest.mark.rendering
+@EVERY
+def test_sensor_file_chooses_the_detector_and_poses_keep_their_covariance(detector, taught, moving_path):
+    """Squared pose errors along a path, normalised by the stated covariance with the detector's bias in it."""
+    content = read_sensor_file("ctrack780").model_dump() | {"detection": {"detector": detector.name}}
+    sensor = Sensor(SensorFile.model_validate(content), seed=1, taught=taught, renderer="analytic")
+    path = moving_path(150)
+    found = [sensor.measure(pose) for pose in path]
+    assert all(m.ok for m in found)
+    errors = np.array([m.pose for m in found]) - path
+    squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv([m.covariance for m in found]), errors)
+    assert squared.mean() == pytest.approx(6.0, rel=0.25)  # neighbouring frames share their places within a pixel
+
+
+def test_unknown_detector_in_a_sensor_file_names_the_valid_ones(tmp_path):
+    built_in = (resources.files("cmmsim") / "sensors" / "ctrack780.toml").read_text()
+    (tmp_path / "mine.toml").write_text(built_in + '\n[detection]\ndetector = "hough"\n')
+    with pytest.raises(SensorFileError, match=r"'maximum_likelihood', 'dual_conic' or 'grey_centroid'.*got 'hough'"):
+        read_sensor_file(tmp_path / "mine.toml")
+    assert list(get_args(Detection.model_fields["detector"].annotation)) == list(DETECTORS)
+    assert Detection().detector == DEFAULT_DETECTOR
