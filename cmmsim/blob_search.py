@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from .ellipse_fit import EllipseFits, FitLimits, fit_ellipses
 from .images import FrameImages, StereoFrame
-from .noise import CameraNoise
+from .noise import CameraNoise, GreyImage
 from .pose import Array
 
 SMALLEST_AREA_PX, LARGEST_AREA_PX = 8, 400
 LARGEST_SIDE_PX = 24
 BRIGHT_SHARE = 1e-4  # share of the image's pixels that are taken as the brightest
-SMALLEST_STEP = 40.0  # grey values between the ground and the brightest pixels
+SMALLEST_STEP = 40.0 / 255.0  # of the largest grey value: between the ground and the brightest pixels
 
 
-def find_blobs(image: NDArray[np.uint8]) -> Array:
-    """Rough centres (n, 2) px of compact bright spots of an image (height, width)."""
-    counts = np.bincount(image.ravel(), minlength=256)
+def find_blobs(image: GreyImage, white_level: int = 255) -> Array:
+    """Rough centres (n, 2) px of compact bright spots of an image (height, width); white_level: largest grey value."""
+    counts = np.bincount(image.ravel())
     from_top = np.cumsum(counts[::-1])
-    bright = 255 - int(np.searchsorted(from_top, max(1.0, BRIGHT_SHARE * image.size)))
+    bright = len(counts) - 1 - int(np.searchsorted(from_top, max(1.0, BRIGHT_SHARE * image.size)))
     ground = int(np.searchsorted(np.cumsum(counts), 0.5 * image.size))
-    if bright - ground < SMALLEST_STEP:
+    if bright - ground < SMALLEST_STEP * white_level:
         return np.zeros((0, 2))
     mask = (image > 0.5 * (bright + ground)).astype(np.uint8)
     _, _, stats, centres = cv2.connectedComponentsWithStats(mask)
@@ -34,12 +33,15 @@ def find_blobs(image: NDArray[np.uint8]) -> Array:
 
 
 def find_ellipses(frame: StereoFrame, noise: CameraNoise, window_size: int, fit_size: int,
-                  limits: FitLimits) -> tuple[EllipseFits, EllipseFits]:
-    """Ellipses fitted to all bright spots of the left and of the right image; only good ones."""
+                  limits: FitLimits, psf_px: float = 0.0) -> tuple[EllipseFits, EllipseFits]:
+    """Ellipses fitted to all bright spots of the left and of the right image; only good ones.
+
+    Parameters: window_size, fit_size and psf_px, the standard deviation of the point spread, in px.
+    """
     found = []
     for image in (frame.left, frame.right):
-        corners = np.rint(find_blobs(image) - 0.5 * (window_size - 1)).astype(int)
+        corners = np.rint(find_blobs(image, noise.white_level) - 0.5 * (window_size - 1)).astype(int)
         windows = FrameImages(StereoFrame(image, image)).windows(np.stack([corners, corners]), window_size)[0]
-        fits = fit_ellipses(windows, corners, noise, fit_size, limits)
+        fits = fit_ellipses(windows, corners, noise, fit_size, limits, psf_px=psf_px)
         found.append(EllipseFits(*(getattr(fits, name)[fits.good] for name in EllipseFits.__dataclass_fields__)))
     return found[0], found[1]

@@ -77,7 +77,8 @@ def measure_frame(frame: StereoFrame, estimator: PoseEstimator, expected: Array 
 
 def points_in_frame(frame: StereoFrame, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings) -> Array:
     """Points (m,3) in the camera frame that may be stickers; true and false pairings together."""
-    left, right = find_ellipses(frame, noise, SEARCH_WINDOW_PX, settings.fit_size, settings.limits)
+    left, right = find_ellipses(frame, noise, SEARCH_WINDOW_PX, settings.fit_size, settings.limits,
+                                settings.optics.psf_px)
     if not len(left.centres) or not len(right.centres):
         raise LostError(f"{len(left.centres)} bright spots in the left image and {len(right.centres)} in the right, "
                         f"at least {FEWEST_TAUGHT} in each needed")

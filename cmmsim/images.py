@@ -9,22 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import ShapeError
+from .noise import GreyImage
 
-Windows = NDArray[np.uint8] | NDArray[np.float64]
+Windows = GreyImage | NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class StereoFrame:
-    """left and right: grey images (height, width) uint8 taken at the same time."""
+    """left and right: grey images (height, width) taken at the same time, uint8, or uint16 of more than 8 bit."""
 
-    left: NDArray[np.uint8]
-    right: NDArray[np.uint8]
+    left: GreyImage
+    right: GreyImage
 
     def __post_init__(self) -> None:
         for name in ("left", "right"):
             image = getattr(self, name)
-            if image.ndim != 2 or image.dtype != np.uint8:
-                raise ShapeError(f"the {name} image must be (height, width) uint8, got {image.shape} {image.dtype}")
+            if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+                raise ShapeError(f"the {name} image must be (height, width) uint8 or uint16, got {image.shape} "
+                                 f"{image.dtype}")
 
 
 class StereoImages(Protocol):

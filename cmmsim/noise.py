@@ -1,7 +1,8 @@
 """Camera noise after the linear model of EMVA 1288.
 
-Radiance (0 to 1) becomes electrons, shot noise and dark noise are added, the gain K turns electrons into grey values,
-which are clipped and rounded. Shot noise is drawn as a normal variable of the Poisson variance.
+Radiance (0 to 1) becomes electrons, shot noise, dark noise and what differs from pixel to pixel are added, the gain K
+turns electrons into grey values, which are clipped and rounded. Shot noise is drawn as a normal variable of the Poisson
+variance.
 """
 
 from __future__ import annotations
@@ -12,7 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import CmmError
+from .fixed_pattern import FixedPattern
 from .pose import Array
+
+BIT_DEPTHS = (8, 10, 12)
+GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 @dataclass(frozen=True)
@@ -24,7 +29,11 @@ class CameraNoise:
     dark_noise           temporal noise in the dark, e- rms
     full_well            saturation capacity, e-
     black_level          grey value at no light
-    enabled              False: no noise; the mean grey value is still rounded to 8 bit
+    enabled              False: no noise at all; the mean grey value is still rounded
+    bit_depth            of the grey values: 8, 10 or 12; images of more than 8 are uint16
+    prnu                 photo response non-uniformity: std of the pixels' sensitivity, relative to its mean
+    dsnu                 dark signal non-uniformity: std of the pixels' offset, e-
+    frames               exposures averaged in each grey value, which divide the temporal noise but not the pattern
     """
 
     electrons_at_white: float
@@ -33,10 +42,27 @@ class CameraNoise:
     full_well: float
     black_level: float
     enabled: bool = True
+    bit_depth: int = 8
+    prnu: float = 0.0
+    dsnu: float = 0.0
+    frames: int = 1
 
     def __post_init__(self) -> None:
         if min(self.electrons_at_white, self.gain, self.full_well) <= 0.0 or self.dark_noise < 0.0:
             raise CmmError(f"camera noise needs positive electrons, gain and full well, got {self}")
+        if min(self.prnu, self.dsnu) < 0.0 or self.bit_depth not in BIT_DEPTHS or self.frames < 1:
+            raise CmmError(f"camera noise needs prnu and dsnu >= 0, bit_depth of {BIT_DEPTHS} and frames >= 1, got "
+                           f"{self}")
+
+    @property
+    def white_level(self) -> int:
+        """Largest grey value."""
+        return int(2**self.bit_depth - 1)
+
+    @property
+    def has_pattern(self) -> bool:
+        """Whether pixels differ from each other."""
+        return self.enabled and (self.prnu > 0.0 or self.dsnu > 0.0)
 
     def mean_grey(self, radiance: NDArray[np.floating]) -> NDArray[np.floating]:
         """Expected grey values of radiance 0 to 1."""
@@ -44,25 +70,45 @@ class CameraNoise:
         return self.black_level + self.gain * electrons
 
     def variance(self, mean_grey: Array) -> Array:
-        """Variance of a grey value with this mean: shot noise, dark noise and rounding (grey values squared)."""
+        """Variance of a grey value with this mean: shot, dark and pattern noise, rounding (grey values squared)."""
         electrons = np.maximum((mean_grey - self.black_level) / self.gain, 0.0)
-        return self.gain**2 * (electrons + self.dark_noise**2) + 1.0 / 12.0
+        constant, linear, quadratic = self.variance_coefficients
+        return constant + electrons * (linear + electrons * quadratic)
 
-    def expose(self, radiance: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.uint8]:
-        """One 8-bit exposure of a radiance image (float32, 0 to 1)."""
-        return np.rint(np.clip(self._analog(radiance, rng), 0.0, 255.0)).astype(np.uint8)
+    @property
+    def variance_coefficients(self) -> tuple[float, float, float]:
+        """Variance of a grey value as a polynomial in its electrons: constant, linear, quadratic."""
+        temporal, pattern = self.gain**2 / self.frames, self.gain**2
+        return (temporal * self.dark_noise**2 + pattern * self.dsnu**2 + 1.0 / (12.0 * self.frames), temporal,
+                pattern * self.prnu**2)
 
-    def mean_of_exposures(self, radiance: NDArray[np.float32], rng: np.random.Generator, frames: int) -> Array:
-        """Mean grey values of ``frames`` independent 8-bit exposures of a scene that stands still (float64)."""
+    def expose(self, radiance: NDArray[np.float32], rng: np.random.Generator,
+               pattern: FixedPattern | None = None) -> GreyImage:
+        """One exposure of a radiance image (float32, 0 to 1); ``pattern`` of the same shape, where pixels differ."""
+        grey = np.rint(np.clip(self._analog(radiance, rng, pattern), 0.0, float(self.white_level)))
+        return grey.astype(np.uint8 if self.bit_depth == 8 else np.uint16)
+
+    def mean_of_exposures(self, radiance: NDArray[np.float32], rng: np.random.Generator, frames: int,
+                          pattern: FixedPattern | None = None) -> Array:
+        """Mean grey values of ``frames`` independent exposures of a scene that stands still (float64).
+
+        Without noise it is not rounded: the mean that noisy exposures approach, as their noise dithers the rounding.
+        """
+        if not self.enabled:
+            return np.clip(self.mean_grey(radiance.astype(np.float64)), 0.0, float(self.white_level))
         total = np.zeros(radiance.shape, dtype=np.int64)
         for _ in range(frames):
-            total += self.expose(radiance, rng)
+            total += self.expose(radiance, rng, pattern)
         return total / frames
 
-    def _analog(self, radiance: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.floating]:
+    def _analog(self, radiance: NDArray[np.float32], rng: np.random.Generator,
+                pattern: FixedPattern | None) -> NDArray[np.floating]:
         if not self.enabled:
             return self.mean_grey(radiance)
-        electrons = np.minimum(radiance * np.float32(self.electrons_at_white), np.float32(self.full_well))
+        light = radiance * np.float32(self.electrons_at_white)
+        electrons = np.minimum(light if pattern is None else light * pattern.sensitivity, np.float32(self.full_well))
         noise = rng.standard_normal(radiance.shape, dtype=np.float32)
         noise *= np.sqrt(electrons + np.float32(self.dark_noise**2))
+        if pattern is not None:
+            noise += pattern.offset
         return np.float32(self.black_level) + np.float32(self.gain) * (electrons + noise)

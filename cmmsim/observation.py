@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from .detectors import DEFAULT_DETECTOR, find_detector
 from .eccentricity import centre_offset
 from .ellipse_fit import FitLimits
-from .images import StereoImages
+from .images import StereoImages, Windows
 from .noise import CameraNoise
+from .optics import Optics
 from .pose import Array, apply
 from .stereo_rig import StereoRig
 from .triangulation import triangulate
@@ -24,7 +25,8 @@ class DetectionSettings:
     """window_size and fit_size px; radius of a sticker m; limits of a good fit; largest_ray_gap: squared distance of
     the two rays of a sticker in units of its noise (one degree of freedom, so 25 is five sigma); centre_error_px: rms
     error of a centre that is not noise, such as the image formation's own; it is added to the noise's covariance, as
-    is the detector's; detector: name of the one that is taken."""
+    is the detector's; detector: name of the one that is taken;
+    optics: point spread and vignetting of the cameras as known."""
 
     window_size: int = 16
     fit_size: int = 14
@@ -33,6 +35,7 @@ class DetectionSettings:
     largest_ray_gap: float = 25.0
     centre_error_px: float = 0.0
     detector: str = DEFAULT_DETECTOR
+    optics: Optics = field(default_factory=Optics)
 
 
 @dataclass(frozen=True)
@@ -67,10 +70,10 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
     corners = np.rint(pixels[:, index] - 0.5 * (settings.window_size - 1)).astype(int)
     if len(index) == 0:
         return StickerObservation(index, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    windows = images.windows(corners, settings.window_size)
+    windows = _evenly_lit(images.windows(corners, settings.window_size), corners, rig, noise, settings)
     detector = find_detector(settings.detector)
     fits = detector.detect(windows.reshape(-1, *windows.shape[2:]), corners.reshape(-1, 2), noise, settings.fit_size,
-                           settings.limits)
+                           settings.limits, psf_px=settings.optics.psf_px)
     seen_at = fits.centres.reshape(2, -1, 2) - np.stack(
         [centre_offset(camera, c[index], t[index], settings.radius)
          for camera, c, t in zip(rig.cameras, centres, turned, strict=True)])
@@ -81,3 +84,18 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
     seen = triangulate(rig.ideal, *ideal, *ideal_spread)
     return StickerObservation(index, seen_at[0], seen_at[1], seen.points, seen.covariances).selected(
         good & (seen.ray_gap < settings.largest_ray_gap))
+
+
+def _evenly_lit(windows: Windows, corners: NDArray[np.int_], rig: StereoRig, noise: CameraNoise,
+                settings: DetectionSettings) -> Windows:
+    """Windows (2, n, size, size) with the light within each made even: that of its middle.
+
+    Only the slope of the light across a sticker would move its centre; the noise stays what it is to a few per mille.
+    """
+    if settings.optics.vignetting == 0.0:
+        return windows
+    size, middle = windows.shape[-1], corners + 0.5 * (windows.shape[-1] - 1)
+    share = np.stack([settings.optics.window_illumination(camera, at, size)
+                      / settings.optics.illumination(camera, centre)[:, None, None]
+                      for camera, at, centre in zip(rig.cameras, corners, middle, strict=True)])
+    return noise.black_level + (windows - noise.black_level) / share

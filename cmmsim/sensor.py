@@ -10,13 +10,17 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
+from .blob_search import SMALLEST_STEP
+from .ellipse_fit import FitLimits
 from .errors import ShapeError, UnknownBodyError, UnknownOptionError
 from .estimator import PoseEstimator
+from .image_formation import ImageFormation
 from .images import StereoFrame, StereoImages
 from .marked_body import marked_body
 from .measurement import Measurement
 from .noise import CameraNoise
 from .observation import DetectionSettings
+from .optics import Optics
 from .pose import Array, pose_to_transform
 from .pose_methods import METHODS
 from .renderers import RENDERER_NAMES, Renderer, choose_renderer
@@ -50,8 +54,9 @@ class Sensor:
         self.method = method
         self.rig, self._camera_from_base = rig_from_file(file.rig)
         self._true_rig = self.rig
-        figures = file.camera.model_dump()
+        figures = file.camera.model_dump(exclude={"pattern_seed"})
         self.noise = CameraNoise(**{("enabled" if k == "noise" else k): v for k, v in figures.items()})
+        self.optics = Optics(**file.lens.model_dump())
         self.platform, self.base = marked_body("platform", file.platform), marked_body("base", file.base)
         self._scene = [scene_body(body, section, file.stickers, stream) for stream, (body, section)
                        in enumerate(((self.platform, file.platform), (self.base, file.base)))]
@@ -74,9 +79,10 @@ class Sensor:
     @cached_property
     def settings(self) -> DetectionSettings:
         """How stickers are looked for in windows."""
-        centre_error = self._renderer.centre_error_px(Quality().supersampling)
+        limits = FitLimits(smallest_contrast=SMALLEST_STEP * self.noise.white_level)
         return DetectionSettings(radius=self._file.stickers.radius, detector=self._file.detection.detector,
-                                 centre_error_px=centre_error)
+                                 limits=limits, optics=self.optics,
+                                 centre_error_px=self._camera.centre_error_px(Quality()))
 
     @property
     def timing(self) -> Timing:
@@ -123,17 +129,28 @@ class Sensor:
         self._true_rig = self._true_rig.shifted(side, shift_px)
         self._build_again()
 
-    def look(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None) -> StereoImages:
-        """One exposure with the platform at ``pose`` (6,), drawn as far as it is read; obstacles as in ``capture``."""
-        return self._camera.look(*self._checked(pose, obstacles))
+    def look(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None,
+             pose_rate: ArrayLike | None = None) -> StereoImages:
+        """One exposure, drawn as far as it is read.
 
-    def capture(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None) -> StereoFrame:
-        """Both whole images with the platform at ``pose`` (6,); obstacles: name -> base_from_body (4,4)."""
-        return self.look(pose, obstacles).full()
+        Parameters: pose (6,) of the platform in the middle of the exposure; obstacles: name -> base_from_body (4,4),
+        they stand still; pose_rate (6,), m/s and rad/s: the time derivative of the pose, which blurs the image when
+        the sensor's exposure is not zero. Raises ShapeError, UnknownBodyError, and CmmError for too long a blur.
+        """
+        return self._camera.look(*self._checked(pose, obstacles), pose_rate=_checked_rate(pose_rate))
 
-    def measure(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None) -> Measurement:
-        """Measure the platform that stands at ``pose`` (6,); the pose goes to the renderer only."""
-        images = self.look(pose, obstacles)
+    def capture(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None,
+                pose_rate: ArrayLike | None = None) -> StereoFrame:
+        """Both whole images; parameters as in ``look``."""
+        return self.look(pose, obstacles, pose_rate).full()
+
+    def measure(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None,
+                pose_rate: ArrayLike | None = None) -> Measurement:
+        """Measure the platform; parameters as in ``look``, they go to the renderer only.
+
+        The measured pose is that in the middle of the exposure.
+        """
+        images = self.look(pose, obstacles, pose_rate)
         if self._tracker is None:
             self._tracker = self._new_tracker(self.taught)
         return self._tracker.measure(images)
@@ -156,8 +173,9 @@ class Sensor:
         owners = [k for k, body in enumerate(self._scene) for _ in body.stickers] + [0, 1]
         owners += range(2, 2 + len(self._obstacles))
         drawable = Drawable([*patches, *self._obstacles.values()], owners)
-        return VirtualStereoCamera(self._true_rig, self._camera_from_base, drawable, self.noise, self._renderer,
-                                   list(self._obstacles), self._file.stickers.background_level / 255.0)
+        formation = ImageFormation(self._renderer, drawable, self._file.stickers.background_level / 255.0, self.optics)
+        return VirtualStereoCamera(self._true_rig, self._camera_from_base, formation, self.noise, list(self._obstacles),
+                                   self._file.timing.exposure, self._file.camera.pattern_seed)
 
     def _checked(self, pose: ArrayLike,
                  obstacles: Mapping[str, Array] | None) -> tuple[Array, np.random.Generator, Mapping[str, Array]]:
@@ -168,6 +186,15 @@ class Sensor:
             if np.shape(place) != (4, 4) or not np.all(np.isfinite(place)):
                 raise ShapeError(f"obstacle {name!r}: base_from_body must be (4,4) and finite, got {np.shape(place)}")
         return np.asarray(pose, dtype=float), self._rng, obstacles or {}
+
+
+def _checked_rate(pose_rate: ArrayLike | None) -> Array | None:
+    if pose_rate is None:
+        return None
+    values = np.asarray(pose_rate, dtype=float)
+    if values.shape != (6,) or not np.isfinite(values).all():
+        raise ShapeError(f"a pose rate is six finite numbers, m/s and rad/s, got {np.asarray(pose_rate).tolist()}")
+    return values
 
 
 def load_sensor(name: str | Path, seed: int = 0, method: str = "registration", taught: Taught | None = None,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from .errors import SensorFileError, UnknownSensorError
 from .pose import Array
@@ -17,6 +17,7 @@ Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 Level = Annotated[int, Field(ge=0, le=255)]
+NARROWEST_PSF = 0.1  # px: a narrower point spread is lost between the points that images are drawn on
 
 
 class _Section(BaseModel):
@@ -66,7 +67,10 @@ class Rig(_Section):
 
 
 class Camera(_Section):
-    """EMVA 1288 figures: electrons, grey values per electron, grey values."""
+    """EMVA 1288 figures: electrons, grey values per electron, grey values; prnu relative, dsnu electrons.
+
+    noise = false leaves out all noise, the pattern of prnu and dsnu too; pattern_seed makes another specimen.
+    """
 
     electrons_at_white: Positive
     gain: Positive
@@ -74,6 +78,34 @@ class Camera(_Section):
     full_well: Positive
     black_level: NotNegative = 0.0
     noise: bool = True
+    bit_depth: Literal[8, 10, 12] = 8
+    prnu: Annotated[float, Field(ge=0.0, le=0.2)] = 0.0
+    dsnu: NotNegative = 0.0
+    pattern_seed: Annotated[int, Field(ge=0)] = 0
+
+    @model_validator(mode="after")
+    def _black_below_white(self) -> Camera:
+        if self.black_level >= 2**self.bit_depth - 1:
+            raise ValueError(f"black_level {self.black_level:g} must lie below the largest grey value of bit_depth "
+                             f"{self.bit_depth}, {2**self.bit_depth - 1}")
+        return self
+
+
+class Lens(_Section):
+    """What both lenses do beside the distortion that stands with each camera.
+
+    psf_px: standard deviation of the Gaussian point spread, px; vignetting: share of the light missing in the corner
+    farthest from the principal point, growing with the square of the distance.
+    """
+
+    psf_px: Annotated[float, Field(ge=0.0, le=4.0)] = 0.0
+    vignetting: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
+
+    @model_validator(mode="after")
+    def _drawable(self) -> Lens:
+        if 0.0 < self.psf_px < NARROWEST_PSF:
+            raise ValueError(f"psf_px {self.psf_px:g} must be 0 or at least {NARROWEST_PSF:g} px")
+        return self
 
 
 class Detection(_Section):
@@ -139,6 +171,7 @@ class SensorFile(_Section):
     timing: Timing
     rig: Rig
     camera: Camera
+    lens: Lens = Field(default_factory=Lens)
     detection: Detection = Field(default_factory=Detection)
     stickers: Stickers
     platform: Platform

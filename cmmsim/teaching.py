@@ -82,10 +82,11 @@ class Teacher:
     def _look_at(self, body: MarkedBody, expected: Array, places: Array, pose: Array, rng: np.random.Generator,
                  quality: Quality, window_size: int) -> StickerObservation:
         """All stickers of a body from averaged exposures. Raises LostError when one is missing."""
-        limits = replace(self.settings.limits, frames=quality.exposures, largest_misfit=np.inf)
+        limits = replace(self.settings.limits, largest_misfit=np.inf)
+        noise = replace(self.noise, frames=quality.exposures)
         settings = replace(self.settings, window_size=window_size, limits=limits, largest_ray_gap=np.inf,
                            centre_error_px=self.camera.centre_error_px(quality))
-        seen = observe(self.camera.look(pose, rng, quality=quality), self.rig, self.noise, settings, expected, places,
+        seen = observe(self.camera.look(pose, rng, quality=quality), self.rig, noise, settings, expected, places,
                        body.sticker_normals)
         if len(seen.index) < len(places):
             missing = np.setdiff1d(np.arange(len(places)), seen.index)

@@ -168,7 +168,7 @@ def test_auto_falls_back_with_one_line(monkeypatch, taught):
         assert sensor.measure(sensor.home).ok
     assert sensor.renderer == "analytic"
     assert len(caught) == 1
-    assert sensor._camera._renderer.draw is draw_windows
+    assert sensor._renderer.draw is draw_windows
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert cmmsim.load_sensor("ctrack780", taught=taught, renderer="pyrender").renderer == "pyrender"
