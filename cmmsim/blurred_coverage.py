@@ -16,14 +16,11 @@ point spread is wide.
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import ndtr
 
 from .errors import CmmError
 from .pose import Array
 
 NARROWEST_PX = 0.05
-POINTS_PER_SIGMA = 1.25  # rim points to one standard deviation of the point spread
-FEWEST_POINTS = 24
 
 
 def blurred_coverage(centres: Array, shapes: Array, size: int, psf_px: float) -> tuple[Array, Array]:
@@ -33,31 +30,16 @@ def blurred_coverage(centres: Array, shapes: Array, size: int, psf_px: float) ->
     symmetric and positive definite; size: window side in px; psf_px: sigma of the point spread. Raises CmmError for
     one narrower than NARROWEST_PX.
     """
+    from .blur_kernel import blur_windows  # compiles, so it is loaded where it is first needed
+
     require_psf(psf_px)
-    count = rim_points(float(np.linalg.norm(shapes, axis=2).max(initial=0.0)), psf_px)
-    angle = 2.0 * np.pi * np.arange(count) / count
-    u = np.stack([np.cos(angle), np.sin(angle)])
-    rim = centres[:, :, None] + shapes @ u
-    normal = np.linalg.det(shapes)[:, None, None] * np.linalg.solve(shapes, np.broadcast_to(u, rim.shape))
-    normal *= 2.0 * np.pi / count
-    ticks = (np.arange(size + 1) - 0.5)[:, None]
-    below = [(ticks - rim[:, None, k]) / psf_px for k in range(2)]
-    across = [np.diff(ndtr(b), axis=1) for b in below]  # g, (n, size, count)
-    density = np.exp(-0.5 * below[0] ** 2) / np.sqrt(2.0 * np.pi)
-    passed = 1.0 - psf_px * np.diff(below[0] * ndtr(below[0]) + density, axis=1)  # P
-    share = across[1] @ (passed * normal[:, :1]).transpose(0, 2, 1)
-    rates = (normal[:, 0], normal[:, 1], u[0] * normal[:, 0], u[1] * normal[:, 0] + u[0] * normal[:, 1],
-             u[1] * normal[:, 1])
-    derivatives = [across[1] @ (across[0] * rate[:, None]).transpose(0, 2, 1) for rate in rates]
-    return share, np.stack(derivatives, axis=-1)
+    shares, derivatives = np.empty((len(centres), size, size)), np.empty((len(centres), size, size, 5))
+    blur_windows(np.ascontiguousarray(centres, dtype=float), np.ascontiguousarray(shapes, dtype=float), float(psf_px),
+                 shares, derivatives)
+    return shares, derivatives
 
 
 def require_psf(psf_px: float) -> None:
     """Raise CmmError for a point spread that is neither 0 nor wide enough to be followed."""
     if not (psf_px == 0.0 or NARROWEST_PX <= psf_px < np.inf):
         raise CmmError(f"a point spread of {psf_px:g} px cannot be fitted, only 0 or at least {NARROWEST_PX:g} px")
-
-
-def rim_points(largest_radius: float, psf_px: float) -> int:
-    """Points on the rim of an ellipse whose largest radius is known, px."""
-    return max(FEWEST_POINTS, int(np.ceil(2.0 * np.pi * largest_radius * POINTS_PER_SIGMA / psf_px)))

@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .blurred_coverage import blurred_coverage, require_psf
-from .ellipse_coverage import coverage
+from .blurred_coverage import require_psf
 from .noise import CameraNoise
 from .pose import Array
 
 RING_REACH = 2.4  # pixels beyond this many sticker radii may lie outside the dark ring and are left out
 SMALLEST_RADIUS_PX = 0.8
+SMALLEST_START_PX = 1.2
+CONVERGED_PX = 1e-4  # a step shorter than this ends a fit
 CORE_SHARE = 0.4  # a pixel with this share of the contrast belongs to the bright spot when the fit starts
 
 
@@ -52,7 +53,7 @@ class FitLimits:
 
 
 def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                 limits: FitLimits | None = None, iterations: int = 3, psf_px: float = 0.0) -> EllipseFits:
+                 limits: FitLimits | None = None, iterations: int = 8, psf_px: float = 0.0) -> EllipseFits:
     """Fit one ellipse in each window.
 
     Parameters: windows (n, h, h) grey values; corners (n, 2) the full-image pixel (x, y) of each window's first pixel;
@@ -61,111 +62,31 @@ def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNo
     """
     require_psf(psf_px)
     limits = limits or FitLimits()
-    if len(windows) == 0:
-        return _none_found()
-    inner, inner_corners = _centre_on_spot(windows, fit_size)
-    parameters = _start(inner)
-    mask = _ring_mask(parameters, fit_size)
-    for step in range(iterations + 1):
-        ellipses = parameters[:, :2], _shape(parameters), fit_size
-        radiance_share, derivatives = coverage(*ellipses) if psf_px == 0.0 else blurred_coverage(*ellipses, psf_px)
-        contrast, ground = parameters[:, 5, None, None], parameters[:, 6, None, None]
-        mean = ground + contrast * radiance_share
-        weights = mask * limits.frames / noise.variance(mean)
-        residuals = inner - mean
-        jacobian = np.concatenate([contrast[..., None] * derivatives, radiance_share[..., None],
-                                   np.ones_like(radiance_share)[..., None]], axis=-1).reshape(len(inner), -1, 7)
-        weighted = jacobian.transpose(0, 2, 1) * weights.reshape(len(inner), 1, -1)
-        normal = weighted @ jacobian + 1e-9 * np.eye(7)
-        if step < iterations:
-            change = np.linalg.solve(normal, weighted @ residuals.reshape(len(inner), -1, 1))[..., 0]
-            parameters = _bounded(parameters + np.clip(change, -_LARGEST_STEP, _LARGEST_STEP), fit_size)
-    misfit = np.sum(weights * residuals**2, axis=(1, 2)) / np.maximum(mask.sum(axis=(1, 2)) - 7.0, 1.0)
-    covariances = np.linalg.inv(normal)[:, :2, :2]
+    from .fit_kernel import UNKNOWNS, FitSettings, fit_windows  # compiles, so it is loaded where it is first needed
+
+    n = len(windows)
+    inner, parameters, misfit = np.empty((n, 2)), np.empty((n, UNKNOWNS)), np.empty(n)
+    shapes, covariances = np.empty((n, 2, 2)), np.empty((n, 2, 2))
+    variances = noise.variance(_GREYS) / limits.frames
+    settings = FitSettings(CORE_SHARE, RING_REACH, SMALLEST_START_PX, SMALLEST_RADIUS_PX, _LARGEST_STEP, iterations,
+                           CONVERGED_PX, float(psf_px), variances, _GREYS[0], 1.0 / (_GREYS[1] - _GREYS[0]))
+    fit_windows(np.ascontiguousarray(windows, dtype=float), fit_size, settings, inner, parameters, shapes, covariances,
+                misfit)
     good = (parameters[:, 5] >= limits.smallest_contrast) & (misfit <= limits.largest_misfit)
-    good &= _inside(parameters, fit_size)
-    return EllipseFits(parameters[:, :2] + inner_corners + corners, covariances, _shape(parameters),
-                       parameters[:, 5], misfit, good)
+    good &= _inside(parameters[:, :2], shapes, fit_size)
+    return EllipseFits(parameters[:, :2] + inner + corners, covariances, shapes, parameters[:, 5], misfit, good)
 
 
 _LARGEST_STEP = np.array([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0])
 _LARGEST_STEP.setflags(write=False)
+_GREYS = np.arange(-64.0, 512.0, 0.25)  # at these the noise variance is tabulated
+_GREYS.setflags(write=False)
 
 
-def _none_found() -> EllipseFits:
-    return EllipseFits(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0),
-                       np.zeros(0, dtype=bool))
-
-
-def _shape(parameters: Array) -> Array:
-    return parameters[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-
-
-def _moments(windows: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Ground and contrast (n,), area px (n,), centroid (n,2) and spread (n,2,2) of each window's bright spot."""
-    n, size, _ = windows.shape
-    flat = np.sort(windows.reshape(n, -1), axis=1)
-    ground = flat[:, flat.shape[1] // 3]
-    contrast = np.maximum(flat[:, -6] - ground, 1.0)
-    share = (windows - ground[:, None, None]) / contrast[:, None, None]
-    share = np.where(share > CORE_SHARE, np.minimum(share, 1.0), 0.0)
-    area = np.maximum(share.sum(axis=(1, 2)), 1e-6)
-    ticks = np.arange(size, dtype=float)
-    x = (share.sum(axis=1) @ ticks) / area
-    y = (share.sum(axis=2) @ ticks) / area
-    dx, dy = ticks - x[:, None], ticks - y[:, None]
-    spread = np.empty((n, 2, 2))
-    spread[:, 0, 0] = np.einsum("nyx,nx->n", share, dx**2) / area
-    spread[:, 1, 1] = np.einsum("nyx,ny->n", share, dy**2) / area
-    spread[:, 0, 1] = spread[:, 1, 0] = np.einsum("nyx,nx,ny->n", share, dx, dy) / area
-    return ground, contrast, area, np.stack([x, y], axis=1), spread
-
-
-def _centre_on_spot(windows: NDArray, fit_size: int) -> tuple[Array, NDArray[np.integer]]:
-    """The fit_size part (n, fit_size, fit_size) of each window around its bright spot, and its corner (n, 2)."""
-    values = windows.astype(float)
-    size = values.shape[1]
-    centroid = _moments(values)[3]
-    corners = np.clip(np.rint(centroid - 0.5 * (fit_size - 1)).astype(int), 0, size - fit_size)
-    ticks = np.arange(fit_size)
-    rows, columns = corners[:, 1, None] + ticks, corners[:, 0, None] + ticks
-    return values[np.arange(len(values))[:, None, None], rows[:, :, None], columns[:, None, :]], corners
-
-
-def _start(windows: Array) -> Array:
-    """First parameters (n, 7) from the moments; a uniform ellipse has spread A A / 4."""
-    ground, contrast, _, centroid, spread = _moments(windows)
-    values, vectors = np.linalg.eigh(spread)
-    radii = np.clip(2.0 * np.sqrt(np.maximum(values, 0.0)), 1.2, 0.5 * windows.shape[1])
-    shape = (vectors * radii[:, None, :]) @ vectors.transpose(0, 2, 1)
-    return np.column_stack([centroid, shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1], contrast, ground])
-
-
-def _ring_mask(parameters: Array, size: int) -> Array:
-    """1 where a pixel lies within the dark ring, else 0 (n, size, size)."""
-    ticks = np.arange(size, dtype=float)
-    inverse = np.linalg.inv(_shape(parameters))[..., None, None]
-    x = ticks[None, None, :] - parameters[:, 0, None, None]
-    y = ticks[None, :, None] - parameters[:, 1, None, None]
-    reach = (inverse[:, 0, 0] * x + inverse[:, 0, 1] * y) ** 2 + (inverse[:, 1, 0] * x + inverse[:, 1, 1] * y) ** 2
-    return (reach < RING_REACH**2).astype(float)
-
-
-def _bounded(parameters: Array, size: int) -> Array:
-    """Parameters kept where the model is defined: centre in the window, radii between limits."""
-    bounded = parameters.copy()
-    bounded[:, :2] = np.clip(parameters[:, :2], 0.0, size - 1.0)
-    values, vectors = np.linalg.eigh(_shape(parameters))
-    values = np.clip(values, SMALLEST_RADIUS_PX, float(size))
-    shape = (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)
-    bounded[:, 2:5] = np.column_stack([shape[:, 0, 0], shape[:, 0, 1], shape[:, 1, 1]])
-    return bounded
-
-
-def _inside(parameters: Array, size: int) -> NDArray[np.bool_]:
+def _inside(centres: Array, shapes: Array, size: int) -> NDArray[np.bool_]:
     """Whether the whole ellipse lies inside the window and is larger than the smallest one."""
-    shape = _shape(parameters)
-    reach = np.linalg.norm(shape, axis=2)  # half extent along x and y
-    centre = parameters[:, :2]
-    return np.all((centre - reach > -0.5) & (centre + reach < size - 0.5), axis=1) & (
-        np.linalg.eigvalsh(shape)[:, 0] > 1.01 * SMALLEST_RADIUS_PX)
+    reach = np.linalg.norm(shapes, axis=2)  # half extent along x and y
+    inside = np.all((centres - reach > -0.5) & (centres + reach < size - 0.5), axis=1)
+    mean = 0.5 * (shapes[:, 0, 0] + shapes[:, 1, 1])
+    smallest = mean - np.hypot(0.5 * (shapes[:, 0, 0] - shapes[:, 1, 1]), shapes[:, 0, 1])
+    return inside & (smallest > 1.01 * SMALLEST_RADIUS_PX)

@@ -36,7 +36,7 @@ def test_shares_match_brute_force_integration(psf_px):
     centres, shapes = random_ellipses(np.random.default_rng(0), 3)
     shares, _ = blurred_coverage(centres, shapes, SIZE, psf_px)
     for centre, shape, share in zip(centres, shapes, shares, strict=True):
-        np.testing.assert_allclose(share, integrated(centre, shape, psf_px), atol=1e-8)
+        np.testing.assert_allclose(share, integrated(centre, shape, psf_px), atol=2e-7)
 
 
 @pytest.mark.parametrize("psf_px", [0.05, 0.4, 1.0])
@@ -44,9 +44,9 @@ def test_shares_match_brute_force_integration(psf_px):
 def test_all_light_is_kept_however_narrow_and_small(psf_px, radii):
     centres, shapes = random_ellipses(np.random.default_rng(1), 5, radii)
     shares, _ = blurred_coverage(centres + 0.5 * SIZE, shapes, 2 * SIZE, psf_px)
-    np.testing.assert_allclose(shares.sum(axis=(1, 2)), np.pi * np.prod(radii), rtol=1e-7)
-    assert shares.min() > -1e-7
-    assert shares.max() < 1.0 + 1e-7
+    np.testing.assert_allclose(shares.sum(axis=(1, 2)), np.pi * np.prod(radii), rtol=1e-6)
+    assert shares.min() > -1e-6
+    assert shares.max() < 1.0 + 1e-6
 
 
 @pytest.mark.parametrize("parameter", range(5))
@@ -61,7 +61,7 @@ def test_derivatives_match_finite_differences(parameter):
         else:
             s += sign * SHAPE_BASIS[parameter - 2]
         moved.append(blurred_coverage(c, s, SIZE, 0.5)[0])
-    np.testing.assert_allclose(derivatives[..., parameter], (moved[0] - moved[1]) / 2e-5, atol=2e-7)
+    np.testing.assert_allclose(derivatives[..., parameter], (moved[0] - moved[1]) / 2e-5, atol=1e-6)
 
 
 def test_fit_of_blurred_windows_reaches_its_own_covariance_and_has_no_bias():

@@ -1,0 +1,100 @@
+"""Exact share of each pixel that an ellipse covers, in plain numpy: the oracle of the compiled one.
+
+An ellipse is the image of the unit disc: centre c (2,) plus A (2,2) symmetric, in px. Seen from the disc, a pixel
+is a small parallelogram; the area they share is a sum over the parallelogram's sides (Green's theorem), each side
+giving two circle sectors and the triangle over its part inside the disc. A change of c or A moves the boundary with a
+velocity v(x) = dc + dA A^-1 (x - c), and by the transport theorem
+
+    d|disc and pixel| = integral of div v over the shared area - flux of v through the pixel's sides inside the disc,
+
+where v is linear along a side, so that its value at the middle of the part inside is exact.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.pose import Array
+
+SHAPE_BASIS = np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
+SHAPE_BASIS.setflags(write=False)
+
+
+def coverage(centres: Array, shapes: Array, size: int) -> tuple[Array, Array]:
+    """Coverage (n, size, size), 0 to 1, and its derivatives (n, size, size, 5) by [c_x, c_y, A_xx, A_xy, A_yy].
+
+    Parameters: centres (n, 2) px, where (0, 0) is the middle of the window's first pixel; shapes (n, 2, 2) px,
+    symmetric and positive definite; size: window side in px.
+    """
+    inverse = np.asarray(np.linalg.inv(shapes), dtype=np.float64)
+    across_x, across_y = _all_sides(centres, inverse, size)
+    area = _area(shapes, across_x, across_y)
+    derivatives = np.empty((*area.shape, 5))
+    derivatives[..., 0] = across_y.length[:, :, :-1] - across_y.length[:, :, 1:]
+    derivatives[..., 1] = across_x.length[:, :-1] - across_x.length[:, 1:]
+    for k, basis in enumerate(SHAPE_BASIS):
+        gradient = basis @ inverse  # dA A^-1, (n, 2, 2)
+        flux_y = across_x.length * across_x.velocity(gradient[:, 1])
+        flux_x = across_y.length * across_y.velocity(gradient[:, 0])
+        divergence = np.trace(gradient, axis1=1, axis2=2)[:, None, None]
+        derivatives[..., 2 + k] = (divergence * area - flux_y[:, 1:] + flux_y[:, :-1]
+                                   - flux_x[:, :, 1:] + flux_x[:, :, :-1])
+    return area, derivatives
+
+
+def covered_area(centres: Array, shapes: Array, size: int) -> Array:
+    """Coverage (n, size, size) as ``coverage`` gives it, without derivatives."""
+    return _area(shapes, *_all_sides(centres, np.asarray(np.linalg.inv(shapes)), size))
+
+
+def _all_sides(centres: Array, inverse: NDArray[np.floating], size: int) -> tuple[_Sides, _Sides]:
+    """Sides along x, indexed (n, line y, pixel x), and along y (n, pixel y, line x)."""
+    ticks = np.arange(size + 1) - 0.5
+    along = np.arange(size) - 0.5
+    return (_Sides(inverse, along[None, :] - centres[:, :1], ticks[None, :] - centres[:, 1:], axis=0),
+            _Sides(inverse, ticks[None, :] - centres[:, :1], along[None, :] - centres[:, 1:], axis=1))
+
+
+def _area(shapes: Array, across_x: _Sides, across_y: _Sides) -> Array:
+    area = across_x.area[:, :-1] - across_x.area[:, 1:] + across_y.area[:, :, 1:] - across_y.area[:, :, :-1]
+    area *= np.linalg.det(shapes)[:, None, None]
+    return area
+
+
+class _Sides:
+    """All pixel sides along one axis: shared area of each (in disc units) and the part that lies inside the disc."""
+
+    def __init__(self, inverse: NDArray[np.floating], x: Array, y: Array, axis: int) -> None:
+        n = len(inverse)
+        self._x, self._y, self._axis = x[:, None, :], y[:, :, None], axis
+        m = inverse[:, :, :, None, None]
+        start_x = m[:, 0, 0] * self._x + m[:, 0, 1] * self._y
+        start_y = m[:, 1, 0] * self._x + m[:, 1, 1] * self._y
+        step_x, step_y = (inverse[:, i, axis].reshape(n, 1, 1) for i in (0, 1))
+        start2 = start_x * start_x + start_y * start_y
+        dot = start_x * step_x + start_y * step_y
+        cross = start_x * step_y - start_y * step_x
+        step2 = step_x * step_x + step_y * step_y
+        enter, leave = _inside_part(start2, dot, step2)
+        self.length = leave - enter
+        self._middle = 0.5 * (enter + leave)
+        sectors = np.arctan2(enter * cross, start2 + enter * dot)
+        to_end = start2 + (1.0 + leave) * dot + leave * step2
+        sectors += np.arctan2((1.0 - leave) * cross, to_end)
+        self.area = 0.5 * (sectors + self.length * cross)
+
+    def velocity(self, row: Array) -> Array:
+        """``row . (x - c)`` at the middle of each side's part inside the disc; ``row`` (n, 2)."""
+        x = self._x + self._middle if self._axis == 0 else self._x
+        y = self._y + self._middle if self._axis == 1 else self._y
+        return row[:, 0, None, None] * x + row[:, 1, None, None] * y
+
+
+def _inside_part(start2: Array, dot: Array, step2: Array) -> tuple[Array, Array]:
+    """Where the side start + t step, t in [0, 1], enters and leaves the unit disc (equal when it stays outside)."""
+    discriminant = dot * dot - step2 * (start2 - 1.0)
+    root = np.sqrt(np.maximum(discriminant, 0.0))
+    enter = np.clip((-dot - root) / step2, 0.0, 1.0)
+    leave = np.clip((-dot + root) / step2, 0.0, 1.0)
+    return enter, leave
