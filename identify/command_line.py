@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table as RichTable
 
+from identify.acceptance_command import acceptance
 from identify.base_parameters_command import base_parameters
 from identify.detectors_command import detectors
 from identify.engine_commands import export, verify_model
@@ -48,6 +49,10 @@ The model in other engines:
 \b
 How well the stickers are found:
   cmmsim detectors                       detectors beside the Cramer-Rao bound
+
+\b
+The sensor alone, tested like a real instrument:
+  cmmsim acceptance                      lengths, moving bar, latency: acceptance.md
 
 \b
 Where the robot can go:
@@ -190,6 +195,7 @@ app.command("verify-model")(verify_model)
 app.add_typer(export, name="export")
 app.command()(detectors)
 app.command()(workspace)
+app.command()(acceptance)
 app.command()(base_parameters)
 
 

@@ -1,0 +1,131 @@
+"""Length measurement error in the style of VDI/VDE 2634-1.
+
+On each measuring line stands an artefact with a row of six stickers; the distances of five of them from the first are
+the test lengths. A length is the mean of a few exposures of the standing artefact; its error is the measured length
+less the certified one, and its magnitude must stay within a limit. Sphere form and spacing are not tested: the targets
+are flat stickers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..pose import Array
+from ..sensor import Sensor
+from ..sensor_file import Platform
+from .artefact import StickerRow, board, facing_rotation
+from .artefact_sensor import SensorUnderTest, estimator_of, locate, observe_stickers, pose_in_base
+from .errors import AcceptanceError
+from .measuring_lines import MeasuringLine, seven_lines
+from .volume import MeasuringVolume
+
+STREAM = 1
+EXPOSURES = 5  # of the standing artefact, whose lengths are averaged
+# irregular stickers by which the artefact is recognised, in shares of the longest length from its middle
+RECOGNITION_B, RECOGNITION_C = (-0.37, -0.08, 0.31), (-0.29, 0.13, 0.4)
+RECOGNITION_ACROSS = (0.044, 0.025, 0.040)
+
+
+@dataclass(frozen=True)
+class MeasuredLength:
+    """line: its name; true: certified length, m; measured (k,): the length in each of k exposures, m; std: stated
+    standard deviation of one exposure's length, m."""
+
+    line: str
+    true: float
+    measured: Array
+    std: float
+
+    @property
+    def error(self) -> float:
+        """Length measurement error E: mean of the exposures less the certified length, m."""
+        return float(self.measured.mean()) - self.true
+
+
+@dataclass(frozen=True)
+class LengthTest:
+    """volume, the seven lines, and all measured lengths."""
+
+    volume: MeasuringVolume
+    lines: tuple[MeasuringLine, ...]
+    lengths: tuple[MeasuredLength, ...]
+
+    @property
+    def errors(self) -> Array:
+        """All length measurement errors E (n,), m."""
+        return np.array([length.error for length in self.lengths])
+
+    @property
+    def single_errors(self) -> Array:
+        """Errors (n,k) of the lengths in single exposures, m."""
+        return np.array([length.measured - length.true for length in self.lengths])
+
+    @property
+    def largest(self) -> MeasuredLength:
+        """The length with the largest error."""
+        return max(self.lengths, key=lambda length: abs(length.error))
+
+    @property
+    def variance_ratio(self) -> float:
+        """Mean square of single exposures' errors in units of their stated variance; 1 when that one is true."""
+        stds = np.array([length.std for length in self.lengths])
+        return float(np.mean((self.single_errors / stds[:, None]) ** 2))
+
+    def of_line(self, name: str) -> tuple[MeasuredLength, ...]:
+        """The measured lengths of one line."""
+        return tuple(length for length in self.lengths if length.line == name)
+
+
+def length_artefact(line: MeasuringLine) -> Platform:
+    """The artefact of a line: six stickers in a row on side A, the first at the line's start."""
+    longest = float(line.lengths.max())
+    along = np.concatenate([[0.0], line.lengths]) - 0.5 * longest
+    return board(StickerRow(along, np.zeros(len(along))),
+                 StickerRow(longest * np.array(RECOGNITION_B), RECOGNITION_ACROSS),
+                 StickerRow(longest * np.array(RECOGNITION_C), RECOGNITION_ACROSS))
+
+
+def length_test(under_test: SensorUnderTest, volume: MeasuringVolume, exposures: int = EXPOSURES,
+                advance: Callable[[], None] = lambda: None) -> LengthTest:
+    """Measure five lengths on each of the seven lines of a volume; ``advance`` is called after each line.
+
+    Raises AcceptanceError when a line breaks a rule or a sticker is not measured.
+    """
+    lines = seven_lines(volume)
+    lengths: list[MeasuredLength] = []
+    for number, line in enumerate(lines):
+        sensor = under_test.facing(length_artefact(line), STREAM + number)
+        lengths += measure_line(sensor, volume, line, exposures)
+        advance()
+    return LengthTest(volume, lines, tuple(lengths))
+
+
+def measure_line(sensor: Sensor, volume: MeasuringVolume, line: MeasuringLine, exposures: int) -> list[MeasuredLength]:
+    """The lengths of one line, whose artefact the sensor faces, from ``exposures`` pictures."""
+    rotation = facing_rotation(line.direction, np.array([0.0, 0.0, -1.0]))
+    pose = pose_in_base(volume.base_from_volume, rotation, 0.5 * (line.start + line.end))
+    estimator = estimator_of(sensor, sensor.platform)
+    expected = locate(estimator, sensor.look(pose))
+    count = 1 + len(line.lengths)  # the row comes first among the stickers
+    values, stds = np.empty((exposures, len(line.lengths))), np.empty((exposures, len(line.lengths)))
+    for k in range(exposures):
+        seen = observe_stickers(estimator, sensor.look(pose), expected)
+        missing = np.setdiff1d(np.arange(count), seen.index)
+        if len(missing):
+            names = ", ".join(sensor.platform.sticker_ids[missing])
+            raise AcceptanceError(f"line {line.name}: stickers {names} are not measured by both cameras")
+        values[k], stds[k] = lengths_from_first(seen.points[:count], seen.covariances[:count])
+    return [MeasuredLength(line.name, float(true), value, float(np.sqrt(np.mean(std**2))))
+            for true, value, std in zip(line.lengths, values.T, stds.T, strict=True)]
+
+
+def lengths_from_first(points: Array, covariances: Array) -> tuple[Array, Array]:
+    """Distances (n-1,) m of points (n,3) from the first, and their standard deviations from covariances (n,3,3)."""
+    steps = points[1:] - points[0]
+    lengths = np.linalg.norm(steps, axis=1)
+    directions = steps / lengths[:, None]
+    variances = np.einsum("ni,nij,nj->n", directions, covariances[1:] + covariances[0], directions)
+    return lengths, np.sqrt(variances)

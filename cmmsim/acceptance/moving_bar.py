@@ -1,0 +1,158 @@
+"""Relative pose error of a moving rigid bar in the style of ASTM E3064-16.
+
+The sensor measures the poses of the clusters at both ends in the same exposure. What the second is to the first is
+certified; the difference to what was measured is the error, of a bar that stands and of one that moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..measurement import Measurement
+from ..pose import Array, euler_rates_matrix, pose_to_transform, rotation_log, skew
+from ..sensor import Sensor
+from ..tracking import Tracker
+from .artefact_sensor import SensorUnderTest, estimator_of, locate, relative_pose
+from .bar import END_FROM_END, bar_ends, rigid_bar
+from .bar_paths import SECONDS, BarPath, bar_paths
+from .errors import AcceptanceError
+from .volume import MeasuringVolume
+
+STREAM = 101
+STANDING = 15  # exposures of the standing bar before each run
+GIVEN_UP = 5  # frames lost in a row end a run: each costs a search of whole images, and the rest would be lost as well
+
+
+@dataclass(frozen=True)
+class BarRun:
+    """One run of the bar. Before it moves, time is negative.
+
+    time (n,) s of the measured frames; errors (n,6) of the relative pose, [shift, turn] in axes of the first end, m
+    and rad; distance_errors (n,) of the ends' distance, m; variance_ratios (n,): squared error in units of the stated
+    covariance, over its six dimensions; lost: frames in which an end was not measured; given_up: why the run was ended
+    after GIVEN_UP of them in a row, its other frames being counted as lost too.
+    """
+
+    name: str
+    time: Array
+    errors: Array
+    distance_errors: Array
+    variance_ratios: Array
+    lost: int
+    given_up: str = ""
+
+    @property
+    def moving(self) -> NDArray[np.bool_]:
+        """Which of the frames (n,) show the moving bar."""
+        return self.time >= 0.0
+
+
+@dataclass(frozen=True)
+class BarTest:
+    """volume and the runs in it; exposure s; largest_speed of the bar's middle, m/s."""
+
+    volume: MeasuringVolume
+    runs: tuple[BarRun, ...]
+    exposure: float
+    largest_speed: float
+
+    @property
+    def frames(self) -> int:
+        """Measured and lost frames of all runs."""
+        return sum(len(run.time) + run.lost for run in self.runs)
+
+    @property
+    def lost(self) -> int:
+        """Lost frames of all runs."""
+        return sum(run.lost for run in self.runs)
+
+    def errors(self, moving: bool) -> Array:
+        """Errors (n,6) [m, rad] of the moving or of the standing bar in all runs."""
+        return np.concatenate([run.errors[run.moving == moving] for run in self.runs])
+
+    def distance_errors(self, moving: bool) -> Array:
+        """Errors (n,) [m] of the ends' distance of the moving or of the standing bar in all runs."""
+        return np.concatenate([run.distance_errors[run.moving == moving] for run in self.runs])
+
+    @property
+    def variance_ratio(self) -> float:
+        """Mean squared error in units of the stated covariance; 1 when that one is true."""
+        return float(np.concatenate([run.variance_ratios for run in self.runs]).mean())
+
+
+def bar_test(under_test: SensorUnderTest, volume: MeasuringVolume, seconds: float = SECONDS, standing: int = STANDING,
+             advance: Callable[[], None] = lambda: None) -> BarTest:
+    """Move the bar along the six paths of a volume; ``advance`` is called after each.
+
+    seconds: of motion that are measured, from the start of each path. Raises AcceptanceError when the bar does not
+    find room or is not found in the first images.
+    """
+    sensor = under_test.facing(rigid_bar(), STREAM)
+    rate = sensor.timing.frame_rate
+    times = np.arange(-standing, int(np.ceil(seconds * rate))) / rate
+    paths, runs = bar_paths(volume), []
+    for number, path in enumerate(paths):
+        sensor.start_run(under_test.seed + 1000 * (STREAM + number))
+        runs.append(bar_run(sensor, path, times))
+        advance()
+    return BarTest(volume, tuple(runs), sensor.timing.exposure, max(path.largest_speed for path in paths))
+
+
+def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
+    """Measure the bar at ``times`` (n,) s of a path; it stands still before time 0."""
+    estimators = [estimator_of(sensor, end) for end in bar_ends(sensor.platform)]
+    for estimator in estimators:
+        locate(estimator, sensor.look(path.pose(0.0)))
+    trackers = [Tracker(estimator) for estimator in estimators]
+    rows: list[tuple[Array, float, float]] = []
+    seen: list[float] = []
+    in_a_row, reason = 0, ""
+    for time in times:
+        images = sensor.look(path.pose(max(time, 0.0)), pose_rate=path.pose_rate(time) if time > 0.0 else None)
+        first, second = (tracker.measure(images) for tracker in trackers)
+        if first.ok and second.ok:
+            in_a_row = 0
+            seen.append(time)
+            rows.append(relative_error(first, second))
+        else:
+            in_a_row, reason = in_a_row + 1, first.reason or second.reason
+            if in_a_row == GIVEN_UP:
+                break
+    if not (np.any(np.array(seen) < 0.0) and np.any(np.array(seen) >= 0.0)):
+        raise AcceptanceError(f"{path.name}: no frame of the standing or none of the moving bar is measured: {reason}")
+    errors, distances, ratios = (np.array(column) for column in zip(*rows, strict=True))
+    return BarRun(path.name, np.array(seen), errors, distances, ratios, len(times) - len(seen),
+                  reason if in_a_row == GIVEN_UP else "")
+
+
+def relative_error(first: Measurement, second: Measurement) -> tuple[Array, float, float]:
+    """Error (6,) of the second end's pose relative to the first one's, in axes of the first; error of their distance;
+    squared error in units of the stated covariance, over six."""
+    measured = relative_pose(first.pose, second.pose)
+    turn = rotation_log(measured[:3, :3] @ END_FROM_END[:3, :3].T)
+    error = np.concatenate([measured[:3, 3] - END_FROM_END[:3, 3], turn])
+    distance = float(np.linalg.norm(measured[:3, 3]) - np.linalg.norm(END_FROM_END[:3, 3]))
+    covariance = relative_covariance(first, second)
+    return error, distance, float(error @ np.linalg.solve(covariance, error)) / 6.0
+
+
+def relative_covariance(first: Measurement, second: Measurement) -> Array:
+    """Covariance (6,6) of the small error [shift, turn] of the relative pose, in axes of the first end."""
+    step = second.pose[:3] - first.pose[:3]
+    by_first = -np.eye(6)
+    by_first[:3, 3:] = skew(step)
+    back = np.zeros((6, 6))
+    back[:3, :3] = back[3:, 3:] = pose_to_transform(first.pose)[:3, :3].T
+    total = by_first @ _small_covariance(first) @ by_first.T + _small_covariance(second)
+    return np.asarray(back @ total @ back.T)
+
+
+def _small_covariance(measurement: Measurement) -> Array:
+    """Covariance (6,6) of the small error [shift, turn] of a pose, instead of its Euler angles."""
+    turn = np.eye(6)
+    turn[3:, 3:] = euler_rates_matrix(measurement.pose)
+    return np.asarray(turn @ measurement.covariance @ turn.T)

@@ -1,0 +1,121 @@
+"""The measuring volume: a cuboid around the point that both cameras look at, wholly seen by both.
+
+Volume axes are x to the right and y downwards as the rig sees them, and z away from it along the line from the middle
+of the baseline to the target; the origin is the target.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from ..pose import Array, apply, invert
+from ..rig_from_file import rig_from_file
+from ..sensor_file import Rig
+from ..stereo_rig import StereoRig
+from .errors import AcceptanceError
+
+MARGIN_PX = 40.0  # the corners stay this far inside the images: room for the width of the artefacts
+LARGEST_SHARE = 0.8  # the front face stays beyond a fifth of the way from the baseline to the target
+SMALLEST_SIZE = 0.1  # m; below, the stickers of an artefact do not find room
+CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
+CORNERS.setflags(write=False)
+
+
+@dataclass(frozen=True)
+class MeasuringVolume:
+    """base_from_volume (4,4) with the origin in the middle; size (3,) m along x, y, z; distance of the middle from the
+    middle of the baseline, m."""
+
+    base_from_volume: Array
+    size: Array
+    distance: float
+
+    def __post_init__(self) -> None:
+        if self.size.shape != (3,) or not np.all(np.isfinite(self.size)) or self.size.min() < SMALLEST_SIZE:
+            raise AcceptanceError(f"measuring volume {self}: three sides of at least {1e3 * SMALLEST_SIZE:.0f} mm "
+                                  "are needed")
+        self.base_from_volume.setflags(write=False)
+        self.size.setflags(write=False)
+
+    def __str__(self) -> str:
+        return " x ".join(f"{1e3 * side:.0f}" for side in np.ravel(self.size)) + " mm"
+
+    @property
+    def diagonal(self) -> float:
+        """Space diagonal, m."""
+        return float(np.linalg.norm(self.size))
+
+    @property
+    def depth_range(self) -> tuple[float, float]:
+        """Nearest and furthest distance of the volume from the baseline along its z axis, m."""
+        return self.distance - 0.5 * float(self.size[2]), self.distance + 0.5 * float(self.size[2])
+
+
+def common_volume(place: Rig) -> MeasuringVolume:
+    """The largest cube around the target of a sensor file's rig that both its cameras see whole, MARGIN_PX from the
+    edges of their images. Raises AcceptanceError when nothing is seen."""
+    rig, camera_from_base = rig_from_file(place)
+    frame, distance = _volume_frame(rig, camera_from_base, place)
+    low, high = 0.0, 2.0 * LARGEST_SHARE * distance
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        if _unseen(rig, camera_from_base @ frame, np.full(3, middle), distance) is None:
+            low = middle
+        else:
+            high = middle
+    if low < SMALLEST_SIZE:
+        raise AcceptanceError(f"nothing is visible to both cameras around their target: the largest common cube has "
+                              f"sides of {1e3 * low:.1f} mm, at least {1e3 * SMALLEST_SIZE:.0f} mm are needed")
+    return MeasuringVolume(frame, np.full(3, np.floor(1e3 * low) / 1e3), distance)
+
+
+def volume_of_size(place: Rig, size: Array) -> MeasuringVolume:
+    """The cuboid of ``size`` (3,) m around the target of a sensor file's rig.
+
+    Raises AcceptanceError naming a corner that is not seen, and the largest cube that is.
+    """
+    rig, camera_from_base = rig_from_file(place)
+    frame, distance = _volume_frame(rig, camera_from_base, place)
+    volume = MeasuringVolume(frame, np.array(size, dtype=float), distance)
+    hidden = _unseen(rig, camera_from_base @ frame, volume.size, distance)
+    if hidden is not None:
+        largest = 1e3 * common_volume(place).size[0]
+        raise AcceptanceError(f"measuring volume {volume} is not wholly visible to both cameras: {hidden}; the largest "
+                              f"cube that is has sides of {largest:.0f} mm")
+    return volume
+
+
+def _volume_frame(rig: StereoRig, camera_from_base: Array, place: Rig) -> tuple[Array, float]:
+    """base_from_volume (4,4), x along the baseline, and the distance of the target from the middle of it, m."""
+    centres = [invert(move @ camera_from_base)[:3, 3] for move in rig.from_camera]
+    view = np.array(place.target) - 0.5 * (centres[0] + centres[1])
+    distance = float(np.linalg.norm(view))
+    z = view / distance
+    x = (centres[1] - centres[0]) - ((centres[1] - centres[0]) @ z) * z
+    x /= np.linalg.norm(x)
+    frame = np.eye(4)
+    frame[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    frame[:3, 3] = place.target
+    return frame, distance
+
+
+def _unseen(rig: StereoRig, camera_from_volume: Array, size: Array, distance: float) -> str | None:
+    """Which corner of a cuboid which camera does not see, in words; None when both see all of them."""
+    corners = CORNERS * size
+    if 0.5 * size[2] > LARGEST_SHARE * distance:
+        return f"its front face comes within {1e3 * (distance - 0.5 * size[2]):.0f} mm of the cameras"
+    points = apply(camera_from_volume, corners)
+    pixels, valid = rig.project(points)
+    for camera, name, spots, ahead in zip(rig.cameras, ("left", "right"), pixels, valid, strict=True):
+        inside = ahead & np.all((spots >= MARGIN_PX) & (spots <= (camera.width - 1 - MARGIN_PX,
+                                                                  camera.height - 1 - MARGIN_PX)), axis=1)
+        if not inside.all():
+            k = int(np.flatnonzero(~inside)[0])
+            corner = ", ".join(f"{1e3 * v:+.0f}" for v in corners[k])
+            x, y = spots[k]
+            return (f"the corner ({corner}) mm is at pixel ({x:.0f}, {y:.0f}) of the {name} camera, whose image has "
+                    f"{camera.width} x {camera.height} px and {MARGIN_PX:.0f} px of margin")
+    return None

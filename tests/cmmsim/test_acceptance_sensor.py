@@ -1,0 +1,152 @@
+"""The tests on rendered images: what they find against closed forms and against the stated noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cmmsim.acceptance import (
+    AcceptanceError,
+    SensorUnderTest,
+    bar_paths,
+    common_volume,
+    latency_test,
+    length_test,
+    seven_lines,
+)
+from cmmsim.acceptance.bar import rigid_bar
+from cmmsim.acceptance.length_test import length_artefact, lengths_from_first, measure_line
+from cmmsim.acceptance.moving_bar import bar_run, relative_covariance, relative_error
+from cmmsim.measurement import Measurement
+from cmmsim.pose import apply, rotation_exp, transform_to_pose
+from cmmsim.rig_from_file import rig_from_file
+from cmmsim.sensor_file import read_sensor_file
+
+FILE = read_sensor_file("ctrack780")
+SILENT = FILE.model_copy(update={"camera": FILE.camera.model_copy(update={"noise": False})})
+
+
+@pytest.fixture(scope="module")
+def volume():
+    return common_volume(FILE.rig)
+
+
+def test_noise_free_lengths_are_right_to_two_microns(volume):
+    found = length_test(SensorUnderTest(SILENT, 0, "analytic"), volume, exposures=1)
+    assert len(found.lengths) == 35
+    assert np.abs(found.errors).max() < 2e-6
+
+
+def test_length_errors_are_as_large_as_stated(volume):
+    """105 lengths of three exposures: their squares against the stated variances, and the mean is no bias."""
+    found = length_test(SensorUnderTest(FILE, 1, "analytic"), volume, exposures=3)
+    assert 0.65 < found.variance_ratio < 1.4
+    errors, stds = found.errors, np.array([length.std for length in found.lengths]) / np.sqrt(3.0)
+    assert abs(errors.mean()) < 4.0 * np.sqrt(np.mean(stds**2) / 7.0)  # the lengths of a line share a sticker
+    assert abs(found.largest.error) == np.abs(errors).max() < 50e-6
+
+
+def test_shifted_camera_gives_the_lengths_that_linearised_triangulation_predicts(volume):
+    """0.1 px in the right image: the points move by the pseudo-inverse of the projection's derivative.
+
+    On the front face the stickers look at the rig, so that all pixels weigh the same.
+    """
+    line = seven_lines(volume)[4]
+    shift = 0.1
+    errors = {}
+    for moved in (0.0, shift):
+        sensor = SensorUnderTest(SILENT, 0, "analytic").facing(length_artefact(line), 1)
+        sensor.shift_camera(1, (moved, 0.0))
+        errors[moved] = np.array([length.error for length in measure_line(sensor, volume, line, 1)])
+    rig, camera_from_base = rig_from_file(FILE.rig)
+    row = line.start + np.concatenate([[0.0], line.lengths])[:, None] * line.direction
+    points = apply(camera_from_base @ volume.base_from_volume, row)
+    steps = []
+    for point in points:
+        jacobian = np.vstack([(rig.project(point + step)[0] - rig.project(point - step)[0]).ravel() / 2e-6
+                              for step in 1e-6 * np.eye(3)]).T
+        steps.append(np.linalg.pinv(jacobian) @ [0.0, 0.0, shift, 0.0])
+    towards = (points[-1] - points[0]) / np.linalg.norm(points[-1] - points[0])
+    predicted = (np.array(steps[1:]) - steps[0]) @ towards
+    assert np.abs(predicted).max() > 20e-6
+    np.testing.assert_allclose(errors[shift] - errors[0.0], predicted, rtol=0.02, atol=1e-6)
+
+
+def test_lengths_and_their_deviations_by_hand():
+    points = np.array([[0.0, 0.0, 1.0], [3.0, 4.0, 1.0], [0.0, 0.0, 3.0]])
+    covariances = np.array([np.diag([1.0, 4.0, 9.0])] * 3)
+    lengths, stds = lengths_from_first(points, covariances)
+    np.testing.assert_allclose(lengths, [5.0, 2.0])
+    np.testing.assert_allclose(stds, np.sqrt([2 * (0.36 * 1.0 + 0.64 * 4.0), 2 * 9.0]))
+
+
+def pose_measurement(transform, covariance=None):
+    return Measurement(transform_to_pose(transform), np.eye(6) if covariance is None else covariance, np.zeros((0, 3)),
+                       np.zeros((0, 3, 3)), np.zeros((0, 2)), np.zeros((0, 2)), np.array([], dtype=str), True)
+
+
+def test_relative_error_of_known_poses():
+    """The second end 10 um too far along x and turned by 1 mrad about z, wherever the bar is."""
+    bar = np.eye(4)
+    bar[:3, :3], bar[:3, 3] = rotation_exp(np.array([0.3, -0.2, 1.1])), [0.2, -0.1, 1.5]
+    second = np.eye(4)
+    second[:3, :3], second[0, 3] = rotation_exp(np.array([0.0, 0.0, 1e-3])), 0.30001
+    error, distance, _ = relative_error(pose_measurement(bar), pose_measurement(bar @ second))
+    np.testing.assert_allclose(error, [1e-5, 0, 0, 0, 0, 1e-3], atol=1e-12)
+    assert distance == pytest.approx(1e-5)
+
+
+def test_relative_covariance_against_sampling():
+    """Poses with drawn errors: the spread of the relative pose is the predicted one."""
+    rng = np.random.default_rng(5)
+    first, second = np.eye(4), np.eye(4)
+    first[:3, :3], first[:3, 3] = rotation_exp(np.array([0.2, 0.4, -0.3])), [0.1, 0.2, 1.4]
+    second[:3, :3] = first[:3, :3]
+    second[:3, 3] = first[:3, 3] + first[:3, :3] @ [0.3, 0.0, 0.0]
+    root = np.diag([1e-5, 2e-5, 3e-5, 1e-4, 2e-4, 3e-4]) @ (np.eye(6) + 0.3 * rng.standard_normal((6, 6)))
+    poses = [transform_to_pose(t) for t in (first, second)]
+    measured = [pose_measurement(t, root @ root.T) for t in (first, second)]
+    draws = []
+    for _ in range(4000):
+        drawn = [replace(m, pose=pose + root @ rng.standard_normal(6)) for m, pose in zip(measured, poses, strict=True)]
+        draws.append(relative_error(*drawn)[0])
+    whitened = np.linalg.solve(np.linalg.cholesky(relative_covariance(*measured)), np.array(draws).T)
+    np.testing.assert_allclose(np.cov(whitened), np.eye(6), atol=0.12)
+
+
+def test_standing_and_moving_bar_have_the_stated_errors(volume):
+    sensor = SensorUnderTest(FILE, 3, "analytic").facing(rigid_bar(), 1)
+    found = bar_run(sensor, bar_paths(volume)[3], np.arange(-10, 40) / 60.0)
+    assert found.lost == 0
+    assert found.moving.sum() == 40
+    assert 0.75 < found.variance_ratios.mean() < 1.3
+    assert np.sqrt(np.mean(found.distance_errors**2)) < 8e-6
+    assert np.sqrt(np.mean(found.errors[:, :3]**2)) < 60e-6
+
+
+def test_same_seed_same_numbers(volume):
+    line = seven_lines(volume)[4]
+    runs = [[length.error for length in measure_line(SensorUnderTest(FILE, seed, "analytic").facing(
+        length_artefact(line), 1), volume, line, 1)] for seed in (0, 0, 1)]
+    assert runs[0] == runs[1]
+    assert runs[0] != runs[2]
+
+
+@pytest.mark.parametrize("latency", [0.0142])
+def test_latency_of_the_sensor_file_is_found_from_images(volume, latency):
+    timing = FILE.timing.model_copy(update={"latency": latency})
+    under_test = SensorUnderTest(FILE.model_copy(update={"timing": timing}), 0, "analytic")
+    found = latency_test(under_test, volume, frames=60)
+    assert found.lost == 0
+    assert found.stated == latency
+    low, high = found.latency.interval
+    assert low <= latency <= high
+    assert high - low < 5e-6
+    assert found.latency.std == pytest.approx(found.latency.resolution, rel=0.3)
+
+
+def test_artefact_that_cannot_be_measured_is_named(volume):
+    """Cameras that see nothing but darkness."""
+    dark = FILE.model_copy(update={"stickers": FILE.stickers.model_copy(update={"sticker_level": 10})})
+    with pytest.raises(AcceptanceError, match="is not found in the images"):
+        length_test(SensorUnderTest(dark, 0, "analytic"), volume)
