@@ -21,8 +21,7 @@ from .pose import Array
 
 PARTS = 3.0  # parts of a pixel to one standard deviation of the point spread: their covered shares are blurred
 REACH = 6.0  # standard deviations within which noise and point spread are followed
-TABLE_STEPS = 64  # tabulated informations in one grey value
-DARKEST, BRIGHTEST = 0, 255
+TABLE_STEPS = 64  # tabulated informations in one grey value; fewer where the noise hides the rounding
 
 
 def light_shares(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> Array:
@@ -82,9 +81,9 @@ def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
     deviation = np.sqrt(variance)
     reach = int(np.ceil(REACH * deviation.max())) + 1
     numbers = np.rint(mean_grey)[..., None] + np.arange(-reach, reach + 1)
-    low = np.where(numbers <= DARKEST, -np.inf, (numbers - 0.5 - mean_grey[..., None]) / deviation[..., None])
-    high = np.where(numbers >= BRIGHTEST, np.inf, (numbers + 0.5 - mean_grey[..., None]) / deviation[..., None])
-    possible = (numbers >= DARKEST) & (numbers <= BRIGHTEST)
+    low = np.where(numbers <= 0, -np.inf, (numbers - 0.5 - mean_grey[..., None]) / deviation[..., None])
+    high = np.where(numbers >= noise.white_level, np.inf, (numbers + 0.5 - mean_grey[..., None]) / deviation[..., None])
+    possible = (numbers >= 0) & (numbers <= noise.white_level)
     # the upper tail is taken from above, where differences of numbers close to one would lose all digits
     probability = np.where(low > 0.0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low))
     change = -(_rise(high, slope, variance) - _rise(low, slope, variance)) / deviation[..., None]
@@ -123,17 +122,19 @@ def edge_bound(shapes: Array, contrast: float, deviation: float, psf_px: float =
 
 def _information_table(lowest: float, highest: float, noise: CameraNoise) -> tuple[Array, Array]:
     """Means that reach from ``lowest`` to ``highest``, and the information at each, averaged over one grey value."""
-    count = int(np.ceil((highest - lowest + 2.0) * TABLE_STEPS)) + 1
-    means = lowest - 1.5 + np.arange(count + TABLE_STEPS) / TABLE_STEPS
-    window = np.full(TABLE_STEPS + 1, 1.0 / TABLE_STEPS)
+    least_noise = float(np.sqrt(_analog_variance(np.array([lowest - 1.5, highest + 1.5]), noise)[0].min()))
+    steps = 2 * int(np.ceil(0.5 * min(TABLE_STEPS, 16.0 / least_noise)))
+    count = int(np.ceil((highest - lowest + 2.0) * steps)) + 1
+    means = lowest - 1.5 + np.arange(count + steps) / steps
+    window = np.full(steps + 1, 1.0 / steps)
     window[[0, -1]] *= 0.5
     averaged = np.convolve(grey_value_information(means, noise), window, mode="valid")
-    return means[TABLE_STEPS // 2:][:count], averaged
+    return means[steps // 2:][:count], averaged
 
 
 def _analog_variance(mean_grey: Array, noise: CameraNoise) -> tuple[Array, Array]:
     """Variance before rounding, and its derivative by the mean."""
-    variance = noise.variance(mean_grey) - 1.0 / 12.0
+    variance = noise.variance(mean_grey) - 1.0 / (12.0 * noise.frames)
     if not noise.enabled or variance.min() <= 0.0:
         raise CmmError(f"without noise there is no Cramer-Rao bound, got {noise}")
     step = 0.5

@@ -107,9 +107,9 @@ def _root_mean(squared: Array) -> float:
 
 
 def _by_window(find: Callable[[NDArray[np.uint8]], tuple[float, float] | None], windows: NDArray,
-               corners: NDArray[np.integer]) -> DetectedCentres:
-    """Centres that a function finds in each 8-bit window alone; OpenCV states no covariance, so it is zero."""
-    found = [find(window) for window in np.rint(windows).astype(np.uint8)]
+               corners: NDArray[np.integer], white_level: int) -> DetectedCentres:
+    """Centres that a function finds in each window alone, in 8 bit; OpenCV states no covariance, so it is zero."""
+    found = [find(window) for window in np.rint(windows * (255.0 / white_level)).astype(np.uint8)]
     good = np.array([centre is not None for centre in found], dtype=bool)
     centres = np.array([centre or (0.0, 0.0) for centre in found]).reshape(-1, 2)
     return DetectedCentres(centres + corners, np.zeros((len(found), 2, 2)), good)
@@ -127,7 +127,7 @@ def detect_by_blobs(windows: NDArray, corners: NDArray[np.integer], noise: Camer
         points = blobs.detect(window)
         return max(points, key=lambda point: point.size).pt if points else None
 
-    return _by_window(find, windows, corners)
+    return _by_window(find, windows, corners, noise.white_level)
 
 
 def detect_by_contour(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
@@ -140,7 +140,7 @@ def detect_by_contour(windows: NDArray, corners: NDArray[np.integer], noise: Cam
         longest = max(contours, key=len, default=())
         return cv2.fitEllipse(longest)[0] if len(longest) >= 5 else None
 
-    return _by_window(find, windows, corners)
+    return _by_window(find, windows, corners, noise.white_level)
 
 
 PEERS = (Detector("opencv_blob", detect_by_blobs, 0.01), Detector("opencv_fit_ellipse", detect_by_contour, 0.05))

@@ -86,7 +86,8 @@ class Scene:
 def scene_of(file: SensorFile) -> Scene:
     """The scene of a sensor file's stickers and left camera."""
     rig = rig_from_file(file.rig)[0]
-    return Scene(Sensor(file).noise, file.stickers.sticker_level / 255.0, file.stickers.ring_level / 255.0,
+    noise = replace(Sensor(file).noise, prnu=0.0, dsnu=0.0)  # a pattern is no noise: it stays from image to image
+    return Scene(noise, file.stickers.sticker_level / 255.0, file.stickers.ring_level / 255.0,
                  rig.left.focal_px)
 
 
@@ -101,7 +102,7 @@ def working_point(file: SensorFile) -> Condition:
     facing = cosine > 0.0
     shapes = project_discs(rig.left, centres, normals, np.full(len(centres), file.stickers.radius))[1]
     return Condition(float(np.median(np.linalg.eigvalsh(shapes[facing])[:, 1])),
-                     float(np.median(np.arccos(cosine[facing]))), scene_of(file).edge_noise)
+                     float(np.median(np.arccos(cosine[facing]))), scene_of(file).edge_noise, file.lens.psf_px)
 
 
 def random_ellipses(condition: Condition, focal_px: float, size: int, count: int,

@@ -95,6 +95,15 @@ def test_large_blurred_disc_reaches_the_closed_form_of_an_edge(half_axes):
     np.testing.assert_allclose(closed, exact, rtol=0.02, atol=0.02 * exact[0, 0])
 
 
+def test_twelve_bits_with_the_same_noise_keep_the_bound():
+    """Sixteen times the gain: all grey values are sixteen times larger, and rounding matters less."""
+    fine = replace(NOISE, bit_depth=12, gain=16.0 * NOISE.gain, black_level=256.0)
+    coarse, deep = (cramer_rao_bound(CENTRES, SHAPES, SIZE, k * CONTRAST, k * GROUND, noise, 0.0)
+                    for k, noise in ((1.0, NOISE), (16.0, fine)))
+    np.testing.assert_allclose(deep, coarse, rtol=0.02, atol=1e-8)
+    assert np.all(np.trace(deep, axis1=1, axis2=2) < np.trace(coarse, axis1=1, axis2=2))
+
+
 def test_closed_form_of_a_circle():
     radius, width = 5.0, np.sqrt(0.6**2 + 1.0 / 12.0)
     expected = 0.005 * np.sqrt(2.0 * width / (np.sqrt(np.pi) * radius))
