@@ -9,16 +9,18 @@ lines; in a pixel with the edges of two layers the covered shares are taken as i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .convex_solid import ConvexSolid
-from .disc_layers import DiscsInView, DiscTable, lay_discs
+from .disc_layers import DiscsInView, DiscTable
 from .views import NEAR, Drawable, View
 
-Covers = dict[tuple[int, int], NDArray[np.float32]]
+if TYPE_CHECKING:
+    from .layer_kernel import Solids
 
 
 def draw_windows(drawable: Drawable, views: Sequence[View], supersampling: int,
@@ -46,46 +48,41 @@ class _AnalyticScene:
 
     def draw(self, images: NDArray[np.float32], views: Sequence[View], group: list[int], lines: int) -> None:
         """Draw the views ``group``, which share a camera and an exposure, into ``images`` (n, h, w)."""
+        from .layer_kernel import Discs, lay_layers  # compiles, so it is loaded where it is first needed
+
         view = views[group[0]]
         seen = self._discs.seen(view)
-        covers: Covers = {}
-        middles = [view.camera_from_bodies[b] @ [*s.vertices.mean(axis=0), 1.0]
-                   for b, s in zip(self._bodies, self._solids, strict=True)]
+        hidden_by = self._hiding(view, seen)
+        discs = Discs(seen.centres, seen.shapes, seen.reach, seen.levels, np.stack(list(hidden_by.values()), axis=1)
+                      if hidden_by else np.zeros((len(seen.levels), 0), dtype=bool))
         corners = np.array([views[k].corner for k in group], dtype=float)
-        for k in sorted(range(len(self._solids)), key=lambda k: -middles[k][2]):
-            self._draw_solid(k, images, view, group, corners, lines, covers)
-        behind = self._hidden(view, seen)
-        lay_discs(images, np.array(group), corners, seen, behind, covers)
+        lay_layers(images, np.array(group), corners, self._outlined(view, list(hidden_by)), lines, discs)
 
-    def _draw_solid(self, k: int, images: NDArray[np.float32], view: View, group: list[int], corners: NDArray,
-                    lines: int, covers: Covers) -> None:
-        """Lay solid ``k`` over the images, and note its share of each window that it reaches."""
-        outline = self._solids[k].outline(view.camera, view.camera_from_bodies[self._bodies[k]])
-        if outline is None:
-            return
-        near = (outline.highest > corners - 0.5) & (outline.lowest < corners - 0.5 + view.size)
-        for place in np.flatnonzero(near.all(axis=1)):
-            image = images[group[place]]
-            if outline.holds(corners[place], view.size):
-                share = np.ones_like(image)
-                image[:] = self._levels[k]
-            else:
-                share = outline.cover(corners[place], view.size, lines)
-                image += share * (np.float32(self._levels[k]) - image)
-            covers[group[place], k] = share
+    def _outlined(self, view: View, hiding: list[int]) -> Solids:
+        """The solids in view from far to near; ``hiding``: those whose cover is kept, in the order of their slots."""
+        from .layer_kernel import Solids
 
-    def _hidden(self, view: View, seen: DiscsInView) -> list[list[int]]:
-        """For each seen disc the solids that stand before one of its probed points."""
-        behind: list[list[int]] = [[] for _ in seen.owners]
+        moves = [view.camera_from_bodies[b] for b in self._bodies]
+        depth = [float(m[2, :3] @ s.middle + m[2, 3]) for m, s in zip(moves, self._solids, strict=True)]
+        outlines = {k: self._solids[k].outline(view.camera, moves[k]) for k in np.argsort(depth)[::-1].tolist()}
+        shown = {k: outline for k, outline in outlines.items() if outline is not None}
+        starts = np.cumsum([0, *(len(outline.half_planes) for outline in shown.values())])
+        return Solids(np.concatenate([np.zeros((0, 3)), *(outline.half_planes for outline in shown.values())]), starts,
+                      np.array([outline.box for outline in shown.values()]).reshape(-1, 4),
+                      np.array([self._levels[k] for k in shown]),
+                      np.array([hiding.index(k) if k in hiding else -1 for k in shown], dtype=int))
+
+    def _hiding(self, view: View, seen: DiscsInView) -> dict[int, NDArray[np.bool_]]:
+        """Solids that stand before one of a disc's probed points, and before which discs (m,)."""
+        hiding = {}
         for k, (solid, body) in enumerate(zip(self._solids, self._bodies, strict=True)):
             move = view.camera_from_bodies[body]
             if move[2, 3] < -NEAR:
                 continue
-            asked = np.flatnonzero(seen.owners != body)
-            hidden = solid.hides(move, seen.probes[asked]).any(axis=1)
-            for d in asked[hidden]:
-                behind[d].append(k)
-        return behind
+            behind = solid.hides(move, seen.probes).any(axis=1) & (seen.owners != body)
+            if behind.any():
+                hiding[k] = behind
+        return hiding
 
 
 _SCENES: WeakKeyDictionary[Drawable, _AnalyticScene] = WeakKeyDictionary()

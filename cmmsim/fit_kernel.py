@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from .blur_kernel import blur_window
+from .cholesky_kernel import factor, invert_factored, solve_factored
 from .compiled import compiled
 from .coverage_kernel import cover_window, inverse_of
 
 UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
-SMALLEST_PIVOT = 1e-12
 
 
 class FitSettings(NamedTuple):
@@ -89,31 +89,6 @@ def bound_radii(xx: float, xy: float, yy: float, lowest: float, highest: float) 
         return bounded_large, 0.0, bounded_large
     scale, middle = (bounded_large - bounded_small) / (2.0 * half), 0.5 * (bounded_large + bounded_small)
     return middle + scale * (xx - mean), scale * xy, middle + scale * (yy - mean)
-
-
-@compiled
-def factor(matrix: np.ndarray) -> None:
-    """Cholesky factor of a symmetric matrix (n,n), in its lower triangle."""
-    for j in range(len(matrix)):
-        for i in range(j, len(matrix)):
-            rest = matrix[i, j]
-            for k in range(j):
-                rest -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] = math.sqrt(max(rest, SMALLEST_PIVOT)) if i == j else rest / matrix[j, j]
-
-
-@compiled
-def solve_factored(lower: np.ndarray, right: np.ndarray) -> None:
-    """Solve L L' x = right in place."""
-    n = len(right)
-    for i in range(n):
-        for k in range(i):
-            right[i] -= lower[i, k] * right[k]
-        right[i] /= lower[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            right[i] -= lower[k, i] * right[k]
-        right[i] /= lower[i, i]
 
 
 @compiled
@@ -197,17 +172,6 @@ def step_within_bounds(parameters: np.ndarray, step: np.ndarray, settings: FitSe
 
 
 @compiled
-def centre_covariance(lower: np.ndarray, covariance: np.ndarray) -> None:
-    """The centre's part (2,2) of the inverse of a factored normal matrix."""
-    column = np.empty(UNKNOWNS)
-    for k in range(2):
-        column[:] = 0.0
-        column[k] = 1.0
-        solve_factored(lower, column)
-        covariance[0, k], covariance[1, k] = column[0], column[1]
-
-
-@compiled
 def set_shape(parameters: np.ndarray, shape: np.ndarray) -> None:
     """The matrix A (2,2) of an ellipse's parameters."""
     shape[0, 0], shape[0, 1], shape[1, 0], shape[1, 1] = parameters[2], parameters[3], parameters[3], parameters[4]
@@ -244,7 +208,7 @@ def fit_window(window: np.ndarray, settings: FitSettings, parameters: np.ndarray
         set_shape(parameters, shape)
         if moved < settings.converged:
             break
-    centre_covariance(normal, covariance)
+    invert_factored(normal, covariance)
     return misfit / freedom
 
 

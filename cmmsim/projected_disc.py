@@ -18,18 +18,9 @@ def project_discs(camera: PinholeCamera, centres: Array, normals: Array, radii: 
     Parameters: centres (n,3) m and normals (n,3) unit, in camera axes; radii (n,) m. The ellipse is the image of the
     unit disc under x -> centre + A x.
     """
-    across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
-    dual = centres[:, :, None] * centres[:, None, :] - radii[:, None, None] ** 2 * across
-    dual = dual / dual[:, 2:, 2:]
-    middle = dual[:, :2, 2]
-    focal = camera.focal_lengths
-    squared = focal[:, None] * focal * (middle[:, :, None] * middle[:, None, :] - dual[:, :2, :2])
-    pixels = focal * middle + (camera.centre_x_px, camera.centre_y_px)
-    return pixels, _root(squared)
+    from .disc_kernel import project_all  # compiles, so it is loaded where it is first needed
 
-
-def _root(matrices: Array) -> Array:
-    """Symmetric square roots of positive definite (n,2,2): (M + d I) / sqrt(trace M + 2 d), d² = det M."""
-    d = np.sqrt(matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] ** 2)
-    scale = np.sqrt(matrices[:, 0, 0] + matrices[:, 1, 1] + 2.0 * d)
-    return (matrices + d[:, None, None] * np.eye(2)) / scale[:, None, None]
+    pixels, shapes = np.empty((len(centres), 2)), np.empty((len(centres), 2, 2))
+    project_all(np.ascontiguousarray(centres, dtype=float), np.ascontiguousarray(normals, dtype=float),
+                np.ascontiguousarray(radii, dtype=float), camera.focal_lengths, camera.centre, pixels, shapes)
+    return pixels, shapes

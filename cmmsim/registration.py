@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .errors import LostError
-from .pose import Array, apply, rotation_exp, skew
+from .pose import Array, apply, rotation_exp
 
 SMALLEST_SPREAD = 0.005  # m; points closer than this to one line do not determine a rotation
 
@@ -49,18 +49,17 @@ def register(source: Array, target: Array, covariances: Array, iterations: int =
     Parameters: source (n,3) known points; target (n,3) measured points, m; covariances (n,3,3) of the measured ones.
     Raises LostError when fewer than three points off one line are given.
     """
+    from .point_kernel import rigid_step  # compiles, so it is loaded where it is first needed
+
     require_spread(source)
     transform = rigid_start(source, target)
     weights = np.linalg.inv(covariances)
+    source, target = np.ascontiguousarray(source, dtype=float), np.ascontiguousarray(target, dtype=float)
+    covariance, change = np.empty((6, 6)), np.empty(6)
     for _ in range(iterations):
-        turned = source @ transform[:3, :3].T
-        jacobian = np.concatenate([np.broadcast_to(np.eye(3), (len(source), 3, 3)), -skew(turned)], axis=2)
-        weighted = jacobian.transpose(0, 2, 1) @ weights
-        covariance = np.linalg.inv((weighted @ jacobian).sum(axis=0))
-        residuals = target - turned - transform[:3, 3]
-        change = covariance @ np.einsum("nij,nj->i", weighted, residuals)
-        transform = transform.copy()
+        rigid_step(source, target, weights, transform, covariance, change)
         transform[:3, :3] = rotation_exp(change[3:]) @ transform[:3, :3]
         transform[:3, 3] += change[:3]
     residuals = target - apply(transform, source)
-    return Registration(transform, covariance, np.einsum("ni,nij,nj->n", residuals, weights, residuals))
+    misfit = np.einsum("ni,nij,nj->n", residuals, weights, residuals)
+    return Registration(transform, covariance, misfit)

@@ -1,4 +1,4 @@
-"""Points from pixel pairs: OpenCV's linear triangulation, then one weighted Gauss-Newton step, and covariances."""
+"""Points from pixel pairs: OpenCV's linear triangulation, then weighted Gauss-Newton steps, and covariances."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import cv2
 import numpy as np
 
 from .errors import ShapeError
-from .pose import Array, apply
+from .pose import Array
 from .stereo_rig import StereoRig
+
+STEPS = 2  # of Gauss-Newton after the linear start
 
 
 @dataclass(frozen=True)
@@ -24,20 +26,17 @@ class StereoPoints:
 
 def triangulate(rig: StereoRig, left: Array, right: Array, left_covariances: Array,
                 right_covariances: Array) -> StereoPoints:
-    """Points seen at pixels ``left`` and ``right`` (n, 2) with covariances (n, 2, 2), px²."""
+    """Points seen at ideal pixels ``left`` and ``right`` (n, 2) with covariances (n, 2, 2), px²."""
     if left.shape != right.shape or left.ndim != 2 or left.shape[1] != 2:
         raise ShapeError(f"left and right pixels must both be (n,2), got {left.shape} and {right.shape}")
-    points = linear_triangulation(rig, left, right)
-    observed = np.stack([left, right], axis=1)
+    from .point_kernel import refine_points  # compiles, so it is loaded where it is first needed
+
+    points = np.ascontiguousarray(linear_triangulation(rig, left, right))
     weights = np.linalg.inv(np.stack([left_covariances, right_covariances], axis=1))
-    for _ in range(2):
-        residuals, jacobian = _reprojection(rig, points, observed)
-        weighted = np.einsum("nkai,nkab->nkib", jacobian, weights)
-        covariances = np.linalg.inv(np.einsum("nkib,nkbj->nij", weighted, jacobian))
-        points = points + np.einsum("nij,nkjb,nkb->ni", covariances, weighted, residuals)
-    residuals, _ = _reprojection(rig, points, observed)
-    gap = np.einsum("nka,nkab,nkb->n", residuals, weights, residuals)
-    return StereoPoints(points, covariances, gap)
+    covariances, gaps = np.empty((len(points), 3, 3)), np.empty(len(points))
+    refine_points(np.stack(rig.projection_matrices), np.stack([left, right], axis=1), weights, STEPS, points,
+                  covariances, gaps)
+    return StereoPoints(points, covariances, gaps)
 
 
 def linear_triangulation(rig: StereoRig, left: Array, right: Array) -> Array:
@@ -48,14 +47,3 @@ def linear_triangulation(rig: StereoRig, left: Array, right: Array) -> Array:
     homogeneous = cv2.triangulatePoints(first, second, np.ascontiguousarray(left.T, dtype=np.float64),
                                         np.ascontiguousarray(right.T, dtype=np.float64))
     return (homogeneous[:3] / homogeneous[3]).T
-
-
-def _reprojection(rig: StereoRig, points: Array, observed: Array) -> tuple[Array, Array]:
-    """Residual pixels (n, 2 cameras, 2) and their Jacobian (n, 2, 2, 3) by the points."""
-    residuals = np.empty_like(observed)
-    jacobian = np.empty((len(points), 2, 2, 3))
-    for k, (camera, move) in enumerate(zip(rig.cameras, rig.from_camera, strict=True)):
-        local = apply(move, points)
-        residuals[:, k] = observed[:, k] - camera.project(local)[0]
-        jacobian[:, k] = camera.projection_jacobian(local) @ move[:3, :3]
-    return residuals, jacobian

@@ -13,6 +13,7 @@ from cmmsim.camera import PinholeCamera
 from cmmsim.convex_solid import ConvexSolid
 from cmmsim.eccentricity import eccentricity
 from cmmsim.ellipse_fit import fit_ellipses
+from cmmsim.layer_kernel import cover_by_polygon, polygon_holds
 from cmmsim.noise import CameraNoise
 from cmmsim.pose import apply, pose_to_transform
 from cmmsim.projected_disc import project_discs
@@ -148,11 +149,13 @@ def test_solid_hides_what_a_ray_caster_says():
 def test_outline_covers_what_sampling_says():
     solid = ConvexSolid(np.asarray(cmmsim.rod(0.02, 0.004).vertices))
     outline = solid.outline(CAMERA, pose_to_transform([0.0, 0.0, 1.5, 0.9, 0.4, 0.0]))
-    corner, size = np.array([1005.0, 745.0]), (40, 40)
-    fine = outline.cover(corner, size, 200)
-    assert np.abs(outline.cover(corner, size, 6) - fine).max() < 0.1
+    corner, fine, coarse = (1004.5, 744.5), np.empty((40, 40)), np.empty((40, 40))
+    cover_by_polygon(outline.half_planes, *corner, 200, fine)
+    cover_by_polygon(outline.half_planes, *corner, 6, coarse)
+    assert np.abs(coarse - fine).max() < 0.1
     x, y = np.meshgrid(np.arange(40), np.arange(40))
-    inside = [outline.holds(corner + np.array([i, j]), (1, 1)) for i, j in zip(x.ravel(), y.ravel(), strict=True)]
+    inside = [polygon_holds(outline.half_planes, corner[0] + i, corner[1] + j, 1, 1)
+              for i, j in zip(x.ravel(), y.ravel(), strict=True)]
     np.testing.assert_allclose(fine.ravel()[inside], 1.0, atol=1e-6)
     area = fine.sum()
     assert 0.9 * area < np.sum(inside) + 0.5 * np.sum((fine > 0) & (fine < 1)) < 1.1 * area

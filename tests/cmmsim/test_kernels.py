@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import cmmsim
-from cmmsim import blur_kernel, coverage_kernel, ellipse_fit, fit_kernel
+from cmmsim import blur_kernel, cholesky_kernel, coverage_kernel, ellipse_fit, fit_kernel
 from cmmsim.blurred_coverage import blurred_coverage
 from cmmsim.ellipse_coverage import coverage
 from cmmsim.noise import CameraNoise
@@ -103,14 +103,17 @@ def test_kernels_compute_the_same_uncompiled():
                                    atol=1e-14)
 
 
-def test_linear_algebra_of_the_fit_is_that_of_lapack():
+def test_small_linear_algebra_is_that_of_lapack():
     rng = np.random.default_rng(6)
     half, right = rng.normal(size=(9, 7)), rng.normal(size=7)
-    for factor, solve in ((fit_kernel.factor, fit_kernel.solve_factored),
-                          (fit_kernel.factor.py_func, fit_kernel.solve_factored.py_func)):
-        lower, found = half.T @ half, right.copy()
+    k = cholesky_kernel
+    for factor, solve, invert in ((k.factor, k.solve_factored, k.invert_factored),
+                                  (k.factor.py_func, k.solve_factored.py_func, k.invert_factored.py_func)):
+        lower, found, inverse = half.T @ half, right.copy(), np.empty((2, 2))
         factor(lower)
         solve(lower, found)
+        invert(lower, inverse)
+        np.testing.assert_allclose(inverse, np.linalg.inv(half.T @ half)[:2, :2], rtol=1e-9)
         np.testing.assert_allclose(np.tril(lower), np.linalg.cholesky(half.T @ half), rtol=1e-9)
         np.testing.assert_allclose(found, np.linalg.solve(half.T @ half, right), rtol=1e-9)
 
