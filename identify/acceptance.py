@@ -1,5 +1,6 @@
 """The acceptance tests of one sensor, one after the other, and whether its limit is kept."""
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -52,6 +53,16 @@ def chosen_standards(name: str) -> tuple[str, ...]:
     if name != "all" and name not in STANDARDS:
         raise UnknownOptionError("standard", name, (*STANDARDS, "all"))
     return STANDARDS if name == "all" else (name,)
+
+
+def require_limit(limit_um: float) -> None:
+    """Refuse a limit of the length error that is no positive number.
+
+    Raises:
+        AcceptanceError: with the value.
+    """
+    if not (math.isfinite(limit_um) and limit_um > 0.0):
+        raise AcceptanceError(f"the limit of the length error must be a positive number of um, got {limit_um:g}")
 
 
 def parse_volume(text: str) -> np.ndarray:

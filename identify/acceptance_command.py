@@ -33,7 +33,7 @@ def acceptance(
         ),
     ] = None,
     limit_um: Annotated[
-        float, typer.Option("--limit-um", min=0.0, help="Largest length error in um that is accepted.")
+        float, typer.Option("--limit-um", help="Largest length error in um that is accepted.")
     ] = DEFAULT_LIMIT_UM,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary.")] = False,
 ) -> None:
@@ -55,11 +55,12 @@ def acceptance(
       cmmsim acceptance mine.toml --standard vdi --limit-um 30
       cmmsim acceptance --volume 0.6 --renderer analytic --seed 3
     """
-    from identify.acceptance import chosen_standards, do, prepare
+    from identify.acceptance import chosen_standards, do, prepare, require_limit
     from identify.acceptance_result import acceptance_entry
     from identify.errors import VerificationError
     from identify.run_folder import new_run_folder
 
+    require_limit(limit_um)
     standards = chosen_standards(standard)
     run = prepare(sensor, seed, renderer, volume, standards)
     folder = new_run_folder(out or Path("runs") / f"acceptance-{run.under_test.file.name}-{seed}").path

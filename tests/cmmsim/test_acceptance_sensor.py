@@ -1,6 +1,7 @@
 """The tests on rendered images: what they find against closed forms and against the stated noise."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -37,6 +38,7 @@ def test_noise_free_lengths_are_right_to_two_microns(volume):
     assert np.abs(found.errors).max() < 2e-6
 
 
+@pytest.mark.slow
 def test_length_errors_are_as_large_as_stated(volume):
     """105 lengths of three exposures: their squares against the stated variances, and the mean is no bias."""
     found = length_test(SensorUnderTest(FILE, 1, "analytic"), volume, exposures=3)
@@ -107,13 +109,14 @@ def test_relative_covariance_against_sampling():
     poses = [transform_to_pose(t) for t in (first, second)]
     measured = [pose_measurement(t, root @ root.T) for t in (first, second)]
     draws = []
-    for _ in range(4000):
+    for _ in range(2000):
         drawn = [replace(m, pose=pose + root @ rng.standard_normal(6)) for m, pose in zip(measured, poses, strict=True)]
         draws.append(relative_error(*drawn)[0])
     whitened = np.linalg.solve(np.linalg.cholesky(relative_covariance(*measured)), np.array(draws).T)
-    np.testing.assert_allclose(np.cov(whitened), np.eye(6), atol=0.12)
+    np.testing.assert_allclose(np.cov(whitened), np.eye(6), atol=0.15)
 
 
+@pytest.mark.slow
 def test_standing_and_moving_bar_have_the_stated_errors(volume):
     sensor = SensorUnderTest(FILE, 3, "analytic").facing(rigid_bar(), 1)
     found = bar_run(sensor, bar_paths(volume)[3], np.arange(-10, 40) / 60.0)
@@ -122,6 +125,36 @@ def test_standing_and_moving_bar_have_the_stated_errors(volume):
     assert 0.75 < found.variance_ratios.mean() < 1.3
     assert np.sqrt(np.mean(found.distance_errors**2)) < 8e-6
     assert np.sqrt(np.mean(found.errors[:, :3]**2)) < 60e-6
+
+
+@pytest.mark.slow
+def test_motion_blur_reaches_the_moving_bar_only(volume):
+    """With 1 ms of exposure the same frames of the standing bar come out, and others once it moves fast."""
+    path, times = bar_paths(volume)[3], np.arange(-2, 16) / 60.0
+    runs = []
+    for exposure in (0.0, 1e-3):
+        timing = FILE.timing.model_copy(update={"exposure": exposure})
+        under_test = SensorUnderTest(FILE.model_copy(update={"timing": timing}), 3, "analytic")
+        runs.append(bar_run(under_test.facing(rigid_bar(), 1), path, times))
+    sharp, blurred = runs
+    np.testing.assert_array_equal(sharp.errors[:3], blurred.errors[:3])  # the bar starts to move at time 0
+    assert np.all(np.any(sharp.errors[-6:] != blurred.errors[-6:], axis=1))
+    assert np.abs(blurred.distance_errors).max() < 30e-6
+
+
+@pytest.mark.slow
+def test_a_run_that_loses_the_bar_is_given_up(volume):
+    """The bar is taken out of sight after four frames."""
+    path = bar_paths(volume)[0]
+    gone = path.pose(0.0) + np.array([0.0, 0.0, -5.0, 0.0, 0.0, 0.0])
+    hidden = SimpleNamespace(name="hidden", pose=lambda time: gone if time > 0.02 else path.pose(0.0),
+                             pose_rate=lambda time: np.zeros(6))
+    sensor = SensorUnderTest(FILE, 0, "analytic").facing(rigid_bar(), 1)
+    found = bar_run(sensor, hidden, np.arange(-2, 30) / 60.0)
+    assert (len(found.time), found.lost) == (4, 28)
+    assert "needed" in found.given_up
+    with pytest.raises(AcceptanceError, match=r"hidden: no frame of the standing .* is measured"):
+        bar_run(sensor, hidden, np.arange(-2, 0) / 60.0)
 
 
 def test_same_seed_same_numbers(volume):

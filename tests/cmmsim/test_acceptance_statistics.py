@@ -22,11 +22,11 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     truth = {"mean": np.sqrt(2.0 / np.pi), "rms": 1.0, "p95": norm.ppf(0.975)}
     rng = np.random.default_rng(1)
     held = dict.fromkeys(truth, 0)
-    for _ in range(300):
+    for _ in range(200):
         found = summarise(np.abs(rng.standard_normal(200)), rng)
         for name, value in truth.items():
             held[name] += found.interval[name][0] <= value <= found.interval[name][1]
-    assert all(0.89 < count / 300 < 0.99 for count in held.values()), held
+    assert all(0.88 < count / 200 < 0.99 for count in held.values()), held
 
 
 def test_blocks_widen_the_interval_of_dependent_values():

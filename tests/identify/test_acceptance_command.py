@@ -33,6 +33,8 @@ def nothing_is_drawn(monkeypatch):
     (["ctrak"], "unknown sensor 'ctrak'"),
     (["--renderer", "oil"], "unknown renderer 'oil': valid are analytic"),
     (["--standard", "iso"], "unknown standard 'iso': valid are all, e3064, e3124, vdi"),
+    (["--limit-um", "0"], "positive number of um, got 0"),
+    (["--limit-um", "nan"], "positive number of um, got nan"),
     (["--volume", "big"], "volume 'big' is neither"),
     (["--volume", "1x2"], "volume '1x2' is neither"),
     (["--volume", "nan"], "volume 'nan' is neither"),
