@@ -12,6 +12,7 @@ from rich.table import Table as RichTable
 
 from identify.acceptance_command import acceptance
 from identify.base_parameters_command import base_parameters
+from identify.calibrate_command import CALIBRATE_HELP, calibrate
 from identify.detectors_command import detectors
 from identify.engine_commands import export, verify_model
 from identify.errors import IdentifyError, ScenarioError
@@ -53,6 +54,10 @@ How well the stickers are found:
 \b
 The sensor alone, tested like a real instrument:
   cmmsim acceptance                      lengths, moving bar, latency: acceptance.md
+
+\b
+A real camera, or pictures to try it with:
+  cmmsim calibrate --help                intrinsics, distortion and stereo from pictures of a board
 
 \b
 Where the robot can go:
@@ -195,6 +200,7 @@ app.command("verify-model")(verify_model)
 app.add_typer(export, name="export")
 app.command()(detectors)
 app.command()(workspace)
+app.command(help=CALIBRATE_HELP)(calibrate)
 app.command()(acceptance)
 app.command()(base_parameters)
 

@@ -1,0 +1,24 @@
+"""Calibration of the stereo rig from pictures of a board: rendered ones, or real photographs.
+
+The way: a board description, pairs of image files, the board in each image, OpenCV's calibration as a start, one joint
+adjustment of both cameras with its covariance.
+"""
+
+from .board import Board, read_board
+from .board_detection import BoardView, find_board
+from .board_poses import board_poses, default_board
+from .calibrate import CalibrationOptions, calibrate
+from .calibration import PARAMETER_NAMES, Calibration
+from .errors import CalibrationError
+from .intrinsics import DISTORTIONS
+from .photographs import ImagePair, pair_images, read_grey
+from .rendering import render_pairs
+from .result_text import as_dict, calibrated_sensor, rig_tables
+from .sightings import PairView
+from .views_of_images import view_pairs
+
+__all__ = [
+    "DISTORTIONS", "PARAMETER_NAMES", "Board", "BoardView", "Calibration", "CalibrationError", "CalibrationOptions",
+    "ImagePair", "PairView", "as_dict", "board_poses", "calibrate", "calibrated_sensor", "default_board", "find_board",
+    "pair_images", "read_board", "read_grey", "render_pairs", "rig_tables", "view_pairs",
+]

@@ -1,0 +1,118 @@
+"""Calibration boards: what a board file (TOML) may hold, and where its points are.
+
+Board frame: origin at the first point, x along the columns, y along the rows, z away from who looks at the front; the
+points lie in z = 0. Points run along x first, then row by row, as OpenCV orders them.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from ..pose import Array
+from .errors import CalibrationError
+
+Length = Annotated[float, Field(gt=0.0, le=100.0)]
+Count = Annotated[int, Field(ge=3, le=200)]
+
+
+class Board(BaseModel):
+    """A flat board.
+
+    kind        "chessboard", "dots" (rows and columns at right angles) or "asymmetric_dots" (every other row shifted)
+    columns     points along x: inner corners of a chessboard, dots in one row
+    rows        points along y
+    spacing     m between neighbouring points; asymmetric_dots: between rows, dots of one row being twice as far apart
+    radius      m of the dots (dots and asymmetric_dots only)
+    dark        whether dots are darker than the board (dots and asymmetric_dots only)
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+    kind: Literal["chessboard", "dots", "asymmetric_dots"]
+    columns: Count
+    rows: Count
+    spacing: Length
+    radius: Length | None = None
+    dark: bool = True
+
+    @model_validator(mode="after")
+    def _dots_fit(self) -> Board:
+        if self.kind == "chessboard":
+            if self.radius is not None:
+                raise ValueError("a chessboard has no dots, remove radius")
+        elif self.radius is None:
+            raise ValueError(f"radius of the dots (m) is missing, {self.kind} need it")
+        elif self.radius > 0.4 * self.nearest:
+            raise ValueError(f"dots of radius {self.radius:g} m, {self.nearest:g} m from centre to centre, nearly "
+                             f"touch: the largest radius is {0.4 * self.nearest:.4g} m")
+        return self
+
+    @property
+    def nearest(self) -> float:
+        """Distance between nearest points, m."""
+        return self.spacing * (np.sqrt(2.0) if self.kind == "asymmetric_dots" else 1.0)
+
+    @property
+    def points(self) -> Array:
+        """Points (rows * columns, 3) in the board frame, m."""
+        row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
+        x = 2 * column + row % 2 if self.kind == "asymmetric_dots" else column
+        return self.spacing * np.column_stack([x, row, np.zeros_like(row)]).astype(float)
+
+    @property
+    def symmetries(self) -> list[NDArray[np.int_]]:
+        """Orders (points,) in which the same board may be read: as it is, half a turn, and quarter turns if square.
+
+        Which of them a picture shows cannot be seen in the picture.
+        """
+        order = np.arange(self.rows * self.columns)
+        if self.kind == "asymmetric_dots":
+            return [order] if self.rows % 2 else [order, order[::-1]]
+        if self.rows != self.columns:
+            return [order, order[::-1]]
+        grid = order.reshape(self.rows, self.columns)
+        return [np.rot90(grid, k).ravel() for k in range(4)]
+
+    def as_toml(self) -> str:
+        """The board as the text of a board file."""
+        lines = [f'kind = "{self.kind}"', f"columns = {self.columns}", f"rows = {self.rows}",
+                 f"spacing = {self.spacing!r}  # m"]
+        if self.radius is not None:
+            lines += [f"radius = {self.radius!r}  # m", f"dark = {str(self.dark).lower()}"]
+        return "\n".join(lines) + "\n"
+
+
+def read_board(path: str | Path) -> Board:
+    """The board of a TOML file.
+
+    Raises CalibrationError with the valid names for an unknown key, and with the value for a wrong one.
+    """
+    try:
+        values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CalibrationError(f"cannot read board file {path}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"board file {path} is not TOML: {error}") from error
+    for name in ("spacing", "radius"):  # TOML's 1 and 1.0 mean the same length
+        if type(values.get(name)) is int:
+            values[name] = float(values[name])
+    try:
+        return Board.model_validate(values)
+    except ValidationError as error:
+        reasons = "; ".join(_explain(e["type"], e["loc"], e["msg"], e["input"]) for e in error.errors())
+        raise CalibrationError(f"board file {path}: {reasons}") from error
+
+
+def _explain(kind: str, where: tuple[int | str, ...], message: str, value: object) -> str:
+    name = ".".join(str(part) for part in where)
+    if kind == "extra_forbidden":
+        return f"unknown key {name!r}, valid are {', '.join(sorted(Board.model_fields))}"
+    if kind == "missing":
+        return f"{name} is missing"
+    return message.removeprefix("Value error, ") if not name else f"{name}: {message} (got {value!r})"

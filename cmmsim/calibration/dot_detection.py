@@ -1,0 +1,108 @@
+"""Centres of a dot grid: OpenCV finds and orders the dots, a fit of a bright ellipse to each makes them exact.
+
+The centre is that of the dot's ellipse in the image, not the image of the dot's centre: see dot_eccentricity.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..ellipse_fit import FitLimits, fit_ellipses
+from ..images import FrameImages, StereoFrame
+from ..noise import CameraNoise
+from ..pose import Array
+from .board import Board
+
+SMALLEST_AREA_PX = 20.0
+FIND_SIDE_PX = 1600  # dots are first looked for in an image of at most this size: faster, and less noise
+FIT_ITERATIONS = 5
+WINDOW_REACH = 2.2  # dot radii around the centre that are looked at
+GROUND_FROM = 1.2  # dot radii from which the ground is taken
+LARGEST_MOVE = 0.3  # a fit that ends farther from OpenCV's centre, in dot radii, has caught something else
+# A photograph's noise is not known and its edges are blurred: all grey values count alike, and the limit only refuses
+# what is no ellipse at all (residuals of 25 grey values rms).
+PLAIN_NOISE = CameraNoise(electrons_at_white=255e4, gain=1e-4, dark_noise=5e4, full_well=1e9, black_level=0.0)
+LIMITS = FitLimits(smallest_contrast=25.0, largest_misfit=25.0)
+
+
+def find_dots(grey: NDArray[np.uint8], board: Board) -> Array | None:
+    """Dot centres (rows * columns, 2) px in the board's order, NaN where a dot is no clean ellipse; None: no board."""
+    bright = 255 - grey if board.dark else grey
+    rough = None
+    for side in (FIND_SIDE_PX, max(grey.shape)):
+        if rough is None:
+            rough = _find_grid(bright, board, min(1.0, side / max(grey.shape)))
+    return None if rough is None else _refine(bright, rough, board)
+
+
+def _find_grid(bright: NDArray[np.uint8], board: Board, scale: float) -> Array | None:
+    """OpenCV's centres (n, 2) px; it returns (n, 1, 2) up to version 4 and (n, 2) from version 5 on."""
+    small = bright if scale == 1.0 else cv2.resize(bright, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (3, 3), 0.0)
+    kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.kind == "asymmetric_dots" else cv2.CALIB_CB_SYMMETRIC_GRID
+    for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
+        found, centres = cv2.findCirclesGrid(small, (board.columns, board.rows), flags=flags,
+                                             blobDetector=_blob_detector(small.size))
+        if found:
+            rough = np.asarray(centres, dtype=float).reshape(-1, 2)
+            return (rough + 0.5) / scale - 0.5  # the first pixel's corner, not its middle, stays in place
+    return None
+
+
+def _blob_detector(pixels: int) -> Any:
+    opencv: Any = cv2  # its type stubs leave the blob detector out
+    options = opencv.SimpleBlobDetector_Params()
+    options.filterByColor, options.blobColor = True, 255
+    options.filterByArea, options.minArea = True, SMALLEST_AREA_PX
+    options.maxArea = max(0.01 * pixels, 2.0 * SMALLEST_AREA_PX)
+    options.filterByConvexity, options.minConvexity = True, 0.85
+    options.filterByInertia, options.minInertiaRatio = True, 0.08
+    options.filterByCircularity = False
+    options.minThreshold, options.maxThreshold, options.thresholdStep = 20.0, 240.0, 10.0
+    options.minDistBetweenBlobs = 3.0
+    return opencv.SimpleBlobDetector_create(options)
+
+
+def _refine(bright: NDArray[np.uint8], rough: Array, board: Board) -> Array:
+    """Fitted centres (n, 2); dots that need windows of one size are fitted together."""
+    shapes = _dot_shapes(rough, board)
+    largest = np.linalg.norm(shapes, axis=2).max(axis=1)
+    reach = min(WINDOW_REACH, board.nearest / float(board.radius or 1.0) - 1.15)  # neighbours stay outside
+    sizes = 2 * np.ceil(reach * largest + 1.0).astype(int)
+    images = FrameImages(StereoFrame(bright, bright))
+    fine = np.full_like(rough, np.nan)
+    for size in np.unique(sizes):
+        chosen = np.flatnonzero(sizes == size)
+        corners = np.rint(rough[chosen] - 0.5 * (size - 1)).astype(int)
+        windows = images.windows(np.stack([corners, corners]), int(size))[0].astype(float)
+        alone = _without_neighbours(windows, rough[chosen] - corners, shapes[chosen], reach)
+        fits = fit_ellipses(alone, corners, PLAIN_NOISE, int(size), LIMITS, FIT_ITERATIONS)
+        moved = np.linalg.norm(fits.centres - rough[chosen], axis=1)
+        clean = fits.good & (moved < np.maximum(LARGEST_MOVE * largest[chosen], 0.5))
+        fine[chosen[clean]] = fits.centres[clean]
+    return fine
+
+
+def _dot_shapes(rough: Array, board: Board) -> Array:
+    """Matrices (n,2,2) px that carry the unit disc to each dot, by the perspective of the whole board."""
+    plane = board.points[:, :2]
+    flat, _ = cv2.findHomography(plane, rough)
+    radius = float(board.radius or 0.0)
+    moved = [cv2.perspectiveTransform((plane + step)[None], flat)[0] for step in radius * np.eye(2)]
+    middle = cv2.perspectiveTransform(plane[None], flat)[0]
+    return np.stack([m - middle for m in moved], axis=2)
+
+
+def _without_neighbours(windows: Array, centres: Array, shapes: Array, reach: float) -> Array:
+    """Windows (n,h,h) whose pixels beyond ``reach`` dot radii are set to the ground around the dot."""
+    ticks = np.arange(windows.shape[1], dtype=float)
+    x, y = ticks[None, None, :] - centres[:, 0, None, None], ticks[None, :, None] - centres[:, 1, None, None]
+    inverse = np.linalg.inv(shapes)[..., None, None]
+    distance = np.hypot(inverse[:, 0, 0] * x + inverse[:, 0, 1] * y, inverse[:, 1, 0] * x + inverse[:, 1, 1] * y)
+    around = np.where((distance > GROUND_FROM) & (distance <= reach), windows, np.nan)
+    ground = np.nan_to_num(np.nanmedian(around.reshape(len(windows), -1), axis=1))
+    return np.where(distance <= reach, windows, ground[:, None, None])

@@ -1,0 +1,189 @@
+"""One least-squares adjustment of both cameras, their relative pose and all board poses to all measured pixels.
+
+Levenberg and Marquardt's method on the normal equations. A board pose is seen by its own view only, so that the poses
+are eliminated view by view (Schur complement) and what remains is the reduced normal matrix N of the free intrinsics
+and of right_from_left. All pixels count alike; their variance sigma² is estimated from the residuals, and
+sigma² N^-1 is the covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from ..pose import Array, apply, skew
+from .errors import CalibrationError
+from .intrinsics import project
+from .sightings import Sightings
+from .state import RigState
+
+MOST_STEPS = 60
+SMALLEST_GAIN = 1e-11  # relative decrease of the sum of squares that ends the iteration
+SINGULAR = 1e-14  # smallest eigenvalue of N, scaled to a unit diagonal, below which nothing is determined
+POSE = 6
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """state; residuals (m,2) px of each camera, measured minus computed; sigma_px: estimated standard deviation of a
+    pixel coordinate; covariance (24,24) of the left and right intrinsics (9 each) and of the small error [dt, dphi] of
+    right_from_left; condition of N scaled to a unit diagonal; steps; freedom: observations minus unknowns."""
+
+    state: RigState
+    residuals: tuple[Array, Array]
+    sigma_px: float
+    covariance: Array
+    condition: float
+    steps: int
+    freedom: int
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """Blocks of the normal equations: common (c,c), mixed (v,c,6), boards (v,6,6), right-hand sides (c,) and (v,6);
+    residuals of both cameras; cost: sum of squares, px²."""
+
+    common: Array
+    mixed: Array
+    boards: Array
+    common_side: Array
+    board_side: Array
+    residuals: tuple[Array, Array]
+    cost: float
+
+
+def adjust(points: Array, sightings: tuple[Sightings, Sightings], start: RigState, free: Array) -> Adjustment:
+    """Adjust the rig and the board poses.
+
+    Parameters: points (n,3) m of the board; sightings of the left and right camera, each view seen by at least one;
+    start; free (9,k) from ``free_directions``. Raises CalibrationError where the views do not determine the cameras.
+    """
+    def build(state: RigState) -> _Normal:
+        return _normal_equations(points, sightings, state, free)
+
+    state, steps = _minimise(build, start, free)
+    normal = build(state)
+    freedom = sum(2 * len(s.view) for s in sightings) - len(normal.common) - POSE * len(state.left_from_boards)
+    if freedom < 1:
+        raise CalibrationError(f"too few points: {freedom + len(normal.common)} more observations than board poses, "
+                               f"more than {len(normal.common)} needed")
+    reduced = _reduced(normal, 0.0)[0]
+    scale = 1.0 / np.sqrt(np.diag(reduced))
+    eigenvalues, vectors = np.linalg.eigh(reduced * scale[:, None] * scale)
+    if not eigenvalues[0] > SINGULAR:
+        raise CalibrationError("these views do not determine the cameras (smallest eigenvalue of the scaled normal "
+                               f"matrix {eigenvalues[0]:.1e}): show the board tilted to several sides, all over "
+                               "the image")
+    sigma2 = normal.cost / freedom
+    inverse = (vectors / eigenvalues) @ vectors.T * scale[:, None] * scale
+    spread = _spread(free)
+    return Adjustment(state, normal.residuals, float(np.sqrt(sigma2)), sigma2 * spread @ inverse @ spread.T,
+                      float(eigenvalues[-1] / eigenvalues[0]), steps, freedom)
+
+
+def _minimise(build: Callable[[RigState], _Normal], state: RigState, free: Array) -> tuple[RigState, int]:
+    """Levenberg-Marquardt: the state of least cost and the steps taken."""
+    damping = 1e-4
+    normal = build(state)
+    k = free.shape[1]
+    for step in range(1, MOST_STEPS + 1):
+        common, boards = _solve(normal, damping)
+        trial = state.moved((free @ common[:2 * k].reshape(2, k).T).T, common[2 * k:], boards)
+        attempt = build(trial)
+        if attempt.cost < normal.cost:
+            gain = (normal.cost - attempt.cost) / normal.cost
+            state, normal, damping = trial, attempt, max(0.1 * damping, 1e-12)
+            if gain < SMALLEST_GAIN:
+                return state, step
+        elif damping > 1e6 or _is_small(common, normal):
+            return state, step
+        else:
+            damping *= 10.0
+    raise CalibrationError(f"the adjustment has not converged in {MOST_STEPS} steps (rms {_rms(normal):.3g} px): show "
+                           "the board tilted to several sides, or free fewer terms of distortion")
+
+
+def _is_small(change: Array, normal: _Normal) -> bool:
+    """Whether a change that does not help is rounding: it would lower the cost by next to nothing."""
+    return bool(abs(change @ normal.common_side) <= 1e-8 * normal.cost)
+
+
+def _rms(normal: _Normal) -> float:
+    return float(np.sqrt(normal.cost / sum(len(r) for r in normal.residuals)))
+
+
+def _normal_equations(points: Array, sightings: tuple[Sightings, Sightings], state: RigState, free: Array) -> _Normal:
+    k, views = free.shape[1], len(state.left_from_boards)
+    size = 2 * k + POSE
+    common, mixed, boards = np.zeros((size, size)), np.zeros((views, size, POSE)), np.zeros((views, POSE, POSE))
+    common_side, board_side, residuals = np.zeros(size), np.zeros((views, POSE)), []
+    for side, seen in enumerate(sightings):
+        computed, by_common, by_board = _predict(points, seen, state, side, free)
+        error = seen.pixels - computed
+        residuals.append(error)
+        edges = np.searchsorted(seen.view, np.arange(views + 1))
+        for v, (first, last) in enumerate(pairwise(edges)):
+            jc = by_common[first:last].reshape(-1, size)
+            jb, e = by_board[first:last].reshape(-1, POSE), error[first:last].ravel()
+            common += jc.T @ jc
+            mixed[v] += jc.T @ jb
+            boards[v] += jb.T @ jb
+            common_side += jc.T @ e
+            board_side[v] += jb.T @ e
+    cost = float(sum(np.sum(r**2) for r in residuals))
+    return _Normal(common, mixed, boards, common_side, board_side, (residuals[0], residuals[1]),
+                   cost if np.isfinite(cost) else np.inf)
+
+
+def _predict(points: Array, seen: Sightings, state: RigState, side: int, free: Array) -> tuple[Array, Array, Array]:
+    """Pixels (m,2) of one camera, and their derivatives by the common unknowns (m,2,c) and the view's board (m,2,6)."""
+    k = free.shape[1]
+    moves = state.left_from_boards[seen.view]
+    turned = np.einsum("mij,mj->mi", moves[:, :3, :3], points[seen.point])
+    places = turned + moves[:, :3, 3]
+    place_by_board = np.concatenate([np.broadcast_to(np.eye(3), (len(places), 3, 3)), -skew(turned)], axis=2)
+    by_common = np.zeros((len(places), 2, 2 * k + POSE))
+    if side == 1:
+        rotation = state.right_from_left[:3, :3]
+        turned = places @ rotation.T
+        places = apply(state.right_from_left, places)
+        place_by_board = rotation @ place_by_board
+    ahead = places[:, 2] > 1e-6
+    pixels, by_intrinsics, by_place = project(state.intrinsics[side], np.where(ahead[:, None], places, [0.0, 0.0, 1.0]))
+    pixels[~ahead] = np.inf  # a step that puts a board behind a camera is no improvement
+    by_common[:, :, side * k:(side + 1) * k] = by_intrinsics @ free
+    if side == 1:
+        by_common[:, :, 2 * k:2 * k + 3] = by_place
+        by_common[:, :, 2 * k + 3:] = by_place @ -skew(turned)
+    return pixels, by_common, by_place @ place_by_board
+
+
+def _reduced(normal: _Normal, damping: float) -> tuple[Array, Array]:
+    """Reduced normal matrix (c,c) and its right-hand side (c,)."""
+    boards = normal.boards + damping * normal.boards * np.eye(POSE)
+    eliminated = np.asarray(np.linalg.solve(boards, normal.mixed.swapaxes(1, 2)).swapaxes(1, 2), dtype=np.float64)
+    matrix = normal.common + damping * np.diag(np.diag(normal.common))
+    matrix = matrix - np.einsum("vci,vdi->cd", eliminated, normal.mixed)
+    return matrix, normal.common_side - np.einsum("vci,vi->c", eliminated, normal.board_side)
+
+
+def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
+    """Damped step: changes of the common unknowns (c,) and of the boards (v,6)."""
+    matrix, side = _reduced(normal, damping)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    common = scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * side, rcond=1e-15)[0]
+    boards = normal.boards + damping * normal.boards * np.eye(POSE)
+    rest = normal.board_side - np.einsum("vci,c->vi", normal.mixed, common)
+    return common, np.linalg.solve(boards, rest[..., None])[..., 0]
+
+
+def _spread(free: Array) -> Array:
+    """Matrix (24,c) from the free unknowns to all intrinsics and the small error of right_from_left."""
+    rows, k = free.shape
+    spread = np.zeros((2 * rows + POSE, 2 * k + POSE))
+    spread[:rows, :k] = spread[rows:2 * rows, k:2 * k] = free
+    spread[2 * rows:, 2 * k:] = np.eye(POSE)
+    return spread

@@ -1,0 +1,145 @@
+"""Where the adjustment starts: OpenCV's calibration of each camera and of the pair.
+
+A symmetric board can be read in several orders (half a turn, quarter turns), and each picture is read by itself. Both
+pictures of a pair must be read alike: the right camera then stands in the same place for all pairs, and only then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..pose import Array, invert
+from .board import Board
+from .board_detection import BoardView
+from .errors import CalibrationError
+from .sightings import SIDES, PairView
+from .state import RigState
+
+ALIKE_ANGLE, ALIKE_SHARE = 0.06, 0.12  # rad; of the baseline: places of the right camera that count as the same
+FEWEST_VIEWS = 3
+MISFIT = "both images show the board in places that fit no other pair: wrong partner, or moved between the exposures"
+
+
+def start_values(board: Board, pairs: Sequence[PairView], size: tuple[int, int], bend: bool,
+                 fix_aspect: bool) -> tuple[RigState, list[PairView]]:
+    """First state, and the pairs with right images read like the left ones; pairs that do not fit lose both sides.
+
+    bend: whether two radial terms of distortion are estimated; size: (width, height) px. Raises CalibrationError.
+    """
+    cameras = [_single(board, pairs, side, size, bend, fix_aspect) for side in range(2)]
+    poses = [dict(camera[1]) for camera in cameras]
+    pairs, right_from_left = _read_alike(board, pairs, poses)
+    right_from_left = _stereo(board, pairs, [camera[0] for camera in cameras], size, right_from_left)
+    boards = np.stack([poses[0][k] if k in poses[0] else invert(right_from_left) @ poses[1].get(k, np.eye(4))
+                       for k in range(len(pairs))])
+    return RigState(np.stack([camera[0] for camera in cameras]), right_from_left, boards), pairs
+
+
+def _single(board: Board, pairs: Sequence[PairView], side: int, size: tuple[int, int], bend: bool,
+            fix_aspect: bool) -> tuple[Array, list[tuple[int, Array]]]:
+    """Intrinsics (9,) of one camera, and camera_from_board (4,4) of each view by the pair's place."""
+    views = [(k, v) for k, v in ((k, p.sides[side]) for k, p in enumerate(pairs)) if not isinstance(v, str)]
+    if len(views) < FEWEST_VIEWS:
+        raise CalibrationError(f"the {SIDES[side]} camera sees the board in {len(views)} images, {FEWEST_VIEWS} needed")
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    flags |= 0 if bend else cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
+    flags |= cv2.CALIB_FIX_ASPECT_RATIO if fix_aspect else 0
+    points = [board.points[view.index].astype(np.float32) for _, view in views]
+    pixels = [view.pixels.astype(np.float32) for _, view in views]
+    try:
+        _, matrix, terms, turns, shifts = cv2.calibrateCamera(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
+    except cv2.error as error:
+        raise CalibrationError(f"OpenCV finds no {SIDES[side]} camera for these views: {error.err}; show the board "
+                               "tilted to several sides") from error
+    terms = np.asarray(terms, dtype=float).ravel()
+    values = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *terms[:5]])
+    places = [_transform(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
+    if not (np.isfinite(values).all() and values[:2].min() > 0.0 and all(np.isfinite(p).all() for p in places)):
+        raise CalibrationError(f"OpenCV's {SIDES[side]} camera is not finite (focal lengths {values[:2]}): show the "
+                               "board tilted to several sides")
+    return values, [(k, place) for (k, _), place in zip(views, places, strict=True)]
+
+
+def _read_alike(board: Board, pairs: Sequence[PairView],
+                poses: list[dict[int, Array]]) -> tuple[list[PairView], Array]:
+    """Pairs whose right images are read in the order that most pairs agree on, and right_from_left (4,4) of it."""
+    orders = board.symmetries
+    turned = [_renaming_move(board, order) for order in orders]
+    names = [(k, j) for k, pair in enumerate(pairs) if pair.both for j in range(len(orders))]
+    places = np.stack([poses[1][k] @ turned[j] @ invert(poses[0][k]) for k, j in names])
+    alike = _alike(places)
+    pair_of = np.array([k for k, _ in names])
+    support = np.array([len(set(pair_of[row])) for row in alike])
+    angle = _angles(places, np.eye(3)[None])[:, 0]
+    best = int(np.lexsort((angle, -support))[0])
+    count = sum(pair.both for pair in pairs)
+    if support[best] < max(FEWEST_VIEWS, 0.5 * count):
+        raise CalibrationError(f"only {support[best]} of {count} pairs agree on where the right camera stands: the "
+                               "images of a pair were not taken together, or the folders are paired wrongly")
+    chosen = {names[i][0]: orders[names[i][1]] for i in np.flatnonzero(alike[best])}
+    read = list(pairs)
+    for k, pair in enumerate(pairs):
+        if pair.both and k in chosen and not isinstance(pair.right, str):
+            read[k] = PairView(pair.name, pair.left, pair.right.read_as(chosen[k]))
+        elif pair.both:
+            read[k] = PairView(pair.name, MISFIT, MISFIT)
+    for k, place in ((names[i][0], places[i]) for i in np.flatnonzero(alike[best])):
+        poses[1][k] = place @ poses[0][k]
+    return read, places[best]
+
+
+def _renaming_move(board: Board, order: NDArray[np.int_]) -> Array:
+    """Rigid move (4,4) in the board's plane that carries points[order] to points: to undo the renaming."""
+    points, renamed = board.points, board.points[order]
+    a, b = renamed[1] - renamed[0], points[1] - points[0]
+    angle = np.arctan2(b[1], b[0]) - np.arctan2(a[1], a[0])
+    move = np.eye(4)
+    move[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    move[:3, 3] = points[0] - move[:3, :3] @ renamed[0]
+    return move
+
+
+def _alike(places: Array) -> Array:
+    """Which transforms (n,4,4) are about the same: (n,n) bool."""
+    shifts = places[:, :3, 3]
+    gap = np.linalg.norm(shifts[:, None] - shifts[None], axis=2)
+    near = gap < ALIKE_SHARE * np.linalg.norm(shifts, axis=1)[:, None]
+    return np.asarray(near & (_angles(places, places[:, :3, :3]) < ALIKE_ANGLE))
+
+
+def _angles(places: Array, rotations: Array) -> Array:
+    """Angles (n,m) rad between the rotations of transforms (n,4,4) and rotations (m,3,3)."""
+    trace = np.einsum("nij,mij->nm", places[:, :3, :3], rotations)
+    return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
+
+
+def _stereo(board: Board, pairs: Sequence[PairView], cameras: list[Array], size: tuple[int, int],
+            guess: Array) -> Array:
+    """right_from_left (4,4) by OpenCV with the cameras as they are, from the points that both see."""
+    points, left, right = [], [], []
+    for pair in pairs:
+        a, b = pair.sides
+        if isinstance(a, BoardView) and isinstance(b, BoardView):
+            index, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
+            points.append(board.points[index].astype(np.float32))
+            left.append(a.pixels[in_a].astype(np.float32))
+            right.append(b.pixels[in_b].astype(np.float32))
+    lenses = [(np.array([[v[0], 0.0, v[2]], [0.0, v[1], v[3]], [0.0, 0.0, 1.0]]), v[4:]) for v in cameras]
+    try:
+        found = cv2.stereoCalibrate(points, left, right, *lenses[0], *lenses[1], size, flags=cv2.CALIB_FIX_INTRINSIC)
+        place = np.eye(4)
+        place[:3, :3], place[:3, 3] = found[5], np.ravel(found[6])
+    except cv2.error:
+        return guess
+    return place if np.isfinite(place).all() else guess
+
+
+def _transform(turn: Array, shift: Array) -> Array:
+    transform = np.eye(4)
+    transform[:3, :3] = cv2.Rodrigues(np.asarray(turn, dtype=float))[0]
+    transform[:3, 3] = np.ravel(shift)
+    return transform

@@ -1,0 +1,228 @@
+"""The joint adjustment against synthetic truth: exact without noise, statistically honest with it.
+
+Pixels come from a projection written here from Brown's formula, not from the code under test.
+"""
+
+import re
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from cmmsim.calibration import CalibrationError, CalibrationOptions, PairView, calibrate
+from cmmsim.calibration.board import Board
+from cmmsim.calibration.board_detection import BoardView
+from cmmsim.calibration.calibration import PARAMETER_NAMES
+from cmmsim.calibration.intrinsics import free_directions, project
+from cmmsim.calibration.joint_adjustment import adjust
+from cmmsim.calibration.sightings import sightings_of
+from cmmsim.calibration.state import RigState
+
+BOARD = Board(kind="chessboard", columns=9, rows=7, spacing=0.05)
+SIZE = (2048, 1536)
+LEFT = np.array([2300.0, 2310.0, 1030.0, 760.0, -0.12, 0.08, 0.0006, -0.0004, 0.01])
+RIGHT = np.array([2280.0, 2275.0, 1010.0, 775.0, -0.10, 0.05, -0.0003, 0.0005, -0.02])
+TURN = np.array([0.02, 0.6, -0.03])
+SHIFT = np.array([-0.95, 0.01, 0.28])
+TRUTH = np.concatenate([LEFT, RIGHT, SHIFT, TURN])
+RIGHT_FROM_LEFT = np.eye(4)
+RIGHT_FROM_LEFT[:3, :3], RIGHT_FROM_LEFT[:3, 3] = Rotation.from_rotvec(TURN).as_matrix(), SHIFT
+
+
+def brown(values, points):
+    """Pixels (n, 2) of points (n, 3) in camera axes."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = values
+    x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+    s = x**2 + y**2
+    radial = 1 + k1 * s + k2 * s**2 + k3 * s**3
+    xd = x * radial + 2 * p1 * x * y + p2 * (s + 2 * x**2)
+    yd = y * radial + p1 * (s + 2 * y**2) + 2 * p2 * x * y
+    return np.column_stack([fx * xd + cx, fy * yd + cy])
+
+
+def board_poses(count, rng, tilt=0.6, board=BOARD):
+    """left_from_board (count, 4, 4): boards before both cameras, tilted to all sides."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    middle = board.points.mean(axis=0)
+    for pose in poses:
+        face = Rotation.from_rotvec([0.0, -0.3, 0.0])
+        pose[:3, :3] = (face * Rotation.from_rotvec(tilt * rng.uniform(-1, 1, 3))).as_matrix()
+        pose[:3, 3] = [*rng.uniform(-0.3, 0.3, 2), rng.uniform(1.4, 2.0)] - pose[:3, :3] @ middle
+    return poses
+
+
+def seen_pairs(poses, noise=0.0, rng=None, values=(LEFT, RIGHT), board=BOARD):
+    pairs = []
+    for k, pose in enumerate(poses):
+        sides = []
+        for own, move in zip(values, (np.eye(4), RIGHT_FROM_LEFT), strict=True):
+            transform = move @ pose
+            pixels = brown(own, board.points @ transform[:3, :3].T + transform[:3, 3])
+            if noise:
+                pixels = pixels + rng.normal(0.0, noise, pixels.shape)
+            sides.append(BoardView(np.arange(len(pixels)), pixels))
+        pairs.append(PairView(f"{k:02d}.png", *sides))
+    return pairs
+
+
+def true_state(poses):
+    return RigState(np.stack([LEFT, RIGHT]), RIGHT_FROM_LEFT, poses)
+
+
+def error_of(solved):
+    """Estimate minus truth (24,): intrinsics, and the small error [dt, dphi] of right_from_left."""
+    place = solved.state.right_from_left
+    turn = Rotation.from_matrix(place[:3, :3] @ RIGHT_FROM_LEFT[:3, :3].T).as_rotvec()
+    return np.concatenate([solved.state.intrinsics[0] - LEFT, solved.state.intrinsics[1] - RIGHT,
+                           place[:3, 3] - SHIFT, turn])
+
+
+def test_projection_and_its_derivatives():
+    points = np.random.default_rng(0).uniform([-0.5, -0.4, 1.2], [0.5, 0.4, 2.0], (20, 3))
+    pixels, by_intrinsics, by_points = project(LEFT, points)
+    np.testing.assert_allclose(pixels, brown(LEFT, points), atol=1e-9)
+    for k, step in enumerate(1e-5 * np.maximum(np.abs(LEFT), 0.1)):
+        change = step * np.eye(9)[k]
+        slope = (brown(LEFT + change, points) - brown(LEFT - change, points)) / (2 * step)
+        np.testing.assert_allclose(by_intrinsics[:, :, k], slope, rtol=1e-6, atol=1e-6)
+    for k in range(3):
+        change = 1e-6 * np.eye(3)[k]
+        slope = (brown(LEFT, points + change) - brown(LEFT, points - change)) / 2e-6
+        np.testing.assert_allclose(by_points[:, :, k], slope, rtol=1e-6, atol=1e-4)
+
+
+def test_noise_free_points_give_the_truth_from_opencvs_start():
+    found = calibrate(BOARD, seen_pairs(board_poses(12, np.random.default_rng(1))), SIZE)
+    np.testing.assert_allclose(found.values, TRUTH, rtol=1e-6, atol=1e-7)
+    assert found.adjustment.sigma_px < 1e-6
+    assert not found.rejected
+
+
+@pytest.mark.parametrize(("distortion", "fix_aspect", "free"),
+                         [("none", False, 4), ("radial2", True, 5), ("brown5", False, 9)])
+def test_what_is_not_free_stays(distortion, fix_aspect, free):
+    values = []
+    for own in (LEFT.copy(), RIGHT.copy()):
+        own[4:] = own[4:] * {"none": 0, "radial2": [1, 1, 0, 0, 0], "brown5": 1}[distortion]
+        own[1] = own[0] if fix_aspect else own[1]
+        values.append(own)
+    pairs = seen_pairs(board_poses(10, np.random.default_rng(2)), 0.05, np.random.default_rng(3), values)
+    found = calibrate(BOARD, pairs, SIZE, CalibrationOptions(distortion, fix_aspect))
+    error, std = found.values - np.concatenate([*values, SHIFT, TURN]), found.std
+    assert np.count_nonzero(std[:9]) == free + fix_aspect
+    assert np.linalg.matrix_rank(found.covariance / np.outer(std, std).clip(1e-300)) == 2 * free + 6
+    np.testing.assert_allclose(error[std == 0], 0, atol=1e-12)
+    assert np.abs(error[std > 0] / std[std > 0]).max() < 4.5
+    if fix_aspect:
+        assert found.values[0] == pytest.approx(found.values[1], rel=1e-12)
+
+
+def monte_carlo(runs, noise=0.1):
+    board = Board(kind="chessboard", columns=7, rows=5, spacing=0.075)
+    poses = board_poses(8, np.random.default_rng(4), board=board)
+    free = free_directions("brown5", False)
+    rng = np.random.default_rng(5)
+    errors, covariances, sigmas = [], [], []
+    for _ in range(runs):
+        solved = adjust(board.points, sightings_of(seen_pairs(poses, noise, rng, board=board)), true_state(poses), free)
+        errors.append(error_of(solved))
+        covariances.append(solved.covariance)
+        sigmas.append(solved.sigma_px)
+    return np.array(errors), np.array(covariances), np.array(sigmas)
+
+
+def test_covariance_is_true():
+    """Normalised squared error of all 24 within its chi-square interval, 95 % intervals hold 95 %, no bias."""
+    runs = 100
+    errors, covariances, sigmas = monte_carlo(runs)
+    squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+    low, high = chi2.ppf([0.0005, 0.9995], 24 * runs) / runs
+    assert low < squared.mean() < high
+    inside = np.abs(errors) < 1.96 * np.sqrt(np.einsum("nii->ni", covariances))
+    assert 0.92 < inside.mean() < 0.975
+    assert np.abs(errors.mean(axis=0) / (errors.std(axis=0) / np.sqrt(runs))).max() < 4.0
+    assert np.mean(sigmas) == pytest.approx(0.1, rel=0.01)
+
+
+@pytest.mark.slow
+def test_95_percent_regions_hold_95_percent():
+    runs = 1000
+    errors, covariances, _ = monte_carlo(runs)
+    squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
+    assert 0.93 < np.mean(squared < chi2.ppf(0.95, 24)) < 0.97
+    assert squared.mean() == pytest.approx(24, rel=0.05)
+
+
+def test_covariance_of_the_rotation_vector():
+    """Against the scatter of the rotation vector's finite differences."""
+    found = calibrate(BOARD, seen_pairs(board_poses(8, np.random.default_rng(6)), 0.1, np.random.default_rng(7)), SIZE)
+    rotation = Rotation.from_matrix(found.rig.right_from_left[:3, :3])
+    slope = np.column_stack([((Rotation.from_rotvec(1e-6 * axis) * rotation).as_rotvec() - rotation.as_rotvec()) / 1e-6
+                             for axis in np.eye(3)])
+    expected = slope @ found.adjustment.covariance[-3:, -3:] @ slope.T
+    np.testing.assert_allclose(found.covariance[-3:, -3:], expected, rtol=1e-4)
+    assert len(found.values) == len(PARAMETER_NAMES)
+
+
+def test_each_picture_may_be_read_in_any_order_of_a_symmetric_board():
+    board = Board(kind="chessboard", columns=7, rows=7, spacing=0.05)
+    rng = np.random.default_rng(8)
+    pairs = seen_pairs(board_poses(10, rng, board=board), 0.05, rng, board=board)
+    plain = calibrate(board, pairs, SIZE)
+    mixed = [PairView(p.name, *(view.read_as(board.symmetries[rng.integers(4)]) for view in p.sides)) for p in pairs]
+    assert np.abs((calibrate(board, mixed, SIZE).values - plain.values) / plain.std).max() < 0.01
+
+
+def test_wrong_partner_and_bad_image_are_given_up_with_their_reasons():
+    rng = np.random.default_rng(9)
+    pairs = seen_pairs(board_poses(12, rng), 0.05, rng)
+    plain = calibrate(BOARD, pairs, SIZE)
+    worse = list(pairs)
+    worse[3] = PairView("03.png", pairs[3].left, pairs[4].right)
+    noisy = BoardView(pairs[7].left.index, pairs[7].left.pixels + rng.normal(0, 2.0, (63, 2)))
+    worse[7] = PairView("07.png", noisy, pairs[7].right)
+    found = calibrate(BOARD, worse, SIZE)
+    assert set(found.rejected) == {"03.png", "07.png"}
+    assert "fit no other pair" in found.rejected["03.png"]
+    assert re.fullmatch(r"left: rms 2\.\d\d px, more than 4 times the median of 0\.05 px", found.rejected["07.png"])
+    assert np.abs((found.values - plain.values) / plain.std).max() < 3.0
+
+
+def test_image_with_the_board_in_one_camera_still_helps_that_camera():
+    rng = np.random.default_rng(10)
+    pairs = seen_pairs(board_poses(14, rng), 0.05, rng)
+    short = calibrate(BOARD, pairs[:8], SIZE)
+    more = calibrate(BOARD, pairs[:8] + [p.without(1, "no board") for p in pairs[8:]], SIZE)
+    assert np.all(more.std[:9] < short.std[:9])
+    assert more.rejected["09.png"] == "right: no board"
+    assert np.abs((more.values - TRUTH) / more.std).max() < 4.0
+
+
+def test_too_few_pairs_are_listed():
+    pairs = seen_pairs(board_poses(5, np.random.default_rng(11)))
+    pairs = pairs[:2] + [p.without(0, "no chessboard found") for p in pairs[2:]]
+    with pytest.raises(CalibrationError, match=r"2 of 5 pairs .* 3 needed; without it: 02.png \(left: no chessboard"):
+        calibrate(BOARD, pairs, SIZE)
+    with pytest.raises(CalibrationError, match="12 needed"):
+        calibrate(BOARD, seen_pairs(board_poses(5, np.random.default_rng(11))), SIZE, CalibrationOptions(min_images=12))
+
+
+def test_parallel_boards_are_warned_of_or_refused():
+    rng = np.random.default_rng(12)
+    flat = seen_pairs(board_poses(10, rng, tilt=0.005), 0.1, rng)
+    try:
+        lines = " ".join(calibrate(BOARD, flat, SIZE).warnings)
+    except CalibrationError as error:
+        lines = str(error)
+    assert "tilt" in lines
+    tilted = calibrate(BOARD, seen_pairs(board_poses(10, rng), 0.1, rng), SIZE)
+    assert not [line for line in tilted.warnings if "parallel" in line or "uncertain" in line]
+
+
+def test_pairs_not_taken_together_are_refused():
+    rng = np.random.default_rng(13)
+    a, b = (seen_pairs(board_poses(8, rng)) for _ in range(2))
+    mixed = [PairView(x.name, x.left, y.right) for x, y in zip(a, b, strict=True)]
+    with pytest.raises(CalibrationError, match="pairs agree on where the right camera stands"):
+        calibrate(BOARD, mixed, SIZE)

@@ -1,0 +1,363 @@
+"""Boards, image files, and the board in rendered and photograph-like images, against the projected truth."""
+
+import cv2
+import numpy as np
+import pytest
+
+import cmmsim
+from cmmsim.calibration import (
+    Board,
+    CalibrationError,
+    CalibrationOptions,
+    ImagePair,
+    PairView,
+    as_dict,
+    board_poses,
+    calibrate,
+    calibrated_sensor,
+    find_board,
+    pair_images,
+    read_board,
+    read_grey,
+    render_pairs,
+    view_pairs,
+)
+from cmmsim.camera import PinholeCamera
+from cmmsim.distortion import Distortion
+from cmmsim.eccentricity import centre_offset
+from cmmsim.noise import CameraNoise
+from cmmsim.optics import Optics
+from cmmsim.pose import apply, rotation_log
+from cmmsim.renderers import ANALYTIC, PYRENDER
+from cmmsim.stereo_rig import StereoRig, toed_in_rig
+
+NOISE = CameraNoise(1600.0, 0.13, 26.0, 1800.0, 16.0)
+DOTS = Board(kind="dots", columns=9, rows=7, spacing=0.05, radius=0.0125)
+ASYMMETRIC = Board(kind="asymmetric_dots", columns=4, rows=9, spacing=0.04, radius=0.014)
+CHESSBOARD = Board(kind="chessboard", columns=8, rows=6, spacing=0.05)
+PERFECT = toed_in_rig(PinholeCamera(1000.0, 399.5, 299.5, 800, 600), 0.5, np.array([0.0, -1.6, 0.0]), np.zeros(3))[0]
+BENT = StereoRig(PinholeCamera(1000.0, 404.0, 296.0, 800, 600, 1.002, Distortion(-0.15, 0.08, 6e-4, -4e-4)),
+                 PinholeCamera(1010.0, 395.0, 303.0, 800, 600, 0.999, Distortion(-0.12, 0.05, -3e-4, 5e-4)),
+                 PERFECT.right_from_left.copy())
+
+
+def rendered(rig, board, count, seed=0, renderer=ANALYTIC, optics=None):
+    rng = np.random.default_rng(seed)
+    poses = board_poses(rig, board, count, rng)
+    return poses, list(render_pairs(rig, board, poses, renderer, optics or Optics(), NOISE, rng))
+
+
+def expected_pixels(camera, camera_from_board, board):
+    points = apply(camera_from_board, board.points)
+    pixels = camera.project(points)[0]
+    if board.radius:
+        normals = np.tile(-camera_from_board[:3, 2], (len(points), 1))
+        pixels = pixels + centre_offset(camera, points, normals, board.radius)
+    return pixels
+
+
+def pixel_errors(rig, board, poses, frames):
+    """Errors (n, 2) px of all found points, each board read in the order that fits."""
+    errors = []
+    for pose, frame in zip(poses, frames, strict=True):
+        for image, camera, move in zip((frame.left, frame.right), rig.cameras, rig.from_camera, strict=True):
+            view = find_board(image, board)
+            assert not isinstance(view, str), view
+            truth = expected_pixels(camera, move @ pose, board)
+            read = [v.pixels - truth[v.index] for v in map(view.read_as, board.symmetries)]
+            errors.append(min(read, key=lambda e: np.abs(e).max()))
+    return np.concatenate(errors)
+
+
+def normalised_errors(found, rig):
+    """Estimate minus truth over reported std, of what was free, [dt, dphi] for the place of the right camera."""
+    errors = []
+    for camera, values in zip(rig.cameras, found.adjustment.state.intrinsics, strict=True):
+        lens = camera.distortion
+        errors += list(values - [*camera.focal_lengths, *camera.centre, lens.k1, lens.k2, lens.p1, lens.p2, lens.k3])
+    place = found.rig.right_from_left
+    turn = rotation_log(place[:3, :3] @ rig.right_from_left[:3, :3].T)
+    errors += [*(place[:3, 3] - rig.right_from_left[:3, 3]), *turn]
+    std = np.sqrt(np.diag(found.adjustment.covariance))
+    return np.array(errors)[std > 0] / std[std > 0]
+
+
+def views_of(frames, board):
+    return [PairView(f"{k:02d}.png", find_board(f.left, board), find_board(f.right, board))
+            for k, f in enumerate(frames)]
+
+
+# --- board files
+
+
+@pytest.mark.parametrize("board", [DOTS, ASYMMETRIC, CHESSBOARD])
+def test_board_file_is_read_back(tmp_path, board):
+    (tmp_path / "board.toml").write_text(board.as_toml())
+    assert read_board(tmp_path / "board.toml") == board
+
+
+@pytest.mark.parametrize(("text", "evidence"), [
+    ("colums = 9", "unknown key 'colums', valid are columns, dark, kind, radius, rows, spacing"),
+    ("columns = 9.5", r"columns: .*integer.*\(got 9.5\)"),
+    ("columns = true", r"columns: .*\(got True\)"),
+    ("columns = 2", "columns: .*greater than or equal to 3"),
+    ('kind = "aruco"', "kind: .*'chessboard', 'dots' or 'asymmetric_dots'"),
+    ("spacing = nan", "spacing: .*finite"),
+    ("spacing = 0", "spacing: .*greater than 0"),
+    ("radius = 0.03", "nearly touch: the largest radius is 0.02 m"),
+    ("rows", "is not TOML"),
+])
+def test_bad_board_file_is_refused_with_evidence(tmp_path, text, evidence):
+    values = {"kind": '"dots"', "columns": "9", "rows": "7", "spacing": "0.05", "radius": "0.01"}
+    name, _, value = text.partition(" = ")
+    values[name] = value
+    (tmp_path / "board.toml").write_text("\n".join(f"{k} = {v}" for k, v in values.items()))
+    with pytest.raises(CalibrationError, match=evidence):
+        read_board(tmp_path / "board.toml")
+
+
+def test_board_with_parts_that_do_not_belong_is_refused(tmp_path):
+    path = tmp_path / "board.toml"
+    with pytest.raises(CalibrationError, match="cannot read board file"):
+        read_board(path)
+    path.write_text(CHESSBOARD.as_toml() + "radius = 0.01\n")
+    with pytest.raises(CalibrationError, match="a chessboard has no dots"):
+        read_board(path)
+    path.write_text(DOTS.as_toml().replace("radius = 0.0125", ""))
+    with pytest.raises(CalibrationError, match="radius of the dots"):
+        read_board(path)
+
+
+@pytest.mark.parametrize("board", [DOTS, ASYMMETRIC, CHESSBOARD, DOTS.model_copy(update={"columns": 7}),
+                                   ASYMMETRIC.model_copy(update={"rows": 8})])
+def test_symmetries_carry_the_board_onto_itself(board):
+    """All distances stay, which a rigid turn of the same points needs."""
+    def distances(points):
+        return np.linalg.norm(points[:, None] - points[None], axis=2)
+
+    assert len({tuple(order) for order in board.symmetries}) == len(board.symmetries)
+    for order in board.symmetries:
+        np.testing.assert_allclose(distances(board.points[order]), distances(board.points), atol=1e-12)
+    if board.kind == "asymmetric_dots" and board.rows % 2:
+        assert len(board.symmetries) == 1
+
+
+# --- image files
+
+
+def test_grey_values_of_other_kinds_of_images(tmp_path):
+    grey = np.linspace(0, 255, 64 * 48).reshape(48, 64).astype(np.uint8)
+    images = {"colour.png": np.dstack([grey] * 3), "alpha.png": np.dstack([grey] * 3 + [np.full_like(grey, 9)]),
+              "twelve.png": (grey.astype(np.uint16) * 16), "grey.png": grey, "photo.jpg": grey,
+              "deep.tif": grey.astype(np.uint16) * 257}
+    for name, image in images.items():
+        assert cv2.imwrite(str(tmp_path / name), image)
+        read = read_grey(tmp_path / name)
+        assert read.shape == (48, 64)
+        assert read.dtype == np.uint8
+        assert np.abs(read.astype(int) - grey).max() <= (6 if name == "photo.jpg" else 1), name
+
+
+def files(folder, names):
+    folder.mkdir(parents=True)
+    for name in names:
+        cv2.imwrite(str(folder / name), np.zeros((8, 8), np.uint8))
+    return folder
+
+
+def test_pairs_are_made_in_the_order_of_the_names(tmp_path):
+    left, right = files(tmp_path / "a", ["l2.png", "l1.png"]), files(tmp_path / "b", ["r1.png", "r2.png"])
+    (left / "notes.txt").touch()
+    assert [pair.name for pair in pair_images(left, right)] == ["l1.png | r1.png", "l2.png | r2.png"]
+
+
+def test_folders_that_make_no_pairs_are_refused(tmp_path):
+    left = files(tmp_path / "a", ["1.png", "2.png", "4.png"])
+    with pytest.raises(CalibrationError, match=r"no folder .*missing"):
+        pair_images(left, tmp_path / "missing")
+    with pytest.raises(CalibrationError, match=r"holds no images, which end in \.bmp"):
+        pair_images(left, files(tmp_path / "empty", []))
+    with pytest.raises(CalibrationError, match=r"holds 3 images and .* 2; .*left: 4; only on the right: none"):
+        pair_images(left, files(tmp_path / "b", ["1.png", "2.png"]))
+    with pytest.raises(CalibrationError, match="Only on the left: 4; only on the right: 3"):
+        pair_images(left, files(tmp_path / "c", ["1.png", "2.png", "3.png"]))
+    with pytest.raises(CalibrationError, match="named for both cameras"):
+        pair_images(left, left)
+
+
+def test_images_that_cannot_be_read_or_differ_in_size_are_refused(tmp_path):
+    left, right = files(tmp_path / "a", ["1.png"]) / "1.png", files(tmp_path / "b", ["1.png"]) / "1.png"
+    for content in (b"", b"no image"):
+        right.write_bytes(content)
+        with pytest.raises(CalibrationError, match=r"cannot read image .*b.1\.png: it is truncated or not"):
+            view_pairs([ImagePair(left, right)], DOTS)
+    cv2.imwrite(str(right), np.zeros((8, 10), np.uint8))
+    with pytest.raises(CalibrationError, match=r"b.1\.png is 10 x 8 px, .*a.1\.png 8 x 8"):
+        view_pairs([ImagePair(left, right)], DOTS)
+
+
+# --- the board in images
+
+
+@pytest.mark.parametrize("board", [DOTS, ASYMMETRIC, DOTS.model_copy(update={"dark": False})])
+def test_dots_are_found_to_hundredths_of_a_pixel(board):
+    errors = pixel_errors(PERFECT, board, *rendered(PERFECT, board, 2))
+    assert np.sqrt(np.mean(errors**2)) < 0.02
+    assert np.abs(errors.mean(axis=0)).max() < 0.004
+
+
+@pytest.mark.slow
+def test_dots_are_found_as_well_behind_bending_lenses():
+    errors = pixel_errors(BENT, DOTS, *rendered(BENT, DOTS, 2))
+    assert np.sqrt(np.mean(errors**2)) < 0.02
+    assert np.abs(errors.mean(axis=0)).max() < 0.004
+
+
+@pytest.mark.rendering
+def test_chessboard_corners_are_found_to_a_tenth_of_a_pixel():
+    errors = pixel_errors(PERFECT, CHESSBOARD, *rendered(PERFECT, CHESSBOARD, 2, renderer=PYRENDER))
+    assert np.sqrt(np.mean(errors**2)) < 0.1
+    assert np.abs(errors.mean(axis=0)).max() < 0.03
+
+
+def test_chessboard_is_found_by_the_older_search_where_the_newer_fails(monkeypatch):
+    poses, frames = rendered(PERFECT, CHESSBOARD, 1, renderer=PYRENDER)
+    monkeypatch.setattr(cv2, "findChessboardCornersSB", lambda *_, **__: (False, None))
+    assert np.sqrt(np.mean(pixel_errors(PERFECT, CHESSBOARD, poses, frames) ** 2)) < 0.1
+
+
+@pytest.mark.parametrize("shape", [lambda c: c[:, None, :], lambda c: c])
+def test_both_shapes_of_opencvs_answer_are_one(monkeypatch, shape):
+    poses, frames = rendered(PERFECT, DOTS, 1)
+    found = cv2.findCirclesGrid
+
+    def other(*arguments, **options):
+        ok, centres = found(*arguments, **options)
+        return ok, shape(np.asarray(centres).reshape(-1, 2)) if ok else None
+
+    monkeypatch.setattr(cv2, "findCirclesGrid", other)
+    assert np.abs(pixel_errors(PERFECT, DOTS, poses, frames)).max() < 0.1
+
+
+def test_no_board_is_a_reason_and_not_an_error():
+    rng = np.random.default_rng(0)
+    for board in (DOTS, ASYMMETRIC, CHESSBOARD):
+        assert "found" in find_board(rng.integers(0, 255, (480, 640), dtype=np.uint8), board)
+    _, frames = rendered(PERFECT, DOTS, 1)
+    half = frames[0].left.copy()
+    rows = np.flatnonzero((half > 120).any(axis=1))
+    half[rows[0]:rows[len(rows) // 2]] = 20
+    assert find_board(half, DOTS) == "no dots of 9 x 7 found"
+
+
+def test_chessboard_needs_pyrender():
+    with pytest.raises(CalibrationError, match="take the renderer pyrender, or a dot board"):
+        rendered(PERFECT, CHESSBOARD, 1)
+
+
+def test_board_too_large_for_the_rig_is_refused():
+    with pytest.raises(CalibrationError, match=r"shows the whole board of 2\.5 x 2 m"):
+        board_poses(PERFECT, DOTS.model_copy(update={"spacing": 0.25}), 1, np.random.default_rng(0))
+
+
+# --- from images to cameras
+
+
+@pytest.fixture(scope="module")
+def dot_views():
+    _, frames = rendered(PERFECT, DOTS, 8, seed=3)
+    return views_of(frames, DOTS)
+
+
+def test_rendered_dots_give_the_true_cameras(dot_views):
+    found = calibrate(DOTS, dot_views, (800, 600))
+    assert len(found.used) == 8
+    assert np.abs(normalised_errors(found, PERFECT)).max() < 4.0
+    assert found.adjustment.sigma_px < 0.02
+
+
+@pytest.mark.slow
+def test_rendered_dots_give_the_true_cameras_and_lenses():
+    found = calibrate(DOTS, views_of(rendered(BENT, DOTS, 10, seed=3)[1], DOTS), (800, 600))
+    assert len(found.used) == 10
+    assert np.abs(normalised_errors(found, BENT)).max() < 4.0
+
+
+def test_calibrated_sensor_file_is_one(dot_views, tmp_path):
+    found = calibrate(DOTS, dot_views, (800, 600))
+    from importlib import resources
+    template = resources.files("cmmsim").joinpath("sensors", "ctrack780.toml").read_text(encoding="utf-8")
+    with pytest.raises(CalibrationError, match="images are 800 x 600 px, those of the sensor file 2048 x 1536"):
+        calibrated_sensor(template, found)
+    template = template.replace("width = 2048", "width = 800").replace("height = 1536", "height = 600")
+    once = calibrated_sensor(template, found)
+    assert calibrated_sensor(once, found) == once
+    (tmp_path / "mine.toml").write_text(once)
+    rig = cmmsim.load_sensor(tmp_path / "mine.toml", renderer="analytic").rig
+    for camera, expected in zip(rig.cameras, found.rig.cameras, strict=True):
+        np.testing.assert_allclose(camera.matrix, expected.matrix, rtol=1e-14)
+        assert camera.distortion == expected.distortion
+    np.testing.assert_allclose(rig.right_from_left, found.rig.right_from_left, atol=1e-12)
+    assert as_dict(found)["opencv"] == cv2.__version__
+
+
+def test_eccentricity_correction_removes_the_bias_of_large_dots():
+    """Centres of dots with 19 px radius as an exact detector gives them, from the closed form of the ellipse."""
+    board = Board(kind="dots", columns=7, rows=6, spacing=0.08, radius=0.031)
+    rng = np.random.default_rng(5)
+    pairs = []
+    for k, pose in enumerate(board_poses(BENT, board, 12, rng)):
+        sides = [cmmsim.calibration.BoardView(np.arange(42), expected_pixels(c, m @ pose, board)
+                                              + rng.normal(0, 0.005, (42, 2)))
+                 for c, m in zip(BENT.cameras, BENT.from_camera, strict=True)]
+        pairs.append(PairView(f"{k}", *sides))
+    on = calibrate(board, pairs, (800, 600))
+    off = calibrate(board, pairs, (800, 600), CalibrationOptions(correct_dots=False))
+    assert np.abs(normalised_errors(on, BENT)).max() < 4.0
+    assert np.abs(normalised_errors(off, BENT)).max() > 8.0  # far outside of what it reports
+    assert on.adjustment.sigma_px == pytest.approx(0.005, rel=0.06)
+    assert off.adjustment.sigma_px > 1.1 * on.adjustment.sigma_px
+
+
+@pytest.mark.slow
+def test_large_rendered_dots_are_unbiased_with_the_correction_only():
+    board = Board(kind="dots", columns=7, rows=6, spacing=0.08, radius=0.031)
+    views = views_of(rendered(PERFECT, board, 14, seed=6)[1], board)
+    options = {correct: CalibrationOptions("none", correct_dots=correct) for correct in (True, False)}
+    worst = {correct: np.abs(normalised_errors(calibrate(board, views, (800, 600), o), PERFECT)).max()
+             for correct, o in options.items()}
+    assert worst[True] < 4.0 < worst[False]
+
+
+def as_photograph(image, rng):
+    """Uneven light, a blurred lens, noise and JPEG."""
+    y, x = np.mgrid[:image.shape[0], :image.shape[1]]
+    light = 1.0 - 0.45 * np.hypot(x - 150, y - 100) / 1000.0
+    soft = cv2.GaussianBlur(image.astype(np.float32) * light, (0, 0), 1.1) + rng.normal(0, 1.5, image.shape)
+    coded = cv2.imencode(".jpg", np.clip(soft, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 88])[1]
+    return cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("board", "renderer"), [(DOTS, ANALYTIC), (ASYMMETRIC, ANALYTIC), (CHESSBOARD, PYRENDER)])
+def test_photograph_like_images_give_the_true_cameras(board, renderer):
+    """One pair shows the board partly outside of the left image: it is left out, with the reason."""
+    rng = np.random.default_rng(7)
+    _, frames = rendered(BENT, board, 16, seed=7, renderer=renderer, optics=Optics(vignetting=0.2))
+    images = [(as_photograph(f.left, rng), as_photograph(f.right, rng)) for f in frames]
+    columns = np.flatnonzero((frames[0].left > 100).any(axis=0))
+    cut = np.roll(images[0][0], -int(np.mean(columns[[0, -1]])), axis=1)
+    cut[:, -int(np.mean(columns[[0, -1]])):] = 10
+    images[0] = cut, images[0][1]
+    views = [PairView(f"{k:02d}.jpg", find_board(a, board), find_board(b, board)) for k, (a, b) in enumerate(images)]
+    found = calibrate(board, views, (800, 600))
+    assert "left: no" in found.rejected["00.jpg"]
+    assert len(found.rejected) <= 3
+    assert np.abs(normalised_errors(found, BENT)).max() < 5.0
+    assert found.adjustment.sigma_px < 0.15
+
+
+@pytest.mark.slow
+def test_rendered_chessboard_gives_the_true_cameras():
+    views = views_of(rendered(BENT, CHESSBOARD, 14, seed=8, renderer=PYRENDER)[1], CHESSBOARD)
+    assert np.abs(normalised_errors(calibrate(CHESSBOARD, views, (800, 600)), BENT)).max() < 4.0
