@@ -11,55 +11,84 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dynamics.closed_loop import simulate
+from dynamics.closed_loop import LoopFailure, simulate
 from identify.arrays import Array
+from identify.errors import EstimationError
 from identify.output_error import OutputErrorProblem
 from identify.progress import Advance
+from identify.recorded_run import RecordedRun
 
 DRAWS = 100
 """Repetitions: they know a standard deviation to 7 %."""
+
+NOISE_DECIDES = 3.0
+"""Mean squared whitened residual beyond which the model's error, not the noise, decides: noise is not propagated then,
+and the covariance is that of white residuals of the size found."""
+
+FEWEST = 50
+"""Repetitions that must have run to their end."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
     """Covariance (67, 67) of the estimate; mean squared whitened residual to expect from noise alone, and its spread
-    from one experiment to the next."""
+    from one experiment to the next; unstable: repeated experiments that ended early and were left out."""
 
     covariance: Array
     expected_noise_ratio: float
     noise_ratio_std: float
+    unstable: int = 0
 
 
 def estimate_uncertainty(
     problem: OutputErrorProblem, parameters: Array, rng: np.random.Generator, advance: Advance = lambda n=1: None
 ) -> Uncertainty:
-    """Uncertainty of the estimate `parameters` (67,), from DRAWS repeated experiments."""
-    _, jacobian = problem.residuals(parameters)
-    flat = jacobian.reshape(-1, len(parameters))
-    data, known = flat.T @ flat, problem.known_information()
-    inverse = np.linalg.inv(data + known)
-    if problem.commands is not None:
+    """Uncertainty of the estimate `parameters` (67,), from DRAWS repeated experiments.
+
+    Raises EstimationError when too many of them are unstable.
+    """
+    size = len(parameters)
+    jacobians = [run.residuals(parameters)[1].reshape(-1, size) for run in problem.runs]
+    known = problem.known_information()
+    inverse = np.linalg.inv(sum(j.T @ j for j in jacobians) + known)
+    if all(run.driven for run in problem.runs):
         advance(DRAWS)
-        count = 6 * int(problem.ok.sum())
+        count = sum(len(j) for j in jacobians)
         return Uncertainty((inverse + inverse.T) / 2, 1.0, float(np.sqrt(2 / count)))
-    model = problem.model_poses(parameters)
-    repeated = [_repeated_poses(problem, parameters, rng, advance) for _ in range(DRAWS)]
-    residuals = np.array([problem.whiten(model - poses) for poses in repeated])
-    scores = residuals.reshape(DRAWS, -1) @ flat
-    covariance = inverse @ (np.cov(scores.T) + known) @ inverse
-    squares = np.mean(residuals**2, axis=(1, 2))
-    return Uncertainty((covariance + covariance.T) / 2, float(squares.mean()), float(squares.std(ddof=1)))
+    misfit = problem.noise_ratio(parameters)
+    if misfit > NOISE_DECIDES:
+        advance(DRAWS)
+        return Uncertainty(misfit * (inverse + inverse.T) / 2, 1.0, float(np.sqrt(2 / sum(map(len, jacobians)))))
+    models = [run.model_poses(parameters) for run in problem.runs]
+    scores, squares = [], []
+    for _ in range(DRAWS):
+        try:
+            repeated = [_repeated_poses(run, parameters, rng) for run in problem.runs]
+        except LoopFailure:
+            continue
+        finally:
+            advance()
+        residuals = [
+            run.whiten(model - poses).ravel() for run, model, poses in zip(problem.runs, models, repeated, strict=True)
+        ]
+        scores.append(sum(r @ j for r, j in zip(residuals, jacobians, strict=True)))
+        squares.append(np.mean(np.concatenate(residuals) ** 2))
+    if len(scores) < FEWEST:
+        raise EstimationError(
+            f"{DRAWS - len(scores)} of {DRAWS} repeated experiments on the identified model ended in an unstable loop: "
+            "its servo cannot bear the sensor's noise, and no interval can be given"
+        )
+    covariance = inverse @ (np.cov(np.array(scores).T) + known) @ inverse
+    return Uncertainty(
+        (covariance + covariance.T) / 2, float(np.mean(squares)), float(np.std(squares, ddof=1)), DRAWS - len(scores)
+    )
 
 
-def _repeated_poses(
-    problem: OutputErrorProblem, parameters: Array, rng: np.random.Generator, advance: Advance
-) -> Array:
+def _repeated_poses(run: RecordedRun, parameters: Array, rng: np.random.Generator) -> Array:
     """Measured poses (N, 6) of one repeated experiment whose plant is the identified model; NaN where lost."""
-    noise = rng.standard_normal(problem.measured.shape) @ np.linalg.cholesky(problem.covariance).T
+    noise = rng.standard_normal(run.measured.shape) @ np.linalg.cholesky(run.covariance).T
 
     def sensor(frame: int, t: float, pose: Array) -> Array | None:
-        return pose + noise[frame] if problem.ok[frame] else None
+        return pose + noise[frame] if run.ok[frame] else None
 
-    repeated = simulate(problem.robot, parameters, problem.reference, problem.settings, sensor)
-    advance()
-    return repeated.measured
+    return simulate(run.robot, parameters + run.payload, run.reference, run.settings, sensor).measured

@@ -8,6 +8,7 @@ settings or the truth.
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from dynamics import DynamicsError, Robot
-from dynamics.closed_loop import Reference
 from identify import warm_start
 from identify.arrays import Array
 from identify.base_parameters import base_parameters, rank_by_threshold, reference_regressor, structural_regressor
@@ -24,12 +24,11 @@ from identify.errors import EstimationError
 from identify.estimate_covariance import DRAWS, Uncertainty, estimate_uncertainty
 from identify.group_estimates import IDENTIFIABLE_SHARE, GroupEstimates, group_estimates
 from identify.loop_parameters import NAMES, StartingGuess, starting_guess
-from identify.loop_setup import model_settings
 from identify.output_error import OutputErrorProblem
 from identify.progress import Advance, Progress, SilentProgress
-from identify.recording import poses
+from identify.recorded_run import recorded_run
 from identify.scale_anchor import ScaleAnchor, read_anchor
-from identify.scenario import Scenario, scenario_from_toml
+from identify.scenario import Scenario
 
 MISFIT_STDS = 5.0
 """Standard deviations from the expected residual beyond which a warning is given."""
@@ -39,9 +38,6 @@ SMALLEST_SHARE = 1e-3
 
 UNCERTAINTY_STREAM = 5
 """Random stream of the repeated experiments, beside those of the experiment."""
-
-MINIMUM_GOOD_SHARE = 0.5
-"""Share of frames that must have been measured."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +72,12 @@ class IdentificationResult:
 
 
 def identify(
-    record: xr.Dataset, robot: Robot, scenario: Scenario, progress: Progress | None = None
+    record: xr.Dataset | Sequence[xr.Dataset],
+    robot: Robot,
+    scenario: Scenario,
+    progress: Progress | None = None,
 ) -> IdentificationResult:
-    """Estimate the parameters of robot and joint PID from one record by closed-loop output error.
+    """Estimate the parameters of robot and joint PID from one or several records by closed-loop output error.
 
     Raises:
         RecordError: the record misses something, or belongs to another robot or frame rate.
@@ -88,22 +87,25 @@ def identify(
     settings = scenario.identification
     problem = output_error_problem(record, robot, scenario)
     began = time.perf_counter()
-    warm = _warm_start(problem, record, scenario)
+    warm = warm_start.linear_warm_start(
+        problem.runs, scenario.timing, scenario.filter, problem.guess, problem.anchor
+    )
     warmed = time.perf_counter()
     count = 2 if settings.method == "closed_loop" else 1
     with progress.stage("identify", count * settings.max_iterations) as advance:
-        driven = problem.driven_by(record["command"].values)
+        driven = problem.driven_by_commands()
         searches = [search(driven, _best_start(driven, warm), scenario, advance)]
         if settings.method == "closed_loop":
             searches.append(search(problem, _best_start(problem, searches[0].parameters), scenario, advance))
     searched = time.perf_counter()
     final = problem if settings.method == "closed_loop" else driven
-    rng = np.random.default_rng([int(record.attrs["seed"]), UNCERTAINTY_STREAM])
+    rng = np.random.default_rng([_seed(record), UNCERTAINTY_STREAM])
     with progress.stage("uncertainty", DRAWS) as advance:
         uncertainty = estimate_uncertainty(final, searches[-1].parameters, rng, advance)
     ended = time.perf_counter()
     seconds = {"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched}
-    excited = reference_regressor(robot, problem.reference, scenario.timing.frame_rate_hz)
+    rate_hz = scenario.timing.frame_rate_hz
+    excited = np.concatenate([reference_regressor(robot, run.reference, rate_hz) for run in problem.runs])
     rank = rank_by_threshold(excited, settings.qr_threshold)
     groups = group_estimates(
         base_parameters(structural_regressor(robot)), problem.guess, searches[-1].parameters, uncertainty.covariance
@@ -123,62 +125,33 @@ def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advanc
     return solution
 
 
-def output_error_problem(record: xr.Dataset, robot: Robot, scenario: Scenario) -> OutputErrorProblem:
-    """The output-error problem of a record.
+def output_error_problem(
+    records: xr.Dataset | Sequence[xr.Dataset], robot: Robot, scenario: Scenario
+) -> OutputErrorProblem:
+    """The output-error problem of one or several records; the first brings the scale anchor.
 
     Raises:
         RecordError: no scale anchor, or no such poses.
-        EstimationError: too many lost frames.
+        EstimationError: a record that does not fit, or cannot carry an identification.
     """
-    _check_origin(record, robot, scenario)
-    ok = record["measured_ok"].values.astype(bool)
-    if ok.mean() < MINIMUM_GOOD_SHARE:
+    given = [records] if isinstance(records, xr.Dataset) else list(records)
+    if not given:
+        raise EstimationError("no record to identify from")
+    runs = tuple(recorded_run(record, robot, scenario) for record in given)
+    anchor = read_anchor(given[0])
+    if anchor.name == "payload" and len({float(run.payload @ run.payload) for run in runs}) < 2:
         raise EstimationError(
-            f"only {ok.sum()} of {len(ok)} frames were measured; at least {MINIMUM_GOOD_SHARE:.0%} are needed"
+            f"the scale anchor is a payload, and the {len(runs)} records have all the same load: one with and one "
+            "without it are needed"
         )
-    return OutputErrorProblem(
-        robot=robot,
-        settings=model_settings(scenario),
-        reference=recorded_reference(record),
-        measured=poses(record, "measured"),
-        ok=ok,
-        covariance=record["measured_covariance"].values[ok].mean(axis=0),
-        guess=starting_guess(robot, scenario.model.start_parameters, scenario.identification.start_std),
-        anchor=read_anchor(record),
-    )
+    guess = starting_guess(robot, scenario.model.start_parameters, scenario.identification.start_std)
+    return OutputErrorProblem(runs, guess, anchor)
 
 
-def recorded_reference(record: xr.Dataset) -> Reference:
-    """Reference motion of a record."""
-    rates = np.hstack([record["reference_velocity"].values, record["reference_orientation_rate"].values])
-    return Reference(poses(record, "reference"), rates)
-
-
-def _check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
-    """The record must be of this robot, and made with the timing and the servo that the model is to have."""
-    if record.attrs.get("robot") != robot.name:
-        raise EstimationError(f"the record is of robot {record.attrs.get('robot')!r}, not of {robot.name!r}")
-    recorded = scenario_from_toml(str(record.attrs.get("scenario", "")), "scenario in the record")
-    for section in ("timing", "servo"):
-        theirs, ours = getattr(recorded, section).model_dump(), getattr(scenario, section).model_dump()
-        for key, value in theirs.items():
-            if value != ours[key]:
-                raise EstimationError(
-                    f"the record was made with {section}.{key} = {value!r}, the scenario says {ours[key]!r}"
-                )
-
-
-def _warm_start(problem: OutputErrorProblem, record: xr.Dataset, scenario: Scenario) -> Array:
-    measured = _without_gaps(problem.measured, problem.ok)
-    commands = record["command"].values
-    arguments = (scenario.timing, scenario.filter, problem.guess, problem.anchor)
-    return warm_start.linear_warm_start(problem.robot, measured, commands, *arguments)
-
-
-def _without_gaps(measured: Array, ok: NDArray[np.bool_]) -> Array:
-    """Measured poses with lost frames interpolated in time; for the linear fit only."""
-    frames = np.arange(len(ok))
-    return np.column_stack([np.interp(frames, frames[ok], column[ok]) for column in measured.T])
+def _seed(record: xr.Dataset | Sequence[xr.Dataset]) -> int:
+    """Seed of the record, or of the first one."""
+    first = record if isinstance(record, xr.Dataset) else record[0]
+    return int(first.attrs["seed"])
 
 
 def _best_start(problem: OutputErrorProblem, warm: Array) -> Array:
@@ -195,7 +168,8 @@ def _best_start(problem: OutputErrorProblem, warm: Array) -> Array:
 
 def _why(problem: OutputErrorProblem, parameters: Array) -> str:
     try:
-        problem.model_poses(parameters)
+        for run in problem.runs:
+            run.model_poses(parameters)
     except DynamicsError as error:
         return str(error)
     return "the cost is not finite"
@@ -212,7 +186,8 @@ def _result(
 ) -> IdentificationResult:
     solution = searches[-1]
     std = np.sqrt(np.diag(uncertainty.covariance))
-    noise_ratio = float(np.mean(problem.whiten(problem.model_poses(solution.parameters) - problem.measured) ** 2))
+    noise_ratio = problem.noise_ratio(solution.parameters)
+    said = tuple(warning for run in problem.runs for warning in run.warnings())
     return IdentificationResult(
         names=NAMES,
         initial=problem.guess.values,
@@ -230,17 +205,24 @@ def _result(
         costs=tuple(one.costs for one in searches),
         noise_ratio=noise_ratio,
         expected_noise_ratio=uncertainty.expected_noise_ratio,
-        warnings=_warnings(noise_ratio, uncertainty),
+        warnings=said + _warnings(noise_ratio, uncertainty),
         seconds=seconds,
     )
 
 
 def _warnings(noise_ratio: float, uncertainty: Uncertainty) -> tuple[str, ...]:
-    """A misfit that the sensor's noise does not explain: a local minimum, or a model that is wrong."""
+    """A misfit that the sensor's noise does not explain (a local minimum, or a model that is wrong), or a model whose
+    loop is close to unstable."""
+    said = []
     expected, spread = uncertainty.expected_noise_ratio, uncertainty.noise_ratio_std
-    if abs(noise_ratio - expected) <= MISFIT_STDS * spread:
-        return ()
-    return (
-        f"the model misses the record by {noise_ratio:.3f} times the noise variance, noise alone gives {expected:.3f} "
-        f"± {spread:.3f}: the model or the stated covariance is wrong, and the intervals are too",
-    )
+    if abs(noise_ratio - expected) > MISFIT_STDS * spread:
+        said.append(
+            f"the model misses the record by {noise_ratio:.3f} times the noise variance, noise alone gives "
+            f"{expected:.3f} ± {spread:.3f}: the model or the stated covariance is wrong, and the intervals are too"
+        )
+    if uncertainty.unstable:
+        said.append(
+            f"{uncertainty.unstable} of {DRAWS} repeated experiments on the identified model were unstable and are "
+            "left out of the intervals"
+        )
+    return tuple(said)

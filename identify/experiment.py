@@ -16,10 +16,10 @@ from dynamics import Robot, load_robot
 from dynamics.closed_loop import ClosedLoopRun, Reference, simulate
 from identify import recording
 from identify.excitation import design_trajectories
-from identify.loop_parameters import NAMES, index_of, starting_guess
+from identify.loop_parameters import NAMES, starting_guess
 from identify.loop_setup import frame_times, plant_settings, reference_motion
 from identify.progress import Advance, Progress, SilentProgress
-from identify.scale_anchor import ANCHORED_PARAMETER, ScaleAnchor, anchor_std, store_anchor
+from identify.scale_anchor import measured_anchor, store_anchor
 from identify.scenario import Scenario
 from identify.sensor_in_loop import SensorInLoop, make_sensor
 from identify.trajectory import FourierTrajectory, check_travel
@@ -103,7 +103,8 @@ def run_plant(
     eye = SensorInLoop(sensor, robot, stream_seed(seed, NOISE, run), advance)
     done = simulate(robot, parameters, reference, plant_settings(scenario), eye)
     record = _record(scenario, robot, reference, done, eye, seed)
-    store_anchor(record, _measured_anchor(scenario, parameters, seed))
+    settings, rng = scenario.identification, np.random.default_rng(stream_seed(seed, ANCHOR))
+    store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, parameters, rng))
     return Experiment(record, _truth(robot, done, parameters))
 
 
@@ -147,15 +148,6 @@ def _truth(robot: Robot, run: ClosedLoopRun, parameters: np.ndarray) -> xr.Datas
         parameter_names=list(NAMES),
         parameters=parameters,
     )
-
-
-def _measured_anchor(scenario: Scenario, parameters: np.ndarray, seed: int) -> ScaleAnchor:
-    """The anchor as measured on the real robot: the true value with the instrument's error."""
-    name = scenario.identification.scale_anchor
-    std = anchor_std(name, scenario.identification.anchor_std)
-    error = std * np.random.default_rng(stream_seed(seed, ANCHOR)).standard_normal()
-    parameter = ANCHORED_PARAMETER[name]
-    return ScaleAnchor(name, parameter, float(parameters[index_of(parameter)] + error), std)
 
 
 def _default_path(scenario: Scenario, seed: int) -> Path:

@@ -19,6 +19,7 @@ from identify.loop_parameters import check_parameter_set
 from identify.loop_setup import frame_times
 from identify.model_runs import build_model_run, write_model_runs
 from identify.progress import Progress
+from identify.recorded_run import recorded_reference
 from identify.report import write_report
 from identify.result_file import load_result, rms_figures, save_result
 from identify.run_folder import RunFolder
@@ -77,7 +78,7 @@ def identify(folder: Path, progress: Progress) -> None:
     seen = recording.read(run_folder.experiment)
     result = estimation.identify(seen, robot, scenario, progress)
     measured, ok = recording.poses(seen, "measured"), seen["measured_ok"].values.astype(bool)
-    reference = estimation.recorded_reference(seen)
+    reference = recorded_reference(seen)
     before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))
     seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
     save_result(
@@ -170,7 +171,7 @@ def _check_singularities(robot: Robot, scenario: Scenario, trajectories: Traject
 
 def _model_poses(robot: Robot, scenario: Scenario, models: list[Array], record: xr.Dataset) -> list[Array]:
     """What each model does on the reference of a record."""
-    reference = estimation.recorded_reference(record)
+    reference = recorded_reference(record)
     return [model_run(robot, scenario, parameters, reference) for parameters in models]
 
 

@@ -9,6 +9,8 @@ of one joint, whose dry friction is known only while it slips: rows of joints ne
 homogeneous: the scale anchor, and weakly the starting guess, decide the common factor.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import lsq_linear
@@ -16,7 +18,8 @@ from scipy.optimize import lsq_linear
 from dynamics import Robot
 from identify.arrays import Array
 from identify.filtering import filtered_derivatives, zero_phase_filter
-from identify.loop_parameters import NAMES, StartingGuess, index_of
+from identify.loop_parameters import NAMES, StartingGuess
+from identify.recorded_run import RecordedRun
 from identify.scale_anchor import ScaleAnchor
 from identify.scenario import Filter, Timing
 
@@ -28,25 +31,33 @@ SLIPPING_SHARE = 0.5
 
 
 def linear_warm_start(
-    robot: Robot,
-    measured: Array,
-    commands: Array,
-    timing: Timing,
-    filtering: Filter,
-    guess: StartingGuess,
-    anchor: ScaleAnchor,
+    runs: Sequence[RecordedRun], timing: Timing, filtering: Filter, guess: StartingGuess, anchor: ScaleAnchor
 ) -> Array:
-    """Parameters (67,) fitted to measured poses (N, 6) without gaps and commands (N, 6) at the frames.
+    """Parameters (67,) fitted to the measured poses and commands of one or several runs.
 
-    The residual's size is estimated from the fit itself, so that the starting guess counts as much as it should.
+    Each run has its own starting torques; what a known payload adds stands on the right side. The residual's size is
+    estimated from the fit itself, so that the starting guess counts as much as it should.
     """
-    columns = regression_columns(robot, measured, commands, timing, filtering)
-    lower = np.concatenate([np.zeros(len(NAMES)), np.full(6, -np.inf)])
+    matrix, right = _stacked(runs, timing, filtering)
+    lower = np.concatenate([np.zeros(len(NAMES)), np.full(matrix.shape[1] - len(NAMES), -np.inf)])
     noise = 0.1
     for _ in range(3):
-        solution = _fit(columns, noise, guess, anchor, lower)
-        noise = max(float(np.sqrt(np.mean((columns @ solution) ** 2))), 1e-9)
+        solution = _fit(matrix, right, noise, guess, anchor, lower)
+        noise = max(float(np.sqrt(np.mean((matrix @ solution - right) ** 2))), 1e-9)
     return np.maximum(solution[: len(NAMES)], 0.0)
+
+
+def _stacked(runs: Sequence[RecordedRun], timing: Timing, filtering: Filter) -> tuple[Array, Array]:
+    """Equations of all runs: matrix (rows, 67 + 6 runs) and right side (rows,), N m."""
+    matrices, right = [], []
+    for place, run in enumerate(runs):
+        columns = regression_columns(run.robot, run.without_gaps(), run.logged, timing, filtering)
+        matrix = np.zeros((len(columns), len(NAMES) + 6 * len(runs)))
+        matrix[:, : len(NAMES)] = columns[:, : len(NAMES)]
+        matrix[:, len(NAMES) + 6 * place :][:, :6] = columns[:, len(NAMES) :]
+        matrices.append(matrix)
+        right.append(-columns[:, : len(NAMES)] @ run.payload)
+    return np.concatenate(matrices), np.concatenate(right)
 
 
 def regression_columns(robot: Robot, measured: Array, commands: Array, timing: Timing, filtering: Filter) -> Array:
@@ -91,12 +102,15 @@ def _running_integral(samples: Array, rate_hz: float) -> Array:
     return integral(np.arange(len(samples)) / rate_hz)
 
 
-def _fit(columns: Array, noise: float, guess: StartingGuess, anchor: ScaleAnchor, lower: Array) -> Array:
-    size = columns.shape[1]
+def _fit(
+    matrix: Array, right: Array, noise: float, guess: StartingGuess, anchor: ScaleAnchor, lower: Array
+) -> Array:
+    size, extra = matrix.shape[1], matrix.shape[1] - len(NAMES)
+    triangle = np.asarray(np.linalg.qr(np.column_stack([matrix, right]) / noise, mode="r"))[:size]
     prior = np.eye(len(NAMES), size) / guess.std[:, None]
-    weighed = np.eye(1, size, index_of(anchor.parameter)) / anchor.std
-    matrix = np.vstack([np.linalg.qr(columns / noise, mode="r"), prior, weighed])
-    right = np.concatenate([np.zeros(size), guess.values / guess.std, [anchor.value / anchor.std]])
-    scale = np.concatenate([guess.std, np.ones(6)])
-    solved = lsq_linear(matrix * scale, right, bounds=(lower / scale, np.inf), method="bvls")
+    place, measured = anchor.row()
+    known = np.vstack([triangle[:, :size], prior, np.pad(place, ((0, 0), (0, extra)))])
+    values = np.concatenate([triangle[:, size], guess.values / guess.std, measured])
+    scale = np.concatenate([guess.std, np.ones(extra)])
+    solved = lsq_linear(known * scale, values, bounds=(lower / scale, np.inf), method="bvls")
     return np.asarray(solved.x * scale, dtype=float)

@@ -55,7 +55,7 @@ def run_plant(scenario, seed, sigma=SIGMA, lost=(), parameters=None, duration_s=
         seed=seed,
         frame_rate_hz=scenario.timing.frame_rate_hz,
     )
-    store_anchor(record, ScaleAnchor("platform_mass", "platform.mass", parameters[0], 0.005))
+    store_anchor(record, ScaleAnchor("platform_mass", parameters[0], 0.005))
     return record, run
 
 
