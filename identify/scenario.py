@@ -118,8 +118,8 @@ class Identification(_Section):
     method: Literal["closed_loop", "command_driven"] = Field(
         "closed_loop", description="the model closes its own loop (the paper), or gets the logged commands"
     )
-    scale_anchor: Literal["platform_mass"] = Field(
-        "platform_mass", description="what fixes the overall scale of the parameters"
+    scale_anchor: Literal["platform_mass", "joint_gain", "payload", "prior"] = Field(
+        "platform_mass", description="what fixes the overall scale of the parameters; payload records a second run"
     )
     anchor_std: float | None = _quantity(None, "unit of the anchor", "standard deviation of the anchor", gt=0)
     start_std: float = _quantity(1.0, "1", "standard deviation of the starting guess, relative to each value", gt=0)
@@ -127,6 +127,15 @@ class Identification(_Section):
     cost_tolerance: float = _quantity(1e-6, "1", "tol1 of eq. 35, relative change of the cost", gt=0, lt=1)
     parameter_tolerance: float = _quantity(1e-3, "1", "tol2 of eq. 35, relative change of a parameter", gt=0, lt=1)
     qr_threshold: float = _quantity(1e-3, "1", "entries of R below it count as zero in base_rank (section 4.2)", gt=0)
+
+
+class Payload(_Section):
+    """The known load that the platform carries in the second run, where the scale anchor is a payload."""
+
+    mass_kg: float = _quantity(8.0, "kg", "mass, its centre in the origin of the platform frame", gt=0)
+    Ixx_kg_m2: float = _quantity(0.02, "kg m2", "moment of inertia about the platform's x axis", ge=0)
+    Iyy_kg_m2: float = _quantity(0.02, "kg m2", "moment of inertia about the platform's y axis", ge=0)
+    Izz_kg_m2: float = _quantity(0.04, "kg m2", "moment of inertia about the platform's z axis", ge=0)
 
 
 class Validation(_Section):
@@ -154,6 +163,7 @@ class Scenario(_Section):
     excitation: Excitation = Excitation()
     filter: Filter = Filter()
     identification: Identification = Identification()
+    payload: Payload = Payload()
     validation: Validation = Validation()
 
     @model_validator(mode="after")
