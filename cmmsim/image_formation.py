@@ -63,7 +63,8 @@ class ImageFormation:
                 sub_pixels: int | None = None, shade: bool = True) -> list[NDArray[np.float32]]:
         """Radiance (k, size, size) of each side's windows.
 
-        supersampling: drawn samples a pixel and axis, at the least; sub_pixels instead of the usual ones; shade: whether the relative illumination is laid over them.
+        supersampling: drawn samples a pixel and axis, at the least; sub_pixels instead of the usual ones; shade: lay
+        the relative illumination over them.
         """
         if self.draws_pixels([side.camera for side in sides]):
             windows = self._drawn([(s.camera.ideal, s.bodies, s.corners) for s in sides], size, supersampling)

@@ -13,7 +13,7 @@ from .camera import PinholeCamera
 from .errors import CmmError
 from .pose import Array
 
-PSF_REACH = 4.0  # standard deviations after which the point spread is cut off
+PSF_REACH = 5.0  # standard deviations after which the point spread is cut off
 
 
 @dataclass(frozen=True)
@@ -53,15 +53,14 @@ class Optics:
 def pixel_response(psf_px: float, size: int, margin: int, sub_pixels: int) -> NDArray[np.float32]:
     """Weights (size, (size + 2 margin) sub_pixels) float32 with which drawn sub-pixels count in each pixel of a row.
 
-    The mean over a pixel of a Gaussian of ``psf_px``. A drawn sub-pixel is a mean over its own width already, whose
-    variance is taken off the Gaussian's.
+    The mean over a pixel of a Gaussian of ``psf_px``: the drawn sub-pixels, means over their own width, make up the
+    exact mean over a pixel wherever the Gaussian puts it.
     """
     total = (size + 2 * margin) * sub_pixels
     into_pixels = np.kron(np.eye(size, size + 2 * margin, margin), np.full(sub_pixels, 1.0 / sub_pixels))
-    variance = (psf_px * sub_pixels) ** 2 - 1.0 / 12.0
-    if variance > 0.0:
+    if psf_px > 0.0:
         gap = np.subtract.outer(np.arange(total), np.arange(total))
-        spread = np.exp(-0.5 * gap**2 / variance) * (np.abs(gap) <= margin * sub_pixels)
+        spread = np.exp(-0.5 * (gap / (psf_px * sub_pixels)) ** 2) * (np.abs(gap) <= margin * sub_pixels)
         into_pixels = into_pixels @ (spread / spread[total // 2].sum())
     weights = into_pixels.astype(np.float32)
     weights.setflags(write=False)

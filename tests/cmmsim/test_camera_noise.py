@@ -1,0 +1,125 @@
+"""The camera's noise recovered from its images, after EMVA 1288: photon transfer, PRNU, DSNU; bit depth, saturation."""
+
+import numpy as np
+import pytest
+import trimesh
+
+import cmmsim
+from cmmsim.fixed_pattern import draw_pattern
+from cmmsim.noise import CameraNoise
+from tests.cmmsim.lenses import lens_sensor
+
+GAIN, DARK_NOISE, WHITE, BLACK = 0.13, 26.0, 1600.0, 16.0
+CORNERS = np.array([[[200 + 400 * i, 150 + 300 * j] for i in range(4) for j in range(4)]] * 2)
+SIZE = 60
+TWELVE_BIT = [("noise = true", "noise = true\nbit_depth = 12"), ("gain = 0.13", "gain = 2.08"),
+              ("black_level = 16.0", "black_level = 256.0")]
+
+
+def lit_evenly(folder, level, seed=0, changes=()):
+    """Windows (2, 16, SIZE, SIZE) of a wall of one level that fills both images; one call is one exposure."""
+    sensor = lens_sensor(folder, seed=seed, changes=[("obstacle_level = 60", f"obstacle_level = {level}"), *changes])
+    sensor.add_bodies({"wall": trimesh.creation.box(extents=(0.1, 4.0, 4.0))})
+    place = np.eye(4)
+    place[:3, 3] = [0.9, 0.0, 0.76]
+    place[:3, :3] = cmmsim.rod_transform([0, 0, 0], [0.72, 0.0, 0.69])[:3, :3] @ [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
+    return lambda: sensor.look(sensor.home, {"wall": place}).windows(CORNERS, SIZE).astype(float)
+
+
+def test_photon_transfer_gives_gain_and_dark_noise(tmp_path):
+    """The variance of a pixel's grey value grows with its mean by the gain K; what the dark has is the dark noise."""
+    means, variances = [], []
+    for level in (0, 40, 90, 140, 190, 230):
+        expose = lit_evenly(tmp_path, level)
+        first, second = expose(), expose()
+        means.append(0.5 * (first + second).mean())
+        variances.append(0.5 * (first - second).var())  # the difference frees it from what differs between pixels
+    gain, dark = np.polyfit(np.array(means) - BLACK, variances, 1)
+    assert gain == pytest.approx(GAIN, rel=0.03)
+    assert np.sqrt(variances[0] - 1.0 / 12.0) / gain == pytest.approx(DARK_NOISE, rel=0.03)
+    assert np.sqrt(dark - 1.0 / 12.0) / gain == pytest.approx(DARK_NOISE, rel=0.03)
+    np.testing.assert_allclose(means, BLACK + GAIN * WHITE * np.array([0, 40, 90, 140, 190, 230]) / 255.0, atol=0.1)
+
+
+def test_pattern_is_recovered_from_averaged_images(tmp_path):
+    """PRNU from a bright and DSNU from a dark level: spatial variance of the mean less what the averaging leaves."""
+    spatial = {}
+    for level in (0, 200):
+        expose = lit_evenly(tmp_path, level, changes=[("noise = true", "noise = true\nprnu = 0.02\ndsnu = 15.0")])
+        stack = np.stack([expose()[0] for _ in range(40)])
+        spatial[level] = stack.mean(axis=0).var() - stack.var(axis=0, ddof=1).mean() / 40.0
+    assert np.sqrt(spatial[0]) / GAIN == pytest.approx(15.0, rel=0.04)
+    electrons = WHITE * 200.0 / 255.0
+    assert np.sqrt(spatial[200] - spatial[0]) / GAIN / electrons == pytest.approx(0.02, rel=0.04)
+
+
+def test_pattern_stays_and_belongs_to_the_camera(tmp_path):
+    """The same in windows and whole images and for other noise; another one for the other camera and pattern seed."""
+    def pattern(seed, pattern_seed):
+        camera = f"noise = true\ndsnu = 60\npattern_seed = {pattern_seed}"
+        expose = lit_evenly(tmp_path, 0, seed, [("noise = true", camera)])
+        return np.mean([expose() for _ in range(6)], axis=0)
+
+    def alike(one, other):
+        return np.corrcoef(one.ravel(), other.ravel())[0, 1]
+
+    given = pattern(0, 0)
+    assert alike(given[0], pattern(5, 0)[0]) > 0.9
+    assert abs(alike(given[0], given[1])) < 0.03
+    assert abs(alike(given[0], pattern(0, 1)[0])) < 0.03
+    sensor = lens_sensor(tmp_path, changes=[("noise = true", "noise = true\ndsnu = 60"), ("_level = 30", "_level = 0")])
+    frame = sensor.capture(sensor.home)
+    x, y = CORNERS[0, -1]
+    assert alike(given[0, -1], frame.left[y:y + SIZE, x:x + SIZE].astype(float)) > 0.8
+
+
+def test_windows_of_a_pattern_are_cut_out_of_it():
+    whole = draw_pattern((90, 120), 0.01, 5.0, np.random.default_rng(0))
+    cut = whole.windows(np.array([[10, 20], [110, 85]]), 16)
+    np.testing.assert_array_equal(cut.sensitivity[0], whole.sensitivity[20:36, 10:26])
+    np.testing.assert_array_equal(cut.offset[1, :5, :10], whole.offset[85:, 110:])
+    assert np.all(cut.offset[1, 5:, 10:] == whole.offset[-1, -1])
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12])
+def test_bit_depth_and_saturation(bits):
+    scale = 2 ** (bits - 8)
+    noise = CameraNoise(WHITE, GAIN * scale, DARK_NOISE, 1e6, BLACK * scale, bit_depth=bits)
+    image = noise.expose(np.full((50, 50), 2.0, dtype=np.float32), np.random.default_rng(0))
+    assert image.dtype == (np.uint8 if bits == 8 else np.uint16)
+    assert np.all(image == 2**bits - 1)
+    half = noise.expose(np.full((300, 300), 0.5, dtype=np.float32), np.random.default_rng(0)).astype(float)
+    assert half.mean() == pytest.approx((BLACK + 0.5 * GAIN * WHITE) * scale, rel=1e-3)
+    assert half.var() == pytest.approx(noise.variance(half.mean()), rel=0.03)
+    full = CameraNoise(WHITE, GAIN * scale, DARK_NOISE, 900.0, BLACK * scale, bit_depth=bits)
+    assert full.mean_grey(np.array(1.0)) == pytest.approx((BLACK + GAIN * 900.0) * scale)
+
+
+def test_averaging_reduces_what_changes_but_not_the_pattern():
+    """The variance of averaged exposures over many patterns, sampled, is as stated."""
+    noise = CameraNoise(WHITE, GAIN, DARK_NOISE, 1e6, BLACK, prnu=0.02, dsnu=10.0, frames=25)
+    radiance, rng = np.full((200, 200), 0.6, dtype=np.float32), np.random.default_rng(1)
+    pattern = draw_pattern(radiance.shape, noise.prnu, noise.dsnu, rng)
+    grey = noise.mean_of_exposures(radiance, rng, 25, pattern)
+    assert grey.var() == pytest.approx(noise.variance(grey.mean()), rel=0.03)
+
+
+def test_twelve_bits_measure_as_well_as_eight(tmp_path):
+    sensor = lens_sensor(tmp_path, changes=TWELVE_BIT)
+    found = [sensor.measure(sensor.home) for _ in range(8)]
+    assert all(len(m.target_ids) == 18 for m in found)
+    errors = np.array([m.pose for m in found]) - sensor.home
+    squared = [e @ np.linalg.solve(m.covariance, e) for e, m in zip(errors, found, strict=True)]
+    assert 3.0 < np.mean(squared) < 10.0  # 6 expected of 8 draws
+
+
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ("noise = true", "noise = true\nbit_depth = 9", "camera.bit_depth: .*8, 10 or 12.*9"),
+    ("noise = true", "noise = true\nprnu = -0.01", "camera.prnu: .*greater than or equal to 0"),
+    ("noise = true", "noise = true\ndsnu = nan", "camera.dsnu: .*finite"),
+    ("noise = true", "noise = true\npattern_seed = -1", "camera.pattern_seed: .*greater than or equal to 0"),
+    ("black_level = 16.0", "black_level = 256.0", "camera: .*black_level 256 must lie below .* 255"),
+])
+def test_bad_noise_in_a_sensor_file(tmp_path, old, new, message):
+    with pytest.raises(cmmsim.SensorFileError, match=message):
+        lens_sensor(tmp_path, changes=[(old, new)])

@@ -1,0 +1,219 @@
+"""Lenses in the images: against finely drawn images, scipy's Gaussian and OpenCV's undistortion."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+import cmmsim
+from cmmsim.camera import PinholeCamera
+from cmmsim.ellipse_fit import fit_ellipses
+from cmmsim.observation import _evenly_lit
+from cmmsim.optics import Optics
+from cmmsim.pose import apply, pose_to_transform
+from cmmsim.views import View
+from tests.cmmsim.lenses import LENSES, expected_centres, lens_sensor, placed_at, pose_errors, poses_about_home
+
+FINE = 16
+
+
+def centre_errors(sensor, pose, supersampling=6):
+    """Fitted minus expected ellipse centres (36, 2) px from unrounded noise-free windows."""
+    expected = expected_centres(sensor, pose)
+    corners = np.rint(expected - 7.5).astype(int)
+    noise = replace(sensor.noise, enabled=False)
+    grey = noise.mean_grey(sensor._camera.radiance(placed_at(sensor, pose), corners, 16, supersampling))
+    grey = _evenly_lit(grey, corners, sensor.rig, noise, sensor.settings)
+    fits = fit_ellipses(grey.reshape(-1, 16, 16), corners.reshape(-1, 2), noise, 14, psf_px=sensor.optics.psf_px)
+    assert fits.good.all()
+    return fits.centres - expected.reshape(-1, 2)
+
+
+def finely_drawn(sensor, side, pose, corner, size):
+    """Radiance (size * FINE, size * FINE) through a perfect lens."""
+    camera = sensor.rig.cameras[side].ideal
+    fine = replace(camera, focal_px=FINE * camera.focal_px, centre_x_px=FINE * (camera.centre_x_px + 0.5) - 0.5,
+                   centre_y_px=FINE * (camera.centre_y_px + 0.5) - 0.5)
+    view = View(fine, placed_at(sensor, pose)[side], (FINE * corner[0], FINE * corner[1]), (FINE * size, FINE * size))
+    formation = sensor._camera._formation
+    return formation.renderer.draw(formation.drawable, [view], 1, formation.background)[0]
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_centres_through_each_lens(tmp_path, lens):
+    """At most 0.0005 px in every sticker; sharp edges that are bent leave up to three times that in single ones."""
+    sensor = lens_sensor(tmp_path, lens)
+    errors = np.concatenate([centre_errors(sensor, pose) for pose in poses_about_home(sensor, 3)])
+    assert np.abs(errors).max() < (15e-4 if lens == "distorted" else 5e-4)
+    assert np.all(np.sqrt((errors**2).mean(axis=0)) < 4e-4)
+    assert np.all(np.abs(errors.mean(axis=0)) < 1e-4)
+
+
+@pytest.mark.rendering
+@pytest.mark.parametrize("lens", ["perfect", "all"])
+def test_centres_drawn_by_pyrender(tmp_path, lens):
+    sensor = lens_sensor(tmp_path, lens, "pyrender")
+    errors = np.concatenate([centre_errors(sensor, pose) for pose in poses_about_home(sensor, 4)])
+    assert np.all(np.sqrt((errors**2).mean(axis=0)) < 3e-3)
+    assert np.all(np.abs(errors.mean(axis=0)) < 6e-4)
+
+
+@pytest.mark.parametrize("psf_px", [0.5, 1.2])
+def test_point_spread_is_a_gaussian(tmp_path, psf_px):
+    sensor = lens_sensor(tmp_path, "blurred", changes=[("psf_px = 0.5", f"psf_px = {psf_px}")])
+    pose, size, margin = sensor.home, 16, 10
+    corners = np.rint(expected_centres(sensor, pose)[:, :4] - 7.5).astype(int)
+    windows = sensor._camera.radiance(placed_at(sensor, pose), corners, size, 6)
+    for side in (0, 1):
+        for corner, window in zip(corners[side], windows[side], strict=True):
+            fine = finely_drawn(sensor, side, pose, corner - margin, size + 2 * margin)
+            spread = gaussian_filter(fine, psf_px * FINE, truncate=7.0)
+            expected = spread.reshape(size + 2 * margin, FINE, -1, FINE).mean(axis=(1, 3))
+            assert np.abs(window - expected[margin:-margin, margin:-margin]).max() < 1e-3
+
+
+def test_bent_images_show_what_opencv_says(tmp_path):
+    """Each fine point of a window, undistorted by OpenCV, looked up in a finely drawn image of a perfect lens."""
+    sensor = lens_sensor(tmp_path, "distorted")
+    pose, size, margin = sensor.home, 16, 6
+    corners = np.rint(expected_centres(sensor, pose)[:, ::6] - 7.5).astype(int)
+    windows = sensor._camera.radiance(placed_at(sensor, pose), corners, size, 6)
+    for side, camera in enumerate(sensor.rig.cameras):
+        lens = camera.distortion
+        for corner, window in zip(corners[side], windows[side], strict=True):
+            ticks = (np.arange(size * FINE) + 0.5) / FINE - 0.5
+            shown = np.stack(np.meshgrid(corner[0] + ticks, corner[1] + ticks), axis=-1).reshape(-1, 1, 2)
+            ideal = cv2.undistortPoints(shown, camera.matrix, np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3]),
+                                        None, None, camera.matrix).reshape(size * FINE, size * FINE, 2)
+            first = np.floor(ideal.min(axis=(0, 1))).astype(int) - margin
+            fine = finely_drawn(sensor, side, pose, first, size + 2 * margin + 4)
+            column, row = (np.moveaxis(ideal, -1, 0) - first[:, None, None] + 0.5) * FINE - 0.5
+            looked_up = map_coordinates(fine, [row, column], order=1)
+            gap = window - looked_up.reshape(size, FINE, size, FINE).mean(axis=(1, 3))
+            assert np.abs(gap).max() < 0.012
+            assert np.sqrt((gap**2).mean()) < 0.001
+
+
+def test_a_perfect_lens_is_drawn_on_the_pixels(tmp_path):
+    sensor = lens_sensor(tmp_path)
+    formation, placed = sensor._camera._formation, placed_at(sensor, sensor.home)
+    corners = np.rint(expected_centres(sensor, sensor.home) - 7.5).astype(int)
+    views = [View(camera, bodies, (int(x), int(y)), (16, 16)) for camera, bodies, side
+             in zip(sensor.rig.cameras, placed, corners, strict=True) for x, y in side]
+    drawn = formation.renderer.draw(formation.drawable, views, 6, 0.0).reshape(2, -1, 16, 16)
+    np.testing.assert_array_equal(sensor._camera.radiance(placed, corners, 16, 6), drawn)
+
+
+def test_vignetting_darkens_with_the_square_of_the_distance():
+    camera, optics = PinholeCamera(2300.0, 1100.0, 700.0, 2048, 1536), Optics(vignetting=0.4)
+    assert optics.illumination(camera, camera.centre) == 1.0
+    corners = np.array([[-0.5, -0.5], [-0.5, 1535.5], [2047.5, -0.5]])
+    found = optics.illumination(camera, corners)
+    assert found[1] == pytest.approx(0.6)  # the farthest
+    assert found.min() == found[1]
+    half_way = camera.centre + 0.5 * (corners[1] - camera.centre)
+    assert optics.illumination(camera, half_way) == pytest.approx(0.9)
+
+
+def test_vignetting_is_laid_over_windows_and_whole_images(tmp_path):
+    dark, bright = lens_sensor(tmp_path, "darkened"), lens_sensor(tmp_path)
+    placed = placed_at(dark, dark.home)
+    corners = np.rint(expected_centres(dark, dark.home) - 7.5).astype(int)
+    share = [s._camera.radiance(placed, corners, 16, 6) for s in (dark, bright)]
+    whole = [s._camera.whole_radiance(1, placed[1], 6) for s in (dark, bright)]
+    y, x = np.mgrid[:1536, :2048]
+    expected = 1.0 - 0.3 * ((x - 1023.5) ** 2 + (y - 767.5) ** 2) / (1024.0**2 + 768.0**2)
+    np.testing.assert_allclose(whole[0], whole[1] * expected, atol=1e-6)
+    for k, (x0, y0) in enumerate(corners[1]):
+        np.testing.assert_allclose(share[0][1, k], share[1][1, k] * expected[y0:y0 + 16, x0:x0 + 16], atol=1e-6)
+
+
+def test_whole_images_show_the_windows(tmp_path):
+    sensor = lens_sensor(tmp_path, "all")
+    placed = placed_at(sensor, sensor.home)
+    corners = np.rint(expected_centres(sensor, sensor.home) - 4.5).astype(int)
+    windows = sensor._camera.radiance(placed, corners, 10, 6)
+    image = sensor._camera.whole_radiance(0, placed[0], 6)
+    for (x, y), window in zip(corners[0], windows[0], strict=True):
+        np.testing.assert_allclose(image[y:y + 10, x:x + 10], window, atol=2e-3)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_poses_from_noise_free_images(tmp_path, lens):
+    """At most 2 um and 10 urad; rounding to 8 bit is all that is left."""
+    sensor = lens_sensor(tmp_path, lens, changes=[("noise = true", "noise = false")])
+    errors, found = pose_errors(sensor, poses_about_home(sensor, 4))
+    assert all(len(m.target_ids) == 18 for m in found)
+    assert np.all(np.abs(errors) < [2, 2, 2, 10, 10, 10])
+
+
+@pytest.mark.slow
+@pytest.mark.rendering
+@pytest.mark.parametrize("lens", ["perfect", "all"])
+def test_poses_from_noise_free_images_of_pyrender(tmp_path, lens):
+    """At most 2 um and 10 urad rms; the six samples a pixel of pyrender leave single poses up to 12 urad off."""
+    sensor = lens_sensor(tmp_path, lens, "pyrender", changes=[("noise = true", "noise = false")])
+    errors, _ = pose_errors(sensor, poses_about_home(sensor, 25))
+    assert np.all(np.sqrt((errors**2).mean(axis=0)) < [1.3, 1.3, 1.3, 5, 5, 5])
+    assert np.all(np.abs(errors) < [2.5, 2.5, 2.5, 13, 13, 13])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("renderer", ["analytic", pytest.param("pyrender", marks=pytest.mark.rendering)])
+def test_noise_free_teaching_and_measuring_through_all_effects(tmp_path, renderer):
+    given = lens_sensor(tmp_path, "all", renderer, changes=[("noise = true", "noise = false")])
+    sensor = cmmsim.load_sensor(tmp_path / "sensor.toml", renderer=renderer)
+    sensor.teach()
+    errors, _ = pose_errors(sensor, poses_about_home(given, 12))
+    assert np.all(np.sqrt((errors**2).mean(axis=0)) < [2, 2, 2, 10, 10, 10])
+
+
+@pytest.mark.slow
+def test_covariance_is_true_through_all_effects(tmp_path):
+    """300 draws of noise, each at its own pose: the mean squared error in units of the stated covariance is 6."""
+    sensor = lens_sensor(tmp_path, "all", changes=[("noise = true", "noise = true\nprnu = 0.01\ndsnu = 8.0")])
+    errors, found = pose_errors(sensor, poses_about_home(sensor, 300))
+    squared = [e @ np.linalg.solve(m.covariance, e) for e, m in zip(1e-6 * errors, found, strict=True)]
+    assert 5.3 < np.mean(squared) < 6.8  # three standard deviations of the mean are 0.6
+    assert np.abs(errors.mean(axis=0) / (errors.std(axis=0) / np.sqrt(300))).max() < 4.0
+
+
+@pytest.mark.parametrize("lens", ["distorted", "all"])
+def test_pixels_and_points_of_a_measurement(tmp_path, lens):
+    """Pixels are those of the image as it is; points lie where the stickers are."""
+    sensor = lens_sensor(tmp_path, lens)
+    pose = poses_about_home(sensor, 1)[0]
+    truth = apply(sensor._camera_from_base @ pose_to_transform(pose), sensor._scene[0].sticker_places)
+    _, (m,) = pose_errors(sensor, pose[None])
+    left, right = sensor.rig.project(truth)[0]
+    assert np.linalg.norm(left - sensor.rig.ideal.project(truth)[0][0], axis=1).max() > 2.0
+    np.testing.assert_allclose(m.left_pixels, left, atol=0.06)
+    np.testing.assert_allclose(m.right_pixels, right, atol=0.06)
+    squared = np.einsum("ni,nij,nj->n", m.points - truth, np.linalg.inv(m.point_covariances), m.points - truth)
+    assert 1.2 < squared.mean() < 5.5  # 3 expected of 18 points
+
+
+def test_search_of_whole_images_through_all_effects(tmp_path):
+    """A first frame of 12 bit without prior; the same frame handed over as arrays."""
+    sensor = lens_sensor(tmp_path, "all", changes=[
+        ("noise = true", "noise = true\nbit_depth = 12"), ("gain = 0.13", "gain = 2.08"),
+        ("black_level = 16.0", "black_level = 256.0")])
+    pose = poses_about_home(sensor, 1, seed=3)[0]
+    frame = sensor.capture(pose)
+    assert frame.left.dtype == np.uint16
+    m = cmmsim.measure_frame(frame, sensor.estimator)
+    assert m.ok, m.reason
+    assert np.all(np.abs(m.pose - pose) * 1e6 < [20, 20, 20, 100, 100, 100])
+
+
+@pytest.mark.parametrize(("addition", "message"), [
+    ("[lens]\npsf_px = -0.5", "lens.psf_px: .*greater than or equal to 0"),
+    ("[lens]\npsf_px = 0.01", "lens: .*psf_px 0.01 must be 0 or at least 0.1 px"),
+    ("[lens]\nvignetting = 1.0", "lens.vignetting: .*less than or equal to 0.9"),
+    ("[lens]\nvignette = 0.3", "unknown key 'lens.vignette', valid are psf_px, vignetting"),
+])
+def test_bad_lens_in_a_sensor_file(tmp_path, addition, message):
+    with pytest.raises(cmmsim.SensorFileError, match=message):
+        lens_sensor(tmp_path, changes=[("[stickers]", f"{addition}\n[stickers]")])

@@ -1,0 +1,96 @@
+"""The exposure of a moving platform: length of the blur, number of sub-frames, and the measured pose."""
+
+import numpy as np
+import pytest
+
+import cmmsim
+from cmmsim.motion_blur import LARGEST_STEP_PX, sub_frame_poses
+from tests.cmmsim.lenses import expected_centres, lens_sensor, pose_errors, poses_about_home
+
+EXPOSURE = [("exposure = 0.0", "exposure = 0.004")]
+DIRECTION = np.array([0.2, 0.6, 0.3, 0.5, -0.4, 0.6])  # m/s, rad/s
+
+
+def rate_of(sensor, pose, longest_px):
+    """The pose rate along DIRECTION at which the fastest sticker moves so far in one exposure."""
+    step = 1e-4 * DIRECTION
+    moved = expected_centres(sensor, pose + step) - expected_centres(sensor, pose - step)
+    return step * longest_px / (0.002 * np.linalg.norm(moved, axis=-1).max())
+
+
+def spot_spread(window):
+    """Second moments (2, 2) px² of the bright spot above its surroundings."""
+    light = window - np.percentile(window, 10)
+    y, x = np.mgrid[:len(window), :len(window)]
+    places = np.stack([x, y], axis=-1) - (light[..., None] * np.stack([x, y], axis=-1)).sum(axis=(0, 1)) / light.sum()
+    return np.einsum("hw,hwi,hwj->ij", light, places, places) / light.sum()
+
+
+def test_blur_has_the_length_of_the_movement(tmp_path):
+    """A movement by d in the image adds d d' / 12 to the second moments of a sticker."""
+    sensor = lens_sensor(tmp_path, changes=[*EXPOSURE, ("noise = true", "noise = false\nbit_depth = 12"),
+                                            ("gain = 0.13", "gain = 2.0"), ("body_level = 30", "body_level = 8"),
+                                            ("background_level = 0", "background_level = 8")])
+    pose = sensor.home
+    rate = rate_of(sensor, pose, 4.0)
+    moved = expected_centres(sensor, pose + 0.002 * rate) - expected_centres(sensor, pose - 0.002 * rate)
+    corners = np.rint(expected_centres(sensor, pose) - 6.5).astype(int)
+    still, blurred = (sensor.look(pose, pose_rate=r).windows(corners, 14).astype(float) for r in (None, rate))
+    for side in (0, 1):
+        for k in np.argsort(-np.linalg.norm(moved[side], axis=-1))[:3]:
+            added = spot_spread(blurred[side, k]) - spot_spread(still[side, k])
+            np.testing.assert_allclose(added, np.outer(moved[side, k], moved[side, k]) / 12.0, atol=0.05)
+
+
+def test_sub_frames_are_close_and_lie_about_the_middle():
+    def pixels(pose):
+        return 1000.0 * pose[:2]
+
+    pose, rate = np.arange(6.0), np.array([3.0, 4.0, 0.0, 0.0, 0.0, 1.0])
+    poses = sub_frame_poses(pose, rate, 1e-3, pixels)
+    assert len(poses) == np.ceil(5.0 / LARGEST_STEP_PX)
+    np.testing.assert_allclose(poses.mean(axis=0), pose, atol=1e-15)
+    steps = np.diff(poses, axis=0)
+    np.testing.assert_allclose(steps, np.tile(steps[0], (len(steps), 1)), atol=1e-15)
+    assert 1000.0 * np.linalg.norm(steps[0, :2]) <= LARGEST_STEP_PX
+    np.testing.assert_allclose(steps[0] * len(poses), 1e-3 * rate, atol=1e-15)
+    np.testing.assert_array_equal(sub_frame_poses(pose, 0.0 * rate, 1e-3, pixels), pose[None])
+
+
+def test_an_instantaneous_exposure_is_not_blurred(tmp_path):
+    frames = []
+    for rate in (None, np.ones(6)):
+        sensor = lens_sensor(tmp_path)
+        frames.append(sensor.look(sensor.home, pose_rate=rate).windows(np.full((2, 1, 2), 800), 64))
+    np.testing.assert_array_equal(*frames)
+
+
+@pytest.mark.parametrize(("lens", "longest_px"), [("perfect", 0.5), ("blurred", 1.5), ("all", 1.5)])
+def test_constant_velocity_does_not_move_the_measured_pose(tmp_path, lens, longest_px):
+    """The pose in the middle of the exposure, within the 2 um and 10 urad of images at rest."""
+    sensor = lens_sensor(tmp_path, lens, changes=[*EXPOSURE, ("noise = true", "noise = false")])
+    for pose in poses_about_home(sensor, 3):
+        errors, (m,) = pose_errors(sensor, pose[None], pose_rate=rate_of(sensor, pose, longest_px))
+        assert len(m.target_ids) == 18
+        assert np.all(np.abs(errors) < [2, 2, 2, 10, 10, 10])
+
+
+def test_whole_image_is_blurred_as_its_windows_are(tmp_path):
+    sensor = lens_sensor(tmp_path, changes=[*EXPOSURE, ("noise = true", "noise = false")])
+    pose = sensor.home
+    rate = rate_of(sensor, pose, 3.0)
+    corners = np.rint(expected_centres(sensor, pose) - 5.5).astype(int)
+    windows = sensor.look(pose, pose_rate=rate).windows(corners, 12)
+    frame = sensor.capture(pose, pose_rate=rate)
+    for image, side, cut in zip((frame.left, frame.right), corners, windows, strict=True):
+        for (x, y), window in zip(side, cut, strict=True):
+            np.testing.assert_allclose(image[y:y + 12, x:x + 12], window.astype(float), atol=1)
+
+
+def test_bad_pose_rates(tmp_path):
+    sensor = lens_sensor(tmp_path, changes=EXPOSURE)
+    for bad in (np.zeros(5), [0, 0, np.nan, 0, 0, 0]):
+        with pytest.raises(cmmsim.ShapeError, match="pose rate is six finite numbers"):
+            sensor.measure(sensor.home, pose_rate=bad)
+    with pytest.raises(cmmsim.CmmError, match=r"moves \d+ px during the exposure of 0.004 s .* at most 150 px"):
+        sensor.measure(sensor.home, pose_rate=[100.0, 0, 0, 0, 0, 0])
