@@ -67,9 +67,12 @@ def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNo
     n = len(windows)
     inner, parameters, misfit = np.empty((n, 2)), np.empty((n, UNKNOWNS)), np.empty(n)
     shapes, covariances = np.empty((n, 2, 2)), np.empty((n, 2, 2))
-    variances = noise.variance(_GREYS) / limits.frames
-    settings = FitSettings(CORE_SHARE, RING_REACH, SMALLEST_START_PX, SMALLEST_RADIUS_PX, _LARGEST_STEP, iterations,
-                           CONVERGED_PX, float(psf_px), variances, _GREYS[0], 1.0 / (_GREYS[1] - _GREYS[0]))
+    scale = noise.white_level / 255.0
+    greys = scale * _GREYS
+    variances = noise.variance(greys) / limits.frames
+    largest_step = _LARGEST_STEP * [1.0, 1.0, 1.0, 1.0, 1.0, scale, scale]
+    settings = FitSettings(CORE_SHARE, RING_REACH, SMALLEST_START_PX, SMALLEST_RADIUS_PX, largest_step, iterations,
+                           CONVERGED_PX, float(psf_px), variances, greys[0], 1.0 / (greys[1] - greys[0]))
     fit_windows(np.ascontiguousarray(windows, dtype=float), fit_size, settings, inner, parameters, shapes, covariances,
                 misfit)
     good = (parameters[:, 5] >= limits.smallest_contrast) & (misfit <= limits.largest_misfit)
@@ -79,7 +82,7 @@ def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNo
 
 _LARGEST_STEP = np.array([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0])
 _LARGEST_STEP.setflags(write=False)
-_GREYS = np.arange(-64.0, 512.0, 0.25)  # at these the noise variance is tabulated
+_GREYS = np.arange(-64.0, 512.0, 0.25)  # at these of 255 the noise variance is tabulated
 _GREYS.setflags(write=False)
 
 

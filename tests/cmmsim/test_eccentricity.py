@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from cmmsim.camera import PinholeCamera
-from cmmsim.convex_solid import Outline
 from cmmsim.distortion import Distortion
 from cmmsim.eccentricity import bending, centre_offset, eccentricity
 from cmmsim.ellipse_fit import FitLimits, fit_ellipses
@@ -12,16 +11,23 @@ from cmmsim.noise import CameraNoise
 
 NOISE = CameraNoise(1600.0, 0.13, 26.0, 1800.0, 16.0, enabled=False)
 CENTRE = np.array([0.62, 0.42, 1.8])  # seen near the corner of the image
-RADIUS, SIZE = 0.0075, 32  # m, px: a radius of some 9.6 px
+RADIUS, SIZE, LINES = 0.0075, 32, 100  # m, px: a radius of some 9.6 px
 BENT = Distortion(-0.12, 0.03, 1e-3, -7e-4, -4e-3)
 
 
 def drawn(camera, normal, corner):
-    """Share of each pixel within the rim, projected point by point."""
+    """Share of each pixel within the rim, projected point by point: exact along x, the mean of scan lines along y."""
     u, v = np.linalg.svd(normal[None])[2][1:]
     angle = np.linspace(0.0, 2.0 * np.pi, 2000, endpoint=False)[:, None]
     rim = camera.project(CENTRE + RADIUS * (np.cos(angle) * u + np.sin(angle) * v))[0]
-    return Outline(rim).cover(corner, (SIZE, SIZE), 100)
+    rim = np.roll(rim - corner, -np.argmin(rim[:, 1]), axis=0)  # from the top round and back
+    lowest = np.argmax(rim[:, 1])
+    lines = (np.arange(SIZE * LINES) + 0.5) / LINES - 0.5
+    ends = np.sort([np.interp(lines, side[:, 1], side[:, 0], np.inf, np.inf)
+                    for side in (rim[:lowest + 1], np.roll(rim, -1, axis=0)[lowest - 1:][::-1])], axis=0)[..., None]
+    ticks = np.arange(SIZE)
+    share = np.clip(np.minimum(ends[1], ticks + 0.5) - np.maximum(ends[0], ticks - 0.5), 0.0, 1.0)
+    return np.where(np.isfinite(ends[0]), share, 0.0).reshape(SIZE, LINES, SIZE).mean(axis=1)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.5, 1.0])
