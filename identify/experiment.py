@@ -1,7 +1,7 @@
 """The experiment: the true plant runs a trajectory with the images in the loop, and what is seen is recorded.
 
 Random streams of one seed: (0) exciting trajectories, (1) unseen trajectories, (2) the sensor's teaching, (3) the scale
-anchor, (4, run) the sensor's noise in each run.
+anchor, (4, run) the sensor's noise in each run (the run under a payload has a number beyond all others).
 """
 
 from dataclasses import dataclass
@@ -18,6 +18,7 @@ from identify import recording
 from identify.excitation import design_trajectories
 from identify.loop_parameters import NAMES, starting_guess
 from identify.loop_setup import frame_times, plant_settings, reference_motion
+from identify.payload import payload_vector, store_payload
 from identify.progress import Advance, Progress, SilentProgress
 from identify.scale_anchor import measured_anchor, store_anchor
 from identify.scenario import Scenario
@@ -26,6 +27,7 @@ from identify.trajectory import FourierTrajectory, check_travel
 from identify.truth import build_truth
 
 TEACHING, ANCHOR, NOISE = 2, 3, 4
+PAYLOAD_RUN = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -37,9 +39,15 @@ class Experiment:
 
 
 def run_experiment(
-    scenario: Scenario, seed: int = 0, path: Path | str | None = None, progress: Progress | None = None
+    scenario: Scenario,
+    seed: int = 0,
+    path: Path | str | None = None,
+    progress: Progress | None = None,
+    payload: bool = False,
 ) -> xr.Dataset:
     """Choose the exciting trajectory, run it with images in the loop, and return the record.
+
+    payload: with the scenario's known load on the platform; such a record beside one without it shows the scale.
 
     Record and truth are also written as netCDF: to `path`, or to the user's cache folder; attribute `path` says where
     (`identify.truth.read_truth(path)` opens the truth).
@@ -49,10 +57,10 @@ def run_experiment(
     robot = load_robot(scenario.robot)
     trajectories = design_trajectories(robot, scenario, seed, progress)
     sensor = taught_sensor(scenario, robot, seed, progress)
-    times = frame_times(scenario, scenario.excitation.duration_s)
-    with progress.stage("record", len(times)) as advance:
-        experiment = run_plant(scenario, robot, sensor, trajectories.excitation, times, seed, 0, advance)
-    target = Path(path) if path else _default_path(scenario, seed)
+    frames = len(frame_times(scenario, scenario.excitation.duration_s))
+    with progress.stage("record", frames) as advance:
+        experiment = excitation_run(scenario, robot, sensor, trajectories.excitation, seed, advance, payload)
+    target = Path(path) if path else _default_path(scenario, seed, payload)
     target.parent.mkdir(parents=True, exist_ok=True)
     recording.write(target, experiment.record, experiment.truth)
     return experiment.record.assign_attrs(path=str(target))
@@ -83,6 +91,29 @@ def teach(sensor: cmmsim.Sensor, progress: Progress) -> None:
         sensor.teach(report)
 
 
+def excitation_run(
+    scenario: Scenario,
+    robot: Robot,
+    sensor: cmmsim.Sensor,
+    trajectory: FourierTrajectory,
+    seed: int,
+    advance: Advance = lambda n=1: None,
+    payload: bool = False,
+) -> Experiment:
+    """Run the plant along the exciting trajectory, bare or under the scenario's load. Raises as `run_plant` does."""
+    times = frame_times(scenario, scenario.excitation.duration_s)
+    if not payload:
+        return run_plant(scenario, robot, sensor, trajectory, times, seed, 0, advance)
+    load = scenario_payload(scenario)
+    return run_plant(scenario, robot, sensor, trajectory, times, seed, PAYLOAD_RUN, advance, load)
+
+
+def scenario_payload(scenario: Scenario) -> np.ndarray:
+    """What the scenario's load adds to the parameters (67,)."""
+    load = scenario.payload
+    return payload_vector(load.mass_kg, (load.Ixx_kg_m2, load.Iyy_kg_m2, load.Izz_kg_m2))
+
+
 def run_plant(
     scenario: Scenario,
     robot: Robot,
@@ -92,8 +123,10 @@ def run_plant(
     seed: int,
     run: int,
     advance: Advance = lambda n=1: None,
+    load: np.ndarray | None = None,
 ) -> Experiment:
-    """Run the plant along a trajectory at the frames `times` (N,) [s]; `run`: number of the run (0: excitation).
+    """Run the plant along a trajectory at the frames `times` (N,) [s]; `run`: number of the run (0: excitation);
+    `load` (67,): what a known load on the platform adds to its parameters.
 
     Raises TrajectoryError before the run when the trajectory leaves the travel, LoopFailure when the loop is unstable.
     """
@@ -101,10 +134,13 @@ def run_plant(
     reference = reference_motion(trajectory, times)
     parameters = true_parameters(robot, scenario)
     eye = SensorInLoop(sensor, robot, stream_seed(seed, NOISE, run), advance)
-    done = simulate(robot, parameters, reference, plant_settings(scenario), eye)
+    loaded = parameters if load is None else parameters + load
+    done = simulate(robot, loaded, reference, plant_settings(scenario), eye)
     record = _record(scenario, robot, reference, done, eye, seed)
     settings, rng = scenario.identification, np.random.default_rng(stream_seed(seed, ANCHOR))
     store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, parameters, rng))
+    if load is not None:
+        store_payload(record, load)
     return Experiment(record, _truth(robot, done, parameters))
 
 
@@ -150,5 +186,6 @@ def _truth(robot: Robot, run: ClosedLoopRun, parameters: np.ndarray) -> xr.Datas
     )
 
 
-def _default_path(scenario: Scenario, seed: int) -> Path:
-    return Path(platformdirs.user_cache_dir("cmmsim")) / "records" / f"{scenario.name}-{seed}.nc"
+def _default_path(scenario: Scenario, seed: int, payload: bool) -> Path:
+    name = f"{scenario.name}-{seed}{'-payload' if payload else ''}.nc"
+    return Path(platformdirs.user_cache_dir("cmmsim")) / "records" / name

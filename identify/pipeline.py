@@ -14,7 +14,7 @@ from identify import estimation, recording
 from identify.arrays import Array
 from identify.atomic import write_text
 from identify.excitation import design_trajectories
-from identify.experiment import run_plant, taught_sensor, teach, untaught_sensor
+from identify.experiment import excitation_run, taught_sensor, teach, untaught_sensor
 from identify.loop_parameters import check_parameter_set
 from identify.loop_setup import frame_times
 from identify.model_runs import build_model_run, write_model_runs
@@ -58,16 +58,20 @@ def excite(scenario: Scenario, seed: int, folder: Path, progress: Progress) -> N
 def record(
     folder: Path, progress: Progress, workers: int | None = None, sensor: cmmsim.Sensor | None = None
 ) -> cmmsim.Taught:
-    """Run the plant on the exciting trajectory; writes experiment.nc. Returns what the sensor was taught."""
+    """Run the plant on the exciting trajectory; writes experiment.nc, and payload.nc where the scale anchor is a
+    payload. Returns what the sensor was taught."""
     run_folder, scenario, trajectories, robot = _open(folder)
     began = time.perf_counter()
     sensor = sensor or taught_sensor(scenario, robot, trajectories.seed, progress)
-    times = frame_times(scenario, scenario.excitation.duration_s)
-    with progress.stage("record", len(times)) as advance:
-        arguments = (trajectories.excitation, times, trajectories.seed, 0, advance)
-        experiment = run_plant(scenario, robot, sensor, *arguments)
-    stored = experiment.record.assign_attrs(record_seconds=time.perf_counter() - began)
-    recording.write(run_folder.experiment, stored, experiment.truth)
+    targets = [run_folder.experiment, *_payload_files(run_folder, scenario)]
+    frames = len(frame_times(scenario, scenario.excitation.duration_s))
+    with progress.stage("record", frames * len(targets)) as advance:
+        for target in targets:
+            payload = target == run_folder.payload
+            arguments = (trajectories.excitation, trajectories.seed, advance, payload)
+            experiment = excitation_run(scenario, robot, sensor, *arguments)
+            stored = experiment.record.assign_attrs(record_seconds=time.perf_counter() - began)
+            recording.write(target, stored, experiment.truth)
     return sensor.taught
 
 
@@ -76,7 +80,10 @@ def identify(folder: Path, progress: Progress) -> None:
     run_folder, scenario, trajectories, robot = _open(folder)
     began = time.perf_counter()
     seen = recording.read(run_folder.experiment)
-    result = estimation.identify(seen, robot, scenario, progress)
+    payload_files = _payload_files(run_folder, scenario)
+    run_folder.require(*(file.name for file in payload_files))
+    loaded = [recording.read(file) for file in payload_files]
+    result = estimation.identify([seen, *loaded], robot, scenario, progress)
     measured, ok = recording.poses(seen, "measured"), seen["measured_ok"].values.astype(bool)
     reference = recorded_reference(seen)
     before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))
@@ -138,6 +145,11 @@ def _open(folder: Path) -> tuple[RunFolder, Scenario, TrajectorySet, Robot]:
     run_folder = RunFolder(folder)
     scenario = load_scenario(run_folder.scenario)
     return run_folder, scenario, load_trajectories(run_folder.trajectories), load_robot(scenario.robot)
+
+
+def _payload_files(run_folder: RunFolder, scenario: Scenario) -> list[Path]:
+    """The file of the run under a load, where the scenario asks for one."""
+    return [run_folder.payload] if scenario.identification.scale_anchor == "payload" else []
 
 
 def _designed(scenario: Scenario, seed: int, progress: Progress) -> TrajectorySet:

@@ -10,6 +10,7 @@ WRITTEN_BY = {
     "scenario.toml": "excite",
     "trajectories.json": "excite",
     "experiment.nc": "record",
+    "payload.nc": "record",
     "result.json": "identify",
     "validation.nc": "validate",
     "model.nc": "validate",
@@ -38,6 +39,11 @@ class RunFolder:
     def experiment(self) -> Path:
         """Record and truth of the excitation run, netCDF."""
         return self.path / "experiment.nc"
+
+    @property
+    def payload(self) -> Path:
+        """Record and truth of the same run under a known load, netCDF; where the scale anchor is a payload."""
+        return self.path / "payload.nc"
 
     @property
     def validation(self) -> Path:

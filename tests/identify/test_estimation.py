@@ -6,11 +6,13 @@ import pytest
 from dynamics.closed_loop import equilibrium, simulate
 from identify.errors import EstimationError, RecordError
 from identify.estimation import identify, output_error_problem
+from identify.experiment import scenario_payload
 from identify.loop_parameters import NAMES, starting_guess
 from identify.loop_setup import model_settings, plant_settings
-from identify.payload import payload_vector, store_payload
+from identify.payload import store_payload
 from identify.recorded_run import recorded_run
 from identify.scale_anchor import ScaleAnchor, read_anchor, store_anchor
+from identify.scenario import load_scenario
 from identify.warm_start import linear_warm_start, regression_columns
 from tests.identify.synthetic import quick, rss6, run_plant, truth
 
@@ -199,11 +201,11 @@ def test_simulate_agrees_with_the_model_of_the_problem(scenario):
     assert np.array_equal(recorded.model_poses(truth()), run.pose)
 
 
-def loaded(scenario, seed, mass_kg=8.0, lost=()):
-    """A record with nothing but the sensor, and one with a known load on the platform."""
-    load = payload_vector(mass_kg, (0.02, 0.02, 0.04))
-    bare, _ = run_plant(scenario, seed=seed, lost=lost)
-    heavy, _ = run_plant(scenario, seed=seed + 1000, parameters=truth() + load)
+def loaded(scenario, seed):
+    """A record of the bare robot, and one with the scenario's known load on the platform."""
+    load, duration = scenario_payload(scenario), scenario.excitation.duration_s
+    bare, _ = run_plant(scenario, seed=seed, duration_s=duration)
+    heavy, _ = run_plant(scenario, seed=seed + 1000, parameters=truth() + load, duration_s=duration)
     for record in (bare, heavy):
         store_anchor(record, ScaleAnchor("payload"))
     store_payload(heavy, load)
@@ -219,6 +221,19 @@ def test_a_known_payload_shows_the_scale(scenario):
     assert spread < 0.05
     deviation = (result.estimate - truth())[FRICTION_AND_PID] / result.std[FRICTION_AND_PID]
     assert np.all(np.abs(deviation) < 3.5), deviation
+
+
+@pytest.mark.slow
+def test_the_payload_recovers_the_scale_of_the_papers_experiment():
+    """The common factor of all parameters, exactly known load: within 0.5 % (design: to <= 0.5 %)."""
+    paper = load_scenario("paper").with_overrides({"identification.scale_anchor": "payload"})
+    scales = []
+    for seed in (1, 2, 3):
+        result = identify(loaded(paper, seed), rss6(), paper)
+        ratio = (result.estimate / truth())[FRICTION_AND_PID]
+        weight = (truth() / result.std)[FRICTION_AND_PID] ** 2
+        scales.append(np.sum(weight * ratio) / np.sum(weight))
+    assert np.all(np.abs(np.array(scales) - 1) < 0.005), scales
 
 
 def test_the_payload_anchor_needs_two_loads(scenario):
