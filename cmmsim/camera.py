@@ -35,15 +35,15 @@ class PinholeCamera:
         if self.focal_px <= 0.0 or self.aspect <= 0.0 or self.width < 1 or self.height < 1:
             raise CmmError(f"camera needs a positive focal length, aspect and size, got {self}")
 
-    @property
+    @cached_property
     def focal_lengths(self) -> Array:
         """Focal lengths (2,) along x and y, px."""
-        return np.array([self.focal_px, self.focal_px * self.aspect])
+        return _constant(self.focal_px, self.focal_px * self.aspect)
 
-    @property
+    @cached_property
     def centre(self) -> Array:
         """Principal point (2,), px."""
-        return np.array([self.centre_x_px, self.centre_y_px])
+        return _constant(self.centre_x_px, self.centre_y_px)
 
     @property
     def matrix(self) -> Array:
@@ -61,7 +61,7 @@ class PinholeCamera:
         depth = points[..., 2]
         ahead = depth > 1e-6
         scale = self.focal_lengths / np.where(ahead, depth, 1.0)[..., None]
-        pixels = points[..., :2] * scale + (self.centre_x_px, self.centre_y_px)
+        pixels = points[..., :2] * scale + self.centre
         if not self.distortion.is_zero:
             pixels, holds = self.distort(pixels)
             ahead &= holds
@@ -104,3 +104,9 @@ class PinholeCamera:
         """Derivative (..., 2, 2) of the image's pixels by the ideal ones (..., 2)."""
         focal = self.focal_lengths
         return self.distortion.jacobian((ideal - self.centre) / focal) * focal[:, None] / focal
+
+
+def _constant(*values: float) -> Array:
+    array = np.array(values)
+    array.setflags(write=False)
+    return array

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from .blob_search import find_ellipses
-from .errors import LostError, UnknownOptionError
+from .errors import LostError, ShapeError, UnknownOptionError
 from .images import FrameImages, StereoFrame, StereoImages
 from .labelling import find_layout
 from .marked_body import MarkedBody
@@ -67,7 +67,12 @@ def measure_frame(frame: StereoFrame, estimator: PoseEstimator, expected: Array 
     """Measure a stereo frame from any source.
 
     ``expected`` (4,4) is a rough camera_from_platform; without it the stickers are searched in the whole images.
+    Raises ShapeError for images of another bit depth than the estimator's cameras have.
     """
+    for name, image in (("left", frame.left), ("right", frame.right)):
+        if image.dtype != estimator.noise.image_type:
+            raise ShapeError(f"the {name} image is {image.dtype}, but the camera's bit_depth "
+                             f"{estimator.noise.bit_depth} makes {estimator.noise.image_type}")
     images = FrameImages(frame)
     try:
         return estimator.measure(images, estimator.locate(images) if expected is None else expected)[0]

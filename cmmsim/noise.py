@@ -60,6 +60,11 @@ class CameraNoise:
         return int(2**self.bit_depth - 1)
 
     @property
+    def image_type(self) -> np.dtype:
+        """Type of the grey values."""
+        return np.dtype(np.uint8 if self.bit_depth == 8 else np.uint16)
+
+    @property
     def has_pattern(self) -> bool:
         """Whether pixels differ from each other."""
         return self.enabled and (self.prnu > 0.0 or self.dsnu > 0.0)
@@ -86,7 +91,7 @@ class CameraNoise:
                pattern: FixedPattern | None = None) -> GreyImage:
         """One exposure of a radiance image (float32, 0 to 1); ``pattern`` of the same shape, where pixels differ."""
         grey = np.rint(np.clip(self._analog(radiance, rng, pattern), 0.0, float(self.white_level)))
-        return grey.astype(np.uint8 if self.bit_depth == 8 else np.uint16)
+        return np.asarray(grey.astype(self.image_type))
 
     def mean_of_exposures(self, radiance: NDArray[np.float32], rng: np.random.Generator, frames: int,
                           pattern: FixedPattern | None = None) -> Array:

@@ -123,3 +123,9 @@ def test_twelve_bits_measure_as_well_as_eight(tmp_path):
 def test_bad_noise_in_a_sensor_file(tmp_path, old, new, message):
     with pytest.raises(cmmsim.SensorFileError, match=message):
         lens_sensor(tmp_path, changes=[(old, new)])
+
+
+def test_images_of_another_bit_depth_are_refused(tmp_path):
+    deep = cmmsim.StereoFrame(*[np.zeros((1536, 2048), dtype=np.uint16)] * 2)
+    with pytest.raises(cmmsim.ShapeError, match="left image is uint16, but the camera's bit_depth 8 makes uint8"):
+        cmmsim.measure_frame(deep, lens_sensor(tmp_path).estimator)
