@@ -17,7 +17,7 @@ from .estimator import PoseEstimator
 from .image_formation import ImageFormation
 from .images import StereoFrame, StereoImages
 from .marked_body import marked_body
-from .measurement import Measurement
+from .measurement import Measurement, lost_measurement
 from .noise import CameraNoise
 from .observation import DetectionSettings
 from .optics import Optics
@@ -33,7 +33,7 @@ from .tracking import Tracker
 from .views import Drawable
 from .virtual_camera import Quality, VirtualStereoCamera
 
-TEACHING_STREAM, RUN_STREAM = 0, 1
+TEACHING_STREAM, RUN_STREAM, DROPOUT_STREAM = 0, 1, 2
 
 
 class Sensor:
@@ -86,8 +86,13 @@ class Sensor:
 
     @property
     def timing(self) -> Timing:
-        """Frame rate, exposure and latency as the file states them."""
+        """Frame rate, exposure, latency with its jitter, and dropout, as the file states them."""
         return self._file.timing
+
+    @property
+    def note(self) -> str:
+        """What a user must know of the file's figures, such as that they are assumed; empty where there is nothing."""
+        return self._file.note
 
     @property
     def home(self) -> Array:
@@ -113,8 +118,12 @@ class Sensor:
         return self._taught
 
     def start_run(self, seed: int) -> None:
-        """Begin a new run: a new noise generator, and the next measurement searches the whole images."""
-        self._rng = np.random.default_rng([seed, RUN_STREAM])
+        """Begin a new run: new noise, and the next measurement searches the whole images.
+
+        Every frame has a noise stream of its own, so that a dropped one changes nothing in the others.
+        """
+        self._run_seed, self._frame = seed, 0
+        self._dropout_rng = np.random.default_rng([seed, DROPOUT_STREAM])
         if self._tracker is not None:
             self._tracker.forget()
 
@@ -148,11 +157,14 @@ class Sensor:
                 pose_rate: ArrayLike | None = None) -> Measurement:
         """Measure the platform; parameters as in ``look``, they go to the renderer only.
 
-        The measured pose is that in the middle of the exposure.
+        The measured pose is that in the middle of the exposure. A frame that drops out is lost without being looked at.
         """
         images = self.look(pose, obstacles, pose_rate)
         if self._tracker is None:
             self._tracker = self._new_tracker(self.taught)
+        if self._dropout_rng.random() < self.timing.dropout:
+            self._tracker.miss()
+            return lost_measurement(f"dropped frame (a share of {self.timing.dropout:.3g} drops out)")
         return self._tracker.measure(images)
 
     def _new_tracker(self, taught: Taught) -> Tracker:
@@ -185,7 +197,9 @@ class Sensor:
                 raise UnknownBodyError(name, self._obstacles)
             if np.shape(place) != (4, 4) or not np.all(np.isfinite(place)):
                 raise ShapeError(f"obstacle {name!r}: base_from_body must be (4,4) and finite, got {np.shape(place)}")
-        return np.asarray(pose, dtype=float), self._rng, obstacles or {}
+        rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
+        self._frame += 1
+        return np.asarray(pose, dtype=float), rng, obstacles or {}
 
 
 def _checked_rate(pose_rate: ArrayLike | None) -> Array | None:

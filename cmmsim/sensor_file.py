@@ -25,11 +25,27 @@ class _Section(BaseModel):
 
 
 class Timing(_Section):
-    """frame_rate Hz; exposure and latency s."""
+    """When the sensor looks, and when its poses can be used: see also :mod:`cmmsim.latency`.
+
+    frame_rate Hz; exposure s: a measured pose is that in its middle; latency s, from the middle of the exposure to the
+    use of the pose, and latency_jitter s, its standard deviation from frame to frame; dropout: probability that a frame
+    is lost before anyone sees it.
+    """
 
     frame_rate: Positive
     exposure: NotNegative = 0.0
     latency: NotNegative = 0.0
+    latency_jitter: NotNegative = 0.0
+    dropout: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+
+    @model_validator(mode="after")
+    def _possible(self) -> Timing:
+        if self.exposure * self.frame_rate > 1.0 + 1e-9:
+            raise ValueError(f"exposure {self.exposure:g} s is longer than a frame of {self.frame_rate:g} Hz, "
+                             f"{1.0 / self.frame_rate:.4g} s")
+        if self.latency_jitter > self.latency:
+            raise ValueError(f"latency_jitter {self.latency_jitter:g} s is larger than latency {self.latency:g} s")
+        return self
 
 
 class Calibrated(_Section):
@@ -164,9 +180,16 @@ class Platform(Body):
 
 
 class SensorFile(_Section):
-    """A whole sensor file; renderer: which one draws, "auto" takes pyrender where OpenGL works, else analytic."""
+    """A whole sensor file.
+
+    based_on: a built-in sensor, or a file beside this one, whose entries hold where this file has none; note: what a
+    user must know of the figures, such as that they are assumed; renderer: which one draws, "auto" takes pyrender where
+    OpenGL works, else analytic.
+    """
 
     name: str
+    based_on: str | None = None
+    note: str = ""
     renderer: Literal["auto", "pyrender", "analytic"] = "auto"
     timing: Timing
     rig: Rig
@@ -189,6 +212,33 @@ def read_sensor_file(name: str | Path) -> SensorFile:
 
     Raises UnknownSensorError for a name that is neither, SensorFileError (with the valid names) for a bad content.
     """
+    try:
+        return SensorFile.model_validate(_content(name))
+    except ValidationError as error:
+        lines = "; ".join(_explain(e) for e in error.errors())
+        raise SensorFileError(f"sensor file {name}: {lines}") from error
+
+
+def _content(name: str | Path) -> dict[str, Any]:
+    """What a file says, completed by the sensor it is based on: entry by entry in each section, no deeper."""
+    own = _table(name)
+    basis = own.get("based_on")
+    if not isinstance(basis, str):
+        return own
+    beside = basis if basis in built_in_names() else Path(name).parent / basis
+    try:
+        base = _table(beside)
+    except UnknownSensorError as error:
+        raise SensorFileError(f"sensor file {name}: based_on: {error}") from error
+    if "based_on" in base:
+        raise SensorFileError(f"sensor file {name}: based_on = {basis!r}, which is itself based on "
+                              f"{base['based_on']!r}: name a sensor whose file is complete")
+    merged = {key: {**base[key], **value} if isinstance(value, dict) and isinstance(base.get(key), dict) else value
+              for key, value in own.items()}
+    return base | merged
+
+
+def _table(name: str | Path) -> dict[str, Any]:
     if str(name) in built_in_names():
         text = resources.files(__package__).joinpath("sensors", f"{name}.toml").read_text(encoding="utf-8")
     elif Path(name).is_file():
@@ -196,12 +246,9 @@ def read_sensor_file(name: str | Path) -> SensorFile:
     else:
         raise UnknownSensorError(str(name), built_in_names())
     try:
-        return SensorFile.model_validate(tomllib.loads(text))
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SensorFileError(f"sensor file {name}: {error}") from error
-    except ValidationError as error:
-        lines = "; ".join(_explain(e) for e in error.errors())
-        raise SensorFileError(f"sensor file {name}: {lines}") from error
 
 
 def _explain(error: Any) -> str:
@@ -209,6 +256,8 @@ def _explain(error: Any) -> str:
     where = ".".join(str(part) for part in error["loc"])
     if error["type"] == "extra_forbidden":
         return f"unknown key {where!r}, valid are {', '.join(_valid_keys(error['loc'][:-1]))}"
+    if error["type"] == "value_error":
+        return f"{where}: {error['ctx']['error']}"
     return f"{where}: {error['msg']} (got {error['input']!r})"
 
 

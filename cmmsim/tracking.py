@@ -37,6 +37,11 @@ class Tracker:
         self._last, self._seen = measured, len(measurement.target_ids)
         return measurement
 
+    def miss(self) -> None:
+        """A frame passed that nobody saw: the movement is taken to go on."""
+        if self._last is not None:
+            self._last = self._predicted()
+
     def _tracked(self, images: StereoImages) -> tuple[Measurement, Array] | None:
         """The measurement in the predicted windows; None without a prediction or where it did not hold."""
         if self._last is None:

@@ -18,6 +18,7 @@ def acceptance_entry(run: AcceptanceRun, limit_um: float) -> dict[str, Any]:
     """All figures of a run; a test that was not done is absent."""
     entry: dict[str, Any] = {
         "sensor": run.under_test.file.name,
+        "note": run.under_test.file.note,
         "renderer": run.renderer,
         "seed": run.under_test.seed,
         "versions": versions(),

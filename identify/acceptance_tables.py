@@ -103,7 +103,8 @@ def acceptance_markdown(entry: dict[str, Any]) -> str:
     parts = [f"# Acceptance of {entry['sensor']}",
              f"Renderer {entry['renderer']}, seed {entry['seed']}. Measuring volume {sides} mm "
              f"({volume['cubic_metres']:.3g} m³, space diagonal {volume['diagonal_mm']:.0f} mm), {near:.0f} to "
-             f"{far:.0f} mm from the middle of the baseline: wholly seen by both cameras."]
+             f"{far:.0f} mm from the middle of the baseline: wholly seen by both cameras.",
+             *([f"Of the sensor's figures: {entry['note']}."] if entry.get("note") else [])]
     tables = [make(entry) for key, make in (("vdi_2634_1", length_table), ("astm_e3064", bar_table),
                                             ("astm_e3124", latency_table)) if key in entry]
     for table in [*tables, published_table(entry)]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import ShapeError
+from ..latency import drawn_latencies
 from ..pose import Array
 from ..tracking import Tracker
 from .artefact import facing_rotation
@@ -120,7 +121,7 @@ def latency_test(under_test: SensorUnderTest, volume: MeasuringVolume, frames: i
     good = np.array([m.ok for m in measured])
     if good.sum() < 4:
         raise AcceptanceError(f"latency: {good.sum()} of {frames} frames are measured: {measured[-1].reason}")
-    reported = taken[good] + sensor.timing.latency
+    reported = (taken + drawn_latencies(sensor.timing, frames, np.random.default_rng([under_test.seed, STREAM])))[good]
     kept = [m for m in measured if m.ok]
     latency = estimate_latency(reported, np.array([m.pose[:3] for m in kept]), motion, 0.5 * PERIOD,
                                np.array([m.covariance[:3, :3] for m in kept]))

@@ -1,0 +1,187 @@
+"""Rate, latency with jitter and dropout of a sensor, and sensor files that are based on another."""
+
+from importlib import resources
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import cmmsim
+from cmmsim.acceptance import SensorUnderTest, common_volume, latency_test
+from cmmsim.latency import drawn_latencies, largest_latency
+from cmmsim.measurement import lost_measurement
+from cmmsim.sensor_file import Timing, read_sensor_file
+from cmmsim.tracking import Tracker
+
+COMPLETE = resources.files("cmmsim").joinpath("sensors", "ctrack780.toml").read_text(encoding="utf-8")
+DROPPING = 'name = "ctrack780"\nbased_on = "ctrack780"\nrenderer = "analytic"\n[timing]\ndropout = {}\n'
+
+
+@pytest.fixture(scope="module")
+def taught():
+    """What the sensors of this file are taught: they differ in nothing that teaching sees."""
+    return cmmsim.load_sensor("ctrack780", seed=0, renderer="analytic").taught
+
+
+@pytest.fixture
+def dropping(tmp_path, taught):
+    """Sensors with a dropout, by its probability."""
+
+    def make(probability, seed=0):
+        path = tmp_path / "dropping.toml"
+        path.write_text(DROPPING.format(probability), encoding="utf-8")
+        return cmmsim.load_sensor(path, seed=seed, taught=taught)
+
+    return make
+
+
+def test_the_29_hz_sensor_is_labelled_as_assumed_and_differs_in_nothing_but_its_timing():
+    slow, usual = read_sensor_file("ctrack780_29hz"), read_sensor_file("ctrack780")
+    assert (slow.timing.frame_rate, slow.timing.latency * slow.timing.frame_rate) == (29.0, 1.0)
+    assert "assumed" in slow.note
+    assert "assumed" in cmmsim.load_sensor("ctrack780_29hz").note
+    assert usual.note == ""
+    own = {"name", "based_on", "note", "timing"}
+    assert slow.model_dump(exclude=own) == usual.model_dump(exclude=own)
+
+
+def test_a_file_based_on_another_changes_single_entries_of_a_section(tmp_path):
+    (tmp_path / "base.toml").write_text(COMPLETE.replace("gain = 0.13", "gain = 0.26"), encoding="utf-8")
+    mine = tmp_path / "mine.toml"
+    mine.write_text('name = "mine"\nbased_on = "base.toml"\n[camera]\ndark_noise = 3.0\n[lens]\npsf_px = 0.5\n')
+    found = read_sensor_file(mine)
+    assert (found.name, found.camera.gain, found.camera.dark_noise, found.lens.psf_px) == ("mine", 0.26, 3.0, 0.5)
+    assert found.rig == read_sensor_file("ctrack780").rig
+
+
+@pytest.mark.parametrize(("basis", "message"), [
+    ('"ctrack78"', r"mine.toml: based_on: unknown sensor .*ctrack78.*ctrack780"),
+    ('"mine.toml"', "which is itself based on 'mine.toml': name a sensor whose file is complete"),
+    ('"ctrack780_29hz"', "which is itself based on 'ctrack780'"),
+    ("3", "based_on: Input should be a valid string"),
+])
+def test_a_bad_basis_is_refused(tmp_path, basis, message):
+    """One level only: neither a chain nor a circle."""
+    mine = tmp_path / "mine.toml"
+    mine.write_text(f'name = "mine"\nbased_on = {basis}\n')
+    with pytest.raises(cmmsim.SensorFileError, match=message):
+        read_sensor_file(mine)
+
+
+@pytest.mark.parametrize(("entry", "message"), [
+    ("dropout = 1.1", "timing.dropout: .*less than or equal to 1"),
+    ("dropout = -0.1", "timing.dropout: .*greater than or equal to 0"),
+    ("latency = 0.01\nlatency_jitter = 0.02", r"timing: latency_jitter 0.02 s is larger than latency 0.01 s$"),
+    ("exposure = 0.02", r"timing: exposure 0.02 s is longer than a frame of 60 Hz, 0.01667 s$"),
+])
+def test_contradictions_in_the_timing_are_refused(tmp_path, entry, message):
+    mine = tmp_path / "mine.toml"
+    mine.write_text(f'name = "mine"\nbased_on = "ctrack780"\n[timing]\n{entry}\n')
+    with pytest.raises(cmmsim.SensorFileError, match=message):
+        read_sensor_file(mine)
+
+
+@pytest.mark.parametrize("jitter", [0.002, 0.008, 0.020])
+def test_latencies_are_a_clipped_normal_distribution(jitter):
+    """Against SciPy's distribution function, and its mass at the two clips."""
+    timing = Timing(frame_rate=60.0, latency=0.020, latency_jitter=jitter)
+    drawn = drawn_latencies(timing, 20_000, np.random.default_rng(1))
+    widest = min(3 * jitter, 0.020)
+    assert (drawn.min(), drawn.max()) == (0.020 - widest, 0.020 + widest)
+    assert drawn.max() == largest_latency(timing)
+    inside = drawn[np.abs(drawn - 0.020) < widest]
+    ends = widest / jitter
+    assert stats.kstest(inside, stats.truncnorm(-ends, ends, 0.020, jitter).cdf).pvalue > 0.001
+    share = stats.binomtest(len(drawn) - len(inside), len(drawn)).proportion_ci(0.999)
+    assert share.low < 2 * stats.norm.sf(ends) < share.high
+    assert abs(drawn.mean() - 0.020) < 4 * drawn.std() / np.sqrt(len(drawn))
+
+
+def test_without_jitter_every_latency_is_the_stated_one():
+    drawn = drawn_latencies(Timing(frame_rate=60.0, latency=0.020), 50, np.random.default_rng(1))
+    assert np.array_equal(drawn, np.full(50, 0.020))
+
+
+def test_the_acceptance_test_of_latency_finds_the_jitter():
+    file = read_sensor_file("ctrack780")
+    timing = Timing(frame_rate=60.0, latency=0.014, latency_jitter=0.001)
+    under_test = SensorUnderTest(file.model_copy(update={"timing": timing}), 0, "analytic")
+    found = latency_test(under_test, common_volume(file.rig), frames=100).latency
+    assert found.mean == pytest.approx(0.014, abs=4e-4)
+    assert found.std == pytest.approx(0.001, rel=0.25)
+    assert found.resolution < 1e-4
+
+
+def test_frames_drop_out_as_often_as_stated_and_independently(dropping):
+    sensor = dropping(0.3)
+    lost = np.array([not sensor.measure(sensor.home).ok for _ in range(400)])
+    low, high = stats.binom.interval(0.999, 400, 0.3)
+    assert low <= lost.sum() <= high
+    low, high = stats.binom.interval(0.999, 200, 0.3**2)
+    assert low <= (lost[::2] & lost[1::2]).sum() <= high
+
+
+def test_a_dropped_frame_says_so_and_the_same_seed_drops_the_same(dropping):
+    sensor = dropping(1.0)
+    measured = sensor.measure(sensor.home)
+    assert not measured.ok
+    assert "dropped frame" in measured.reason
+    patterns = []
+    for seed in (3, 3, 4):
+        sensor = dropping(0.5, seed)
+        patterns.append([sensor.measure(sensor.home).ok for _ in range(30)])
+    assert patterns[0] == patterns[1] != patterns[2]
+
+
+def test_the_images_of_other_frames_are_the_same_with_and_without_dropout(dropping):
+    """Six frames of which some drop out, then one more: the same grey values, noise and all."""
+    corners = np.array([[[900, 700], [1000, 800]], [[950, 700], [1100, 800]]])
+    grey = []
+    for probability in (0.0, 0.5, 1.0):
+        sensor = dropping(probability, seed=5)
+        for _ in range(6):
+            sensor.measure(sensor.home)
+        grey.append(sensor.look(sensor.home).windows(corners, 16))
+    assert np.array_equal(grey[0], grey[1])
+    assert np.array_equal(grey[0], grey[2])
+    assert not np.array_equal(grey[0], sensor.look(sensor.home).windows(corners, 16))
+
+
+def test_after_dropped_frames_the_moving_platform_is_measured_again_at_once(dropping, moving_path):
+    sensor, lost = dropping(0.4), 0
+    for pose in moving_path(60):
+        measured = sensor.measure(pose)
+        assert measured.ok or "dropped" in measured.reason
+        lost += not measured.ok
+        if measured.ok:
+            assert np.abs(measured.pose - pose)[:3].max() < 100e-6
+    assert lost > 10
+
+
+def test_the_prediction_goes_on_through_missed_frames():
+    """A stand-in for the estimator: the platform moves 1 mm a frame, and the tracker says where it expects it."""
+    expected = []
+
+    class Estimator:
+        def locate(self, images):
+            return _at(images)
+
+        def measure(self, images, predicted):
+            expected.append(predicted[0, 3])
+            good = lost_measurement("stands for a good one")
+            return good, _at(images)
+
+    tracker = Tracker(Estimator())
+    tracker.miss()
+    for frame in range(9):
+        if frame in (3, 4, 6):
+            tracker.miss()
+        else:
+            tracker.measure(frame)
+    np.testing.assert_allclose(expected, np.array([0, 0, 2, 5, 7, 8]) * 1e-3, atol=1e-15)
+
+
+def _at(frame):
+    place = np.eye(4)
+    place[0, 3] = 1e-3 * frame
+    return place
