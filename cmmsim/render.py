@@ -1,6 +1,7 @@
 """Rendering of many small windows in one pass. The only module that imports pyrender.
 
-pyrender supplies the OpenGL context, the mesh buffers, the flat shader and the four-sample frame buffer. Each window
+pyrender supplies the OpenGL context, the mesh buffers and the flat shader; the frame buffers hold one channel only,
+which draws faster than pyrender's four. Each window
 is drawn into its own cell of one large frame buffer with its own projection, drawn larger by the supersampling factor,
 and averaged in linear light. A cell draws only the patches whose bounding box reaches into it. Projection and
 camera_from_body are multiplied in double precision, so that the shader sees one well-scaled matrix.
@@ -18,12 +19,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import OpenGLMissingError
+from .errors import CmmError, OpenGLMissingError
 from .scene import Patch
 from .views import Drawable, View
 
 ATLAS_SIDE_PX = 2048
 KEPT_FRAME_BUFFERS = 12
+SAMPLES = 4  # a drawn pixel
 
 
 def render_windows(drawable: Drawable, views: Sequence[View], supersampling: int,
@@ -72,12 +74,16 @@ class _Atlas:
 
     def __init__(self, pyrender: Any) -> None:
         from OpenGL import GL
+        from OpenGL.raw.GL.VERSION import GL_1_0, GL_1_1, GL_2_0, GL_3_0  # without the conversion of arguments
         from pyrender.renderer import Renderer
 
-        self._gl, self._pyrender, self._renderer_class = GL, pyrender, Renderer
+        self._gl, self._pyrender = GL, pyrender
+        self._viewport, self._draw_elements = GL_1_0.glViewport, GL_1_1.glDrawElements
+        self._set_matrix, self._bind_mesh = GL_2_0.glUniformMatrix4fv, GL_3_0.glBindVertexArray
         self._context = pyrender.OffscreenRenderer(64, 64)
+        self._shaders = Renderer(64, 64)
         self._flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.OFFSCREEN
-        self._frame_buffers: dict[tuple[int, int], Any] = {}
+        self._frame_buffers: dict[tuple[int, int], _FrameBuffer] = {}
         self._primitives: weakref.WeakKeyDictionary[Drawable, list[Any]] = weakref.WeakKeyDictionary()
 
     def draw(self, drawable: Drawable, views: Sequence[View], cell: tuple[int, int], columns: int, rows: int,
@@ -86,28 +92,30 @@ class _Atlas:
         gl, width, height = self._gl, columns * cell[0], rows * cell[1]
         self._context._platform.make_current()
         primitives = self._uploaded(drawable)
-        renderer = self._frame_buffer(width, height)
-        renderer._configure_forward_pass_viewport(self._flags)
+        frame_buffer = self._frame_buffer(width, height)
+        frame_buffer.bind()
+        gl.glEnable(gl.GL_DEPTH_TEST)
+        gl.glDepthFunc(gl.GL_LESS)
         gl.glEnable(gl.GL_MULTISAMPLE)
         gl.glDisable(gl.GL_CULL_FACE)
         gl.glDisable(gl.GL_BLEND)
         gl.glClearColor(background, background, background, 1.0)
         gl.glClear(gl.GL_COLOR_BUFFER_BIT | gl.GL_DEPTH_BUFFER_BIT)
-        matrix_location = self._bind_program(renderer, primitives[0])
-        reaching = drawable.reaching(views)
+        matrix_location = self._bind_program(primitives[0])
+        reaching, meshes = drawable.reaching(views), [(m._vaid, m.indices.size) for m in primitives]
         for k, view in enumerate(views):
-            gl.glViewport((k % columns) * cell[0], (k // columns) * cell[1], *cell)
+            self._viewport((k % columns) * cell[0], (k // columns) * cell[1], *cell)
             clip_from_bodies = (view.projection() @ view.camera_from_bodies).astype(np.float32)
             body = -1
-            for p in np.flatnonzero(reaching[k]):
+            for p in np.flatnonzero(reaching[k]).tolist():
                 if drawable.body_index[p] != body:
                     body = drawable.body_index[p]
-                    gl.glUniformMatrix4fv(matrix_location, 1, gl.GL_TRUE, clip_from_bodies[body])
-                primitive = primitives[p]
-                gl.glBindVertexArray(primitive._vaid)
-                gl.glDrawElementsInstanced(gl.GL_TRIANGLES, primitive.indices.size, gl.GL_UNSIGNED_INT, None, 1)
+                    self._set_matrix(matrix_location, 1, gl.GL_TRUE, clip_from_bodies[body])
+                mesh, count = meshes[p]
+                self._bind_mesh(mesh)
+                self._draw_elements(gl.GL_TRIANGLES, count, gl.GL_UNSIGNED_INT, None)
         gl.glBindVertexArray(0)
-        return self._read(renderer, width, height)
+        return frame_buffer.read()
 
     def _uploaded(self, drawable: Drawable) -> list[Any]:
         if drawable not in self._primitives:
@@ -123,31 +131,66 @@ class _Atlas:
         primitive._add_to_context()
         return primitive
 
-    def _frame_buffer(self, width: int, height: int) -> Any:
+    def _frame_buffer(self, width: int, height: int) -> _FrameBuffer:
         if (width, height) not in self._frame_buffers:
             if len(self._frame_buffers) >= KEPT_FRAME_BUFFERS:
                 self._frame_buffers.pop(next(iter(self._frame_buffers))).delete()
-            self._frame_buffers[width, height] = self._renderer_class(width, height)
+            self._frame_buffers[width, height] = _FrameBuffer(self._gl, width, height)
         return self._frame_buffers[width, height]
 
-    def _bind_program(self, renderer: Any, primitive: Any) -> int:
+    def _bind_program(self, primitive: Any) -> int:
         """Binds pyrender's flat shader with all matrices identity but P; returns the place of P."""
         from pyrender.constants import ProgramFlags
 
-        program = renderer._get_primitive_program(primitive, self._flags, ProgramFlags.USE_MATERIAL)
+        program = self._shaders._get_primitive_program(primitive, self._flags, ProgramFlags.USE_MATERIAL)
         program._bind()
         for name in ("V", "M"):
             program.set_uniform(name, np.eye(4))
         program.set_uniform("material.base_color_factor", np.ones(4))
         return self._gl.glGetUniformLocation(program._program_id, "P")
 
-    def _read(self, renderer: Any, width: int, height: int) -> NDArray[np.uint8]:
-        """Resolves the four samples and reads the red channel only."""
-        gl = self._gl
-        gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, renderer._main_fb_ms)
-        gl.glBindFramebuffer(gl.GL_DRAW_FRAMEBUFFER, renderer._main_fb)
-        gl.glBlitFramebuffer(0, 0, width, height, 0, 0, width, height, gl.GL_COLOR_BUFFER_BIT, gl.GL_LINEAR)
-        gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, renderer._main_fb)
+
+class _FrameBuffer:
+    """Red channel and depth with four samples a pixel, and the red channel they are resolved to."""
+
+    def __init__(self, gl: Any, width: int, height: int) -> None:
+        self._gl, self._size = gl, (width, height)
+        self._buffers: list[int] = []
+        self._drawn = self._made({gl.GL_COLOR_ATTACHMENT0: gl.GL_R8, gl.GL_DEPTH_ATTACHMENT: gl.GL_DEPTH_COMPONENT24},
+                                 SAMPLES)
+        self._resolved = self._made({gl.GL_COLOR_ATTACHMENT0: gl.GL_R8}, 0)
+
+    def bind(self) -> None:
+        """What is drawn from now on goes here."""
+        self._gl.glBindFramebuffer(self._gl.GL_DRAW_FRAMEBUFFER, self._drawn)
+
+    def read(self) -> NDArray[np.uint8]:
+        """The image (height, width), each pixel the mean of its samples."""
+        gl, (width, height) = self._gl, self._size
+        gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._drawn)
+        gl.glBindFramebuffer(gl.GL_DRAW_FRAMEBUFFER, self._resolved)
+        gl.glBlitFramebuffer(0, 0, width, height, 0, 0, width, height, gl.GL_COLOR_BUFFER_BIT, gl.GL_NEAREST)
+        gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._resolved)
         gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
         pixels = gl.glReadPixels(0, 0, width, height, gl.GL_RED, gl.GL_UNSIGNED_BYTE)
         return np.frombuffer(pixels, dtype=np.uint8).reshape(height, width)
+
+    def delete(self) -> None:
+        """Give the memory back."""
+        self._gl.glDeleteFramebuffers(2, [self._drawn, self._resolved])
+        self._gl.glDeleteRenderbuffers(len(self._buffers), self._buffers)
+
+    def _made(self, formats: dict[int, int], samples: int) -> int:
+        gl = self._gl
+        name = gl.glGenFramebuffers(1)
+        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, name)
+        for attachment, kind in formats.items():
+            buffer = gl.glGenRenderbuffers(1)
+            gl.glBindRenderbuffer(gl.GL_RENDERBUFFER, buffer)
+            gl.glRenderbufferStorageMultisample(gl.GL_RENDERBUFFER, samples, kind, *self._size)
+            gl.glFramebufferRenderbuffer(gl.GL_FRAMEBUFFER, attachment, gl.GL_RENDERBUFFER, buffer)
+            self._buffers.append(buffer)
+        state = gl.glCheckFramebufferStatus(gl.GL_FRAMEBUFFER)
+        if state != gl.GL_FRAMEBUFFER_COMPLETE:
+            raise CmmError(f"OpenGL cannot draw {self._size} px with {samples} samples: frame buffer state {state}")
+        return int(name)

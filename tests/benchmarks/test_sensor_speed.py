@@ -1,0 +1,146 @@
+"""Rendering and measuring in the loop: frames a second, against a straightforward pipeline, and over many frames.
+
+SENSOR_FRAMES=100000 in the environment makes the runs for memory that long.
+"""
+
+import os
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cmmsim
+from cmmsim import render
+from tests.benchmarks.timing import OtherLoad, judge
+
+pytestmark = [pytest.mark.slow, pytest.mark.rendering]
+GOALS = {"analytic": 300.0, "pyrender": 60.0}  # stereo frames a second on two free cores
+TIMES_STRAIGHTFORWARD = 20.0
+BATCH, BATCHES = 20, 30
+MEMORY_FRAMES = {"analytic": 10_000, "pyrender": 3_000}
+KEPT = []  # what must live as long as OpenGL is used
+LARGEST_GROWTH = 4e6  # bytes; one renderer made anew takes 2 MB
+
+
+@pytest.fixture(scope="module")
+def taught():
+    return cmmsim.load_sensor("ctrack780", seed=0).taught
+
+
+@pytest.fixture(params=["analytic", "pyrender"])
+def sensor(request, taught):
+    return cmmsim.load_sensor("ctrack780", seed=0, taught=taught, renderer=request.param)
+
+
+def path(sensor, count):
+    """Poses (count, 6) at 60 Hz inside the travel of the platform."""
+    t = np.arange(count)[:, None] / 60.0
+    angle = 2.0 * np.pi * np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.3]) * t + np.arange(6)
+    return sensor.home + np.array([0.009] * 3 + [0.035] * 3) * np.sin(angle)
+
+
+def frame_seconds(sensor, poses):
+    """Seconds a frame of the fastest batch; all frames are measured well."""
+    fastest = np.inf
+    for start in range(0, len(poses), BATCH):
+        batch = poses[start:start + BATCH]
+        began = time.perf_counter()
+        found = [sensor.measure(pose) for pose in batch]
+        fastest = min(fastest, (time.perf_counter() - began) / len(batch))
+        assert all(m.ok and len(m.target_ids) == 18 for m in found)
+    return fastest
+
+
+def test_frames_a_second(sensor, record_property):
+    poses = path(sensor, BATCH * (BATCHES + 1))
+    for pose in poses[:BATCH]:
+        sensor.measure(pose)
+    with OtherLoad() as load:
+        rate = 1.0 / frame_seconds(sensor, poses[BATCH:])
+    record_property("frames_per_second", round(rate, 1))
+    goal = GOALS[sensor.renderer]
+    judge(rate >= goal, f"{rate:.1f} stereo frames a second with {sensor.renderer}, goal {goal:g}", load)
+
+
+def test_against_a_straightforward_pipeline(taught, record_property):
+    """Rounds alternate and the fastest of each counts. The other pipeline measures the same poses, only worse."""
+    from tests.benchmarks.straightforward_sensor import StraightforwardSensor
+
+    sensor = cmmsim.load_sensor("ctrack780", seed=0, taught=taught, renderer="pyrender")
+    other = StraightforwardSensor(sensor)
+    KEPT.append(other)
+    poses = path(sensor, 6 * BATCH)
+    ours, theirs, errors = np.inf, np.inf, []
+    with OtherLoad() as load:
+        for start in range(0, len(poses), BATCH):
+            ours = min(ours, frame_seconds(sensor, poses[start:start + BATCH]))
+            for pose in poses[start:start + 3]:
+                began = time.perf_counter()
+                found, count = other.measure(pose, pose)
+                theirs = min(theirs, time.perf_counter() - began)
+                assert count >= 12
+                errors.append(found - pose)
+    assert np.abs(errors)[:, :3].max() < 1e-3
+    ratio = theirs / ours
+    record_property("times_straightforward", round(ratio, 1))
+    judge(ratio >= TIMES_STRAIGHTFORWARD, f"{ratio:.1f} times a straightforward pipeline ({1e3 * theirs:.0f} ms a "
+          f"frame), goal {TIMES_STRAIGHTFORWARD:g}", load)
+
+
+def test_memory_and_renderer_stay_over_many_frames(sensor, monkeypatch):
+    """Memory in use after all frames is that after the first tenth, and nothing of OpenGL is made anew."""
+    frames = int(os.environ.get("SENSOR_FRAMES", MEMORY_FRAMES[sensor.renderer]))
+    made = count_renderers(monkeypatch) if sensor.renderer == "pyrender" else []
+    poses = path(sensor, 600)
+    for n in range(frames):
+        if n == frames // 10:
+            made.clear()
+            before = resident_bytes()
+        assert sensor.measure(poses[n % len(poses)]).ok
+    growth = resident_bytes() - before
+    assert growth < LARGEST_GROWTH, f"{growth / 1e6:.1f} MB in {frames} frames"
+    assert made == []
+    if sensor.renderer == "pyrender":
+        assert render._shared_atlas.cache_info().misses == 1
+
+
+def count_renderers(monkeypatch):
+    """A list that gets the name of each renderer or frame buffer that is made."""
+    import pyrender
+    from pyrender.renderer import Renderer
+
+    made = []
+    for kind in (pyrender.OffscreenRenderer, Renderer, render._FrameBuffer):
+        def counted(self, *args, _kind=kind, _plain=kind.__init__, **kwargs):
+            made.append(_kind.__name__)
+            _plain(self, *args, **kwargs)
+
+        monkeypatch.setattr(kind, "__init__", counted)
+    return made
+
+
+def resident_bytes():
+    """Memory in use now."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+
+def test_kernels_compile_within_ten_seconds(tmp_path, taught, record_property):
+    """Of processor time, into an empty cache; a second process loads them in a small part of it."""
+    code = ("import time, numpy as np, cmmsim; s = cmmsim.load_sensor('ctrack780', renderer='analytic');"
+            "from cmmsim import teaching; c = time.process_time(); s.look(s.home).windows(np.full((2, 3, 2), 700), 16);"
+            "from cmmsim.ellipse_fit import fit_ellipses; from cmmsim.triangulation import triangulate;"
+            "from cmmsim.registration import register;"
+            "fit_ellipses(np.zeros((1, 16, 16)), np.zeros((1, 2), int), s.noise, 14);"
+            "p = np.full((4, 2), 1000.0); e = np.tile(np.eye(2), (4, 1, 1)); triangulate(s.rig, p, p, e, e);"
+            "x = np.eye(3); register(x, x, np.tile(np.eye(3), (3, 1, 1))); print(time.process_time() - c)")
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    with OtherLoad() as load:
+        cold, warm = (float(subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True,
+                                           env=environment).stdout) for _ in range(2))
+    record_property("compile_seconds", round(cold, 1))
+    assert warm < 0.3 * cold
+    judge(cold <= 10.0, f"kernels took {cold:.1f} s to compile, goal 10", load)
