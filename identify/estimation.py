@@ -20,6 +20,7 @@ from identify import warm_start
 from identify.arrays import Array
 from identify.base_parameters import base_parameters, rank_by_threshold, reference_regressor, structural_regressor
 from identify.bounded_least_squares import Solution, StopCriteria, minimise
+from identify.dataset import POSE
 from identify.errors import EstimationError
 from identify.estimate_covariance import DRAWS, Uncertainty, estimate_uncertainty
 from identify.group_estimates import IDENTIFIABLE_SHARE, GroupEstimates, group_estimates
@@ -29,6 +30,7 @@ from identify.progress import Advance, Progress, SilentProgress
 from identify.recorded_run import recorded_run
 from identify.scale_anchor import ScaleAnchor, read_anchor
 from identify.scenario import Scenario
+from identify.whiteness import LAGS, Whiteness, whiteness
 
 MISFIT_STDS = 5.0
 """Standard deviations from the expected residual beyond which a warning is given."""
@@ -48,7 +50,8 @@ class IdentificationResult:
     parameters; base_rank: independent groups that the trajectory excites by the paper's rule; iterations and
     evaluations: of all searches; stop_reason: of the last; costs: after each iteration, one tuple a search (command
     driven, then closed loop where asked for); noise_ratio: mean squared whitened residual, to compare with
-    expected_noise_ratio, what the sensor's noise alone would leave.
+    expected_noise_ratio, what the sensor's noise alone would leave; whiteness: test of the residuals of the model
+    driven by the logged commands.
     """
 
     names: tuple[str, ...]
@@ -67,6 +70,7 @@ class IdentificationResult:
     costs: tuple[tuple[float, ...], ...]
     noise_ratio: float
     expected_noise_ratio: float
+    whiteness: Whiteness
     warnings: tuple[str, ...]
     seconds: dict[str, float]
 
@@ -102,6 +106,7 @@ def identify(
     rng = np.random.default_rng([_seed(record), UNCERTAINTY_STREAM])
     with progress.stage("uncertainty", DRAWS) as advance:
         uncertainty = estimate_uncertainty(final, searches[-1].parameters, rng, advance)
+    tested = _whiteness(driven, searches[0].parameters)
     ended = time.perf_counter()
     seconds = {"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched}
     rate_hz = scenario.timing.frame_rate_hz
@@ -110,7 +115,7 @@ def identify(
     groups = group_estimates(
         base_parameters(structural_regressor(robot)), problem.guess, searches[-1].parameters, uncertainty.covariance
     )
-    return _result(final, warm, searches, uncertainty, groups, rank, seconds)
+    return _result(final, warm, searches, uncertainty, groups, tested, rank, seconds)
 
 
 def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance) -> Solution:
@@ -148,6 +153,17 @@ def output_error_problem(
     return OutputErrorProblem(runs, guess, anchor)
 
 
+def _whiteness(driven: OutputErrorProblem, parameters: Array) -> Whiteness:
+    """Whiteness of all command-driven residuals, one record after the other, with a gap of all lags between them."""
+    gap, residuals, ok = np.full((LAGS, 6), np.nan), [], []
+    for run in driven.runs:
+        rows = np.full(run.measured.shape, np.nan)
+        rows[run.ok] = run.whiten(run.model_poses(parameters) - run.measured)
+        residuals += [rows, gap]
+        ok += [run.ok, np.zeros(LAGS, dtype=bool)]
+    return whiteness(np.concatenate(residuals), np.concatenate(ok))
+
+
 def _seed(record: xr.Dataset | Sequence[xr.Dataset]) -> int:
     """Seed of the record, or of the first one."""
     first = record if isinstance(record, xr.Dataset) else record[0]
@@ -181,6 +197,7 @@ def _result(
     searches: list[Solution],
     uncertainty: Uncertainty,
     groups: GroupEstimates,
+    tested: Whiteness,
     rank: int,
     seconds: dict[str, float],
 ) -> IdentificationResult:
@@ -205,12 +222,13 @@ def _result(
         costs=tuple(one.costs for one in searches),
         noise_ratio=noise_ratio,
         expected_noise_ratio=uncertainty.expected_noise_ratio,
-        warnings=said + _warnings(noise_ratio, uncertainty),
+        whiteness=tested,
+        warnings=said + _warnings(noise_ratio, uncertainty, tested),
         seconds=seconds,
     )
 
 
-def _warnings(noise_ratio: float, uncertainty: Uncertainty) -> tuple[str, ...]:
+def _warnings(noise_ratio: float, uncertainty: Uncertainty, tested: Whiteness) -> tuple[str, ...]:
     """A misfit that the sensor's noise does not explain (a local minimum, or a model that is wrong), or a model whose
     loop is close to unstable."""
     said = []
@@ -224,5 +242,11 @@ def _warnings(noise_ratio: float, uncertainty: Uncertainty) -> tuple[str, ...]:
         said.append(
             f"{uncertainty.unstable} of {DRAWS} repeated experiments on the identified model were unstable and are "
             "left out of the intervals"
+        )
+    if tested.suspicious:
+        parts = ", ".join(f"{name} {p:.1g}" for name, p in zip(POSE, tested.p_values, strict=True))
+        said.append(
+            "the residuals of the model driven by the logged commands are not white (probability "
+            f"{tested.p_value:.1g}, by component {parts}): the model is wrong"
         )
     return tuple(said)

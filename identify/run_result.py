@@ -9,7 +9,7 @@ from identify import recording
 from identify.arrays import Array
 from identify.estimation import IdentificationResult
 from identify.loop_parameters import unit_of
-from identify.result_file import rms_figures
+from identify.result_file import AXES, rms_figures
 from identify.truth import true_poses
 
 
@@ -27,6 +27,10 @@ def identification_entry(result: IdentificationResult) -> dict[str, Any]:
         "searches": ["command_driven", "closed_loop"][: len(result.costs)],
         "noise_ratio": result.noise_ratio,
         "expected_noise_ratio": result.expected_noise_ratio,
+        "whiteness": {
+            "p_value": result.whiteness.p_value,
+            "p_values": dict(zip(AXES, result.whiteness.p_values, strict=True)),
+        },
         "warnings": list(result.warnings),
         "base_rank": result.base_rank,
         "parameters": {

@@ -100,6 +100,7 @@ def test_noise_is_explained(noisy):
     assert 0.9 < result.noise_ratio < 1.2
     assert result.noise_ratio == pytest.approx(result.expected_noise_ratio, abs=0.1)
     assert result.warnings == ()
+    assert not result.whiteness.suspicious
 
 
 def test_a_misfit_that_noise_does_not_explain_is_said(scenario):
@@ -108,6 +109,8 @@ def test_a_misfit_that_noise_does_not_explain_is_said(scenario):
     record, _ = run_plant(other, seed=1)
     result = identify(record, rss6(), scenario.with_overrides({"identification.max_iterations": 4}))
     assert "noise alone" in result.warnings[0]
+    assert "not white" in result.warnings[1]
+    assert result.whiteness.p_value < 1e-10
 
 
 def test_the_command_driven_model_explains_the_noise_fully(scenario):
@@ -228,7 +231,7 @@ def test_the_payload_recovers_the_scale_of_the_papers_experiment():
     """The common factor of all parameters, exactly known load: within 0.5 % (design: to <= 0.5 %)."""
     paper = load_scenario("paper").with_overrides({"identification.scale_anchor": "payload"})
     scales = []
-    for seed in (1, 2, 3):
+    for seed in (1, 2):
         result = identify(loaded(paper, seed), rss6(), paper)
         ratio = (result.estimate / truth())[FRICTION_AND_PID]
         weight = (truth() / result.std)[FRICTION_AND_PID] ** 2
