@@ -22,6 +22,8 @@ FIND_SIDE_PX = 1600  # dots are first looked for in an image of at most this siz
 FIT_ITERATIONS = 5
 WINDOW_REACH = 2.2  # dot radii around the centre that are looked at
 GROUND_FROM = 1.2  # dot radii from which the ground is taken
+SPREADS_PX = (0.0, 0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.0)  # blurs that are tried, sigma
+PROBED = 12  # dots on which they are tried
 LARGEST_MOVE = 0.3  # a fit that ends farther from OpenCV's centre, in dot radii, has caught something else
 # A photograph's noise is not known and its edges are blurred: all grey values count alike, and the limit only refuses
 # what is no ellipse at all (residuals of 25 grey values rms).
@@ -74,17 +76,25 @@ def _refine(bright: NDArray[np.uint8], rough: Array, board: Board) -> Array:
     reach = min(WINDOW_REACH, board.nearest / float(board.radius or 1.0) - 1.15)  # neighbours stay outside
     sizes = 2 * np.ceil(reach * largest + 1.0).astype(int)
     images = FrameImages(StereoFrame(bright, bright))
-    fine = np.full_like(rough, np.nan)
-    for size in np.unique(sizes):
+    fine, spread = np.full_like(rough, np.nan), None
+    for size in np.unique(sizes)[::-1]:
         chosen = np.flatnonzero(sizes == size)
         corners = np.rint(rough[chosen] - 0.5 * (size - 1)).astype(int)
         windows = images.windows(np.stack([corners, corners]), int(size))[0].astype(float)
         alone = _without_neighbours(windows, rough[chosen] - corners, shapes[chosen], reach)
-        fits = fit_ellipses(alone, corners, PLAIN_NOISE, int(size), LIMITS, FIT_ITERATIONS)
+        spread = _point_spread(alone[:PROBED], corners[:PROBED]) if spread is None else spread
+        fits = fit_ellipses(alone, corners, PLAIN_NOISE, int(size), LIMITS, FIT_ITERATIONS, spread)
         moved = np.linalg.norm(fits.centres - rough[chosen], axis=1)
         clean = fits.good & (moved < np.maximum(LARGEST_MOVE * largest[chosen], 0.5))
         fine[chosen[clean]] = fits.centres[clean]
     return fine
+
+
+def _point_spread(windows: Array, corners: NDArray[np.int_]) -> float:
+    """Sigma in px of the Gaussian blur with which ellipses fit these windows best: that of lens and focus together."""
+    misfits = [np.median(fit_ellipses(windows, corners, PLAIN_NOISE, windows.shape[1], LIMITS, FIT_ITERATIONS,
+                                      spread).misfit) for spread in SPREADS_PX]
+    return SPREADS_PX[int(np.argmin(misfits))]
 
 
 def _dot_shapes(rough: Array, board: Board) -> Array:
