@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from identify.errors import ScenarioError
 from identify.filtering import padding_samples
 from identify.scenario_text import one_line, to_toml
+from identify.sensor_timing import NAMES, check_delay, sensor_timing, timing_in_file
 
 BUILT_IN = Path(__file__).parent / "scenarios"
 
@@ -37,10 +38,17 @@ class _Section(BaseModel):
 
 
 class Timing(_Section):
-    """Sampling of the pose sensor and of the visual servo."""
+    """Sampling of the pose sensor and of the visual servo.
+
+    All but the hold is the sensor file's where a scenario does not state it. A measured pose is that in the middle of
+    its exposure, which is the time of its frame.
+    """
 
     frame_rate_hz: float = _quantity(60.0, "Hz", "stereo frames a second; the servo acts once a frame", gt=0, le=2000)
-    latency_s: float = _quantity(0.0, "s", "delay from the exposure to the use of the pose", ge=0, le=1)
+    exposure_s: float = _quantity(0.0, "s", "time in which a picture gathers light; 0 is an instant", ge=0, le=1)
+    latency_s: float = _quantity(0.0, "s", "mean delay from the middle of the exposure to the command", ge=0, le=1)
+    latency_jitter_s: float = _quantity(0.0, "s", "standard deviation of the latency between frames", ge=0, le=1)
+    dropout: float = _quantity(0.0, "1", "probability that a frame is lost on its way", ge=0, le=1)
     hold: Literal["zero", "linear"] = Field("zero", description="joint command between two frames")
 
     @property
@@ -152,6 +160,7 @@ class Scenario(_Section):
     description: str = ""
     robot: str = Field("rss6", description="built-in robot or path of a robot file")
     sensor: str = Field("ctrack780", description="built-in sensor or path of a sensor file")
+    sensor_note: str = Field("", description="what the sensor's file says about its own figures")
     renderer: Literal["pyrender", "analytic", "auto"] = Field(
         "pyrender", description="what draws the images; analytic needs no OpenGL, auto takes it where OpenGL is missing"
     )
@@ -168,11 +177,31 @@ class Scenario(_Section):
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Scenario":
+        self._complete_from_the_sensor()
+        check_delay(sensor_timing(self.timing.model_dump()))
         self._check_filter()
         self._check_excitation_fits_the_filter()
         self._check_whole_frames("excitation.duration_s", self.excitation.duration_s)
         self._check_whole_frames("validation.duration_s", self.validation.duration_s)
         return self
+
+    def _complete_from_the_sensor(self) -> None:
+        """Fill in the timing and the note that the scenario leaves to its sensor.
+
+        They do not count as set: with another sensor they are taken from that one.
+        """
+        stated = self.timing.model_fields_set
+        if stated.issuperset(NAMES) and "sensor_note" in self.model_fields_set:
+            return
+        in_file, note = timing_in_file(self.sensor)
+        own = {name: getattr(self.timing, name) for name in stated}
+        try:
+            timing = Timing(**(in_file | own))
+        except ValidationError as error:
+            raise ValueError(f"timing of the sensor {self.sensor!r}: {one_line(error, Timing)}") from error
+        self.__dict__["timing"] = Timing.model_construct(_fields_set=set(stated), **timing.model_dump())
+        if "sensor_note" not in self.model_fields_set:
+            self.__dict__["sensor_note"] = note
 
     def _check_filter(self) -> None:
         nyquist, cutoff = self.timing.frame_rate_hz / 2, self.filter.cutoff_hz
@@ -205,12 +234,14 @@ class Scenario(_Section):
             )
 
     def with_overrides(self, overrides: Mapping[str, Any]) -> "Scenario":
-        """Copy with values replaced by dotted path, such as ``{"timing.frame_rate_hz": 30.0}``.
+        """Copy with values replaced by dotted path, such as ``{"timing.frame_rate_hz": 30.0}``; None takes one back.
+
+        What this scenario took from its sensor is taken again, from the copy's.
 
         Raises:
             ScenarioError: a path that does not exist (with the valid names) or a value that does not fit.
         """
-        data = self.model_dump(exclude_none=True)
+        data = self.model_dump(exclude_none=True, exclude_unset=True)
         for path, value in overrides.items():
             _replace(data, path, value)
         return scenario_from_dict(data, source=f"scenario {self.name!r}")

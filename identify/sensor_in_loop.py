@@ -5,18 +5,23 @@ import time
 import numpy as np
 
 import cmmsim
+from cmmsim.sensor_file import read_sensor_file
 from dynamics import Robot
 from identify.arrays import Array
 from identify.progress import Advance
 from identify.robot_bodies import robot_meshes, robot_transforms
 from identify.scenario import Scenario
+from identify.sensor_timing import sensor_timing
 
 
 def make_sensor(scenario: Scenario, robot: Robot, seed: int, taught: cmmsim.Taught | None = None) -> cmmsim.Sensor:
-    """The scenario's sensor with the robot's cranks and links in its view. One a process: it owns the renderer."""
-    sensor = cmmsim.load_sensor(
-        scenario.sensor, seed=seed, method=scenario.pose_method, taught=taught, renderer=scenario.renderer
-    )
+    """The scenario's sensor, with its timing and with the robot's cranks and links in its view.
+
+    One a process: it owns the renderer.
+    """
+    file = read_sensor_file(scenario.sensor)
+    file = file.model_copy(update={"timing": sensor_timing(scenario.timing.model_dump())})
+    sensor = cmmsim.Sensor(file, seed, scenario.pose_method, taught, renderer=scenario.renderer)
     sensor.add_bodies(robot_meshes(robot))
     return sensor
 

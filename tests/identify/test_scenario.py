@@ -31,6 +31,62 @@ def test_quick_scenario_differs_only_in_length():
     assert differing == {"excitation.duration_s", "excitation.candidates", "validation.count", "validation.duration_s"}
 
 
+def test_timing_is_the_sensors_unless_the_scenario_states_it():
+    paper = load_scenario("paper")
+    slow = paper.with_overrides({"sensor": "ctrack780_29hz"})
+    assert (slow.timing.frame_rate_hz, slow.timing.latency_s) == (29.0, 1 / 29)
+    assert "assumed" in slow.sensor_note
+    assert slow.with_overrides({"sensor": "ctrack780"}) == paper
+    faster = slow.with_overrides({"timing.frame_rate_hz": 58.0})
+    assert (faster.timing.frame_rate_hz, faster.timing.latency_s) == (58.0, 1 / 29)
+    assert faster.with_overrides({"timing.frame_rate_hz": None}) == slow
+    still_faster = faster.with_overrides({"sensor": "ctrack780"})
+    assert (still_faster.timing.frame_rate_hz, still_faster.timing.latency_s) == (58.0, 0.0)
+
+
+def test_resolved_scenario_keeps_its_timing_whatever_the_sensor_file_says(tmp_path):
+    """What a run folder holds: every number is stated there, so the sensor's file is not asked."""
+    sensor = tmp_path / "mine.toml"
+    sensor.write_text(
+        'name = "mine"\nbased_on = "ctrack780"\n[timing]\nframe_rate = 50\nlatency = 0.02\ndropout = 0.1\n'
+        "latency_jitter = 0.005\nexposure = 0.002\n"
+    )
+    scenario = load_scenario("paper").with_overrides({"sensor": str(sensor)})
+    timing = scenario.timing
+    assert (timing.frame_rate_hz, timing.exposure_s, timing.latency_s) == (50.0, 0.002, 0.02)
+    assert (timing.latency_jitter_s, timing.dropout) == (0.005, 0.1)
+    sensor.unlink()
+    assert scenario_from_toml(scenario.to_toml()) == scenario
+
+
+def test_rate_of_a_sensor_file_that_no_scenario_may_have_is_named(tmp_path):
+    sensor = tmp_path / "mine.toml"
+    sensor.write_text('name = "mine"\nbased_on = "ctrack780"\n[timing]\nframe_rate = 5000\n')
+    message = refusal({"sensor": str(sensor)})
+    assert f"timing of the sensor {str(sensor)!r}: frame_rate_hz = 5000.0 [Hz]" in message
+
+
+@pytest.mark.parametrize(
+    ("overrides", "evidence"),
+    [
+        ({"sensor": "ctrack79"}, ["ctrack79", "ctrack780", "ctrack780_29hz"]),
+        ({"timing.latency_s": 0.7, "timing.frame_rate_hz": 100.0}, ["0.7 s", "70.0 frames", "at most 60 frames"]),
+        (
+            {"timing.latency_s": 0.9, "timing.latency_jitter_s": 0.1},
+            ["timing.latency_jitter_s = 0.1 s", "1.2 s", "72.0 frames"],
+        ),
+        ({"timing.latency_s": 0.01, "timing.latency_jitter_s": 0.02}, ["latency_jitter 0.02 s", "latency 0.01 s"]),
+        ({"timing.dropout": 1.5}, ["timing.dropout = 1.5"]),
+        ({"timing.dropout": -0.5}, ["timing.dropout = -0.5"]),
+        ({"timing.exposure_s": 0.02}, ["exposure 0.02 s", "60 Hz"]),
+        ({"sensor": "ctrack780_29hz", "filter.cutoff_hz": 14.5}, ["14.5 Hz", "29 Hz"]),
+    ],
+)
+def test_contradictions_in_the_timing_are_refused(overrides, evidence):
+    message = refusal(overrides)
+    assert all(part in message for part in evidence), message
+
+
 @pytest.mark.parametrize("name", scenario_names())
 def test_resolved_toml_names_every_value_and_reads_back_equal(name):
     scenario = load_scenario(name).with_overrides(
@@ -60,7 +116,7 @@ def test_file_that_is_no_toml_is_named(tmp_path):
 
 
 def test_unknown_key_lists_the_valid_names():
-    assert "unknown key 'timing.frame_rat'; valid names in [timing]: frame_rate_hz, latency_s, hold" in refusal(
+    assert "unknown key 'timing.frame_rat'; valid names in [timing]: frame_rate_hz, exposure_s, latency_s, " in refusal(
         {"timing.frame_rat": 3.0}
     )
     assert "unknown key 'camera'" in refusal({"camera.gain": 3.0})
