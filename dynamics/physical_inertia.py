@@ -73,21 +73,23 @@ def _fault(row: np.ndarray) -> str:
             return f"{name} = {value:g} is below {SMALLEST:g}"
     largest = int(np.argmax(row[1:]))
     others = [index for index in range(3) if index != largest]
-    if row[1 + largest] <= row[1 + others[0]] + row[1 + others[1]]:
+    half = row[1:] / 2  # sums of two of the largest floats overflow
+    if half[largest] <= half[others[0]] + half[others[1]]:
         return ""
     total = " + ".join(f"{MOMENTS[index]} {row[1 + index]:g}" for index in others)
     return f"{MOMENTS[largest]} {row[1 + largest]:g} > {total}"
 
 
 def _repaired(body: str, row: np.ndarray) -> np.ndarray:
-    mass, *moments = np.maximum(row, SMALLEST)
+    mass = max(row[0], SMALLEST)
+    moments = np.maximum(row[1:], SMALLEST) / 4  # sums of three of the largest floats overflow
     if body.startswith("crank"):
         moments = _crank_moments(*moments)
     elif body.startswith("link"):
         moments = _link_moments(*moments)
     else:
-        moments = _nearest_moments(np.array(moments))
-    return np.array([mass, *moments])
+        moments = _nearest_moments(moments)
+    return np.array([mass, *4 * np.array(moments)])
 
 
 def _crank_moments(x: float, y: float, z: float) -> list[float]:

@@ -3,12 +3,14 @@
 import tomllib
 from dataclasses import dataclass
 from importlib import resources
+from os import PathLike
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
+from dynamics.arrays import shown
 from dynamics.errors import DynamicsError, RobotFileError
 from dynamics.geometry import LEGS, Rss6Geometry
 from dynamics.kinematics import check_home
@@ -146,11 +148,13 @@ def _vectors(name: str, rows: list[list[float]]) -> np.ndarray:
 
 
 def _read_text(name_or_path: str | Path) -> tuple[str, str]:
+    if not isinstance(name_or_path, str | PathLike):
+        raise RobotFileError(f"a robot is given by its name or the path of its file, got {shown(name_or_path)}")
     path = Path(name_or_path)
     if path.suffix == ".toml" or path.is_file():
         try:
             return str(path), path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
+        except (OSError, ValueError) as error:
             raise RobotFileError(f"cannot read robot file {path}: {error}") from error
     if str(name_or_path) not in built_in_robots():
         valid = f"built-in robots: {', '.join(built_in_robots())}; or give the path of a .toml file"

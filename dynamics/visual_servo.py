@@ -42,13 +42,15 @@ class VisualServo:
     def command(self, frame: int, reference: Reference, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Command (6,), rad, of a good measurement (6,); and the demanded pose rate (6,) it came from."""
         gains = self._gains
-        error = reference.poses[frame] - measured
-        rate = (measured - self._previous) / self._elapsed
-        self._integral += self._period * error
-        demand = gains.kp * error + gains.kd * (reference.rates[frame] - rate) + gains.ki * self._integral
-        self._previous = measured
         jacobian = np.asarray(self._functions["pose_jacobian"](measured), dtype=float)
-        return jacobian @ demand, demand
+        with np.errstate(over="ignore", invalid="ignore"):  # the loop refuses a command that is not finite
+            error = reference.poses[frame] - measured
+            rate = (measured - self._previous) / self._elapsed
+            self._integral += self._period * error
+            demand = gains.kp * error + gains.kd * (reference.rates[frame] - rate) + gains.ki * self._integral
+            command = jacobian @ demand
+        self._previous = measured
+        return command, demand
 
     def command_tangent(self, measured: np.ndarray, demand: np.ndarray, d_measured: np.ndarray) -> np.ndarray:
         """Derivative (6, columns) of the command, given that of the measurement; see `step_sensitivity`."""

@@ -1,5 +1,6 @@
 """Bad input ends in an error that holds the value, the limit and the leg or name; never in a NaN."""
 
+import re
 import tomllib
 from importlib import resources
 
@@ -194,6 +195,19 @@ def test_unknown_robot_lists_the_known_ones(tmp_path):
     with pytest.raises(RobotFileError, match=r"cannot read robot file .*none\.toml"):
         dynamics.load_robot(tmp_path / "none.toml")
     assert dynamics.built_in_robots() == ["rss6"]
+
+
+@pytest.mark.parametrize("name", [None, 5, b"rss6", ["rss6"]])
+def test_a_robot_is_asked_for_by_name_or_path(name):
+    """Anything else is one line with what was given, not an error of pathlib."""
+    with pytest.raises(RobotFileError, match=re.escape(f"by its name or the path of its file, got {name!r}")):
+        dynamics.load_robot(name)
+
+
+def test_a_path_that_no_system_has():
+    """A null byte is refused by Python before any file is looked for."""
+    with pytest.raises(RobotFileError, match=r"cannot read robot file .*null byte"):
+        dynamics.load_robot("rss6\0.toml")
 
 
 def test_a_file_by_path_is_the_same_robot(load, robot):

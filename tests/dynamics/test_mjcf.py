@@ -2,6 +2,7 @@
 
 import json
 import sys
+import warnings
 from pathlib import Path
 from xml.etree import ElementTree as Xml
 
@@ -295,6 +296,16 @@ def test_changed_inertias_are_physical_and_keep_what_the_motion_feels(numbers):
     np.testing.assert_array_equal(after[:, 0], floor[:, 0])
     np.testing.assert_array_equal(after[1:7, 3], floor[1:7, 3])
     np.testing.assert_array_equal(after[7:, 1:3], floor[7:, 1:3])
+
+
+def test_the_largest_moments_are_changed_as_small_ones_are():
+    """Powers of two scale without rounding: up to the largest floats the result is the same, without overflow."""
+    given_ = np.tile([0.5, 0.1, 0.2, 0.8], 13)
+    expected = physical_inertias(given_, allow_changes=True).values
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        largest = physical_inertias(given_ * 2.0**1023 * 2, allow_changes=True).values
+    np.testing.assert_array_equal(largest / 2.0**512, expected * 2.0**512)
 
 
 def test_platform_gets_the_nearest_moments():
