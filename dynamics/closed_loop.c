@@ -137,6 +137,7 @@ CASADI_SYMBOL_EXPORT int closed_loop_run(const problem *p, measure_fn measure, t
         begin(c, v, ring, &s);
         status = run_frames(c, v, ring, &s, measure, out);
         out->events = c->events;
+        memcpy(out->last_pose, c->known_pose, sizeof(vec));
     }
     if (c) { free((void *)c->arg); free(c->res); free(c->iw); free(c->w); }
     free(c); free(v); free(ring);

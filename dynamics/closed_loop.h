@@ -4,6 +4,7 @@
  * joint_modes.c, step_sensitivity.c, stick_slip.c, visual_servo.c, closed_loop.c.
  */
 #include <math.h>
+#include <stddef.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -55,6 +56,7 @@ typedef struct {
     double *pose_sensitivity;                          /* (frames, 6, NP) or NULL */
     double *start_sensitivity;                         /* (frames, 6, NSTART) or NULL */
     int events, failed_frame;
+    vec last_pose;                                     /* the last at which the equation of motion was evaluated */
 } trajectory;
 
 typedef int (*measure_fn)(int frame, const double *pose, double *measured);
@@ -63,10 +65,14 @@ typedef struct { vec pose, rate, integral; } state;
 
 typedef struct { vec value, slope, rate; } command; /* U(t) = value + slope t; U_dot as the joint PID sees it */
 
+typedef double factor[N][N]; /* Cholesky factor L, with the reciprocals of its diagonal */
+
 typedef struct {
-    double mass[N * N], jacobian[N * N], cholesky[N][N];
-    vec bias, bias_acceleration, angle, error;
-    vec velocity, torque, net_torque, stick_force, acceleration;
+    double jacobian[N * N];
+    factor cholesky;           /* of the mass matrix */
+    vec bias, bias_acceleration, angle, velocity;
+    vec error;                 /* from here on: more than a function of pose and pose rate */
+    vec torque, net_torque, stick_force, acceleration;
     vec inverse_rows[N];       /* M^-1 J^T, column i for joint i */
     double compliance[N][N];   /* J M^-1 J^T */
 } evaluation;
@@ -80,6 +86,9 @@ typedef union {
 typedef struct {
     const problem *p;
     int mode[N]; /* 0: stuck, +1 or -1: slipping that way */
+    vec known_pose, known_rate; /* where the equation of motion was evaluated last */
+    evaluation known;           /* what it gave there, up to `error`, if `knows` */
+    int knows;
     command u;
     rows du_value, du_slope, du_rate;
     state stage_state[4];

@@ -26,7 +26,8 @@ from dynamics.errors import DynamicsError
 from dynamics.geometry import Rss6Geometry
 
 # No fused multiply-add: the same seed must give the same numbers on every x86-64 and on the plain path.
-FLAGS = ("-O2", "-ftree-vectorize", "-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno")
+# CasADi exports its own `sq`: without -fno-semantic-interposition every square of a variable is a call.
+FLAGS = ("-O3", "-fPIC", "-shared", "-fno-semantic-interposition", "-ffp-contract=off", "-fno-math-errno")
 
 
 class CompilerWarning(UserWarning):

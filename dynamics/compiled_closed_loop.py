@@ -12,6 +12,7 @@ from dynamics.compilation import load_library, open_library
 from dynamics.errors import SimulationError
 from dynamics.geometry import Rss6Geometry
 from dynamics.loop_types import (
+    LEFT_REACH,
     MEASURED_OUT_OF_REACH,
     PARAMETER_COUNT,
     SINGULAR_MASS,
@@ -24,7 +25,7 @@ from dynamics.loop_types import (
 )
 
 FAILURES = {
-    1: "the robot left the reachable set (the loop is unstable)",
+    1: LEFT_REACH,
     2: "more stick-slip events than a frame can hold",
     4: "out of memory",
     5: MEASURED_OUT_OF_REACH,
@@ -73,8 +74,8 @@ class _Trajectory(Structure):
         ("start_sensitivity", _DoublePointer),
         ("events", c_int),
         ("failed_frame", c_int),
+        ("last_pose", c_double * 6),
     ]
-
 
 
 @cache
@@ -110,7 +111,8 @@ def run(library: ctypes.CDLL, problem: LoopProblem) -> ClosedLoopRun:
     if status == SENSOR_FAILED:
         raise raised[0] if raised else SimulationError("the pose sensor failed without an error")
     if status:
-        raise failure(FAILURES[status], trajectory.failed_frame, problem, arrays["pose"], arrays["measured"])
+        last_pose = np.array(trajectory.last_pose)
+        raise failure(FAILURES[status], trajectory.failed_frame, problem, last_pose, arrays["measured"])
     return ClosedLoopRun(
         time=np.arange(frames) * period,
         **arrays,

@@ -12,6 +12,11 @@ def function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Functio
     return ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs]))
 
 
+def symmetric_from_lower(matrix: ca.SX) -> ca.SX:
+    """A matrix known to be symmetric, its upper triangle taken from the lower: each entry is formed once."""
+    return ca.tril2symm(ca.tril(matrix))
+
+
 def evaluate(function: ca.Function, *batches: np.ndarray) -> list[np.ndarray]:
     """All outputs (N, rows, columns) of a function over batches (N, columns) of its arguments, NaN included."""
     if not len(batches[0]):

@@ -6,28 +6,28 @@ static double dot_row(const double *matrix, int row, const double *v) {
     return sum;
 }
 
-static int cholesky(const double *a, double l[N][N]) {
+static int cholesky(const double *a, factor l) {
     for (int i = 0; i < N; i++)
         for (int j = 0; j <= i; j++) {
             double sum = a[i + N * j];
             for (int k = 0; k < j; k++) sum -= l[i][k] * l[j][k];
             if (i == j) {
                 if (!(sum > 0)) return 0;
-                l[i][i] = sqrt(sum);
+                l[i][i] = 1 / sqrt(sum);
             } else
-                l[i][j] = sum / l[j][j];
+                l[i][j] = sum * l[j][j];
         }
     return 1;
 }
 
-static void cholesky_solve(const double l[N][N], int n, double *b) {
+static void cholesky_solve(const factor l, int n, double *b) {
     for (int i = 0; i < n; i++) {
         for (int k = 0; k < i; k++) b[i] -= l[i][k] * b[k];
-        b[i] /= l[i][i];
+        b[i] *= l[i][i];
     }
     for (int i = n - 1; i >= 0; i--) {
         for (int k = i + 1; k < n; k++) b[i] -= l[k][i] * b[k];
-        b[i] /= l[i][i];
+        b[i] *= l[i][i];
     }
 }
 
@@ -39,18 +39,18 @@ static int stuck_joints(const int *mode, int *list) {
 }
 
 /* Cholesky factor of compliance[list][list], size count. */
-static void factor_stuck(const double compliance[N][N], const int *list, int count, double l[N][N]) {
+static void factor_stuck(const double compliance[N][N], const int *list, int count, factor l) {
     for (int i = 0; i < count; i++)
         for (int j = 0; j <= i; j++) {
             double sum = compliance[list[i]][list[j]];
             for (int k = 0; k < j; k++) sum -= l[i][k] * l[j][k];
-            l[i][j] = i == j ? sqrt(sum) : sum / l[j][j];
+            l[i][j] = i == j ? 1 / sqrt(sum) : sum * l[j][j];
         }
 }
 
 /* Solve the symmetric positive definite system compliance[list][list] f = b in place, size count. */
 static void solve_stuck(const double compliance[N][N], const int *list, int count, double *b) {
-    double l[N][N];
+    factor l;
     factor_stuck(compliance, list, count, l);
     cholesky_solve(l, count, b);
 }
@@ -91,16 +91,42 @@ static int finite_mass(const double *mass) {
     return 1;
 }
 
+/* The terms of the equation of motion at a pose and rate. Neighbouring steps and frames share their ends. */
+static int know_motion(context *c, const double *pose, const double *rate) {
+    double mass[N * N];
+    evaluation *e = &c->known;
+    if (c->knows && !memcmp(c->known_pose, pose, sizeof(vec)) && !memcmp(c->known_rate, rate, sizeof(vec))) return OK;
+    memcpy(c->known_pose, pose, sizeof(vec));
+    memcpy(c->known_rate, rate, sizeof(vec));
+    c->arg[0] = pose; c->arg[1] = rate; c->arg[2] = c->p->rigid;
+    c->res[0] = mass; c->res[1] = e->bias; c->res[2] = e->jacobian;
+    c->res[3] = e->bias_acceleration; c->res[4] = e->angle;
+    equation_of_motion(c->arg, c->res, c->iw, c->w, 0);
+    c->knows = cholesky(mass, e->cholesky);
+    if (!c->knows) return finite_mass(mass) ? SINGULAR_MASS : LEFT_REACH;
+    for (int i = 0; i < N; i++) e->velocity[i] = dot_row(e->jacobian, i, rate);
+    return OK;
+}
+
+/* J_theta alone, at a measured pose: often the true one. */
+static void pose_jacobian(context *c, const double *pose, double *jacobian) {
+    vec rest = {0};
+    if (c->knows && !memcmp(c->known_pose, pose, sizeof(vec))) {
+        memcpy(jacobian, c->known.jacobian, sizeof c->known.jacobian);
+        return;
+    }
+    c->arg[0] = pose; c->arg[1] = rest; c->arg[2] = c->p->rigid;
+    c->res[0] = c->res[1] = c->res[3] = c->res[4] = NULL; c->res[2] = jacobian;
+    equation_of_motion(c->arg, c->res, c->iw, c->w, 0);
+}
+
 /* Everything at one state that does not depend on the stick modes. */
 static int evaluate_terms(context *c, const state *s, double t, evaluation *e) {
     const problem *p = c->p;
-    c->arg[0] = s->pose; c->arg[1] = s->rate; c->arg[2] = p->rigid;
-    c->res[0] = e->mass; c->res[1] = e->bias; c->res[2] = e->jacobian;
-    c->res[3] = e->bias_acceleration; c->res[4] = e->angle;
-    equation_of_motion(c->arg, c->res, c->iw, c->w, 0);
-    if (!cholesky(e->mass, e->cholesky)) return finite_mass(e->mass) ? SINGULAR_MASS : LEFT_REACH;
+    int status = know_motion(c, s->pose, s->rate);
+    if (status != OK) return status;
+    memcpy(e, &c->known, offsetof(evaluation, error));
     for (int i = 0; i < N; i++) {
-        e->velocity[i] = dot_row(e->jacobian, i, s->rate);
         e->error[i] = c->u.value[i] + c->u.slope[i] * t - e->angle[i];
         e->torque[i] = p->lp * e->error[i] + p->ld * (c->u.rate[i] - e->velocity[i]) + p->li * s->integral[i];
     }

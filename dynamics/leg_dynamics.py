@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
+from dynamics.expressions import symmetric_from_lower
 from dynamics.jacobians import crank_leverage
 from dynamics.kinematics import LegVectors
 
@@ -87,7 +88,7 @@ def leg_mass(leg: LegVectors, crank: ca.SX, link: ca.SX) -> ca.SX:
     for inertia, direction in ((link[1], y), (link[2], x)):
         row = direction - gradient * ca.dot(tangent, direction)
         total += (inertia * (1 / leg.link_length**2)) * (row @ row.T)
-    return total
+    return symmetric_from_lower(total)
 
 
 def link_axes(leg: LegVectors) -> tuple[ca.SX, ca.SX]:

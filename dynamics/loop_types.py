@@ -208,13 +208,13 @@ class LoopFailure(SimulationError):
 
 
 def failure(reason: str, frame: int, problem: LoopProblem, pose: np.ndarray, measured: np.ndarray) -> LoopFailure:
-    """The error of a run that ended early, the same on both paths; true and measured poses (frames, 6) up to there."""
+    """The error of a run that ended early, the same on both paths; pose (6,) where it stopped, measured (frames, 6)."""
     when = f"frame {frame} (t = {frame * problem.period:.3f} s)"
     evidence = ""
     if reason == MEASURED_OUT_OF_REACH:
         evidence = f"; there {_nearest_leg(problem.robot, measured[frame])}"
     if reason == LEFT_REACH:
-        evidence = f"; at the start of the frame {_nearest_leg(problem.robot, pose[frame])}"
+        evidence = f": {_nearest_leg(problem.robot, pose)}"
     return LoopFailure(f"closed loop stopped at {when}: {reason}{evidence}", frame)
 
 

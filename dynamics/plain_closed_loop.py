@@ -65,11 +65,11 @@ def run(robot: Robot, problem: LoopProblem) -> ClosedLoopRun:
             issued.append(_servo_command(servo, frame, reference, measured, d_pose))
         result.command[frame] = issued[-1][0]
         if not np.isfinite(issued[-1][0]).all():
-            raise failure(MEASURED_OUT_OF_REACH, frame, problem, result.pose, result.measured)
+            raise failure(MEASURED_OUT_OF_REACH, frame, problem, state.pose, result.measured)
         try:
             state = _frame(motion, state, issued, frame, problem, result)
         except MotionStopped as reason:
-            raise failure(str(reason), frame, problem, result.pose, result.measured) from None
+            raise failure(str(reason), frame, problem, reason.pose, result.measured) from None
     return replace(result, events=motion.events)
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from dynamics.expressions import function
+from dynamics.expressions import function, symmetric_from_lower
 from dynamics.geometry import LEGS, Rss6Geometry
 from dynamics.kinematics import leg_to
 from dynamics.leg_dynamics import leg_columns, leg_force, leg_mass, leg_motion, torque_to_force
@@ -40,6 +40,7 @@ def equation_of_motion(geometry: Rss6Geometry) -> ca.Function:
         rows.append(torque_to_force(vectors).T @ gradient)
         crank_accelerations.append(motion.crank_acceleration)
         angles.append(vectors.angle)
+    mass = symmetric_from_lower(mass)
     outputs = [mass, bias, ca.vertcat(*rows), ca.vertcat(*crank_accelerations), ca.vertcat(*angles)]
     return function("equation_of_motion", [pose, rate, rigid], outputs)
 

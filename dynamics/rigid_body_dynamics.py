@@ -6,6 +6,7 @@ positive definite, G the wrench that holds the robot up, and tau_g = M twist_dot
 
 import casadi as ca
 
+from dynamics.expressions import symmetric_from_lower
 from dynamics.geometry import LEGS, Rss6Geometry
 from dynamics.jacobian_rates import crank_jacobian_rate, link_jacobian_rate, moving_leg
 from dynamics.jacobians import crank_jacobian, link_jacobian
@@ -68,7 +69,7 @@ def mass_matrix(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
         at_joint = leg_mass(leg, crank_parameters(rigid, index), link_parameters(rigid, index))
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
         total += to_joint.T @ at_joint @ to_joint
-    return total
+    return symmetric_from_lower(total)
 
 
 def virtual_work_mass_matrix(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:

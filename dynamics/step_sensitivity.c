@@ -20,14 +20,14 @@ static void multiply_add(const context *c, double scale, const double *matrix, r
 }
 
 /* Solve L L^T x = b in place for n rows b. */
-static void solve_rows(const double l[N][N], int n, row *b, int width) {
+static void solve_rows(const factor l, int n, row *b, int width) {
     for (int i = 0; i < n; i++) {
         for (int k = 0; k < i; k++) add_row(-l[i][k], b[k], b[i], width);
-        scale_row(1 / l[i][i], b[i], width);
+        scale_row(l[i][i], b[i], width);
     }
     for (int i = n - 1; i >= 0; i--) {
         for (int k = i + 1; k < n; k++) add_row(-l[k][i], b[k], b[i], width);
-        scale_row(1 / l[i][i], b[i], width);
+        scale_row(l[i][i], b[i], width);
     }
 }
 
@@ -85,7 +85,7 @@ static void slope_tangent(context *c, const evaluation *e, const state *s, doubl
     solve_rows(e->cholesky, N, out->v, width);
     int list[N], count = stuck_joints(c->mode, list);
     if (!count) return;
-    double l[N][N];
+    factor l;
     memset(force, 0, sizeof force);
     for (int n = 0; n < count; n++)
         for (int i = list[n], j = 0; j < N; j++) {
@@ -184,7 +184,8 @@ static void step_tangent(context *c, double h, int event, int cut, const evaluat
 static void stop_tangent(context *c, const evaluation *e, const state *s, const int *list, int count,
                          const double *change, const double *impulse) {
     const int width = c->width;
-    double by_pose[2][N * N], columns[2][N * NRIGID], map[N * N], l[N][N];
+    double by_pose[2][N * N], columns[2][N * NRIGID], map[N * N];
+    factor l;
     vec zero = {0}, torque = {0};
     rows moved, force;
     for (int n = 0; n < count; n++) torque[list[n]] = -impulse[n];

@@ -70,12 +70,18 @@ static int breaks_halfway(context *c, const state *s, double t, double *h, state
     return 1;
 }
 
-/* The step in (0, h] at which the modes stop holding, to rounding: regula falsi (Illinois) on the margin. A joint that
+/* By how much to weigh down the end of the bracket that stayed, when the other end moved twice. */
+static double kept_share(double margin, double before) {
+    double share = 1 - margin / before;
+    return share > 0 ? share : 0.5;
+}
+
+/* The step in (0, h] at which the modes stop holding, to rounding: regula falsi (Anderson-Bjorck) on the margin. A joint that
  * has just started from rest has no margin yet: then the bracket is found by halving; *held tells whether there is one. */
 static int locate_event(context *c, const state *s, double t, double h, double margin_at_h, double *step, state *out,
                         evaluation *end, int *held) {
     int joint, side = 0, status;
-    double low = 0, high = h, at_high = margin_at_h, at_low = mode_margin(c, &c->stage[0], &joint), margin;
+    double low = 0, high = h, at_high = margin_at_h, at_low = mode_margin(c, &c->stage[0], &joint), margin, tried = -1;
     for (int halving = 0; at_low < NO_MARGIN && halving < 40; halving++) {
         status = trial_margin(c, s, t, high / 2, out, end, &margin);
         if (status != OK) return status;
@@ -88,19 +94,20 @@ static int locate_event(context *c, const state *s, double t, double h, double m
         if (iteration > 40 || !(middle > low && middle < high)) middle = 0.5 * (low + high);
         status = trial_margin(c, s, t, middle, out, end, &margin);
         if (status != OK) return status;
+        tried = middle;
         if (margin <= 0) {
+            if (side < 0) at_low *= kept_share(margin, at_high);
             high = middle; at_high = margin;
             if (margin == 0) break;
-            if (side < 0) at_low /= 2;
             side = -1;
         } else {
+            if (side > 0) at_high *= kept_share(margin, at_low);
             low = middle; at_low = margin;
-            if (side > 0) at_high /= 2;
             side = 1;
         }
     }
     *step = high;
-    return trial_margin(c, s, t, high, out, end, &margin);
+    return high == tried ? OK : trial_margin(c, s, t, high, out, end, &margin);
 }
 
 /* `held` is 0 where a joint that starts from rest turns back at once: it sticks. */

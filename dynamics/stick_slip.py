@@ -23,7 +23,11 @@ NO_MARGIN = 1e-12  # rad/s, or share of the breakaway torque
 
 
 class MotionStopped(Exception):
-    """Integration cannot go on; the text is the reason."""
+    """Integration cannot go on: the reason, and the pose (6,) at which it was found."""
+
+    def __init__(self, reason: str, pose: np.ndarray) -> None:
+        super().__init__(reason)
+        self.pose = pose
 
 
 class StickSlipMotion:
@@ -96,7 +100,7 @@ class StickSlipMotion:
                     continue
                 events += 1
                 if events > MAX_EVENTS_PER_SEGMENT:
-                    raise MotionStopped("more stick-slip events than a frame can hold")
+                    raise MotionStopped("more stick-slip events than a frame can hold", now.state.pose)
                 stages, end, held = self._locate_event(now, command, h, end)
                 if self._sensitivity and held:
                     self._sensitivity.cut_step(stages, end, command, self.mode, self._margin(end)[1])
@@ -110,11 +114,11 @@ class StickSlipMotion:
         values = self._functions["equation_of_motion"](state.pose, state.rate, self._rigid)
         mass, bias, jacobian, bias_acceleration, angle = (np.asarray(value, dtype=float) for value in values)
         if not np.isfinite(mass).all():
-            raise MotionStopped(LEFT_REACH)
+            raise MotionStopped(LEFT_REACH, state.pose)
         try:
             np.linalg.cholesky(mass)
         except np.linalg.LinAlgError:
-            raise MotionStopped(SINGULAR_MASS) from None
+            raise MotionStopped(SINGULAR_MASS, state.pose) from None
         angle, velocity = angle[:, 0], jacobian @ state.rate
         error = command.value + command.slope * time - angle
         torque = self._lp * error + self._ld * (command.rate - velocity) + self._li * state.integral
@@ -192,7 +196,7 @@ class StickSlipMotion:
     def _locate_event(
         self, now: Evaluation, command: Command, h: float, end: Evaluation
     ) -> tuple[list[Evaluation], Evaluation, bool]:
-        """The step in (0, h] at which the modes stop holding: regula falsi (Illinois) on the margin.
+        """The step in (0, h] at which the modes stop holding: regula falsi (Anderson-Bjorck) on the margin.
 
         A joint that has just started from rest has no margin yet: then the bracket is found by halving, and the last
         entry returned is False where there is none.
@@ -216,14 +220,14 @@ class StickSlipMotion:
                 middle = 0.5 * (low + high)
             margin = self._margin(self._trial(now, command, middle)[1])[0]
             if margin <= 0:
+                at_low *= _kept_share(margin, at_high) if side < 0 else 1.0
                 high, at_high = middle, margin
                 if margin == 0:
                     break
-                at_low = at_low / 2 if side < 0 else at_low
                 side = -1
             else:
+                at_high *= _kept_share(margin, at_low) if side > 0 else 1.0
                 low, at_low = middle, margin
-                at_high = at_high / 2 if side > 0 else at_high
                 side = 1
         return (*self._trial(now, command, high), held)
 
@@ -250,6 +254,12 @@ class StickSlipMotion:
         if held:
             self._decide_modes(self._terms(state, end.time, command), joints)
         return self._evaluate(state, end.time, command)
+
+
+def _kept_share(margin: float, before: float) -> float:
+    """By how much to weigh down the end of the bracket that stayed, when the other end moved twice."""
+    share = 1 - margin / before
+    return share if share > 0 else 0.5
 
 
 def _slope(at: Evaluation) -> State:

@@ -10,18 +10,16 @@ typedef struct {
 static void servo_update(context *c, servo *v, int k, const double *measured) {
     const problem *p = c->p;
     const double period = p->frame_period;
-    vec demand, zero = {0};
-    evaluation e;
+    vec demand;
+    double jacobian[N * N];
     for (int i = 0; i < N; i++) {
         double error = p->reference[N * k + i] - measured[i];
         double rate = (measured[i] - v->previous_measured[i]) / v->elapsed;
         v->integral[i] += period * error;
         demand[i] = p->kp * error + p->kd * (p->reference_rate[N * k + i] - rate) + p->ki * v->integral[i];
     }
-    c->arg[0] = measured; c->arg[1] = zero; c->arg[2] = p->rigid;
-    c->res[0] = e.mass; c->res[1] = e.bias; c->res[2] = e.jacobian; c->res[3] = e.bias_acceleration; c->res[4] = e.angle;
-    equation_of_motion(c->arg, c->res, c->iw, c->w, 0);
-    for (int i = 0; i < N; i++) v->last_command[i] = dot_row(e.jacobian, i, demand);
+    pose_jacobian(c, measured, jacobian);
+    for (int i = 0; i < N; i++) v->last_command[i] = dot_row(jacobian, i, demand);
     if (p->sensitivities) {
         double by_pose[N * N];
         rows d_demand;
@@ -37,7 +35,7 @@ static void servo_update(context *c, servo *v, int k, const double *measured) {
                 v->d_previous[i][n] = d;
             }
         memset(v->d_command, 0, sizeof v->d_command);
-        multiply_add(c, 1, e.jacobian, d_demand, v->d_command);
+        multiply_add(c, 1, jacobian, d_demand, v->d_command);
         multiply_add(c, 1, by_pose, v->d_previous, v->d_command);
     }
     memcpy(v->previous_measured, measured, sizeof(vec));

@@ -1,5 +1,6 @@
 """The sampled loop: compiled against plain, the frame protocol, and runs that end early."""
 
+import re
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 
@@ -179,22 +180,20 @@ def _reach_margins(robot, pose, numerics):
     return 1 - ((square + g.crank_length**2 - g.link_length**2) / (2 * g.crank_length)) ** 2 / in_plane
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_the_leg_nearest_its_reach_is_named_where_a_run_leaves_it(
-    robot, make_reference, make_settings, numerics, compiled
-):
-    """The same run with its last frame cut off ends well; the pose it ends at has that leg and margin."""
+def test_the_leg_that_leaves_its_reach_is_named(robot, make_reference, make_settings, numerics):
+    """Both paths, written apart, name the same leg and margin, out of reach; at the frame before, all legs reach."""
     settings, reference = make_settings(29.0, latency_s=1 / 29), make_reference(580, 29.0)
-    unstable = robot.parameter_sets["initial"].vector
-    with pytest.raises(closed_loop.LoopFailure) as caught:
-        closed_loop.simulate(robot, unstable, reference, settings, compiled=compiled)
+    unstable, messages = robot.parameter_sets["initial"].vector, []
+    for compiled in (True, False):
+        with pytest.raises(closed_loop.LoopFailure) as caught:
+            closed_loop.simulate(robot, unstable, reference, settings, compiled=compiled)
+        messages.append(str(caught.value))
+    assert messages[0] == messages[1]
+    margin = re.search(r"unstable\): leg [1-6] has the least reach margin, (\S+), must be > 0$", messages[0])
+    assert -0.5 < float(margin[1]) <= 0
     stop = caught.value.frame + 1
     shorter = closed_loop.Reference(reference.poses[:stop], reference.rates[:stop])
-    margins = _reach_margins(robot, closed_loop.simulate(robot, unstable, shorter, settings).pose[-1], numerics)
-    leg, least = int(np.argmin(margins)) + 1, margins.min()
-    assert least > 0
-    evidence = f"unstable); at the start of the frame leg {leg} has the least reach margin, {least:.3g}, must be > 0"
-    assert evidence in str(caught.value)
+    assert _reach_margins(robot, closed_loop.simulate(robot, unstable, shorter, settings).pose[-1], numerics).min() > 0
 
 
 def test_stable_where_the_paper_is(robot, identified, make_reference, make_settings):
@@ -243,6 +242,18 @@ def test_measured_pose_out_of_reach_ends_the_run(robot, identified, make_referen
     leg = int(np.argmin(margins))
     assert margins[leg] < 0
     assert f"there leg {leg + 1} has the least reach margin, {margins[leg]:.3g}, must be > 0" in str(caught.value)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_measured_pose_that_overflows_ends_the_run_without_warnings(
+    robot, identified, make_reference, make_settings, compiled
+):
+    """Differences of the largest floats are infinite; the error is the only thing said."""
+    settings, sensor = make_settings(), lambda frame, time, pose: np.full(6, 1e308)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(closed_loop.LoopFailure, match=r"frame 0 .*least reach margin, -inf, must be > 0"):
+            closed_loop.simulate(robot, identified, make_reference(5), settings, sensor, compiled=compiled)
 
 
 def test_runs_in_threads_equal_runs_in_turn(robot, identified, make_reference, make_settings):
