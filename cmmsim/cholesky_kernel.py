@@ -44,4 +44,5 @@ def invert_factored(lower: np.ndarray, inverse: np.ndarray) -> None:
         column[:] = 0.0
         column[k] = 1.0
         solve_factored(lower, column)
-        inverse[:, k] = column[:len(inverse)]
+        for i in range(len(inverse)):
+            inverse[i, k] = column[i]

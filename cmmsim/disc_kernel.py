@@ -28,7 +28,9 @@ def project_disc(centre: np.ndarray, normal: np.ndarray, radius: float, focal: n
     scale = math.sqrt(shape[0, 0] + shape[1, 1] + 2.0 * d)
     shape[0, 0] += d
     shape[1, 1] += d
-    shape /= scale
+    for i in range(2):
+        for j in range(2):
+            shape[i, j] /= scale
 
 
 @compiled
@@ -60,14 +62,16 @@ def probe_discs(centres: np.ndarray, normals: np.ndarray, radii: np.ndarray, pro
     u = np.empty(3)
     for n in range(len(centres)):
         normal = normals[n]
-        least = np.abs(normal).argmin()
+        least = 0
+        for i in range(1, 3):
+            if abs(normal[i]) < abs(normal[least]):
+                least = i
         length = math.sqrt(1.0 - normal[least] ** 2)
         i, j = (least + 1) % 3, (least + 2) % 3  # u = normal x e_least / length, which lies in the plane
         u[least], u[i], u[j] = 0.0, normal[j] / length, -normal[i] / length
-        probes[n, 0] = centres[n]
-        for k in range(count):
-            angle = 2.0 * math.pi * k / count
+        for k in range(count + 1):
+            angle, distance = 2.0 * math.pi * k / count, 0.0 if k == 0 else radii[n]
             for a in range(3):
                 b, c = (a + 1) % 3, (a + 2) % 3
                 v = normal[b] * u[c] - normal[c] * u[b]
-                probes[n, k + 1, a] = centres[n, a] + radii[n] * (math.cos(angle) * u[a] + math.sin(angle) * v)
+                probes[n, k, a] = centres[n, a] + distance * (math.cos(angle) * u[a] + math.sin(angle) * v)

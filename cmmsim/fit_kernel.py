@@ -12,7 +12,7 @@ from .cholesky_kernel import factor, invert_factored, solve_factored
 from .compiled import compiled
 from .coverage_kernel import cover_window, inverse_of
 
-UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
+ELLIPSE_UNKNOWNS, UNKNOWNS = 5, 7  # c_x, c_y, A_xx, A_xy, A_yy; contrast, ground
 
 
 class FitSettings(NamedTuple):
@@ -58,7 +58,7 @@ def nth_smallest(values: np.ndarray, n: int) -> float:
 @compiled
 def moments(window: np.ndarray, core_share: float) -> tuple:
     """Ground, contrast, centroid x, y and spread xx, xy, yy of the bright spot of a window (h, w) of floats."""
-    flat = window.copy().reshape(-1)
+    flat = window.flatten()
     ground = nth_smallest(flat, len(flat) // 3)
     contrast = max(nth_smallest(flat, len(flat) - 6) - ground, 1.0)
     area, x, y, xx, xy, yy = 1e-300, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -183,7 +183,7 @@ def fit_window(window: np.ndarray, settings: FitSettings, parameters: np.ndarray
     """Gauss-Newton from ``parameters`` (7,), which it moves; returns the reduced chi-square.
 
     It ends when the ellipse moves by less than ``converged`` px: the normal matrix and the misfit of that last step
-    are those of the result. Fills the ellipse's ``shape`` (2,2) and the ``covariance`` (2,2) of its centre.
+    are those of the result. Fills the ellipse's ``shape`` (2,2) and the ``covariance`` (m,m) of its first m parameters.
     """
     size = len(window)
     mask = np.empty((size, size), np.bool_)
@@ -217,15 +217,15 @@ def fit_windows(windows: np.ndarray, size: int, settings: FitSettings, corners: 
                 shapes: np.ndarray, covariances: np.ndarray, misfits: np.ndarray) -> None:
     """Fit the part of ``size`` px around the bright spot of each window (n,h,h) of floats.
 
-    Fills the corners (n,2) of these parts, and in their px the parameters (n,7), shapes (n,2,2), covariances (n,2,2) of
-    the centres and misfits (n,).
+    Fills the corners (n,2) of these parts, and in their px the parameters (n,7), shapes (n,2,2), covariances (n,m,m) of
+    the first m parameters and misfits (n,).
     """
     for k in range(len(windows)):
         spot = moments(windows[k], settings.core_share)
         room = windows.shape[1] - size
         left = min(max(int(np.rint(spot[2] - 0.5 * (size - 1))), 0), room)
         top = min(max(int(np.rint(spot[3] - 0.5 * (size - 1))), 0), room)
-        part = windows[k, top:top + size, left:left + size].copy()
+        part = windows[k, top:top + size, left:left + size]
         start_ellipse(part, settings, parameters[k])
         misfits[k] = fit_window(part, settings, parameters[k], shapes[k], covariances[k])
         corners[k, 0], corners[k, 1] = left, top

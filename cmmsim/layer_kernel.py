@@ -38,8 +38,10 @@ class Discs(NamedTuple):
 def half_planes_of(corners: np.ndarray, half_planes: np.ndarray) -> int:
     """Fill half_planes with a, b, c of a x + b y <= c for the sides of a convex polygon (n,2); returns their number,
     sides of no length being left out."""
-    n, count = len(corners), 0
-    middle_x, middle_y = corners[:, 0].mean(), corners[:, 1].mean()
+    n, count, middle_x, middle_y = len(corners), 0, 0.0, 0.0
+    for k in range(n):
+        middle_x += corners[k, 0] / n
+        middle_y += corners[k, 1] / n
     for k in range(n):
         x, y = corners[k]
         a, b = corners[(k + 1) % n, 1] - y, x - corners[(k + 1) % n, 0]
@@ -100,8 +102,8 @@ def lay_solids(image: np.ndarray, x: float, y: float, solids: Solids, lines: int
         for row in range(height):
             for column in range(width):
                 image[row, column] += share[row, column] * (solids.levels[k] - image[row, column])
-        if solids.slots[k] >= 0:
-            covers[solids.slots[k], :, :] = share
+                if solids.slots[k] >= 0:
+                    covers[solids.slots[k], row, column] = share[row, column]
 
 
 @compiled
@@ -172,10 +174,10 @@ def hides(eye: np.ndarray, point: np.ndarray, normals: np.ndarray, offsets: np.n
 def hidden_points(body_from_camera: np.ndarray, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray,
                   touching: float, hidden: np.ndarray) -> None:
     """``hides`` for points (n,3) in camera axes, into ``hidden`` (n,)."""
-    eye, point = body_from_camera[:3, 3].copy(), np.empty(3)
+    eye, point = np.empty(3), np.empty(3)
     for n in range(len(points)):
         for i in range(3):
-            point[i] = eye[i]
+            point[i] = eye[i] = body_from_camera[i, 3]
             for j in range(3):
                 point[i] += body_from_camera[i, j] * points[n, j]
         hidden[n] = hides(eye, point, normals, offsets, touching)

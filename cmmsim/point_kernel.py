@@ -48,19 +48,22 @@ def refine_points(projections: np.ndarray, observed: np.ndarray, weights: np.nda
     projections (c,3,4); observed (n,c,2) px; weights (n,c,2,2), inverse covariances; points (n,3) from start to result;
     fills covariances (n,3,3) and gaps (n,): the squared residual in units of its noise.
     """
-    pixel, jacobian = np.empty(2), np.empty((2, 3))
+    pixel, residual, jacobian = np.empty(2), np.empty(2), np.empty((2, 3))
     normal, right = np.empty((3, 3)), np.empty(3)
     for n in range(len(points)):
         for step in range(steps + 1):
             normal[:], right[:], gaps[n] = 0.0, 0.0, 0.0
             for c in range(len(projections)):
                 project_point(projections[c], points[n], pixel, jacobian)
-                gaps[n] += add_weighted(jacobian, weights[n, c], observed[n, c] - pixel, normal, right)
+                for k in range(2):
+                    residual[k] = observed[n, c, k] - pixel[k]
+                gaps[n] += add_weighted(jacobian, weights[n, c], residual, normal, right)
             if step < steps:
                 factor(normal)
                 invert_factored(normal, covariances[n])
                 solve_factored(normal, right)
-                points[n] += right
+                for i in range(3):
+                    points[n, i] += right[i]
 
 
 @compiled

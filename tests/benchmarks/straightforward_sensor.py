@@ -28,9 +28,6 @@ class StraightforwardSensor:
         self._camera = self._scene.add(camera)
         settings = cv2.SimpleBlobDetector_Params()
         settings.blobColor, settings.filterByArea, settings.minArea, settings.maxArea = 255, True, 10.0, 400.0
-        settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 60.0, 200.0, 20.0
-        settings.filterByConvexity = settings.filterByInertia = False
-        settings.minDistBetweenBlobs = 8.0
         self._detector = cv2.SimpleBlobDetector_create(settings)
 
     def measure(self, pose, expected):

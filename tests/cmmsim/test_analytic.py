@@ -13,10 +13,11 @@ from cmmsim.camera import PinholeCamera
 from cmmsim.convex_solid import ConvexSolid
 from cmmsim.eccentricity import eccentricity
 from cmmsim.ellipse_fit import fit_ellipses
-from cmmsim.layer_kernel import cover_by_polygon, polygon_holds
+from cmmsim.layer_kernel import Discs, Solids, cover_by_polygon, lay_layers, polygon_holds
 from cmmsim.noise import CameraNoise
 from cmmsim.pose import apply, pose_to_transform
 from cmmsim.projected_disc import project_discs
+from tests.cmmsim import numpy_coverage
 
 CAMERA = PinholeCamera(2300.0, 1023.5, 767.5, 2048, 1536)
 NOISE = CameraNoise(1600.0, 0.13, 26.0, 1800.0, 16.0, enabled=False)
@@ -181,3 +182,23 @@ def test_auto_falls_back_with_one_line(monkeypatch, taught):
 def test_unknown_renderer_names_the_valid_ones():
     with pytest.raises(cmmsim.UnknownOptionError, match="analytic, auto, pyrender"):
         cmmsim.load_sensor("ctrack780", renderer="blender")
+
+
+def test_layers_are_laid_as_plain_numpy_lays_them():
+    """Two discs over a ground, the second behind a solid that covers the left half of the window."""
+    rng = np.random.default_rng(3)
+    centres, shapes = rng.uniform(6.0, 9.0, (2, 2)), np.stack([np.diag([5.0, 3.0]), [[2.5, 0.4], [0.4, 1.8]]])
+    levels, corner = np.array([0.1, 0.9]), np.array([100.0, 50.0])
+    half = np.array([[1.0, 0.0, corner[0] + 7.25]])
+    solids = Solids(half, np.array([0, 1]), np.array([[-1e3, -1e3, corner[0] + 7.25, 1e3]]), np.array([0.4]),
+                    np.array([0]))
+    discs = Discs(centres + corner, shapes, np.linalg.norm(shapes, axis=2), levels, np.array([[False], [True]]))
+    shares = numpy_coverage.covered_area(centres, shapes, 16)
+    cover = np.tile(np.clip(7.75 - np.arange(16), 0.0, 1.0), (16, 1))
+    expected = 0.2 + cover * (0.4 - 0.2)
+    for share, level in zip((shares[0], shares[1] * (1.0 - cover)), levels, strict=True):
+        expected += share * (level - expected)
+    for function in (lay_layers, lay_layers.py_func):
+        images = np.full((1, 16, 16), 0.2, dtype=np.float32)
+        function(images, np.array([0]), corner[None], solids, 6, discs)
+        np.testing.assert_allclose(images[0], expected, atol=3e-7)
