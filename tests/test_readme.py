@@ -103,7 +103,7 @@ def test_every_linked_file_exists():
 
 
 def test_every_command_it_names_exists():
-    commands = {command.name or command.callback.__name__ for command in app.registered_commands}
+    commands = {command.name or command.callback.__name__.replace("_", "-") for command in app.registered_commands}
     groups = {group.name for group in app.registered_groups}
     for name in set(re.findall(r"cmmsim ([a-z][a-z-]+)", README)):
         assert name in commands | groups, name
