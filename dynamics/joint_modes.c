@@ -6,7 +6,7 @@ static double dot_row(const double *matrix, int row, const double *v) {
     return sum;
 }
 
-static int cholesky(const double *a, factor l) {
+static inline int cholesky(const double *a, factor l) {
     for (int i = 0; i < N; i++)
         for (int j = 0; j <= i; j++) {
             double sum = a[i + N * j];
@@ -20,7 +20,7 @@ static int cholesky(const double *a, factor l) {
     return 1;
 }
 
-static void cholesky_solve(const factor l, int n, double *b) {
+static inline void cholesky_solve(const factor l, int n, double *b) {
     for (int i = 0; i < n; i++) {
         for (int k = 0; k < i; k++) b[i] -= l[i][k] * b[k];
         b[i] *= l[i][i];
