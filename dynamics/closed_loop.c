@@ -1,17 +1,12 @@
 /* The frame loop: see plain_closed_loop.py. */
 
-static int steps_in(const problem *p, double duration) {
-    int steps = (int)ceil(duration / p->frame_period * p->steps_per_frame - 1e-9);
-    return steps < 1 ? 1 : steps;
-}
-
 static int frame_command(context *c, servo *v, int k, const state *s, measure_fn measure, trajectory *out) {
     const problem *p = c->p;
     double measured[N];
     int good = 1;
     memcpy(measured, s->pose, sizeof measured);
     if (measure) {
-        int answer = measure(k, s->pose, measured);
+        int answer = measure(k, s->pose, s->rate, measured);
         if (answer != MEASURED && answer != LOST) return SENSOR_FAILED;
         good = answer == MEASURED;
     } else if (p->lost && p->lost[k]) {
@@ -48,9 +43,7 @@ static void record_sensitivities(const context *c, int k, trajectory *out) {
 
 static int run_frames(context *c, servo *v, issued *ring, state *s, measure_fn measure, trajectory *out) {
     const problem *p = c->p;
-    int whole = (int)floor(p->latency / p->frame_period + 1e-9), status = OK;
-    double rest = p->latency - whole * p->frame_period;
-    if (rest < 1e-12) rest = 0;
+    int status = OK;
     for (int k = 0; k < p->frames; k++) {
         out->failed_frame = k;
         memcpy(out->pose + N * k, s->pose, sizeof(vec));
@@ -63,18 +56,14 @@ static int run_frames(context *c, servo *v, issued *ring, state *s, measure_fn m
         issued *slot = &ring[k % MAX_DELAY];
         memcpy(slot->value, v->last_command, sizeof(vec));
         if (p->sensitivities) memcpy(slot->tangent, v->d_command, sizeof(rows));
-        if (rest > 0) {
-            apply_command(c, ring, k - whole - 1);
-            status = record_torque(c, s, out->torque + N * k);
-            if (status == OK) status = segment(c, s, rest, steps_in(p, rest));
+        for (int n = p->first_span[k]; n < p->first_span[k + 1]; n++) {
+            apply_command(c, ring, p->span_command[n], p->span_ramp[n]);
+            if (n == p->first_span[k]) status = record_torque(c, s, out->torque + N * k);
+            if (status != OK) return status;
+            if (k + 1 == p->frames) break;
+            status = segment(c, s, p->span_duration[n], p->span_steps[n]);
             if (status != OK) return status;
         }
-        apply_command(c, ring, k - whole);
-        if (rest == 0) status = record_torque(c, s, out->torque + N * k);
-        if (status != OK) return status;
-        if (k + 1 == p->frames) break;
-        status = segment(c, s, p->frame_period - rest, steps_in(p, p->frame_period - rest));
-        if (status != OK) return status;
     }
     out->failed_frame = -1;
     return OK;

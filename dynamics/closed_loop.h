@@ -36,8 +36,8 @@ typedef double row[WIDTH];
 typedef row rows[N];
 
 typedef struct {
-    int frames, steps_per_frame, linear_hold, law, sensitivities, start_sensitivities, commands_before;
-    double frame_period, latency, smoothing_velocity, static_level, stribeck_velocity;
+    int frames, law, sensitivities, start_sensitivities, commands_before;
+    double frame_period, smoothing_velocity, static_level, stribeck_velocity;
     double rigid[NRIGID];
     vec coulomb, viscous;
     double lp, li, ld, kp, kd, ki;
@@ -48,6 +48,8 @@ typedef struct {
     const double *reference_rate;       /* (frames, 6) */
     const double *logged_commands;      /* (frames, 6), or NULL: the servo computes them */
     const signed char *lost;            /* (frames) 1 where the ideal sensor measures nothing, or NULL */
+    const int *first_span, *span_command, *span_steps; /* which command acts when: see command_schedule.py */
+    const double *span_ramp, *span_duration;
 } problem;
 
 typedef struct {
@@ -59,7 +61,7 @@ typedef struct {
     vec last_pose;                                     /* the last at which the equation of motion was evaluated */
 } trajectory;
 
-typedef int (*measure_fn)(int frame, const double *pose, double *measured);
+typedef int (*measure_fn)(int frame, const double *pose, const double *rate, double *measured);
 
 typedef struct { vec pose, rate, integral; } state;
 
@@ -90,6 +92,7 @@ typedef struct {
     evaluation known;           /* what it gave there, up to `error`, if `knows` */
     int knows;
     command u;
+    int ramping;                /* whether its slope is not zero */
     rows du_value, du_slope, du_rate;
     state stage_state[4];
     evaluation stage[4];

@@ -21,9 +21,11 @@ from dynamics.loop_types import (
     LoopProblem,
     LoopSettings,
     PoseSensor,
+    RateSensor,
     Reference,
     ServoGains,
     StartState,
+    checked_latencies,
 )
 from dynamics.parameters import JOINT_PID_NAMES, check_parameters
 from dynamics.robot import Robot
@@ -35,6 +37,7 @@ __all__ = [
     "LoopFailure",
     "LoopSettings",
     "PoseSensor",
+    "RateSensor",
     "Reference",
     "ServoGains",
     "StartState",
@@ -49,13 +52,14 @@ def simulate(
     parameters: np.ndarray,
     reference: Reference,
     settings: LoopSettings,
-    sensor: PoseSensor | None = None,
+    sensor: PoseSensor | RateSensor | None = None,
     *,
     start: StartState | None = None,
     sensitivities: bool = False,
     start_sensitivities: bool = False,
     commands: np.ndarray | None = None,
     lost: np.ndarray | None = None,
+    latencies: np.ndarray | None = None,
     compiled: bool | None = None,
 ) -> ClosedLoopRun:
     """Run the closed loop for parameters (67,): the 64 dynamic ones, then lp, li, ld.
@@ -64,6 +68,7 @@ def simulate(
     parameters. sensitivities: also derivatives of the poses with respect to all parameters; start_sensitivities: those
     and the ones with respect to the start (ideal sensor only). commands (frames, 6): drive the joints with these
     instead of the servo's; what is measured is then recorded and steers nothing.
+    latencies (frames,), s: of each frame's command, instead of the settings' for all; see `command_schedule`.
     lost (frames,) bool: frames at which the ideal sensor measures nothing, so that a model loses what its plant lost.
     compiled: None takes the compiled path when a C compiler is at hand; False forces the plain path.
     Raises LoopFailure when the robot leaves the reachable set (an unstable loop); and before the run
@@ -81,6 +86,8 @@ def simulate(
         commands = np.ascontiguousarray(floats("commands", commands, reference.poses.shape, error=SimulationError))
     if lost is not None:
         lost = mask("lost", lost, len(reference.poses), SimulationError).astype(np.int8)
+    if latencies is not None:
+        latencies = checked_latencies(latencies, len(reference.poses), settings.timing)
     robot.check_reach(reference.poses, "reference pose", "frame")
     parameters = _check_loop_parameters(parameters)
     if start is None:
@@ -89,7 +96,17 @@ def simulate(
         check_type("start", start, StartState, SimulationError)
         _check_start_pose(robot, parameters, start.pose)
     problem = LoopProblem(
-        robot, parameters, reference, settings, start, sensor, sensitivities, start_sensitivities, commands, lost
+        robot,
+        parameters,
+        reference,
+        settings,
+        start,
+        sensor,
+        sensitivities,
+        start_sensitivities,
+        commands,
+        lost,
+        latencies,
     )
     library = compiled_closed_loop.library(robot.geometry) if compiled in (None, True) else None
     if library is not None:
@@ -140,9 +157,9 @@ def _check_start_pose(robot: Robot, parameters: np.ndarray, pose: np.ndarray) ->
     robot.pose_rate(pose, np.zeros(6))  # refuses Euler angles at their singularity
 
 
-def _check_kinds(robot: Robot, reference: Reference, settings: LoopSettings, sensor: PoseSensor | None) -> None:
+def _check_kinds(robot: Robot, reference: Reference, settings: LoopSettings, sensor: object) -> None:
     for name, value, kind in (("robot", robot, Robot), ("reference", reference, Reference)):
         check_type(name, value, kind, SimulationError)
     check_type("settings", settings, LoopSettings, SimulationError)
-    if sensor is not None and not callable(sensor):
+    if sensor is not None and not callable(sensor) and not isinstance(sensor, RateSensor):
         raise SimulationError(f"sensor must be a function of frame, time and pose, or None, got {shown(sensor)}")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dynamics import model
+from dynamics.command_schedule import CommandSchedule, command_schedule
 from dynamics.compilation import load_library, open_library
 from dynamics.errors import SimulationError
 from dynamics.geometry import Rss6Geometry
@@ -20,8 +21,9 @@ from dynamics.loop_types import (
     ClosedLoopRun,
     LoopProblem,
     PoseSensor,
-    checked_measurement,
+    RateSensor,
     failure,
+    measurement,
 )
 
 FAILURES = {
@@ -41,19 +43,18 @@ SOURCES = (
     "closed_loop.c",
 )
 LAWS = ("coulomb_viscous", "smoothed", "stribeck")
-_TIMES_AND_FRICTION = ("frame_period", "latency", "smoothing_velocity", "static_level", "stribeck_velocity")
+_TIMES_AND_FRICTION = ("frame_period", "smoothing_velocity", "static_level", "stribeck_velocity")
 # What the sensor callback returns. An error that escapes it makes ctypes return 0.
 SENSOR_RAISED, MEASURED, LOST = 0, 1, 2
 _RECORDS = ("pose", "pose_rate", "torque", "command", "measured", "joint_integral", "servo_integral")  # (frames, 6)
 
-_Measure = CFUNCTYPE(c_int, c_int, POINTER(c_double), POINTER(c_double))
 _DoublePointer = POINTER(c_double)
+_Measure = CFUNCTYPE(c_int, c_int, _DoublePointer, _DoublePointer, _DoublePointer)
 
 
 class _Problem(Structure):
     _fields_ = [
-        *[(name, c_int) for name in ("frames", "steps_per_frame", "linear_hold", "law")],
-        *[(name, c_int) for name in ("sensitivities", "start_sensitivities", "commands_before")],
+        *[(name, c_int) for name in ("frames", "law", "sensitivities", "start_sensitivities", "commands_before")],
         *[(name, c_double) for name in _TIMES_AND_FRICTION],
         ("rigid", c_double * 52),
         ("coulomb", c_double * 6),
@@ -63,6 +64,8 @@ class _Problem(Structure):
         *[(name, _DoublePointer) for name in ("start_commands", "integral_sensitivity")],
         *[(name, _DoublePointer) for name in ("reference", "reference_rate", "logged_commands")],
         ("lost", POINTER(c_byte)),
+        *[(name, POINTER(c_int)) for name in ("first_span", "span_command", "span_steps")],
+        *[(name, _DoublePointer) for name in ("span_ramp", "span_duration")],
     ]
 
 
@@ -99,7 +102,7 @@ def run(library: ctypes.CDLL, problem: LoopProblem) -> ClosedLoopRun:
     measured_ok = np.zeros(frames, dtype=np.int8)
     sensitivity = np.zeros((frames, 6, PARAMETER_COUNT)) if problem.sensitivities else None
     by_start = np.zeros((frames, 6, START_COUNT)) if problem.start_sensitivities else None
-    struct = _struct(problem)
+    struct = _struct(problem, command_schedule(problem))
     trajectory = _Trajectory(
         **{name: _pointer(array) for name, array in arrays.items()},
         measured_ok=measured_ok.ctypes.data_as(POINTER(c_byte)),
@@ -124,20 +127,17 @@ def run(library: ctypes.CDLL, problem: LoopProblem) -> ClosedLoopRun:
     )
 
 
-def _struct(problem: LoopProblem) -> _Problem:
-    """The C struct. It borrows the arrays' memory: the problem keeps them alive during the call."""
-    servo, timing, friction = problem.settings.servo, problem.settings.timing, problem.settings.friction
+def _struct(problem: LoopProblem, schedule: CommandSchedule) -> _Problem:
+    """The C struct. It borrows the arrays' memory: problem and cached schedule keep them alive during the call."""
+    servo, friction = problem.settings.servo, problem.settings.friction
     parameters, start, lost = problem.parameters, problem.start, problem.lost
     struct = _Problem(
         frames=problem.frames,
-        steps_per_frame=problem.settings.steps_per_frame,
-        linear_hold=timing.hold == "linear",
         law=LAWS.index(friction.name),
         sensitivities=problem.sensitivities,
         start_sensitivities=problem.start_sensitivities,
         commands_before=len(start.commands),
         frame_period=problem.period,
-        latency=timing.latency_s,
         smoothing_velocity=friction.smoothing_velocity or 0.0,
         static_level=friction.static_level,
         stribeck_velocity=friction.stribeck_velocity or 0.0,
@@ -153,6 +153,11 @@ def _struct(problem: LoopProblem) -> _Problem:
         reference_rate=_pointer(problem.reference.rates),
         logged_commands=_pointer(problem.commands),
         lost=None if lost is None else lost.ctypes.data_as(POINTER(c_byte)),
+        first_span=schedule.first_span.ctypes.data_as(POINTER(c_int)),
+        span_command=schedule.command.ctypes.data_as(POINTER(c_int)),
+        span_steps=schedule.steps.ctypes.data_as(POINTER(c_int)),
+        span_ramp=_pointer(schedule.ramp),
+        span_duration=_pointer(schedule.duration),
     )
     struct.rigid[:] = parameters[:52]
     struct.coulomb[:] = parameters[52:58]
@@ -169,15 +174,22 @@ def _pointer(array: np.ndarray | None) -> "ctypes._Pointer[c_double] | None":
     return None if array is None else array.ctypes.data_as(_DoublePointer)
 
 
-def _callback(sensor: PoseSensor | None, period: float) -> tuple["ctypes._CFunctionType", list[BaseException]]:
+def _callback(
+    sensor: PoseSensor | RateSensor | None, period: float
+) -> tuple["ctypes._CFunctionType", list[BaseException]]:
     """The sensor as a C callback; what it raises is kept for the caller, since C cannot pass it on."""
     raised: list[BaseException] = []
     if sensor is None:
         return _Measure(), raised
 
-    def measure(frame: int, pose: "ctypes._Pointer[c_double]", measured: "ctypes._Pointer[c_double]") -> int:
+    def measure(
+        frame: int,
+        pose: "ctypes._Pointer[c_double]",
+        rate: "ctypes._Pointer[c_double]",
+        measured: "ctypes._Pointer[c_double]",
+    ) -> int:
         try:
-            result = checked_measurement(sensor(frame, frame * period, np.array([pose[i] for i in range(6)])), frame)
+            result = measurement(sensor, frame, frame * period, np.array(pose[:6]), np.array(rate[:6]))
             for index in range(6):
                 measured[index] = np.nan if result is None else result[index]
             return MEASURED if result is not None else LOST

@@ -28,6 +28,13 @@ PoseSensor = Callable[[int, float, np.ndarray], np.ndarray | None]
 
 
 @dataclass(frozen=True)
+class RateSensor:
+    """A pose sensor that depends on the motion too: measure(frame, time s, true pose (6,), true pose rate (6,))."""
+
+    measure: Callable[[int, float, np.ndarray, np.ndarray], np.ndarray | None]
+
+
+@dataclass(frozen=True)
 class ServoGains:
     """Visual servo gains of eq. 30: kp (1), kd (s), ki (1/s)."""
 
@@ -42,7 +49,7 @@ class ServoGains:
 
 @dataclass(frozen=True)
 class FrameTiming:
-    """Frame rate (Hz), latency from exposure to command (s), and the hold of the joint command between frames.
+    """Frame rate (Hz), latency from exposure to command (s), and the hold of the joint command after its arrival.
 
     hold "zero": the command jumps to its new value; "linear": it ramps there over one frame. In both the joint PID
     takes the difference of the last two commands over the frame period for U_dot.
@@ -133,11 +140,12 @@ class LoopProblem:
     reference: Reference
     settings: LoopSettings
     start: StartState
-    sensor: PoseSensor | None
+    sensor: PoseSensor | RateSensor | None
     sensitivities: bool
     start_sensitivities: bool
     commands: np.ndarray | None
     lost: np.ndarray | None
+    latencies: np.ndarray | None
 
     @property
     def frames(self) -> int:
@@ -172,7 +180,7 @@ class ClosedLoopRun:
     start: StartState
 
     def state_at(self, frame: int) -> StartState:
-        """The state at a frame: a run that starts from it repeats the rest of this one.
+        """The state at a frame: a run that starts from it repeats the rest of this one, if its latency is constant.
 
         Raises SimulationError for a frame that the run does not have, or that follows a lost measurement.
         """
@@ -192,11 +200,30 @@ class ClosedLoopRun:
         )
 
 
-def checked_measurement(measured: object, frame: int) -> np.ndarray | None:
-    """What a pose sensor returned, as (6,) floats or None for a lost measurement. Raises SimulationError otherwise."""
+def measurement(
+    sensor: PoseSensor | RateSensor, frame: int, time: float, pose: np.ndarray, rate: np.ndarray
+) -> np.ndarray | None:
+    """What a sensor returns, as (6,) floats or None for a lost measurement. Raises SimulationError otherwise."""
+    if isinstance(sensor, RateSensor):
+        measured = sensor.measure(frame, time, pose, rate)
+    else:
+        measured = sensor(frame, time, pose)
     if measured is None:
         return None
     return floats(f"what the pose sensor returned at frame {frame}", measured, (6,), error=SimulationError)
+
+
+def checked_latencies(latencies: object, frames: int, timing: FrameTiming) -> np.ndarray:
+    """Latency (frames,), s, of each frame's command. Raises SimulationError for one that no `FrameTiming` may have."""
+    values = floats("latencies", latencies, (frames,), error=SimulationError)
+    in_frames = values * timing.frame_rate_hz
+    wrong = np.flatnonzero((in_frames < 0) | (in_frames > MAX_DELAY_FRAMES))
+    if len(wrong):
+        raise SimulationError(
+            f"latency of frame {wrong[0]} is {values[wrong[0]]:g} s, must be >= 0 and at most "
+            f"{MAX_DELAY_FRAMES} frames ({MAX_DELAY_FRAMES / timing.frame_rate_hz:.3g} s)"
+        )
+    return values
 
 
 class LoopFailure(SimulationError):

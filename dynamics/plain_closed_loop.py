@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 from functools import lru_cache
-from math import ceil, floor
 
 import casadi as ca
 import numpy as np
 
 from dynamics import model
+from dynamics.command_schedule import CommandSchedule, command_schedule
 from dynamics.geometry import Rss6Geometry
 from dynamics.loop_types import (
     LENGTH,
@@ -16,10 +16,9 @@ from dynamics.loop_types import (
     START_COUNT,
     ClosedLoopRun,
     LoopProblem,
-    LoopSettings,
     Reference,
-    checked_measurement,
     failure,
+    measurement,
 )
 from dynamics.robot import Robot
 from dynamics.stick_slip import Command, MotionStopped, State, StickSlipMotion
@@ -49,11 +48,12 @@ def run(robot: Robot, problem: LoopProblem) -> ClosedLoopRun:
     state = State(start.pose, start.pose_rate, start.joint_integral)
     result = _empty(problem)
     issued: list[Issued] = [(command, rest) for command in start.commands]
+    schedule = command_schedule(problem)
     motion.start_from(state)
     for frame in range(problem.frames):
         d_pose = _record_state(result, frame, state, motion)
         result.servo_integral[frame] = servo.integral
-        measured = _measure(problem, frame, state.pose)
+        measured = _measure(problem, frame, state)
         servo.next_frame()
         result.measured_ok[frame] = measured is not None
         result.measured[frame] = np.nan if measured is None else measured
@@ -67,7 +67,7 @@ def run(robot: Robot, problem: LoopProblem) -> ClosedLoopRun:
         if not np.isfinite(issued[-1][0]).all():
             raise failure(MEASURED_OUT_OF_REACH, frame, problem, state.pose, result.measured)
         try:
-            state = _frame(motion, state, issued, frame, problem, result)
+            state = _frame(motion, state, issued, frame, problem, schedule, result)
         except MotionStopped as reason:
             raise failure(str(reason), frame, problem, reason.pose, result.measured) from None
     return replace(result, events=motion.events)
@@ -85,11 +85,11 @@ def _record_state(result: ClosedLoopRun, frame: int, state: State, motion: Stick
     return motion.tangent.pose
 
 
-def _measure(problem: LoopProblem, frame: int, pose: np.ndarray) -> np.ndarray | None:
-    """What the sensor says of a pose (6,), or None where the frame is lost."""
+def _measure(problem: LoopProblem, frame: int, state: State) -> np.ndarray | None:
+    """What the sensor says of the pose (6,) of a state, or None where the frame is lost."""
     if problem.sensor is not None:
-        return checked_measurement(problem.sensor(frame, frame * problem.period, pose.copy()), frame)
-    return None if problem.lost is not None and problem.lost[frame] else pose
+        return measurement(problem.sensor, frame, frame * problem.period, state.pose.copy(), state.rate.copy())
+    return None if problem.lost is not None and problem.lost[frame] else state.pose
 
 
 def _servo_command(
@@ -107,38 +107,30 @@ def _frame(
     issued: list[Issued],
     frame: int,
     problem: LoopProblem,
+    schedule: CommandSchedule,
     result: ClosedLoopRun,
 ) -> State:
-    """Integrate from one frame to the next, changing the command when the newest one arrives."""
-    timing, period = problem.settings.timing, problem.period
-    whole = floor(timing.latency_s / period + 1e-9)
-    rest = timing.latency_s - whole * period
-    arrival = rest if rest >= 1e-12 else 0.0
-    last = frame + 1 == len(result.time)
-    if arrival:
-        before = _command(issued, frame - whole - 1, problem)
-        result.torque[frame] = motion.torque_at(state, before)
-        state = motion.segment(state, before, arrival, _steps(problem.settings, arrival * timing.frame_rate_hz))
-    now = _command(issued, frame - whole, problem)
-    if not arrival:
-        result.torque[frame] = motion.torque_at(state, now)
-    if last:
-        return state
-    return motion.segment(state, now, period - arrival, _steps(problem.settings, 1 - arrival * timing.frame_rate_hz))
+    """Integrate from one frame to the next, changing the command whenever another acts."""
+    spans = range(*schedule.first_span[frame : frame + 2])
+    for span in spans:
+        command = _command(issued, int(schedule.command[span]), float(schedule.ramp[span]), problem)
+        if span == spans[0]:
+            result.torque[frame] = motion.torque_at(state, command)
+        if frame + 1 == problem.frames:
+            break
+        state = motion.segment(state, command, float(schedule.duration[span]), int(schedule.steps[span]))
+    return state
 
 
-def _steps(settings: LoopSettings, frames: float) -> int:
-    return max(1, ceil(frames * settings.steps_per_frame - 1e-9))
-
-
-def _command(issued: list[Issued], number: int, problem: LoopProblem) -> Command:
-    """Command `number` (from frame 0 on) acting on the joints; before frame 0 those of the start."""
+def _command(issued: list[Issued], number: int, ramp: float, problem: LoopProblem) -> Command:
+    """Command `number` (from frame 0 on) acting on the joints, a share `ramp` of the way from the one before done."""
     first = len(problem.start.commands)
     (value, d_value), (before, d_before) = (issued[max(0, first + number - n)] for n in (0, 1))
     frame_rate = problem.settings.timing.frame_rate_hz
     rate, d_rate = (value - before) * frame_rate, (d_value - d_before) * frame_rate
-    if problem.settings.timing.hold == "linear":
-        return Command(before, rate, rate, d_before, d_rate, d_rate)
+    if ramp < 1:
+        begin, d_begin = before + ramp * (value - before), d_before + ramp * (d_value - d_before)
+        return Command(begin, rate, rate, d_begin, d_rate, d_rate)
     return Command(value, np.zeros(6), rate, d_value, np.zeros_like(d_rate), d_rate)
 
 

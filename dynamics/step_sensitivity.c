@@ -66,7 +66,7 @@ static void slope_tangent(context *c, const evaluation *e, const state *s, doubl
     motion_derivatives(c->arg, c->res, c->iw, c->w, 0);
     memcpy(out->q, x->v, sizeof(rows));
     memcpy(out->z, c->du_value, sizeof(rows));
-    for (int i = 0; i < N && c->p->linear_hold; i++) {
+    for (int i = 0; i < N && c->ramping; i++) {
         add_row(t, c->du_slope[i], out->z[i], width);
         add_row(c->u.slope[i], d_time, out->z[i], width);
     }

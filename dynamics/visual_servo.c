@@ -44,18 +44,20 @@ static void servo_update(context *c, servo *v, int k, const double *measured) {
 
 typedef struct { vec value; rows tangent; } issued; /* a command on its way to the joint controllers */
 
-/* Let command number `newest` act, coming from the one before it. */
-static void apply_command(context *c, const issued *ring, int newest) {
+/* Let command number `newest` act, when a share of the way from the one before it is done: 1 is all of it. */
+static void apply_command(context *c, const issued *ring, int newest, double ramp) {
     const problem *p = c->p;
     const issued *now = &ring[(newest + MAX_DELAY) % MAX_DELAY], *before = &ring[(newest + MAX_DELAY - 1) % MAX_DELAY];
+    c->ramping = ramp < 1;
     for (int i = 0; i < N; i++) {
         c->u.rate[i] = (now->value[i] - before->value[i]) / p->frame_period;
-        c->u.value[i] = p->linear_hold ? before->value[i] : now->value[i];
-        c->u.slope[i] = p->linear_hold ? c->u.rate[i] : 0;
+        c->u.value[i] = c->ramping ? before->value[i] + ramp * (now->value[i] - before->value[i]) : now->value[i];
+        c->u.slope[i] = c->ramping ? c->u.rate[i] : 0;
         for (int k = 0; k < c->width; k++) {
             c->du_rate[i][k] = (now->tangent[i][k] - before->tangent[i][k]) / p->frame_period;
-            c->du_value[i][k] = p->linear_hold ? before->tangent[i][k] : now->tangent[i][k];
-            c->du_slope[i][k] = p->linear_hold ? c->du_rate[i][k] : 0;
+            double d_step = now->tangent[i][k] - before->tangent[i][k];
+            c->du_value[i][k] = c->ramping ? before->tangent[i][k] + ramp * d_step : now->tangent[i][k];
+            c->du_slope[i][k] = c->ramping ? c->du_rate[i][k] : 0;
         }
     }
 }

@@ -1,7 +1,8 @@
 """The experiment: the true plant runs a trajectory with the images in the loop, and what is seen is recorded.
 
 Random streams of one seed: (0) exciting trajectories, (1) unseen trajectories, (2) the sensor's teaching, (3) the scale
-anchor, (4, run) the sensor's noise in each run (the run under a payload has a number beyond all others).
+anchor, (4, run) the sensor's noise in each run, (5, run) the latency of its frames (the run under a payload has a
+number beyond all others).
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ import xarray as xr
 
 import cmmsim
 from dynamics import Robot, load_robot
-from dynamics.closed_loop import ClosedLoopRun, Reference, simulate
+from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference, simulate
 from identify import recording
 from identify.excitation import design_trajectories
 from identify.loop_parameters import NAMES, starting_guess
@@ -22,11 +23,11 @@ from identify.payload import payload_vector, store_payload
 from identify.progress import Advance, Progress, SilentProgress
 from identify.scale_anchor import measured_anchor, store_anchor
 from identify.scenario import Scenario
-from identify.sensor_in_loop import SensorInLoop, make_sensor
+from identify.sensor_in_loop import SensorInLoop, frame_latencies, make_sensor
 from identify.trajectory import FourierTrajectory, check_travel
 from identify.truth import build_truth
 
-TEACHING, ANCHOR, NOISE = 2, 3, 4
+TEACHING, ANCHOR, NOISE, LATENCY = 2, 3, 4, 5
 PAYLOAD_RUN = 1_000_000
 
 
@@ -135,7 +136,9 @@ def run_plant(
     parameters = true_parameters(robot, scenario)
     eye = SensorInLoop(sensor, robot, stream_seed(seed, NOISE, run), advance)
     loaded = parameters if load is None else parameters + load
-    done = simulate(robot, loaded, reference, plant_settings(scenario), eye)
+    latencies = frame_latencies(scenario, len(times), np.random.default_rng(stream_seed(seed, LATENCY, run)))
+    sensor_in_loop = RateSensor(eye.measure)
+    done = simulate(robot, loaded, reference, plant_settings(scenario), sensor_in_loop, latencies=latencies)
     record = _record(scenario, robot, reference, done, eye, seed)
     settings, rng = scenario.identification, np.random.default_rng(stream_seed(seed, ANCHOR))
     store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, parameters, rng))

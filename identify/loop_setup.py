@@ -14,12 +14,15 @@ def plant_settings(scenario: Scenario) -> LoopSettings:
 
 
 def model_settings(scenario: Scenario) -> LoopSettings:
-    """The loop around the estimator's model: the same servo and timing, its own friction law and steps."""
+    """The loop around the estimator's model: the same servo and timing, its own friction law and steps.
+
+    Of the latency it knows the mean only.
+    """
     return _settings(scenario, scenario.model)
 
 
 def frame_times(scenario: Scenario, duration_s: float) -> Array:
-    """Instants of exposure (N,) [s] of a run: whole frames, the end of the run excluded."""
+    """Instants of exposure (N,) [s], each the middle of one, of a run: whole frames, the end of the run excluded."""
     return np.arange(scenario.timing.frames(duration_s), dtype=float) * scenario.timing.frame_period_s
 
 

@@ -5,6 +5,7 @@ import time
 import numpy as np
 
 import cmmsim
+from cmmsim.latency import drawn_latencies
 from cmmsim.sensor_file import read_sensor_file
 from dynamics import Robot
 from identify.arrays import Array
@@ -26,8 +27,14 @@ def make_sensor(scenario: Scenario, robot: Robot, seed: int, taught: cmmsim.Taug
     return sensor
 
 
+def frame_latencies(scenario: Scenario, frames: int, rng: np.random.Generator) -> Array | None:
+    """Latency of each frame (frames,) [s] of a run; None where all have the mean."""
+    timing = sensor_timing(scenario.timing.model_dump())
+    return drawn_latencies(timing, frames, rng) if timing.latency_jitter else None
+
+
 class SensorInLoop:
-    """Callable for `closed_loop.simulate`: a measured pose (6,) a frame, or None where the sensor lost the platform.
+    """Sensor for `closed_loop.simulate`: a measured pose (6,) a frame, or None where it lost the platform.
 
     Keeps the covariances (6, 6) of every frame (NaN where lost), the reasons of lost frames, and the seconds spent on
     rendering and measuring.
@@ -40,11 +47,14 @@ class SensorInLoop:
         self.seconds = 0.0
         sensor.start_run(seed)
 
-    def __call__(self, frame: int, t: float, pose: Array) -> Array | None:
-        """Measure the platform at its true pose; only the renderer sees that pose."""
+    def measure(self, frame: int, t: float, pose: Array, rate: Array) -> Array | None:
+        """Measure the platform at its true pose in motion at its true rate; only the renderer sees these.
+
+        The rate blurs the picture of an exposure that is not instantaneous.
+        """
         bodies = robot_transforms(self._robot, pose)
         began = time.perf_counter()
-        measured = self._sensor.measure(pose, bodies)
+        measured = self._sensor.measure(pose, bodies, rate)
         self.seconds += time.perf_counter() - began
         self._advance()
         self.covariances.append(measured.covariance if measured.ok else np.full((6, 6), np.nan))

@@ -64,7 +64,7 @@ def _assert_same(compiled, plain, tolerance=1e-9):
 @pytest.mark.parametrize("timing", TIMINGS)
 def test_compiled_run_equals_plain_run(robot, identified, make_reference, make_settings, timing, friction):
     """C and NumPy, written apart, agree to 1e-9 in pose, rate, torque, command and all 67 sensitivities."""
-    settings, reference = make_settings(**TIMINGS[timing], **FRICTION[friction]), make_reference(30)
+    settings, reference = make_settings(**TIMINGS[timing], **FRICTION[friction]), make_reference(32)
     runs = [
         closed_loop.simulate(robot, identified, reference, settings, sensitivities=True, compiled=compiled)
         for compiled in (True, False)

@@ -94,9 +94,9 @@ def _blinded(sensor, frames):
         def start_run(self, seed):
             sensor.start_run(seed)
 
-        def measure(self, pose, obstacles=None):
+        def measure(self, pose, obstacles=None, pose_rate=None):
             self.frame += 1
-            measured = sensor.measure(pose, obstacles)
+            measured = sensor.measure(pose, obstacles, pose_rate)
             return lost_measurement("shutter closed") if self.frame in frames else measured
 
     return Blinded()
@@ -127,5 +127,5 @@ def test_streams_of_one_seed_differ():
 
 def test_sensor_in_loop_passes_obstacles_and_keeps_covariances(sensor):
     eye = SensorInLoop(sensor, load_robot("rss6"), seed=1)
-    assert eye(0, 0.0, rss6().home_pose) is not None
+    assert eye.measure(0, 0.0, rss6().home_pose, np.zeros(6)) is not None
     assert np.all(np.linalg.eigvalsh(eye.covariances[0]) > 0)
