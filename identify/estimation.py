@@ -98,9 +98,9 @@ def identify(
     count = 2 if settings.method == "closed_loop" else 1
     with progress.stage("identify", count * settings.max_iterations) as advance:
         driven = problem.driven_by_commands()
-        searches = [search(driven, _best_start(driven, warm), scenario, advance)]
+        searches = [search(driven, best_start(driven, warm), scenario, advance)]
         if settings.method == "closed_loop":
-            searches.append(search(problem, _best_start(problem, searches[0].parameters), scenario, advance))
+            searches.append(search(problem, best_start(problem, searches[0].parameters), scenario, advance))
     searched = time.perf_counter()
     final = problem if settings.method == "closed_loop" else driven
     rng = np.random.default_rng([_seed(record), UNCERTAINTY_STREAM])
@@ -170,7 +170,7 @@ def _seed(record: xr.Dataset | Sequence[xr.Dataset]) -> int:
     return int(first.attrs["seed"])
 
 
-def _best_start(problem: OutputErrorProblem, warm: Array) -> Array:
+def best_start(problem: OutputErrorProblem, warm: Array) -> Array:
     """The better of warm start and starting guess; the latter's loop may be unstable."""
     guess: StartingGuess = problem.guess
     costs = [(problem.cost(start), index) for index, start in enumerate((warm, guess.values))]

@@ -12,6 +12,7 @@ homogeneous: the scale anchor, and weakly the starting guess, decide the common 
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import lsq_linear
 
@@ -29,6 +30,9 @@ EDGE_FRACTION = 0.02
 SLIPPING_SHARE = 0.5
 """A joint counts as slipping above this share of its RMS velocity."""
 
+REWEIGHTINGS = 3
+"""Solutions of the fit: each takes the size of the residual from the one before."""
+
 
 def linear_warm_start(
     runs: Sequence[RecordedRun], timing: Timing, filtering: Filter, guess: StartingGuess, anchor: ScaleAnchor
@@ -41,8 +45,8 @@ def linear_warm_start(
     matrix, right = _stacked(runs, timing, filtering)
     lower = np.concatenate([np.zeros(len(NAMES)), np.full(matrix.shape[1] - len(NAMES), -np.inf)])
     noise = 0.1
-    for _ in range(3):
-        solution = _fit(matrix, right, noise, guess, anchor, lower)
+    for _ in range(REWEIGHTINGS):
+        solution = bounded_fit(matrix / noise, right / noise, guess, anchor, lower)
         noise = max(float(np.sqrt(np.mean((matrix @ solution - right) ** 2))), 1e-9)
     return np.maximum(solution[: len(NAMES)], 0.0)
 
@@ -61,7 +65,19 @@ def _stacked(runs: Sequence[RecordedRun], timing: Timing, filtering: Filter) -> 
 
 
 def regression_columns(robot: Robot, measured: Array, commands: Array, timing: Timing, filtering: Filter) -> Array:
-    """Homogeneous regression (rows, 73): 64 dynamic parameters, lp, li, ld, and the six starting torques; N m."""
+    """Homogeneous regression (rows, 73) of the joints that slip, see `joint_balance`; N m."""
+    columns, slipping = joint_balance(robot, measured, commands, timing, filtering)
+    return columns[slipping]
+
+
+def joint_balance(
+    robot: Robot, measured: Array, commands: Array, timing: Timing, filtering: Filter
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Torque balance of every joint (N, 6, 73) of poses (N, 6) and commands (N, 6), and where it slips (N, 6).
+
+    Columns: 64 dynamic parameters, which give the joint's torque, then lp, li, ld and the six starting torques, which
+    give the controller's with the opposite sign; N m per unit of each.
+    """
     rate_hz = timing.frame_rate_hz
     pose, pose_rate, acceleration = filtered_derivatives(measured, rate_hz, filtering.cutoff_hz, filtering.order)
     twist, twist_dot = robot.twist(pose, pose_rate), robot.twist_dot(pose, pose_rate, acceleration)
@@ -78,7 +94,7 @@ def regression_columns(robot: Robot, measured: Array, commands: Array, timing: T
     slipping = np.abs(velocity) > SLIPPING_SHARE * velocity.std(axis=0)
     edge = max(1, round(EDGE_FRACTION * count))
     slipping[:edge] = slipping[count - edge :] = False
-    return columns[slipping]
+    return columns, slipping
 
 
 def _effective_command(commands: Array, timing: Timing, filtering: Filter) -> tuple[Array, Array, Array]:
@@ -102,11 +118,13 @@ def _running_integral(samples: Array, rate_hz: float) -> Array:
     return integral(np.arange(len(samples)) / rate_hz)
 
 
-def _fit(
-    matrix: Array, right: Array, noise: float, guess: StartingGuess, anchor: ScaleAnchor, lower: Array
-) -> Array:
+def bounded_fit(matrix: Array, right: Array, guess: StartingGuess, anchor: ScaleAnchor, lower: Array) -> Array:
+    """Unknowns (p,) >= lower of whitened equations (rows, p), beside the starting guess and the anchor.
+
+    The first 67 unknowns are the parameters; of those after them nothing is known beforehand.
+    """
     size, extra = matrix.shape[1], matrix.shape[1] - len(NAMES)
-    triangle = np.asarray(np.linalg.qr(np.column_stack([matrix, right]) / noise, mode="r"))[:size]
+    triangle = np.asarray(np.linalg.qr(np.column_stack([matrix, right]), mode="r"))[:size]
     prior = np.eye(len(NAMES), size) / guess.std[:, None]
     place, measured = anchor.row()
     known = np.vstack([triangle[:, :size], prior, np.pad(place, ((0, 0), (0, extra)))])

@@ -1,0 +1,79 @@
+"""Output error in its variants: the paper's, driven by the logged commands, with known gains; and its warm start."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.estimate_covariance import estimate_uncertainty
+from identify.estimation import best_start, search
+from identify.estimators.evidence import Estimate, Evidence
+from identify.loop_parameters import NAMES, StartingGuess
+from identify.output_error import OutputErrorProblem
+from identify.warm_start import REWEIGHTINGS, linear_warm_start
+
+GAINS = slice(64, 67)
+
+KNOWN = 1e-6
+"""Relative standard deviation of a gain that is known."""
+
+DRAWS_STREAM = 21
+"""Random stream of the repeated experiments behind the standard deviations."""
+
+
+def closed_loop(evidence: Evidence) -> Estimate:
+    """Closed-loop output error with unknown PID, as in the paper; warm start and command-driven search before it."""
+    return _search_both(evidence, evidence.problem)
+
+
+def command_driven(evidence: Evidence) -> Estimate:
+    """Output error of the model driven by the logged commands."""
+    began = time.perf_counter()
+    problem = evidence.problem.driven_by_commands()
+    solution = search(problem, best_start(problem, _warm(evidence, problem)), evidence.scenario, _silent)
+    seconds = time.perf_counter() - began
+    std = _std(problem, solution.parameters)
+    return Estimate(solution.parameters, std, seconds, solution.iterations, solution.evaluations, solution.stop_reason)
+
+
+def known_pid(evidence: Evidence) -> Estimate:
+    """Closed-loop output error with the joint PID's gains known. Raises EstimationError where they are not."""
+    if evidence.known_gains is None:
+        raise EstimationError("the gains of the joint PID are not known: this estimator needs lp, li and ld")
+    values, std = evidence.problem.guess.values.copy(), evidence.problem.guess.std.copy()
+    values[GAINS] = evidence.known_gains
+    std[GAINS] = KNOWN * np.abs(evidence.known_gains)
+    return _search_both(evidence, replace(evidence.problem, guess=StartingGuess(values, std)))
+
+
+def warm_start_alone(evidence: Evidence) -> Estimate:
+    """The linear closed-loop equation with the logged commands, solved once; no standard deviations."""
+    began = time.perf_counter()
+    parameters = _warm(evidence, evidence.problem)
+    return Estimate(parameters, None, time.perf_counter() - began, REWEIGHTINGS, 0)
+
+
+def _search_both(evidence: Evidence, problem: OutputErrorProblem) -> Estimate:
+    began = time.perf_counter()
+    driven = problem.driven_by_commands()
+    first = search(driven, best_start(driven, _warm(evidence, problem)), evidence.scenario, _silent)
+    last = search(problem, best_start(problem, first.parameters), evidence.scenario, _silent)
+    seconds = time.perf_counter() - began
+    counts = first.iterations + last.iterations, first.evaluations + last.evaluations
+    return Estimate(last.parameters, _std(problem, last.parameters), seconds, *counts, last.stop_reason)
+
+
+def _warm(evidence: Evidence, problem: OutputErrorProblem) -> Array:
+    scenario = evidence.scenario
+    return linear_warm_start(problem.runs, scenario.timing, scenario.filter, problem.guess, problem.anchor)
+
+
+def _std(problem: OutputErrorProblem, parameters: Array) -> Array:
+    covariance = estimate_uncertainty(problem, parameters, np.random.default_rng(DRAWS_STREAM)).covariance
+    return np.asarray(np.sqrt(np.diag(covariance)).reshape(len(NAMES)), dtype=float)
+
+
+def _silent(n: int = 1) -> None:
+    pass
