@@ -158,11 +158,20 @@ def excite(
     out: NewFolder = None,
     seed: Seed = 0,
     settings: Settings = None,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Only compare the methods: writes comparison.json and comparison.png.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Choose the exciting trajectory and the unseen ones: writes scenario.toml and trajectories.json."""
     chosen = _scenario(scenario, settings)
-    folder = new_run_folder(out or Path("runs") / f"{chosen.name}-{seed}")
+    name = f"excite-{chosen.name}-{seed}" if compare else f"{chosen.name}-{seed}"
+    folder = new_run_folder(out or Path("runs") / name)
+    if compare:
+        from identify import excite_compare
+
+        excite_compare.compare(chosen, seed, folder.path, _progress(quiet), quiet)
+        return
     _pipeline().excite(chosen, seed, folder.path, _progress(quiet))
 
 

@@ -110,7 +110,17 @@ class Excitation(_Section):
     position_amplitude_m: float = _quantity(0.010, "m", "largest distance from home in x, y and z", gt=0)
     orientation_amplitude_rad: float = _quantity(0.04, "rad", "largest angle from home in each axis", gt=0, lt=1.5)
     travel_margin_rad: float = _quantity(0.10, "rad", "distance kept from the travel limit of the cranks", ge=0)
-    candidates: int = _quantity(64, "1", "random trajectories among which the best is chosen", ge=1, le=100_000)
+    candidates: int = _quantity(
+        64, "1", "random trajectories: the best is chosen, is where a search begins, or they evolve", ge=1, le=100_000
+    )
+    method: Literal["random", "evolutionary", "gradient"] = Field(
+        "random", description="best random trajectory, differential evolution (the paper's kind), or IPOPT"
+    )
+    criterion: Literal["observability", "information"] = Field(
+        "observability", description="eq. 39, or D-optimality of the output error's information"
+    )
+    max_joint_velocity_rad_s: float = _quantity(2.0, "rad/s", "largest velocity of a crank", gt=0)
+    generations: int = _quantity(324, "1", "generations of the evolutionary method (the paper: 324)", ge=1, le=100_000)
 
 
 class Filter(_Section):

@@ -106,11 +106,17 @@ def random_trajectory(
     order = np.arange(1, harmonics + 1)
     sine = _without(rng.standard_normal((6, harmonics)), np.ones(harmonics))
     cosine = _without(rng.standard_normal((6, harmonics)), order.astype(float))
-    shape = _from_home(np.zeros(6), fundamental_hz, sine, cosine)
+    shape = from_home(np.zeros(6), fundamental_hz, sine, cosine)
     box = np.repeat([position_amplitude_m, orientation_amplitude_rad], 3)
     period = np.linspace(0.0, 1.0 / fundamental_hz, 200 * harmonics, endpoint=False)
     scale = (box / np.abs(shape.pose(period)).max(axis=0))[:, None]
-    return _from_home(np.asarray(home_pose, dtype=float), fundamental_hz, scale * sine, scale * cosine)
+    return from_home(np.asarray(home_pose, dtype=float), fundamental_hz, scale * sine, scale * cosine)
+
+
+def from_home(home: Array, fundamental_hz: float, sine: Array, cosine: Array) -> FourierTrajectory:
+    """Trajectory with coefficients ``sine`` and ``cosine`` (6, n) [m/s, rad/s] that is at ``home`` (6,) at t = 0."""
+    w = 2 * np.pi * fundamental_hz * np.arange(1, sine.shape[1] + 1)
+    return FourierTrajectory(fundamental_hz, sine, cosine, home + (cosine / w).sum(axis=1))
 
 
 def check_travel(
@@ -146,11 +152,6 @@ def _joint_angles(robot: TravelLimitedRobot, trajectory: FourierTrajectory, time
             f"trajectory leaves the reach of {robot.name}: leg {leg + 1} at t = {times[row]:.3f} s, pose {poses[row]}"
         )
     return angles
-
-
-def _from_home(home: Array, fundamental_hz: float, sine: Array, cosine: Array) -> FourierTrajectory:
-    w = 2 * np.pi * fundamental_hz * np.arange(1, sine.shape[1] + 1)
-    return FourierTrajectory(fundamental_hz, sine, cosine, home + (cosine / w).sum(axis=1))
 
 
 def _without(rows: Array, direction: Array) -> Array:

@@ -3,9 +3,9 @@ import pytest
 
 from dynamics import load_robot
 from identify.errors import TrajectoryError
-from identify.excitation import (
+from identify.excitation import design_trajectories
+from identify.excitation.random_search import (
     NULL_TOLERANCE,
-    design_trajectories,
     observability_indices,
     stacked_regressor,
 )

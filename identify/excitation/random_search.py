@@ -1,4 +1,4 @@
-"""The exciting trajectory: the best of many random ones by the paper's observability index (eq. 39).
+"""The exciting trajectory as the best of many random ones by the paper's observability index (eq. 39).
 
 The index is the geometric mean of the singular values of the stacked regressor H over sqrt(m), m sampled poses. H of
 a parallel robot has directions in the parameter space that no motion excites; their singular value is zero and the
@@ -7,29 +7,30 @@ regressors of all of them together excite. Its dimension is the paper's zeta. H 
 paper, and like there only the dynamic parameters count, not the gains of the joint controller.
 """
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
 
 from identify.arrays import Array
 from identify.errors import TrajectoryError
-from identify.progress import Advance, Progress, SilentProgress
-from identify.scenario import Excitation, Scenario
+from identify.excitation.motion import SAMPLES_PER_HARMONIC
+from identify.progress import Advance
+from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory, TravelLimitedRobot, check_travel, random_trajectory
-from identify.trajectory_file import TrajectorySet
 
 NULL_TOLERANCE = 1e-9
 """Singular values below this fraction of the largest belong to directions that no candidate excites."""
 
-SAMPLES_PER_HARMONIC = 20
-"""Poses sampled in a period of the highest harmonic when the index is computed."""
-
 ATTEMPTS = 50
-"""Random trajectories tried, on the average, for each one that has to stay inside the travel."""
+"""Random trajectories tried, on the average, for each one that has to be admissible."""
+
+Check = Callable[[FourierTrajectory], object]
+"""Raises TrajectoryError for a trajectory that is not admissible."""
 
 
 class RegressorRobot(TravelLimitedRobot, Protocol):
-    """What the design of an exciting trajectory needs to know of a robot."""
+    """What the choice among random trajectories needs to know of a robot."""
 
     @property
     def home_pose(self) -> Any:
@@ -47,32 +48,6 @@ class RegressorRobot(TravelLimitedRobot, Protocol):
     def regressor(self, pose: Any, twist: Any, twist_dot: Any) -> Any:
         """Regressors (N, 6, p) of the inverse dynamics."""
         ...
-
-
-def design_trajectories(
-    robot: RegressorRobot, scenario: Scenario, seed: int, progress: Progress | None = None
-) -> TrajectorySet:
-    """Exciting trajectory and validation trajectories of a scenario, each kind from its own stream of the seed.
-
-    Raises:
-        TrajectoryError: no random trajectory of this amplitude stays inside the travel less the margin.
-    """
-    progress = progress or SilentProgress()
-    excitation_seed, validation_seed = np.random.SeedSequence(seed).spawn(2)
-    settings = scenario.excitation
-    with progress.stage("excitation", settings.candidates) as advance:
-        candidates = _admissible(robot, settings, settings.duration_s, settings.candidates, excitation_seed)
-        indices = observability_indices(robot, candidates, settings.duration_s, advance)
-    best = int(np.argmax(indices))
-    unseen = _admissible(robot, settings, scenario.validation.duration_s, scenario.validation.count, validation_seed)
-    return TrajectorySet(
-        seed=seed,
-        excitation=candidates[best],
-        validation=tuple(unseen),
-        observability_index=float(indices[best]),
-        first_index=float(indices[0]),
-        median_index=float(np.median(indices)),
-    )
 
 
 def observability_indices(
@@ -101,20 +76,18 @@ def stacked_regressor(robot: RegressorRobot, trajectory: FourierTrajectory, dura
     return np.asarray(regressor, dtype=float).reshape(6 * len(t), -1)
 
 
-def _row_space(matrix: Array) -> Array:
-    _, singular, rows = np.linalg.svd(matrix, full_matrices=False)
-    return rows[singular > NULL_TOLERANCE * singular[0]].T
-
-
-def _geometric_mean(matrix: Array) -> float:
-    singular = np.linalg.svd(matrix, compute_uv=False)
-    with np.errstate(divide="ignore"):
-        return float(np.exp(np.mean(np.log(singular))))
-
-
-def _admissible(
-    robot: RegressorRobot, settings: Excitation, duration_s: float, count: int, seed: np.random.SeedSequence
+def admissible_trajectories(
+    robot: RegressorRobot,
+    settings: Excitation,
+    duration_s: float,
+    count: int,
+    seed: np.random.SeedSequence,
+    check: Check = lambda trajectory: None,
 ) -> list[FourierTrajectory]:
+    """Random trajectories that stay inside the travel less the margin and pass `check`.
+
+    Raises TrajectoryError, with the last reason, when too few of them do.
+    """
     rng = np.random.default_rng(seed)
     rate_hz = 4 * SAMPLES_PER_HARMONIC * settings.harmonics * settings.fundamental_hz
     t = np.arange(round(duration_s * rate_hz) + 1) / rate_hz
@@ -131,6 +104,7 @@ def _admissible(
         )
         try:
             check_travel(robot, candidate, t, settings.travel_margin_rad)
+            check(candidate)
         except TrajectoryError as error:
             reason = error
             continue
@@ -139,5 +113,17 @@ def _admissible(
             return accepted
     raise TrajectoryError(
         f"only {len(accepted)} of {ATTEMPTS * count} random trajectories of ±{settings.position_amplitude_m:g} m and "
-        f"±{settings.orientation_amplitude_rad:g} rad stay inside the travel, {count} are needed; the last: {reason}"
+        f"±{settings.orientation_amplitude_rad:g} rad stay inside the travel and the other limits, {count} are needed; "
+        f"the last: {reason}"
     )
+
+
+def _row_space(matrix: Array) -> Array:
+    _, singular, rows = np.linalg.svd(matrix, full_matrices=False)
+    return rows[singular > NULL_TOLERANCE * singular[0]].T
+
+
+def _geometric_mean(matrix: Array) -> float:
+    singular = np.linalg.svd(matrix, compute_uv=False)
+    with np.errstate(divide="ignore"):
+        return float(np.exp(np.mean(np.log(singular))))

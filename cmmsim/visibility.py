@@ -1,0 +1,81 @@
+"""Which of the platform's stickers both cameras can look for at a pose, and what a measurement there would be worth.
+
+A sticker can be looked for when it lies in both images, a detection window away from their edges, and neither camera
+sees it at grazing incidence. What stands between it and a camera is not asked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import LostError
+from .marked_body import MarkedBody, marked_body
+from .observation import GRAZING, DetectionSettings, observe
+from .pose import Array, apply, compose_covariance, invert, pose_covariance, pose_to_transform
+from .pose_methods import by_planes, by_registration
+from .rig_from_file import rig_from_file
+from .sensor import load_sensor
+from .sensor_file import read_sensor_file
+from .stereo_rig import StereoRig
+
+EDGE_PX = DetectionSettings().window_size
+
+
+@dataclass(frozen=True)
+class SightLines:
+    """The geometry of sight: platform with nominal sticker places, rig, and camera_from_base (4,4)."""
+
+    platform: MarkedBody
+    rig: StereoRig
+    camera_from_base: Array
+
+    @property
+    def cameras_from_base(self) -> list[Array]:
+        """Transforms (4,4) from base axes into the axes of the left and of the right camera."""
+        return [move @ self.camera_from_base for move in self.rig.from_camera]
+
+    def visible(self, pose: ArrayLike) -> NDArray[np.bool_]:
+        """Whether both cameras can look for each sticker (n,) with the platform at a pose (6,) in the base frame."""
+        base_from_platform = pose_to_transform(pose)
+        seen = np.ones(len(self.platform.sticker_ids), dtype=bool)
+        for camera, from_base in zip(self.rig.cameras, self.cameras_from_base, strict=True):
+            move = from_base @ base_from_platform
+            places, normals = apply(move, self.platform.nominal), self.platform.sticker_normals @ move[:3, :3].T
+            pixels, ahead = camera.project(places)
+            inside = np.all((pixels >= EDGE_PX) & (pixels <= (camera.width - 1 - EDGE_PX,
+                                                              camera.height - 1 - EDGE_PX)), axis=1)
+            facing = -np.einsum("ni,ni->n", places, normals) > GRAZING * np.linalg.norm(places, axis=1)
+            seen &= ahead & inside & facing
+        return seen
+
+
+def sight_lines(name: str | Path) -> SightLines:
+    """Geometry of sight of a built-in sensor or a sensor file. Raises UnknownSensorError, SensorFileError."""
+    file = read_sensor_file(name)
+    rig, camera_from_base = rig_from_file(file.rig)
+    return SightLines(marked_body("platform", file.platform), rig, camera_from_base)
+
+
+def expected_covariance(name: str | Path, pose: ArrayLike, method: str = "registration", seed: int = 0) -> Array:
+    """Covariance (6,6) that a sensor would state for a pose (6,), m and rad, from one exposure drawn without OpenGL.
+
+    Taken as taught without error. Raises LostError where the stickers do not suffice, and what `load_sensor` raises.
+    """
+    sensor, sight = load_sensor(name, seed, method, renderer="analytic"), sight_lines(name)
+    base_from_platform = pose_to_transform(pose)
+    expected = sight.camera_from_base @ base_from_platform
+    seen = observe(sensor.look(pose), sight.rig, sensor.noise, sensor.settings, expected, sight.platform.nominal,
+                   sight.platform.sticker_normals)
+    if method == "planes":
+        covariance = by_planes(seen, sight.platform, sight.platform.normals @ expected[:3, :3].T)[1]
+    else:
+        places = sight.platform.nominal.copy()
+        places[seen.index] = apply(invert(expected), seen.points)
+        covariance = by_registration(seen, places)[1]
+    if not np.isfinite(covariance).all():
+        raise LostError(f"sensor {sensor.name} states no covariance at pose {np.asarray(pose).tolist()}")
+    return pose_covariance(base_from_platform, compose_covariance(invert(sight.camera_from_base), covariance))

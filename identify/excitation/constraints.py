@@ -1,0 +1,171 @@
+"""What an exciting trajectory has to keep, as CasADi expressions of pose and pose rate.
+
+Every constraint is written as the share of its limit that is used; the trajectory is admissible while all shares are
+within -1 and +1:
+
+    box           distance from home over the amplitude that the scenario allows, a pose component
+    travel        crank angle over the travel limit less the margin, a leg
+    velocity      crank velocity over the largest allowed, a leg
+    leverage      least leverage of J_a1 over the leverage, a leg (see `dynamics.workspace`)
+    conditioning  condition number of the scaled J_a2 over its limit. The one of the Frobenius norm is taken: it is
+                  smooth, and never below that of the 2-norm
+    visibility    angle to grazing and place in the image of four stickers a plane and both cameras; left out where the
+                  whole box is proved to be in sight
+
+The start at home and at rest holds by the form of the trajectory, the end because the run lasts whole periods.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from cmmsim.visibility import SightLines, sight_lines
+from dynamics import Robot
+from dynamics.jacobians import crank_leverage, loop_jacobians, pose_jacobian
+from dynamics.kinematics import leg_vectors
+from dynamics.workspace import LEAST_LEVERAGE, MOST_CONDITION, characteristic_length
+from identify.arrays import Array
+from identify.errors import TrajectoryError
+from identify.excitation.sight import required_stickers, sight_uses, within_sight
+from identify.scenario import Scenario
+from identify.trajectory import FourierTrajectory
+
+COMPONENTS = ("x", "y", "z", "alpha", "beta", "gamma")
+
+
+@dataclass(frozen=True)
+class Limit:
+    """One constraint: name, the limit in its unit, who it concerns (one entry a row), and whether it bounds from below
+    (a share is then limit / value)."""
+
+    name: str
+    limit: tuple[float, ...]
+    unit: str
+    who: tuple[str, ...]
+    lower: bool = False
+
+
+@dataclass(frozen=True)
+class Worst:
+    """Where a trajectory comes nearest to a limit: value and limit in `unit`, share used, whom, and time [s]."""
+
+    name: str
+    value: float
+    limit: float
+    unit: str
+    share: float
+    who: str
+    time_s: float
+
+    def __str__(self) -> str:
+        who = f" of {self.who}" if self.who else ""
+        return f"{self.name}{who} is {self.value:.4g}{self.unit} at t = {self.time_s:.3f} s, limit {self.limit:.4g}" + (
+            self.unit
+        )
+
+
+class MotionConstraints:
+    """The constraints of a scenario on the motion of a robot."""
+
+    def __init__(self, robot: Robot, scenario: Scenario, sight: SightLines | None = None) -> None:
+        self._robot, self._settings = robot, scenario.excitation
+        sight = sight or sight_lines(scenario.sensor)
+        amplitude = (self._settings.position_amplitude_m, self._settings.orientation_amplitude_rad)
+        self.box = np.repeat(amplitude, 3)
+        stickers = required_stickers(sight, robot.home_pose)
+        self.always_in_sight = within_sight(sight, stickers, robot.home_pose, self.box)
+        self._sight, self._stickers = sight, [] if self.always_in_sight else stickers
+        travel = robot.travel_limit - self._settings.travel_margin_rad
+        if travel <= 0:
+            raise TrajectoryError(
+                f"excitation.travel_margin_rad = {self._settings.travel_margin_rad:g} rad leaves nothing of the travel "
+                f"limit {robot.travel_limit:g} rad of {robot.name}"
+            )
+        legs = tuple(f"leg {k}" for k in range(1, 7))
+        self.limits = [
+            Limit("box", tuple(self.box), "", COMPONENTS),
+            Limit("travel", (travel,) * 6, " rad", legs),
+            Limit("velocity", (self._settings.max_joint_velocity_rad_s,) * 6, " rad/s", legs),
+            Limit("leverage", (LEAST_LEVERAGE,) * 6, "", legs, lower=True),
+            Limit("conditioning", (MOST_CONDITION,), "", ("",)),
+        ]
+        if self._stickers:
+            names = [f"sticker {sight.platform.sticker_ids[k]}, {side} camera, {what}" for k in self._stickers
+                     for side in ("left", "right") for what in ("incidence", "across", "up")]
+            self.limits.append(Limit("visibility", (1.0,) * len(names), " of the limit", tuple(names)))
+
+    @cached_property
+    def shares(self) -> ca.Function:
+        """(pose, pose rate) (6,) -> shares used of all limits, in the order of `limits`."""
+        return self.shares_of([limit.name for limit in self.limits])
+
+    def shares_of(self, names: Collection[str]) -> ca.Function:
+        """As `shares`, of some limits only."""
+        pose, rate = ca.SX.sym("pose", 6), ca.SX.sym("rate", 6)
+        rows = self._rows(pose, rate)
+        return ca.Function("shares", [pose, rate], ca.cse([ca.vertcat(*[rows[n] for n in rows if n in names])]))
+
+    def _rows(self, pose: ca.SX, rate: ca.SX) -> dict[str, ca.SX]:
+        geometry, settings = self._robot.geometry, self._settings
+        travel = self._robot.travel_limit - settings.travel_margin_rad
+        legs = leg_vectors(geometry, pose)
+        size = geometry.crank_length * geometry.link_length
+        leverage = ca.vertcat(*[ca.fabs(crank_leverage(leg)) / size for leg in legs])
+        scale = np.repeat([1.0, characteristic_length(geometry)], 3) * geometry.link_length
+        link_rows = loop_jacobians(geometry, pose)[1] @ ca.diag(1 / scale)
+        condition = ca.norm_fro(link_rows) * ca.norm_fro(ca.solve(link_rows, ca.SX.eye(6)))
+        rows = {
+            "box": (pose - geometry.home_pose) / self.box,
+            "travel": ca.vertcat(*[leg.angle for leg in legs]) / travel,
+            "velocity": pose_jacobian(geometry, pose) @ rate / settings.max_joint_velocity_rad_s,
+            "leverage": LEAST_LEVERAGE / leverage,
+            "conditioning": condition / MOST_CONDITION,
+        }
+        if self._stickers:
+            rows["visibility"] = sight_uses(self._sight, self._stickers, pose)
+        return rows
+
+    def worst(self, trajectory: FourierTrajectory, times: Array) -> list[Worst]:
+        """Where a trajectory, sampled at `times` (N,) [s], comes nearest to each limit; share NaN: out of reach."""
+        poses, rates = trajectory.pose(times), trajectory.pose_rate(times)
+        used = np.array(self.shares(poses.T, rates.T)).T
+        found, first = [], 0
+        for limit in self.limits:
+            block = np.abs(used[:, first : first + len(limit.who)])
+            row, who = np.unravel_index(np.argmax(block), block.shape)  # the first NaN counts as the largest
+            share, bound = float(block[row, who]), limit.limit[who]
+            value = bound / share if limit.lower else bound * share
+            unit = (" m" if who < 3 else " rad") if limit.name == "box" else limit.unit
+            found.append(Worst(limit.name, value, bound, unit, share, limit.who[who], float(times[row])))
+            first += len(limit.who)
+        return found
+
+    def check(self, trajectory: FourierTrajectory, times: Array, tolerance: float = 1e-9) -> list[Worst]:
+        """`worst` of an admissible trajectory.
+
+        Raises TrajectoryError naming constraint, leg, value, limit and time of the one that is broken most.
+        """
+        found = self.worst(trajectory, times)
+        broken = [w for w in found if not w.share <= 1 + tolerance]
+        if broken:
+            raise TrajectoryError(f"the trajectory is not admissible: {max(broken, key=_excess)}")
+        return found
+
+
+def check_periods(scenario: Scenario) -> None:
+    """Raise TrajectoryError where a run is no whole number of periods, so that it cannot end at home and at rest."""
+    settings = scenario.excitation
+    periods = settings.duration_s * settings.fundamental_hz
+    if round(periods) < 1 or abs(periods - round(periods)) > 1e-9 * periods:
+        raise TrajectoryError(
+            f"end at rest: excitation.duration_s = {settings.duration_s:g} s is {periods:.4g} periods of "
+            f"excitation.fundamental_hz = {settings.fundamental_hz:g} Hz; excitation.method = {settings.method!r} "
+            "needs a whole number of periods, at least 1"
+        )
+
+
+def _excess(worst: Worst) -> float:
+    return np.inf if np.isnan(worst.share) else worst.share

@@ -1,0 +1,169 @@
+"""The trajectories of a run: the exciting one by the scenario's method and criterion, and unseen random ones.
+
+Methods: the best of `candidates` random trajectories; differential evolution that begins with them; IPOPT from the
+best few of them. Criteria: the observability index (eq. 39), or the D-criterion in the linearised loop, by which the
+searches go; what IPOPT found from several starts is then ranked by the D-criterion of the simulated loop.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynamics import Robot
+from identify.arrays import Array
+from identify.errors import TrajectoryError
+from identify.excitation.constraints import MotionConstraints, check_periods
+from identify.excitation.criterion_information import Knowledge, knowledge, log_information
+from identify.excitation.criterion_linear_information import log_linear_information
+from identify.excitation.criterion_observability import SMOOTHING_RAD_S, log_observability
+from identify.excitation.evolutionary_search import FEWEST_MEMBERS, evolve
+from identify.excitation.gradient_search import climb
+from identify.excitation.motion import sample_times
+from identify.excitation.random_search import Check, RegressorRobot, admissible_trajectories, observability_indices
+from identify.excitation.search import SearchProblem, SearchResult
+from identify.excitation.unknowns import unknowns
+from identify.progress import Progress, SilentProgress
+from identify.scenario import Scenario
+from identify.trajectory import FourierTrajectory
+from identify.trajectory_file import TrajectorySet
+
+STARTS = 3
+"""Random trajectories from which IPOPT climbs."""
+
+CHECK_REFINEMENT = 4
+"""How much finer random trajectories are checked than criteria are sampled."""
+
+RANDOM_TOLERANCE = 1e-3
+"""Share by which random trajectories may go over a limit: they fill the box as closely as they were sampled for it."""
+
+
+def design_trajectories(
+    robot: RegressorRobot, scenario: Scenario, seed: int, progress: Progress | None = None
+) -> TrajectorySet:
+    """Exciting trajectory and validation trajectories of a scenario, each kind from its own stream of the seed.
+
+    A robot that is not a `dynamics.Robot` has no geometry to search with: only the best random trajectory by eq. 39 is
+    chosen, and of the limits only the travel is checked.
+    Raises:
+        TrajectoryError: no random trajectory of this amplitude keeps the limits; no whole number of periods where a
+            search needs it; a search that finds nothing.
+    """
+    progress = progress or SilentProgress()
+    settings = scenario.excitation
+    excitation_seed, validation_seed, search_seed = np.random.SeedSequence(seed).spawn(3)
+    check = motion_check(robot, scenario)
+    if isinstance(robot, Robot) and (settings.method, settings.criterion) != ("random", "observability"):
+        excitation, indices = _searched(robot, scenario, excitation_seed, search_seed, check, progress)
+    else:
+        excitation, indices = _best_random(robot, scenario, excitation_seed, check, progress)
+    unseen = admissible_trajectories(
+        robot, settings, scenario.validation.duration_s, scenario.validation.count, validation_seed, check
+    )
+    return TrajectorySet(
+        seed=seed,
+        excitation=excitation,
+        validation=tuple(unseen),
+        observability_index=float(indices[0]),
+        first_index=float(indices[1]),
+        median_index=float(np.median(indices[1:])),
+    )
+
+
+def motion_check(robot: RegressorRobot, scenario: Scenario) -> Check:
+    """What refuses a trajectory that breaks a limit beside the travel."""
+    if not isinstance(robot, Robot):
+        if scenario.excitation.method != "random" or scenario.excitation.criterion != "observability":
+            raise TrajectoryError(
+                f"excitation.method = {scenario.excitation.method!r} with criterion "
+                f"{scenario.excitation.criterion!r} needs the geometry of a robot, {robot.name} has none"
+            )
+        return lambda trajectory: None
+    constraints = MotionConstraints(robot, scenario)
+    times = sample_times(scenario.excitation.fundamental_hz, scenario.excitation.harmonics, CHECK_REFINEMENT)
+    return lambda trajectory: constraints.check(trajectory, times, RANDOM_TOLERANCE)
+
+
+@dataclass(frozen=True)
+class Search:
+    """A scenario's search: the problem, its random candidates (z) in the order of their value, best first, and what is
+    known before the run (None where the criterion does not ask)."""
+
+    robot: Robot
+    scenario: Scenario
+    problem: SearchProblem
+    candidates: list[Array]
+    known: Knowledge | None
+
+    def run(self, method: str, seed: np.random.SeedSequence, progress: Progress) -> SearchResult:
+        """What one method finds."""
+        if method == "random":
+            best = self.candidates[0]
+            count = len(self.candidates)
+            return SearchResult(best, float(self.problem.value(best)), count, 0, 0, f"best of {count}")
+        if method == "evolutionary":
+            generations = self.scenario.excitation.generations
+            with progress.stage("evolutionary search", generations) as advance:
+                return evolve(self.problem, self.candidates, generations, np.random.default_rng(seed), advance)
+        starts = self.candidates[:STARTS]
+        with progress.stage("gradient search", len(starts)) as advance:
+            return self._best(climb(self.problem, starts, advance))
+
+    def _best(self, results: list[SearchResult]) -> SearchResult:
+        if self.known is None:
+            return results[0]
+        trajectories = [result.trajectory(self.problem) for result in results]
+        true = [log_information(self.robot, self.scenario, self.known, t) for t in trajectories]
+        return results[int(np.argmax(true))]
+
+
+def prepare_search(robot: Robot, scenario: Scenario, candidates: list[FourierTrajectory]) -> Search:
+    """The search of a scenario among and from admissible random trajectories."""
+    if scenario.excitation.method == "evolutionary" and len(candidates) < FEWEST_MEMBERS:
+        raise TrajectoryError(
+            f"excitation.candidates = {len(candidates)}: the evolutionary method needs at least {FEWEST_MEMBERS}"
+        )
+    if scenario.excitation.method != "random":
+        check_periods(scenario)
+    free = unknowns(robot.home_pose, scenario.excitation)
+    pool = [free.of(trajectory) for trajectory in candidates]
+    if scenario.excitation.criterion == "observability":
+        known = None
+        value, smooth = (log_observability(robot, free, pool[0], v) for v in (None, SMOOTHING_RAD_S))
+    else:
+        known = knowledge(robot, scenario)
+        value, smooth = (log_linear_information(robot, free, scenario, known, v) for v in (None, SMOOTHING_RAD_S))
+    problem = SearchProblem(free, MotionConstraints(robot, scenario), value, smooth)
+    order = np.argsort([-float(value(z)) for z in pool], kind="stable")
+    return Search(robot, scenario, problem, [pool[k] for k in order], known)
+
+
+def _best_random(
+    robot: RegressorRobot, scenario: Scenario, seed: np.random.SeedSequence, check: Check, progress: Progress
+) -> tuple[FourierTrajectory, Array]:
+    """The best candidate, and the indices (eq. 39) of it and of all."""
+    settings = scenario.excitation
+    with progress.stage("excitation", settings.candidates) as advance:
+        candidates = admissible_trajectories(robot, settings, settings.duration_s, settings.candidates, seed, check)
+        indices = observability_indices(robot, candidates, settings.duration_s, advance)
+    best = int(np.argmax(indices))
+    return candidates[best], np.concatenate([indices[[best]], indices])
+
+
+def _searched(
+    robot: Robot,
+    scenario: Scenario,
+    excitation_seed: np.random.SeedSequence,
+    search_seed: np.random.SeedSequence,
+    check: Check,
+    progress: Progress,
+) -> tuple[FourierTrajectory, Array]:
+    """What the scenario's method finds, and the indices (eq. 39) of it and of all candidates."""
+    settings = scenario.excitation
+    candidates = admissible_trajectories(
+        robot, settings, settings.duration_s, settings.candidates, excitation_seed, check
+    )
+    search = prepare_search(robot, scenario, candidates)
+    found = search.run(settings.method, search_seed, progress)
+    index = log_observability(robot, search.problem.unknowns, search.candidates[0])
+    pool = [search.problem.unknowns.of(trajectory) for trajectory in candidates]
+    return found.trajectory(search.problem), np.exp([float(index(z)) for z in (found.z, *pool)])

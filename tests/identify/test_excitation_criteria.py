@@ -1,0 +1,158 @@
+"""The criteria as functions of a trajectory's unknowns, against numpy, finite differences and the simulated loop."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from dynamics import load_robot
+from dynamics.closed_loop import simulate
+from dynamics.parameters import VISCOUS
+from identify.errors import TrajectoryError
+from identify.excitation.criterion_information import knowledge, log_information
+from identify.excitation.criterion_linear_information import (
+    harmonics,
+    log_linear_information,
+    sensitivity_spectrum,
+)
+from identify.excitation.criterion_observability import SMOOTHING_RAD_S, log_observability
+from identify.excitation.motion import sample_times
+from identify.excitation.random_search import observability_indices
+from identify.excitation.unknowns import unknowns
+from identify.loop_parameters import NAMES, index_of
+from identify.loop_setup import frame_times, model_settings, reference_motion
+from identify.scenario import load_scenario
+from identify.trajectory import random_trajectory
+
+SCENARIO = load_scenario("quick")
+SMALL = {"excitation.position_amplitude_m": 1e-4, "excitation.orientation_amplitude_rad": 4e-4}
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot("rss6")
+
+
+@pytest.fixture(scope="module")
+def known(robot):
+    return knowledge(robot, SCENARIO)
+
+
+def drawn(robot, seed, scenario=SCENARIO):
+    """Unknowns, and the z of a random trajectory."""
+    settings = scenario.excitation
+    free = unknowns(robot.home_pose, settings)
+    trajectory = random_trajectory(
+        np.random.default_rng(seed), robot.home_pose, settings.fundamental_hz, settings.harmonics,
+        settings.position_amplitude_m, settings.orientation_amplitude_rad,
+    )
+    return free, free.of(trajectory), trajectory
+
+
+@pytest.mark.parametrize("harmonics_", [2, 5])
+def test_unknowns_and_trajectories_are_the_same_thing(robot, harmonics_):
+    free, z, trajectory = drawn(robot, 1, SCENARIO.with_overrides({"excitation.harmonics": harmonics_}))
+    assert z.shape == (12 * (harmonics_ - 1),)
+    t = np.linspace(0, 10, 50)
+    np.testing.assert_allclose(free.trajectory(z).pose(t), trajectory.pose(t), atol=1e-15)
+    for basis, derivative in zip(free.basis(t), ("pose", "pose_rate", "pose_acceleration"), strict=True):
+        moved = (z.reshape(6, -1) @ basis.T).T * free.box + (robot.home_pose if derivative == "pose" else 0)
+        np.testing.assert_allclose(moved, getattr(trajectory, derivative)(t), atol=1e-14)
+
+
+def test_any_unknowns_start_and_end_at_home_and_at_rest(robot):
+    free, z, _ = drawn(robot, 2)
+    trajectory = free.trajectory(np.random.default_rng(3).standard_normal(z.size))
+    for t in (0.0, 10.0, 20.0):
+        np.testing.assert_allclose(trajectory.pose(t), robot.home_pose, atol=1e-14)
+        np.testing.assert_allclose(trajectory.pose_rate(t), 0, atol=1e-14)
+        np.testing.assert_allclose(trajectory.pose_acceleration(t), 0, atol=1e-13)
+
+
+def test_index_is_the_geometric_mean_of_the_singular_values_that_are_not_zero(robot):
+    """Equation 39 by a singular value decomposition of all 64 columns of the robot's own regressor."""
+    free, z, trajectory = drawn(robot, 4)
+    t = sample_times(0.1, 5)
+    pose, rate, acceleration = trajectory.pose(t), trajectory.pose_rate(t), trajectory.pose_acceleration(t)
+    stacked = robot.regressor(pose, robot.twist(pose, rate), robot.twist_dot(pose, rate, acceleration))
+    singular = np.linalg.svd(stacked.reshape(-1, 64), compute_uv=False)
+    seen = singular[singular > 1e-9 * singular[0]]
+    assert len(seen) == 37
+    expected = np.exp(np.mean(np.log(seen))) / np.sqrt(len(t))
+    assert np.exp(float(log_observability(robot, free, z)(z))) == pytest.approx(expected, rel=1e-7)
+    assert observability_indices(robot, [trajectory], 10.0)[0] == pytest.approx(expected, rel=2e-3)
+
+
+def test_index_does_not_depend_on_the_trajectory_that_sets_the_scale(robot):
+    free, z, _ = drawn(robot, 5)
+    _, other, _ = drawn(robot, 6)
+    values = [float(log_observability(robot, free, typical)(z)) for typical in (z, other)]
+    assert values[0] == pytest.approx(values[1], abs=1e-8)
+
+
+@pytest.mark.parametrize("criterion", ["observability", "information"])
+def test_gradients_are_those_of_finite_differences(robot, known, criterion):
+    free, z, _ = drawn(robot, 7)
+    if criterion == "observability":
+        value = log_observability(robot, free, z, SMOOTHING_RAD_S)
+    else:
+        value = log_linear_information(robot, free, SCENARIO, known, SMOOTHING_RAD_S)
+    unknown = ca.MX.sym("z", z.size)
+    gradient = np.array(ca.Function("gradient", [unknown], [ca.gradient(value(unknown), unknown)])(z)).ravel()
+    rng, step = np.random.default_rng(0), 1e-5
+    for direction in rng.standard_normal((3, z.size)):
+        quotient = (float(value(z + step * direction)) - float(value(z - step * direction))) / (2 * step)
+        assert gradient @ direction == pytest.approx(quotient, rel=1e-5, abs=1e-7)
+
+
+def test_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
+    """Small motion, no dry friction, 600 frames a second: the second period against the spectrum."""
+    scenario = SCENARIO.with_overrides({**SMALL, "timing.frame_rate_hz": 600.0, "excitation.duration_s": 20.0})
+    free, z, trajectory = drawn(robot, 8, scenario)
+    parameters = robot.parameter_sets["initial"].vector.copy()
+    parameters[VISCOUS] = 0.5  # without friction the loop rings longer than a period
+    run = simulate(
+        robot, parameters, reference_motion(trajectory, frame_times(scenario, 20.0)), model_settings(scenario),
+        sensitivities=True,
+    )
+    s, t = harmonics(free), run.time[6000:]
+    unknown = ca.MX.sym("z", z.size)
+    spectrum = sensitivity_spectrum(robot, free, scenario, parameters, unknown)
+    parts = np.array(ca.Function("spectrum", [unknown], [spectrum])(z)).reshape(67, len(s), 2, 6)
+    waves = np.exp(np.outer(s, t))
+    expected = np.einsum("pkj,kt->tjp", parts[:, :, 0] + 1j * parts[:, :, 1], waves).real
+    for name in ("platform.mass", "platform.Ixx", "crank1.Izz", "link2.mass", "joint3.viscous", "joint_pid.lp",
+                 "joint_pid.li", "joint_pid.ld"):
+        column = index_of(name)
+        seen = run.pose_sensitivity[6000:, :, column]
+        seen, linear = seen - seen.mean(axis=0), expected[:, :, column]
+        assert np.linalg.norm(seen - linear) < 0.02 * np.linalg.norm(seen), name
+
+
+def test_information_is_the_determinant_of_rows_and_prior(robot, known):
+    """By the singular values of whitened sensitivities over prior rows, with another whitening."""
+    _, _, trajectory = drawn(robot, 9)
+    run = simulate(
+        robot, known.guess.values, reference_motion(trajectory, frame_times(SCENARIO, 10.0)),
+        model_settings(SCENARIO), sensitivities=True,
+    )
+    values, vectors = np.linalg.eigh(known.covariance)
+    rows = (np.diag(values**-0.5) @ vectors.T @ run.pose_sensitivity).reshape(-1, 67) * known.guess.std
+    anchor = np.zeros((1, 67))
+    anchor[0, NAMES.index("platform.mass")] = known.guess.std[NAMES.index("platform.mass")] / 0.005
+    singular = np.linalg.svd(np.vstack([rows, np.eye(67), anchor]), compute_uv=False)
+    expected = np.mean(np.log(singular))
+    assert log_information(robot, SCENARIO, known, trajectory) == pytest.approx(expected, rel=1e-6)
+
+
+def test_longer_runs_inform_more(robot, known):
+    _, _, trajectory = drawn(robot, 10)
+    longer = SCENARIO.with_overrides({"excitation.duration_s": 20.0})
+    once, twice = (log_information(robot, s, known, trajectory) for s in (SCENARIO, longer))
+    assert 0.0 < twice - once < np.log(2) / 2 + 0.05
+
+
+def test_unstable_starting_model_is_named(robot, known):
+    late = SCENARIO.with_overrides({"timing.frame_rate_hz": 30.0, "timing.latency_s": 0.05})
+    _, _, trajectory = drawn(robot, 11)
+    with pytest.raises(TrajectoryError, match=r"no D-criterion: .*model\.start_parameters = 'initial' is unstable"):
+        log_information(robot, late, known, trajectory)
