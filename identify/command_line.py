@@ -16,6 +16,7 @@ from identify.calibrate_command import CALIBRATE_HELP, calibrate
 from identify.detectors_command import detectors
 from identify.engine_commands import export, verify_model
 from identify.errors import IdentifyError, ScenarioError
+from identify.estimators_command import estimators
 from identify.progress import Progress, RichProgress, SilentProgress
 from identify.run_folder import RunFolder, new_run_folder
 from identify.scenario import Scenario, load_scenario, scenario_names
@@ -66,6 +67,10 @@ Where the robot can go:
 \b
 What its motion can show:
   cmmsim base-parameters rss6            groups of parameters that no motion can separate
+
+\b
+Other estimators on the same record:
+  cmmsim estimators --out mine           a table beside measured torques and encoders: estimators.json
 """
 
 app = typer.Typer(
@@ -212,6 +217,7 @@ app.command()(workspace)
 app.command(help=CALIBRATE_HELP)(calibrate)
 app.command()(acceptance)
 app.command()(base_parameters)
+app.command()(estimators)
 
 
 def parse_settings(settings: list[str] | None) -> dict[str, Any]:
