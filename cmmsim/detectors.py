@@ -43,7 +43,7 @@ def detect_by_maximum_likelihood(windows: NDArray, corners: NDArray[np.integer],
                                  limits: FitLimits | None = None, psf_px: float = 0.0) -> DetectedCentres:
     """Centres of the maximum-likelihood fit of a blurred ellipse. Parameters as of ``DetectWindows``."""
     fits = fit_ellipses(windows, corners, noise, fit_size, limits, psf_px=psf_px)
-    return DetectedCentres(fits.centres, fits.covariances, fits.good)
+    return DetectedCentres(fits.centres, fits.covariances, fits.good, fits.shapes, fits.shape_covariances)
 
 
 DETECTORS = {d.name: d for d in (

@@ -18,6 +18,7 @@ from .pose import Array
 
 RING_REACH = 2.4  # pixels beyond this many sticker radii may lie outside the dark ring and are left out
 SMALLEST_RADIUS_PX = 0.8
+ELLIPSE_UNKNOWNS = 5  # the first parameters: c_x, c_y, A_xx, A_xy, A_yy
 SMALLEST_START_PX = 1.2
 CONVERGED_PX = 1e-4  # a step shorter than this ends a fit
 CORE_SHARE = 0.4  # a pixel with this share of the contrast belongs to the bright spot when the fit starts
@@ -27,13 +28,15 @@ CORE_SHARE = 0.4  # a pixel with this share of the contrast belongs to the brigh
 class EllipseFits:
     """Result for n windows, in full-image px.
 
-    centres (n,2); covariances (n,2,2) of the centres, px²; shapes (n,2,2) the ellipses' matrices A; contrast (n,)
-    grey values; misfit (n,) the reduced chi-square of the grey values; good (n,) whether the window holds one ellipse.
+    centres (n,2); covariances (n,2,2) of the centres, px²; shapes (n,2,2) the ellipses' matrices A;
+    shape_covariances (n,3,3) of A_xx, A_xy, A_yy, px²; contrast (n,) grey values; misfit (n,) the reduced chi-square of
+    the grey values; good (n,) whether the window holds one ellipse.
     """
 
     centres: Array
     covariances: Array
     shapes: Array
+    shape_covariances: Array
     contrast: Array
     misfit: Array
     good: NDArray[np.bool_]
@@ -66,7 +69,7 @@ def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNo
 
     n = len(windows)
     inner, parameters, misfit = np.empty((n, 2)), np.empty((n, UNKNOWNS)), np.empty(n)
-    shapes, covariances = np.empty((n, 2, 2)), np.empty((n, 2, 2))
+    shapes, covariances = np.empty((n, 2, 2)), np.empty((n, ELLIPSE_UNKNOWNS, ELLIPSE_UNKNOWNS))
     scale = noise.white_level / 255.0
     greys = scale * _GREYS
     variances = noise.variance(greys) / limits.frames
@@ -77,7 +80,8 @@ def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNo
                 misfit)
     good = (parameters[:, 5] >= limits.smallest_contrast) & (misfit <= limits.largest_misfit)
     good &= _inside(parameters[:, :2], shapes, fit_size)
-    return EllipseFits(parameters[:, :2] + inner + corners, covariances, shapes, parameters[:, 5], misfit, good)
+    return EllipseFits(parameters[:, :2] + inner + corners, covariances[:, :2, :2], shapes, covariances[:, 2:, 2:],
+                       parameters[:, 5], misfit, good)
 
 
 _LARGEST_STEP = np.array([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from .blob_search import find_ellipses
+from .consistency import consistent
 from .errors import LostError, ShapeError, UnknownOptionError
 from .images import FrameImages, StereoFrame, StereoImages
 from .labelling import find_layout
@@ -14,7 +15,7 @@ from .measurement import Measurement, lost_measurement
 from .noise import CameraNoise
 from .observation import DetectionSettings, StickerObservation, observe
 from .pose import Array, compose_covariance, pose_covariance, transform_to_pose
-from .pose_methods import METHODS, Solution, by_planes, by_registration
+from .pose_methods import METHODS, Solution, by_planes
 from .stereo_rig import StereoRig
 from .taught import Taught
 
@@ -49,7 +50,7 @@ class PoseEstimator:
         """Measurement near an expected camera_from_platform (4,4), and the measured one. Raises LostError."""
         seen = observe(images, self.rig, self.noise, self.settings, expected, self.taught.platform_places,
                        self.platform.sticker_normals)
-        camera_from_platform, covariance, used = self._solve(seen, expected)
+        camera_from_platform, covariance, used = self._solve(seen)
         base_from_platform = self.taught.base_from_camera @ camera_from_platform
         spread = compose_covariance(self.taught.base_from_camera, covariance)
         measurement = Measurement(
@@ -57,10 +58,11 @@ class PoseEstimator:
             used.covariances, used.left_pixels, used.right_pixels, self.platform.sticker_ids[used.index], True)
         return measurement, camera_from_platform
 
-    def _solve(self, seen: StickerObservation, expected: Array) -> Solution:
+    def _solve(self, seen: StickerObservation) -> Solution:
+        used, result = consistent(seen, self.rig, self.platform, self.taught.platform_places, self.settings.radius)
         if self.method == "planes":
-            return by_planes(seen, self.platform, self.platform.normals @ expected[:3, :3].T)
-        return by_registration(seen, self.platform, self.taught.platform_places)
+            return by_planes(used, self.platform, self.platform.normals @ result.transform[:3, :3].T)
+        return result.transform, result.covariance, used
 
 
 def measure_frame(frame: StereoFrame, estimator: PoseEstimator, expected: Array | None = None) -> Measurement:

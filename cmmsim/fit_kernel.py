@@ -12,7 +12,7 @@ from .cholesky_kernel import factor, invert_factored, solve_factored
 from .compiled import compiled
 from .coverage_kernel import cover_window, inverse_of
 
-ELLIPSE_UNKNOWNS, UNKNOWNS = 5, 7  # c_x, c_y, A_xx, A_xy, A_yy; contrast, ground
+UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
 
 
 class FitSettings(NamedTuple):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from .detected_centres import DetectedCentres
 from .detectors import DEFAULT_DETECTOR, find_detector
 from .eccentricity import centre_offset
 from .ellipse_fit import FitLimits
@@ -39,11 +40,25 @@ class DetectionSettings:
 
 
 @dataclass(frozen=True)
+class Outlines:
+    """shapes (2,k,2,2): symmetric matrices A of the ellipses of k stickers in the left and the right image, px, and
+    covariances (2,k,3,3) of A_xx, A_xy, A_yy, px²."""
+
+    shapes: Array
+    covariances: Array
+
+    def selected(self, keep: NDArray[np.bool_]) -> Outlines:
+        """Those of only some of the stickers."""
+        return Outlines(self.shapes[:, keep], self.covariances[:, keep])
+
+
+@dataclass(frozen=True)
 class StickerObservation:
     """k stickers seen by both cameras.
 
     index (k,) into the body's stickers; left_pixels and right_pixels (k,2) of the sticker centres in the images as they
-    are, distorted (eccentricity removed); points (k,3) and covariances (k,3,3) in the camera frame, m.
+    are, distorted (eccentricity removed); points (k,3) and covariances (k,3,3) in the camera frame, m. outlines: the
+    ellipses' shapes, where the detector states them.
     """
 
     index: NDArray[np.int_]
@@ -51,11 +66,13 @@ class StickerObservation:
     right_pixels: Array
     points: Array
     covariances: Array
+    outlines: Outlines | None = None
 
     def selected(self, keep: NDArray[np.bool_]) -> StickerObservation:
         """The observation with only some of its stickers."""
         return StickerObservation(self.index[keep], self.left_pixels[keep], self.right_pixels[keep],
-                                  self.points[keep], self.covariances[keep])
+                                  self.points[keep], self.covariances[keep],
+                                  None if self.outlines is None else self.outlines.selected(keep))
 
 
 def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings,
@@ -82,8 +99,17 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
     ideal, ideal_spread, found = rig.undistort(seen_at, spread)
     good = np.all(fits.good.reshape(2, -1) & found, axis=0)
     seen = triangulate(rig.ideal, *ideal, *ideal_spread)
-    return StickerObservation(index, seen_at[0], seen_at[1], seen.points, seen.covariances).selected(
+    outlines = _outlines(fits, settings.centre_error_px**2)
+    return StickerObservation(index, seen_at[0], seen_at[1], seen.points, seen.covariances, outlines).selected(
         good & (seen.ray_gap < settings.largest_ray_gap))
+
+
+def _outlines(fits: DetectedCentres, systematic: float) -> Outlines | None:
+    """Shapes of both images' ellipses; ``systematic`` px²: variance of a rim's place that is not noise."""
+    if fits.shapes is None or fits.shape_covariances is None:
+        return None
+    spread = fits.shape_covariances.reshape(2, -1, 3, 3) + systematic * np.eye(3)
+    return Outlines(fits.shapes.reshape(2, -1, 2, 2), spread)
 
 
 def _evenly_lit(windows: Windows, corners: NDArray[np.int_], rig: StereoRig, noise: CameraNoise,

@@ -6,33 +6,22 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .errors import LostError
 from .marked_body import MarkedBody
 from .observation import StickerObservation
 from .plane_frame import frame_of_points
 from .pose import Array, invert, skew
 from .registration import register
 
-LARGEST_POINT_MISFIT = 30.0  # squared residual in units of its noise, three degrees of freedom: one in 700 000
-
 Solution = tuple[Array, Array, StickerObservation]
 
 
-def by_registration(observation: StickerObservation, body: MarkedBody, places: Array) -> Solution:
+def by_registration(observation: StickerObservation, places: Array) -> Solution:
     """camera_from_body (4,4), its covariance (6,6) and the stickers used, by a rigid fit of taught ``places`` (n,3).
 
-    Stickers that contradict the others are left out one by one. Raises LostError with fewer than three off one line.
+    Raises LostError with fewer than three stickers off one line.
     """
-    while True:
-        result = register(places[observation.index], observation.points, observation.covariances)
-        worst = int(result.misfit.argmax())
-        if result.misfit[worst] <= LARGEST_POINT_MISFIT:
-            return result.transform, result.covariance, observation
-        if len(result.misfit) <= 3:
-            raise LostError(f"the {len(result.misfit)} visible stickers contradict each other: squared misfit "
-                            f"{result.misfit[worst]:.0f} of sticker {body.sticker_ids[observation.index[worst]]}, "
-                            f"at most {LARGEST_POINT_MISFIT:.0f}")
-        observation = observation.selected(np.arange(len(result.misfit)) != worst)
+    result = register(places[observation.index], observation.points, observation.covariances)
+    return result.transform, result.covariance, observation
 
 
 def by_planes(observation: StickerObservation, body: MarkedBody, towards: Array) -> Solution:

@@ -8,13 +8,17 @@ from .images import StereoImages
 from .measurement import Measurement, lost_measurement
 from .pose import Array, invert
 
-# A tracked frame that shows less than this share of the stickers seen before is searched as a whole: most windows may
-# have been laid beside their stickers.
+# A tracked frame that shows less than this share of the stickers seen before is searched as a whole too: most windows
+# may have been laid beside their stickers.
 EXPECTED_SHARE = 0.7
 
 
 class Tracker:
-    """Remembers the last two measured poses. A frame in which the prediction fails is searched as a whole at once."""
+    """Remembers the last two measured poses.
+
+    A frame in which the prediction fails is searched as a whole at once; where that finds fewer stickers, what the
+    prediction found stands.
+    """
 
     def __init__(self, estimator: PoseEstimator) -> None:
         self._estimator = estimator
@@ -28,11 +32,17 @@ class Tracker:
 
     def measure(self, images: StereoImages) -> Measurement:
         """Measure one frame; never raises for what is in the images."""
-        try:
-            measurement, measured = self._tracked(images) or self._found(images)
-        except LostError as error:
-            self.forget()
-            return lost_measurement(str(error))
+        best = self._tracked(images)
+        if best is None or len(best[0].target_ids) < EXPECTED_SHARE * self._seen:
+            try:
+                found = self._found(images)
+            except LostError as error:
+                if best is None:
+                    self.forget()
+                    return lost_measurement(str(error))
+            else:
+                best = found if best is None else max(best, found, key=lambda result: len(result[0].target_ids))
+        measurement, measured = best
         self._step_before = None if self._last is None else invert(self._last) @ measured
         self._last, self._seen = measured, len(measurement.target_ids)
         return measurement
@@ -47,12 +57,9 @@ class Tracker:
         if self._last is None:
             return None
         try:
-            measurement, measured = self._estimator.measure(images, self._predicted())
+            return self._estimator.measure(images, self._predicted())
         except LostError:
             return None
-        if len(measurement.target_ids) < EXPECTED_SHARE * self._seen:
-            return None
-        return measurement, measured
 
     def _found(self, images: StereoImages) -> tuple[Measurement, Array]:
         """The measurement after a search of the whole images without any prior."""

@@ -58,7 +58,7 @@ def vision():
         if method == "planes":
             transform, covariance, _ = by_planes(observed, estimator.platform, towards)
         else:
-            transform, covariance, _ = by_registration(observed, estimator.platform, estimator.taught.platform_places)
+            transform, covariance, _ = by_registration(observed, estimator.taught.platform_places)
         base_from_platform = estimator.taught.base_from_camera @ transform
         spread_6 = compose_covariance(estimator.taught.base_from_camera, covariance)
         return transform_to_pose(base_from_platform), pose_covariance(base_from_platform, spread_6)

@@ -26,11 +26,11 @@ def fit_ellipses(windows, corners, noise, fit_size, limits=None, iterations=3):
             change = np.linalg.solve(normal, weighted @ residuals.reshape(len(inner), -1, 1))[..., 0]
             parameters = _bounded(parameters + np.clip(change, -_LARGEST_STEP, _LARGEST_STEP), fit_size)
     misfit = np.sum(weights * residuals**2, axis=(1, 2)) / np.maximum(mask.sum(axis=(1, 2)) - 7.0, 1.0)
-    covariances = np.linalg.inv(normal)[:, :2, :2]
+    covariances = np.linalg.inv(normal)
     good = (parameters[:, 5] >= limits.smallest_contrast) & (misfit <= limits.largest_misfit)
     good &= _inside(parameters, fit_size)
-    return EllipseFits(parameters[:, :2] + inner_corners + corners, covariances, _shape(parameters),
-                       parameters[:, 5], misfit, good)
+    return EllipseFits(parameters[:, :2] + inner_corners + corners, covariances[:, :2, :2], _shape(parameters),
+                       covariances[:, 2:5, 2:5], parameters[:, 5], misfit, good)
 
 
 _LARGEST_STEP = np.array([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0])

@@ -64,7 +64,7 @@ def test_pose_covariance(draws, method):
         if method == "planes":
             found, covariance, _ = by_planes(seen, BODY, BODY.normals @ camera_from_body[:3, :3].T)
         else:
-            found, covariance, _ = by_registration(seen, BODY, BODY.nominal)
+            found, covariance, _ = by_registration(seen, BODY.nominal)
         base_from_body = BASE_FROM_CAMERA @ found
         errors.append(transform_to_pose(base_from_body) - true_pose)
         covariances.append(pose_covariance(base_from_body, compose_covariance(BASE_FROM_CAMERA, covariance)))
@@ -79,5 +79,5 @@ def test_registration_beats_planes(draws):
     _, camera_from_body, _, observed = draws
     seen = observed[0]
     planes = by_planes(seen, BODY, BODY.normals @ camera_from_body[:3, :3].T)[1]
-    rigid = by_registration(seen, BODY, BODY.nominal)[1]
+    rigid = by_registration(seen, BODY.nominal)[1]
     assert np.all(np.linalg.eigvalsh(planes - rigid) > -1e-16)

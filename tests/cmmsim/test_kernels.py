@@ -80,7 +80,7 @@ def test_windows_without_an_ellipse_give_finite_numbers():
     flat[1], flat[2, 3, 3] = 255.0, 255.0
     fits = ellipse_fit.fit_ellipses(flat, np.zeros((3, 2), dtype=int), NOISE, 14)
     assert not fits.good.any()
-    for name in ("centres", "covariances", "shapes", "contrast", "misfit"):
+    for name in ("centres", "covariances", "shapes", "shape_covariances", "contrast", "misfit"):
         assert np.isfinite(getattr(fits, name)).all()
 
 
