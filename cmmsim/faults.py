@@ -1,0 +1,253 @@
+"""Faults of stereo images, drawn at random: what a measurement has to survive or to refuse.
+
+    from cmmsim.faults import FaultGenerator, FaultyImages
+    from cmmsim.tracking import Tracker
+
+    faults = FaultGenerator(sensor.estimator)
+    fault = faults.draw("false_discs", pose, np.random.default_rng(1))
+    tracker = Tracker(sensor.estimator)
+    tracker.measure(FaultyImages(sensor.look(pose), fault, sensor.noise, np.random.default_rng(2)))
+
+Faults are laid over grey values, so they can be laid over pictures from anywhere. Only bodies that hide stickers from
+both cameras consistently have to be drawn with the scene: ``sensor.add_bodies(fault_bodies())`` once, then
+``sensor.look(pose, obstacles=fault.obstacles)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from .errors import UnknownOptionError
+from .estimator import PoseEstimator
+from .fault_marks import DiscMark, FillMark, GlintMark, Mark, PlateMark, paint
+from .images import StereoFrame, StereoImages, Windows
+from .noise import CameraNoise
+from .outlines import sticker_outlines
+from .pose import Array, apply, invert, pose_to_transform
+
+BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)  # m, sides of the boxes that hide stickers
+FEW = 4
+STICKER_RADIANCE, DARK_RADIANCE, SATURATING = 228.0 / 255.0, 60.0 / 255.0, 1.5
+
+
+@dataclass(frozen=True)
+class Fault:
+    """kind: its name; marks: laid over the images; swapped: left image for right; obstacles: bodies of
+    ``fault_bodies`` that stand before the platform, name -> base_from_body (4,4)."""
+
+    kind: str
+    marks: tuple[Mark, ...] = ()
+    swapped: bool = False
+    obstacles: Mapping[str, Array] = field(default_factory=dict)
+
+
+class FaultyImages:
+    """Images with a fault laid over them; reads like the images it is given."""
+
+    def __init__(self, images: StereoImages, fault: Fault, noise: CameraNoise, rng: np.random.Generator) -> None:
+        self._images, self._fault, self._noise, self._rng = images, fault, noise, rng
+
+    def full(self) -> StereoFrame:
+        """Both whole images."""
+        frame = self._images.full()
+        sides = (frame.right, frame.left) if self._fault.swapped else (frame.left, frame.right)
+        origin = np.zeros((1, 2), dtype=int)
+        return StereoFrame(*(self._spoilt(side, image[None], origin)[0] for side, image in enumerate(sides)))
+
+    def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
+        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x, y)."""
+        order = slice(None, None, -1) if self._fault.swapped else slice(None)
+        windows = self._images.windows(corners[order], size)[order]
+        return np.stack([self._spoilt(side, windows[side], corners[side]) for side in range(2)])
+
+    def _spoilt(self, side: int, images: NDArray, corners: NDArray[np.int_]) -> NDArray:
+        """Images (n, h, w) of one camera, with first pixels (n, 2), after its marks were laid over them."""
+        marks = [m for m in self._fault.marks if m.side == side]
+        if not marks:
+            return images
+        grey = images.astype(float)
+        for part, corner in zip(grey, corners, strict=True):
+            for mark in marks:
+                paint(part, corner, mark, self._noise, self._rng)
+        grey = np.clip(grey, 0.0, float(self._noise.white_level))
+        return grey if images.dtype.kind == "f" else np.rint(grey).astype(images.dtype)
+
+
+def fault_bodies() -> dict[str, trimesh.Trimesh]:
+    """Boxes that hide stickers, by the names that ``Fault.obstacles`` uses, m."""
+    return {f"fault box {k}": trimesh.creation.box(extents=(0.5 * size, size, size))
+            for k, size in enumerate(BODY_SIZES)}
+
+
+class FaultGenerator:
+    """Draws faults where an estimator's stickers are; ``kinds`` are the names."""
+
+    def __init__(self, estimator: PoseEstimator) -> None:
+        self._rig, self._platform, self._taught = estimator.rig, estimator.platform, estimator.taught
+        self._radius = estimator.settings.radius
+        self._drawn: dict[str, Callable[[Array, np.random.Generator], Fault]] = {
+            "hidden": self._hidden, "half_hidden": self._half_hidden, "obstacles": self._obstacles,
+            "one_camera_dark": self._one_camera_dark, "one_camera_covered": self._one_camera_covered,
+            "false_discs": self._false_discs, "false_points": self._false_points, "glint": self._glint,
+            "merging": self._merging, "swapped": self._swapped, "black": self._black, "saturated": self._saturated,
+            "several": self._several}
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """hidden: stickers covered in one or both images; half_hidden: cut by a straight edge; obstacles: bodies stand
+        before the platform; one_camera_dark, one_camera_covered; false_discs: discs like stickers in single images;
+        false_points: discs in both images where one point in space would show; glint: saturated light with a tail on
+        or beside stickers; merging: discs that touch stickers; swapped: left for right; black, saturated: whole frames;
+        several: two or three of those at once that leave something to measure."""
+        return tuple(self._drawn)
+
+    def draw(self, kind: str, pose: Array, rng: np.random.Generator) -> Fault:
+        """A fault of that kind for the platform at a pose (6,). Raises UnknownOptionError with the valid kinds."""
+        if kind not in self._drawn:
+            raise UnknownOptionError("fault", kind, self.kinds)
+        return self._drawn[kind](np.asarray(pose, dtype=float), rng)
+
+    def _outlines(self, pose: Array) -> tuple[Array, Array]:
+        """Ellipses of all stickers: centres (2, n, 2) and shapes (2, n, 2, 2), px."""
+        camera_from_platform = invert(self._taught.base_from_camera) @ pose_to_transform(pose)
+        return sticker_outlines(self._rig, camera_from_platform, self._taught.platform_places,
+                                self._platform.sticker_normals, self._radius)
+
+    def _some(self, rng: np.random.Generator, most: int | None = None) -> NDArray[np.int_]:
+        """Random stickers: as often as not up to FEW of them, else up to all; never more than ``most``."""
+        count = len(self._taught.platform_places)
+        largest = min(most or count, FEW if rng.random() < 0.5 else count, count)
+        return rng.choice(count, rng.integers(1, largest + 1), replace=False)
+
+    def _hidden(self, pose: Array, rng: np.random.Generator) -> Fault:
+        centres, shapes = self._outlines(pose)
+        sides = _one_or_both(rng)
+        return Fault("hidden", tuple(
+            PlateMark(side, centres[side, k], _reach(shapes[side, k]) + rng.uniform(1.0, 12.0, 2),
+                      rng.uniform(0.0, np.pi), DARK_RADIANCE) for k in self._some(rng) for side in sides))
+
+    def _half_hidden(self, pose: Array, rng: np.random.Generator) -> Fault:
+        """The edge stands anywhere between a sticker's nearest and farthest rim, often close to the nearest one."""
+        centres, shapes = self._outlines(pose)
+        sides, marks = _one_or_both(rng), []
+        for k in self._some(rng):
+            angle, depth = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.0, 1.0) ** rng.choice([1, 3])
+            normal = np.array([np.cos(angle), np.sin(angle)])
+            for side in sides:
+                rim = float(np.linalg.norm(shapes[side, k] @ normal))
+                half = np.array([rng.uniform(6.0, 20.0), 15.0])
+                away = half[0] + rim * (1.0 - 2.0 * depth)
+                marks.append(PlateMark(side, centres[side, k] + away * normal, half, angle, DARK_RADIANCE))
+        return Fault("half_hidden", tuple(marks))
+
+    def _obstacles(self, pose: Array, rng: np.random.Generator) -> Fault:
+        names = list(fault_bodies())
+        places = {}
+        for number in rng.choice(len(names), rng.integers(1, len(names) + 1), replace=False):
+            sticker = self._taught.platform_places[rng.integers(len(self._taught.platform_places))]
+            at = apply(pose_to_transform(pose), sticker)
+            middle = 0.5 * (self._taught.base_from_camera[:3, 3] + self._right_eye())
+            place = np.eye(4)
+            size = BODY_SIZES[number]
+            place[:3, 3] = at + rng.uniform(0.02, 0.5) * (middle - at) + rng.uniform(-0.7, 0.7, 3) * size
+            place[:3, :3] = pose_to_transform(np.r_[0.0, 0.0, 0.0, rng.uniform(-1.0, 1.0, 3)])[:3, :3]
+            places[names[number]] = place
+        return Fault("obstacles", obstacles=places)
+
+    def _right_eye(self) -> Array:
+        """Place (3,) of the right camera in the base frame."""
+        return apply(self._taught.base_from_camera, invert(self._rig.right_from_left)[:3, 3])
+
+    def _one_camera_dark(self, pose: Array, rng: np.random.Generator) -> Fault:
+        return Fault("one_camera_dark", (FillMark(int(rng.integers(2)), 0.0),))
+
+    def _one_camera_covered(self, pose: Array, rng: np.random.Generator) -> Fault:
+        return Fault("one_camera_covered", (FillMark(int(rng.integers(2)), rng.uniform(0.0, 1.0)),))
+
+    def _false_discs(self, pose: Array, rng: np.random.Generator) -> Fault:
+        """Among the stickers, on them or near them."""
+        centres, shapes = self._outlines(pose)
+        marks = []
+        for _ in range(rng.integers(1, 31)):
+            side = int(rng.integers(2))
+            near, shape = centres[side, rng.integers(centres.shape[1])], shapes[side, rng.integers(centres.shape[1])]
+            marks.append(DiscMark(side, near + rng.choice([2.0, 6.0, 80.0]) * rng.standard_normal(2),
+                                  rng.uniform(0.7, 1.4) * shape, _radiance(rng)))
+        return Fault("false_discs", tuple(marks))
+
+    def _false_points(self, pose: Array, rng: np.random.Generator) -> Fault:
+        """Discs in space, on the platform's planes or somewhere around; they hide what is behind them."""
+        stickers, marks = self._taught.platform_places, []
+        camera_from_platform = invert(self._taught.base_from_camera) @ pose_to_transform(pose)
+        for _ in range(rng.integers(1, 21)):
+            k = rng.integers(len(stickers))
+            off = rng.choice([0.0005, 0.003, 0.01, 0.1]) * rng.standard_normal(3)
+            centres, shapes = sticker_outlines(self._rig, camera_from_platform, stickers[k:k + 1] + off,
+                                               self._platform.sticker_normals[k:k + 1], self._radius)
+            radiance = _radiance(rng)
+            marks += [DiscMark(side, centres[side, 0], shapes[side, 0], radiance) for side in range(2)]
+        return Fault("false_points", tuple(marks))
+
+    def _glint(self, pose: Array, rng: np.random.Generator) -> Fault:
+        """Of one surface, so both cameras see it near the same sticker, in unlike directions and strengths."""
+        centres, shapes = self._outlines(pose)
+        return Fault("glint", tuple(
+            GlintMark(side, centres[side, k] + rng.uniform(0.0, 4.0) * shapes[side, k] @ _direction(rng),
+                      10.0 ** rng.uniform(-1.5, 1.0), rng.uniform(0.5, 3.0), 10.0 ** rng.uniform(-2.5, 0.5),
+                      rng.uniform(2.0, 20.0), rng.uniform(0.0, np.pi))
+            for k in self._some(rng, 6) for side in _one_or_both(rng)))
+
+    def _merging(self, pose: Array, rng: np.random.Generator) -> Fault:
+        """The discs' rims overlap, touch, or leave a small gap."""
+        centres, shapes = self._outlines(pose)
+        sides, marks = _one_or_both(rng), []
+        for k in self._some(rng):
+            towards, gap, radiance = _direction(rng), rng.uniform(0.2, 2.4), _radiance(rng)
+            marks += [DiscMark(side, centres[side, k] + gap * shapes[side, k] @ towards, shapes[side, k], radiance)
+                      for side in sides]
+        return Fault("merging", tuple(marks))
+
+    def _swapped(self, pose: Array, rng: np.random.Generator) -> Fault:
+        return Fault("swapped", swapped=True)
+
+    def _black(self, pose: Array, rng: np.random.Generator) -> Fault:
+        return Fault("black", (FillMark(0, 0.0), FillMark(1, 0.0)))
+
+    def _saturated(self, pose: Array, rng: np.random.Generator) -> Fault:
+        return Fault("saturated", (FillMark(0, SATURATING), FillMark(1, SATURATING)))
+
+    def _several(self, pose: Array, rng: np.random.Generator) -> Fault:
+        kinds = ["hidden", "half_hidden", "obstacles", "false_discs", "false_points", "glint", "merging"]
+        parts = [self.draw(kind, pose, rng) for kind in rng.choice(kinds, rng.integers(2, 4), replace=False)]
+        obstacles = {name: place for part in parts for name, place in part.obstacles.items()}
+        return Fault("several", tuple(mark for part in parts for mark in part.marks), obstacles=obstacles)
+
+
+def jump(pose: Array, rng: np.random.Generator, shift: float = 0.01, turn: float = 0.04) -> Array:
+    """A pose (6,) up to ``shift`` m and ``turn`` rad off in each coordinate: the platform moved between two frames."""
+    return np.asarray(pose, dtype=float) + rng.uniform(-1.0, 1.0, 6) * ([shift] * 3 + [turn] * 3)
+
+
+def _one_or_both(rng: np.random.Generator) -> tuple[int, ...]:
+    """The left image, the right one, or, as often as not, both."""
+    return ((0,), (1,), (0, 1), (0, 1))[rng.integers(4)]
+
+
+def _radiance(rng: np.random.Generator) -> float:
+    """That of a sticker, or another bright one."""
+    return STICKER_RADIANCE if rng.random() < 0.5 else float(rng.uniform(0.3, 1.3))
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+def _reach(shape: Array) -> Array:
+    """Half sides (2,) px of a box that holds an ellipse however it is turned."""
+    return np.full(2, np.linalg.norm(shape, 2))
