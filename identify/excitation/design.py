@@ -18,7 +18,6 @@ from identify.excitation.criterion_linear_information import log_linear_informat
 from identify.excitation.criterion_observability import SMOOTHING_RAD_S, log_observability
 from identify.excitation.evolutionary_search import FEWEST_MEMBERS, evolve
 from identify.excitation.gradient_search import climb
-from identify.excitation.motion import sample_times
 from identify.excitation.random_search import Check, RegressorRobot, admissible_trajectories, observability_indices
 from identify.excitation.search import SearchProblem, SearchResult
 from identify.excitation.unknowns import unknowns
@@ -29,9 +28,6 @@ from identify.trajectory_file import TrajectorySet
 
 STARTS = 3
 """Random trajectories from which IPOPT climbs."""
-
-CHECK_REFINEMENT = 4
-"""How much finer random trajectories are checked than criteria are sampled."""
 
 RANDOM_TOLERANCE = 1e-3
 """Share by which random trajectories may go over a limit: they fill the box as closely as they were sampled for it."""
@@ -77,10 +73,9 @@ def motion_check(robot: RegressorRobot, scenario: Scenario) -> Check:
                 f"excitation.method = {scenario.excitation.method!r} with criterion "
                 f"{scenario.excitation.criterion!r} needs the geometry of a robot, {robot.name} has none"
             )
-        return lambda trajectory: None
+        return lambda trajectory, times: None
     constraints = MotionConstraints(robot, scenario)
-    times = sample_times(scenario.excitation.fundamental_hz, scenario.excitation.harmonics, CHECK_REFINEMENT)
-    return lambda trajectory: constraints.check(trajectory, times, RANDOM_TOLERANCE)
+    return lambda trajectory, times: constraints.check(trajectory, times, RANDOM_TOLERANCE)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,9 @@ INTERIOR = 0.98
 FAR = 0.5
 """A limit of which a start uses less than this share is left out at first."""
 
+INTERRUPTED = ("NonIpopt_Exception_Thrown", "User_Requested_Stop")
+"""What CasADi makes of Ctrl-C; nothing in the problem calls back to Python, where other exceptions could come from."""
+
 ALWAYS = "box"
 """The limit that always counts: without it a criterion grows without end."""
 
@@ -59,6 +62,8 @@ def _climb_from(problem: SearchProblem, z: Array) -> SearchResult:
         done, stats = solver(x0=z, lbg=-1.0, ubg=1.0), solver.stats()
         values, gradients = values + int(stats["n_call_nlp_f"]), gradients + int(stats["n_call_nlp_grad_f"])
         iterations, reason = iterations + int(stats["iter_count"]), str(stats["return_status"])
+        if reason in INTERRUPTED:
+            raise KeyboardInterrupt
         found = np.array(done["x"]).ravel()
         if not np.isfinite(found).all() or not np.isfinite(float(done["f"])):
             return SearchResult(z, -np.inf, values, gradients, iterations, reason)

@@ -25,8 +25,8 @@ NULL_TOLERANCE = 1e-9
 ATTEMPTS = 50
 """Random trajectories tried, on the average, for each one that has to be admissible."""
 
-Check = Callable[[FourierTrajectory], object]
-"""Raises TrajectoryError for a trajectory that is not admissible."""
+Check = Callable[[FourierTrajectory, Array], object]
+"""Raises TrajectoryError for a trajectory that is not admissible at some instants (N,) [s]."""
 
 
 class RegressorRobot(TravelLimitedRobot, Protocol):
@@ -82,7 +82,7 @@ def admissible_trajectories(
     duration_s: float,
     count: int,
     seed: np.random.SeedSequence,
-    check: Check = lambda trajectory: None,
+    check: Check = lambda trajectory, times: None,
 ) -> list[FourierTrajectory]:
     """Random trajectories that stay inside the travel less the margin and pass `check`.
 
@@ -104,7 +104,7 @@ def admissible_trajectories(
         )
         try:
             check_travel(robot, candidate, t, settings.travel_margin_rad)
-            check(candidate)
+            check(candidate, t)
         except TrajectoryError as error:
             reason = error
             continue

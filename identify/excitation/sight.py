@@ -10,7 +10,7 @@ from identify.arrays import Array
 from identify.errors import TrajectoryError
 
 STICKERS_A_PLANE = 4
-"""Stickers of each plane that both cameras must be able to look for at every pose."""
+"""Stickers of each plane that both cameras must be able to look for at every pose; all where it has fewer."""
 
 PLANES = "ABC"
 
@@ -24,13 +24,14 @@ def required_stickers(sight: SightLines, home: Array) -> list[int]:
     worst, visible = np.abs(uses).max(axis=(1, 2)), sight.visible(home)
     chosen: list[int] = []
     for index, plane in enumerate(PLANES):
-        able = np.flatnonzero(visible & (sight.platform.plane_index == index))
-        if len(able) < STICKERS_A_PLANE:
+        on_plane = sight.platform.plane_index == index
+        able, needed = np.flatnonzero(visible & on_plane), min(STICKERS_A_PLANE, int(on_plane.sum()))
+        if len(able) < needed:
             raise TrajectoryError(
                 f"visibility: both cameras can look for {len(able)} stickers of plane {plane} at the home pose, "
-                f"{STICKERS_A_PLANE} are needed"
+                f"{needed} are needed"
             )
-        chosen += able[np.argsort(worst[able], kind="stable")][:STICKERS_A_PLANE].tolist()
+        chosen += able[np.argsort(worst[able], kind="stable")][:needed].tolist()
     return chosen
 
 
