@@ -23,7 +23,7 @@ from identify.excitation.unknowns import Unknowns
 from identify.loop_parameters import NAMES
 from identify.scenario import Scenario
 
-HARMONICS_SEEN = 4
+HARMONICS_SEEN = 8
 """Sensitivities count up to this multiple of the highest harmonic of the trajectory."""
 
 
