@@ -61,6 +61,10 @@ A real camera, or pictures to try it with:
   cmmsim calibrate --help                intrinsics, distortion and stereo from pictures of a board
 
 \b
+Which motion shows most:
+  cmmsim excite paper --compare          random, evolutionary and gradient search side by side
+
+\b
 Where the robot can go:
   cmmsim workspace rss6                  maps of travel, reach and conditioning
 
