@@ -1,6 +1,7 @@
 """Faults of stereo images, drawn at random: what a measurement has to survive or to refuse.
 
-    from cmmsim.faults import FaultGenerator, FaultyImages
+    from cmmsim.faults import FaultGenerator
+    from cmmsim.faulty_images import FaultyImages
     from cmmsim.tracking import Tracker
 
     faults = FaultGenerator(sensor.estimator)
@@ -15,8 +16,7 @@ both cameras consistently have to be drawn with the scene: ``sensor.add_bodies(f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
 
 import numpy as np
 import trimesh
@@ -24,58 +24,14 @@ from numpy.typing import NDArray
 
 from .errors import UnknownOptionError
 from .estimator import PoseEstimator
-from .fault_marks import DiscMark, FillMark, GlintMark, Mark, PlateMark, paint
-from .images import StereoFrame, StereoImages, Windows
-from .noise import CameraNoise
+from .fault_marks import DiscMark, FillMark, GlintMark, PlateMark
+from .faulty_images import Fault
 from .outlines import sticker_outlines
 from .pose import Array, apply, invert, pose_to_transform
 
 BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)  # m, sides of the boxes that hide stickers
 FEW = 4
 STICKER_RADIANCE, DARK_RADIANCE, SATURATING = 228.0 / 255.0, 60.0 / 255.0, 1.5
-
-
-@dataclass(frozen=True)
-class Fault:
-    """kind: its name; marks: laid over the images; swapped: left image for right; obstacles: bodies of
-    ``fault_bodies`` that stand before the platform, name -> base_from_body (4,4)."""
-
-    kind: str
-    marks: tuple[Mark, ...] = ()
-    swapped: bool = False
-    obstacles: Mapping[str, Array] = field(default_factory=dict)
-
-
-class FaultyImages:
-    """Images with a fault laid over them; reads like the images it is given."""
-
-    def __init__(self, images: StereoImages, fault: Fault, noise: CameraNoise, rng: np.random.Generator) -> None:
-        self._images, self._fault, self._noise, self._rng = images, fault, noise, rng
-
-    def full(self) -> StereoFrame:
-        """Both whole images."""
-        frame = self._images.full()
-        sides = (frame.right, frame.left) if self._fault.swapped else (frame.left, frame.right)
-        origin = np.zeros((1, 2), dtype=int)
-        return StereoFrame(*(self._spoilt(side, image[None], origin)[0] for side, image in enumerate(sides)))
-
-    def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
-        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x, y)."""
-        order = slice(None, None, -1) if self._fault.swapped else slice(None)
-        windows = self._images.windows(corners[order], size)[order]
-        return np.stack([self._spoilt(side, windows[side], corners[side]) for side in range(2)])
-
-    def _spoilt(self, side: int, images: NDArray, corners: NDArray[np.int_]) -> NDArray:
-        """Images (n, h, w) of one camera, with first pixels (n, 2), after its marks were laid over them."""
-        marks = [m for m in self._fault.marks if m.side == side]
-        if not marks:
-            return images
-        grey = images.astype(float)
-        for part, corner in zip(grey, corners, strict=True):
-            for mark in marks:
-                paint(part, corner, mark, self._noise, self._rng)
-        grey = np.clip(grey, 0.0, float(self._noise.white_level))
-        return grey if images.dtype.kind == "f" else np.rint(grey).astype(images.dtype)
 
 
 def fault_bodies() -> dict[str, trimesh.Trimesh]:

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import cmmsim
-from cmmsim.faults import FaultGenerator, FaultyImages, fault_bodies
+from cmmsim.faults import FaultGenerator, fault_bodies
+from cmmsim.faulty_images import FaultyImages
 from cmmsim.pose import invert
 from cmmsim.sensor_file import read_sensor_file
 from cmmsim.taught import Taught

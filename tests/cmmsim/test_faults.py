@@ -6,7 +6,8 @@ from scipy.stats import binom, chi2
 
 import cmmsim
 from cmmsim.fault_marks import DiscMark, FillMark, GlintMark, PlateMark, paint
-from cmmsim.faults import Fault, FaultGenerator, FaultyImages, jump
+from cmmsim.faults import FaultGenerator, jump
+from cmmsim.faulty_images import Fault, FaultyImages
 from cmmsim.images import FrameImages, StereoFrame
 from cmmsim.noise import CameraNoise
 from cmmsim.tracking import Tracker
