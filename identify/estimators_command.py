@@ -1,5 +1,6 @@
 """The command ``cmmsim estimators``. Heavy imports are late."""
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 INSTRUMENTS_STREAM = 20
 """Random stream of the joint instruments, beside those of the experiment."""
 
-HEADER = ("estimator", "groups\n%", "gains\n%", "position\num", "orient.\nurad", "time\ns", "iter.", "evals")
+HEADER = ("estimator", "groups\n%", "median\n%", "gains\n%", "pos.\num", "ori.\nurad", "time\ns", "iter.", "evals")
 
 
 def estimators(
@@ -40,8 +41,6 @@ def estimators(
     are simulated from its truth, with the noise given here. Where the PID is known it has the true gains. All are
     judged by the truth of the record and of the unseen trajectories.
     """
-    from math import pi
-
     from identify.estimators.registry import choose
     from identify.estimators_figure import estimators_figure
     from identify.figures import save_figure
@@ -50,7 +49,7 @@ def estimators(
 
     folder = RunFolder(out)
     folder.require("scenario.toml", "experiment.nc", "validation.nc")
-    instruments = JointInstruments(torque_noise, encoder_noise, 2 * pi / 2**encoder_bits)
+    instruments = JointInstruments(torque_noise, encoder_noise, 2 * math.pi / 2**encoder_bits)
     chosen = choose(only)
     scores = _scores(folder, instruments, chosen, seed, quiet)
     entry = {"seed": seed, "instruments": asdict(instruments), "estimators": {s.name: _entry(s) for s in scores}}
@@ -109,9 +108,9 @@ def _entry(score: "Score") -> dict[str, Any]:
 def _print(scores: list["Score"], out: Path) -> None:
     table = RichTable(
         title="estimators on one record, against one truth",
-        caption="groups, gains: RMS relative error of the base parameters that the record shows, and of the joint PID; "
-        "position, orientation: model against true plant on unseen trajectories, RMS of the worst axis and run; "
-        "evals: simulated runs of the model",
+        caption="groups: RMS and median relative error of the base parameters that the record shows; gains: RMS of "
+        "those of the joint PID; position, orientation: model against true plant on unseen trajectories, RMS of the "
+        "worst axis and run; evals: simulated runs of the model",
         box=SIMPLE_HEAD,
         show_edge=False,
         padding=0,
@@ -129,7 +128,14 @@ def _print(scores: list["Score"], out: Path) -> None:
 
 
 def _figures(score: "Score") -> list[str]:
-    from identify.tables import number
+    """A row of the table; a dash where there is nothing, such as the error of an unstable model."""
+    gains = "given" if "gains" in score.uses else _short(100 * score.gain_distance)
+    groups = [_short(100 * value) for value in (score.group_distance, score.group_median)]
+    poses = [_short(value) for value in (score.position_um, score.orientation_urad, score.seconds)]
+    return [*groups, gains, *poses, str(score.iterations), str(score.evaluations)]
 
-    shown = (100 * score.group_distance, 100 * score.gain_distance, score.position_um, score.orientation_urad)
-    return [*map(number, shown), number(score.seconds), str(score.iterations), str(score.evaluations)]
+
+def _short(value: float) -> str:
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"

@@ -1,4 +1,4 @@
-"""Figure of the estimators: distances of parameters and poses, and time, one bar each."""
+"""Figure of the estimators: distances of parameters and poses, and time, one point each."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from identify.estimator_comparison import Score
 
 PANELS = (
-    ("base parameters", "RMS error [%]", "group_distance", 100.0),
+    ("base parameters", "median error [%]", "group_median", 100.0),
     ("unseen position", "worst RMS [um]", "position_um", 1.0),
     ("unseen orientation", "worst RMS [urad]", "orientation_urad", 1.0),
     ("time", "seconds", "seconds", 1.0),
@@ -17,15 +17,15 @@ PANELS = (
 
 
 def estimators_figure(scores: Sequence[Score]) -> Figure:
-    """Logarithmic bars, one panel a figure of merit; what does not exist (an unstable model) has no bar."""
+    """Points on logarithmic axes, one panel a figure of merit; what does not exist (an unstable model) has none."""
     figure = Figure(figsize=(14, 1.2 + 0.42 * len(scores)), layout="constrained")
     FigureCanvasAgg(figure)
     places = np.arange(len(scores))[::-1]
     for axes, (title, label, field, factor) in zip(figure.subplots(1, len(PANELS), sharey=True), PANELS, strict=True):
         values = np.array([factor * getattr(score, field) for score in scores], dtype=float)
-        axes.barh(places, np.where(values > 0, values, np.nan), color="tab:blue", height=0.7)
+        axes.plot(np.where(values > 0, values, np.nan), places, "o", color="tab:blue")
         axes.set(title=title, xlabel=label, xscale="log")
-        axes.grid(alpha=0.3, axis="x", which="both")
+        axes.grid(alpha=0.3, which="both")
     figure.axes[0].set_yticks(places, [score.title for score in scores])
     figure.suptitle("Estimators on one record, against one truth")
     return figure

@@ -43,6 +43,7 @@ def test_distances_are_relative_and_of_what_the_record_shows(seen, asked):
     assert 20 <= len(asked.combinations) <= 37
     off = score(seen, asked, 1.03 * truth())
     assert off.group_distance == pytest.approx(0.03, rel=1e-9)
+    assert off.group_median == pytest.approx(0.03, rel=1e-9)
     assert off.gain_distance == pytest.approx(0.03, rel=1e-9)
     hidden = truth().copy()
     hidden[[5, 6]] *= 5.0  # Ixx and Iyy of the first crank do no work
