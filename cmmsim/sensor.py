@@ -33,6 +33,7 @@ from .tracking import Tracker
 from .views import Drawable
 from .virtual_camera import Quality, VirtualStereoCamera
 
+SHARP_SIZES, BLURRED_SIZES = (14, 12), (16, 14)  # px, of windows and of what is fitted in them
 TEACHING_STREAM, RUN_STREAM, DROPOUT_STREAM = 0, 1, 2
 
 
@@ -78,10 +79,12 @@ class Sensor:
 
     @cached_property
     def settings(self) -> DetectionSettings:
-        """How stickers are looked for in windows."""
+        """How stickers are looked for in windows; blurred ones need a wider view."""
         limits = FitLimits(smallest_contrast=SMALLEST_STEP * self.noise.white_level)
-        return DetectionSettings(radius=self._file.stickers.radius, detector=self._file.detection.detector,
-                                 limits=limits, optics=self.optics,
+        sharp = self.optics.psf_px == 0.0 and self.timing.exposure == 0.0
+        window_size, fit_size = SHARP_SIZES if sharp else BLURRED_SIZES
+        return DetectionSettings(window_size, fit_size, radius=self._file.stickers.radius,
+                                 detector=self._file.detection.detector, limits=limits, optics=self.optics,
                                  centre_error_px=self._camera.centre_error_px(Quality()))
 
     @property

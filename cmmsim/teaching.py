@@ -41,6 +41,8 @@ class TeachingPlan:
     platform: Quality = field(default_factory=lambda: Quality(supersampling=12, exposures=30))
     poses: int = 64
     base_window: int = 20
+    first_window: int = 24
+    platform_window: int = 16
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ class Teacher:
         """Observations along the teaching path, each expected where the ones before lead to."""
         places, last, step, seen = self.platform.nominal, rough, np.eye(4), []
         for k, pose in enumerate(path):
-            size = self.settings.window_size + (8 if k < 2 else 0)
+            size = self.plan.first_window if k < 2 else self.plan.platform_window
             seen.append(self._look_at(self.platform, last @ step, places, pose, rng, self.plan.platform, size))
             if k == 0:
                 body_from_camera = invert(by_planes(seen[0], self.platform, _towards(self.platform, rough))[0])

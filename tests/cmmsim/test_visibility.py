@@ -14,9 +14,9 @@ HOME = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
 def test_all_stickers_are_visible_at_home_and_few_with_the_platform_turned_away():
     sight = sight_lines("ctrack780")
     assert sight.visible(HOME).all()
-    away = sight.visible(HOME + [0, 0, 0, 0, 0, np.pi / 2])
+    away = sight.visible(HOME + np.array([0, 0, 0, 0, 0, np.pi / 2]))
     assert not away.all()
-    assert not sight.visible(HOME + [0, 0, 0, 0, np.pi, 0])[sight.platform.plane_index == 0].any()
+    assert not sight.visible(HOME + np.array([0, 0, 0, 0, np.pi, 0]))[sight.platform.plane_index == 0].any()
 
 
 def test_stickers_beyond_the_image_are_not_visible():
