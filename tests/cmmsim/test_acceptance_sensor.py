@@ -129,7 +129,7 @@ def test_standing_and_moving_bar_have_the_stated_errors(volume):
 
 @pytest.mark.slow
 def test_motion_blur_reaches_the_moving_bar_only(volume):
-    """With 1 ms of exposure the same frames of the standing bar come out as with 1 ns, and others once it moves fast."""
+    """With 1 ms of exposure a standing bar gives the frames it gives with 1 ns, and others once it moves fast."""
     path, times = bar_paths(volume)[3], np.arange(-2, 16) / 60.0
     runs = []
     for exposure in (1e-9, 1e-3):
