@@ -88,7 +88,7 @@ def simulate(
         lost = mask("lost", lost, len(reference.poses), SimulationError).astype(np.int8)
     if latencies is not None:
         latencies = checked_latencies(latencies, len(reference.poses), settings.timing)
-    robot.check_reach(reference.poses, "reference pose", "frame")
+    reference.check_reach(robot)
     parameters = _check_loop_parameters(parameters)
     if start is None:
         start = equilibrium(robot, parameters, reference.poses[0], settings.servo)

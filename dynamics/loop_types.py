@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, get_args
+from weakref import WeakSet
 
 import numpy as np
 
@@ -88,19 +89,31 @@ class LoopSettings:
 
 @dataclass(frozen=True)
 class Reference:
-    """Desired motion at the frame times: poses (frames, 6) and pose rates (frames, 6)."""
+    """Desired motion at the frame times: poses (frames, 6) and pose rates (frames, 6), copied and frozen."""
 
     poses: np.ndarray
     rates: np.ndarray
+    _reached_by: WeakSet[Robot] = field(default_factory=WeakSet, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("poses", "rates"):
             array = floats(f"reference {name}", getattr(self, name), ("N", 6), error=SimulationError)
             if len(array) < 2:
                 raise SimulationError(f"reference {name} must have at least 2 frames, got {len(array)}")
-            object.__setattr__(self, name, np.ascontiguousarray(array))
+            frozen = np.array(array, order="C")
+            frozen.setflags(write=False)
+            object.__setattr__(self, name, frozen)
         if self.poses.shape != self.rates.shape:
             raise SimulationError(f"reference poses {self.poses.shape} and rates {self.rates.shape} differ in shape")
+
+    def __reduce__(self) -> tuple[type["Reference"], tuple[np.ndarray, np.ndarray]]:
+        return Reference, (self.poses, self.rates)
+
+    def check_reach(self, robot: Robot) -> None:
+        """Raise UnreachablePoseError, naming frame and leg, for a pose out of a robot's reach; asked once a robot."""
+        if robot not in self._reached_by:
+            robot.check_reach(self.poses, "reference pose", "frame")
+            self._reached_by.add(robot)
 
 
 @dataclass(frozen=True)
