@@ -40,6 +40,22 @@ def fastest(rounds: dict[str, Callable[[], object]], count: int) -> dict[str, fl
     return best
 
 
+REFERENCE_SECONDS = 0.026
+"""Fastest `calibration` on the machine whose absolute figures are the goals."""
+
+
+def calibration() -> object:
+    """A fixed piece of work in NumPy and Python on one core."""
+    values = np.random.default_rng(0).standard_normal(200_000)
+    return np.sort(values)[0] + sum(k * k for k in range(300_000))
+
+
+def slowness() -> float:
+    """How many times slower this machine is than the one of the absolute goals; at least 1, so that none is eased on a
+    fast machine."""
+    return max(1.0, fastest({"work": calibration}, 15)["work"] / REFERENCE_SECONDS)
+
+
 @dataclass(frozen=True)
 class CoreTime:
     """Wall time, time in which cores were busy, and what of it this process and its ended children took, all in s."""
