@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 from identify.errors import IdentifyError
 
 if TYPE_CHECKING:
-    from identify.estimation import IdentificationResult, identify
-    from identify.experiment import run_experiment
+    from identify.estimation.identification import IdentificationResult, identify
+    from identify.experiment.run import run_experiment
     from identify.scenario import Scenario, load_scenario, scenario_names
 
 _HOME = {
-    "IdentificationResult": "identify.estimation",
-    "identify": "identify.estimation",
-    "run_experiment": "identify.experiment",
+    "IdentificationResult": "identify.estimation.identification",
+    "identify": "identify.estimation.identification",
+    "run_experiment": "identify.experiment.run",
     "Scenario": "identify.scenario",
     "load_scenario": "identify.scenario",
     "scenario_names": "identify.scenario",

@@ -10,17 +10,17 @@ import typer
 from rich.console import Console
 from rich.table import Table as RichTable
 
-from identify.acceptance_command import acceptance
-from identify.base_parameters_command import base_parameters
-from identify.calibrate_command import CALIBRATE_HELP, calibrate
-from identify.detectors_command import detectors
-from identify.engine_commands import export, verify_model
+from identify.commands.acceptance import acceptance
+from identify.commands.base_parameters import base_parameters
+from identify.commands.calibrate import CALIBRATE_HELP, calibrate
+from identify.commands.detectors import detectors
+from identify.commands.engines import export, verify_model
+from identify.commands.estimators import estimators
+from identify.commands.workspace import workspace
 from identify.errors import IdentifyError, ScenarioError
-from identify.estimators_command import estimators
+from identify.files.run_folder import RunFolder, new_run_folder
 from identify.progress import Progress, RichProgress, SilentProgress
-from identify.run_folder import RunFolder, new_run_folder
 from identify.scenario import Scenario, load_scenario, scenario_names
-from identify.workspace_command import workspace
 
 HELP = """
 Identify a parallel robot from rendered stereo images, and prove how good the result is.
@@ -177,9 +177,9 @@ def excite(
     name = f"excite-{chosen.name}-{seed}" if compare else f"{chosen.name}-{seed}"
     folder = new_run_folder(out or Path("runs") / name)
     if compare:
-        from identify import excite_compare
+        from identify.commands import compare_excitation
 
-        excite_compare.compare(chosen, seed, folder.path, _progress(quiet), quiet)
+        compare_excitation.compare(chosen, seed, folder.path, _progress(quiet), quiet)
         return
     _pipeline().excite(chosen, seed, folder.path, _progress(quiet))
 
@@ -241,8 +241,8 @@ def parse_settings(settings: list[str] | None) -> dict[str, Any]:
 
 def print_summary(folder: RunFolder) -> None:
     """Print the goals of a run with their values, and where its report is."""
-    from identify.result_file import load_result
-    from identify.tables import goals_table
+    from identify.files.result_file import load_result
+    from identify.reporting.tables import goals_table
 
     table = goals_table(load_result(folder.result))
     shown = RichTable(title=table.title, caption=table.note, show_edge=False)

@@ -19,17 +19,17 @@ from numpy.typing import NDArray
 
 from dynamics import DynamicsError, Robot
 from identify.arrays import Array
-from identify.base_parameters import base_parameters, structural_regressor
 from identify.errors import EstimationError
-from identify.estimate_covariance import estimate_uncertainty
+from identify.estimation.base_parameters import base_parameters, structural_regressor
+from identify.estimation.estimate_covariance import estimate_uncertainty
+from identify.estimation.group_estimates import group_estimates
 from identify.estimators.evidence import Evidence
 from identify.estimators.registry import Estimator
-from identify.group_estimates import group_estimates
+from identify.experiment.truth import true_poses
+from identify.files.result_file import rms_figures, rms_row
 from identify.progress import Progress
-from identify.recorded_run import recorded_reference
-from identify.result_file import rms_figures, rms_row
+from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario
-from identify.truth import true_poses
 from identify.validation import model_run
 
 START = "starting guess"

@@ -10,25 +10,32 @@ import cmmsim
 from dynamics import Robot, load_robot
 from dynamics.closed_loop import prepare
 from dynamics.workspace import check_motion
-from identify import estimation, recording
 from identify.arrays import Array
-from identify.atomic import write_text
+from identify.estimation import identification
+from identify.estimation.loop_parameters import check_parameter_set
 from identify.excitation import design_trajectories
-from identify.experiment import excitation_run, taught_sensor, teach, untaught_sensor
-from identify.loop_parameters import check_parameter_set
-from identify.loop_setup import frame_times
-from identify.model_runs import build_model_run, write_model_runs
+from identify.experiment.run import excitation_run, taught_sensor, teach, untaught_sensor
+from identify.experiment.truth import read_truth, true_parameters
+from identify.files.atomic import write_text
+from identify.files.result_file import load_result, rms_figures, save_result
+from identify.files.run_folder import RunFolder
+from identify.files.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
+from identify.files.versions import versions
 from identify.progress import Progress
-from identify.recorded_run import recorded_reference
-from identify.report import write_report
-from identify.result_file import load_result, rms_figures, save_result
-from identify.run_folder import RunFolder
-from identify.run_result import add_truth, identification_entry, parameter_vector, sensor_entry, validation_entry
+from identify.record import recording
+from identify.record.loop_setup import frame_times
+from identify.record.recorded_run import recorded_reference
+from identify.reporting.model_runs import build_model_run, write_model_runs
+from identify.reporting.report import write_report
+from identify.reporting.run_result import (
+    add_truth,
+    identification_entry,
+    parameter_vector,
+    sensor_entry,
+    validation_entry,
+)
 from identify.scenario import Scenario, load_scenario
-from identify.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
-from identify.truth import read_truth, true_parameters
 from identify.validation import model_run, run_unseen
-from identify.versions import versions
 
 
 def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:
@@ -83,7 +90,7 @@ def identify(folder: Path, progress: Progress) -> None:
     payload_files = _payload_files(run_folder, scenario)
     run_folder.require(*(file.name for file in payload_files))
     loaded = [recording.read(file) for file in payload_files]
-    result = estimation.identify([seen, *loaded], robot, scenario, progress)
+    result = identification.identify([seen, *loaded], robot, scenario, progress)
     measured, ok = recording.poses(seen, "measured"), seen["measured_ok"].values.astype(bool)
     reference = recorded_reference(seen)
     before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from identify.errors import ScenarioError
-from identify.filtering import padding_samples
+from identify.record.filtering import padding_samples
 from identify.scenario_text import one_line, to_toml
 from identify.sensor_timing import NAMES, check_delay, sensor_timing, timing_in_file
 

@@ -14,11 +14,11 @@ import cmmsim
 from dynamics import DynamicsError, Robot, load_robot
 from dynamics.closed_loop import Reference, simulate
 from identify.arrays import Array
-from identify.experiment import Experiment, run_plant
-from identify.loop_setup import frame_times, model_settings
+from identify.experiment.run import Experiment, run_plant
+from identify.experiment.sensor_in_loop import make_sensor
 from identify.progress import Advance, Progress
+from identify.record.loop_setup import frame_times, model_settings
 from identify.scenario import Scenario
-from identify.sensor_in_loop import make_sensor
 from identify.trajectory import FourierTrajectory
 
 POLL_S = 0.2

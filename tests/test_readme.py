@@ -11,9 +11,9 @@ import pytest
 
 from identify import command_line
 from identify.command_line import app
-from identify.goals import check_goals
-from identify.result_file import load_result
-from identify.tables import excitation_error_table, goals_table
+from identify.files.result_file import load_result
+from identify.reporting.goals import check_goals
+from identify.reporting.tables import excitation_error_table, goals_table
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")

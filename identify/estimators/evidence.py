@@ -7,8 +7,8 @@ import xarray as xr
 
 from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
-from identify.output_error import OutputErrorProblem
-from identify.recorded_run import RecordedRun
+from identify.estimation.output_error import OutputErrorProblem
+from identify.record.recorded_run import RecordedRun
 from identify.scenario import Scenario
 
 

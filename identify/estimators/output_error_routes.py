@@ -7,12 +7,12 @@ import numpy as np
 
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.estimate_covariance import estimate_uncertainty
-from identify.estimation import best_start, search
+from identify.estimation.estimate_covariance import estimate_uncertainty
+from identify.estimation.identification import best_start, search
+from identify.estimation.loop_parameters import NAMES, StartingGuess
+from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.warm_start import REWEIGHTINGS, linear_warm_start
 from identify.estimators.evidence import Estimate, Evidence
-from identify.loop_parameters import NAMES, StartingGuess
-from identify.output_error import OutputErrorProblem
-from identify.warm_start import REWEIGHTINGS, linear_warm_start
 
 GAINS = slice(64, 67)
 

@@ -17,6 +17,8 @@ import numpy as np
 
 from identify.arrays import Array
 from identify.errors import EstimationError
+from identify.estimation.loop_parameters import NAMES
+from identify.estimation.warm_start import REWEIGHTINGS
 from identify.estimators.evidence import Estimate, Evidence
 from identify.estimators.least_squares import fit_equations, information
 from identify.estimators.torque_equations import (
@@ -27,8 +29,6 @@ from identify.estimators.torque_equations import (
     prior_of,
     torque_equations,
 )
-from identify.loop_parameters import NAMES
-from identify.warm_start import REWEIGHTINGS
 
 DRAWS = 4
 """Disturbed copies of a record: each has thousands of rows to average the errors over."""

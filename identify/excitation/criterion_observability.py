@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import qr, solve_triangular
 
 from dynamics import Robot
-from identify.base_parameters import base_parameters, structural_regressor
+from identify.estimation.base_parameters import base_parameters, structural_regressor
 from identify.excitation.log_determinant import log_determinant
 from identify.excitation.motion import motion, sample_times, wrench_regressor
 from identify.excitation.unknowns import Unknowns

@@ -21,10 +21,10 @@ from identify.excitation.gradient_search import climb
 from identify.excitation.random_search import Check, RegressorRobot, admissible_trajectories, observability_indices
 from identify.excitation.search import SearchProblem, SearchResult
 from identify.excitation.unknowns import unknowns
+from identify.files.trajectory_file import TrajectorySet
 from identify.progress import Progress, SilentProgress
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
-from identify.trajectory_file import TrajectorySet
 
 STARTS = 3
 """Random trajectories from which IPOPT climbs."""

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from identify.atomic import write_text
+from identify.files.atomic import write_text
 
 FIGURES = (
     "forward_dynamics_over_pinocchio",

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from dynamics.errors import DynamicsError
-from identify.model_runs import build_model_run, write_model_runs
-from identify.recording import build_record, write, write_runs
-from identify.result_file import rms_figures, save_result
-from identify.run_folder import RunFolder
+from identify.experiment.truth import build_truth
+from identify.files.result_file import rms_figures, save_result
+from identify.files.run_folder import RunFolder
+from identify.record.recording import build_record, write, write_runs
+from identify.reporting.model_runs import build_model_run, write_model_runs
 from identify.scenario import load_scenario
-from identify.truth import build_truth
 
 HOME = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from dynamics import Robot, load_robot
 from dynamics.closed_loop import simulate
-from identify.loop_setup import frame_times, plant_settings, reference_motion
-from identify.recording import build_record
-from identify.scale_anchor import ScaleAnchor, store_anchor
+from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
+from identify.record.loop_setup import frame_times, plant_settings, reference_motion
+from identify.record.recording import build_record
 from identify.scenario import load_scenario
 from identify.trajectory import random_trajectory
 

@@ -5,8 +5,9 @@ import sys
 
 import pytest
 
-from identify import acceptance, command_line
-from identify.acceptance_tables import acceptance_markdown
+from identify import command_line
+from identify.acceptance import procedure as acceptance
+from identify.acceptance.tables import acceptance_markdown
 
 
 def command(*arguments):

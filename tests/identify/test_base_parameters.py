@@ -9,14 +9,14 @@ from typer.testing import CliRunner
 
 from dynamics import load_robot
 from dynamics.parameters import PARAMETER_NAMES
-from identify.base_parameters import (
+from identify.command_line import app
+from identify.errors import EstimationError
+from identify.estimation.base_parameters import (
     base_parameters,
     rank_by_singular_values,
     rank_by_threshold,
     structural_regressor,
 )
-from identify.command_line import app
-from identify.errors import EstimationError
 from tests.identify.synthetic import rss6
 
 

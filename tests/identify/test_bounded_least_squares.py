@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.optimize import least_squares, nnls
 
-from identify.bounded_least_squares import StopCriteria, minimise
+from identify.estimation.bounded_least_squares import StopCriteria, minimise
 
 CRITERIA = StopCriteria(cost_tolerance=1e-12, parameter_tolerance=1e-9, max_iterations=200)
 

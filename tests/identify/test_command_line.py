@@ -6,8 +6,8 @@ import pytest
 
 from identify import command_line
 from identify.errors import OutputFolderError, ScenarioError
-from identify.result_file import load_result, save_result
-from identify.run_folder import RunFolder, new_run_folder
+from identify.files.result_file import load_result, save_result
+from identify.files.run_folder import RunFolder, new_run_folder
 
 
 @pytest.fixture

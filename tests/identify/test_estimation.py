@@ -5,15 +5,15 @@ import pytest
 
 from dynamics.closed_loop import equilibrium, simulate
 from identify.errors import EstimationError, RecordError
-from identify.estimation import identify, output_error_problem
-from identify.experiment import scenario_payload
-from identify.loop_parameters import NAMES, starting_guess
-from identify.loop_setup import model_settings, plant_settings
-from identify.payload import store_payload
-from identify.recorded_run import recorded_run
-from identify.scale_anchor import ScaleAnchor, read_anchor, store_anchor
+from identify.estimation.identification import identify, output_error_problem
+from identify.estimation.loop_parameters import NAMES, starting_guess
+from identify.estimation.scale_anchor import ScaleAnchor, read_anchor, store_anchor
+from identify.estimation.warm_start import linear_warm_start, regression_columns
+from identify.experiment.run import scenario_payload
+from identify.record.loop_setup import model_settings, plant_settings
+from identify.record.payload import store_payload
+from identify.record.recorded_run import recorded_run
 from identify.scenario import load_scenario
-from identify.warm_start import linear_warm_start, regression_columns
 from tests.identify.synthetic import quick, rss6, run_plant, truth
 
 FRICTION_AND_PID = [i for i, name in enumerate(NAMES) if name.startswith("joint")]

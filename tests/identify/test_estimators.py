@@ -8,8 +8,8 @@ from identify.estimator_comparison import START, compare, examination
 from identify.estimators.evidence import Estimate, Evidence
 from identify.estimators.output_error_routes import known_pid
 from identify.estimators.registry import ESTIMATORS, Estimator, choose
-from identify.estimators_figure import estimators_figure
 from identify.progress import SilentProgress
+from identify.reporting.estimators_figure import estimators_figure
 from tests.identify.estimator_evidence import evidence, unseen
 from tests.identify.synthetic import truth
 

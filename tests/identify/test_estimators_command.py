@@ -5,10 +5,10 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from identify import recording
 from identify.command_line import app
 from identify.errors import OutputFolderError, ScenarioError
-from identify.joint_instruments import read_channels
+from identify.experiment.joint_instruments import read_channels
+from identify.record import recording
 from tests.identify.estimator_evidence import truth_of, unseen
 from tests.identify.synthetic import quick, run_plant, truth
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from identify.errors import EstimationError, RecordError, ScenarioError
+from identify.estimation.loop_parameters import NAMES, StartingGuess
 from identify.estimators.encoder_route import encoder_route
 from identify.estimators.evidence import Evidence, joint_channels
 from identify.estimators.instrumental_variables import instrumental_variables, iv_fit
@@ -18,10 +19,15 @@ from identify.estimators.torque_equations import (
     torque_equations,
 )
 from identify.estimators.total_least_squares import total_least_squares, truncated_tls
-from identify.joint_instruments import JointInstruments, frame_mean, measure_joints, read_channels, write_channels
-from identify.loop_parameters import NAMES, StartingGuess
-from identify.netcdf import write_groups
-from identify.recorded_run import recorded_run
+from identify.experiment.joint_instruments import (
+    JointInstruments,
+    frame_mean,
+    measure_joints,
+    read_channels,
+    write_channels,
+)
+from identify.files.netcdf import write_groups
+from identify.record.recorded_run import recorded_run
 from tests.identify.estimator_evidence import PERFECT, evidence, truth_of
 from tests.identify.synthetic import quick, rss6, run_plant, truth
 

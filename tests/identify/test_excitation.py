@@ -9,9 +9,9 @@ from identify.excitation.random_search import (
     observability_indices,
     stacked_regressor,
 )
+from identify.files.trajectory_file import load_trajectories, save_trajectories
 from identify.scenario import load_scenario
 from identify.trajectory import check_travel, random_trajectory
-from identify.trajectory_file import load_trajectories, save_trajectories
 
 QUICK = load_scenario("quick").with_overrides({"excitation.travel_margin_rad": 0.0})
 

@@ -8,6 +8,7 @@ from dynamics import load_robot
 from dynamics.closed_loop import simulate
 from dynamics.parameters import VISCOUS
 from identify.errors import TrajectoryError
+from identify.estimation.loop_parameters import NAMES, index_of
 from identify.excitation.criterion_information import knowledge, log_information
 from identify.excitation.criterion_linear_information import (
     harmonics,
@@ -18,8 +19,7 @@ from identify.excitation.criterion_observability import SMOOTHING_RAD_S, log_obs
 from identify.excitation.motion import sample_times
 from identify.excitation.random_search import observability_indices
 from identify.excitation.unknowns import unknowns
-from identify.loop_parameters import NAMES, index_of
-from identify.loop_setup import frame_times, model_settings, reference_motion
+from identify.record.loop_setup import frame_times, model_settings, reference_motion
 from identify.scenario import load_scenario
 from identify.trajectory import random_trajectory
 

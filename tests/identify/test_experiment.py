@@ -11,14 +11,14 @@ import cmmsim
 from cmmsim.measurement import lost_measurement
 from dynamics import load_robot
 from identify.errors import TrajectoryError
-from identify.experiment import run_experiment, run_plant, stream_seed, taught_sensor
-from identify.loop_setup import frame_times
+from identify.experiment.robot_bodies import robot_transforms
+from identify.experiment.run import run_experiment, run_plant, stream_seed, taught_sensor
+from identify.experiment.sensor_in_loop import SensorInLoop
+from identify.experiment.truth import read_truth, true_poses
 from identify.progress import SilentProgress
-from identify.recording import poses
-from identify.robot_bodies import robot_transforms
-from identify.sensor_in_loop import SensorInLoop
+from identify.record.loop_setup import frame_times
+from identify.record.recording import poses
 from identify.trajectory import random_trajectory
-from identify.truth import read_truth, true_poses
 from tests.identify.synthetic import quick, rss6, trajectory
 
 pytestmark = pytest.mark.rendering

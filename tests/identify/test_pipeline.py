@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from identify.goals import check_goals
-from identify.recording import read, read_runs
-from identify.result_file import load_result
+from identify.files.result_file import load_result
+from identify.record.recording import read, read_runs
+from identify.reporting.goals import check_goals
 
 pytestmark = [pytest.mark.slow, pytest.mark.rendering]
 

@@ -3,7 +3,7 @@ import io
 import pytest
 from rich.console import Console
 
-from identify.atomic import atomic_path, write_text
+from identify.files.atomic import atomic_path, write_text
 from identify.progress import RichProgress, SilentProgress
 
 

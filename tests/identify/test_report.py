@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from identify import figures
 from identify.errors import OutputFolderError, RecordError
 from identify.excitation import design_trajectories
-from identify.model_runs import build_model_run, write_model_runs
-from identify.report import SECTIONS, read_report_data, render, write_report
-from identify.result_file import load_result, save_result
+from identify.files.result_file import load_result, save_result
+from identify.files.trajectory_file import save_trajectories
+from identify.reporting import figures
+from identify.reporting.model_runs import build_model_run, write_model_runs
+from identify.reporting.report import SECTIONS, read_report_data, render, write_report
 from identify.scenario import load_scenario
-from identify.trajectory_file import save_trajectories
 
 FIGURES = {"excitation", "fit_excitation", "fit_validation", "validation_errors", "parameters"}
 

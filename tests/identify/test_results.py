@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from identify import paper_results
 from identify.errors import RecordError
-from identify.goals import check_goals, within_tolerance
-from identify.result_file import load_result, rms_figures, rms_row, save_result
-from identify.tables import (
+from identify.files.result_file import load_result, rms_figures, rms_row, save_result
+from identify.reporting import paper_results
+from identify.reporting.goals import check_goals, within_tolerance
+from identify.reporting.tables import (
     excitation_error_table,
     goals_table,
     parameter_table,

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from cmmsim.sensor_file import read_sensor_file
-from identify.experiment import run_plant, taught_sensor
-from identify.loop_setup import frame_times, model_settings
+from identify.experiment.run import run_plant, taught_sensor
+from identify.experiment.sensor_in_loop import SensorInLoop, frame_latencies, make_sensor
+from identify.experiment.truth import true_poses
 from identify.progress import SilentProgress
-from identify.recording import poses
-from identify.sensor_in_loop import SensorInLoop, frame_latencies, make_sensor
+from identify.record.loop_setup import frame_times, model_settings
+from identify.record.recording import poses
 from identify.trajectory import random_trajectory
-from identify.truth import true_poses
 from tests.identify.synthetic import quick, rss6, trajectory
 
 ANALYTIC = {"renderer": "analytic", "excitation.duration_s": 1.0}

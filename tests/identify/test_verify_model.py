@@ -11,12 +11,12 @@ import dynamics
 from dynamics.parameters import PARAMETER_NAMES
 from identify import command_line
 from identify.errors import RecordError, ScenarioError, TrajectoryError
-from identify.figure7_loop import EngineRuns, compare_engines, exciting_trajectory
-from identify.model_verification import judge
-from identify.parameter_choice import choose_parameters
-from identify.result_file import load_result, save_result
+from identify.files.parameter_choice import choose_parameters
+from identify.files.result_file import load_result, save_result
+from identify.reporting.verification_figure import figure_8
+from identify.robot_checks.figure7_loop import EngineRuns, compare_engines, exciting_trajectory
+from identify.robot_checks.model_verification import judge
 from identify.trajectory import check_travel
-from identify.verification_figure import figure_8
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +136,7 @@ def test_command_verifies_the_reference_robot(capfd, tmp_path):
 
 
 def test_command_fails_in_one_line_where_a_goal_is_missed(made_runs, monkeypatch, capfd, tmp_path):
-    from identify import model_verification
+    from identify.robot_checks import model_verification
 
     off = replace(made_runs, mujoco_pose=made_runs.mujoco_pose + 1e-4)
     monkeypatch.setattr(model_verification, "verify", lambda *_: off)
@@ -255,8 +255,8 @@ def test_folder_that_cannot_be_made_is_refused_before_anything_is_computed(
     def compute(*_):
         raise AssertionError("computed first")
 
-    monkeypatch.setattr("identify.model_verification.verify", compute)
-    monkeypatch.setattr("identify.workspace_map.map_workspace", compute)
+    monkeypatch.setattr("identify.robot_checks.model_verification.verify", compute)
+    monkeypatch.setattr("identify.robot_checks.workspace_map.map_workspace", compute)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     assert command(command_name, "--out", folder) == 1

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import kstest
 
 from identify.errors import EstimationError
-from identify.whiteness import whiteness
+from identify.estimation.whiteness import whiteness
 
 
 def noise(seed, frames=600, memory=0.0):

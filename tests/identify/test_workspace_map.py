@@ -7,8 +7,9 @@ import pytest
 
 import dynamics
 from dynamics.errors import UnreachablePoseError
-from identify import workspace_command, workspace_map
+from identify.commands import workspace as workspace_command
 from identify.errors import OutputFolderError
+from identify.robot_checks import workspace_map
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,185 @@
+"""The command ``cmmsim calibrate``. Heavy imports are late."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from identify.errors import OutputFolderError, ScenarioError
+from identify.progress import Progress, RichProgress, SilentProgress
+
+if TYPE_CHECKING:
+    from cmmsim.calibration import Board, Calibration
+
+CALIBRATE_HELP = """
+Calibrate a stereo camera from pictures of a board: real photographs, or rendered ones.
+
+Both cameras take a picture of the board at the same time, 10 to 30 times. Move the board all over both images and
+into their corners, and tilt it by 30 degrees and more to all sides. LEFT and RIGHT are folders of the pictures; the
+order of the sorted file names makes the pairs. A picture may be PNG, JPEG, TIFF, BMP, PGM or WebP, grey or coloured,
+8 or 16 bit.
+
+\b
+The board is a TOML file:
+  kind = "dots"         # chessboard, dots, or asymmetric_dots (every other row shifted)
+  columns = 13          # dots in a row; of a chessboard: inner corners, one less than squares
+  rows = 9
+  spacing = 0.038       # m between neighbours; asymmetric_dots: between rows
+  radius = 0.0095       # m, of dots only
+  dark = true           # dots darker than the board, of dots only
+
+\b
+Examples:
+  cmmsim calibrate photos/left photos/right --board board.toml --out mine
+  cmmsim calibrate photos/left photos/right --board board.toml --out mine --sensor ctrack780 --distortion radial2
+  cmmsim calibrate --render 20 --sensor ctrack780 --out pictures     render pictures to try it with
+  cmmsim calibrate pictures/left pictures/right --board pictures/board.toml --out mine
+
+\b
+Writes into the folder:
+  calibration.json      estimates with standard deviations, covariance, residuals, images used and rejected
+  rig.toml              tables [rig.left], [rig.right], [rig.right_from_left] for a sensor file
+  sensor.toml           with --sensor: that sensor file with the calibrated cameras, for load_sensor
+  residuals.png, coverage.png, distortion.png
+"""
+
+
+def calibrate(
+    left: Annotated[Path | None, typer.Argument(help="Folder of the left pictures.", show_default=False)] = None,
+    right: Annotated[Path | None, typer.Argument(help="Folder of the right pictures.", show_default=False)] = None,
+    board: Annotated[
+        Path | None, typer.Option("--board", metavar="FILE", help="Board description, TOML.", show_default=False)
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", help="Output folder, new or empty.")] = Path("runs/calibration"),
+    sensor: Annotated[
+        str | None,
+        typer.Option("--sensor", metavar="NAME|FILE", help="Sensor whose file takes the cameras, or which renders."),
+    ] = None,
+    distortion: Annotated[
+        str, typer.Option("--distortion", help="Free terms: none, radial2 (k1, k2) or brown5 (k1, k2, p1, p2, k3).")
+    ] = "brown5",
+    fix_aspect: Annotated[bool, typer.Option("--fix-aspect", help="Square pixels: fx = fy.")] = False,
+    min_images: Annotated[
+        int, typer.Option("--min-images", min=3, help="Fewest pairs that must show the board to both cameras.")
+    ] = 3,
+    render: Annotated[
+        int | None, typer.Option("--render", min=1, help="Render this many pairs of pictures instead, and stop.")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rendered poses and of their noise.")] = 0,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary.")] = False,
+) -> None:
+    """Calibrate a stereo camera from pictures of a board, or render such pictures."""
+    from cmmsim.calibration import read_board
+    from identify.files.run_folder import new_run_folder
+
+    folder = new_run_folder(out).path
+    progress = SilentProgress() if quiet else RichProgress()
+    if render is not None:
+        if left is not None or right is not None:
+            raise ScenarioError("--render makes pictures and reads none: leave out LEFT and RIGHT")
+        chosen = None if board is None else read_board(board)
+        _render(folder, sensor or "ctrack780", chosen, render, seed, progress, quiet)
+        return
+    if left is None or right is None or board is None:
+        missing = ["LEFT"] * (left is None) + ["RIGHT"] * (right is None) + ["--board FILE"] * (board is None)
+        raise ScenarioError(f"missing {', '.join(missing)}; cmmsim calibrate --help shows examples")
+    template = None if sensor is None else _template(sensor)
+    found = _calibrate(left, right, read_board(board), (distortion, fix_aspect, min_images), progress)
+    _write(folder, found, template)
+    if not quiet:
+        _print_summary(found, folder)
+
+
+def _calibrate(left: Path, right: Path, board: "Board", options: tuple[str, bool, int],
+               progress: Progress) -> "Calibration":
+    from cmmsim.calibration import CalibrationOptions, calibrate, pair_images, view_pairs
+
+    chosen = CalibrationOptions(*options)
+    files = pair_images(left, right)
+    with progress.stage("find the board", len(files)) as advance:
+        pairs, size = view_pairs(files, board, advance)
+    with progress.stage("adjust", 1) as advance:
+        found = calibrate(board, pairs, size, chosen)
+        advance()
+    return found
+
+
+def _template(sensor: str) -> str:
+    """Text of a sensor file, checked to be one."""
+    from importlib import resources
+
+    from cmmsim.sensor_file import built_in_names, read_sensor_file
+
+    read_sensor_file(sensor)
+    if sensor in built_in_names():
+        return resources.files("cmmsim").joinpath("sensors", f"{sensor}.toml").read_text(encoding="utf-8")
+    return Path(sensor).read_text(encoding="utf-8")
+
+
+def _write(folder: Path, found: "Calibration", template: str | None) -> None:
+    """All files, the texts made before the first is written."""
+    from cmmsim.calibration import as_dict, calibrated_sensor, rig_tables
+    from identify.files.atomic import write_text
+    from identify.files.result_file import save_result
+    from identify.reporting.calibration_figures import coverage_figure, distortion_figure, residual_figure
+    from identify.reporting.figures import save_figure
+
+    texts = {"rig.toml": rig_tables(found)}
+    if template is not None:
+        texts["sensor.toml"] = calibrated_sensor(template, found)
+    figures = {"residuals": residual_figure, "coverage": coverage_figure, "distortion": distortion_figure}
+    for name, text in texts.items():
+        write_text(folder / name, text)
+    save_result(folder / "calibration.json", as_dict(found))
+    for name, draw in figures.items():
+        save_figure(draw(found), folder / f"{name}.png")
+
+
+def _render(folder: Path, sensor: str, board: "Board | None", count: int, seed: int, progress: Progress,
+            quiet: bool) -> None:
+    """Pictures in left/ and right/, and board.toml beside them."""
+    import cv2
+    import numpy as np
+
+    from cmmsim import load_sensor
+    from cmmsim.calibration import board_poses, default_board, render_pairs
+    from cmmsim.renderers import choose_renderer
+    from identify.files.atomic import atomic_path, write_text
+
+    source = load_sensor(sensor, seed)
+    board = board or default_board(source.rig)
+    rng = np.random.default_rng(seed)
+    poses = board_poses(source.rig, board, count, rng)
+    renderer = choose_renderer(source.renderer)
+    frames = render_pairs(source.rig, board, poses, renderer, source.optics, source.noise, rng)
+    with progress.stage("render", count) as advance:
+        for k, frame in enumerate(frames):
+            for side, image in (("left", frame.left), ("right", frame.right)):
+                with atomic_path(folder / side / f"{k:03d}.png") as path:
+                    if not cv2.imwrite(str(path), image):
+                        raise OutputFolderError(f"cannot write {folder / side / f'{k:03d}.png'}")
+            advance()
+    write_text(folder / "board.toml", board.as_toml())
+    if not quiet:
+        typer.echo(f"pictures: {folder}\ncalibrate with: cmmsim calibrate {folder}/left {folder}/right "
+                   f"--board {folder}/board.toml --sensor {sensor}")
+
+
+def _print_summary(found: "Calibration", folder: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from cmmsim.calibration import PARAMETER_NAMES
+
+    count = sum(len(view.rms_px) == 2 for view in found.used)
+    table = Table(title=f"{count} pairs, sigma {found.adjustment.sigma_px:.3g} px", show_edge=False)
+    for name in ("parameter", "estimate", "std"):
+        table.add_column(name, no_wrap=True, justify="left" if name == "parameter" else "right")
+    for name, value, std in zip(PARAMETER_NAMES, found.values, found.std, strict=True):
+        table.add_row(name, f"{value:.6g}", f"{std:.2g}" if std > 0.0 else "fixed")
+    Console().print(table)
+    for name, reason in found.rejected.items():
+        typer.echo(f"not used: {name}: {reason}")
+    for line in found.warnings:
+        typer.echo(f"warning: {line}", err=True)
+    typer.echo(f"calibration: {folder}")

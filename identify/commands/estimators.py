@@ -1,0 +1,141 @@
+"""The command ``cmmsim estimators``. Heavy imports are late."""
+
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table as RichTable
+
+from identify.files.run_folder import RunFolder
+from identify.progress import RichProgress, SilentProgress
+
+if TYPE_CHECKING:
+    from identify.estimator_comparison import Score
+    from identify.experiment.joint_instruments import JointInstruments
+
+INSTRUMENTS_STREAM = 20
+"""Random stream of the joint instruments, beside those of the experiment."""
+
+HEADER = ("estimator", "groups\n%", "median\n%", "gains\n%", "pos.\num", "ori.\nurad", "time\ns", "iter.", "evals")
+
+
+def estimators(
+    out: Annotated[Path, typer.Option("--out", help="Folder of a whole run: cmmsim run.")],
+    only: Annotated[
+        list[str] | None, typer.Option(help="Name of an estimator; repeatable.", show_default="all")
+    ] = None,
+    torque_noise: Annotated[float, typer.Option(min=0, help="Standard deviation of a measured torque, N m.")] = 0.02,
+    encoder_noise: Annotated[float, typer.Option(min=0, help="Standard deviation of a joint angle, rad.")] = 1e-5,
+    encoder_bits: Annotated[int, typer.Option(min=4, max=40, help="Bits a turn of the joint encoders.")] = 17,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the joint instruments' noise.")] = 0,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no table.")] = False,
+) -> None:
+    """Compare estimators on the record of a run: writes instruments.nc, estimators.json and figures/estimators.png.
+
+    The paper's output error beside its variants and beside what the literature does with measured joint torques and
+    encoders (inverse dynamics; poses from the camera, or by forward kinematics). The run has no such instruments: they
+    are simulated from its truth, with the noise given here. Where the PID is known it has the true gains. All are
+    judged by the truth of the record and of the unseen trajectories.
+    """
+    from identify.estimators.registry import choose
+    from identify.experiment.joint_instruments import JointInstruments
+    from identify.files.result_file import save_result
+    from identify.reporting.estimators_figure import estimators_figure
+    from identify.reporting.figures import save_figure
+
+    folder = RunFolder(out)
+    folder.require("scenario.toml", "experiment.nc", "validation.nc")
+    instruments = JointInstruments(torque_noise, encoder_noise, 2 * math.pi / 2**encoder_bits)
+    chosen = choose(only)
+    scores = _scores(folder, instruments, chosen, seed, quiet)
+    entry = {"seed": seed, "instruments": asdict(instruments), "estimators": {s.name: _entry(s) for s in scores}}
+    save_result(out / "estimators.json", entry)
+    save_figure(estimators_figure(scores), folder.figures / "estimators.png")
+    if not quiet:
+        _print(scores, out)
+
+
+def _scores(
+    folder: RunFolder, instruments: "JointInstruments", chosen: dict[str, Any], seed: int, quiet: bool
+) -> list["Score"]:
+    import numpy as np
+
+    from dynamics import load_robot
+    from identify.estimation.identification import output_error_problem
+    from identify.estimation.loop_parameters import NAMES
+    from identify.estimator_comparison import compare, examination
+    from identify.estimators.evidence import Evidence, joint_channels
+    from identify.experiment.joint_instruments import measure_joints, read_channels, write_channels
+    from identify.experiment.run import LATENCY, stream_seed
+    from identify.experiment.sensor_in_loop import frame_latencies
+    from identify.experiment.truth import read_truth, read_truth_runs, true_parameters
+    from identify.record import recording
+    from identify.scenario import load_scenario
+
+    scenario = load_scenario(folder.scenario)
+    record, truth = recording.read(folder.experiment), read_truth(folder.experiment)
+    problem = output_error_problem(record, load_robot(scenario.robot), scenario)
+    rng = np.random.default_rng([seed, INSTRUMENTS_STREAM])
+    channels = folder.path / "instruments.nc"
+    draws = np.random.default_rng(stream_seed(int(record.attrs["seed"]), LATENCY, 0))
+    latencies = frame_latencies(scenario, record.sizes["time"], draws)
+    write_channels(channels, measure_joints(record, truth, scenario.timing, instruments, rng, latencies))
+    known = true_parameters(truth)
+    true = np.array([known[name] for name in NAMES])
+    evidence = Evidence(problem, scenario, joint_channels(read_channels(channels), record), true[64:])
+    unseen = zip(recording.read_runs(folder.validation), read_truth_runs(folder.validation), strict=True)
+    asked = examination(evidence, true, list(unseen))
+    return compare(evidence, asked, chosen, SilentProgress() if quiet else RichProgress())
+
+
+def _entry(score: "Score") -> dict[str, Any]:
+    """A score with its parameters by name."""
+    from identify.estimation.loop_parameters import NAMES
+
+    entry = asdict(score)
+    estimate, std = entry.pop("parameters"), entry.pop("std")
+    if estimate is not None:
+        entry["parameters"] = {
+            name: {"estimate": estimate[k], "std": None if std is None else std[k]} for k, name in enumerate(NAMES)
+        }
+    return entry
+
+
+def _print(scores: list["Score"], out: Path) -> None:
+    table = RichTable(
+        title="estimators on one record, against one truth",
+        caption="groups: RMS and median relative error of the base parameters that the record shows; gains: RMS of "
+        "those of the joint PID; position, orientation: model against true plant on unseen trajectories, RMS of the "
+        "worst axis and run; evals: simulated runs of the model",
+        box=SIMPLE_HEAD,
+        show_edge=False,
+        padding=0,
+    )
+    for place, name in enumerate(HEADER):
+        table.add_column(name, justify="right" if place else "left", no_wrap=not place)
+    for score in scores:
+        table.add_row(score.title, *_figures(score))
+    console = Console()
+    console.print(table)
+    for score in scores:
+        if score.note:
+            console.print(f"{score.title}: {score.note}", highlight=False, soft_wrap=True)
+    console.print(f"files: {out}", highlight=False, soft_wrap=True)
+
+
+def _figures(score: "Score") -> list[str]:
+    """A row of the table; a dash where there is nothing, such as the error of an unstable model."""
+    gains = "given" if "gains" in score.uses else _short(100 * score.gain_distance)
+    groups = [_short(100 * value) for value in (score.group_distance, score.group_median)]
+    poses = [_short(value) for value in (score.position_um, score.orientation_urad, score.seconds)]
+    return [*groups, gains, *poses, str(score.iterations), str(score.evaluations)]
+
+
+def _short(value: float) -> str:
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"

@@ -1,0 +1,172 @@
+"""Base parameters: the combinations of dynamic parameters that a motion can tell apart (section 4.2).
+
+The wrench is H Xi (eq. 26). Where columns of H depend on each other, only combinations of their parameters act:
+H = H_1 (1 | beta) P, so that H Xi = H_1 (xi_1 + beta xi_2), and the base parameters are xi_1 + beta xi_2, one for each
+pivot column. Columns are scaled to length one, so that the choice does not depend on units. Pivots are deterministic:
+of all columns that are long enough, the first in a stated order is taken (threshold pivoting), so that the groups are
+the same whatever motion shows them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import qr
+
+from dynamics import Robot
+from dynamics.closed_loop import Reference
+from dynamics.errors import DynamicsError
+from dynamics.parameters import COULOMB_NAMES, PARAMETER_NAMES, VISCOUS_NAMES
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.record.filtering import spline_derivatives
+
+DEPENDENT = 1e-8
+"""A column of length one whose part outside the pivots is shorter than this depends on them."""
+
+LONG_ENOUGH = 1e-3
+"""A column may be a pivot when what is left of it is at least this fraction of the longest one."""
+
+NEGLIGIBLE = 1e-7
+"""Coefficients below this fraction of a group's largest contribution are rounding."""
+
+MOTIONS = 200
+"""Random motions that excite whatever can be excited."""
+
+REACH_SHARES, TURN = (0.03, 0.01, 0.003, 0.001), 0.05
+"""Random poses lie within a share of the largest distance between joints (m) and a turn (rad) about home."""
+
+
+@dataclass(frozen=True)
+class BaseParameters:
+    """Base parameters of a regression matrix with columns `names`.
+
+    combinations (rank, p): base = combinations @ parameters; pivots (rank,): the parameter that each group is named
+    after, with coefficient 1; unseen: names of the parameters with no effect at all; gap: largest column remainder that
+    was taken as dependent and smallest that was taken as independent.
+    """
+
+    names: tuple[str, ...]
+    combinations: Array
+    pivots: tuple[int, ...]
+    unseen: tuple[str, ...]
+    gap: tuple[float, float]
+
+    @property
+    def rank(self) -> int:
+        """Number of base parameters."""
+        return len(self.pivots)
+
+    def group_names(self) -> tuple[str, ...]:
+        """Name of each group: its pivot's, with a plus where other parameters belong to it."""
+        lone = (np.abs(self.combinations) > 0).sum(axis=1) == 1
+        return tuple(self.names[p] + ("" if alone else " +") for p, alone in zip(self.pivots, lone, strict=True))
+
+    def expressions(self) -> tuple[str, ...]:
+        """Each group as a sum, such as ``crank1.Izz + 0.0009 crank1.mass``."""
+        return tuple(self._expression(row, pivot) for row, pivot in zip(self.combinations, self.pivots, strict=True))
+
+    def _expression(self, row: Array, pivot: int) -> str:
+        others = [k for k in np.flatnonzero(row) if k != pivot]
+        terms = [f"{'-' if row[k] < 0 else '+'} {_coefficient(abs(row[k]))}{self.names[k]}" for k in others]
+        return " ".join([self.names[pivot], *terms])
+
+
+def base_parameters(matrix: Array, names: tuple[str, ...] = PARAMETER_NAMES) -> BaseParameters:
+    """Base parameters of a regression matrix (rows, p) by pivoted QR.
+
+    Among the columns of which enough is left, pivots go to friction first, then to the platform, the inertias of cranks
+    and links, the masses of links, and last of cranks. Raises EstimationError for a matrix without any effect.
+    """
+    lengths = np.linalg.norm(matrix, axis=0)
+    seen = np.flatnonzero(lengths > DEPENDENT * lengths.max(initial=0.0))
+    if len(seen) == 0:
+        raise EstimationError(f"the regression matrix {matrix.shape} is zero: the motion excites no parameter")
+    columns = matrix[:, seen] / lengths[seen]
+    pivots, gap = _pivots(columns, np.array([_preference(names[k]) for k in seen]))
+    others = np.setdiff1d(np.arange(len(seen)), pivots)
+    beta = np.linalg.lstsq(columns[:, pivots], columns[:, others], rcond=None)[0]
+    beta[np.abs(beta) < NEGLIGIBLE] = 0.0
+    combinations = np.zeros((len(pivots), len(names)))
+    combinations[np.arange(len(pivots)), seen[pivots]] = 1.0
+    combinations[:, seen[others]] = beta * lengths[seen[others]] / lengths[seen[pivots]][:, None]
+    order = np.argsort(seen[pivots])
+    unseen = tuple(name for k, name in enumerate(names) if k not in seen)
+    return BaseParameters(tuple(names), combinations[order], tuple(int(k) for k in seen[pivots][order]), unseen, gap)
+
+
+def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) -> Array:
+    """Regression matrix (6 motions, 64) of random poses about home, twists and accelerations: what can be excited is.
+
+    Raises EstimationError, with the last reason, where no neighbourhood of home is in reach.
+    """
+    rng = np.random.default_rng(seed)
+    size = float(np.abs(robot.geometry.platform_joints).max())
+    draws = rng.uniform(-1.0, 1.0, (3, motions, 6))
+    reason: Exception | None = None
+    for share in REACH_SHARES:
+        poses = robot.home_pose + draws[0] * np.repeat([share * size, TURN * share / REACH_SHARES[0]], 3)
+        try:
+            robot.inverse_kinematics(poses)
+        except DynamicsError as error:
+            reason = error
+            continue
+        unit = np.repeat([size, 1.0], 3)
+        regressor = robot.regressor(poses, draws[1] * unit, 10.0 * draws[2] * unit)
+        return np.asarray(regressor, dtype=float).reshape(-1, regressor.shape[2])
+    raise EstimationError(f"robot {robot.name} reaches no neighbourhood of its home pose: {reason}")
+
+
+def rank_by_singular_values(matrix: Array) -> int:
+    """Rank of a regression matrix whose columns are scaled to length one, from its singular values."""
+    lengths = np.linalg.norm(matrix, axis=0)
+    singular = np.linalg.svd(matrix / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
+    return int(np.sum(singular > DEPENDENT * singular[0]))
+
+
+def rank_by_threshold(matrix: Array, threshold: float) -> int:
+    """The paper's count: diagonal entries of R above `threshold` in the pivoted QR of the unscaled H (section 4.2).
+
+    The entries have the regressor's units (N, N m per unit of a parameter) and grow with the root of the number of
+    samples, so the count depends on both; where it exceeds the rank, the threshold lies below rounding.
+    """
+    return int(np.sum(np.abs(np.diag(qr(matrix, mode="r", pivoting=True)[0])) > threshold))
+
+
+def reference_regressor(robot: Robot, reference: Reference, rate_hz: float) -> Array:
+    """Regression matrix H (6 n, 64) of a reference motion sampled at `rate_hz`."""
+    acceleration, _ = spline_derivatives(reference.rates, rate_hz)
+    twist = robot.twist(reference.poses, reference.rates)
+    twist_dot = robot.twist_dot(reference.poses, reference.rates, acceleration)
+    regressor = robot.regressor(reference.poses, twist, twist_dot)
+    return np.asarray(regressor.reshape(-1, regressor.shape[2]), dtype=float)
+
+
+def _pivots(columns: Array, preference: Array) -> tuple[Array, tuple[float, float]]:
+    """Indices of independent columns, and the remainders on both sides of the limit."""
+    left, smallest = columns.copy(), 1.0
+    chosen: list[int] = []
+    while True:
+        lengths = np.linalg.norm(left, axis=0)
+        longest = float(lengths.max())
+        if longest <= DEPENDENT:
+            return np.array(chosen), (longest, smallest)
+        able = np.flatnonzero(lengths >= LONG_ENOUGH * longest)
+        pivot = int(able[np.argmin(preference[able])])
+        smallest = min(smallest, float(lengths[pivot]))
+        chosen.append(pivot)
+        direction = left[:, pivot] / lengths[pivot]
+        for _ in range(2):  # the second pass removes what rounding left
+            left -= np.outer(direction, direction @ left)
+        left[:, chosen] = 0.0
+
+
+def _preference(name: str) -> int:
+    """Place of a parameter among columns that are long enough."""
+    kinds = (name in COULOMB_NAMES + VISCOUS_NAMES, name.startswith("platform"), not name.endswith(".mass"),
+             name.startswith("link"), True)
+    place = PARAMETER_NAMES.index(name) if name in PARAMETER_NAMES else 0
+    return kinds.index(True) * len(PARAMETER_NAMES) + place
+
+
+def _coefficient(value: float) -> str:
+    return "" if abs(value - 1.0) < 5e-7 else f"{value:.6g} "

@@ -1,0 +1,94 @@
+"""Covariance of an output-error estimate, by propagating the sensor's noise through the experiment.
+
+Sensor noise enters twice: in the measured poses, and through the servo in the plant's motion, which a model that
+closes its own loop cannot follow (its residuals are coloured, and stick-slip makes the response nonlinear). So the
+experiment is repeated on the identified model with drawn noise: each draw gives residuals r, and their scores J^T r
+spread as those of the real record do. With W the information of data and prior, the covariance of the estimate is
+W^-1 (cov(J^T r) + prior information) W^-1. A model driven by the logged commands has white residuals, and W^-1 is all.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynamics.closed_loop import LoopFailure, simulate
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.estimation.output_error import OutputErrorProblem
+from identify.progress import Advance
+from identify.record.recorded_run import RecordedRun
+
+DRAWS = 100
+"""Repetitions: they know a standard deviation to 7 %."""
+
+NOISE_DECIDES = 3.0
+"""Mean squared whitened residual beyond which the model's error, not the noise, decides: noise is not propagated then,
+and the covariance is that of white residuals of the size found."""
+
+FEWEST = 50
+"""Repetitions that must have run to their end."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Covariance (67, 67) of the estimate; mean squared whitened residual to expect from noise alone, and its spread
+    from one experiment to the next; unstable: repeated experiments that ended early and were left out."""
+
+    covariance: Array
+    expected_noise_ratio: float
+    noise_ratio_std: float
+    unstable: int = 0
+
+
+def estimate_uncertainty(
+    problem: OutputErrorProblem, parameters: Array, rng: np.random.Generator, advance: Advance = lambda n=1: None
+) -> Uncertainty:
+    """Uncertainty of the estimate `parameters` (67,), from DRAWS repeated experiments.
+
+    Raises EstimationError when too many of them are unstable.
+    """
+    size = len(parameters)
+    jacobians = [run.residuals(parameters)[1].reshape(-1, size) for run in problem.runs]
+    known = problem.known_information()
+    inverse = np.linalg.inv(sum(j.T @ j for j in jacobians) + known)
+    if all(run.driven for run in problem.runs):
+        advance(DRAWS)
+        count = sum(len(j) for j in jacobians)
+        return Uncertainty((inverse + inverse.T) / 2, 1.0, float(np.sqrt(2 / count)))
+    misfit = problem.noise_ratio(parameters)
+    if misfit > NOISE_DECIDES:
+        advance(DRAWS)
+        return Uncertainty(misfit * (inverse + inverse.T) / 2, 1.0, float(np.sqrt(2 / sum(map(len, jacobians)))))
+    models = [run.model_poses(parameters) for run in problem.runs]
+    scores, squares = [], []
+    for _ in range(DRAWS):
+        try:
+            repeated = [_repeated_poses(run, parameters, rng) for run in problem.runs]
+        except LoopFailure:
+            continue
+        finally:
+            advance()
+        residuals = [
+            run.whiten(model - poses).ravel() for run, model, poses in zip(problem.runs, models, repeated, strict=True)
+        ]
+        scores.append(sum(r @ j for r, j in zip(residuals, jacobians, strict=True)))
+        squares.append(np.mean(np.concatenate(residuals) ** 2))
+    if len(scores) < FEWEST:
+        raise EstimationError(
+            f"{DRAWS - len(scores)} of {DRAWS} repeated experiments on the identified model ended in an unstable loop: "
+            "its servo cannot bear the sensor's noise, and no interval can be given"
+        )
+    covariance = inverse @ (np.cov(np.array(scores).T) + known) @ inverse
+    return Uncertainty(
+        (covariance + covariance.T) / 2, float(np.mean(squares)), float(np.std(squares, ddof=1)), DRAWS - len(scores)
+    )
+
+
+def _repeated_poses(run: RecordedRun, parameters: Array, rng: np.random.Generator) -> Array:
+    """Measured poses (N, 6) of one repeated experiment whose plant is the identified model; NaN where lost."""
+    noise = rng.standard_normal(run.measured.shape) @ np.linalg.cholesky(run.covariance).T
+
+    def sensor(frame: int, t: float, pose: Array) -> Array | None:
+        return pose + noise[frame] if run.ok[frame] else None
+
+    return simulate(run.robot, parameters + run.payload, run.reference, run.settings, sensor).measured

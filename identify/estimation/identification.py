@@ -1,0 +1,257 @@
+"""Identification of one record: linear warm start, output error, uncertainty, identifiability.
+
+The search goes from the linear warm start through the command-driven output error, which has few local minima, to the
+closed-loop output error, whose stick-slip events make narrow ones.
+
+Sees the record, the robot's geometry and starting guess, and the scenario's model side; never the sensor, the plant's
+settings or the truth.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from dynamics import DynamicsError, Robot
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.estimation import warm_start
+from identify.estimation.base_parameters import (
+    base_parameters,
+    rank_by_threshold,
+    reference_regressor,
+    structural_regressor,
+)
+from identify.estimation.bounded_least_squares import Solution, StopCriteria, minimise
+from identify.estimation.estimate_covariance import DRAWS, Uncertainty, estimate_uncertainty
+from identify.estimation.group_estimates import IDENTIFIABLE_SHARE, GroupEstimates, group_estimates
+from identify.estimation.loop_parameters import NAMES, StartingGuess, starting_guess
+from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.scale_anchor import ScaleAnchor, read_anchor
+from identify.estimation.whiteness import LAGS, Whiteness, whiteness
+from identify.files.dataset import POSE
+from identify.progress import Advance, Progress, SilentProgress
+from identify.record.recorded_run import recorded_run
+from identify.scenario import Scenario
+
+MISFIT_STDS = 5.0
+"""Standard deviations from the expected residual beyond which a warning is given."""
+
+SMALLEST_SHARE = 1e-3
+"""Lower bound of platform mass and integral gain, as a share of the starting guess."""
+
+UNCERTAINTY_STREAM = 5
+"""Random stream of the repeated experiments, beside those of the experiment."""
+
+
+@dataclass(frozen=True)
+class IdentificationResult:
+    """What one record says about the 67 parameters, in the order of `names`; SI.
+
+    initial, warm_start, estimate, std (67,), covariance (67, 67); identifiable (67,) bool; groups: the same of the base
+    parameters; base_rank: independent groups that the trajectory excites by the paper's rule; iterations and
+    evaluations: of all searches; stop_reason: of the last; costs: after each iteration, one tuple a search (command
+    driven, then closed loop where asked for); noise_ratio: mean squared whitened residual, to compare with
+    expected_noise_ratio, what the sensor's noise alone would leave; whiteness: test of the residuals of the model
+    driven by the logged commands.
+    """
+
+    names: tuple[str, ...]
+    initial: Array
+    warm_start: Array
+    estimate: Array
+    std: Array
+    covariance: Array
+    identifiable: NDArray[np.bool_]
+    groups: GroupEstimates
+    scale_anchor: ScaleAnchor
+    base_rank: int
+    iterations: int
+    evaluations: int
+    stop_reason: str
+    costs: tuple[tuple[float, ...], ...]
+    noise_ratio: float
+    expected_noise_ratio: float
+    whiteness: Whiteness
+    warnings: tuple[str, ...]
+    seconds: dict[str, float]
+
+
+def identify(
+    record: xr.Dataset | Sequence[xr.Dataset],
+    robot: Robot,
+    scenario: Scenario,
+    progress: Progress | None = None,
+) -> IdentificationResult:
+    """Estimate the parameters of robot and joint PID from one or several records by closed-loop output error.
+
+    Raises:
+        RecordError: the record misses something, or belongs to another robot or frame rate.
+        EstimationError: too many lost frames, or no model that runs from the starting guess or the warm start.
+    """
+    progress = progress or SilentProgress()
+    settings = scenario.identification
+    problem = output_error_problem(record, robot, scenario)
+    began = time.perf_counter()
+    warm = warm_start.linear_warm_start(
+        problem.runs, scenario.timing, scenario.filter, problem.guess, problem.anchor
+    )
+    warmed = time.perf_counter()
+    count = 2 if settings.method == "closed_loop" else 1
+    with progress.stage("identify", count * settings.max_iterations) as advance:
+        driven = problem.driven_by_commands()
+        searches = [search(driven, best_start(driven, warm), scenario, advance)]
+        if settings.method == "closed_loop":
+            searches.append(search(problem, best_start(problem, searches[0].parameters), scenario, advance))
+    searched = time.perf_counter()
+    final = problem if settings.method == "closed_loop" else driven
+    rng = np.random.default_rng([_seed(record), UNCERTAINTY_STREAM])
+    with progress.stage("uncertainty", DRAWS) as advance:
+        uncertainty = estimate_uncertainty(final, searches[-1].parameters, rng, advance)
+    tested = _whiteness(driven, searches[0].parameters)
+    ended = time.perf_counter()
+    seconds = {"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched}
+    rate_hz = scenario.timing.frame_rate_hz
+    excited = np.concatenate([reference_regressor(robot, run.reference, rate_hz) for run in problem.runs])
+    rank = rank_by_threshold(excited, settings.qr_threshold)
+    groups = group_estimates(
+        base_parameters(structural_regressor(robot)), problem.guess, searches[-1].parameters, uncertainty.covariance
+    )
+    return _result(final, warm, searches, uncertainty, groups, tested, rank, seconds)
+
+
+def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance) -> Solution:
+    """Minimise one output-error problem from parameters (67,); masses and gains stay positive."""
+    settings = scenario.identification
+    criteria = StopCriteria(settings.cost_tolerance, settings.parameter_tolerance, settings.max_iterations)
+    lower = np.zeros(len(NAMES))
+    for name in ("platform.mass", "joint_pid.li"):
+        lower[NAMES.index(name)] = SMALLEST_SHARE * problem.guess.values[NAMES.index(name)]
+    solution = minimise(problem, start, lower, problem.guess.std, criteria, lambda i, cost: advance())
+    advance(settings.max_iterations - solution.iterations)
+    return solution
+
+
+def output_error_problem(
+    records: xr.Dataset | Sequence[xr.Dataset], robot: Robot, scenario: Scenario
+) -> OutputErrorProblem:
+    """The output-error problem of one or several records; the first brings the scale anchor.
+
+    Raises:
+        RecordError: no scale anchor, or no such poses.
+        EstimationError: a record that does not fit, or cannot carry an identification.
+    """
+    given = [records] if isinstance(records, xr.Dataset) else list(records)
+    if not given:
+        raise EstimationError("no record to identify from")
+    runs = tuple(recorded_run(record, robot, scenario) for record in given)
+    anchor = read_anchor(given[0])
+    if anchor.name == "payload" and len({float(run.payload @ run.payload) for run in runs}) < 2:
+        raise EstimationError(
+            f"the scale anchor is a payload, and the {len(runs)} records have all the same load: one with and one "
+            "without it are needed"
+        )
+    guess = starting_guess(robot, scenario.model.start_parameters, scenario.identification.start_std)
+    return OutputErrorProblem(runs, guess, anchor)
+
+
+def _whiteness(driven: OutputErrorProblem, parameters: Array) -> Whiteness:
+    """Whiteness of all command-driven residuals, one record after the other, with a gap of all lags between them."""
+    gap, residuals, ok = np.full((LAGS, 6), np.nan), [], []
+    for run in driven.runs:
+        rows = np.full(run.measured.shape, np.nan)
+        rows[run.ok] = run.whiten(run.model_poses(parameters) - run.measured)
+        residuals += [rows, gap]
+        ok += [run.ok, np.zeros(LAGS, dtype=bool)]
+    return whiteness(np.concatenate(residuals), np.concatenate(ok))
+
+
+def _seed(record: xr.Dataset | Sequence[xr.Dataset]) -> int:
+    """Seed of the record, or of the first one."""
+    first = record if isinstance(record, xr.Dataset) else record[0]
+    return int(first.attrs["seed"])
+
+
+def best_start(problem: OutputErrorProblem, warm: Array) -> Array:
+    """The better of warm start and starting guess; the latter's loop may be unstable."""
+    guess: StartingGuess = problem.guess
+    costs = [(problem.cost(start), index) for index, start in enumerate((warm, guess.values))]
+    cost, index = min(costs)
+    if not np.isfinite(cost):
+        raise EstimationError(
+            f"neither the warm start nor the starting guess gives a loop that runs: {_why(problem, warm)}"
+        )
+    return (warm, guess.values)[index]
+
+
+def _why(problem: OutputErrorProblem, parameters: Array) -> str:
+    try:
+        for run in problem.runs:
+            run.model_poses(parameters)
+    except DynamicsError as error:
+        return str(error)
+    return "the cost is not finite"
+
+
+def _result(
+    problem: OutputErrorProblem,
+    warm: Array,
+    searches: list[Solution],
+    uncertainty: Uncertainty,
+    groups: GroupEstimates,
+    tested: Whiteness,
+    rank: int,
+    seconds: dict[str, float],
+) -> IdentificationResult:
+    solution = searches[-1]
+    std = np.sqrt(np.diag(uncertainty.covariance))
+    noise_ratio = problem.noise_ratio(solution.parameters)
+    said = tuple(warning for run in problem.runs for warning in run.warnings())
+    return IdentificationResult(
+        names=NAMES,
+        initial=problem.guess.values,
+        warm_start=warm,
+        estimate=solution.parameters,
+        std=std,
+        covariance=uncertainty.covariance,
+        identifiable=std < IDENTIFIABLE_SHARE * problem.guess.std,
+        groups=groups,
+        scale_anchor=problem.anchor,
+        base_rank=rank,
+        iterations=sum(one.iterations for one in searches),
+        evaluations=sum(one.evaluations for one in searches),
+        stop_reason=solution.stop_reason,
+        costs=tuple(one.costs for one in searches),
+        noise_ratio=noise_ratio,
+        expected_noise_ratio=uncertainty.expected_noise_ratio,
+        whiteness=tested,
+        warnings=said + _warnings(noise_ratio, uncertainty, tested),
+        seconds=seconds,
+    )
+
+
+def _warnings(noise_ratio: float, uncertainty: Uncertainty, tested: Whiteness) -> tuple[str, ...]:
+    """A misfit that the sensor's noise does not explain (a local minimum, or a model that is wrong), or a model whose
+    loop is close to unstable."""
+    said = []
+    expected, spread = uncertainty.expected_noise_ratio, uncertainty.noise_ratio_std
+    if abs(noise_ratio - expected) > MISFIT_STDS * spread:
+        said.append(
+            f"the model misses the record by {noise_ratio:.3f} times the noise variance, noise alone gives "
+            f"{expected:.3f} ± {spread:.3f}: the model or the stated covariance is wrong, and the intervals are too"
+        )
+    if uncertainty.unstable:
+        said.append(
+            f"{uncertainty.unstable} of {DRAWS} repeated experiments on the identified model were unstable and are "
+            "left out of the intervals"
+        )
+    if tested.suspicious:
+        parts = ", ".join(f"{name} {p:.1g}" for name, p in zip(POSE, tested.p_values, strict=True))
+        said.append(
+            "the residuals of the model driven by the logged commands are not white (probability "
+            f"{tested.p_value:.1g}, by component {parts}): the model is wrong"
+        )
+    return tuple(said)

@@ -1,0 +1,72 @@
+"""Output error: measured poses against those of the model under the same excitation (eq. 32, figure 3).
+
+Two ways to drive the model. Closed loop, as in the paper: the model has the servo around it and follows the reference
+with an ideal sensor of the same sampling, delay and hold, which loses the frames that the real one lost. Command
+driven: the joints get the logged commands, so the model feels what the sensor's noise did to the plant.
+
+The residuals are the pose differences of all records, whitened by the sensor's covariance, and one row for each thing
+known beside the poses: the starting guess, with its standard deviations, and the scale anchor.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dynamics import DynamicsError
+from identify.arrays import Array
+from identify.estimation.loop_parameters import StartingGuess
+from identify.estimation.scale_anchor import ScaleAnchor
+from identify.record.recorded_run import RecordedRun
+
+
+@dataclass(frozen=True)
+class OutputErrorProblem:
+    """Least-squares problem in the 67 parameters over one or several records, for `bounded_least_squares.minimise`."""
+
+    runs: tuple[RecordedRun, ...]
+    guess: StartingGuess
+    anchor: ScaleAnchor
+
+    def driven_by_commands(self) -> "OutputErrorProblem":
+        """The same problem with the joints driven by the logged commands."""
+        return replace(self, runs=tuple(run.driven_by_commands() for run in self.runs))
+
+    def cost(self, parameters: Array) -> float:
+        """Sum of squared whitened residuals; infinite where the model cannot run."""
+        known, _ = self._known(parameters)
+        total = float(known @ known)
+        try:
+            for run in self.runs:
+                total += float(np.sum(run.whiten(run.model_poses(parameters) - run.measured) ** 2))
+        except DynamicsError:
+            return np.inf
+        return total
+
+    def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
+        """Cost and the triangular form of its linearisation, see `bounded_least_squares.Problem`."""
+        known, known_jacobian = self._known(parameters)
+        size, cost = len(parameters), float(known @ known)
+        triangle = np.column_stack([known_jacobian, known])
+        for run in self.runs:
+            residual, jacobian = run.residuals(parameters)
+            cost += float(np.sum(residual**2))
+            rows = np.column_stack([jacobian.reshape(-1, size), residual.ravel()])
+            triangle = np.asarray(np.linalg.qr(np.vstack([triangle, rows]), mode="r"))
+        return cost, triangle[:size, :size], triangle[:size, size]
+
+    def noise_ratio(self, parameters: Array) -> float:
+        """Mean squared whitened pose residual of all records."""
+        squares = [run.whiten(run.model_poses(parameters) - run.measured) ** 2 for run in self.runs]
+        return float(np.mean(np.concatenate(squares)))
+
+    def known_information(self) -> Array:
+        """Information (67, 67) of what is known beside the poses."""
+        _, rows = self._known(self.guess.values)
+        return np.asarray(rows.T @ rows, dtype=float)
+
+    def _known(self, parameters: Array) -> tuple[Array, Array]:
+        """Rows of the starting guess and of the scale anchor, in their standard deviations."""
+        place, measured = self.anchor.row()
+        rows = np.vstack([np.diag(1 / self.guess.std), place])
+        values = np.concatenate([self.guess.values / self.guess.std, measured])
+        return rows @ parameters - values, rows

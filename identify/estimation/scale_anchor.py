@@ -1,0 +1,89 @@
+"""The scale anchor: poses alone leave one common factor of all parameters free, and something known fixes it.
+
+Multiplying every dynamic parameter and the three PID gains by the same number changes no pose of the closed loop
+(eq. 17 and 31). What fixes the factor is one of
+
+    platform_mass   the platform was weighed
+    joint_gain      the proportional gain of the joint PID is known
+    payload         a second run with a known load on the platform (`identify.record.payload`)
+    prior           nothing but the starting guess, with its standard deviations
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from identify.arrays import Array
+from identify.errors import RecordError, ScenarioError
+from identify.estimation.loop_parameters import NAMES, index_of
+
+MEASURED_PARAMETER = {"platform_mass": "platform.mass", "joint_gain": "joint_pid.lp"}
+"""Anchors that measure a parameter."""
+
+ANCHORS = (*MEASURED_PARAMETER, "payload", "prior")
+
+DEFAULT_STD = {"platform_mass": 0.005, "joint_gain": 0.01}
+"""Standard deviation of an ordinary platform balance [kg], and of a gain read from the controller's data [N m/rad]."""
+
+
+@dataclass(frozen=True)
+class ScaleAnchor:
+    """What fixes the scale; value and std (SI) where it is a parameter measured on its own, else None."""
+
+    name: str
+    value: float | None = None
+    std: float | None = None
+
+    def row(self) -> tuple[Array, Array]:
+        """What was measured as equations: rows (k, 67) and right side (k,), in standard deviations; k is 0 or 1."""
+        if self.value is None or self.std is None:
+            return np.zeros((0, len(NAMES))), np.zeros(0)
+        row = np.zeros((1, len(NAMES)))
+        row[0, index_of(MEASURED_PARAMETER[self.name])] = 1 / self.std
+        return row, np.array([self.value / self.std])
+
+
+def measured_anchor(name: str, std: float | None, true: Array, rng: np.random.Generator) -> ScaleAnchor:
+    """The anchor as an experimenter with an instrument of standard deviation `std` (or the usual one) brings it.
+
+    Raises:
+        ScenarioError: no such anchor (with the valid names), or a deviation for one that measures nothing.
+    """
+    if name not in ANCHORS:
+        raise ScenarioError(f"unknown identification.scale_anchor {name!r}; valid: {', '.join(ANCHORS)}")
+    if name not in MEASURED_PARAMETER:
+        if std is not None:
+            raise ScenarioError(f"identification.anchor_std = {std:g}: the anchor {name} measures no parameter")
+        return ScaleAnchor(name)
+    spread = DEFAULT_STD[name] if std is None else std
+    return ScaleAnchor(name, float(true[index_of(MEASURED_PARAMETER[name])] + spread * rng.standard_normal()), spread)
+
+
+def store_anchor(record: xr.Dataset, anchor: ScaleAnchor) -> None:
+    """Keep the anchor's measurement with the record."""
+    record.attrs["scale_anchor"] = anchor.name
+    if anchor.value is not None and anchor.std is not None:
+        record.attrs |= {"scale_anchor_value": anchor.value, "scale_anchor_std": anchor.std}
+
+
+def read_anchor(record: xr.Dataset) -> ScaleAnchor:
+    """The anchor's measurement of a record.
+
+    Raises:
+        RecordError: the record has none: the scale of its parameters is free.
+    """
+    name = record.attrs.get("scale_anchor")
+    if name in ANCHORS and name not in MEASURED_PARAMETER:
+        return ScaleAnchor(str(name))
+    value, std = (_number(record.attrs.get(f"scale_anchor_{key}")) for key in ("value", "std"))
+    if name not in ANCHORS or not 0 < std < np.inf or not np.isfinite(value):
+        raise RecordError(
+            f"the record holds no scale anchor (attributes scale_anchor, scale_anchor_value, scale_anchor_std), found "
+            f"{name!r}; valid anchors: {', '.join(ANCHORS)}"
+        )
+    return ScaleAnchor(str(name), value, std)
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float | np.number) else np.nan

@@ -1,0 +1,134 @@
+"""Linear warm start: the closed-loop equation is linear in everything unknown, so one fit starts the search close by.
+
+With the logged commands U and the crank angles theta of the measured poses, at every instant
+
+    J_ad^-T Gamma(pose, twist, twist_dot) Xi - lp (U - theta) - ld (U_dot - theta_dot) - li integral(U - theta) = z
+
+with z the torque the integrators held at the start (6,). Poses are filtered and differentiated. Each row is the balance
+of one joint, whose dry friction is known only while it slips: rows of joints near rest are left out. The equation is
+homogeneous: the scale anchor, and weakly the starting guess, decide the common factor.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+from scipy.optimize import lsq_linear
+
+from dynamics import Robot
+from identify.arrays import Array
+from identify.estimation.loop_parameters import NAMES, StartingGuess
+from identify.estimation.scale_anchor import ScaleAnchor
+from identify.record.filtering import filtered_derivatives, zero_phase_filter
+from identify.record.recorded_run import RecordedRun
+from identify.scenario import Filter, Timing
+
+EDGE_FRACTION = 0.02
+"""Share of the record left out at either end, where filtered derivatives are poor."""
+
+SLIPPING_SHARE = 0.5
+"""A joint counts as slipping above this share of its RMS velocity."""
+
+REWEIGHTINGS = 3
+"""Solutions of the fit: each takes the size of the residual from the one before."""
+
+
+def linear_warm_start(
+    runs: Sequence[RecordedRun], timing: Timing, filtering: Filter, guess: StartingGuess, anchor: ScaleAnchor
+) -> Array:
+    """Parameters (67,) fitted to the measured poses and commands of one or several runs.
+
+    Each run has its own starting torques; what a known payload adds stands on the right side. The residual's size is
+    estimated from the fit itself, so that the starting guess counts as much as it should.
+    """
+    matrix, right = _stacked(runs, timing, filtering)
+    lower = np.concatenate([np.zeros(len(NAMES)), np.full(matrix.shape[1] - len(NAMES), -np.inf)])
+    noise = 0.1
+    for _ in range(REWEIGHTINGS):
+        solution = bounded_fit(matrix / noise, right / noise, guess, anchor, lower)
+        noise = max(float(np.sqrt(np.mean((matrix @ solution - right) ** 2))), 1e-9)
+    return np.maximum(solution[: len(NAMES)], 0.0)
+
+
+def _stacked(runs: Sequence[RecordedRun], timing: Timing, filtering: Filter) -> tuple[Array, Array]:
+    """Equations of all runs: matrix (rows, 67 + 6 runs) and right side (rows,), N m."""
+    matrices, right = [], []
+    for place, run in enumerate(runs):
+        columns = regression_columns(run.robot, run.without_gaps(), run.logged, timing, filtering)
+        matrix = np.zeros((len(columns), len(NAMES) + 6 * len(runs)))
+        matrix[:, : len(NAMES)] = columns[:, : len(NAMES)]
+        matrix[:, len(NAMES) + 6 * place :][:, :6] = columns[:, len(NAMES) :]
+        matrices.append(matrix)
+        right.append(-columns[:, : len(NAMES)] @ run.payload)
+    return np.concatenate(matrices), np.concatenate(right)
+
+
+def regression_columns(robot: Robot, measured: Array, commands: Array, timing: Timing, filtering: Filter) -> Array:
+    """Homogeneous regression (rows, 73) of the joints that slip, see `joint_balance`; N m."""
+    columns, slipping = joint_balance(robot, measured, commands, timing, filtering)
+    return columns[slipping]
+
+
+def joint_balance(
+    robot: Robot, measured: Array, commands: Array, timing: Timing, filtering: Filter
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Torque balance of every joint (N, 6, 73) of poses (N, 6) and commands (N, 6), and where it slips (N, 6).
+
+    Columns: 64 dynamic parameters, which give the joint's torque, then lp, li, ld and the six starting torques, which
+    give the controller's with the opposite sign; N m per unit of each.
+    """
+    rate_hz = timing.frame_rate_hz
+    pose, pose_rate, acceleration = filtered_derivatives(measured, rate_hz, filtering.cutoff_hz, filtering.order)
+    twist, twist_dot = robot.twist(pose, pose_rate), robot.twist_dot(pose, pose_rate, acceleration)
+    regressor = robot.regressor(pose, twist, twist_dot)
+    torque_map = np.linalg.inv(robot.joint_jacobian(pose)).transpose(0, 2, 1)
+    angle = robot.inverse_kinematics(pose)
+    velocity = np.einsum("nij,nj->ni", robot.joint_jacobian(pose), twist)
+    command, command_rate, integral = _effective_command(commands, timing, filtering)
+    angle_integral = _running_integral(angle, rate_hz)
+    count = len(measured)
+    start = np.broadcast_to(-np.eye(6), (count, 6, 6))
+    pid = -np.stack([command - angle, integral - angle_integral, command_rate - velocity], axis=2)
+    columns = np.concatenate([torque_map @ regressor, pid, start], axis=2)
+    slipping = np.abs(velocity) > SLIPPING_SHARE * velocity.std(axis=0)
+    edge = max(1, round(EDGE_FRACTION * count))
+    slipping[:edge] = slipping[count - edge :] = False
+    return columns, slipping
+
+
+def _effective_command(commands: Array, timing: Timing, filtering: Filter) -> tuple[Array, Array, Array]:
+    """Filtered command as the joints feel it, its rate as the joint PID sees it, and its integral, at the frames.
+
+    A held command lags by half a frame, a ramped one by a whole frame; U_dot is the difference of two commands, held.
+    """
+    rate_hz, period = timing.frame_rate_hz, timing.frame_period_s
+    smooth = zero_phase_filter(commands, rate_hz, filtering.cutoff_hz, filtering.order)
+    times = np.arange(len(commands)) * period
+    spline = make_interp_spline(times, smooth, k=5)
+    lag = timing.latency_s + (period if timing.hold == "linear" else period / 2)
+    felt = spline(np.clip(times - lag, 0.0, None))
+    rate = spline(np.clip(times - timing.latency_s - period, 0.0, None), nu=1)
+    return felt, rate, _running_integral(felt, rate_hz)
+
+
+def _running_integral(samples: Array, rate_hz: float) -> Array:
+    spline = make_interp_spline(np.arange(len(samples)) / rate_hz, samples, k=5)
+    integral = spline.antiderivative()
+    return integral(np.arange(len(samples)) / rate_hz)
+
+
+def bounded_fit(matrix: Array, right: Array, guess: StartingGuess, anchor: ScaleAnchor, lower: Array) -> Array:
+    """Unknowns (p,) >= lower of whitened equations (rows, p), beside the starting guess and the anchor.
+
+    The first 67 unknowns are the parameters; of those after them nothing is known beforehand.
+    """
+    size, extra = matrix.shape[1], matrix.shape[1] - len(NAMES)
+    triangle = np.asarray(np.linalg.qr(np.column_stack([matrix, right]), mode="r"))[:size]
+    prior = np.eye(len(NAMES), size) / guess.std[:, None]
+    place, measured = anchor.row()
+    known = np.vstack([triangle[:, :size], prior, np.pad(place, ((0, 0), (0, extra)))])
+    values = np.concatenate([triangle[:, size], guess.values / guess.std, measured])
+    scale = np.concatenate([guess.std, np.ones(extra)])
+    solved = lsq_linear(known * scale, values, bounds=(lower / scale, np.inf), method="bvls")
+    return np.asarray(solved.x * scale, dtype=float)

@@ -1,0 +1,194 @@
+"""The experiment: the true plant runs a trajectory with the images in the loop, and what is seen is recorded.
+
+Random streams of one seed: (0) exciting trajectories, (1) unseen trajectories, (2) the sensor's teaching, (3) the scale
+anchor, (4, run) the sensor's noise in each run, (5, run) the latency of its frames (the run under a payload has a
+number beyond all others).
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+import xarray as xr
+
+import cmmsim
+from dynamics import Robot, load_robot
+from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference, simulate
+from identify.estimation.loop_parameters import NAMES, starting_guess
+from identify.estimation.scale_anchor import measured_anchor, store_anchor
+from identify.excitation import design_trajectories
+from identify.experiment.sensor_in_loop import SensorInLoop, frame_latencies, make_sensor
+from identify.experiment.truth import build_truth
+from identify.progress import Advance, Progress, SilentProgress
+from identify.record import recording
+from identify.record.loop_setup import frame_times, plant_settings, reference_motion
+from identify.record.payload import payload_vector, store_payload
+from identify.scenario import Scenario
+from identify.trajectory import FourierTrajectory, check_travel
+
+TEACHING, ANCHOR, NOISE, LATENCY = 2, 3, 4, 5
+PAYLOAD_RUN = 1_000_000
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One run: what the experimenter sees, and the truth."""
+
+    record: xr.Dataset
+    truth: xr.Dataset
+
+
+def run_experiment(
+    scenario: Scenario,
+    seed: int = 0,
+    path: Path | str | None = None,
+    progress: Progress | None = None,
+    payload: bool = False,
+) -> xr.Dataset:
+    """Choose the exciting trajectory, run it with images in the loop, and return the record.
+
+    payload: with the scenario's known load on the platform; such a record beside one without it shows the scale.
+
+    Record and truth are also written as netCDF: to `path`, or to the user's cache folder; attribute `path` says where
+    (`identify.experiment.truth.read_truth(path)` opens the truth).
+    Raises ScenarioError, TrajectoryError, cmmsim.CmmError, dynamics.DynamicsError.
+    """
+    progress = progress or SilentProgress()
+    robot = load_robot(scenario.robot)
+    trajectories = design_trajectories(robot, scenario, seed, progress)
+    sensor = taught_sensor(scenario, robot, seed, progress)
+    frames = len(frame_times(scenario, scenario.excitation.duration_s))
+    with progress.stage("record", frames) as advance:
+        experiment = excitation_run(scenario, robot, sensor, trajectories.excitation, seed, advance, payload)
+    target = Path(path) if path else _default_path(scenario, seed, payload)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    recording.write(target, experiment.record, experiment.truth)
+    return experiment.record.assign_attrs(path=str(target))
+
+
+def taught_sensor(scenario: Scenario, robot: Robot, seed: int, progress: Progress) -> cmmsim.Sensor:
+    """The scenario's sensor with its frames taught."""
+    sensor = untaught_sensor(scenario, robot, seed)
+    teach(sensor, progress)
+    return sensor
+
+
+def untaught_sensor(scenario: Scenario, robot: Robot, seed: int) -> cmmsim.Sensor:
+    """The scenario's sensor, its teaching seeded by the run's seed."""
+    return make_sensor(scenario, robot, stream_seed(seed, TEACHING))
+
+
+def teach(sensor: cmmsim.Sensor, progress: Progress) -> None:
+    """Teach the frames of a sensor, in hundredths of the work."""
+    with progress.stage("teach the sensor", 100) as advance:
+        shown = 0
+
+        def report(done: int, total: int) -> None:
+            nonlocal shown
+            advance(100 * done // total - shown)
+            shown = 100 * done // total
+
+        sensor.teach(report)
+
+
+def excitation_run(
+    scenario: Scenario,
+    robot: Robot,
+    sensor: cmmsim.Sensor,
+    trajectory: FourierTrajectory,
+    seed: int,
+    advance: Advance = lambda n=1: None,
+    payload: bool = False,
+) -> Experiment:
+    """Run the plant along the exciting trajectory, bare or under the scenario's load. Raises as `run_plant` does."""
+    times = frame_times(scenario, scenario.excitation.duration_s)
+    if not payload:
+        return run_plant(scenario, robot, sensor, trajectory, times, seed, 0, advance)
+    load = scenario_payload(scenario)
+    return run_plant(scenario, robot, sensor, trajectory, times, seed, PAYLOAD_RUN, advance, load)
+
+
+def scenario_payload(scenario: Scenario) -> np.ndarray:
+    """What the scenario's load adds to the parameters (67,)."""
+    load = scenario.payload
+    return payload_vector(load.mass_kg, (load.Ixx_kg_m2, load.Iyy_kg_m2, load.Izz_kg_m2))
+
+
+def run_plant(
+    scenario: Scenario,
+    robot: Robot,
+    sensor: cmmsim.Sensor,
+    trajectory: FourierTrajectory,
+    times: np.ndarray,
+    seed: int,
+    run: int,
+    advance: Advance = lambda n=1: None,
+    load: np.ndarray | None = None,
+) -> Experiment:
+    """Run the plant along a trajectory at the frames `times` (N,) [s]; `run`: number of the run (0: excitation);
+    `load` (67,): what a known load on the platform adds to its parameters.
+
+    Raises TrajectoryError before the run when the trajectory leaves the travel, LoopFailure when the loop is unstable.
+    """
+    check_travel(robot, trajectory, times)
+    reference = reference_motion(trajectory, times)
+    parameters = true_parameters(robot, scenario)
+    eye = SensorInLoop(sensor, robot, stream_seed(seed, NOISE, run), advance)
+    loaded = parameters if load is None else parameters + load
+    latencies = frame_latencies(scenario, len(times), np.random.default_rng(stream_seed(seed, LATENCY, run)))
+    sensor_in_loop = RateSensor(eye.measure)
+    done = simulate(robot, loaded, reference, plant_settings(scenario), sensor_in_loop, latencies=latencies)
+    record = _record(scenario, robot, reference, done, eye, seed)
+    settings, rng = scenario.identification, np.random.default_rng(stream_seed(seed, ANCHOR))
+    store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, parameters, rng))
+    if load is not None:
+        store_payload(record, load)
+    return Experiment(record, _truth(robot, done, parameters))
+
+
+def true_parameters(robot: Robot, scenario: Scenario) -> np.ndarray:
+    """The plant's parameters (67,). Raises ScenarioError for an unknown set (with the valid names)."""
+    return starting_guess(robot, scenario.plant.parameters, 1.0).values
+
+
+def stream_seed(seed: int, *stream: int) -> int:
+    """Seed of one independent random stream of a run's seed."""
+    return int(np.random.SeedSequence(seed, spawn_key=stream).generate_state(1)[0])
+
+
+def _record(
+    scenario: Scenario, robot: Robot, reference: Reference, run: ClosedLoopRun, eye: SensorInLoop, seed: int
+) -> xr.Dataset:
+    record = recording.build_record(
+        time=run.time,
+        reference_pose=reference.poses,
+        reference_rate=reference.rates,
+        measured_pose=run.measured,
+        measured_covariance=np.array(eye.covariances),
+        measured_ok=run.measured_ok,
+        command=run.command,
+        scenario_toml=scenario.to_toml(),
+        robot=robot.name,
+        seed=seed,
+        frame_rate_hz=scenario.timing.frame_rate_hz,
+    )
+    return record.assign_attrs(sensor_seconds=eye.seconds, lost_frames="; ".join(eye.lost[:20]))
+
+
+def _truth(robot: Robot, run: ClosedLoopRun, parameters: np.ndarray) -> xr.Dataset:
+    jacobian = robot.pose_jacobian(run.pose)
+    return build_truth(
+        time=run.time,
+        pose=run.pose,
+        joint_angle=robot.inverse_kinematics(run.pose),
+        joint_velocity=np.einsum("nij,nj->ni", jacobian, run.pose_rate),
+        joint_torque=run.torque,
+        parameter_names=list(NAMES),
+        parameters=parameters,
+    )
+
+
+def _default_path(scenario: Scenario, seed: int, payload: bool) -> Path:
+    name = f"{scenario.name}-{seed}{'-payload' if payload else ''}.nc"
+    return Path(platformdirs.user_cache_dir("cmmsim")) / "records" / name

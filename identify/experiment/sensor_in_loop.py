@@ -1,0 +1,64 @@
+"""The rendering stereo sensor as the pose sensor of the closed loop: it measures, and remembers what it said."""
+
+import time
+
+import numpy as np
+
+import cmmsim
+from cmmsim.latency import drawn_latencies
+from cmmsim.sensor_file import read_sensor_file
+from dynamics import Robot
+from identify.arrays import Array
+from identify.experiment.robot_bodies import robot_meshes, robot_transforms
+from identify.progress import Advance
+from identify.scenario import Scenario
+from identify.sensor_timing import sensor_timing
+
+
+def make_sensor(scenario: Scenario, robot: Robot, seed: int, taught: cmmsim.Taught | None = None) -> cmmsim.Sensor:
+    """The scenario's sensor, with its timing and with the robot's cranks and links in its view.
+
+    One a process: it owns the renderer.
+    """
+    file = read_sensor_file(scenario.sensor)
+    file = file.model_copy(update={"timing": sensor_timing(scenario.timing.model_dump())})
+    sensor = cmmsim.Sensor(file, seed, scenario.pose_method, taught, renderer=scenario.renderer)
+    sensor.add_bodies(robot_meshes(robot))
+    return sensor
+
+
+def frame_latencies(scenario: Scenario, frames: int, rng: np.random.Generator) -> Array | None:
+    """Latency of each frame (frames,) [s] of a run; None where all have the mean."""
+    timing = sensor_timing(scenario.timing.model_dump())
+    return drawn_latencies(timing, frames, rng) if timing.latency_jitter else None
+
+
+class SensorInLoop:
+    """Sensor for `closed_loop.simulate`: a measured pose (6,) a frame, or None where it lost the platform.
+
+    Keeps the covariances (6, 6) of every frame (NaN where lost), the reasons of lost frames, and the seconds spent on
+    rendering and measuring.
+    """
+
+    def __init__(self, sensor: cmmsim.Sensor, robot: Robot, seed: int, advance: Advance = lambda n=1: None) -> None:
+        self._sensor, self._robot, self._advance = sensor, robot, advance
+        self.covariances: list[Array] = []
+        self.lost: list[str] = []
+        self.seconds = 0.0
+        sensor.start_run(seed)
+
+    def measure(self, frame: int, t: float, pose: Array, rate: Array) -> Array | None:
+        """Measure the platform at its true pose in motion at its true rate; only the renderer sees these.
+
+        The rate blurs the picture of an exposure that is not instantaneous.
+        """
+        bodies = robot_transforms(self._robot, pose)
+        began = time.perf_counter()
+        measured = self._sensor.measure(pose, bodies, rate)
+        self.seconds += time.perf_counter() - began
+        self._advance()
+        self.covariances.append(measured.covariance if measured.ok else np.full((6, 6), np.nan))
+        if not measured.ok:
+            self.lost.append(f"frame {frame} (t = {t:.3f} s): {measured.reason}")
+            return None
+        return np.asarray(measured.pose, dtype=float)

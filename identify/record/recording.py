@@ -1,0 +1,174 @@
+"""What the experimenter sees of a run, as an xarray dataset in the main group of a netCDF file.
+
+The truth stands in a group of its own (:mod:`identify.experiment.truth`), so that an estimator that reads a record
+cannot see it. Several runs share a file as the groups ``run01``, ``run01/truth``, ``run02``, ...
+"""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from identify.arrays import Array
+from identify.errors import RecordError
+from identify.files.dataset import Variables, check_finite, check_variables, described_dataset, pose_array
+from identify.files.netcdf import group_names, read_group, write_groups
+from identify.files.versions import versions
+
+TRUTH_GROUP = "truth"
+
+CONVENTIONS = (
+    "SI units. Pose [x y z alpha beta gamma] of the platform frame in the base frame, R = Rx(alpha) Ry(beta) "
+    "Rz(gamma). Rates are time derivatives of the pose components, not the angular velocity. time is the instant of "
+    "exposure."
+)
+
+VARIABLES: Variables = {
+    "reference_position": (("time", "axis"), "m", "desired position of the platform"),
+    "reference_orientation": (("time", "angle"), "rad", "desired orientation of the platform"),
+    "reference_velocity": (("time", "axis"), "m/s", "time derivative of the desired position"),
+    "reference_orientation_rate": (("time", "angle"), "rad/s", "time derivative of the desired Euler angles"),
+    "measured_position": (("time", "axis"), "m", "position measured by the sensor, NaN where it was lost"),
+    "measured_orientation": (("time", "angle"), "rad", "orientation measured by the sensor, NaN where it was lost"),
+    "measured_covariance": (
+        ("time", "pose_component", "pose_component_2"),
+        "m2, m rad and rad2",
+        "covariance of the measured pose as the sensor reports it",
+    ),
+    "measured_ok": (("time",), "1", "1 where the sensor measured the pose, 0 where it was lost"),
+    "command": (("time", "joint"), "rad", "joint command of the visual servo from this frame on"),
+}
+MAY_BE_LOST = ("measured_position", "measured_orientation", "measured_covariance")
+
+
+def build_record(
+    *,
+    time: ArrayLike,
+    reference_pose: ArrayLike,
+    reference_rate: ArrayLike,
+    measured_pose: ArrayLike,
+    measured_covariance: ArrayLike,
+    measured_ok: ArrayLike,
+    command: ArrayLike,
+    scenario_toml: str,
+    robot: str,
+    seed: int,
+    frame_rate_hz: float,
+    title: str = "Visual closed-loop experiment",
+) -> xr.Dataset:
+    """Record of one run: ``time`` (N,) [s], poses, rates and ``command`` (N, 6), covariance (N, 6, 6), ok (N,).
+
+    Raises:
+        RecordError: wrong shapes, or numbers that are not finite where a measurement was not lost.
+    """
+    reference, rate = pose_array(reference_pose, "reference_pose"), pose_array(reference_rate, "reference_rate")
+    measured = pose_array(measured_pose, "measured_pose")
+    record = described_dataset(
+        {
+            "reference_position": reference[:, :3],
+            "reference_orientation": reference[:, 3:],
+            "reference_velocity": rate[:, :3],
+            "reference_orientation_rate": rate[:, 3:],
+            "measured_position": measured[:, :3],
+            "measured_orientation": measured[:, 3:],
+            "measured_covariance": np.asarray(measured_covariance, dtype=float),
+            "measured_ok": np.asarray(measured_ok).astype(np.int8),
+            "command": np.asarray(command, dtype=float),
+        },
+        time,
+        VARIABLES,
+    )
+    record.attrs = {
+        "title": title,
+        "conventions_text": CONVENTIONS,
+        "robot": robot,
+        "seed": np.int64(seed),
+        "frame_rate_hz": float(frame_rate_hz),
+        "scenario": scenario_toml,
+        "software": "; ".join(f"{name} {version}" for name, version in versions().items()),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    return check_record(record, "new record")
+
+
+def write(path: Path | str, record: xr.Dataset, truth: xr.Dataset | None = None) -> None:
+    """Write one run: the record as the main group and the truth as the group ``truth``."""
+    write_groups(path, {"": record} if truth is None else {"": record, TRUTH_GROUP: truth})
+
+
+def read(path: Path | str, run: str = "") -> xr.Dataset:
+    """Read the record of a file, or of one of its runs (``"run01"``), checked; never the truth.
+
+    Raises:
+        RecordError: truncated file, missing variables, wrong shapes, or numbers that are not finite.
+    """
+    return check_record(read_group(path, run), f"{path}{':' + run if run else ''}")
+
+
+def write_runs(path: Path | str, runs: Sequence[tuple[xr.Dataset, xr.Dataset | None]]) -> None:
+    """Write several (record, truth) pairs as the groups ``run01``, ``run01/truth``, ``run02``, ..."""
+    groups = {}
+    for number, (record, truth) in enumerate(runs, start=1):
+        groups[run_name(number)] = record
+        if truth is not None:
+            groups[f"{run_name(number)}/{TRUTH_GROUP}"] = truth
+    write_groups(path, groups)
+
+
+def read_runs(path: Path | str) -> list[xr.Dataset]:
+    """Read the records of all runs of a file in their order, checked.
+
+    Raises:
+        RecordError: as :func:`read`, or no runs in the file.
+    """
+    return [read(path, name) for name in run_names(path)]
+
+
+def run_names(path: Path | str) -> list[str]:
+    """Names of the runs in a file, ``["run01", "run02", ...]``.
+
+    Raises:
+        RecordError: truncated file, or no runs in it.
+    """
+    names = [name for name in group_names(path) if name.startswith("run") and "/" not in name]
+    if not names:
+        raise RecordError(f"{path} holds no runs (groups run01, run02, ...)")
+    return sorted(names, key=lambda name: int(name.removeprefix("run")))
+
+
+def run_name(number: int) -> str:
+    """Group of the run with this number, counted from 1."""
+    return f"run{number:02d}"
+
+
+def poses(record: xr.Dataset, kind: str) -> Array:
+    """Poses (N, 6) [m, rad] of one kind: ``measured`` (NaN where lost) or ``reference``.
+
+    The same for the kinds ``initial`` and ``identified`` of a model run.
+
+    Raises:
+        RecordError: the dataset has no such poses.
+    """
+    missing = [name for name in (f"{kind}_position", f"{kind}_orientation") if name not in record]
+    if missing:
+        raise RecordError(f"the record has no {' and '.join(missing)}; it has {', '.join(map(str, record.data_vars))}")
+    return np.hstack([record[f"{kind}_position"].values, record[f"{kind}_orientation"].values])
+
+
+def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
+    """Return the record when it is complete, of the right shapes and finite where nothing was lost.
+
+    Raises:
+        RecordError: the first thing that is not so.
+    """
+    check_variables(record, VARIABLES, source)
+    ok = record["measured_ok"].values.astype(bool)
+    for name in VARIABLES:
+        values = record[name].values
+        check_finite(values[ok] if name in MAY_BE_LOST else values, name, source)
+    if np.any(np.diff(record["time"].values) <= 0):
+        raise RecordError(f"{source}: time does not increase")
+    return record

@@ -1,0 +1,100 @@
+"""The goals of a run and whether its result meets them."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from identify.files.result_file import rms_row
+
+VALIDATION_UM, VALIDATION_URAD = 5.0, 25.0
+SENSOR_UM, SENSOR_URAD = 20.0, 100.0
+FRAMES_PER_SECOND = 15.0
+PARAMETER_FRACTION, PARAMETER_STDS = 0.05, 3.0
+SECONDS = {"paper": 600.0, "quick": 90.0}
+
+
+@dataclass(frozen=True)
+class Goal:
+    """One goal: ``value`` against ``limit`` in ``unit``; ``relation`` is ``<=`` or ``>=``."""
+
+    name: str
+    value: float
+    relation: str
+    limit: float
+    unit: str
+    detail: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the value meets the limit; a value that is NaN does not."""
+        return self.value <= self.limit if self.relation == "<=" else self.value >= self.limit
+
+
+def check_goals(result: dict[str, Any]) -> list[Goal]:
+    """The goals that the parts of a result allow to judge; accuracy is that of the worst axis of the worst run."""
+    return [*_validation(result), *_sensor(result), *_parameters(result), *_time(result)]
+
+
+def _validation(result: dict[str, Any]) -> list[Goal]:
+    rows = [rms_row(run["true"]) for run in result.get("validation", [])]
+    if not rows:
+        return []
+    position, orientation = [v for row in rows for v in row[:3]], [v for row in rows for v in row[3:]]
+    text = f"identified model against the true plant, {len(rows)} unseen trajectories"
+    return [
+        Goal("unseen position", _worst(position), "<=", VALIDATION_UM, "um", text),
+        Goal("unseen orientation", _worst(orientation), "<=", VALIDATION_URAD, "urad", text),
+    ]
+
+
+def _sensor(result: dict[str, Any]) -> list[Goal]:
+    sensor = result.get("sensor")
+    if not sensor:
+        return []
+    row = rms_row(sensor)
+    text = f"measured pose against truth, {sensor['frames']} frames"
+    goals = [
+        Goal("sensor position", _worst(row[:3]), "<=", SENSOR_UM, "um", text),
+        Goal("sensor orientation", _worst(row[3:]), "<=", SENSOR_URAD, "urad", text),
+        Goal("lost frames", float(sensor["lost_frames"]), "<=", 0.0, "", text),
+    ]
+    rate = sensor.get("stereo_frames_per_second")
+    if rate is not None:
+        goals.append(Goal("stereo frames", float(rate), ">=", FRAMES_PER_SECOND, "1/s", "rendered and measured"))
+    return goals
+
+
+def _parameters(result: dict[str, Any]) -> list[Goal]:
+    parameters = result.get("identification", {}).get("parameters", {})
+    judged = {name: p for name, p in parameters.items() if is_friction_or_pid(name)}
+    if not judged:
+        return []
+    outside = [name for name, p in judged.items() if not within_tolerance(p)]
+    text = f"of {len(judged)} within 5 % of truth or 3 std" + (f"; outside: {', '.join(outside)}" if outside else "")
+    return [Goal("friction and PID outside", float(len(outside)), "<=", 0.0, "", text)]
+
+
+def _time(result: dict[str, Any]) -> list[Goal]:
+    limit, seconds = SECONDS.get(str(result.get("scenario"))), result.get("seconds")
+    if limit is None or not seconds:
+        return []
+    stages = [value for name, value in seconds.items() if name != "total" and "." not in name and value is not None]
+    total = seconds.get("total") or sum(stages)
+    return [Goal("whole run", float(total), "<=", limit, "s", "all stages so far, compiling included")]
+
+
+def is_friction_or_pid(name: str) -> bool:
+    """Whether the goals judge the parameter: friction of the joints and gains of the joint controller."""
+    return name.startswith("joint_pid.") or name.endswith((".coulomb", ".viscous"))
+
+
+def within_tolerance(parameter: dict[str, Any]) -> bool:
+    """Whether an estimate lies within 5 % of the truth or within 3 of its reported standard deviations."""
+    if parameter["estimate"] is None or parameter["true"] is None:
+        return False
+    error, std = abs(parameter["estimate"] - parameter["true"]), parameter["std"]
+    return error <= PARAMETER_FRACTION * abs(parameter["true"]) or (std is not None and error <= PARAMETER_STDS * std)
+
+
+def _worst(values: list[float]) -> float:
+    return math.nan if any(math.isnan(value) for value in values) else max(values)

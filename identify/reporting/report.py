@@ -1,0 +1,254 @@
+"""The report of a run: PNG figures and one HTML file, built from sections, that opens without a network."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import xarray as xr
+
+from identify.arrays import Array
+from identify.errors import RecordError
+from identify.experiment.truth import read_truth_runs, true_poses
+from identify.files.atomic import write_text
+from identify.files.result_file import load_result
+from identify.files.run_folder import RunFolder
+from identify.files.trajectory_file import TrajectorySet, load_trajectories
+from identify.progress import Progress, SilentProgress
+from identify.record.recording import poses, read, read_runs, run_name
+from identify.reporting import figures, report_plots, tables
+from identify.reporting.goals import check_goals
+from identify.reporting.model_runs import EXCITATION, read_model_runs
+from identify.reporting.paper_results import INDEX_BEST, INDEX_FIRST
+from identify.reporting.tables import Table
+
+TEMPLATES = Path(__file__).parent / "templates"
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """All that a report shows: the result, the records, the truth of the validation runs, the models' runs
+    and, where they are there, the trajectories."""
+
+    result: dict[str, Any]
+    experiment: xr.Dataset
+    validation: list[xr.Dataset]
+    validation_truth: list[xr.Dataset]
+    models: Mapping[str, xr.Dataset]
+    trajectories: TrajectorySet | None = None
+
+
+@dataclass(frozen=True)
+class Section:
+    """One section of the report: text, tables and plots (HTML fragments)."""
+
+    title: str
+    text: str = ""
+    tables: tuple[Table, ...] = ()
+    plots: tuple[str, ...] = ()
+
+
+def write_report(folder: Path | str, progress: Progress | None = None) -> Path:
+    """Write ``figures/*.png`` and ``report.html`` of a run folder; return the path of the report.
+
+    Raises:
+        OutputFolderError: an earlier stage has not been run.
+        RecordError: a file of the run is damaged.
+    """
+    run = RunFolder(Path(folder))
+    run.require("result.json", "experiment.nc", "validation.nc", "model.nc")
+    data = read_report_data(run)
+    drawings = png_figures(data)
+    with (progress or SilentProgress()).stage("report", len(drawings) + 1) as advance:
+        for name, draw in drawings.items():
+            figures.save_figure(draw(), run.figures / f"{name}.png")
+            advance()
+        write_text(run.report, render(data))
+        advance()
+    return run.report
+
+
+def read_report_data(run: RunFolder) -> ReportData:
+    """Read what the stages of a run wrote.
+
+    Raises:
+        RecordError: a file is damaged, or the files are not of one run.
+    """
+    data = ReportData(
+        result=load_result(run.result),
+        experiment=read(run.experiment),
+        validation=read_runs(run.validation),
+        validation_truth=read_truth_runs(run.validation),
+        models=read_model_runs(run.model),
+        trajectories=load_trajectories(run.trajectories) if run.trajectories.is_file() else None,
+    )
+    records = {EXCITATION: data.experiment}
+    records |= {run_name(number): record for number, record in enumerate(data.validation, start=1)}
+    for name, record in records.items():
+        if name not in data.models or data.models[name].sizes["time"] != record.sizes["time"]:
+            raise RecordError(f"{run.model} does not belong to the records of {run.path}: run {name} differs")
+    missing = [key for key in ("identification", "before", "after", "sensor", "validation") if key not in data.result]
+    if missing:
+        raise RecordError(
+            f"{run.result} lacks {', '.join(missing)}; complete it with: cmmsim validate --out {run.path}"
+        )
+    return data
+
+
+def png_figures(data: ReportData) -> dict[str, Callable[[], Any]]:
+    """The figures of a run by file name, each as a function that draws it."""
+    time = data.experiment["time"].values
+    first = run_name(1)
+    return {
+        "excitation": lambda: figures.excitation_figure(time, poses(data.experiment, "reference")),
+        "fit_excitation": lambda: figures.fit_figure(
+            time,
+            poses(data.experiment, "measured"),
+            *_model_poses(data, EXCITATION),
+            title="Exciting trajectory: measurement, starting and identified model",
+        ),
+        "fit_validation": lambda: figures.fit_figure(
+            data.validation[0]["time"].values,
+            poses(data.validation[0], "measured"),
+            *_model_poses(data, first),
+            title="First unseen trajectory: measurement, starting and identified model",
+            truth=true_poses(data.validation_truth[0]),
+        ),
+        "validation_errors": lambda: figures.validation_figure(data.result["validation"]),
+        "parameters": lambda: figures.parameter_figure(data.result["identification"]["parameters"]),
+    }
+
+
+def render(data: ReportData) -> str:
+    """The report as one HTML text."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    return environment.get_template("report.html.j2").render(
+        title=f"Identification run: scenario {data.result.get('scenario')}, seed {data.result.get('seed')}",
+        goals=check_goals(data.result),
+        sections=[build(data) for build in SECTIONS],
+        plotly=report_plots.plotly_javascript(),
+    )
+
+
+# --- sections ----------------------------------------------------------------------------------------------
+
+
+def summary_section(data: ReportData) -> Section:
+    """Goals met and missed."""
+    goals = check_goals(data.result)
+    missed = [goal.name for goal in goals if not goal.passed]
+    text = f"All {len(goals)} goals are met." if not missed else f"Missed: {', '.join(missed)}."
+    return Section("Summary", text, (tables.goals_table(data.result),))
+
+
+def sensor_section(data: ReportData) -> Section:
+    """What the sensor measured against the truth."""
+    return Section("Sensor", "", (tables.sensor_table(data.result),))
+
+
+def excitation_section(data: ReportData) -> Section:
+    """The exciting trajectory and the fit on it."""
+    time = data.experiment["time"].values
+    return Section(
+        "Excitation and fit",
+        f"Measured pose as black dots, starting model green, identified model blue. {_index_text(data.trajectories)}",
+        (tables.excitation_error_table(data.result),),
+        (
+            report_plots.trajectory_plot(time, poses(data.experiment, "reference")),
+            report_plots.fit_plot(time, poses(data.experiment, "measured"), *_model_poses(data, EXCITATION)),
+        ),
+    )
+
+
+def identification_section(data: ReportData) -> Section:
+    """The parameters, what stopped the search and what it warns of."""
+    identification = data.result["identification"]
+    parameters, groups = identification["parameters"], identification.get("groups", {})
+    count = sum(bool(p["identifiable"]) for p in parameters.values())
+    text = (
+        f"{identification['iterations']} iterations, stopped by: {identification['stop_reason']}. "
+        f"{count} of {len(parameters)} parameters identifiable, "
+        f"{sum(bool(g['identifiable']) for g in groups.values())} of {len(groups)} groups."
+    )
+    warnings = identification.get("warnings", [])
+    text += f" Warnings: {'; '.join(warnings)}." if warnings else ""
+    return Section(
+        "Parameters",
+        text,
+        (tables.parameter_table(data.result), tables.group_table(data.result)),
+        (report_plots.parameter_plot(parameters),),
+    )
+
+
+def validation_section(data: ReportData) -> Section:
+    """Unseen trajectories."""
+    record = data.validation[0]
+    fit = report_plots.fit_plot(
+        record["time"].values,
+        poses(record, "measured"),
+        *_model_poses(data, run_name(1)),
+        truth=true_poses(data.validation_truth[0]),
+    )
+    return Section(
+        "Validation on unseen trajectories",
+        "The plots below the bars show the first unseen trajectory.",
+        (tables.validation_table(data.result),),
+        (report_plots.validation_plot(data.result["validation"]), fit),
+    )
+
+
+def provenance_section(data: ReportData) -> Section:
+    """Scenario, versions and times, so that the run can be repeated."""
+    versions = tuple((name, str(value)) for name, value in data.result.get("versions", {}).items())
+    scenario = tuple(_split_toml(str(data.experiment.attrs.get("scenario", ""))))
+    return Section(
+        "How it was made",
+        f"Record made {data.experiment.attrs.get('created', 'at an unknown time')}.",
+        (
+            tables.seconds_table(data.result),
+            Table("Scenario", ("key", "value", "meaning"), scenario),
+            Table("Software", ("package", "version"), versions),
+        ),
+    )
+
+
+SECTIONS: tuple[Callable[[ReportData], Section], ...] = (
+    summary_section,
+    sensor_section,
+    excitation_section,
+    identification_section,
+    validation_section,
+    provenance_section,
+)
+
+
+def _model_poses(data: ReportData, name: str) -> tuple[Array | None, Array]:
+    run = data.models[name]
+    initial = poses(run, "initial")
+    return (initial if np.isfinite(initial).any() else None), poses(run, "identified")
+
+
+def _index_text(trajectories: TrajectorySet | None) -> str:
+    if trajectories is None:
+        return ""
+    return (
+        f"Observability index (eq. 39): {trajectories.first_index:.3g} of the first candidate, "
+        f"{trajectories.median_index:.3g} of the middle one, {trajectories.observability_index:.3g} of the best, which "
+        f"is used. The paper, on its own geometry: from {INDEX_FIRST:g} to {INDEX_BEST:g} by a genetic algorithm."
+    )
+
+
+def _split_toml(text: str) -> list[tuple[str, str, str]]:
+    rows, section = [], ""
+    for line in text.splitlines():
+        if line.startswith("["):
+            section = line.strip("[] ") + "."
+        elif " = " in line:
+            key, _, rest = line.partition(" = ")
+            value, _, meaning = rest.partition(" # ")
+            rows.append((section + key, value.strip(), meaning.strip()))
+    return rows

@@ -1,0 +1,102 @@
+"""Entries of `result.json` from what the stages computed and recorded."""
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from identify.arrays import Array
+from identify.estimation.identification import IdentificationResult
+from identify.estimation.loop_parameters import unit_of
+from identify.experiment.truth import true_poses
+from identify.files.result_file import AXES, rms_figures
+from identify.record import recording
+
+
+def identification_entry(result: IdentificationResult) -> dict[str, Any]:
+    """Estimates with their uncertainty; the true values are added by validation."""
+    anchor = result.scale_anchor
+    return {
+        "scale_anchor": anchor.name,
+        "scale_anchor_value": anchor.value,
+        "scale_anchor_std": anchor.std,
+        "iterations": result.iterations,
+        "evaluations": result.evaluations,
+        "stop_reason": result.stop_reason,
+        "costs": [list(costs) for costs in result.costs],
+        "searches": ["command_driven", "closed_loop"][: len(result.costs)],
+        "noise_ratio": result.noise_ratio,
+        "expected_noise_ratio": result.expected_noise_ratio,
+        "whiteness": {
+            "p_value": result.whiteness.p_value,
+            "p_values": dict(zip(AXES, result.whiteness.p_values, strict=True)),
+        },
+        "warnings": list(result.warnings),
+        "base_rank": result.base_rank,
+        "parameters": {
+            name: {
+                "unit": unit_of(name),
+                "initial": result.initial[index],
+                "true": None,
+                "warm_start": result.warm_start[index],
+                "estimate": result.estimate[index],
+                "std": result.std[index],
+                "identifiable": bool(result.identifiable[index]),
+            }
+            for index, name in enumerate(result.names)
+        },
+        "groups": {
+            name: {
+                "expression": result.groups.expressions[index],
+                "coefficients": _coefficients(result.groups.combinations[index], result.names),
+                "initial": result.groups.initial[index],
+                "true": None,
+                "estimate": result.groups.estimate[index],
+                "std": result.groups.std[index],
+                "identifiable": bool(result.groups.identifiable[index]),
+            }
+            for index, name in enumerate(result.groups.names)
+        },
+    }
+
+
+def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
+    """Enter the true parameters, and the true values of their groups, into an identification entry."""
+    for name, value in truth.items():
+        identification["parameters"][name]["true"] = value
+    for group in identification.get("groups", {}).values():
+        group["true"] = sum(weight * truth[name] for name, weight in group["coefficients"].items())
+
+
+def _coefficients(row: Array, names: tuple[str, ...]) -> dict[str, float]:
+    return {names[k]: float(row[k]) for k in np.flatnonzero(row)}
+
+
+def parameter_vector(identification: dict[str, Any], column: str) -> Array:
+    """Parameters (67,) of one column ("initial", "estimate", ...) of an identification entry."""
+    return np.array([entry[column] for entry in identification["parameters"].values()], dtype=float)
+
+
+def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:
+    """The sensor against the truth over all (record, truth) pairs; speed of rendering and measuring in one process."""
+    errors = np.vstack([recording.poses(record, "measured") - true_poses(truth) for record, truth in runs])
+    ok = np.concatenate([record["measured_ok"].values.astype(bool) for record, _ in runs])
+    seconds = sum(float(record.attrs["sensor_seconds"]) for record, _ in runs)
+    return {
+        "frames": len(ok),
+        "lost_frames": int(np.sum(~ok)),
+        "stereo_frames_per_second": len(ok) / seconds,
+        **rms_figures(errors, ok),
+    }
+
+
+def validation_entry(record: xr.Dataset, truth: xr.Dataset, initial: Array, identified: Array) -> dict[str, Any]:
+    """One unseen run: both models (N, 6) against the measured and against the true plant pose."""
+    ok = record["measured_ok"].values.astype(bool)
+    measured, true = recording.poses(record, "measured"), true_poses(truth)
+    return {
+        "measured": rms_figures(identified - measured, ok),
+        "true": rms_figures(identified - true),
+        "initial_measured": rms_figures(initial - measured, ok),
+        "initial_true": rms_figures(initial - true),
+    }
