@@ -41,6 +41,16 @@ static void record_sensitivities(const context *c, int k, trajectory *out) {
     }
 }
 
+/* The state of a frame that is not yet measured: pose, pose rate, joint PID integral, servo integral. */
+static void record_end(const context *c, const servo *v, trajectory *out) {
+    for (int i = 0; i < NSTART; i++) {
+        const double *entry = i < NSTATE ? c->x.all[i] : v->d_integral[i - NSTATE];
+        if (out->end_sensitivity) memcpy(out->end_sensitivity + NP * i, entry, NP * sizeof(double));
+        if (out->end_start_sensitivity)
+            memcpy(out->end_start_sensitivity + NSTART * i, entry + START, NSTART * sizeof(double));
+    }
+}
+
 static int run_frames(context *c, servo *v, issued *ring, state *s, measure_fn measure, trajectory *out) {
     const problem *p = c->p;
     int status = OK;
@@ -51,6 +61,7 @@ static int run_frames(context *c, servo *v, issued *ring, state *s, measure_fn m
         memcpy(out->integral + N * k, s->integral, sizeof(vec));
         memcpy(out->servo_integral + N * k, v->integral, sizeof(vec));
         record_sensitivities(c, k, out);
+        if (k + 1 == p->frames) record_end(c, v, out);
         status = frame_command(c, v, k, s, measure, out);
         if (status != OK) return status;
         issued *slot = &ring[k % MAX_DELAY];

@@ -57,6 +57,7 @@ typedef struct {
     signed char *measured_ok;                          /* (frames) */
     double *pose_sensitivity;                          /* (frames, 6, NP) or NULL */
     double *start_sensitivity;                         /* (frames, 6, NSTART) or NULL */
+    double *end_sensitivity, *end_start_sensitivity;   /* of the last frame's state: (NSTART, NP), (NSTART, NSTART) or NULL */
     int events, failed_frame;
     vec last_pose;                                     /* the last at which the equation of motion was evaluated */
 } trajectory;

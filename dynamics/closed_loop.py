@@ -65,9 +65,10 @@ def simulate(
     """Run the closed loop for parameters (67,): the 64 dynamic ones, then lp, li, ld.
 
     sensor: None for the ideal one. start: None for the equilibrium at the first reference pose, which moves with the
-    parameters. sensitivities: also derivatives of the poses with respect to all parameters; start_sensitivities: those
-    and the ones with respect to the start (ideal sensor only). commands (frames, 6): drive the joints with these
-    instead of the servo's; what is measured is then recorded and steers nothing.
+    parameters. sensitivities: also derivatives of the poses and of the last frame's state with respect to all
+    parameters; start_sensitivities: those and the ones with respect to the start (ideal sensor only).
+    commands (frames, 6): drive the joints with these instead of the servo's; what is measured is then recorded and
+    steers nothing.
     latencies (frames,), s: of each frame's command, instead of the settings' for all; see `command_schedule`.
     lost (frames,) bool: frames at which the ideal sensor measures nothing, so that a model loses what its plant lost.
     compiled: None takes the compiled path when a C compiler is at hand; False forces the plain path.

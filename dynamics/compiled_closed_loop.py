@@ -2,6 +2,7 @@
 
 import ctypes
 from ctypes import CFUNCTYPE, POINTER, Structure, byref, c_byte, c_double, c_int
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -15,13 +16,12 @@ from dynamics.geometry import Rss6Geometry
 from dynamics.loop_types import (
     LEFT_REACH,
     MEASURED_OUT_OF_REACH,
-    PARAMETER_COUNT,
     SINGULAR_MASS,
-    START_COUNT,
     ClosedLoopRun,
     LoopProblem,
     PoseSensor,
     RateSensor,
+    empty_run,
     failure,
     measurement,
 )
@@ -47,6 +47,7 @@ _TIMES_AND_FRICTION = ("frame_period", "smoothing_velocity", "static_level", "st
 # What the sensor callback returns. An error that escapes it makes ctypes return 0.
 SENSOR_RAISED, MEASURED, LOST = 0, 1, 2
 _RECORDS = ("pose", "pose_rate", "torque", "command", "measured", "joint_integral", "servo_integral")  # (frames, 6)
+_SENSITIVITIES = ("pose_sensitivity", "start_sensitivity", "end_sensitivity", "end_start_sensitivity")
 
 _DoublePointer = POINTER(c_double)
 _Measure = CFUNCTYPE(c_int, c_int, _DoublePointer, _DoublePointer, _DoublePointer)
@@ -73,8 +74,7 @@ class _Trajectory(Structure):
     _fields_ = [
         *[(name, _DoublePointer) for name in _RECORDS],
         ("measured_ok", POINTER(c_byte)),
-        ("pose_sensitivity", _DoublePointer),
-        ("start_sensitivity", _DoublePointer),
+        *[(name, _DoublePointer) for name in _SENSITIVITIES],
         ("events", c_int),
         ("failed_frame", c_int),
         ("last_pose", c_double * 6),
@@ -97,34 +97,20 @@ def library(geometry: Rss6Geometry) -> ctypes.CDLL | None:
 
 def run(library: ctypes.CDLL, problem: LoopProblem) -> ClosedLoopRun:
     """Do one run with the compiled loop; see `closed_loop.simulate`."""
-    frames, period = problem.frames, problem.period
-    arrays = {name: np.zeros((frames, 6)) for name in _RECORDS}
-    measured_ok = np.zeros(frames, dtype=np.int8)
-    sensitivity = np.zeros((frames, 6, PARAMETER_COUNT)) if problem.sensitivities else None
-    by_start = np.zeros((frames, 6, START_COUNT)) if problem.start_sensitivities else None
+    result = empty_run(problem)
     struct = _struct(problem, command_schedule(problem))
     trajectory = _Trajectory(
-        **{name: _pointer(array) for name, array in arrays.items()},
-        measured_ok=measured_ok.ctypes.data_as(POINTER(c_byte)),
-        pose_sensitivity=_pointer(sensitivity),
-        start_sensitivity=_pointer(by_start),
+        **{name: _pointer(getattr(result, name)) for name in (*_RECORDS, *_SENSITIVITIES)},
+        measured_ok=result.measured_ok.ctypes.data_as(POINTER(c_byte)),
     )
-    callback, raised = _callback(problem.sensor, period)
+    callback, raised = _callback(problem.sensor, problem.period)
     status = library.closed_loop_run(byref(struct), callback, byref(trajectory))
     if status == SENSOR_FAILED:
         raise raised[0] if raised else SimulationError("the pose sensor failed without an error")
     if status:
         last_pose = np.array(trajectory.last_pose)
-        raise failure(FAILURES[status], trajectory.failed_frame, problem, last_pose, arrays["measured"])
-    return ClosedLoopRun(
-        time=np.arange(frames) * period,
-        **arrays,
-        measured_ok=measured_ok.astype(bool),
-        pose_sensitivity=sensitivity,
-        start_sensitivity=by_start,
-        events=trajectory.events,
-        start=problem.start,
-    )
+        raise failure(FAILURES[status], trajectory.failed_frame, problem, last_pose, result.measured)
+    return replace(result, events=trajectory.events)
 
 
 def _struct(problem: LoopProblem, schedule: CommandSchedule) -> _Problem:

@@ -175,8 +175,9 @@ class LoopProblem:
 class ClosedLoopRun:
     """A run, one row a frame: time (s), true pose and pose rate, actuator torque (N m), command (rad), measured pose,
     whether the measurement was good; joint PID integral (rad s) and servo integral (m s, rad s) as the frame begins;
-    derivatives of the poses by the parameters (frames, 6, 67) and by the start (frames, 6, 24; see StartState), or
-    None; number of stick-slip events; the start."""
+    derivatives of the poses by the parameters (frames, 6, 67) and by the start (frames, 6, 24; see StartState), and of
+    the 24 entries of the last frame's state by both, end_sensitivity (24, 67) and end_start_sensitivity (24, 24), each
+    or None; number of stick-slip events; the start."""
 
     time: np.ndarray
     pose: np.ndarray
@@ -189,6 +190,8 @@ class ClosedLoopRun:
     servo_integral: np.ndarray
     pose_sensitivity: np.ndarray | None
     start_sensitivity: np.ndarray | None
+    end_sensitivity: np.ndarray | None
+    end_start_sensitivity: np.ndarray | None
     events: int
     start: StartState
 
@@ -211,6 +214,30 @@ class ClosedLoopRun:
             commands,
             self.measured[frame - 1],
         )
+
+
+def empty_run(problem: LoopProblem) -> ClosedLoopRun:
+    """What a run is written into: zeros, and None for the derivatives that it is not asked for."""
+    frames = problem.frames
+    pose, rate, torque, command, measured, joint_integral, servo_integral = np.zeros((7, frames, 6))
+    by_parameters, by_start = problem.sensitivities, problem.start_sensitivities
+    return ClosedLoopRun(
+        time=np.arange(frames) * problem.period,
+        pose=pose,
+        pose_rate=rate,
+        torque=torque,
+        command=command,
+        measured=measured,
+        measured_ok=np.zeros(frames, dtype=bool),
+        joint_integral=joint_integral,
+        servo_integral=servo_integral,
+        pose_sensitivity=np.zeros((frames, 6, PARAMETER_COUNT)) if by_parameters else None,
+        start_sensitivity=np.zeros((frames, 6, START_COUNT)) if by_start else None,
+        end_sensitivity=np.zeros((START_COUNT, PARAMETER_COUNT)) if by_parameters else None,
+        end_start_sensitivity=np.zeros((START_COUNT, START_COUNT)) if by_start else None,
+        events=0,
+        start=problem.start,
+    )
 
 
 def measurement(

@@ -17,6 +17,7 @@ from dynamics.loop_types import (
     ClosedLoopRun,
     LoopProblem,
     Reference,
+    empty_run,
     failure,
     measurement,
 )
@@ -46,13 +47,15 @@ def run(robot: Robot, problem: LoopProblem) -> ClosedLoopRun:
         functions, settings.servo, period, start.last_measured, start.servo_integral, d_servo_integral
     )
     state = State(start.pose, start.pose_rate, start.joint_integral)
-    result = _empty(problem)
+    result = empty_run(problem)
     issued: list[Issued] = [(command, rest) for command in start.commands]
     schedule = command_schedule(problem)
     motion.start_from(state)
     for frame in range(problem.frames):
         d_pose = _record_state(result, frame, state, motion)
         result.servo_integral[frame] = servo.integral
+        if frame + 1 == problem.frames:
+            _record_end(result, motion, servo)
         measured = _measure(problem, frame, state)
         servo.next_frame()
         result.measured_ok[frame] = measured is not None
@@ -83,6 +86,17 @@ def _record_state(result: ClosedLoopRun, frame: int, state: State, motion: Stick
     if result.start_sensitivity is not None:
         result.start_sensitivity[frame] = motion.tangent.pose[:, LENGTH + 1 :]
     return motion.tangent.pose
+
+
+def _record_end(result: ClosedLoopRun, motion: StickSlipMotion, servo: VisualServo) -> None:
+    """Write the derivatives of the last frame's state into the result, where they are wanted."""
+    x = motion.tangent
+    if x is None or result.end_sensitivity is None:
+        return
+    entries = np.vstack([x.pose, x.rate, x.integral, servo.integral_tangent])
+    result.end_sensitivity[:] = entries[:, :PARAMETER_COUNT]
+    if result.end_start_sensitivity is not None:
+        result.end_start_sensitivity[:] = entries[:, LENGTH + 1 :]
 
 
 def _measure(problem: LoopProblem, frame: int, state: State) -> np.ndarray | None:
@@ -143,23 +157,3 @@ def _start_tangent(problem: LoopProblem) -> tuple[State, np.ndarray]:
         for block, rows in enumerate((pose, rate, integral, servo_integral)):
             rows[:, LENGTH + 1 + 6 * block :][:, :6] = np.eye(6)
     return State(pose, rate, integral), servo_integral
-
-
-def _empty(problem: LoopProblem) -> ClosedLoopRun:
-    frames = problem.frames
-    pose, rate, torque, command, measured, joint_integral, servo_integral = np.zeros((7, frames, 6))
-    return ClosedLoopRun(
-        time=np.arange(frames) * problem.period,
-        pose=pose,
-        pose_rate=rate,
-        torque=torque,
-        command=command,
-        measured=measured,
-        measured_ok=np.zeros(frames, dtype=bool),
-        joint_integral=joint_integral,
-        servo_integral=servo_integral,
-        pose_sensitivity=np.zeros((frames, 6, PARAMETER_COUNT)) if problem.sensitivities else None,
-        start_sensitivity=np.zeros((frames, 6, START_COUNT)) if problem.start_sensitivities else None,
-        events=0,
-        start=problem.start,
-    )

@@ -35,6 +35,11 @@ class VisualServo:
         """Sum of the errors times the frame period (6,), m s and rad s."""
         return self._integral.copy()
 
+    @property
+    def integral_tangent(self) -> np.ndarray:
+        """Derivatives of `integral`, (6, columns)."""
+        return self._d_integral.copy()
+
     def next_frame(self) -> None:
         """Let one frame period pass."""
         self._elapsed += self._period

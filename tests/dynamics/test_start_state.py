@@ -140,6 +140,38 @@ def test_velocities_of_a_robot_at_rest_have_no_effect(robot, identified, half_wa
     assert 50 < changes[0] / changes[1] < 200
 
 
+def _entries(state):
+    return np.concatenate([getattr(state, name) for name in ENTRIES])
+
+
+@pytest.mark.parametrize("timing", TIMINGS)
+def test_the_end_state_moves_with_start_and_parameters_as_runs_do(robot, identified, half_way, timing):
+    """All 24 entries of the last frame's state, by finite differences of runs along the start and the parameters."""
+    reference, settings, start = half_way(**TIMINGS[timing])
+
+    def end(move, change):
+        run = closed_loop.simulate(robot, identified + change, reference, settings, start=_moved(start, move))
+        return _entries(run.state_at(len(reference.poses) - 1))
+
+    def difference(move, change):
+        ends = {n: end(n * move, n * change) for n in (-2, -1, 1, 2)}
+        return (8 * (ends[1] - ends[-1]) - (ends[2] - ends[-2])) / 12
+
+    run = closed_loop.simulate(robot, identified, reference, settings, start=start, start_sensitivities=True)
+    assert run.end_sensitivity.shape == (24, 67)
+    assert run.end_start_sensitivity.shape == (24, 24)
+    moves = [(direction, np.zeros(67)) for direction in _directions(robot, start)[0]]
+    moves += [(np.zeros(24), identified[k] * np.eye(67)[k]) for k in (0, 1, 7, 28, 29, *range(52, 67))]
+    for move, change in moves:
+        ours = run.end_start_sensitivity @ move + run.end_sensitivity @ change
+        scale = np.maximum(np.abs(ours).reshape(4, 6).max(axis=1).repeat(6), 1e-3 * np.abs(ours).max())
+        misses = []
+        for step in (1e-7, 1e-8, 1e-9):
+            h = step / np.abs(ours[:6]).max()
+            misses.append((np.abs(difference(h * move, h * change) / h - ours) / scale).max())
+        assert min(misses) <= 1e-6, (move, change, misses)
+
+
 @pytest.mark.parametrize("timing", TIMINGS)
 def test_both_paths_give_the_same_from_a_start(robot, identified, half_way, timing):
     """Compiled and plain: poses, and the derivatives with respect to start and parameters, to 1e-9."""
@@ -154,6 +186,10 @@ def test_both_paths_give_the_same_from_a_start(robot, identified, half_way, timi
     for name in ("pose", "joint_integral", "servo_integral", "pose_sensitivity", "start_sensitivity"):
         other = getattr(plain, name)
         scale = np.abs(other).max(axis=(0, 1))
+        assert (np.abs(getattr(ours, name) - other) <= 1e-9 * scale + 1e-14).all(), name
+    for name in ("end_sensitivity", "end_start_sensitivity"):
+        other = getattr(plain, name)
+        scale = np.abs(other).reshape(4, 6, -1).max(axis=1).repeat(6, axis=0)
         assert (np.abs(getattr(ours, name) - other) <= 1e-9 * scale + 1e-14).all(), name
 
 
