@@ -1,25 +1,12 @@
 """``cmmsim acceptance``: what it writes, what it prints, and what it refuses before it draws anything."""
 
 import json
-import sys
 
 import pytest
 
-from identify import command_line
 from identify.acceptance import procedure as acceptance
 from identify.acceptance.tables import acceptance_markdown
-
-
-def command(*arguments):
-    """Exit status of the command in this process."""
-    old, sys.argv = sys.argv, ["cmmsim", *map(str, arguments)]
-    try:
-        command_line.main()
-    except SystemExit as exit_:
-        return exit_.code or 0
-    finally:
-        sys.argv = old
-    return 0
+from tests.identify.commands import command
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """``cmmsim calibrate``: pictures rendered by the command are read back by it; what cannot be done is one line."""
 
 import json
-import sys
 import tomllib
 from importlib import resources
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 import cmmsim
-from identify import command_line
+from tests.identify.commands import command
 
 SENSOR = (resources.files("cmmsim").joinpath("sensors", "ctrack780.toml").read_text(encoding="utf-8")
           .replace("width = 2048", "width = 640").replace("height = 1536", "height = 480")
@@ -19,25 +18,13 @@ SENSOR = (resources.files("cmmsim").joinpath("sensors", "ctrack780.toml").read_t
 BOARD = 'kind = "dots"\ncolumns = 7\nrows = 6\nspacing = 0.07\nradius = 0.0175\n'
 
 
-def command(*arguments):
-    """Exit status of the command in this process."""
-    old, sys.argv = sys.argv, ["cmmsim", "calibrate", *map(str, arguments)]
-    try:
-        command_line.main()
-    except SystemExit as exit_:
-        return exit_.code or 0
-    finally:
-        sys.argv = old
-    return 0
-
-
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrate")
     (folder / "small.toml").write_text("renderer = \"analytic\"\n" + SENSOR)
     (folder / "board.toml").write_text(BOARD)
     options = ("--sensor", folder / "small.toml", "--board", folder / "board.toml", "--out", folder / "pictures")
-    assert command("--render", 8, *options, "--quiet") == 0
+    assert command("calibrate", "--render", 8, *options, "--quiet") == 0
     return folder
 
 
@@ -48,7 +35,7 @@ def arguments(folder):
 
 def test_command_calibrates_what_it_rendered(pictures, tmp_path, capfd):
     out = tmp_path / "new"
-    assert command(*arguments(pictures), "--sensor", pictures / "small.toml", "--out", out) == 0
+    assert command("calibrate", *arguments(pictures), "--sensor", pictures / "small.toml", "--out", out) == 0
     said = capfd.readouterr()
     assert "8 pairs" in said.out
     assert "right_from_left.tx_m" in said.out
@@ -73,7 +60,7 @@ def test_command_calibrates_what_it_rendered(pictures, tmp_path, capfd):
 
 def test_options_reach_the_calibration(pictures, tmp_path):
     options = ("--distortion", "none", "--fix-aspect", "--out", tmp_path / "new", "--quiet")
-    assert command(*arguments(pictures), *options) == 0
+    assert command("calibrate", *arguments(pictures), *options) == 0
     result = json.loads((tmp_path / "new" / "calibration.json").read_text())
     assert result["options"] == {"distortion": "none", "fix_aspect": True}
     assert [n for n, p in result["parameters"].items() if not p["free"] and n.startswith("left")] == [
@@ -83,8 +70,8 @@ def test_options_reach_the_calibration(pictures, tmp_path):
 
 def test_rendering_again_gives_the_same_pictures(pictures, tmp_path):
     options = ("--sensor", pictures / "small.toml", "--board", pictures / "board.toml", "--quiet")
-    assert command("--render", 1, *options, "--seed", 5, "--out", tmp_path / "a") == 0
-    assert command("--render", 1, *options, "--seed", 5, "--out", tmp_path / "b") == 0
+    assert command("calibrate", "--render", 1, *options, "--seed", 5, "--out", tmp_path / "a") == 0
+    assert command("calibrate", "--render", 1, *options, "--seed", 5, "--out", tmp_path / "b") == 0
     for side in ("left", "right"):
         first, second = ((tmp_path / k / side / "000.png").read_bytes() for k in "ab")
         assert first == second
@@ -103,7 +90,7 @@ def test_rendering_again_gives_the_same_pictures(pictures, tmp_path):
 ])
 def test_what_cannot_be_done_is_one_line_and_leaves_nothing(pictures, monkeypatch, capfd, tmp_path, change, evidence):
     monkeypatch.chdir(tmp_path)
-    assert command(*change(list(arguments(pictures))), "--out", "new", "--quiet") == 1
+    assert command("calibrate", *change(list(arguments(pictures))), "--out", "new", "--quiet") == 1
     said = capfd.readouterr().err
     assert said.startswith("error: ")
     assert said.count("\n") == 1
@@ -112,7 +99,7 @@ def test_what_cannot_be_done_is_one_line_and_leaves_nothing(pictures, monkeypatc
 
 
 def test_help_teaches_the_board_file(capfd):
-    assert command("--help") == 0
+    assert command("calibrate", "--help") == 0
     said = capfd.readouterr().out
     assert "asymmetric_dots" in said
     assert "--render 20" in said

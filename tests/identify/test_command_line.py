@@ -8,6 +8,7 @@ from identify import command_line
 from identify.errors import OutputFolderError, ScenarioError
 from identify.files.result_file import load_result, save_result
 from identify.files.run_folder import RunFolder, new_run_folder
+from tests.identify.commands import command, one_line
 
 
 @pytest.fixture
@@ -21,24 +22,6 @@ def calls(monkeypatch):
     names = ("run", "excite", "record", "identify", "validate", "report")
     monkeypatch.setattr(command_line, "_pipeline", lambda: SimpleNamespace(**{n: stage(n) for n in names}))
     return made
-
-
-def command(*arguments):
-    """Exit status of the command in this process."""
-    old, sys.argv = sys.argv, ["cmmsim", *map(str, arguments)]
-    try:
-        command_line.main()
-    except SystemExit as exit_:
-        return exit_.code or 0
-    finally:
-        sys.argv = old
-    return 0
-
-
-def one_line(text):
-    assert text.startswith("error: ")
-    assert text.count("\n") == 1, text
-    return text
 
 
 def test_run_passes_scenario_seed_folder_and_workers(calls, tmp_path):

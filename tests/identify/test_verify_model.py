@@ -9,7 +9,6 @@ import pytest
 
 import dynamics
 from dynamics.parameters import PARAMETER_NAMES
-from identify import command_line
 from identify.errors import RecordError, ScenarioError, TrajectoryError
 from identify.files.parameter_choice import choose_parameters
 from identify.files.result_file import load_result, save_result
@@ -17,6 +16,7 @@ from identify.reporting.verification_figure import figure_8
 from identify.robot_checks.figure7_loop import EngineRuns, compare_engines, exciting_trajectory
 from identify.robot_checks.model_verification import judge
 from identify.trajectory import check_travel
+from tests.identify.commands import command
 
 
 @pytest.fixture(scope="module")
@@ -45,18 +45,6 @@ def made_runs():
     other[:2, 2] = 4e-6
     reference = np.full((9, 6), [1e-3, 0, 0, 0, 0, 2e-3])
     return EngineRuns(time, reference, poses, other, torques, torques - 0.5, time * 1e-9, time * 1e-3, "4.0.0")
-
-
-def command(*arguments):
-    """Exit status of the command in this process."""
-    old, sys.argv = sys.argv, ["cmmsim", *map(str, arguments)]
-    try:
-        command_line.main()
-    except SystemExit as exit_:
-        return exit_.code or 0
-    finally:
-        sys.argv = old
-    return 0
 
 
 def test_verdict_takes_lengths_before_and_after_settling(made_runs):

@@ -1,0 +1,24 @@
+"""The command ``cmmsim`` called in this process, and what it may say."""
+
+import sys
+
+from identify import command_line
+
+
+def command(*arguments):
+    """Exit status of the command in this process."""
+    old, sys.argv = sys.argv, ["cmmsim", *map(str, arguments)]
+    try:
+        command_line.main()
+    except SystemExit as exit_:
+        return exit_.code or 0
+    finally:
+        sys.argv = old
+    return 0
+
+
+def one_line(text):
+    """The text, which must be one error line."""
+    assert text.startswith("error: ")
+    assert text.count("\n") == 1, text
+    return text
