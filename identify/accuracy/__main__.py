@@ -1,0 +1,23 @@
+"""Print saved figures as a Markdown table: python -m identify.accuracy FILE."""
+
+import sys
+from pathlib import Path
+
+from identify.accuracy.errors import AccuracyError
+from identify.accuracy.saved import read_saved
+from identify.accuracy.table import markdown_table
+
+
+def main(arguments: list[str]) -> int | str:
+    """Exit status of the command: 0, or the line that says what is wrong."""
+    if len(arguments) != 1:
+        return "usage: python -m identify.accuracy FILE, a file that pytest --accuracy-save NAME has left"
+    try:
+        sys.stdout.write(markdown_table(read_saved(Path(arguments[0])).figures))
+    except AccuracyError as error:
+        return str(error)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,56 @@
+"""Figures of this session beside those of a saved one: what got worse, and by how much."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from identify.accuracy.figure import Figure, with_unit
+
+Key = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A figure, and the one that was saved under the same test and name."""
+
+    now: Figure
+    saved: Figure
+
+    @property
+    def mismatch(self) -> str:
+        """Why the two cannot be compared, or nothing."""
+        for what, new, old in (
+            ("unit", self.now.unit, self.saved.unit),
+            ("better", self.now.better, self.saved.better),
+        ):
+            if new != old:
+                return f"{what} is {new!r}, was {old!r}"
+        return ""
+
+    @property
+    def change(self) -> float:
+        """Growth of the value as a share of the saved one's size; infinite from zero to anything else."""
+        grown = self.now.value - self.saved.value
+        if not grown:
+            return 0.0
+        return grown / abs(self.saved.value) if self.saved.value else float("inf") * grown
+
+    def worse_by_more_than(self, ratio: float) -> bool:
+        """Whether the value got worse by more than this share of the saved one's size.
+
+        Where there are intervals, only if even the good end of the new one is that much worse than the bad end of the
+        saved one.
+        """
+        sign = self.now.sign
+        return sign * (self.now.best - self.saved.worst) > ratio * abs(self.saved.value)
+
+    @property
+    def regression(self) -> str:
+        """One line: name, both values and the change."""
+        now, saved = (with_unit(f"{figure.value:.6g}", self.now.unit) for figure in (self.now, self.saved))
+        return f"{self.now.test}: {self.now.name} is {now}, was {saved}, {self.change:+.1%}"
+
+
+def compare(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[Key, Comparison]:
+    """Pairs of figures by their key; figures that have no partner are left out."""
+    before = {figure.key: figure for figure in saved}
+    return {figure.key: Comparison(figure, before[figure.key]) for figure in figures if figure.key in before}

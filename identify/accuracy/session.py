@@ -1,0 +1,125 @@
+"""What the session does with all figures: gather, compare, save, and show the table.
+
+The figures travel as user properties in the reports of the tests, which pytest-xdist brings from its workers: with or
+without it the same figures arrive here, and sorted by node id they make the same table and the same file.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from identify.accuracy.comparison import Comparison, Key, compare
+from identify.accuracy.errors import AccuracyError
+from identify.accuracy.figure import PROPERTY, Figure
+from identify.accuracy.table import terminal_table
+
+
+class AccuracySession:
+    """A plugin object for the process that runs the session, not for the workers of pytest-xdist."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self._figures: dict[str, list[Figure]] = {}
+        self._remarks: list[tuple[str, bool]] = []
+        folder, base = config.getoption("accuracy_dir"), config.rootpath / ".accuracy"
+        self._folder = config.invocation_params.dir / folder if folder else base
+        self._seed = config.getoption("accuracy_seed")
+        self._save, self._compare = config.getoption("accuracy_save"), config.getoption("accuracy_compare")
+        self._ratio: float | None = config.getoption("accuracy_fail")
+        self._saved: list[Figure] = []
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Refuse before any test runs what could not work after the last one."""
+        if self._ratio is not None and self._compare is None:
+            raise pytest.UsageError("--accuracy-fail needs --accuracy-compare NAME: worse than what?")
+        if self._save is None and self._compare is None:
+            return
+        from identify.accuracy.saved import check_replaceable, find_saved, saved_path
+
+        try:
+            if self._save is not None:
+                check_replaceable(saved_path(self._folder, self._save))
+            if self._compare is not None:
+                self._saved = find_saved(self._folder, self._compare).figures
+        except AccuracyError as error:
+            raise pytest.UsageError(str(error)) from error
+
+    @property
+    def figures(self) -> list[Figure]:
+        """All figures, by node id and in the order of their test."""
+        return [figure for test in sorted(self._figures) for figure in self._figures[test]]
+
+    @property
+    def comparisons(self) -> dict[Key, Comparison]:
+        """Figures beside the saved ones."""
+        return dict(compare(self.figures, self._saved))
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Take the figures from a test's last report."""
+        if report.when == "teardown":
+            found = [_figure(value) for name, value in report.user_properties if name == PROPERTY]
+            if found:
+                self._figures[found[0].test] = found
+
+    def pytest_sessionfinish(self, session: pytest.Session) -> None:
+        """Judge the comparison, then save if everything passed."""
+        if self._compare is not None:
+            self._judge(session)
+        if self._save is not None:
+            self._keep(session)
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        """Show the table."""
+        if not self._figures and not self._remarks:
+            return
+        terminalreporter.section("accuracy")
+        if self._figures:
+            for line in terminal_table(self.figures, self.comparisons, self._compare):
+                terminalreporter.write_line(line)
+        for remark, bad in self._remarks:
+            terminalreporter.write_line(remark, red=bad)
+
+    def _judge(self, session: pytest.Session) -> None:
+        comparisons = self.comparisons
+        gone = len({figure.key for figure in self._saved} - set(comparisons))
+        if gone:
+            self._remark(f"{gone} of {len(self._saved)} figures saved as {self._compare} were not measured now")
+        if self._ratio is None:
+            return
+        for pair in comparisons.values():
+            if pair.mismatch:
+                self._fail(session, f"{pair.now.test}: {pair.now.name} cannot be compared: {pair.mismatch}")
+            elif pair.worse_by_more_than(self._ratio):
+                self._fail(session, f"worse by more than {self._ratio:.0%}: {pair.regression}")
+
+    def _keep(self, session: pytest.Session) -> None:
+        from identify.accuracy.saved import SavedSession, save, saved_path
+
+        path = saved_path(self._folder, self._save)
+        if session.exitstatus != pytest.ExitCode.OK or not self._figures:
+            why = "the session did not pass" if self._figures else "no figures were recorded"
+            self._remark(f"not saved as {self._save}: {why}")
+            return
+        try:
+            save(path, SavedSession(name=self._save, seed=self._seed, figures=self.figures))
+        except AccuracyError as error:
+            self._fail(session, str(error))
+        else:
+            self._remark(f"saved: {_shown(path)}")
+
+    def _remark(self, text: str, bad: bool = False) -> None:
+        self._remarks.append((text, bad))
+
+    def _fail(self, session: pytest.Session, text: str) -> None:
+        self._remark(text, bad=True)
+        if session.exitstatus == pytest.ExitCode.OK:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def _figure(properties: Any) -> Figure:
+    return Figure(**properties)
+
+
+def _shown(path: Path) -> str:
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
