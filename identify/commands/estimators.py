@@ -78,7 +78,7 @@ def _scores(
 
     scenario = load_scenario(folder.scenario)
     record, truth = recording.read(folder.experiment), read_truth(folder.experiment)
-    problem = output_error_problem(record, load_robot(scenario.robot), scenario)
+    problem = output_error_problem([record], load_robot(scenario.robot), scenario)
     rng = np.random.default_rng([seed, INSTRUMENTS_STREAM])
     channels = folder.path / "instruments.nc"
     draws = np.random.default_rng(stream_seed(int(record.attrs["seed"]), LATENCY, 0))

@@ -31,10 +31,12 @@ FEWEST = 50
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Covariance (67, 67) of the estimate; mean squared whitened residual to expect from noise alone, and its spread
-    from one experiment to the next; unstable: repeated experiments that ended early and were left out."""
+    """Covariance (67, 67) of the estimate; mean squared whitened residual of the record, what noise alone would make of
+    it, and how that spreads from one experiment to the next; unstable: repeated experiments that ended early and were
+    left out."""
 
     covariance: Array
+    noise_ratio: float
     expected_noise_ratio: float
     noise_ratio_std: float
     unstable: int = 0
@@ -48,18 +50,21 @@ def estimate_uncertainty(
     Raises EstimationError when too many of them are unstable.
     """
     size = len(parameters)
-    jacobians = [run.residuals(parameters)[1].reshape(-1, size) for run in problem.runs]
+    residuals, jacobians = [], []
+    for run in problem.runs:
+        residual, jacobian = run.residuals(parameters)
+        residuals.append(residual)
+        jacobians.append(jacobian.reshape(-1, size))
+    ratio = float(np.mean(np.concatenate(residuals) ** 2))
     known = problem.known_information()
     inverse = np.linalg.inv(sum(j.T @ j for j in jacobians) + known)
     if all(run.driven for run in problem.runs):
         advance(DRAWS)
         count = sum(len(j) for j in jacobians)
-        return Uncertainty((inverse + inverse.T) / 2, 1.0, float(np.sqrt(2 / count)))
-    misfit = problem.noise_ratio(parameters)
-    if misfit > NOISE_DECIDES:
+        return Uncertainty((inverse + inverse.T) / 2, ratio, 1.0, float(np.sqrt(2 / count)))
+    if ratio > NOISE_DECIDES:
         advance(DRAWS)
-        return Uncertainty(misfit * (inverse + inverse.T) / 2, 1.0, float(np.sqrt(2 / sum(map(len, jacobians)))))
-    models = [run.model_poses(parameters) for run in problem.runs]
+        return Uncertainty(ratio * (inverse + inverse.T) / 2, ratio, 1.0, float(np.sqrt(2 / sum(map(len, jacobians)))))
     scores, squares = [], []
     for _ in range(DRAWS):
         try:
@@ -68,11 +73,12 @@ def estimate_uncertainty(
             continue
         finally:
             advance()
-        residuals = [
-            run.whiten(model - poses).ravel() for run, model, poses in zip(problem.runs, models, repeated, strict=True)
+        drawn = [
+            (residual + run.whiten(run.measured - poses)).ravel()
+            for run, residual, poses in zip(problem.runs, residuals, repeated, strict=True)
         ]
-        scores.append(sum(r @ j for r, j in zip(residuals, jacobians, strict=True)))
-        squares.append(np.mean(np.concatenate(residuals) ** 2))
+        scores.append(sum(r @ j for r, j in zip(drawn, jacobians, strict=True)))
+        squares.append(np.mean(np.concatenate(drawn) ** 2))
     if len(scores) < FEWEST:
         raise EstimationError(
             f"{DRAWS - len(scores)} of {DRAWS} repeated experiments on the identified model ended in an unstable loop: "
@@ -80,7 +86,11 @@ def estimate_uncertainty(
         )
     covariance = inverse @ (np.cov(np.array(scores).T) + known) @ inverse
     return Uncertainty(
-        (covariance + covariance.T) / 2, float(np.mean(squares)), float(np.std(squares, ddof=1)), DRAWS - len(scores)
+        (covariance + covariance.T) / 2,
+        ratio,
+        float(np.mean(squares)),
+        float(np.std(squares, ddof=1)),
+        DRAWS - len(scores),
     )
 
 

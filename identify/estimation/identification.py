@@ -94,7 +94,8 @@ def identify(
     """
     progress = progress or SilentProgress()
     settings = scenario.identification
-    problem = output_error_problem(record, robot, scenario)
+    records = [record] if isinstance(record, xr.Dataset) else list(record)
+    problem = output_error_problem(records, robot, scenario)
     began = time.perf_counter()
     warm = warm_start.linear_warm_start(
         problem.runs, scenario.timing, scenario.filter, problem.guess, problem.anchor
@@ -108,7 +109,7 @@ def identify(
             searches.append(search(problem, best_start(problem, searches[0].parameters), scenario, advance))
     searched = time.perf_counter()
     final = problem if settings.method == "closed_loop" else driven
-    rng = np.random.default_rng([_seed(record), UNCERTAINTY_STREAM])
+    rng = np.random.default_rng([int(records[0].attrs["seed"]), UNCERTAINTY_STREAM])
     with progress.stage("uncertainty", DRAWS) as advance:
         uncertainty = estimate_uncertainty(final, searches[-1].parameters, rng, advance)
     tested = _whiteness(driven, searches[0].parameters)
@@ -135,20 +136,17 @@ def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advanc
     return solution
 
 
-def output_error_problem(
-    records: xr.Dataset | Sequence[xr.Dataset], robot: Robot, scenario: Scenario
-) -> OutputErrorProblem:
+def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario) -> OutputErrorProblem:
     """The output-error problem of one or several records; the first brings the scale anchor.
 
     Raises:
         RecordError: no scale anchor, or no such poses.
         EstimationError: a record that does not fit, or cannot carry an identification.
     """
-    given = [records] if isinstance(records, xr.Dataset) else list(records)
-    if not given:
+    if not records:
         raise EstimationError("no record to identify from")
-    runs = tuple(recorded_run(record, robot, scenario) for record in given)
-    anchor = read_anchor(given[0])
+    runs = tuple(recorded_run(record, robot, scenario) for record in records)
+    anchor = read_anchor(records[0])
     if anchor.name == "payload" and len({float(run.payload @ run.payload) for run in runs}) < 2:
         raise EstimationError(
             f"the scale anchor is a payload, and the {len(runs)} records have all the same load: one with and one "
@@ -167,12 +165,6 @@ def _whiteness(driven: OutputErrorProblem, parameters: Array) -> Whiteness:
         residuals += [rows, gap]
         ok += [run.ok, np.zeros(LAGS, dtype=bool)]
     return whiteness(np.concatenate(residuals), np.concatenate(ok))
-
-
-def _seed(record: xr.Dataset | Sequence[xr.Dataset]) -> int:
-    """Seed of the record, or of the first one."""
-    first = record if isinstance(record, xr.Dataset) else record[0]
-    return int(first.attrs["seed"])
 
 
 def best_start(problem: OutputErrorProblem, warm: Array) -> Array:
@@ -208,7 +200,6 @@ def _result(
 ) -> IdentificationResult:
     solution = searches[-1]
     std = np.sqrt(np.diag(uncertainty.covariance))
-    noise_ratio = problem.noise_ratio(solution.parameters)
     said = tuple(warning for run in problem.runs for warning in run.warnings())
     return IdentificationResult(
         names=NAMES,
@@ -225,19 +216,20 @@ def _result(
         evaluations=sum(one.evaluations for one in searches),
         stop_reason=solution.stop_reason,
         costs=tuple(one.costs for one in searches),
-        noise_ratio=noise_ratio,
+        noise_ratio=uncertainty.noise_ratio,
         expected_noise_ratio=uncertainty.expected_noise_ratio,
         whiteness=tested,
-        warnings=said + _warnings(noise_ratio, uncertainty, tested),
+        warnings=said + _warnings(uncertainty, tested),
         seconds=seconds,
     )
 
 
-def _warnings(noise_ratio: float, uncertainty: Uncertainty, tested: Whiteness) -> tuple[str, ...]:
+def _warnings(uncertainty: Uncertainty, tested: Whiteness) -> tuple[str, ...]:
     """A misfit that the sensor's noise does not explain (a local minimum, or a model that is wrong), or a model whose
     loop is close to unstable."""
     said = []
-    expected, spread = uncertainty.expected_noise_ratio, uncertainty.noise_ratio_std
+    noise_ratio, expected = uncertainty.noise_ratio, uncertainty.expected_noise_ratio
+    spread = uncertainty.noise_ratio_std
     if abs(noise_ratio - expected) > MISFIT_STDS * spread:
         said.append(
             f"the model misses the record by {noise_ratio:.3f} times the noise variance, noise alone gives "

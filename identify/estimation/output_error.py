@@ -54,11 +54,6 @@ class OutputErrorProblem:
             triangle = np.asarray(np.linalg.qr(np.vstack([triangle, rows]), mode="r"))
         return cost, triangle[:size, :size], triangle[:size, size]
 
-    def noise_ratio(self, parameters: Array) -> float:
-        """Mean squared whitened pose residual of all records."""
-        squares = [run.whiten(run.model_poses(parameters) - run.measured) ** 2 for run in self.runs]
-        return float(np.mean(np.concatenate(squares)))
-
     def known_information(self) -> Array:
         """Information (67, 67) of what is known beside the poses."""
         _, rows = self._known(self.guess.values)

@@ -32,7 +32,7 @@ def evidence(seed, noise=1.0, instruments=None, scenario=None):
     record, run = run_plant(scenario, seed, sigma=noise * SIGMA)
     rng = np.random.default_rng([seed, 1])
     channels = measure_joints(record, truth_of(run), scenario.timing, instruments or JointInstruments(), rng)
-    problem = output_error_problem(record, rss6(), scenario)
+    problem = output_error_problem([record], rss6(), scenario)
     return Evidence(problem, scenario, joint_channels(channels, record), truth()[64:])
 
 

@@ -33,7 +33,7 @@ def noisy(scenario):
 def unseen_error(scenario, parameters, seed=7):
     """RMS (6,) of a model against the noise-free plant on a trajectory it has not seen."""
     record, run = run_plant(scenario, seed=0, sigma=np.zeros(6), trajectory_seed=seed)
-    problem = output_error_problem(record, rss6(), scenario)
+    problem = output_error_problem([record], rss6(), scenario)
     return np.sqrt(np.mean((problem.runs[0].model_poses(parameters) - run.pose) ** 2, axis=0))
 
 
