@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -215,12 +216,14 @@ def _checked_rate(pose_rate: ArrayLike | None) -> Array | None:
 
 
 def load_sensor(name: str | Path, seed: int = 0, method: str = "registration", taught: Taught | None = None,
-                progress: Progress | None = None, renderer: str | None = None) -> Sensor:
+                progress: Progress | None = None, renderer: str | None = None,
+                changes: Mapping[str, Any] | None = None) -> Sensor:
     """Sensor of a built-in name or of a TOML file.
 
     Parameters: seed of teaching and of the first run's noise; method "registration" or "planes"; taught: the result of
     an earlier teaching of the same sensor; progress(done, total), called while teaching; renderer: "pyrender",
-    "analytic" or "auto" instead of what the file says.
+    "analytic" or "auto" instead of what the file says; changes: other entries than the file's, by dotted key as
+    ``{"camera.dark_noise": 40.0}``.
     Raises UnknownSensorError, SensorFileError, UnknownOptionError.
     """
-    return Sensor(read_sensor_file(name), seed, method, taught, progress, renderer)
+    return Sensor(read_sensor_file(name, changes), seed, method, taught, progress, renderer)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -207,16 +208,43 @@ def built_in_names() -> list[str]:
                   if f.name.endswith(".toml"))
 
 
-def read_sensor_file(name: str | Path) -> SensorFile:
+def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None) -> SensorFile:
     """The sensor file of a built-in name or a path.
 
-    Raises UnknownSensorError for a name that is neither, SensorFileError (with the valid names) for a bad content.
+    changes: entries that hold instead of the file's, by dotted key as ``{"camera.dark_noise": 40.0}`` or nested as in
+    the file. Raises UnknownSensorError for a name that is neither, SensorFileError (with the valid names) for a bad
+    content.
     """
+    source = f"sensor file {name}" + (f" with changes to {', '.join(changes)}" if changes else "")
+    content = _content(name)
+    for path, value in dotted(changes or {}).items():
+        _replace(content, path, value, source)
     try:
-        return SensorFile.model_validate(_content(name))
+        return SensorFile.model_validate(content)
     except ValidationError as error:
         lines = "; ".join(_explain(e) for e in error.errors())
-        raise SensorFileError(f"sensor file {name}: {lines}") from error
+        raise SensorFileError(f"{source}: {lines}") from error
+
+
+def dotted(changes: Mapping[str, Any], section: str = "") -> dict[str, Any]:
+    """Changes by dotted key, whether given so or as tables in tables; a later one replaces an earlier one."""
+    found: dict[str, Any] = {}
+    for key, value in changes.items():
+        path = f"{section}{key}"
+        found |= dotted(value, f"{path}.") if isinstance(value, Mapping) else {path: value}
+    return found
+
+
+def _replace(content: dict[str, Any], path: str, value: Any, source: str) -> None:
+    """Put a value in its place; what is no key of a sensor file is found later, with the valid names."""
+    *sections, key = path.split(".")
+    for section in sections:
+        content = content.setdefault(section, {})
+        if not isinstance(content, dict):
+            raise SensorFileError(f"{source}: {section!r} in {path!r} is a value, not a section")
+    if isinstance(content.get(key), dict):
+        raise SensorFileError(f"{source}: {path} = {value!r} is a section; its keys are {', '.join(content[key])}")
+    content[key] = value
 
 
 def _content(name: str | Path) -> dict[str, Any]:

@@ -6,8 +6,10 @@ sees it at grazing incidence. What stands between it and a camera is not asked.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,19 +55,23 @@ class SightLines:
         return seen
 
 
-def sight_lines(name: str | Path) -> SightLines:
-    """Geometry of sight of a built-in sensor or a sensor file. Raises UnknownSensorError, SensorFileError."""
-    file = read_sensor_file(name)
+def sight_lines(name: str | Path, changes: Mapping[str, Any] | None = None) -> SightLines:
+    """Geometry of sight of a built-in sensor or a sensor file, with changes to its entries as in `load_sensor`.
+
+    Raises UnknownSensorError, SensorFileError.
+    """
+    file = read_sensor_file(name, changes)
     rig, camera_from_base = rig_from_file(file.rig)
     return SightLines(marked_body("platform", file.platform), rig, camera_from_base)
 
 
-def expected_covariance(name: str | Path, pose: ArrayLike, method: str = "registration", seed: int = 0) -> Array:
+def expected_covariance(name: str | Path, pose: ArrayLike, method: str = "registration", seed: int = 0,
+                        changes: Mapping[str, Any] | None = None) -> Array:
     """Covariance (6,6) that a sensor would state for a pose (6,), m and rad, from one exposure drawn without OpenGL.
 
     Taken as taught without error. Raises LostError where the stickers do not suffice, and what `load_sensor` raises.
     """
-    sensor, sight = load_sensor(name, seed, method, renderer="analytic"), sight_lines(name)
+    sensor, sight = load_sensor(name, seed, method, renderer="analytic", changes=changes), sight_lines(name, changes)
     base_from_platform = pose_to_transform(pose)
     expected = sight.camera_from_base @ base_from_platform
     seen = observe(sensor.look(pose), sight.rig, sensor.noise, sensor.settings, expected, sight.platform.nominal,

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from identify.errors import ScenarioError
 from identify.record.filtering import padding_samples
@@ -171,6 +171,7 @@ class Scenario(_Section):
     robot: str = Field("rss6", description="built-in robot or path of a robot file")
     sensor: str = Field("ctrack780", description="built-in sensor or path of a sensor file")
     sensor_note: str = Field("", description="what the sensor's file says about its own figures")
+    sensor_changes: dict[str, Any] = Field({}, description="entries that hold instead of the sensor file's")
     renderer: Literal["pyrender", "analytic", "auto"] = Field(
         "pyrender", description="what draws the images; analytic needs no OpenGL, auto takes it where OpenGL is missing"
     )
@@ -184,6 +185,13 @@ class Scenario(_Section):
     identification: Identification = Identification()
     payload: Payload = Payload()
     validation: Validation = Validation()
+
+    @field_validator("sensor_changes")
+    @classmethod
+    def _by_dotted_key(cls, changes: dict[str, Any]) -> dict[str, Any]:
+        from cmmsim.sensor_file import dotted
+
+        return dotted(changes)
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Scenario":
@@ -201,10 +209,16 @@ class Scenario(_Section):
         They do not count as set: with another sensor they are taken from that one.
         """
         stated = self.timing.model_fields_set
-        if stated.issuperset(NAMES) and "sensor_note" in self.model_fields_set:
+        if stated.issuperset(NAMES) and "sensor_note" in self.model_fields_set and not self.sensor_changes:
             return
-        in_file, note = timing_in_file(self.sensor)
+        in_file, note = timing_in_file(self.sensor, self.sensor_changes)
         own = {name: getattr(self.timing, name) for name in stated}
+        for name in stated & NAMES.keys():
+            if f"timing.{NAMES[name]}" in self.sensor_changes and own[name] != in_file[name]:
+                raise ValueError(
+                    f"sensor_changes.timing.{NAMES[name]} = {in_file[name]:g} has no effect where the scenario itself "
+                    f"states timing.{name} = {own[name]:g}"
+                )
         try:
             timing = Timing(**(in_file | own))
         except ValidationError as error:
@@ -316,7 +330,7 @@ def _read(name_or_path: str | Path) -> tuple[str, str]:
 
 
 def _replace(data: dict[str, Any], path: str, value: Any) -> None:
-    *sections, key = path.split(".")
+    *sections, key = path.split(".", 1 if path.startswith("sensor_changes.") else -1)
     for section in sections:
         data = data.setdefault(section, {})
         if not isinstance(data, dict):

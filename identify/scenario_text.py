@@ -18,6 +18,9 @@ def to_toml(model: BaseModel) -> str:
         value = getattr(model, name)
         if isinstance(value, BaseModel):
             sections += ["", f"[{name}]", *_entries(value)]
+        elif isinstance(value, dict):
+            entries = [f"{key} = {_toml_value(one)}" for key, one in value.items()]
+            sections += ["", f"[{name}]  # {field.description or ''}", *entries]
         elif value is not None:
             lines.append(_entry(name, value, field))
     return "\n".join(lines + sections) + "\n"
@@ -42,6 +45,8 @@ def _entry(name: str, value: Any, field: FieldInfo) -> str:
 def _toml_value(value: Any) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(_toml_value(one) for one in value)}]"
     return repr(value).lower() if isinstance(value, bool) else repr(value)
 
 

@@ -22,15 +22,17 @@ NAMES = {
 """The sensor file's key of each key of a scenario's ``[timing]``."""
 
 
-def timing_in_file(sensor: str) -> tuple[dict[str, float], str]:
+def timing_in_file(sensor: str, changes: Mapping[str, Any]) -> tuple[dict[str, float], str]:
     """Timing of a built-in sensor or of a sensor file under the scenario's names, and the file's note.
+
+    ``changes``: a scenario's ``[sensor_changes]``.
 
     Raises:
         cmmsim.CmmError: no such sensor, or a bad file.
     """
     from cmmsim.sensor_file import read_sensor_file
 
-    file = read_sensor_file(sensor)
+    file = read_sensor_file(sensor, changes)
     return {ours: getattr(file.timing, theirs) for ours, theirs in NAMES.items()}, file.note
 
 

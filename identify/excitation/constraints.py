@@ -72,7 +72,7 @@ class MotionConstraints:
 
     def __init__(self, robot: Robot, scenario: Scenario, sight: SightLines | None = None) -> None:
         self._robot, self._settings = robot, scenario.excitation
-        sight = sight or sight_lines(scenario.sensor)
+        sight = sight or sight_lines(scenario.sensor, scenario.sensor_changes)
         amplitude = (self._settings.position_amplitude_m, self._settings.orientation_amplitude_rad)
         self.box = np.repeat(amplitude, 3)
         stickers = required_stickers(sight, robot.home_pose)

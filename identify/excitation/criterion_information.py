@@ -44,7 +44,9 @@ def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
         place = index_of(MEASURED_PARAMETER[anchor])
         std = scenario.identification.anchor_std or DEFAULT_STD[anchor]
         prior[place, place] += (guess.std[place] / std) ** 2
-    covariance = expected_covariance(scenario.sensor, robot.home_pose, scenario.pose_method)
+    covariance = expected_covariance(
+        scenario.sensor, robot.home_pose, scenario.pose_method, changes=scenario.sensor_changes
+    )
     return Knowledge(guess, covariance, prior)
 
 

@@ -20,7 +20,7 @@ def make_sensor(scenario: Scenario, robot: Robot, seed: int, taught: cmmsim.Taug
 
     One a process: it owns the renderer.
     """
-    file = read_sensor_file(scenario.sensor)
+    file = read_sensor_file(scenario.sensor, scenario.sensor_changes)
     file = file.model_copy(update={"timing": sensor_timing(scenario.timing.model_dump())})
     sensor = cmmsim.Sensor(file, seed, scenario.pose_method, taught, renderer=scenario.renderer)
     sensor.add_bodies(robot_meshes(robot))
