@@ -1,0 +1,149 @@
+"""The fixture `accuracy`: which figures pass, which fail a test, what is no figure, and that the interval holds."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from identify.accuracy.recorder import mean_interval
+
+pytest_plugins = "pytester"
+
+
+@pytest.mark.parametrize(
+    ("value", "limit", "better", "passes"),
+    [
+        (1.0, 2.0, "lower", True),
+        (2.0, 2.0, "lower", True),
+        (2.1, 2.0, "lower", False),
+        (2.1, 2.0, "higher", True),
+        (1.9, 2.0, "higher", False),
+        (-1.0, -2.0, "lower", False),
+        (0.1, 0.0, "lower", False),
+        (1e300, None, "lower", True),
+    ],
+)
+def test_a_value_beyond_its_limit_fails(project, value, limit, better, passes):
+    done = project(f"def test_it(accuracy): accuracy.record('bias', {value}, limit={limit}, better={better!r})")
+    done.assert_outcomes(passed=int(passes), failed=int(not passes))
+
+
+@pytest.mark.parametrize(
+    ("values", "limit", "better", "passes"),
+    [
+        # mean 10, interval 10 +- 12.706 * 1 (two values) and 10 +- 0.04 (2000 values)
+        ("[9.0, 11.0]", -2.0, "lower", True),
+        ("[9.0, 11.0]", -3.0, "lower", False),
+        ("[9.0, 11.0]", 22.0, "higher", True),
+        ("[9.0, 11.0]", 23.0, "higher", False),
+        ("[9.0, 11.0] * 1000", 9.97, "lower", True),
+        ("[9.0, 11.0] * 1000", 9.95, "lower", False),
+        ("[5, 5, 5]", 5, "lower", True),
+        ("[5, 5, 5]", 4.9, "lower", False),
+    ],
+)
+def test_a_sample_fails_only_when_its_whole_interval_is_beyond(project, values, limit, better, passes):
+    done = project(f"def test_it(accuracy): accuracy.sample('bias', {values}, limit={limit}, better={better!r})")
+    done.assert_outcomes(passed=int(passes), failed=int(not passes))
+
+
+def test_the_interval_is_students(subtests):
+    rng = np.random.default_rng(1)
+    for count in (2, 3, 10, 1000):
+        with subtests.test(count=count):
+            values = rng.normal(3.0, 2.0, count)
+            low, high = stats.t.interval(0.95, count - 1, np.mean(values), stats.sem(values))
+            mean, interval = mean_interval(values)
+            assert mean == pytest.approx(values.mean())
+            assert interval == pytest.approx((low, high))
+
+
+def test_the_interval_holds_the_true_mean_in_95_of_100_samples():
+    """4,000 samples of six values: the share is uncertain by 0.35 %."""
+    rng = np.random.default_rng(2)
+    held = [low <= 7.0 <= high for _, (low, high) in (mean_interval(rng.normal(7.0, 3.0, 6)) for _ in range(4000))]
+    assert np.mean(held) == pytest.approx(0.95, abs=4 * 0.0035)
+
+
+def test_a_failure_says_everything_and_points_at_the_users_line(project):
+    done = project(
+        """
+        def test_value(accuracy):
+            accuracy.record("centre bias", 0.0042, unit="px", limit=0.003)
+
+        def test_sample(accuracy):
+            accuracy.sample("hits", [0.5, 0.6], unit="%", limit=2, better="higher")
+        """
+    )
+    done.stdout.fnmatch_lines(
+        [
+            '>*accuracy.record("centre bias", 0.0042, unit="px", limit=0.003)',
+            "E*centre bias: 0.0042 px is above the limit of 0.003 px",
+            "test_mine.py:*: Failed",
+            '>*accuracy.sample("hits"*',
+            "E*hits: mean 0.55 % of 2 values, 95% interval [[]-0.0853102, 1.18531[]] %, lies wholly below*2 %",
+            "test_mine.py:*: Failed",
+        ]
+    )
+    assert "recorder.py" not in done.stdout.str()
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        ("record('x', float('nan'))", "x: value is nan, not a finite number"),
+        ("record('x', np.float32('inf'))", "x: value is inf, not a finite number"),
+        ("record('x', '1.0')", "x: value must be one number, got '1.0'"),
+        ("record('x', None)", "x: value must be one number, got None"),
+        ("record('x', True)", "x: value must be one number, got True"),
+        ("record('x', [1.0, 2.0])", "x: value must be one number, got an array of shape (2,)"),
+        ("record('x', 1.0, limit=float('nan'))", "x: limit is nan, not a finite number"),
+        ("record('x', 1.0, limit='2')", "x: limit must be one number, got '2'"),
+        ("record('x', 1.0, better='smaller')", "x: better is 'smaller', must be 'lower' or 'higher'"),
+        ("record('', 1.0)", "the name of a figure is a line of text, got ''"),
+        ("record('x', 1.0, unit=3)", "the unit of a figure is a line of text, got 3"),
+        ("sample('x', [])", "x: a sample needs at least 2 values, got 0"),
+        ("sample('x', [1.0])", "x: a sample needs at least 2 values, got 1"),
+        ("sample('x', 1.0)", "x: values must be a row of numbers, got an array of shape ()"),
+        ("sample('x', np.ones((50, 6)))", "x: values must be a row of numbers, got an array of shape (50, 6)"),
+        ("sample('x', [1.0, 2.0, float('inf')])", "x: values[2] is inf, not a finite number"),
+        ("sample('x', ['a', 'b'])", "x: values must be a row of numbers, got ['a', 'b']"),
+        ("sample('x', [[1], [2, 3]])", "x: values must be a row of numbers, got rows of different lengths"),
+    ],
+)
+def test_what_is_no_figure_is_one_line(project, call, says):
+    done = project(f"def test_it(accuracy): accuracy.{call}")
+    done.assert_outcomes(failed=1)
+    evidence = [line[1:].strip() for line in done.outlines if line.startswith("E ")]
+    assert evidence == [f"identify.accuracy.errors.AccuracyError: {says}"]
+    assert not [line for line in done.outlines if "= accuracy =" in line]
+
+
+def test_a_name_is_recorded_once_a_test(project):
+    done = project(
+        """
+        @pytest.mark.parametrize("twice", [False, True])
+        def test_it(accuracy, twice):
+            accuracy.record("x", 1.0)
+            if twice:
+                accuracy.sample("x", [1.0, 2.0])
+        """
+    )
+    done.assert_outcomes(passed=1, failed=1)
+    done.stdout.fnmatch_lines(["E*AccuracyError: x: recorded already in this test"])
+
+
+def test_a_failure_can_be_expected_but_not_swallowed(project):
+    done = project(
+        """
+        @pytest.mark.xfail(strict=True)
+        def test_expected(accuracy):
+            accuracy.record("x", 2.0, limit=1.0)
+
+        def test_swallowed(accuracy):
+            try:
+                accuracy.record("x", 2.0, limit=1.0)
+            except Exception:
+                pass
+        """
+    )
+    done.assert_outcomes(xfailed=1, failed=1)
