@@ -18,7 +18,7 @@ from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference, simulate
 from identify.estimation.loop_parameters import NAMES, starting_guess
 from identify.estimation.scale_anchor import measured_anchor, store_anchor
 from identify.excitation import design_trajectories
-from identify.experiment.sensor_in_loop import SensorInLoop, frame_latencies, make_sensor
+from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, frame_latencies, make_sensor
 from identify.experiment.truth import build_truth
 from identify.progress import Advance, Progress, SilentProgress
 from identify.record import recording
@@ -95,7 +95,7 @@ def teach(sensor: cmmsim.Sensor, progress: Progress) -> None:
 def excitation_run(
     scenario: Scenario,
     robot: Robot,
-    sensor: cmmsim.Sensor,
+    sensor: PoseSensor,
     trajectory: FourierTrajectory,
     seed: int,
     advance: Advance = lambda n=1: None,
@@ -118,7 +118,7 @@ def scenario_payload(scenario: Scenario) -> np.ndarray:
 def run_plant(
     scenario: Scenario,
     robot: Robot,
-    sensor: cmmsim.Sensor,
+    sensor: PoseSensor,
     trajectory: FourierTrajectory,
     times: np.ndarray,
     seed: int,

@@ -1,6 +1,8 @@
 """The rendering stereo sensor as the pose sensor of the closed loop: it measures, and remembers what it said."""
 
 import time
+from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 
@@ -33,6 +35,19 @@ def frame_latencies(scenario: Scenario, frames: int, rng: np.random.Generator) -
     return drawn_latencies(timing, frames, rng) if timing.latency_jitter else None
 
 
+class PoseSensor(Protocol):
+    """What measures in the loop: `cmmsim.Sensor`, or one that answers as it does."""
+
+    def start_run(self, seed: int) -> None:
+        """Begin a new run with noise of its own."""
+
+    def measure(
+        self, pose: Array, obstacles: Mapping[str, Array] | None = None, pose_rate: Array | None = None
+    ) -> cmmsim.Measurement:
+        """Measure the platform at a pose (6,) [m, rad] in motion at pose_rate (6,), behind obstacles (4, 4)."""
+        ...
+
+
 class SensorInLoop:
     """Sensor for `closed_loop.simulate`: a measured pose (6,) a frame, or None where it lost the platform.
 
@@ -40,7 +55,7 @@ class SensorInLoop:
     rendering and measuring.
     """
 
-    def __init__(self, sensor: cmmsim.Sensor, robot: Robot, seed: int, advance: Advance = lambda n=1: None) -> None:
+    def __init__(self, sensor: PoseSensor, robot: Robot, seed: int, advance: Advance = lambda n=1: None) -> None:
         self._sensor, self._robot, self._advance = sensor, robot, advance
         self.covariances: list[Array] = []
         self.lost: list[str] = []

@@ -1,0 +1,95 @@
+"""Rows of kind `path_pose`: the sensor alone follows a platform along a random path of the scenario's excitation.
+
+Exposure, latency, its jitter and dropout act as the scenario says. A row is a stretch of a few frames from a random
+instant of the path. The first picture is searched as a whole, the others are tracked. Beside the error of what was
+measured it gives that of the pose in use: the last one that had arrived, held until the next one arrives.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+import cmmsim
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.experiment.sensor_in_loop import frame_latencies
+from identify.scenario import Scenario
+from identify.studies.row_columns import Column, Kind, Row, RowOptions, rms_um, stated_um
+from identify.studies.row_sensor import RowSensor, Teaching, row_sensor, stream_seed
+from identify.trajectory import FourierTrajectory, random_trajectory
+
+PATH, SENSOR, LATENCY = 0, 1, 2
+INSTANTS_PER_FRAME = 16
+"""Instants of a frame period at which the pose in use is compared with the true one."""
+
+COLUMNS = {
+    "frames": Column("1", "stereo pictures taken"),
+    "lost_frames": Column("1", "frames without a pose; they count in no other figure but the pose in use"),
+    "speed_rms_mm_s": Column("mm/s", "speed of the platform along each axis, rms over the frames"),
+    "position_rms_um": Column("um", "measured against true position in the middle of the exposure, rms over axes"),
+    "orientation_rms_urad": Column("urad", "measured against true orientation in the middle of the exposure"),
+    "stated_position_rms_um": Column("um", "the same, as the sensor's own covariance states it"),
+    "stated_orientation_rms_urad": Column("urad", "the same, as the sensor's own covariance states it"),
+    "used_position_rms_um": Column("um", "last position that had arrived against the true one at all times"),
+    "used_orientation_rms_urad": Column("urad", "last orientation that had arrived against the true one at all times"),
+}
+
+
+class PathPoseOptions(RowOptions):
+    """How much a row looks at."""
+
+    frames: int = Field(30, ge=4, le=1_000_000, description="frames in a row")
+    teaching: Teaching = Field("exact", description="exact, or by the sensor itself, seeded by the row")
+
+
+def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseOptions) -> Row:
+    """One row. Raises EstimationError where fewer than two poses were measured, and what the sensor raises."""
+    eye = row_sensor(scenario, options.teaching, stream_seed(seed, SENSOR))
+    rng = np.random.default_rng(stream_seed(seed, PATH))
+    excitation = scenario.excitation
+    path = random_trajectory(rng, eye.sensor.home, excitation.fundamental_hz, excitation.harmonics,
+                             excitation.position_amplitude_m, excitation.orientation_amplitude_rad)
+    start = rng.uniform(0.0, 1.0 / excitation.fundamental_hz)
+    times: Array = start + scenario.timing.frame_period_s * np.arange(options.frames, dtype=float)
+    poses, covariances = _measured(eye, path, times)
+    ok = np.isfinite(poses[:, 0])
+    if ok.sum() < 2:
+        raise EstimationError(f"{ok.sum()} of {options.frames} frames along the path gave a pose, 2 are needed")
+    errors = (poses - path.pose(times))[ok]
+    latencies = frame_latencies(scenario, len(times), np.random.default_rng(stream_seed(seed, LATENCY)))
+    arrivals: Array = times + (scenario.timing.latency_s if latencies is None else latencies)
+    used = _used_errors(path, poses[ok], arrivals[ok], scenario.timing.frame_period_s)
+    stated = stated_um(covariances[ok])
+    return {
+        "frames": options.frames,
+        "lost_frames": int(np.sum(~ok)),
+        "speed_rms_mm_s": 1e-3 * rms_um(path.pose_rate(times)[:, :3]),
+        "position_rms_um": rms_um(errors[:, :3]),
+        "orientation_rms_urad": rms_um(errors[:, 3:]),
+        "stated_position_rms_um": stated[0],
+        "stated_orientation_rms_urad": stated[1],
+        "used_position_rms_um": rms_um(used[:, :3]),
+        "used_orientation_rms_urad": rms_um(used[:, 3:]),
+    }
+
+
+def _measured(eye: RowSensor, path: FourierTrajectory, times: Array) -> tuple[Array, Array]:
+    """Measured poses (N, 6) and covariances (N, 6, 6), NaN where a frame was lost."""
+    seen: list[cmmsim.Measurement] = [
+        eye.sensor.measure(pose, pose_rate=rate)
+        for pose, rate in zip(path.pose(times), path.pose_rate(times), strict=True)
+    ]
+    return np.array([one.pose for one in seen]), np.array([one.covariance for one in seen])
+
+
+def _used_errors(path: FourierTrajectory, poses: Array, arrivals: Array, period_s: float) -> Array:
+    """Errors (m, 6) of the pose in use from the first arrival to the last; poses come into use in their order."""
+    arrivals = np.maximum.accumulate(arrivals)
+    count = max(1, round(INSTANTS_PER_FRAME * float(arrivals[-1] - arrivals[0]) / period_s))
+    instants = arrivals[0] + (np.arange(count) + 0.5) / count * (arrivals[-1] - arrivals[0])
+    in_use = np.searchsorted(arrivals, instants, side="right") - 1
+    return np.asarray(poses[in_use] - path.pose(instants), dtype=float)
+
+
+PATH_POSE = Kind("path_pose", COLUMNS, PathPoseOptions, compute)

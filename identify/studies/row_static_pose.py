@@ -1,0 +1,131 @@
+"""Rows of kind `static_pose`: the sensor alone looks at a platform that stands still at a pose drawn in the box.
+
+The box is the scenario's excitation amplitude around the sensor's home pose. Each row draws one pose (or several) and
+takes several pictures of it. Stickers are looked for where a tracker would expect them, a little beside the true place;
+no picture is searched as a whole. Teaching is exact unless asked for otherwise: the rows show observation noise alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+import cmmsim
+from cmmsim.estimator import PoseEstimator
+from cmmsim.pose import apply, invert
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.scenario import Scenario
+from identify.studies.row_columns import Column, Kind, Row, RowOptions, rms_um, stated_um
+from identify.studies.row_sensor import RowSensor, Teaching, row_sensor, stream_seed
+
+POSES, SENSOR = 0, 1
+PREDICTION_ERROR = np.repeat([1e-4, 5e-4], 3)
+"""Standard deviation [m, rad] of the pose near which a picture's stickers are looked for: what a tracker predicts."""
+
+COLUMNS = {
+    "captures": Column("1", "stereo pictures taken"),
+    "lost_frames": Column("1", "pictures in which no pose was found; they count in no other figure"),
+    "stickers": Column("1", "stickers used, mean over the pictures"),
+    "pixel_noise_grey": Column("grey values", "rms noise of a grey value half-way between sticker and ring"),
+    "position_rms_um": Column("um", "error of the measured position, rms over pictures and axes"),
+    "orientation_rms_urad": Column("urad", "error of the measured orientation, rms over pictures and axes"),
+    "stated_position_rms_um": Column("um", "the same, as the sensor's own covariance states it"),
+    "stated_orientation_rms_urad": Column("urad", "the same, as the sensor's own covariance states it"),
+    "mean_position_rms_um": Column("um", "error of the position averaged over the pictures of a pose"),
+    "mean_orientation_rms_urad": Column("urad", "error of the orientation averaged over the pictures of a pose"),
+    "point_depth_rms_um": Column("um", "error of single stickers along the view from rig to platform"),
+    "point_lateral_rms_um": Column("um", "error of single stickers across that view, rms over both axes"),
+    "centre_rms_px": Column("px", "error of sticker centres in the images, rms over stickers, cameras and axes"),
+}
+
+
+class StaticPoseOptions(RowOptions):
+    """How much a row looks at."""
+
+    poses: int = Field(1, ge=1, le=10_000, description="poses drawn a row")
+    captures: int = Field(4, ge=1, le=100_000, description="pictures of each pose, where hold_s is not given")
+    hold_s: float | None = Field(
+        None, gt=0, le=3600, description="time for which each pose is held: pictures at the frame rate, not `captures`"
+    )
+    teaching: Teaching = Field("exact", description="exact, or by the sensor itself, seeded by the row")
+
+
+def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPoseOptions) -> Row:
+    """One row. Raises EstimationError, with a reason, where every picture was lost, and what the sensor raises."""
+    eye = row_sensor(scenario, options.teaching, stream_seed(seed, SENSOR))
+    rng = np.random.default_rng(stream_seed(seed, POSES))
+    amplitude = (scenario.excitation.position_amplitude_m, scenario.excitation.orientation_amplitude_rad)
+    box = np.repeat(amplitude, 3)
+    captures = options.captures if options.hold_s is None else max(1, scenario.timing.frames(options.hold_s))
+    looks = [_Look(eye, eye.sensor.home + box * rng.uniform(-1.0, 1.0, 6), captures, rng) for _ in range(options.poses)]
+    return _row(eye, looks, captures)
+
+
+class _Look:
+    """What all pictures of one pose gave: errors (n, 6), covariances (n, 6, 6), those of points and of centres."""
+
+    def __init__(self, eye: RowSensor, pose: Array, captures: int, rng: np.random.Generator) -> None:
+        estimator = eye.sensor.estimator
+        self.reasons: list[str] = []
+        seen = [self._measured(eye, estimator, pose, rng) for _ in range(captures)]
+        good = [one for one in seen if one is not None]
+        self.errors = np.array([one.pose - pose for one in good]).reshape(-1, 6)
+        self.covariances = np.array([one.covariance for one in good]).reshape(-1, 6, 6)
+        self.counts = [len(one.target_ids) for one in good]
+        pairs = [_sticker_errors(eye, estimator, one, pose) for one in good]
+        self.points = np.concatenate([points for points, _ in pairs]) if pairs else np.zeros((0, 3))
+        self.centres = np.concatenate([centres for _, centres in pairs]) if pairs else np.zeros((0, 2))
+
+    def _measured(
+        self, eye: RowSensor, estimator: PoseEstimator, pose: Array, rng: np.random.Generator
+    ) -> cmmsim.Measurement | None:
+        predicted = pose + PREDICTION_ERROR * rng.standard_normal(6)
+        expected = invert(estimator.taught.base_from_camera) @ cmmsim.pose_to_transform(predicted)
+        try:
+            return estimator.measure(eye.sensor.look(pose), expected)[0]
+        except cmmsim.LostError as error:
+            self.reasons.append(str(error))
+            return None
+
+
+def _sticker_errors(
+    eye: RowSensor, estimator: PoseEstimator, seen: cmmsim.Measurement, pose: Array
+) -> tuple[Array, Array]:
+    """Errors of the stickers seen: of their points (k, 3) in base axes, m, and of their centres (2 k, 2), px."""
+    index = np.flatnonzero(np.isin(estimator.platform.sticker_ids, seen.target_ids))
+    places = invert(eye.truth.base_from_camera) @ cmmsim.pose_to_transform(pose)
+    true = apply(places, eye.truth.platform_places[index])
+    pixels, _ = estimator.rig.project(true)
+    errors = np.concatenate([seen.left_pixels - pixels[0], seen.right_pixels - pixels[1]])
+    return (seen.points - true) @ eye.truth.base_from_camera[:3, :3].T, errors
+
+
+def _row(eye: RowSensor, looks: list[_Look], captures: int) -> Row:
+    errors = np.concatenate([look.errors for look in looks])
+    if not len(errors):
+        raise EstimationError(f"no pose was found in any of {captures * len(looks)} pictures: {looks[-1].reasons[-1]}")
+    means = np.array([look.errors.mean(axis=0) for look in looks if len(look.errors)])
+    points = np.concatenate([look.points for look in looks])
+    depth = points @ eye.view
+    stated = stated_um(np.concatenate([look.covariances for look in looks]))
+    noise = eye.sensor.noise
+    rim_grey: Array = np.asarray(noise.mean_grey(np.array(eye.rim)), dtype=float)
+    return {
+        "captures": captures * len(looks),
+        "lost_frames": captures * len(looks) - len(errors),
+        "stickers": float(np.mean([count for look in looks for count in look.counts])),
+        "pixel_noise_grey": float(np.sqrt(noise.variance(rim_grey))),
+        "position_rms_um": rms_um(errors[:, :3]),
+        "orientation_rms_urad": rms_um(errors[:, 3:]),
+        "stated_position_rms_um": stated[0],
+        "stated_orientation_rms_urad": stated[1],
+        "mean_position_rms_um": rms_um(means[:, :3]),
+        "mean_orientation_rms_urad": rms_um(means[:, 3:]),
+        "point_depth_rms_um": rms_um(depth),
+        "point_lateral_rms_um": rms_um(points - depth[:, None] * eye.view) * float(np.sqrt(1.5)),
+        "centre_rms_px": float(np.sqrt(np.mean(np.concatenate([look.centres for look in looks]) ** 2))),
+    }
+
+
+STATIC_POSE = Kind("static_pose", COLUMNS, StaticPoseOptions, compute)
