@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from .errors import SensorFileError, UnknownSensorError
 from .pose import Array
+from .sticker_ring import closest, ring_of_stickers
 
 Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -68,6 +69,7 @@ class RightFromLeft(_Section):
 class Rig(_Section):
     """baseline m; focal_px, width, height px; position (the middle of the baseline) and target m in the base frame.
 
+    distance m, where given: the position is moved along its line to the target to stand that far from it.
     left and right, where given, replace focal_px and the principal point in the middle of the image; right_from_left
     replaces the baseline and the toe-in towards the target.
     """
@@ -78,9 +80,17 @@ class Rig(_Section):
     height: Annotated[int, Field(ge=64)]
     position: Vector3
     target: Vector3
+    distance: Positive | None = None
     left: Calibrated | None = None
     right: Calibrated | None = None
     right_from_left: RightFromLeft | None = None
+
+    @model_validator(mode="after")
+    def _at_its_distance(self) -> Rig:
+        if self.distance is not None:
+            away = unit(np.subtract(self.position, self.target))
+            self.__dict__["position"] = tuple((np.array(self.target) + self.distance * away).tolist())
+        return self
 
 
 class Camera(_Section):
@@ -132,7 +142,10 @@ class Detection(_Section):
 
 
 class Stickers(_Section):
-    """Radii and placement distances m; levels of 255."""
+    """Radii and placement distances m; levels of 255.
+
+    per_plane: that many stickers on each plane of the platform instead of those listed there, evenly on an ellipse.
+    """
 
     radius: Positive
     ring_radius: Positive
@@ -143,6 +156,7 @@ class Stickers(_Section):
     body_level: Level
     obstacle_level: Level
     background_level: Level = 0
+    per_plane: Annotated[int, Field(ge=3)] | None = None
 
 
 class HalfSpace(_Section):
@@ -220,10 +234,26 @@ def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None)
     for path, value in dotted(changes or {}).items():
         _replace(content, path, value, source)
     try:
-        return SensorFile.model_validate(content)
+        return _with_stickers(SensorFile.model_validate(content), source)
     except ValidationError as error:
         lines = "; ".join(_explain(e) for e in error.errors())
         raise SensorFileError(f"{source}: {lines}") from error
+
+
+def _with_stickers(file: SensorFile, source: str) -> SensorFile:
+    """The file with as many stickers on each plane of the platform as it asks for."""
+    count, room = file.stickers.per_plane, 2.0 * file.stickers.ring_radius
+    if count is None:
+        return file
+    planes = {}
+    for name, plane in file.platform.planes:
+        places = ring_of_stickers(plane.stickers, count)
+        if closest(places) < room:
+            raise SensorFileError(f"{source}: stickers.per_plane = {count} puts stickers {closest(places):.4f} m apart "
+                                  f"on plane {name}, two rings need {room:g} m")
+        planes[name] = plane.model_copy(update={"stickers": [(u, v) for u, v in places.tolist()]})
+    platform = file.platform.model_copy(update={"planes": file.platform.planes.model_copy(update=planes)})
+    return file.model_copy(update={"platform": platform})
 
 
 def dotted(changes: Mapping[str, Any], section: str = "") -> dict[str, Any]:
