@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from identify.errors import ScenarioError
 from identify.record.filtering import padding_samples
 from identify.scenario_text import one_line, to_toml
-from identify.sensor_timing import NAMES, check_delay, sensor_timing, timing_in_file
+from identify.sensor_timing import NAMES, by_dotted_key, check_delay, sensor_timing, timing_in_file
 
 BUILT_IN = Path(__file__).parent / "scenarios"
 
@@ -189,9 +189,7 @@ class Scenario(_Section):
     @field_validator("sensor_changes")
     @classmethod
     def _by_dotted_key(cls, changes: dict[str, Any]) -> dict[str, Any]:
-        from cmmsim.sensor_file import dotted
-
-        return dotted(changes)
+        return by_dotted_key(changes)
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Scenario":

@@ -36,6 +36,13 @@ def timing_in_file(sensor: str, changes: Mapping[str, Any]) -> tuple[dict[str, f
     return {ours: getattr(file.timing, theirs) for ours, theirs in NAMES.items()}, file.note
 
 
+def by_dotted_key(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A scenario's ``[sensor_changes]``, also as tables in tables, by dotted key of the sensor's file."""
+    from cmmsim.sensor_file import dotted
+
+    return dotted(changes)
+
+
 def sensor_timing(timing: Mapping[str, Any]) -> "SensorTiming":
     """The values of a scenario's ``[timing]`` in the form of a sensor file.
 
