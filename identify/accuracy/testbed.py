@@ -55,8 +55,8 @@ def cmmsim_robot(cmmsim_scenario: Scenario) -> Robot:
 
 
 @pytest.fixture(scope="session")
-def cmmsim_taught() -> dict[tuple[str, str | None], Taught]:
-    """What each sensor was taught, by its file and renderer: it takes seconds, and is done once a process."""
+def cmmsim_taught() -> dict[str, Taught]:
+    """What each sensor was taught, by what teaching depends on: it takes seconds, and is done once a process."""
     return {}
 
 
@@ -64,18 +64,18 @@ def cmmsim_taught() -> dict[tuple[str, str | None], Taught]:
 def cmmsim_sensor(
     request: pytest.FixtureRequest,
     cmmsim_scenario: Scenario,
+    cmmsim_robot: Robot,
     cmmsim_seed: int,
-    cmmsim_taught: dict[tuple[str, str | None], Taught],
+    cmmsim_taught: dict[str, Taught],
 ) -> Sensor:
     """The scenario's sensor at the start of a run; its noise is this test's, its teaching that of all tests."""
-    from cmmsim import load_sensor
+    from identify.experiment.sensor_in_loop import make_sensor
 
-    name, method, renderer = cmmsim_scenario.sensor, cmmsim_scenario.pose_method, cmmsim_scenario.renderer
-    key = (name, renderer)
+    key = cmmsim_scenario.model_dump_json(include={"sensor", "sensor_changes", "timing", "renderer"})
     if key not in cmmsim_taught:
         seed = request.config.getoption("accuracy_seed")
-        cmmsim_taught[key] = load_sensor(name, seed=seed, renderer=renderer).teach()
-    return load_sensor(name, cmmsim_seed, method, cmmsim_taught[key], renderer=renderer)
+        cmmsim_taught[key] = make_sensor(cmmsim_scenario, cmmsim_robot, seed).teach()
+    return make_sensor(cmmsim_scenario, cmmsim_robot, cmmsim_seed, cmmsim_taught[key])
 
 
 def _choices(request: pytest.FixtureRequest) -> dict[str, str]:
