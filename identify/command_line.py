@@ -16,6 +16,7 @@ from identify.commands.calibrate import CALIBRATE_HELP, calibrate
 from identify.commands.detectors import detectors
 from identify.commands.engines import export, verify_model
 from identify.commands.estimators import estimators
+from identify.commands.study import STUDY_HELP, study
 from identify.commands.workspace import workspace
 from identify.errors import IdentifyError, ScenarioError
 from identify.files.run_folder import RunFolder, new_run_folder
@@ -75,6 +76,10 @@ What its motion can show:
 \b
 Other estimators on the same record:
   cmmsim estimators --out mine           a table beside measured torques and encoders: estimators.json
+
+\b
+Many rows over a grid of settings, on all cores or many machines:
+  cmmsim study --list                    the built-in studies
 """
 
 app = typer.Typer(
@@ -222,6 +227,7 @@ app.command(help=CALIBRATE_HELP)(calibrate)
 app.command()(acceptance)
 app.command()(base_parameters)
 app.command()(estimators)
+app.command(help=STUDY_HELP)(study)
 
 
 def parse_settings(settings: list[str] | None) -> dict[str, Any]:

@@ -31,3 +31,11 @@ class EstimationError(IdentifyError):
 
 class VerificationError(IdentifyError):
     """A model that differs from an independent engine by more than the goal."""
+
+
+class StudyError(IdentifyError):
+    """A study that contradicts itself, a folder of another one, or machines on which it cannot run."""
+
+
+class StudyInterrupted(StudyError):
+    """A study that its user stopped; what is done is kept."""

@@ -6,8 +6,17 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Protocol
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.progress import Progress as RichBars
+from rich.text import Text
 
 Advance = Callable[..., None]
 """``advance(n=1)``: n more steps of the stage are done."""
@@ -33,8 +42,9 @@ class SilentProgress:
 class RichProgress:
     """Bars with elapsed time and time left; a plain line for each finished stage when not on a terminal."""
 
-    def __init__(self, console: Console | None = None) -> None:
-        self._console = console or Console(stderr=True)
+    def __init__(self, console: Console | None = None, rate: str = "") -> None:
+        """``rate``: unit of the steps' rate, such as rows/s; empty shows none."""
+        self._console, self._rate = console or Console(stderr=True), rate
 
     def stage(self, name: str, total: int) -> AbstractContextManager[Advance]:
         """Open a stage of ``total`` steps."""
@@ -49,6 +59,7 @@ class RichProgress:
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(),
+            *([_RateColumn(self._rate)] if self._rate else []),
         )
         with RichBars(*columns, console=self._console) as bars:
             task = bars.add_task(name, total=total)
@@ -65,4 +76,18 @@ class RichProgress:
         start = time.perf_counter()
         yield advance
         seconds = time.perf_counter() - start
-        self._console.print(f"{name}: {done} of {total} in {seconds:.1f} s", highlight=False, soft_wrap=True)
+        rate = f", {done / seconds:.3g} {self._rate}" if self._rate else ""
+        self._console.print(f"{name}: {done} of {total} in {seconds:.1f} s{rate}", highlight=False, soft_wrap=True)
+
+
+class _RateColumn(ProgressColumn):
+    """Steps a second."""
+
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self._unit = unit
+
+    def render(self, task: Task) -> Text:
+        """The rate of late, or over all where the stage has ended."""
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{speed:.3g} {self._unit}")

@@ -9,7 +9,13 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("cmmsim", "dynamics", "identify")
 ESTIMATOR = ("identify/estimation", "identify/estimators")
-HEAVY = {"pyrender": {"cmmsim/render.py"}, "mujoco": {"dynamics/mujoco_engine.py"}, "dask": set(), "rerun": set()}
+HEAVY = {
+    "pyrender": {"cmmsim/render.py"},
+    "mujoco": {"dynamics/mujoco_engine.py"},
+    "dask": {"identify/studies/dask_runner.py"},
+    "distributed": {"identify/studies/dask_runner.py"},
+    "rerun": set(),
+}
 
 
 def imports(path: Path) -> set[str]:

@@ -1,0 +1,136 @@
+"""The command ``cmmsim study``. Heavy imports are late."""
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table as RichTable
+
+from identify.errors import StudyError, StudyInterrupted
+from identify.progress import RichProgress, SilentProgress
+
+if TYPE_CHECKING:
+    from identify.studies.runner import Outcome, Workers
+    from identify.studies.study_file import Study
+
+MANY_ROWS = 100_000
+"""Rows of a study above which it must be confirmed."""
+
+SOME_ROWS_FAILED = 3
+"""Exit status of a study that is done, but in which rows failed."""
+
+STUDY_HELP = f"""
+Run a study: a scenario varied over factors, row by row, on all cores or on many machines.
+
+STUDY is a built-in name (--list) or a TOML file. What is finished stays in the folder: after Ctrl-C, or whatever ends
+the program, the same command goes on where it stopped. The same study gives the same figures however it is run.
+
+\b
+A study file:
+  name = "noise_and_baseline"
+  kind = "static_pose"                            # what a row is; or module:function of your own
+  scenario = "paper"
+  repeats = 10
+  [changes]                                       # in every row
+  scenario.renderer = "analytic"
+  [factors]                                       # a grid
+  sensor.camera.dark_noise = [13.0, 26.0, 52.0]   # a key of the sensor file
+  sensor.rig.baseline = [0.5, 1.0, 2.0]
+  options.captures = [1, 16]                      # an option of the kind
+With sample = N at the top: N points drawn at random instead, where a factor may also be
+  sensor.rig.baseline = {{ low = 0.5, high = 2.0, scale = "log" }}
+
+\b
+Written into the folder:
+  study.json       the resolved study, with its scenario and sensor
+  rows.jsonl       finished rows as they come
+  study.parquet    one table: factors, figures with units, seeds, seconds, errors
+
+\b
+On many machines:
+  dask scheduler                                  on one
+  dask worker tcp://HOST:8786 --nthreads 1        on each, once a core, with cmmsim installed
+  cmmsim study STUDY --scheduler tcp://HOST:8786
+
+Exit status: {SOME_ROWS_FAILED} where rows failed (they say why in the column error), 130 after Ctrl-C.
+"""
+
+
+def study(
+    name: Annotated[
+        str | None, typer.Argument(metavar="STUDY", help="Built-in study or path of a TOML file.", show_default=False)
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder of the study.", show_default="runs/study-NAME")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Use a running Dask cluster: tcp://HOST:8786.")
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=0, help="Processes on this machine; 0: none but this one.", show_default="one a core"),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help=f"Do run more than {MANY_ROWS} rows.")] = False,
+    list_: Annotated[bool, typer.Option("--list", help="Only list the built-in studies.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar and no summary.")] = False,
+) -> None:
+    """Run or continue a study."""
+    if list_:
+        _list()
+        return
+    if name is None:
+        raise typer.BadParameter("name a built-in study or a TOML file, or ask for --list", param_hint="STUDY")
+    if scheduler is not None and workers is not None:
+        raise typer.BadParameter("--workers is for this machine, not for a running cluster", param_hint="--workers")
+    from identify.studies.study_file import load_study
+
+    chosen = load_study(name)
+    if chosen.rows > MANY_ROWS and not yes:
+        raise StudyError(f"study {chosen.name!r} has {chosen.rows:,} rows; to run more than {MANY_ROWS:,}, say --yes")
+    folder = out or Path("runs") / f"study-{chosen.name}"
+    try:
+        outcome = _run(chosen, folder, scheduler, workers, quiet)
+    except StudyInterrupted as stopped:
+        typer.echo(f"{stopped}; the same command goes on from there", err=True)
+        raise typer.Exit(130) from None
+    _summarise(folder, outcome, quiet)
+    if outcome.failed:
+        typer.echo(f"{outcome.failed} of {outcome.rows} rows failed; {outcome.first_error}", err=True)
+        raise typer.Exit(SOME_ROWS_FAILED)
+
+
+def _run(study: "Study", folder: Path, scheduler: str | None, workers: int | None, quiet: bool) -> "Outcome":
+    from identify.studies.runner import run_study
+
+    progress = SilentProgress() if quiet else RichProgress(rate="rows/s")
+    return run_study(study, folder, progress, _workers(scheduler, workers))
+
+
+def _workers(scheduler: str | None, workers: int | None) -> "Workers":
+    if workers == 0:
+        from identify.studies.runner import in_this_process
+
+        return in_this_process
+    from identify.studies.dask_runner import cores, local_cluster, running_cluster
+
+    return partial(running_cluster, scheduler) if scheduler else partial(local_cluster, workers or cores())
+
+
+def _summarise(folder: Path, outcome: "Outcome", quiet: bool) -> None:
+    if not quiet:
+        again = f", {outcome.found} of them from before" if outcome.found else ""
+        typer.echo(f"{outcome.rows} rows{again}: {folder}")
+
+
+def _list() -> None:
+    from identify.studies.study_file import load_study, study_names
+
+    table = RichTable(show_edge=False)
+    for title in ("study", "rows", "what it asks"):
+        table.add_column(title, justify="right" if title == "rows" else "left", no_wrap=title != "what it asks")
+    for name in study_names():
+        found = load_study(name)
+        table.add_row(name, f"{found.rows:,}", found.title)
+    Console().print(table)

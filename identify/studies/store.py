@@ -1,0 +1,97 @@
+"""The folder of a study: whose it is, who works on it, and what is done.
+
+``study.json`` is the resolved study, ``rows.jsonl`` its finished rows, ``study.parquet`` the table made of them.
+"""
+
+import fcntl
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from cmmsim.sensor_file import read_sensor_file
+from identify.errors import StudyError
+from identify.files.atomic import write_text
+from identify.studies.design import Setup
+from identify.studies.journal import Journal
+from identify.studies.study_file import Study
+from identify.studies.table import study_in
+
+STUDY, JOURNAL, TABLE, LOCK = "study.json", "rows.jsonl", "study.parquet", ".lock"
+
+
+def resolved(study: Study, setup: Setup) -> dict[str, Any]:
+    """Everything that decides the rows of a study, as JSON has it: its file, and the scenario and sensor it names."""
+    scenario = setup.scenario
+    sensor = read_sensor_file(scenario.sensor, scenario.sensor_changes)
+    entry = {
+        "study": study.model_dump(mode="json"),
+        "scenario": scenario.model_dump(mode="json"),
+        "sensor": sensor.model_dump(mode="json"),
+    }
+    return dict(json.loads(json.dumps(entry)))
+
+
+@contextmanager
+def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Journal]:
+    """Work on the folder of a resolved study with ``rows`` rows, new or begun before; nobody else may meanwhile.
+
+    Raises:
+        StudyError: the folder is of another study, in use, holds something else or cannot be made; one of its files
+            is damaged.
+    """
+    _check_content(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / LOCK).open("a+")
+    except OSError as error:
+        raise StudyError(f"study folder {folder} cannot be made: {error.strerror}; name another with --out") from error
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise StudyError(f"study folder {folder} is in use by another process; wait, or name another") from None
+        _claim(folder, entry)
+        with Journal(folder / JOURNAL, rows) as journal:
+            yield journal
+
+
+def _check_content(folder: Path) -> None:
+    """Refuse to put a study among files that are not a study's."""
+    if folder.exists() and not folder.is_dir():
+        raise StudyError(f"study folder {folder} is a file; name another with --out")
+    if folder.is_dir() and not (folder / STUDY).exists():
+        others = sorted(path.name for path in folder.iterdir() if path.name not in (LOCK, TABLE))
+        if others:
+            raise StudyError(f"study folder {folder} holds {others[0]} and no {STUDY}; name another with --out")
+
+
+def _claim(folder: Path, entry: dict[str, Any]) -> None:
+    """Make the folder that of a study, or refuse where it is that of another."""
+    for name, found in ((STUDY, _study_file(folder / STUDY)), (TABLE, study_in(folder / TABLE))):
+        if found is not None and found != entry:
+            raise StudyError(
+                f"{folder / name} is of another study, which differs in {', '.join(_differences(found, entry)[:4])}; "
+                "name another folder with --out"
+            )
+    if not (folder / STUDY).exists():
+        write_text(folder / STUDY, json.dumps(entry, indent=1) + "\n")
+
+
+def _study_file(path: Path) -> dict[str, Any] | None:
+    """What a folder says of its study; None where it says nothing."""
+    if not path.exists():
+        return None
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise StudyError(f"{path} is damaged: {error}") from error
+
+
+def _differences(one: Any, other: Any, path: str = "") -> list[str]:
+    """Paths at which two trees of JSON differ."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        keys = [*one, *(key for key in other if key not in one)]
+        return [d for k in keys for d in _differences(one.get(k), other.get(k), f"{path}.{k}" if path else k)]
+    return [] if one == other else [path]

@@ -1,0 +1,152 @@
+"""A study: which scenario is varied how, read from TOML and checked before anything is computed.
+
+    name = "pixel_noise"
+    title = "Pose error against pixel noise"
+    kind = "static_pose"                          # what a row is: a built-in kind, or module:function
+    scenario = "paper"
+    repeats = 20
+    seed = 0
+
+    [changes]                                     # for every row
+    scenario.renderer = "analytic"
+
+    [factors]                                     # a grid; with `sample = N` a random sample of N points
+    sensor.camera.dark_noise = [13.0, 26.0, 52.0]
+    options.captures = [1, 4, 16]
+    # sensor.rig.baseline = { low = 0.5, high = 2.0, scale = "log" }   # only in a sample
+
+Keys are dotted paths: ``scenario.`` and a key of a scenario, ``sensor.`` and a key of a sensor file, ``options.`` and
+an option of the kind.
+"""
+
+import math
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from identify.errors import StudyError
+from identify.scenario_text import one_line
+from identify.studies.law import Law
+
+BUILT_IN = Path(__file__).parent / "built_in"
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class Range(_Table):
+    """A factor of a random sample, drawn evenly between two bounds or evenly between their logarithms."""
+
+    low: int | float
+    high: int | float
+    scale: Literal["linear", "log"] = "linear"
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Range":
+        if not self.low < self.high:
+            raise ValueError(f"low = {self.low:g} must be less than high = {self.high:g}")
+        if self.scale == "log" and self.low <= 0:
+            raise ValueError(f"low = {self.low:g} must be positive on a logarithmic scale")
+        return self
+
+
+class Study(_Table):
+    """A whole study; load one with :func:`load_study`."""
+
+    name: str = Field(description="short name, used for folders", pattern=r"^[\w.-]+$")
+    title: str = Field("", description="what the study asks")
+    kind: str = Field(description="kind of row: a built-in one, or module:function")
+    scenario: str = Field("paper", description="built-in scenario or path of a TOML file")
+    changes: dict[str, Any] = Field({}, description="values that hold in every row, by dotted path")
+    factors: dict[str, list[Any] | Range] = Field({}, description="values of each factor, by dotted path")
+    sample: int | None = Field(None, description="points drawn at random; none: the whole grid", ge=1)
+    repeats: int = Field(1, description="rows at each point", ge=1)
+    seed: int = Field(0, description="seed of all randomness", ge=0)
+    theory: list[Law] = Field([], description="laws with which the summary compares")
+    options: dict[str, Any] = Field({}, description="options of the kind")
+
+    @field_validator("changes", mode="before")
+    @classmethod
+    def _changes_by_path(cls, tables: Any) -> Any:
+        return _by_path(tables)
+
+    @field_validator("factors", mode="before")
+    @classmethod
+    def _factors_by_path(cls, tables: Any) -> Any:
+        return _by_path(tables, keep=Range.model_fields.keys())
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Study":
+        for path, values in self.factors.items():
+            if isinstance(values, Range) and self.sample is None:
+                raise ValueError(f"factors.{path} has low and high, which needs sample = N; a grid needs a list")
+            if isinstance(values, list) and not values:
+                raise ValueError(f"factors.{path} has no values")
+            if path in self.changes:
+                raise ValueError(f"{path} is both a factor and among the changes")
+        return self
+
+    @property
+    def points(self) -> int:
+        """Number of different settings."""
+        if self.sample is not None:
+            return self.sample
+        return math.prod(len(values) for values in self.factors.values() if isinstance(values, list))
+
+    @property
+    def rows(self) -> int:
+        """Number of rows: each point once a repeat."""
+        return self.points * self.repeats
+
+
+def study_names() -> list[str]:
+    """Names of the built-in studies."""
+    return sorted(path.stem for path in BUILT_IN.glob("*.toml"))
+
+
+def load_study(name_or_path: str | Path) -> Study:
+    """Load a built-in study by name, or one from a TOML file.
+
+    Raises:
+        StudyError: no such study (with the built-in names), no TOML, or wrong content; the keys of factors and changes
+            are checked by :mod:`identify.studies.design`.
+    """
+    name = str(name_or_path)
+    path, source = Path(name), f"study file {name}"
+    if name in study_names():
+        path, source = BUILT_IN / f"{name}.toml", f"study {name!r}"
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = f", and {error}" if path.exists() else " nor a file"
+        raise StudyError(f"study {name!r} is neither built in ({', '.join(study_names())}){reason}") from error
+    return study_from_toml(text, source)
+
+
+def study_from_toml(text: str, source: str = "study") -> Study:
+    """Study from TOML text; ``source`` names it in error messages.
+
+    Raises:
+        StudyError: no TOML, or wrong content.
+    """
+    try:
+        return Study.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise StudyError(f"{source} is not valid TOML: {error}") from error
+    except ValidationError as error:
+        raise StudyError(f"{source}: {one_line(error, Study)}") from error
+
+
+def _by_path(tables: Any, keep: Any = (), section: str = "") -> Any:
+    """Tables in tables as one table by dotted path; a table with nothing but the keys ``keep`` is a value."""
+    if not isinstance(tables, Mapping):
+        return tables
+    found: dict[str, Any] = {}
+    for key, value in tables.items():
+        nested = isinstance(value, Mapping) and not (keep and value and set(value) <= set(keep))
+        found |= _by_path(value, keep, f"{section}{key}.") if nested else {f"{section}{key}": value}
+    return found

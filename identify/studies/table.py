@@ -1,0 +1,124 @@
+"""Finished rows as one tidy table: Parquet with the study in its metadata, and a view by factors.
+
+Columns: ``row``, ``repeat``, the seed as ``seed_entropy`` and ``seed_spawn_key`` (what ``numpy.random.SeedSequence``
+takes), one a factor under its dotted path, one a figure with its unit in the name, ``seconds`` and ``error``. A row
+that failed has NaN figures and says why in ``error``.
+"""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import xarray as xr
+
+from identify.arrays import Array
+from identify.errors import StudyError
+from identify.files.atomic import atomic_path
+from identify.files.versions import versions
+from identify.studies.computation import Finished
+from identify.studies.design import Design
+from identify.studies.study_file import Study
+
+STUDY_KEY, VERSIONS_KEY = b"cmmsim.study", b"cmmsim.versions"
+
+FIRST = ("row", "repeat", "seed_entropy", "seed_spawn_key")
+LAST = ("seconds", "error")
+
+
+def tidy_table(study: Study, finished: Iterable[Finished]) -> pd.DataFrame:
+    """The table of a study's finished rows, ordered by row. A factor whose values are lists has them as JSON text."""
+    count, design = len(Design(study)), Design(study)
+    figures: dict[str, Array] = {}
+    seconds, errors = np.full(count, np.nan), [""] * count
+    for row in finished:
+        seconds[row.number], errors[row.number] = row.seconds, row.error
+        for name, value in row.figures.items():
+            figures.setdefault(name, np.full(count, np.nan))[row.number] = value
+    done = np.flatnonzero(np.isfinite(seconds))
+    cases = [design.case(int(number)) for number in done]
+    columns: dict[str, Any] = {
+        "row": done,
+        "repeat": [case.repeat for case in cases],
+        "seed_entropy": str(study.seed),
+        "seed_spawn_key": done,
+    }
+    columns |= {path: [plain(case.factors[path]) for case in cases] for path in study.factors}
+    columns |= {name: values[done] for name, values in figures.items()}
+    return pd.DataFrame(columns | {"seconds": seconds[done], "error": [errors[number] for number in done]})
+
+
+def figure_names(frame: pd.DataFrame, study: Study) -> list[str]:
+    """The columns that are figures of the rows."""
+    return [name for name in frame.columns if name not in {*FIRST, *study.factors, *LAST}]
+
+
+def plain(value: Any) -> Any:
+    """A factor's value as a table holds it."""
+    return json.dumps(value) if isinstance(value, (list, dict)) else value
+
+
+def write_table(path: Path, frame: pd.DataFrame, entry: dict[str, Any]) -> None:
+    """Write a table as Parquet, whole or not at all; ``entry`` is the resolved study, kept with it.
+
+    Raises:
+        StudyError: it cannot be written.
+    """
+    table = pa.Table.from_pandas(frame, preserve_index=False)
+    own = {STUDY_KEY: json.dumps(entry).encode(), VERSIONS_KEY: json.dumps(versions()).encode()}
+    try:
+        with atomic_path(path) as temporary:
+            pq.write_table(table.replace_schema_metadata((table.schema.metadata or {}) | own), temporary)
+    except OSError as error:
+        raise StudyError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def read_table(path: Path) -> tuple[pd.DataFrame, Study]:
+    """A study's table and the study.
+
+    Raises:
+        StudyError: no such file, no Parquet, or not of a study.
+    """
+    entry = study_in(path)
+    if entry is None:
+        raise StudyError(f"no table {path}")
+    return pd.read_parquet(path), Study.model_validate(entry["study"])
+
+
+def study_in(path: Path) -> dict[str, Any] | None:
+    """The resolved study that a table is of; None where there is no such file.
+
+    Raises:
+        StudyError: no Parquet, or not of a study.
+    """
+    if not path.exists():
+        return None
+    try:
+        metadata = pq.read_schema(path).metadata or {}
+        return dict(json.loads(metadata[STUDY_KEY]))
+    except (pa.ArrowException, KeyError, ValueError, OSError) as error:
+        raise StudyError(f"{path} is no table of a study: {' '.join(str(error).split())}") from error
+
+
+def to_xarray(frame: pd.DataFrame, study: Study) -> xr.Dataset:
+    """The figures by factors and repeat; NaN where a row failed or is not done.
+
+    Dimensions are one a factor (its dotted path) and ``repeat`` for a grid, ``point`` and ``repeat`` for a sample,
+    whose factors are coordinates of ``point``.
+    """
+    dimensions = list(study.factors) if study.sample is None else ["point"]
+    indexed = frame if study.sample is None else frame.assign(point=frame["row"] % study.points)
+    figures = indexed.set_index([*dimensions, "repeat"])[[*figure_names(frame, study), "seconds"]]
+    view = xr.Dataset.from_dataframe(figures)
+    lists = {path: values for path, values in study.factors.items() if isinstance(values, list)}
+    wanted = {path: [plain(value) for value in lists[path]] for path in lists if path in view.dims}
+    view = view.reindex(wanted | {"repeat": np.arange(study.repeats)})
+    if study.sample is not None:
+        cases = [Design(study).case(point) for point in range(study.points)]
+        view = view.reindex(point=np.arange(study.points))
+        view = view.assign_coords({path: ("point", [plain(c.factors[path]) for c in cases]) for path in study.factors})
+    return view.assign_attrs(name=study.name, title=study.title, kind=study.kind)
