@@ -60,6 +60,8 @@ static int run_frames(context *c, servo *v, issued *ring, state *s, measure_fn m
         memcpy(out->rate + N * k, s->rate, sizeof(vec));
         memcpy(out->integral + N * k, s->integral, sizeof(vec));
         memcpy(out->servo_integral + N * k, v->integral, sizeof(vec));
+        if (out->motor) memcpy(out->motor + N * k, s->motor, sizeof(vec));
+        if (out->motor_rate) memcpy(out->motor_rate + N * k, s->motor_rate, sizeof(vec));
         record_sensitivities(c, k, out);
         if (k + 1 == p->frames) record_end(c, v, out);
         status = frame_command(c, v, k, s, measure, out);
@@ -83,13 +85,14 @@ static int run_frames(context *c, servo *v, issued *ring, state *s, measure_fn m
 static casadi_int largest(casadi_int a, casadi_int b) { return a > b ? a : b; }
 
 static int allocate_work(context *c) {
+    const work_fn sizes[] = {equation_of_motion_work, motion_derivatives_work, rate_map_derivative_work,
+                             c->p->servo_motion_work};
     casadi_int arg = 0, res = 0, iw = 0, w = 0, a, r, i, n;
-    equation_of_motion_work(&a, &r, &i, &n);
-    arg = largest(arg, a); res = largest(res, r); iw = largest(iw, i); w = largest(w, n);
-    motion_derivatives_work(&a, &r, &i, &n);
-    arg = largest(arg, a); res = largest(res, r); iw = largest(iw, i); w = largest(w, n);
-    rate_map_derivative_work(&a, &r, &i, &n);
-    arg = largest(arg, a); res = largest(res, r); iw = largest(iw, i); w = largest(w, n);
+    for (size_t k = 0; k < sizeof sizes / sizeof *sizes; k++) {
+        if (!sizes[k]) continue;
+        sizes[k](&a, &r, &i, &n);
+        arg = largest(arg, a); res = largest(res, r); iw = largest(iw, i); w = largest(w, n);
+    }
     c->arg = calloc((size_t)arg + 1, sizeof *c->arg);
     c->res = calloc((size_t)res + 1, sizeof *c->res);
     c->iw = calloc((size_t)iw + 1, sizeof *c->iw);
@@ -103,6 +106,8 @@ static void begin(context *c, servo *v, issued *ring, state *s) {
     memcpy(s->pose, p->pose, sizeof(vec));
     memcpy(s->rate, p->rate, sizeof(vec));
     memcpy(s->integral, p->integral, sizeof(vec));
+    memcpy(s->motor, p->motor, sizeof(vec));
+    memcpy(s->motor_rate, p->motor_rate, sizeof(vec));
     memcpy(v->integral, p->servo_integral, sizeof(vec));
     memcpy(v->previous_measured, p->last_measured, sizeof(vec));
     memcpy(v->last_command, p->start_commands + N * (p->commands_before - 1), sizeof(vec));
@@ -131,9 +136,9 @@ CASADI_SYMBOL_EXPORT int closed_loop_run(const problem *p, measure_fn measure, t
     servo *v = calloc(1, sizeof *v);
     issued *ring = calloc(MAX_DELAY, sizeof *ring);
     int status = OUT_OF_MEMORY;
+    if (c) c->p = p;
     if (c && v && ring && allocate_work(c)) {
         state s;
-        c->p = p;
         begin(c, v, ring, &s);
         status = run_frames(c, v, ring, &s, measure, out);
         out->events = c->events;

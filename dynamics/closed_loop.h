@@ -1,7 +1,8 @@
 /* Constants and types of the compiled closed loop: the twin of plain_closed_loop.py, stick_slip.py, step_sensitivity.py
  * and visual_servo.py, which explain the method and are tested to be equal. After this file come, in one unit with the C
  * code that CasADi generates for equation_of_motion, motion_derivatives and rate_map_derivative (column-major matrices):
- * joint_modes.c, step_sensitivity.c, stick_slip.c, visual_servo.c, closed_loop.c.
+ * linear_algebra.c, joint_friction.c, elastic_joints.c, joint_modes.c, step_sensitivity.c, stick_slip.c, visual_servo.c,
+ * closed_loop.c.
  */
 #include <math.h>
 #include <stddef.h>
@@ -35,12 +36,18 @@ typedef double vec[N];
 typedef double row[WIDTH];
 typedef row rows[N];
 
+/* What CasADi generates for a function, and for the sizes of its work arrays. */
+typedef int (*motion_fn)(const double **arg, double **res, casadi_int *iw, double *w, int mem);
+typedef int (*work_fn)(casadi_int *arg, casadi_int *res, casadi_int *iw, casadi_int *w);
+
 typedef struct {
     int frames, law, sensitivities, start_sensitivities, commands_before;
     double frame_period, smoothing_velocity, static_level, stribeck_velocity;
     double rigid[NRIGID];
     vec coulomb, viscous;
     double lp, li, ld, kp, kd, ki;
+    double stiffness, damping, motor_inertia; /* of elastic joints; a stiffness of 0: rigid */
+    vec motor, motor_rate;
     vec pose, rate, integral, servo_integral, last_measured;
     const double *start_commands;       /* (commands_before, 6), oldest first; the first also acted earlier */
     const double *integral_sensitivity; /* (6, NP) or NULL */
@@ -50,6 +57,8 @@ typedef struct {
     const signed char *lost;            /* (frames) 1 where the ideal sensor measures nothing, or NULL */
     const int *first_span, *span_command, *span_steps; /* which command acts when: see command_schedule.py */
     const double *span_ramp, *span_duration;
+    motion_fn servo_motion; /* equation of motion of the robot that the servo knows, or NULL: of this one */
+    work_fn servo_motion_work;
 } problem;
 
 typedef struct {
@@ -57,14 +66,15 @@ typedef struct {
     signed char *measured_ok;                          /* (frames) */
     double *pose_sensitivity;                          /* (frames, 6, NP) or NULL */
     double *start_sensitivity;                         /* (frames, 6, NSTART) or NULL */
-    double *end_sensitivity, *end_start_sensitivity;   /* of the last frame's state: (NSTART, NP), (NSTART, NSTART) or NULL */
+    double *end_sensitivity, *end_start_sensitivity;   /* (NSTART, NP) and (NSTART, NSTART), or NULL */
+    double *motor, *motor_rate;                        /* (frames, 6) of elastic joints or NULL */
     int events, failed_frame;
     vec last_pose;                                     /* the last at which the equation of motion was evaluated */
 } trajectory;
 
 typedef int (*measure_fn)(int frame, const double *pose, const double *rate, double *measured);
 
-typedef struct { vec pose, rate, integral; } state;
+typedef struct { vec pose, rate, integral, motor, motor_rate; } state; /* the last two: of elastic joints */
 
 typedef struct { vec value, slope, rate; } command; /* U(t) = value + slope t; U_dot as the joint PID sees it */
 
@@ -76,6 +86,7 @@ typedef struct {
     vec bias, bias_acceleration, angle, velocity;
     vec error;                 /* from here on: more than a function of pose and pose rate */
     vec torque, net_torque, stick_force, acceleration;
+    vec spring, motor_acceleration; /* of elastic joints, for which angle and velocity are those of the motors */
     vec inverse_rows[N];       /* M^-1 J^T, column i for joint i */
     double compliance[N][N];   /* J M^-1 J^T */
 } evaluation;

@@ -12,6 +12,7 @@ import numpy as np
 from dynamics import compiled_closed_loop, plain_closed_loop
 from dynamics.arrays import check_type, flag, floats, mask, real, shown
 from dynamics.errors import SimulationError
+from dynamics.joint_elasticity import JointElasticity
 from dynamics.loop_types import (
     PARAMETER_COUNT,
     ClosedLoopRun,
@@ -34,6 +35,7 @@ __all__ = [
     "ClosedLoopRun",
     "FrameTiming",
     "FrictionLaw",
+    "JointElasticity",
     "LoopFailure",
     "LoopSettings",
     "PoseSensor",
@@ -60,6 +62,7 @@ def simulate(
     commands: np.ndarray | None = None,
     lost: np.ndarray | None = None,
     latencies: np.ndarray | None = None,
+    servo_robot: Robot | None = None,
     compiled: bool | None = None,
 ) -> ClosedLoopRun:
     """Run the closed loop for parameters (67,): the 64 dynamic ones, then lp, li, ld.
@@ -70,6 +73,7 @@ def simulate(
     commands (frames, 6): drive the joints with these instead of the servo's; what is measured is then recorded and
     steers nothing.
     latencies (frames,), s: of each frame's command, instead of the settings' for all; see `command_schedule`.
+    servo_robot: the robot whose kinematics the servo knows, where that is another (no sensitivities then).
     lost (frames,) bool: frames at which the ideal sensor measures nothing, so that a model loses what its plant lost.
     compiled: None takes the compiled path when a C compiler is at hand; False forces the plain path.
     Raises LoopFailure when the robot leaves the reachable set (an unstable loop); and before the run
@@ -89,13 +93,20 @@ def simulate(
         lost = mask("lost", lost, len(reference.poses), SimulationError).astype(np.int8)
     if latencies is not None:
         latencies = checked_latencies(latencies, len(reference.poses), settings.timing)
+    if servo_robot is not None:
+        check_type("servo_robot", servo_robot, Robot, SimulationError)
+        if sensitivities:
+            raise SimulationError("sensitivities need a servo that knows the robot: pass servo_robot=None")
+    if settings.elasticity is not None and sensitivities:
+        raise SimulationError("sensitivities are those of rigid joints: pass settings with elasticity=None")
     reference.check_reach(robot)
     parameters = _check_loop_parameters(parameters)
     if start is None:
-        start = equilibrium(robot, parameters, reference.poses[0], settings.servo)
+        start = equilibrium(robot, parameters, reference.poses[0], settings.servo, servo_robot, settings.elasticity)
     else:
         check_type("start", start, StartState, SimulationError)
         _check_start_pose(robot, parameters, start.pose)
+    _check_elasticity(robot, parameters, settings, start)
     problem = LoopProblem(
         robot,
         parameters,
@@ -108,6 +119,7 @@ def simulate(
         commands,
         lost,
         latencies,
+        servo_robot or robot,
     )
     library = compiled_closed_loop.library(robot.geometry) if compiled in (None, True) else None
     if library is not None:
@@ -123,8 +135,15 @@ def prepare(robot: Robot) -> bool:
     return compiled_closed_loop.library(robot.geometry) is not None
 
 
-def equilibrium(robot: Robot, parameters: np.ndarray, pose: np.ndarray, servo: ServoGains) -> StartState:
-    """State of rest at a pose (6,), friction unloaded, for parameters (67,).
+def equilibrium(
+    robot: Robot,
+    parameters: np.ndarray,
+    pose: np.ndarray,
+    servo: ServoGains,
+    servo_robot: Robot | None = None,
+    elasticity: JointElasticity | None = None,
+) -> StartState:
+    """State of rest at a pose (6,), friction unloaded, for parameters (67,); servo_robot as in `simulate`.
 
     The holding torque is linear in the dynamic parameters. Raises what `simulate` raises before a run.
     """
@@ -139,8 +158,28 @@ def equilibrium(robot: Robot, parameters: np.ndarray, pose: np.ndarray, servo: S
     sensitivity = np.zeros((6, PARAMETER_COUNT))
     sensitivity[:, :64] = torque_map / li
     sensitivity[:, 65] = -integral / li
-    servo_integral = np.linalg.solve(robot.pose_jacobian(pose), angles) / servo.ki if servo.ki else np.zeros(6)
-    return StartState(pose, rest, integral, servo_integral, angles[None], pose, sensitivity)
+    motors = {}
+    if elasticity is not None:
+        angles = angles + li * integral / elasticity.stiffness
+        motors = {"motor_angle": angles, "motor_rate": rest}
+    known = servo_robot or robot
+    servo_integral = np.linalg.solve(known.pose_jacobian(pose), angles) / servo.ki if servo.ki else np.zeros(6)
+    return StartState(pose, rest, integral, servo_integral, angles[None], pose, sensitivity, **motors)
+
+
+def _check_elasticity(robot: Robot, parameters: np.ndarray, settings: LoopSettings, start: StartState) -> None:
+    elasticity = settings.elasticity
+    if elasticity is None:
+        return
+    if start.motor_angle is None or start.motor_rate is None:
+        raise SimulationError("a start with elastic joints needs motor_angle and motor_rate")
+    period = 1 / settings.timing.frame_rate_hz
+    steps = elasticity.steps_needed(robot, parameters, start.pose, period, settings.friction)
+    if settings.steps_per_frame < steps:
+        raise SimulationError(
+            f"steps_per_frame is {settings.steps_per_frame}, must be >= {steps} to follow joints with "
+            f"a stiffness of {elasticity.stiffness:g} N m/rad"
+        )
 
 
 def _check_loop_parameters(parameters: np.ndarray) -> np.ndarray:

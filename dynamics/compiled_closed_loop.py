@@ -1,7 +1,7 @@
 """Binding of the compiled closed loop (C files, see `closed_loop.h`) by ctypes."""
 
 import ctypes
-from ctypes import CFUNCTYPE, POINTER, Structure, byref, c_byte, c_double, c_int
+from ctypes import CFUNCTYPE, POINTER, Structure, byref, c_byte, c_double, c_int, c_void_p, cast
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -36,6 +36,9 @@ FAILURES = {
 SENSOR_FAILED = 3
 SOURCES = (
     "closed_loop.h",
+    "linear_algebra.c",
+    "joint_friction.c",
+    "elastic_joints.c",
     "joint_modes.c",
     "step_sensitivity.c",
     "stick_slip.c",
@@ -48,6 +51,7 @@ _TIMES_AND_FRICTION = ("frame_period", "smoothing_velocity", "static_level", "st
 SENSOR_RAISED, MEASURED, LOST = 0, 1, 2
 _RECORDS = ("pose", "pose_rate", "torque", "command", "measured", "joint_integral", "servo_integral")  # (frames, 6)
 _SENSITIVITIES = ("pose_sensitivity", "start_sensitivity", "end_sensitivity", "end_start_sensitivity")
+_MOTORS = ("motor_angle", "motor_rate")
 
 _DoublePointer = POINTER(c_double)
 _Measure = CFUNCTYPE(c_int, c_int, _DoublePointer, _DoublePointer, _DoublePointer)
@@ -61,12 +65,15 @@ class _Problem(Structure):
         ("coulomb", c_double * 6),
         ("viscous", c_double * 6),
         *[(name, c_double) for name in ("lp", "li", "ld", "kp", "kd", "ki")],
+        *[(name, c_double) for name in ("stiffness", "damping", "motor_inertia")],
+        *[(name, c_double * 6) for name in ("motor", "motor_rate")],
         *[(name, c_double * 6) for name in ("pose", "rate", "integral", "servo_integral", "last_measured")],
         *[(name, _DoublePointer) for name in ("start_commands", "integral_sensitivity")],
         *[(name, _DoublePointer) for name in ("reference", "reference_rate", "logged_commands")],
         ("lost", POINTER(c_byte)),
         *[(name, POINTER(c_int)) for name in ("first_span", "span_command", "span_steps")],
         *[(name, _DoublePointer) for name in ("span_ramp", "span_duration")],
+        *[(name, c_void_p) for name in ("servo_motion", "servo_motion_work")],
     ]
 
 
@@ -75,6 +82,7 @@ class _Trajectory(Structure):
         *[(name, _DoublePointer) for name in _RECORDS],
         ("measured_ok", POINTER(c_byte)),
         *[(name, _DoublePointer) for name in _SENSITIVITIES],
+        *[(name, _DoublePointer) for name in _MOTORS],
         ("events", c_int),
         ("failed_frame", c_int),
         ("last_pose", c_double * 6),
@@ -95,16 +103,16 @@ def library(geometry: Rss6Geometry) -> ctypes.CDLL | None:
     return _library_at(path) if path else None
 
 
-def run(library: ctypes.CDLL, problem: LoopProblem) -> ClosedLoopRun:
+def run(compiled: ctypes.CDLL, problem: LoopProblem) -> ClosedLoopRun:
     """Do one run with the compiled loop; see `closed_loop.simulate`."""
     result = empty_run(problem)
     struct = _struct(problem, command_schedule(problem))
     trajectory = _Trajectory(
-        **{name: _pointer(getattr(result, name)) for name in (*_RECORDS, *_SENSITIVITIES)},
+        **{name: _pointer(getattr(result, name)) for name in (*_RECORDS, *_SENSITIVITIES, *_MOTORS)},
         measured_ok=result.measured_ok.ctypes.data_as(POINTER(c_byte)),
     )
     callback, raised = _callback(problem.sensor, problem.period)
-    status = library.closed_loop_run(byref(struct), callback, byref(trajectory))
+    status = compiled.closed_loop_run(byref(struct), callback, byref(trajectory))
     if status == SENSOR_FAILED:
         raise raised[0] if raised else SimulationError("the pose sensor failed without an error")
     if status:
@@ -145,7 +153,13 @@ def _struct(problem: LoopProblem, schedule: CommandSchedule) -> _Problem:
         span_ramp=_pointer(schedule.ramp),
         span_duration=_pointer(schedule.duration),
     )
-    struct.rigid[:] = parameters[:52]
+    elasticity, rigid = problem.settings.elasticity, parameters[:52]
+    if elasticity is not None:
+        rigid = elasticity.beyond_the_springs(rigid)
+        struct.stiffness, struct.damping = elasticity.stiffness, elasticity.damping
+        struct.motor_inertia = elasticity.motor_inertia
+        struct.motor[:], struct.motor_rate[:] = start.motor_angle, start.motor_rate
+    struct.rigid[:] = rigid
     struct.coulomb[:] = parameters[52:58]
     struct.viscous[:] = parameters[58:64]
     struct.pose[:] = start.pose
@@ -153,6 +167,11 @@ def _struct(problem: LoopProblem, schedule: CommandSchedule) -> _Problem:
     struct.integral[:] = start.joint_integral
     struct.servo_integral[:] = start.servo_integral
     struct.last_measured[:] = start.last_measured
+    if problem.servo_robot.geometry != problem.robot.geometry:
+        known = library(problem.servo_robot.geometry)
+        assert known is not None
+        struct.servo_motion = cast(known.equation_of_motion, c_void_p)
+        struct.servo_motion_work = cast(known.equation_of_motion_work, c_void_p)
     return struct
 
 

@@ -1,90 +1,5 @@
 /* The equation of motion for given stick modes of the joints, and which modes hold: see stick_slip.py. */
 
-static double dot_row(const double *matrix, int row, const double *v) {
-    double sum = 0;
-    for (int j = 0; j < N; j++) sum += matrix[row + N * j] * v[j];
-    return sum;
-}
-
-static inline int cholesky(const double *a, factor l) {
-    for (int i = 0; i < N; i++)
-        for (int j = 0; j <= i; j++) {
-            double sum = a[i + N * j];
-            for (int k = 0; k < j; k++) sum -= l[i][k] * l[j][k];
-            if (i == j) {
-                if (!(sum > 0)) return 0;
-                l[i][i] = 1 / sqrt(sum);
-            } else
-                l[i][j] = sum * l[j][j];
-        }
-    return 1;
-}
-
-static inline void cholesky_solve(const factor l, int n, double *b) {
-    for (int i = 0; i < n; i++) {
-        for (int k = 0; k < i; k++) b[i] -= l[i][k] * b[k];
-        b[i] *= l[i][i];
-    }
-    for (int i = n - 1; i >= 0; i--) {
-        for (int k = i + 1; k < n; k++) b[i] -= l[k][i] * b[k];
-        b[i] *= l[i][i];
-    }
-}
-
-static int stuck_joints(const int *mode, int *list) {
-    int count = 0;
-    for (int i = 0; i < N; i++)
-        if (mode[i] == 0) list[count++] = i;
-    return count;
-}
-
-/* Cholesky factor of compliance[list][list], size count. */
-static void factor_stuck(const double compliance[N][N], const int *list, int count, factor l) {
-    for (int i = 0; i < count; i++)
-        for (int j = 0; j <= i; j++) {
-            double sum = compliance[list[i]][list[j]];
-            for (int k = 0; k < j; k++) sum -= l[i][k] * l[j][k];
-            l[i][j] = i == j ? 1 / sqrt(sum) : sum * l[j][j];
-        }
-}
-
-/* Solve the symmetric positive definite system compliance[list][list] f = b in place, size count. */
-static void solve_stuck(const double compliance[N][N], const int *list, int count, double *b) {
-    factor l;
-    factor_stuck(compliance, list, count, l);
-    cholesky_solve(l, count, b);
-}
-
-static int needs_event(const problem *p, int i) { return p->law != SMOOTHED && p->coulomb[i] > 0; }
-
-/* Dry friction over Coulomb torque of a joint that slips towards `mode`, and its derivative: see friction.py. */
-static double dry_level(const problem *p, double velocity, int mode) {
-    if (p->law == SMOOTHED) return tanh(velocity / p->smoothing_velocity);
-    if (p->law == STRIBECK) {
-        double ratio = velocity / p->stribeck_velocity;
-        return mode * (1 + (p->static_level - 1) * exp(-ratio * ratio));
-    }
-    return mode;
-}
-
-static double dry_slope(const problem *p, double velocity, int mode) {
-    if (p->law == SMOOTHED) {
-        double dry = tanh(velocity / p->smoothing_velocity);
-        return (1 - dry * dry) / p->smoothing_velocity;
-    }
-    if (p->law == STRIBECK) {
-        double ratio = velocity / p->stribeck_velocity;
-        return -2 * mode * (p->static_level - 1) * ratio / p->stribeck_velocity * exp(-ratio * ratio);
-    }
-    return 0;
-}
-
-static double breakaway(const problem *p, int i) { return p->static_level * p->coulomb[i]; }
-
-static double slip_friction(const problem *p, const evaluation *e, int i, int mode) {
-    return p->coulomb[i] * dry_level(p, e->velocity[i], mode) + p->viscous[i] * e->velocity[i];
-}
-
 static int finite_mass(const double *mass) {
     for (int i = 0; i < N * N; i++)
         if (!isfinite(mass[i])) return 0;
@@ -108,16 +23,17 @@ static int know_motion(context *c, const double *pose, const double *rate) {
     return OK;
 }
 
-/* J_theta alone, at a measured pose: often the true one. */
+/* J_theta alone, as the servo knows it, at a measured pose: often the true one. */
 static void pose_jacobian(context *c, const double *pose, double *jacobian) {
     vec rest = {0};
-    if (c->knows && !memcmp(c->known_pose, pose, sizeof(vec))) {
+    motion_fn motion = c->p->servo_motion ? c->p->servo_motion : equation_of_motion;
+    if (!c->p->servo_motion && c->knows && !memcmp(c->known_pose, pose, sizeof(vec))) {
         memcpy(jacobian, c->known.jacobian, sizeof c->known.jacobian);
         return;
     }
     c->arg[0] = pose; c->arg[1] = rest; c->arg[2] = c->p->rigid;
     c->res[0] = c->res[1] = c->res[3] = c->res[4] = NULL; c->res[2] = jacobian;
-    equation_of_motion(c->arg, c->res, c->iw, c->w, 0);
+    motion(c->arg, c->res, c->iw, c->w, 0);
 }
 
 /* Everything at one state that does not depend on the stick modes. */
@@ -126,6 +42,7 @@ static int evaluate_terms(context *c, const state *s, double t, evaluation *e) {
     int status = know_motion(c, s->pose, s->rate);
     if (status != OK) return status;
     memcpy(e, &c->known, offsetof(evaluation, error));
+    if (elastic(p)) wind_springs(p, s, e);
     for (int i = 0; i < N; i++) {
         e->error[i] = c->u.value[i] + c->u.slope[i] * t - e->angle[i];
         e->torque[i] = p->lp * e->error[i] + p->ld * (c->u.rate[i] - e->velocity[i]) + p->li * s->integral[i];
@@ -152,6 +69,10 @@ static void accelerate(const context *c, evaluation *e) {
     for (int i = 0; i < N; i++) {
         e->stick_force[i] = 0;
         e->net_torque[i] = e->torque[i] - (c->mode[i] ? slip_friction(c->p, e, i, c->mode[i]) : 0);
+    }
+    if (elastic(c->p)) {
+        accelerate_elastic(c, e);
+        return;
     }
     for (int j = 0; j < N; j++) {
         right[j] = -e->bias[j];
@@ -184,6 +105,10 @@ static int evaluate(context *c, const state *s, double t, evaluation *e) {
 static void decide_modes(context *c, evaluation *e, const int *list, int count) {
     vec force = {0};
     if (!count) return;
+    if (elastic(c->p)) {
+        decide_motor_modes(c, e, list, count);
+        return;
+    }
     for (int s = 0; s < count; s++) c->mode[list[s]] = 1;
     evaluate_compliance(e, list, count);
     vec right;

@@ -100,6 +100,12 @@ def check_home(geometry: Rss6Geometry) -> None:
             )
 
 
+def home_angles(geometry: Rss6Geometry) -> np.ndarray:
+    """Crank angles (6,), rad, at the home pose. Raises RobotFileError, naming the leg, where that is out of reach."""
+    check_home(geometry)
+    return np.array([float(leg.angle) for leg in leg_vectors(geometry, ca.SX(geometry.home_pose))])
+
+
 def _home_chord(geometry: Rss6Geometry, leg: int) -> tuple[float, float, float]:
     home = ca.SX(geometry.home_pose)
     joint = home[0:3] + rotation_matrix(home[3:6]) @ geometry.platform_joints[leg]

@@ -1,8 +1,13 @@
 """What the plain integrator of the loop works on: command, state, and the equation of motion evaluated at a state."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+
+MotionFunctions = Mapping[str, Callable[..., Any]]
+"""What the integrator evaluates, by the names of `pose_space_motion`: CasADi functions, or ones made from them."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +26,10 @@ class Command:
 
 @dataclass(frozen=True)
 class State:
-    """Pose, pose rate and joint PID integral, (6,) each; or their derivatives, (6, columns) each."""
+    """Pose, pose rate and joint PID integral, (6,) each; or their derivatives, (6, columns) each.
+
+    With elastic joints pose and rate are those of the platform and then of the motors, (12,) each.
+    """
 
     pose: np.ndarray
     rate: np.ndarray

@@ -10,6 +10,7 @@ import numpy as np
 from dynamics.arrays import Shape, check_choice, check_type, floats, real, whole
 from dynamics.errors import SimulationError
 from dynamics.friction import FrictionLaw
+from dynamics.joint_elasticity import JointElasticity
 from dynamics.parameters import PARAMETER_NAMES
 from dynamics.robot import Robot
 
@@ -73,16 +74,20 @@ class FrameTiming:
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """What the loop is made of besides the robot: servo, timing, friction law, Runge-Kutta steps per frame."""
+    """What the loop is made of besides the robot: servo, timing, friction law, Runge-Kutta steps per frame, and the
+    elasticity of the joints (None: rigid)."""
 
     servo: ServoGains
     timing: FrameTiming
     friction: FrictionLaw = field(default_factory=FrictionLaw)
     steps_per_frame: int = 4
+    elasticity: JointElasticity | None = None
 
     def __post_init__(self) -> None:
         for name, kind in (("servo", ServoGains), ("timing", FrameTiming), ("friction", FrictionLaw)):
             check_type(name, getattr(self, name), kind, SimulationError)
+        if self.elasticity is not None:
+            check_type("elasticity", self.elasticity, JointElasticity, SimulationError)
         steps = whole("steps_per_frame", self.steps_per_frame, SimulationError, least=1, most=MAX_STEPS_PER_FRAME)
         object.__setattr__(self, "steps_per_frame", steps)
 
@@ -124,6 +129,7 @@ class StartState:
     order, are what start_sensitivity differentiates by. commands (n, 6): the commands issued before, rad, oldest first
     (the first one also acted before), and last_measured (6,): the pose measured one frame before; both are records.
     joint_integral_sensitivity (6, 67): how the joint PID integral follows the parameters; zero where it is just given.
+    motor_angle (6,), rad, and motor_rate (6,): of elastic joints only.
     Raises SimulationError for a wrong shape or a number that is not finite.
     """
 
@@ -134,10 +140,14 @@ class StartState:
     commands: np.ndarray
     last_measured: np.ndarray
     joint_integral_sensitivity: np.ndarray = field(default_factory=lambda: np.zeros((6, PARAMETER_COUNT)))
+    motor_angle: np.ndarray | None = None
+    motor_rate: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         shapes: dict[str, Shape] = {"commands": ("N", 6), "joint_integral_sensitivity": (6, PARAMETER_COUNT)}
         for name in self.__dataclass_fields__:
+            if getattr(self, name) is None and name in ("motor_angle", "motor_rate"):
+                continue
             array = floats(f"start {name}", getattr(self, name), shapes.get(name, (6,)), error=SimulationError)
             object.__setattr__(self, name, np.ascontiguousarray(array))
         if not len(self.commands):
@@ -159,6 +169,7 @@ class LoopProblem:
     commands: np.ndarray | None
     lost: np.ndarray | None
     latencies: np.ndarray | None
+    servo_robot: Robot
 
     @property
     def frames(self) -> int:
@@ -177,7 +188,7 @@ class ClosedLoopRun:
     whether the measurement was good; joint PID integral (rad s) and servo integral (m s, rad s) as the frame begins;
     derivatives of the poses by the parameters (frames, 6, 67) and by the start (frames, 6, 24; see StartState), and of
     the 24 entries of the last frame's state by both, end_sensitivity (24, 67) and end_start_sensitivity (24, 24), each
-    or None; number of stick-slip events; the start."""
+    or None; angle (rad) and rate of the motors of elastic joints, or None; number of stick-slip events; the start."""
 
     time: np.ndarray
     pose: np.ndarray
@@ -192,6 +203,8 @@ class ClosedLoopRun:
     start_sensitivity: np.ndarray | None
     end_sensitivity: np.ndarray | None
     end_start_sensitivity: np.ndarray | None
+    motor_angle: np.ndarray | None
+    motor_rate: np.ndarray | None
     events: int
     start: StartState
 
@@ -213,6 +226,8 @@ class ClosedLoopRun:
             self.servo_integral[frame],
             commands,
             self.measured[frame - 1],
+            motor_angle=None if self.motor_angle is None else self.motor_angle[frame],
+            motor_rate=None if self.motor_rate is None else self.motor_rate[frame],
         )
 
 
@@ -235,6 +250,8 @@ def empty_run(problem: LoopProblem) -> ClosedLoopRun:
         start_sensitivity=np.zeros((frames, 6, START_COUNT)) if by_start else None,
         end_sensitivity=np.zeros((START_COUNT, PARAMETER_COUNT)) if by_parameters else None,
         end_start_sensitivity=np.zeros((START_COUNT, START_COUNT)) if by_start else None,
+        motor_angle=np.zeros((frames, 6)) if problem.settings.elasticity else None,
+        motor_rate=np.zeros((frames, 6)) if problem.settings.elasticity else None,
         events=0,
         start=problem.start,
     )

@@ -8,7 +8,9 @@ import numpy as np
 
 from dynamics import model
 from dynamics.command_schedule import CommandSchedule, command_schedule
+from dynamics.elastic_motion import elastic_functions, with_motors
 from dynamics.geometry import Rss6Geometry
+from dynamics.loop_motion import MotionFunctions
 from dynamics.loop_types import (
     LENGTH,
     MEASURED_OUT_OF_REACH,
@@ -36,17 +38,18 @@ def _functions(geometry: Rss6Geometry) -> dict[str, ca.Function]:
 
 def run(robot: Robot, problem: LoopProblem) -> ClosedLoopRun:
     """Do one run in plain Python; see `closed_loop.simulate`."""
-    functions = _functions(robot.geometry)
+    functions: MotionFunctions = _functions(robot.geometry)
     reference, settings, period, start = problem.reference, problem.settings, problem.period, problem.start
+    state = State(start.pose, start.pose_rate, start.joint_integral)
+    if settings.elasticity is not None:
+        state, functions = with_motors(state, start), elastic_functions(functions, settings.elasticity)
     tangent, d_servo_integral = _start_tangent(problem)
     rest = np.zeros_like(d_servo_integral)
     motion = StickSlipMotion(
         functions, problem.parameters, settings.friction, tangent if problem.sensitivities else None
     )
-    servo = VisualServo(
-        functions, settings.servo, period, start.last_measured, start.servo_integral, d_servo_integral
-    )
-    state = State(start.pose, start.pose_rate, start.joint_integral)
+    known = _functions(problem.servo_robot.geometry)
+    servo = VisualServo(known, settings.servo, period, start.last_measured, start.servo_integral, d_servo_integral)
     result = empty_run(problem)
     issued: list[Issued] = [(command, rest) for command in start.commands]
     schedule = command_schedule(problem)
@@ -68,17 +71,19 @@ def run(robot: Robot, problem: LoopProblem) -> ClosedLoopRun:
             issued.append(_servo_command(servo, frame, reference, measured, d_pose))
         result.command[frame] = issued[-1][0]
         if not np.isfinite(issued[-1][0]).all():
-            raise failure(MEASURED_OUT_OF_REACH, frame, problem, state.pose, result.measured)
+            raise failure(MEASURED_OUT_OF_REACH, frame, problem, state.pose[:6], result.measured)
         try:
             state = _frame(motion, state, issued, frame, problem, schedule, result)
         except MotionStopped as reason:
-            raise failure(str(reason), frame, problem, reason.pose, result.measured) from None
+            raise failure(str(reason), frame, problem, reason.pose[:6], result.measured) from None
     return replace(result, events=motion.events)
 
 
 def _record_state(result: ClosedLoopRun, frame: int, state: State, motion: StickSlipMotion) -> np.ndarray | None:
     """Write the state at a frame into the result; returns the sensitivity of the pose, if there is one."""
-    result.pose[frame], result.pose_rate[frame] = state.pose, state.rate
+    result.pose[frame], result.pose_rate[frame] = state.pose[:6], state.rate[:6]
+    if result.motor_angle is not None and result.motor_rate is not None:
+        result.motor_angle[frame], result.motor_rate[frame] = state.pose[6:], state.rate[6:]
     result.joint_integral[frame] = state.integral
     if motion.tangent is None or result.pose_sensitivity is None:
         return None
@@ -101,9 +106,10 @@ def _record_end(result: ClosedLoopRun, motion: StickSlipMotion, servo: VisualSer
 
 def _measure(problem: LoopProblem, frame: int, state: State) -> np.ndarray | None:
     """What the sensor says of the pose (6,) of a state, or None where the frame is lost."""
+    pose, rate = state.pose[:6], state.rate[:6]
     if problem.sensor is not None:
-        return measurement(problem.sensor, frame, frame * problem.period, state.pose.copy(), state.rate.copy())
-    return None if problem.lost is not None and problem.lost[frame] else state.pose
+        return measurement(problem.sensor, frame, frame * problem.period, pose.copy(), rate.copy())
+    return None if problem.lost is not None and problem.lost[frame] else pose
 
 
 def _servo_command(

@@ -8,11 +8,10 @@ that follows is shorter by it. Stopping joints by an impulse is differentiated i
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 
 from dynamics.friction import FrictionLaw
-from dynamics.loop_motion import Command, Evaluation, State, compliance
+from dynamics.loop_motion import Command, Evaluation, MotionFunctions, State, compliance
 from dynamics.loop_types import LENGTH
 from dynamics.parameters import COULOMB, RIGID_BODY, VISCOUS
 
@@ -26,7 +25,7 @@ class StepSensitivity:
     """Derivatives of the state (`tangent`: (6, columns) each) and of the time at which the present step starts."""
 
     def __init__(
-        self, functions: dict[str, ca.Function], parameters: np.ndarray, friction: FrictionLaw, tangent: State
+        self, functions: MotionFunctions, parameters: np.ndarray, friction: FrictionLaw, tangent: State
     ) -> None:
         self._functions = functions
         self._rigid = parameters[RIGID_BODY]

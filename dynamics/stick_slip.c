@@ -1,10 +1,15 @@
 /* Motion over a span of one command: Runge-Kutta steps cut where a joint stops or breaks away: see stick_slip.py. */
 
-static void moved(const state *s, const state *slope_of, const evaluation *e, double h, state *out) {
+static void moved(const context *c, const state *s, const state *slope_of, const evaluation *e, double h,
+                  state *out) {
     for (int i = 0; i < N; i++) {
         out->pose[i] = s->pose[i] + h * slope_of->rate[i];
         out->rate[i] = s->rate[i] + h * e->acceleration[i];
         out->integral[i] = s->integral[i] + h * e->error[i];
+    }
+    for (int i = 0; i < N && elastic(c->p); i++) {
+        out->motor[i] = s->motor[i] + h * slope_of->motor_rate[i];
+        out->motor_rate[i] = s->motor_rate[i] + h * e->motor_acceleration[i];
     }
 }
 
@@ -14,19 +19,23 @@ static int rk4(context *c, const state *s, double t, double h, state *out) {
     c->stage_state[0] = *s;
     c->stage_time[0] = t;
     for (int k = 1; k < 4; k++) {
-        moved(s, &c->stage_state[k - 1], &c->stage[k - 1], fraction[k] * h, &c->stage_state[k]);
+        moved(c, s, &c->stage_state[k - 1], &c->stage[k - 1], fraction[k] * h, &c->stage_state[k]);
         c->stage_time[k] = t + fraction[k] * h;
         int status = evaluate(c, &c->stage_state[k], c->stage_time[k], &c->stage[k]);
         if (status != OK) return status;
     }
     *out = *s;
     for (int k = 0; k < 4; k++)
-        moved(out, &c->stage_state[k], &c->stage[k], weight[k] * h, out);
+        moved(c, out, &c->stage_state[k], &c->stage[k], weight[k] * h, out);
     return OK;
 }
 
 /* Take the velocities of the joints in the list out of the pose rate, as an impulse would. */
 static void stop_joints(context *c, evaluation *e, state *s, const int *list, int count) {
+    if (elastic(c->p)) {
+        for (int k = 0; k < count; k++) s->motor_rate[list[k]] = 0;
+        return;
+    }
     if (!count) return;
     if (count == N) {
         memset(s->rate, 0, sizeof s->rate);

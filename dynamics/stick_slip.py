@@ -9,11 +9,10 @@ step: see `step_sensitivity`.
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 
 from dynamics.friction import FrictionLaw
-from dynamics.loop_motion import Command, Evaluation, State, compliance
+from dynamics.loop_motion import Command, Evaluation, MotionFunctions, State, compliance
 from dynamics.loop_types import LEFT_REACH, SINGULAR_MASS
 from dynamics.parameters import COULOMB, RIGID_BODY, VISCOUS
 from dynamics.step_sensitivity import FRACTION, WEIGHT, StepSensitivity
@@ -38,7 +37,7 @@ class StickSlipMotion:
 
     def __init__(
         self,
-        functions: dict[str, ca.Function],
+        functions: MotionFunctions,
         parameters: np.ndarray,
         friction: FrictionLaw,
         tangent: State | None = None,
@@ -139,7 +138,7 @@ class StickSlipMotion:
             at.stick_force[stuck] = force
             at.net_torque[stuck] -= force
             # A robot that stands still stands still: rounding must not make it creep.
-            free = free - response @ force if len(stuck) < 6 else np.zeros(6)
+            free = free - response @ force if len(stuck) < len(free) else np.zeros_like(free)
         at.acceleration = free
         return at
 
@@ -237,7 +236,8 @@ class StickSlipMotion:
             return at.state
         matrix, response = compliance(at, joints)
         impulse = np.linalg.solve(matrix, at.jacobian[joints] @ at.state.rate)
-        rate = at.state.rate - response @ impulse if len(joints) < 6 else np.zeros(6)
+        rate = at.state.rate
+        rate = rate - response @ impulse if len(joints) < len(rate) else np.zeros_like(rate)
         if self._sensitivity:
             self._sensitivity.stop(at, joints, rate, impulse)
         return replace(at.state, rate=rate)

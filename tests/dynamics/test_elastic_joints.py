@@ -1,0 +1,181 @@
+"""Elastic joints against energy, against an ODE solver on the twist-space model, and against the rigid robot."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import fsolve
+
+from dynamics import closed_loop
+from dynamics.closed_loop import FrictionLaw, JointElasticity
+from dynamics.errors import SimulationError
+from dynamics.parameters import COULOMB, PARAMETER_NAMES
+
+GRAVITY = 9.81
+CRANK_IZZ = [PARAMETER_NAMES.index(f"crank{leg}.Izz") for leg in range(1, 7)]
+SOFT = JointElasticity(stiffness=500.0, motor_inertia=3e-4, damping=0.02)
+
+
+@pytest.fixture(scope="module")
+def frictionless(identified):
+    """The truth without dry friction, all cranks heavier than a motor."""
+    values = identified.copy()
+    values[COULOMB] = 0.0
+    values[CRANK_IZZ] = 6e-4
+    return values
+
+
+@pytest.fixture
+def make_elastic(make_settings):
+    def make(elasticity, steps=80, **options):
+        return dataclasses.replace(make_settings(steps=steps, **options), elasticity=elasticity)
+
+    return make
+
+
+def _potential(pose, motors, stiffness, parameters, robot, legs_at):
+    """Energy of gravity and springs, J, from heights and crank angles; rods have their centres at mid-length."""
+    legs = legs_at(pose)
+    crank_mass, link_mass = parameters[4:28:4], parameters[28:52:4]
+    tip, joint, foot = legs.tip[:, 2], legs.joint[:, 2], robot.geometry.base_joints[:, 2]
+    heights = parameters[0] * pose[2] + crank_mass @ (foot + tip) / 2 + link_mass @ (tip + joint) / 2
+    return GRAVITY * heights + stiffness / 2 * np.sum((motors - robot.inverse_kinematics(pose)) ** 2)
+
+
+def _least_energy(start, *arguments):
+    """Pose at which the energy has no slope, by MINPACK on differences over 20 um and 20 urad."""
+    scale = 1e-4
+
+    def slope(x):
+        moves = 0.2 * np.vstack([np.eye(6), -np.eye(6)])
+        energies = [_potential(start + scale * (x + move), *arguments) for move in moves]
+        return np.array(energies[:6]) - energies[6:]
+
+    return start + scale * fsolve(slope, np.zeros(6), xtol=1e-10)
+
+
+def test_a_load_sinks_to_the_pose_of_least_energy(robot, frictionless, legs_at, make_elastic):
+    """Motors held where they are, 8 kg put on the platform: after the vibration has died the sum of the energies of
+    gravity and springs is least; the cranks have given way by torque over stiffness."""
+    stiff_loop = frictionless.copy()
+    stiff_loop[64:] = 40.0, 200.0, 0.5
+    pose = robot.home_pose + np.array([2e-3, -1e-3, 1e-3, 0.01, -0.005, 0.01])
+    settings = make_elastic(SOFT)
+    start = closed_loop.equilibrium(robot, stiff_loop, pose, settings.servo, elasticity=SOFT)
+    loaded = stiff_loop.copy()
+    loaded[0] += 8.0
+    reference = closed_loop.Reference(np.tile(pose, (300, 1)), np.zeros((300, 6)))
+    commands = np.tile(start.commands[0], (300, 1))
+    run = closed_loop.simulate(robot, loaded, reference, settings, start=start, commands=commands)
+    np.testing.assert_allclose(run.motor_angle[-1], commands[0], atol=1e-8)
+    sunk = _least_energy(pose, commands[0], SOFT.stiffness, loaded[:64], robot, legs_at)
+    assert np.abs(sunk - pose)[2] > 1e-4
+    np.testing.assert_allclose(run.pose[-1], sunk, atol=1e-8)
+    given_way = run.motor_angle[-1] - robot.inverse_kinematics(run.pose[-1])
+    np.testing.assert_allclose(given_way, robot.static_torque(run.pose[-1], loaded[:64]) / SOFT.stiffness, atol=1e-8)
+
+
+def test_the_equilibrium_is_the_pose_of_least_energy_and_stays(robot, frictionless, legs_at, make_elastic):
+    settings, pose = make_elastic(SOFT), robot.home_pose
+    start = closed_loop.equilibrium(robot, frictionless, pose, settings.servo, elasticity=SOFT)
+    least = _least_energy(pose + 1e-5, start.motor_angle, SOFT.stiffness, frictionless[:64], robot, legs_at)
+    np.testing.assert_allclose(least, pose, atol=1e-8)
+    reference = closed_loop.Reference(np.tile(pose, (20, 1)), np.zeros((20, 6)))
+    run = closed_loop.simulate(robot, frictionless, reference, settings)
+    np.testing.assert_allclose(run.pose, reference.poses, atol=1e-13)
+
+
+def test_motion_is_that_of_the_twist_space_model_with_springs(robot, frictionless, make_elastic, make_reference):
+    """Three frames of moving commands against DOP853 on forward dynamics (eq. 40) with the springs as its actuators."""
+    el, frames = SOFT, 3
+    reference = make_reference(frames)
+    settings = make_elastic(el, steps=200)
+    run = closed_loop.simulate(
+        robot, frictionless, reference, settings, commands=0.02 * np.sin(np.arange(frames))[:, None] * np.ones(6)
+    )
+    lp, li, ld = frictionless[64:]
+    carried, viscous = frictionless[:64].copy(), frictionless[58:64]
+    carried[CRANK_IZZ] -= el.motor_inertia
+    carried[52:] = 0.0
+
+    def slope(t, x, command, command_rate):
+        pose, twist, motor, rate, integral = x.reshape(5, 6)
+        crank_rate = robot.joint_jacobian(pose) @ twist
+        spring = el.stiffness * (motor - robot.inverse_kinematics(pose)) + el.damping * (rate - crank_rate)
+        torque = lp * (command - motor) + ld * (command_rate - rate) + li * integral
+        motion = (robot.pose_rate(pose, twist), robot.forward_dynamics(pose, twist, spring, carried))
+        return np.concatenate([*motion, rate, (torque - viscous * rate - spring) / el.motor_inertia, command - motor])
+
+    start, before = run.start, run.start.commands[-1]
+    x = np.concatenate([start.pose, np.zeros(6), start.motor_angle, start.motor_rate, start.joint_integral])
+    for k in range(frames - 1):
+        command = run.command[k]
+        inputs = (command, (command - before) * 60.0)
+        solution = solve_ivp(slope, (0, 1 / 60), x, "DOP853", args=inputs, rtol=1e-10, atol=1e-12)
+        x, before = solution.y[:, -1], command
+        pose, twist, motor, rate, _ = x.reshape(5, 6)
+        np.testing.assert_allclose(run.pose[k + 1], pose, atol=1e-10)
+        np.testing.assert_allclose(robot.twist(run.pose[k + 1], run.pose_rate[k + 1]), twist, atol=1e-8)
+        np.testing.assert_allclose(run.motor_angle[k + 1], motor, atol=1e-9)
+        np.testing.assert_allclose(run.motor_rate[k + 1], rate, atol=1e-6)
+
+
+def test_stiff_springs_give_the_rigid_run_to_first_order(robot, frictionless, make_reference, make_elastic):
+    """The difference halves with the compliance: the order between stiffnesses of 1, 2 and 4e4 N m/rad is 1."""
+    reference = make_reference(30)
+    rigid = closed_loop.simulate(robot, frictionless, reference, make_elastic(None))
+    misses = []
+    for stiffness in (1e4, 2e4, 4e4):
+        settings = make_elastic(JointElasticity(stiffness, 3e-4, 0.02), steps=200)
+        misses.append(np.abs(closed_loop.simulate(robot, frictionless, reference, settings).pose - rigid.pose).max())
+    np.testing.assert_allclose(np.log2(misses[0] / np.array(misses[1:])), [1, 2], atol=0.02)
+
+
+@pytest.mark.parametrize("friction", [FrictionLaw(), FrictionLaw("stribeck", None, 1.5, 0.05)], ids=lambda f: f.name)
+def test_both_paths_stick_and_slip_alike(robot, identified, make_reference, make_elastic, friction):
+    reference = make_reference(40)
+    settings = make_elastic(SOFT, steps=60, friction=friction, latency_s=1.3 / 60, hold="linear")
+    start = closed_loop.simulate(robot, identified, reference, settings).state_at(34)
+    rest = closed_loop.Reference(reference.poses[34:], reference.rates[34:])
+    ours, plain = (
+        closed_loop.simulate(robot, identified, rest, settings, start=start, compiled=compiled)
+        for compiled in (True, False)
+    )
+    assert ours.events == plain.events > 3
+    for name in ("pose", "pose_rate", "motor_angle", "motor_rate", "torque", "command", "joint_integral"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(plain, name), atol=1e-10, err_msg=name)
+
+
+def test_a_run_from_the_state_of_another_repeats_its_rest(robot, identified, make_reference, make_elastic):
+    reference, settings = make_reference(30), make_elastic(SOFT)
+    run = closed_loop.simulate(robot, identified, reference, settings)
+    rest = closed_loop.Reference(reference.poses[17:], reference.rates[17:])
+    again = closed_loop.simulate(robot, identified, rest, settings, start=run.state_at(17))
+    np.testing.assert_array_equal(again.pose, run.pose[17:])
+    np.testing.assert_array_equal(again.motor_rate, run.motor_rate[17:])
+
+
+def test_what_cannot_be_simulated_is_refused(robot, identified, make_reference, make_elastic):
+    reference = make_reference(5)
+
+    def run(elasticity, steps=80, **options):
+        closed_loop.simulate(robot, identified, reference, make_elastic(elasticity, steps), **options)
+
+    with pytest.raises(SimulationError, match=r"joint stiffness is 0\.0 N m/rad, must be finite and > 0"):
+        JointElasticity(0.0, 3e-4)
+    with pytest.raises(SimulationError, match="motor inertia is inf"):
+        JointElasticity(500.0, np.inf)
+    with pytest.raises(SimulationError, match=r"joint damping is -1\.0"):
+        JointElasticity(500.0, 3e-4, -1.0)
+    with pytest.raises(SimulationError, match="elasticity must be of type JointElasticity"):
+        make_elastic(500.0)
+    with pytest.raises(SimulationError, match=r"must be below the 0.000718 kg m\^2 of crank 2 about its axis"):
+        run(JointElasticity(500.0, 1e-3))
+    with pytest.raises(SimulationError, match=r"steps_per_frame is 20, must be >= \d+ .* stiffness of 500 N m/rad"):
+        run(SOFT, steps=20)
+    with pytest.raises(SimulationError, match="pass settings with elasticity=None"):
+        run(SOFT, sensitivities=True)
+    rigid = closed_loop.equilibrium(robot, identified, reference.poses[0], make_elastic(None).servo)
+    with pytest.raises(SimulationError, match="needs motor_angle and motor_rate"):
+        run(SOFT, start=rigid)

@@ -1,0 +1,113 @@
+"""Robots whose joints are off their nominal places, and the servo that does not know it."""
+
+import numpy as np
+import pytest
+from scipy.optimize import fsolve
+from scipy.stats import chi2
+
+from dynamics import closed_loop
+from dynamics.errors import RobotFileError, SimulationError
+from dynamics.geometry_error import with_geometry_error
+
+ERROR = 1e-4
+THETA = np.array([0.21, -0.14, 0.3, 0.05, -0.22, 0.11])
+
+
+@pytest.fixture(scope="module")
+def plant(robot):
+    return with_geometry_error(robot, ERROR, np.random.default_rng(3))
+
+
+def _offsets(plant, robot):
+    names = ("base_joints", "platform_joints")
+    return np.stack([getattr(plant.geometry, name) - getattr(robot.geometry, name) for name in names])
+
+
+def test_joint_centres_are_off_by_normal_errors_of_the_given_size(robot):
+    """The squares of 40 robots' 36 errors over the variance are chi-square, their mean is zero."""
+    errors = np.stack([_offsets(with_geometry_error(robot, ERROR, np.random.default_rng(k)), robot) for k in range(40)])
+    assert errors.shape == (40, 2, 6, 3)
+    assert 1e-3 < chi2.cdf(np.sum(errors**2) / ERROR**2, errors.size) < 1 - 1e-3
+    assert abs(errors.mean()) < 3.3 * ERROR / np.sqrt(errors.size)
+
+
+def test_the_same_seed_gives_the_same_robot_and_no_error_the_robot_itself(robot, plant):
+    assert with_geometry_error(robot, ERROR, np.random.default_rng(3)).geometry == plant.geometry
+    assert with_geometry_error(robot, ERROR, np.random.default_rng(4)).geometry != plant.geometry
+    assert with_geometry_error(robot, 0.0, np.random.default_rng(3)) is robot
+
+
+def _gaps(pose, theta, geometry, rotation):
+    """|A - T| less the link length of every leg, from joint centres and crank angles alone."""
+    zero, angle = geometry.crank_zero_directions, theta[:, None]
+    tip = geometry.base_joints + geometry.crank_length * (
+        np.cos(angle) * zero + np.sin(angle) * np.cross(geometry.crank_axes, zero)
+    )
+    joint = pose[:3] + geometry.platform_joints @ rotation(pose).T
+    return np.linalg.norm(joint - tip, axis=1) - geometry.link_length
+
+
+def test_its_loops_close_at_home_with_cranks_at_zero(plant, numerics):
+    gaps = _gaps(plant.home_pose, np.zeros(6), plant.geometry, numerics.base_from_platform)
+    np.testing.assert_allclose(gaps, 0, atol=1e-15)
+
+
+def test_an_error_that_no_home_survives_is_refused(robot):
+    with pytest.raises(RobotFileError, match=r"with joints off by 0.2 m: leg \d cannot reach the home pose"):
+        with_geometry_error(robot, 0.2, np.random.default_rng(0))
+    with pytest.raises(RobotFileError, match=r"geometry error is -1.0 m, must be finite and >= 0"):
+        with_geometry_error(robot, -1.0, np.random.default_rng(0))
+
+
+@pytest.mark.slow  # compiles the plant
+def test_forward_kinematics_of_the_plant_closes_its_own_loops(robot, plant, numerics):
+    """Against MINPACK on the loops; the nominal robot with the same crank angles is elsewhere, by about the error."""
+    pose = plant.forward_kinematics(THETA)
+    arguments = (THETA, plant.geometry, numerics.base_from_platform)
+    solved = fsolve(_gaps, plant.home_pose, args=arguments, xtol=1e-13)
+    np.testing.assert_allclose(pose, solved, atol=1e-12)
+    assert 0.1 * ERROR < np.abs(pose - robot.forward_kinematics(THETA))[:3].max() < 10 * ERROR
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_servo_commands_with_the_kinematics_it_knows(
+    robot, plant, identified, make_reference, make_settings, compiled
+):
+    """Eq. 30 worked out from what was measured, with the nominal Jacobian by differences of its inverse kinematics."""
+    reference, settings = make_reference(12), make_settings()
+    run = closed_loop.simulate(
+        plant, identified, reference, settings, lambda k, t, pose: pose, servo_robot=robot, compiled=compiled
+    )
+    error = reference.poses - run.measured
+    before = np.vstack([run.start.last_measured, run.measured[:-1]])
+    rate_error = reference.rates - (run.measured - before) * 60.0
+    integral = run.start.servo_integral + np.cumsum(error / 60.0, axis=0)
+    demand = 0.3 * error + 0.001 * rate_error + 2.4 * integral
+    for k in range(12):
+        moved = robot.inverse_kinematics(run.measured[k] + 1e-6 * np.vstack([np.eye(6), -np.eye(6)]))
+        jacobian = (moved[:6] - moved[6:]).T / 2e-6
+        np.testing.assert_allclose(run.command[k], jacobian @ demand[k], atol=1e-8)
+    np.testing.assert_allclose(run.command[0], 0, atol=1e-12)  # the plant's cranks at home
+
+
+@pytest.mark.slow
+def test_both_paths_agree_and_the_servos_ignorance_matters(robot, plant, identified, make_reference, make_settings):
+    reference, settings = make_reference(40), make_settings()
+    arguments = (plant, identified, reference, settings, lambda k, t, pose: pose)
+    ours = closed_loop.simulate(*arguments, servo_robot=robot)
+    plain = closed_loop.simulate(*arguments, servo_robot=robot, compiled=False)
+    knowing = closed_loop.simulate(*arguments)
+    assert ours.events == plain.events > 3
+    np.testing.assert_allclose(ours.pose, plain.pose, atol=1e-13)
+    assert np.abs(ours.pose - knowing.pose).max() > 1e-7
+    same = closed_loop.simulate(robot, identified, reference, settings, servo_robot=robot)
+    np.testing.assert_array_equal(same.pose, closed_loop.simulate(robot, identified, reference, settings).pose)
+
+
+def test_sensitivities_need_a_servo_that_knows_the_robot(robot, identified, make_reference, make_settings):
+    arguments = (robot, identified, make_reference(5), make_settings())
+    with pytest.raises(SimulationError, match="pass servo_robot=None"):
+        closed_loop.simulate(*arguments, servo_robot=robot, sensitivities=True)
+    with pytest.raises(SimulationError, match="servo_robot must be of type Robot"):
+        closed_loop.simulate(*arguments, servo_robot="rss6")
