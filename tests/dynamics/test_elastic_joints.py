@@ -136,8 +136,8 @@ def test_stiff_springs_give_the_rigid_run_to_first_order(robot, frictionless, ma
 def test_both_paths_stick_and_slip_alike(robot, identified, make_reference, make_elastic, friction):
     reference = make_reference(40)
     settings = make_elastic(SOFT, steps=60, friction=friction, latency_s=1.3 / 60, hold="linear")
-    start = closed_loop.simulate(robot, identified, reference, settings).state_at(34)
-    rest = closed_loop.Reference(reference.poses[34:], reference.rates[34:])
+    start = closed_loop.simulate(robot, identified, reference, settings).state_at(32)
+    rest = closed_loop.Reference(reference.poses[32:], reference.rates[32:])
     ours, plain = (
         closed_loop.simulate(robot, identified, rest, settings, start=start, compiled=compiled)
         for compiled in (True, False)
