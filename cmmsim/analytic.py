@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from .convex_solid import ConvexSolid
 from .disc_layers import DiscsInView, DiscTable
+from .scene import Mesh
 from .views import NEAR, Drawable, View
 
 if TYPE_CHECKING:
@@ -40,11 +41,11 @@ class _AnalyticScene:
     """Discs and solids of a drawable."""
 
     def __init__(self, drawable: Drawable) -> None:
-        solids = [k for k, p in enumerate(drawable.patches) if not p.discs]
+        solids = {k: p for k, p in enumerate(drawable.patches) if isinstance(p, Mesh)}
         self._discs = DiscTable(drawable)
-        self._solids = [ConvexSolid(drawable.patches[k].vertices) for k in solids]
-        self._bodies = drawable.body_index[solids]
-        self._levels = [float(drawable.patches[k].levels[0]) for k in solids]
+        self._solids = [ConvexSolid(mesh.vertices) for mesh in solids.values()]
+        self._bodies = drawable.body_index[list(solids)]
+        self._levels = [float(mesh.levels[0]) for mesh in solids.values()]
 
     def draw(self, images: NDArray[np.float32], views: Sequence[View], group: list[int], lines: int) -> None:
         """Draw the views ``group``, which share a camera and an exposure, into ``images`` (n, h, w)."""

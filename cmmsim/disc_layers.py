@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from .pose import Array
 from .projected_disc import project_discs
+from .scene import DiscStack
 from .views import NEAR, Drawable, View
 
 PROBES = 8  # points on a disc's rim, asked with its middle whether a solid hides them
@@ -35,7 +36,7 @@ class DiscTable:
 
     def __init__(self, drawable: Drawable) -> None:
         rows = [(disc, body) for patch, body in zip(drawable.patches, drawable.body_index, strict=True)
-                for disc in patch.discs]
+                if isinstance(patch, DiscStack) for disc in patch.discs]
         self._places = np.array([d.centre for d, _ in rows]).reshape(-1, 3)
         self._normals = np.array([d.normal for d, _ in rows]).reshape(-1, 3)
         self._radii = np.array([d.radius for d, _ in rows])

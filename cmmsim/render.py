@@ -1,10 +1,11 @@
 """Rendering of many small windows in one pass. The only module that imports pyrender.
 
 pyrender supplies the OpenGL context, the mesh buffers and the flat shader; the frame buffers hold one channel only,
-which draws faster than pyrender's four. Each window
-is drawn into its own cell of one large frame buffer with its own projection, drawn larger by the supersampling factor,
-and averaged in linear light. A cell draws only the patches whose bounding box reaches into it. Projection and
-camera_from_body are multiplied in double precision, so that the shader sees one well-scaled matrix.
+which draws faster than pyrender's four. Each window is drawn into its own cell of one large frame buffer with its own
+projection, drawn larger by the supersampling factor, and averaged in linear light. Every drawn pixel has one sample:
+several of pyrender's multisampling cost more than they gain on the stickers' soft rims. A cell draws only the patches
+whose bounding box reaches into it. Projection and camera_from_body are multiplied in double precision, so that the
+shader sees one well-scaled matrix.
 """
 
 from __future__ import annotations
@@ -19,20 +20,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .disc_mesh import disc_mesh
 from .errors import CmmError, OpenGLMissingError
-from .scene import Patch
+from .scene import DiscStack, Mesh
 from .views import Drawable, View
 
 ATLAS_SIDE_PX = 2048
 KEPT_FRAME_BUFFERS = 12
-SAMPLES = 4  # a drawn pixel
 
 
 def render_windows(drawable: Drawable, views: Sequence[View], supersampling: int,
                    background: float = 0.0) -> NDArray[np.float32]:
     """Radiance (n, h, w) float32, 0 to 1, of n windows of one size.
 
-    Each pixel is the mean of ``supersampling``² drawn pixels of four samples each. Raises OpenGLMissingError.
+    Each pixel is the mean of ``supersampling``² drawn pixels of one sample each. Raises OpenGLMissingError.
     """
     width, height = views[0].size
     cell_w, cell_h = width * supersampling, height * supersampling
@@ -84,19 +85,18 @@ class _Atlas:
         self._shaders = Renderer(64, 64)
         self._flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.OFFSCREEN
         self._frame_buffers: dict[tuple[int, int], _FrameBuffer] = {}
-        self._primitives: weakref.WeakKeyDictionary[Drawable, list[Any]] = weakref.WeakKeyDictionary()
+        self._uploaded: weakref.WeakKeyDictionary[Drawable, dict[float, list[Any]]] = weakref.WeakKeyDictionary()
 
     def draw(self, drawable: Drawable, views: Sequence[View], cell: tuple[int, int], columns: int, rows: int,
              background: float) -> NDArray[np.uint8]:
         """The drawn atlas (rows * cell_h, columns * cell_w) uint8, cells in reading order."""
         gl, width, height = self._gl, columns * cell[0], rows * cell[1]
         self._context._platform.make_current()
-        primitives = self._uploaded(drawable)
+        primitives = self._primitives(drawable, views[0].camera.focal_px * cell[0] / views[0].size[0])
         frame_buffer = self._frame_buffer(width, height)
         frame_buffer.bind()
         gl.glEnable(gl.GL_DEPTH_TEST)
         gl.glDepthFunc(gl.GL_LESS)
-        gl.glEnable(gl.GL_MULTISAMPLE)
         gl.glDisable(gl.GL_CULL_FACE)
         gl.glDisable(gl.GL_BLEND)
         gl.glClearColor(background, background, background, 1.0)
@@ -117,15 +117,18 @@ class _Atlas:
         gl.glBindVertexArray(0)
         return frame_buffer.read()
 
-    def _uploaded(self, drawable: Drawable) -> list[Any]:
-        if drawable not in self._primitives:
-            self._primitives[drawable] = [self._upload(p) for p in drawable.patches]
-        return self._primitives[drawable]
+    def _primitives(self, drawable: Drawable, samples: float) -> list[Any]:
+        """The patches in OpenGL's memory, their discs made for ``samples`` drawn pixels a radian."""
+        known = self._uploaded.setdefault(drawable, {})
+        if samples not in known:
+            known[samples] = [self._upload(disc_mesh(p, drawable.distance / samples) if isinstance(p, DiscStack) else p)
+                              for p in drawable.patches]
+        return known[samples]
 
-    def _upload(self, patch: Patch) -> Any:
-        grey = np.repeat(patch.levels[:, None], 3, axis=1)
+    def _upload(self, mesh: Mesh) -> Any:
+        grey = np.repeat(mesh.levels[:, None], 3, axis=1)
         primitive = self._pyrender.Primitive(
-            positions=patch.vertices.astype(np.float32), indices=patch.faces.astype(np.uint32),
+            positions=mesh.vertices.astype(np.float32), indices=mesh.faces.astype(np.uint32),
             color_0=np.column_stack([grey, np.ones(len(grey))]).astype(np.float32),
             material=self._pyrender.MetallicRoughnessMaterial(baseColorFactor=(1.0, 1.0, 1.0, 1.0)), mode=4)
         primitive._add_to_context()
@@ -151,46 +154,40 @@ class _Atlas:
 
 
 class _FrameBuffer:
-    """Red channel and depth with four samples a pixel, and the red channel they are resolved to."""
+    """Red channel and depth with one sample a pixel."""
 
     def __init__(self, gl: Any, width: int, height: int) -> None:
         self._gl, self._size = gl, (width, height)
-        self._buffers: list[int] = []
-        self._drawn = self._made({gl.GL_COLOR_ATTACHMENT0: gl.GL_R8, gl.GL_DEPTH_ATTACHMENT: gl.GL_DEPTH_COMPONENT24},
-                                 SAMPLES)
-        self._resolved = self._made({gl.GL_COLOR_ATTACHMENT0: gl.GL_R8}, 0)
+        self._name = gl.glGenFramebuffers(1)
+        self._buffers = [self._attached(gl.GL_COLOR_ATTACHMENT0, gl.GL_R8),
+                         self._attached(gl.GL_DEPTH_ATTACHMENT, gl.GL_DEPTH_COMPONENT24)]
+        self.bind()
+        state = gl.glCheckFramebufferStatus(gl.GL_FRAMEBUFFER)
+        if state != gl.GL_FRAMEBUFFER_COMPLETE:
+            raise CmmError(f"OpenGL cannot draw {self._size} px: frame buffer state {state}")
 
     def bind(self) -> None:
-        """What is drawn from now on goes here."""
-        self._gl.glBindFramebuffer(self._gl.GL_DRAW_FRAMEBUFFER, self._drawn)
+        """What is drawn from now on goes here, what is read comes from here."""
+        self._gl.glBindFramebuffer(self._gl.GL_FRAMEBUFFER, self._name)
 
     def read(self) -> NDArray[np.uint8]:
-        """The image (height, width), each pixel the mean of its samples."""
+        """The image (height, width)."""
         gl, (width, height) = self._gl, self._size
-        gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._drawn)
-        gl.glBindFramebuffer(gl.GL_DRAW_FRAMEBUFFER, self._resolved)
-        gl.glBlitFramebuffer(0, 0, width, height, 0, 0, width, height, gl.GL_COLOR_BUFFER_BIT, gl.GL_NEAREST)
-        gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._resolved)
+        self.bind()
         gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
         pixels = gl.glReadPixels(0, 0, width, height, gl.GL_RED, gl.GL_UNSIGNED_BYTE)
         return np.frombuffer(pixels, dtype=np.uint8).reshape(height, width)
 
     def delete(self) -> None:
         """Give the memory back."""
-        self._gl.glDeleteFramebuffers(2, [self._drawn, self._resolved])
+        self._gl.glDeleteFramebuffers(1, [self._name])
         self._gl.glDeleteRenderbuffers(len(self._buffers), self._buffers)
 
-    def _made(self, formats: dict[int, int], samples: int) -> int:
+    def _attached(self, attachment: int, kind: int) -> int:
         gl = self._gl
-        name = gl.glGenFramebuffers(1)
-        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, name)
-        for attachment, kind in formats.items():
-            buffer = gl.glGenRenderbuffers(1)
-            gl.glBindRenderbuffer(gl.GL_RENDERBUFFER, buffer)
-            gl.glRenderbufferStorageMultisample(gl.GL_RENDERBUFFER, samples, kind, *self._size)
-            gl.glFramebufferRenderbuffer(gl.GL_FRAMEBUFFER, attachment, gl.GL_RENDERBUFFER, buffer)
-            self._buffers.append(buffer)
-        state = gl.glCheckFramebufferStatus(gl.GL_FRAMEBUFFER)
-        if state != gl.GL_FRAMEBUFFER_COMPLETE:
-            raise CmmError(f"OpenGL cannot draw {self._size} px with {samples} samples: frame buffer state {state}")
-        return int(name)
+        buffer = int(gl.glGenRenderbuffers(1))
+        self.bind()
+        gl.glBindRenderbuffer(gl.GL_RENDERBUFFER, buffer)
+        gl.glRenderbufferStorage(gl.GL_RENDERBUFFER, kind, *self._size)
+        gl.glFramebufferRenderbuffer(gl.GL_FRAMEBUFFER, attachment, gl.GL_RENDERBUFFER, buffer)
+        return buffer

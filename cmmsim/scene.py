@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial import HalfspaceIntersection
 
 from .marked_body import MarkedBody
@@ -15,7 +14,6 @@ from .sensor_file import Body, Stickers, unit
 
 SUNK = 0.0003  # m the solid surface lies below the sticker planes
 RING_SUNK = 0.0001  # m the dark ring lies below its sticker
-DISC_SIDES, RING_SIDES = 64, 16
 
 
 @dataclass(frozen=True)
@@ -29,24 +27,44 @@ class Disc:
 
 
 @dataclass(frozen=True)
-class Patch:
-    """A piece of a body drawn as one call: vertices (n,3) m, faces (m,3), levels (n,) 0 to 1 of its vertices.
+class DiscStack:
+    """Discs that lie over each other, the largest and lowest first; each renderer draws them in its own way."""
 
-    discs: what the mesh stands for when it is a sticker, the outer one first; empty for a solid in one level.
-    """
+    discs: tuple[Disc, ...]
+
+    @property
+    def bounds(self) -> Array:
+        """Smallest and largest coordinates (2,3), m."""
+        reach = [d.radius * np.sqrt(np.maximum(1.0 - d.normal**2, 0.0)) for d in self.discs]
+        return np.stack([np.min([d.centre - r for d, r in zip(self.discs, reach, strict=True)], axis=0),
+                         np.max([d.centre + r for d, r in zip(self.discs, reach, strict=True)], axis=0)])
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """vertices (n,3) m, faces (m,3), levels (n,) 0 to 1 of the vertices; a solid has one level."""
 
     vertices: Array
     faces: Array
     levels: Array
-    discs: tuple[Disc, ...] = ()
+
+    @property
+    def bounds(self) -> Array:
+        """Smallest and largest coordinates (2,3), m."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+
+Patch = DiscStack | Mesh
+"""A piece of a body that is drawn as one call."""
 
 
 @dataclass(frozen=True)
 class SceneBody:
-    """A rigid body as drawn: its solid and one patch for each sticker; sticker_places (n,3) are the true ones, m."""
+    """A rigid body as drawn: its solid and one stack of discs for each sticker; sticker_places (n,3) are the true ones,
+    m."""
 
-    solid: Patch
-    stickers: tuple[Patch, ...]
+    solid: Mesh
+    stickers: tuple[DiscStack, ...]
     sticker_places: Array
 
 
@@ -62,16 +80,15 @@ def placed_stickers(body: MarkedBody, stickers: Stickers, stream: int) -> Array:
 def scene_body(body: MarkedBody, section: Body, stickers: Stickers, stream: int) -> SceneBody:
     """The drawn body of a sensor file's section."""
     places = placed_stickers(body, stickers, stream)
-    patches = tuple(_sticker_patch(place, axes, stickers)
-                    for place, axes in zip(places, body.in_plane, strict=True))
-    solid = mesh_patch(_solid(body, section), stickers.body_level / 255.0)
-    return SceneBody(solid, patches, places)
+    drawn = tuple(_sticker(place, axes, stickers) for place, axes in zip(places, body.in_plane, strict=True))
+    solid = solid_mesh(_solid(body, section), stickers.body_level / 255.0)
+    return SceneBody(solid, drawn, places)
 
 
-def mesh_patch(mesh: trimesh.Trimesh, level: float) -> Patch:
-    """A mesh in one grey level."""
+def solid_mesh(mesh: trimesh.Trimesh, level: float) -> Mesh:
+    """A solid in one grey level."""
     vertices = np.asarray(mesh.vertices, dtype=float)
-    return Patch(vertices, np.asarray(mesh.faces), np.full(len(vertices), level))
+    return Mesh(vertices, np.asarray(mesh.faces), np.full(len(vertices), level))
 
 
 def rod(length: float, radius: float) -> trimesh.Trimesh:
@@ -101,32 +118,8 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
     return trimesh.convex.convex_hull(HalfspaceIntersection(half_spaces, inside).intersections)
 
 
-def _sticker_patch(place: Array, axes: Array, stickers: Stickers) -> Patch:
+def _sticker(place: Array, axes: Array, stickers: Stickers) -> DiscStack:
     """A bright disc, and RING_SUNK below it a dark one that shows as a ring."""
-    vertices, faces, levels, first = [], [], [], 0
-    discs: list[Disc] = []
     normal = np.cross(axes[:, 0], axes[:, 1])
-    for sides, radius, sunk, level in ((DISC_SIDES, stickers.radius, 0.0, stickers.sticker_level),
-                                       (RING_SIDES, stickers.ring_radius, RING_SUNK, stickers.ring_level)):
-        angles = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
-        fill = np.sqrt(2.0 * np.pi / (sides * np.sin(2.0 * np.pi / sides)))  # the polygon has the circle's area
-        circle = fill * radius * np.column_stack([np.cos(angles), np.sin(angles)]) @ axes.T
-        vertices.append(place - sunk * normal + circle)
-        discs.insert(0, Disc(place - sunk * normal, normal, radius, level / 255.0))
-        faces.append(first + _balanced_triangles(sides))
-        levels.append(np.full(sides, level / 255.0))
-        first += sides
-    return Patch(np.concatenate(vertices), np.concatenate(faces), np.concatenate(levels), tuple(discs))
-
-
-def _balanced_triangles(sides: int) -> NDArray[np.int_]:
-    """Triangles (sides - 2, 3) of a convex polygon, large ones inside: faster to draw than a fan of slivers."""
-    triangles: list[tuple[int, int, int]] = []
-    arcs = [(0, sides - 1)]
-    while arcs:
-        start, end = arcs.pop()
-        if end - start >= 2:
-            middle = (start + end) // 2
-            triangles.append((start, middle, end))
-            arcs += [(start, middle), (middle, end)]
-    return np.array(triangles)
+    return DiscStack((Disc(place - RING_SUNK * normal, normal, stickers.ring_radius, stickers.ring_level / 255.0),
+                      Disc(place, normal, stickers.radius, stickers.sticker_level / 255.0)))

@@ -26,7 +26,7 @@ from .pose import Array, pose_to_transform
 from .pose_methods import METHODS
 from .renderers import RENDERER_NAMES, Renderer, choose_renderer
 from .rig_from_file import rig_from_file
-from .scene import Patch, mesh_patch, scene_body
+from .scene import Mesh, scene_body, solid_mesh
 from .sensor_file import SensorFile, Timing, read_sensor_file
 from .taught import Taught
 from .teaching import Progress, Teacher
@@ -62,7 +62,7 @@ class Sensor:
         self.platform, self.base = marked_body("platform", file.platform), marked_body("base", file.base)
         self._scene = [scene_body(body, section, file.stickers, stream) for stream, (body, section)
                        in enumerate(((self.platform, file.platform), (self.base, file.base)))]
-        self._obstacles: dict[str, Patch] = {}
+        self._obstacles: dict[str, Mesh] = {}
         self._asked_renderer = renderer or file.renderer
         self._taught = taught
         self._tracker: Tracker | None = None
@@ -134,7 +134,7 @@ class Sensor:
     def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
         """Register further rigid bodies (meshes in m) that may hide stickers; drawn where ``obstacles`` says."""
         level = self._file.stickers.obstacle_level / 255.0
-        self._obstacles.update({name: mesh_patch(mesh, level) for name, mesh in meshes.items()})
+        self._obstacles.update({name: solid_mesh(mesh, level) for name, mesh in meshes.items()})
         self._build_again()
 
     def shift_camera(self, side: int, shift_px: tuple[float, float]) -> None:
@@ -188,7 +188,8 @@ class Sensor:
         patches = [p for body in self._scene for p in body.stickers] + [body.solid for body in self._scene]
         owners = [k for k, body in enumerate(self._scene) for _ in body.stickers] + [0, 1]
         owners += range(2, 2 + len(self._obstacles))
-        drawable = Drawable([*patches, *self._obstacles.values()], owners)
+        distance = float(np.linalg.norm(np.subtract(self._file.rig.position, self._file.rig.target)))
+        drawable = Drawable([*patches, *self._obstacles.values()], owners, distance)
         formation = ImageFormation(self._renderer, drawable, self._file.stickers.background_level / 255.0, self.optics)
         return VirtualStereoCamera(self._true_rig, self._camera_from_base, formation, self.noise, list(self._obstacles),
                                    self._file.timing.exposure, self._file.camera.pattern_seed)

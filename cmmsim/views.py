@@ -42,13 +42,14 @@ class View:
 
 
 class Drawable:
-    """Patches of several bodies: which body each belongs to, and the corners (n,8,3) of its bounding box, m."""
+    """Patches of several bodies: which body each belongs to, the corners (n,8,3) of its bounding box, m, and the
+    distance m from which they are usually looked at, for which discs are triangulated."""
 
-    def __init__(self, patches: Sequence[Patch], body_index: Sequence[int]) -> None:
+    def __init__(self, patches: Sequence[Patch], body_index: Sequence[int], distance: float) -> None:
         self.patches = tuple(patches)
         self.body_index = np.array(body_index, dtype=int)
-        self.corners = np.array([list(product(*zip(p.vertices.min(axis=0), p.vertices.max(axis=0), strict=True)))
-                                 for p in patches])
+        self.corners = np.array([list(product(*p.bounds.T)) for p in patches])
+        self.distance = distance
 
     def reaching(self, views: Sequence[View]) -> NDArray[np.bool_]:
         """Which patches may show in each window (n views, n patches): bounding boxes against windows."""

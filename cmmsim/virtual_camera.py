@@ -15,10 +15,11 @@ from .images import StereoFrame, Windows
 from .motion_blur import sub_frame_poses
 from .noise import CameraNoise
 from .pose import Array, apply, pose_to_transform
+from .scene import DiscStack
 from .stereo_rig import StereoRig
 from .whole_image import whole_image
 
-SUPERSAMPLING = 6
+SUPERSAMPLING = 9
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,8 @@ class VirtualStereoCamera:
         """Pixels (2, n, 2) of the platform's stickers."""
         drawable = self._formation.drawable
         places = np.array([patch.discs[-1].centre for patch, body in
-                           zip(drawable.patches, drawable.body_index, strict=True) if body == 0 and patch.discs])
+                           zip(drawable.patches, drawable.body_index, strict=True)
+                           if body == 0 and isinstance(patch, DiscStack)])
         return np.stack([camera.project(apply(c @ pose_to_transform(pose), places))[0]
                          for camera, c in zip(self._rig.cameras, self._from_base, strict=True)])
 

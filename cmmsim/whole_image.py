@@ -18,6 +18,7 @@ LARGEST_PASTED_SIZE = 96  # px: a larger spot is left coarse
 DARK_RIM = 8  # px of the surroundings that are drawn finely with a spot that is longer than a sticker
 BRIGHT = 0.4  # radiance above which a spot is drawn finely
 TILE = 64  # px side of the pieces that are bent and blurred at a time
+COARSE = 2  # drawn samples a pixel and axis away from bright spots
 
 
 def whole_image(formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array],
@@ -40,14 +41,14 @@ def _mean(images: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
 
 
 def _coarse(formation: ImageFormation, camera: PinholeCamera, bodies: Array) -> NDArray[np.float32]:
-    """Radiance (height, width) with one drawn sample a pixel."""
+    """Radiance (height, width) with COARSE² drawn samples a pixel."""
     if formation.draws_pixels([camera]):
         view = View(camera.ideal, bodies, (0, 0), (camera.width, camera.height))
-        return formation.renderer.draw(formation.drawable, [view], 1, formation.background)[0]
+        return formation.renderer.draw(formation.drawable, [view], COARSE, formation.background)[0]
     rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
     x, y = np.meshgrid(TILE * np.arange(columns), TILE * np.arange(rows))
     corners = np.column_stack([x.ravel(), y.ravel()])
-    tiles = formation.windows([Side(camera, bodies, corners)], TILE, 1, sub_pixels=1, shade=False)[0]
+    tiles = formation.windows([Side(camera, bodies, corners)], TILE, COARSE, sub_pixels=1, shade=False)[0]
     joined = tiles.reshape(rows, columns, TILE, TILE).swapaxes(1, 2).reshape(rows * TILE, columns * TILE)
     return joined[:camera.height, :camera.width]
 

@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 from ..pose import Array
-from ..scene import SUNK, Disc, Patch, mesh_patch
+from ..scene import SUNK, Disc, DiscStack, Mesh, Patch, solid_mesh
 from ..views import Drawable
 from .board import Board
 
@@ -14,17 +14,16 @@ MARGIN = 1.0  # of the spacing: rim of the plate beyond its outermost points; a 
 RIM = 0.35  # of the spacing: bright rim beyond the outer squares of a chessboard
 THICKNESS = 0.008  # m
 BRIGHT, DARK = 0.86, 0.06  # share of white light sent back
-DOT_SIDES = 96
 FRONT = np.array([0.0, 0.0, -1.0])  # the front looks against the board's z axis
 FRONT.setflags(write=False)
 
 
-def board_drawable(board: Board) -> Drawable:
-    """Everything of a board as one body in the board frame; the points lie in z = 0."""
+def board_drawable(board: Board, distance: float) -> Drawable:
+    """Everything of a board as one body in the board frame, seen from ``distance`` m; the points lie in z = 0."""
     ground, mark = (BRIGHT, DARK) if board.dark else (DARK, BRIGHT)
-    marks = _squares(board, mark) if board.kind == "chessboard" else _dots(board, mark)
+    marks: list[Patch] = [*(_squares(board, mark) if board.kind == "chessboard" else _dots(board, mark))]
     patches = [*marks, _plate(board, ground)]
-    return Drawable(patches, [0] * len(patches))
+    return Drawable(patches, [0] * len(patches), distance)
 
 
 def plate_corners(board: Board) -> Array:
@@ -35,27 +34,21 @@ def plate_corners(board: Board) -> Array:
     return np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
 
 
-def _plate(board: Board, level: float) -> Patch:
+def _plate(board: Board, level: float) -> Mesh:
     corners = plate_corners(board)
     size = [*(corners[2, :2] - corners[0, :2]), THICKNESS]
     mesh = trimesh.creation.box(extents=size)
     mesh.apply_translation([*corners[:, :2].mean(axis=0), SUNK + 0.5 * THICKNESS])
-    return mesh_patch(mesh, level)
+    return solid_mesh(mesh, level)
 
 
-def _dots(board: Board, level: float) -> list[Patch]:
-    angles = 2.0 * np.pi * np.arange(DOT_SIDES) / DOT_SIDES
-    fill = np.sqrt(2.0 * np.pi / (DOT_SIDES * np.sin(2.0 * np.pi / DOT_SIDES)))  # the polygon has the circle's area
-    radius = float(board.radius or 0.0)
-    rim = fill * radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(DOT_SIDES)])
-    fan = np.array([[0, k, k + 1] for k in range(1, DOT_SIDES - 1)])
-    return [Patch(point + rim, fan, np.full(DOT_SIDES, level), (Disc(point, FRONT, radius, level),))
-            for point in board.points]
+def _dots(board: Board, level: float) -> list[DiscStack]:
+    return [DiscStack((Disc(point, FRONT, float(board.radius or 0.0), level),)) for point in board.points]
 
 
-def _squares(board: Board, level: float) -> list[Patch]:
+def _squares(board: Board, level: float) -> list[Mesh]:
     """The dark squares of a chessboard, its outermost ones included."""
     corners = board.spacing * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
     places = [np.array([column, row, 0.0]) * board.spacing for row in range(-1, board.rows)
               for column in range(-1, board.columns) if (row + column) % 2 == 0]
-    return [Patch(corners + place, np.array([[0, 1, 2], [0, 2, 3]]), np.full(4, level)) for place in places]
+    return [Mesh(corners + place, np.array([[0, 1, 2], [0, 2, 3]]), np.full(4, level)) for place in places]

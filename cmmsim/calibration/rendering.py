@@ -20,7 +20,7 @@ from .board_scene import board_drawable, plate_corners
 from .errors import CalibrationError
 
 TILE_PX = 64
-SUPERSAMPLING = 6
+SUPERSAMPLING = 12
 OUTLINE_POINTS = 15  # along each side of the plate, to know where a bent one reaches
 
 
@@ -32,7 +32,8 @@ def render_pairs(rig: StereoRig, board: Board, poses: Sequence[Array], renderer:
     """
     if board.kind == "chessboard" and renderer.name == "analytic":
         raise CalibrationError("the analytic renderer draws no chessboard: take the renderer pyrender, or a dot board")
-    formation = ImageFormation(renderer, board_drawable(board), 0.0, optics)
+    distance = float(np.mean([np.linalg.norm(pose[:3, 3]) for pose in poses]))
+    formation = ImageFormation(renderer, board_drawable(board, distance), 0.0, optics)
     for pose in poses:
         sides = [noise.expose(_radiance(formation, camera, move @ pose, board), rng)
                  for camera, move in zip(rig.cameras, rig.from_camera, strict=True)]

@@ -4,11 +4,13 @@ import cv2
 import numpy as np
 import pyrender
 
+from cmmsim.disc_mesh import disc_mesh
 from cmmsim.pose import apply, pose_to_transform, transform_to_pose
 from cmmsim.registration import rigid_start
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 NEAREST_PX = 6.0
+SAMPLE = 1e-4  # m: as finely as stickers are triangulated
 
 
 class StraightforwardSensor:
@@ -63,7 +65,7 @@ class StraightforwardSensor:
     @staticmethod
     def _primitive(body):
         """Solid and stickers of a body as one mesh."""
-        patches = [body.solid, *body.stickers]
+        patches = [body.solid, *(disc_mesh(sticker, SAMPLE) for sticker in body.stickers)]
         starts = np.cumsum([0, *(len(p.vertices) for p in patches)])
         grey = np.repeat(np.concatenate([p.levels for p in patches])[:, None], 3, axis=1)
         return pyrender.Primitive(

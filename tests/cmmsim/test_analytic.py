@@ -17,6 +17,7 @@ from cmmsim.layer_kernel import Discs, Solids, cover_by_polygon, lay_layers, pol
 from cmmsim.noise import CameraNoise
 from cmmsim.pose import apply, pose_to_transform
 from cmmsim.projected_disc import project_discs
+from cmmsim.virtual_camera import SUPERSAMPLING
 from tests.cmmsim import numpy_coverage
 
 CAMERA = PinholeCamera(2300.0, 1023.5, 767.5, 2048, 1536)
@@ -34,7 +35,7 @@ def placed_at(sensor, pose):
     return [np.stack([move @ pose_to_transform(pose), move]) for move in moves]
 
 
-def centres_of(sensor, pose, supersampling=6):
+def centres_of(sensor, pose, supersampling=SUPERSAMPLING):
     """Fitted and expected ellipse centres (36, 2) px of the platform's stickers from noise-free windows."""
     placed = placed_at(sensor, pose)
     points = [apply(bodies[0], sensor._scene[0].sticker_places) for bodies in placed]
@@ -74,11 +75,11 @@ def test_centres_are_exact(analytic):
 
 
 @pytest.mark.rendering
-@pytest.mark.parametrize("supersampling", [12, 16])
+@pytest.mark.parametrize("supersampling", [SUPERSAMPLING, 12, 16])
 def test_both_renderers_agree_in_every_sticker_centre(analytic, taught, supersampling):
-    """At most 0.005 px; at the 6 of measuring, pyrender's own sampling leaves 0.0022 px rms."""
+    """At most 0.005 px as they are drawn for measuring, and finer; 0.0031 was the largest in 300 poses."""
     other = cmmsim.load_sensor("ctrack780", taught=taught, renderer="pyrender")
-    for pose in random_poses(analytic, 4):
+    for pose in random_poses(analytic, 40):
         gap = centres_of(analytic, pose)[0] - centres_of(other, pose, supersampling)[0]
         assert np.abs(gap).max() < 0.005
 

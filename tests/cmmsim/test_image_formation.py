@@ -14,12 +14,13 @@ from cmmsim.observation import _evenly_lit
 from cmmsim.optics import Optics
 from cmmsim.pose import apply, pose_to_transform
 from cmmsim.views import View
+from cmmsim.virtual_camera import SUPERSAMPLING
 from tests.cmmsim.lenses import LENSES, expected_centres, lens_sensor, placed_at, pose_errors, poses_about_home
 
 FINE = 16
 
 
-def centre_errors(sensor, pose, supersampling=6):
+def centre_errors(sensor, pose, supersampling=SUPERSAMPLING):
     """Fitted minus expected ellipse centres (36, 2) px from unrounded noise-free windows."""
     expected = expected_centres(sensor, pose)
     corners = np.rint(expected - 7.5).astype(int)
@@ -56,8 +57,9 @@ def test_centres_through_each_lens(tmp_path, lens):
 def test_centres_drawn_by_pyrender(tmp_path, lens):
     sensor = lens_sensor(tmp_path, lens, "pyrender")
     errors = np.concatenate([centre_errors(sensor, pose) for pose in poses_about_home(sensor, 4)])
-    assert np.all(np.sqrt((errors**2).mean(axis=0)) < 3e-3)
-    assert np.all(np.abs(errors.mean(axis=0)) < 6e-4)
+    assert np.all(np.sqrt((errors**2).mean(axis=0)) < 8e-4)
+    assert np.all(np.abs(errors.mean(axis=0)) < 2e-4)
+    assert np.abs(errors).max() < 5e-3
 
 
 @pytest.mark.parametrize("psf_px", [0.5, 1.2])
@@ -153,11 +155,11 @@ def test_poses_from_noise_free_images(tmp_path, lens):
 @pytest.mark.rendering
 @pytest.mark.parametrize("lens", ["perfect", "all"])
 def test_poses_from_noise_free_images_of_pyrender(tmp_path, lens):
-    """At most 2 um and 10 urad rms; the six samples a pixel of pyrender leave single poses up to 12 urad off."""
+    """At most 2 um and 10 urad at every pose; 0.9 um and 4.5 urad were the largest in 300 poses."""
     sensor = lens_sensor(tmp_path, lens, "pyrender", changes=[("noise = true", "noise = false")])
-    errors, _ = pose_errors(sensor, poses_about_home(sensor, 25))
-    assert np.all(np.sqrt((errors**2).mean(axis=0)) < [1.3, 1.3, 1.3, 5, 5, 5])
-    assert np.all(np.abs(errors) < [2.5, 2.5, 2.5, 13, 13, 13])
+    errors, _ = pose_errors(sensor, poses_about_home(sensor, 200))
+    assert np.all(np.sqrt((errors**2).mean(axis=0)) < [0.5, 0.5, 0.5, 2, 2, 2])
+    assert np.all(np.abs(errors) < [2, 2, 2, 10, 10, 10])
 
 
 @pytest.mark.slow
