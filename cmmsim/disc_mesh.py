@@ -38,8 +38,8 @@ def _soft_disc(disc: Disc, around: float, sample: float) -> Mesh:
     middle = np.sqrt(disc.radius**2 - width**2 / 12.0)  # as much light as the sharp disc
     sides = _sides(disc.radius, sample)
     corners = np.concatenate([_corners(disc, middle - 0.5 * width, sides), _corners(disc, middle + 0.5 * width, sides)])
-    return Mesh(corners, np.concatenate([_balanced_triangles(sides), _band_triangles(sides)]),
-                np.repeat(np.array([disc.level, around]), sides))
+    triangles = np.concatenate([_balanced_triangles(sides), _band_triangles(sides)])
+    return Mesh(corners, triangles, np.concatenate([np.full(sides, disc.level), np.full(sides, around)]))
 
 
 def _sharp_disc(disc: Disc, sides: int) -> Mesh:

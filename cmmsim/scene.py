@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 from scipy.spatial import HalfspaceIntersection
 
 from .marked_body import MarkedBody
@@ -45,7 +46,7 @@ class Mesh:
     """vertices (n,3) m, faces (m,3), levels (n,) 0 to 1 of the vertices; a solid has one level."""
 
     vertices: Array
-    faces: Array
+    faces: NDArray[np.int_]
     levels: Array
 
     @property
