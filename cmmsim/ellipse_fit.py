@@ -46,13 +46,11 @@ class EllipseFits:
 class FitLimits:
     """When a window counts as one whole sticker.
 
-    smallest_contrast in grey values; largest_misfit of the reduced chi-square; frames: exposures averaged in each grey
-    value, which divide the noise variance.
+    smallest_contrast in grey values; largest_misfit of the reduced chi-square.
     """
 
     smallest_contrast: float = 40.0
     largest_misfit: float = 1.8
-    frames: int = 1
 
 
 def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
@@ -72,7 +70,7 @@ def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNo
     shapes, covariances = np.empty((n, 2, 2)), np.empty((n, ELLIPSE_UNKNOWNS, ELLIPSE_UNKNOWNS))
     scale = noise.white_level / 255.0
     greys = scale * _GREYS
-    variances = noise.variance(greys) / limits.frames
+    variances = noise.variance(greys)
     largest_step = _LARGEST_STEP * [1.0, 1.0, 1.0, 1.0, 1.0, scale, scale]
     settings = FitSettings(CORE_SHARE, RING_REACH, SMALLEST_START_PX, SMALLEST_RADIUS_PX, largest_step, iterations,
                            CONVERGED_PX, float(psf_px), variances, greys[0], 1.0 / (greys[1] - greys[0]))

@@ -16,7 +16,7 @@ def fit_ellipses(windows, corners, noise, fit_size, limits=None, iterations=3):
         radiance_share, derivatives = coverage(parameters[:, :2], _shape(parameters), fit_size)
         contrast, ground = parameters[:, 5, None, None], parameters[:, 6, None, None]
         mean = ground + contrast * radiance_share
-        weights = mask * limits.frames / noise.variance(mean)
+        weights = mask / noise.variance(mean)
         residuals = inner - mean
         jacobian = np.concatenate([contrast[..., None] * derivatives, radiance_share[..., None],
                                    np.ones_like(radiance_share)[..., None]], axis=-1).reshape(len(inner), -1, 7)
