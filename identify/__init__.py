@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from identify.errors import IdentifyError
 
 if TYPE_CHECKING:
+    from identify.accuracy.unseen import unseen_errors
     from identify.estimation.identification import IdentificationResult, identify
     from identify.experiment.run import run_experiment
     from identify.scenario import Scenario, load_scenario, scenario_names
@@ -21,6 +22,7 @@ _HOME = {
     "Scenario": "identify.scenario",
     "load_scenario": "identify.scenario",
     "scenario_names": "identify.scenario",
+    "unseen_errors": "identify.accuracy.unseen",
 }
 
 __all__ = [
@@ -31,6 +33,7 @@ __all__ = [
     "load_scenario",
     "run_experiment",
     "scenario_names",
+    "unseen_errors",
 ]
 
 

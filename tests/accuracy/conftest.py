@@ -1,8 +1,11 @@
 """What the tests of the plugin share: projects of one file, run by pytest."""
 
 import textwrap
+from pathlib import Path
 
 import pytest
+
+GUIDE = Path(__file__).parent / "guide"
 
 QUICK = ("-p", "no:cacheprovider", "-p", "no:hypothesispytest")  # Hypothesis would be imported anew by each
 
@@ -17,3 +20,12 @@ def project(pytester):
         return pytester.runpytest_inprocess(*QUICK, *options)
 
     return run
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """The files of the guide are as an outsider writes them: what marks of this project they deserve stands here."""
+    for item in items:
+        if item.path.parent == GUIDE:
+            item.add_marker("slow")
+            item.add_marker("rendering")

@@ -1,0 +1,28 @@
+"""How wrong estimated parameters are: plant and model on trajectories that the estimator never saw."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dynamics import Robot
+from dynamics.closed_loop import simulate
+from identify.arrays import Array
+from identify.excitation.design import design_trajectories
+from identify.experiment.run import true_parameters
+from identify.record.loop_setup import frame_times, plant_settings, reference_motion
+from identify.scenario import Scenario
+from identify.validation import model_run
+
+
+def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed: int = 0) -> Array:
+    """Pose errors (runs, N, 6) [m, rad] of the model with these parameters (67,) against the plant with the true ones.
+
+    On the scenario's unseen trajectories for this seed; plant and model each with their own friction law and steps.
+    Both see by an ideal sensor, so that only the parameters and what the model leaves out make the error. NaN where the
+    model's loop is unstable. Raises TrajectoryError, dynamics.DynamicsError.
+    """
+    values, true = np.asarray(parameters, dtype=float), true_parameters(robot, scenario)
+    times = frame_times(scenario, scenario.validation.duration_s)
+    references = [reference_motion(path, times) for path in design_trajectories(robot, scenario, seed).validation]
+    plant = [simulate(robot, true, reference, plant_settings(scenario)).pose for reference in references]
+    model = [model_run(robot, scenario, values, reference) for reference in references]
+    return np.array(model) - np.array(plant)

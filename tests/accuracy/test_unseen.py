@@ -1,0 +1,48 @@
+"""`identify.unseen_errors`, by which an own identification method is judged."""
+
+import numpy as np
+import pytest
+
+import dynamics
+import identify
+from dynamics.closed_loop import simulate
+from identify.excitation.design import design_trajectories
+from identify.record.loop_setup import frame_times, model_settings, reference_motion
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return identify.load_scenario("quick").with_overrides({"validation.duration_s": 1.0, "excitation.candidates": 1})
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return dynamics.load_robot("rss6")
+
+
+def test_the_true_parameters_leave_nothing_but_the_model_s_steps(scenario, robot):
+    """Plant and model integrate the same law with other steps: below a hundredth of a micrometre and microradian."""
+    errors = identify.unseen_errors(robot.parameter_sets["identified"].vector, robot, scenario)
+    assert errors.shape == (2, 60, 6)
+    assert 0 < np.abs(errors).max() < 1e-8
+
+
+def test_wrong_parameters_err_as_two_runs_of_the_loop_differ(scenario, robot):
+    """Against runs made here with both parameter sets on the same trajectory."""
+    wrong = robot.parameter_sets["identified"].vector.copy()
+    wrong[52:58] = 0.0
+    errors = identify.unseen_errors(wrong, robot, scenario, seed=3)
+    path = design_trajectories(robot, scenario, 3).validation[1]
+    reference = reference_motion(path, frame_times(scenario, 1.0))
+    settings = model_settings(scenario)
+    runs = [simulate(robot, p, reference, settings).pose for p in (wrong, robot.parameter_sets["identified"].vector)]
+    assert np.abs(errors[1]).max() > 1e-5
+    np.testing.assert_allclose(errors[1], runs[0] - runs[1], atol=1e-8)
+    other = identify.unseen_errors(wrong, robot, scenario, seed=4)
+    assert np.abs(other - errors).max() > 1e-5
+
+
+def test_an_unstable_model_has_no_error(scenario, robot):
+    unstable = robot.parameter_sets["initial"].vector.copy()
+    unstable[64:67] = [0.1, 500.0, 0.0]
+    assert np.isnan(identify.unseen_errors(unstable, robot, scenario)).all()
