@@ -33,7 +33,7 @@ class OutputErrorProblem:
 
     def cost(self, parameters: Array) -> float:
         """Sum of squared whitened residuals; infinite where the model cannot run."""
-        known, _ = self._known(parameters)
+        known, _ = self.known(parameters)
         total = float(known @ known)
         try:
             for run in self.runs:
@@ -44,7 +44,7 @@ class OutputErrorProblem:
 
     def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
         """Cost and the triangular form of its linearisation, see `bounded_least_squares.Problem`."""
-        known, known_jacobian = self._known(parameters)
+        known, known_jacobian = self.known(parameters)
         size, cost = len(parameters), float(known @ known)
         triangle = np.column_stack([known_jacobian, known])
         for run in self.runs:
@@ -56,11 +56,11 @@ class OutputErrorProblem:
 
     def known_information(self) -> Array:
         """Information (67, 67) of what is known beside the poses."""
-        _, rows = self._known(self.guess.values)
+        _, rows = self.known(self.guess.values)
         return np.asarray(rows.T @ rows, dtype=float)
 
-    def _known(self, parameters: Array) -> tuple[Array, Array]:
-        """Rows of the starting guess and of the scale anchor, in their standard deviations."""
+    def known(self, parameters: Array) -> tuple[Array, Array]:
+        """Residuals (k,) of what is known beside the poses, starting guess and scale anchor, and their rows (k, 67)."""
         place, measured = self.anchor.row()
         rows = np.vstack([np.diag(1 / self.guess.std), place])
         values = np.concatenate([self.guess.values / self.guess.std, measured])

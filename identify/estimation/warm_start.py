@@ -85,8 +85,8 @@ def joint_balance(
     torque_map = np.linalg.inv(robot.joint_jacobian(pose)).transpose(0, 2, 1)
     angle = robot.inverse_kinematics(pose)
     velocity = np.einsum("nij,nj->ni", robot.joint_jacobian(pose), twist)
-    command, command_rate, integral = _effective_command(commands, timing, filtering)
-    angle_integral = _running_integral(angle, rate_hz)
+    command, command_rate, integral = effective_command(commands, timing, filtering)
+    angle_integral = running_integral(angle, rate_hz)
     count = len(measured)
     start = np.broadcast_to(-np.eye(6), (count, 6, 6))
     pid = -np.stack([command - angle, integral - angle_integral, command_rate - velocity], axis=2)
@@ -97,7 +97,7 @@ def joint_balance(
     return columns, slipping
 
 
-def _effective_command(commands: Array, timing: Timing, filtering: Filter) -> tuple[Array, Array, Array]:
+def effective_command(commands: Array, timing: Timing, filtering: Filter) -> tuple[Array, Array, Array]:
     """Filtered command as the joints feel it, its rate as the joint PID sees it, and its integral, at the frames.
 
     A held command lags by half a frame, a ramped one by a whole frame; U_dot is the difference of two commands, held.
@@ -109,10 +109,11 @@ def _effective_command(commands: Array, timing: Timing, filtering: Filter) -> tu
     lag = timing.latency_s + (period if timing.hold == "linear" else period / 2)
     felt = spline(np.clip(times - lag, 0.0, None))
     rate = spline(np.clip(times - timing.latency_s - period, 0.0, None), nu=1)
-    return felt, rate, _running_integral(felt, rate_hz)
+    return felt, rate, running_integral(felt, rate_hz)
 
 
-def _running_integral(samples: Array, rate_hz: float) -> Array:
+def running_integral(samples: Array, rate_hz: float) -> Array:
+    """Integral from the first frame to each of samples (N, ...), by a quintic spline."""
     spline = make_interp_spline(np.arange(len(samples)) / rate_hz, samples, k=5)
     integral = spline.antiderivative()
     return integral(np.arange(len(samples)) / rate_hz)

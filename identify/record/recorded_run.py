@@ -70,12 +70,12 @@ class RecordedRun:
         """Whitened pose residuals model - measurement (n, 6) of the good frames, and their Jacobian (n, 6, 67)."""
         run = self.simulate(parameters, sensitivities=True)
         assert run.pose_sensitivity is not None
-        jacobian = np.asarray(self._whitener @ run.pose_sensitivity[self.ok], dtype=float)
+        jacobian = np.asarray(self.whitener @ run.pose_sensitivity[self.ok], dtype=float)
         return self.whiten(run.pose - self.measured), jacobian
 
     def whiten(self, differences: Array) -> Array:
         """Pose differences (N, 6) at the good frames in standard deviations of the sensor, (n, 6)."""
-        return np.asarray(differences[self.ok] @ self._whitener.T, dtype=float)
+        return np.asarray(differences[self.ok] @ self.whitener.T, dtype=float)
 
     def without_gaps(self) -> Array:
         """Measured poses (N, 6) with lost frames interpolated in time; for linear fits only."""
@@ -97,7 +97,8 @@ class RecordedRun:
         )
 
     @property
-    def _whitener(self) -> Array:
+    def whitener(self) -> Array:
+        """Matrix (6, 6) that brings pose differences to standard deviations of the sensor."""
         return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance)), dtype=float)
 
 
