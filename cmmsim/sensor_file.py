@@ -222,6 +222,15 @@ def built_in_names() -> list[str]:
                   if f.name.endswith(".toml"))
 
 
+def sensor_text(name: str | Path) -> str:
+    """Text of the sensor file of a built-in name or a path. Raises UnknownSensorError for a name that is neither."""
+    if str(name) in built_in_names():
+        return resources.files(__package__).joinpath("sensors", f"{name}.toml").read_text(encoding="utf-8")
+    if not Path(name).is_file():
+        raise UnknownSensorError(str(name), built_in_names())
+    return Path(name).read_text(encoding="utf-8")
+
+
 def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None) -> SensorFile:
     """The sensor file of a built-in name or a path.
 
@@ -297,12 +306,7 @@ def _content(name: str | Path) -> dict[str, Any]:
 
 
 def _table(name: str | Path) -> dict[str, Any]:
-    if str(name) in built_in_names():
-        text = resources.files(__package__).joinpath("sensors", f"{name}.toml").read_text(encoding="utf-8")
-    elif Path(name).is_file():
-        text = Path(name).read_text(encoding="utf-8")
-    else:
-        raise UnknownSensorError(str(name), built_in_names())
+    text = sensor_text(name)
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

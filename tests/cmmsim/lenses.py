@@ -1,15 +1,13 @@
 """Sensors with real lenses for the tests: their files, and a teaching without any error."""
 
-from importlib import resources
-
 import numpy as np
 
 import cmmsim
 from cmmsim.eccentricity import centre_offset
 from cmmsim.pose import apply, pose_to_transform
+from cmmsim.sensor_file import sensor_text
 
-TEXT = resources.files("cmmsim").joinpath("sensors", "ctrack780.toml").read_text(encoding="utf-8")
-DISTORTED = """
+CAMERAS = """
 [rig.left]
 focal_px = [2295.0, 2301.5]
 centre_px = [1017.2, 771.9]
@@ -17,8 +15,8 @@ distortion = [-0.11, 0.07, 4e-4, -3e-4, 0.0]
 [rig.right]
 focal_px = [2306.0, 2304.0]
 centre_px = [1030.1, 760.4]
-distortion = [-0.15, 0.05, -6e-4, 5e-4, 0.01]
 """
+DISTORTED = CAMERAS + "distortion = [-0.15, 0.05, -6e-4, 5e-4, 0.01]\n"
 LENSES = {
     "perfect": "",
     "distorted": DISTORTED,
@@ -30,7 +28,7 @@ LENSES = {
 
 def lens_sensor(folder, lens="perfect", renderer="analytic", seed=0, changes=()):
     """A ctrack780 with another lens, and other changes of its file; taught without error."""
-    text = TEXT + LENSES[lens]
+    text = sensor_text("ctrack780") + LENSES[lens]
     for old, new in changes:
         assert old in text
         text = text.replace(old, new, 1)

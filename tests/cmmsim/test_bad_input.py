@@ -1,14 +1,13 @@
 """Bad input is refused with one message that holds the evidence and the valid names."""
 
-from importlib import resources
-
 import numpy as np
 import pytest
 
 import cmmsim
 from cmmsim.scene import rod, rod_transform
+from cmmsim.sensor_file import sensor_text
 
-TEXT = resources.files("cmmsim").joinpath("sensors", "ctrack780.toml").read_text(encoding="utf-8")
+TEXT = sensor_text("ctrack780")
 
 
 def write(tmp_path, text):

@@ -29,6 +29,7 @@ from cmmsim.noise import CameraNoise
 from cmmsim.optics import Optics
 from cmmsim.pose import apply, rotation_log
 from cmmsim.renderers import ANALYTIC, PYRENDER
+from cmmsim.sensor_file import sensor_text
 from cmmsim.stereo_rig import StereoRig, toed_in_rig
 
 NOISE = CameraNoise(1600.0, 0.13, 26.0, 1800.0, 16.0)
@@ -292,8 +293,7 @@ def test_rendered_dots_give_the_true_cameras_and_lenses():
 
 def test_calibrated_sensor_file_is_one(dot_views, tmp_path):
     found = calibrate(DOTS, dot_views, (800, 600))
-    from importlib import resources
-    template = resources.files("cmmsim").joinpath("sensors", "ctrack780.toml").read_text(encoding="utf-8")
+    template = sensor_text("ctrack780")
     with pytest.raises(CalibrationError, match="images are 800 x 600 px, those of the sensor file 2048 x 1536"):
         calibrated_sensor(template, found)
     template = template.replace("width = 2048", "width = 800").replace("height = 1536", "height = 600")

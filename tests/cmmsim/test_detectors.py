@@ -1,7 +1,6 @@
 """One contract for all detectors, their stated covariance and bias against sampling, and the eccentricity of discs."""
 
 from dataclasses import replace
-from importlib import resources
 from typing import get_args
 
 import numpy as np
@@ -12,7 +11,7 @@ from cmmsim.drawn_discs import Condition, draw_discs, random_ellipses, scene_of
 from cmmsim.ellipse_fit import FitLimits
 from cmmsim.errors import CmmError, SensorFileError, UnknownOptionError
 from cmmsim.sensor import Sensor
-from cmmsim.sensor_file import Detection, SensorFile, read_sensor_file
+from cmmsim.sensor_file import Detection, SensorFile, read_sensor_file, sensor_text
 
 SCENE = scene_of(read_sensor_file("ctrack780"))
 SIZE, FIT = 18, 14
@@ -148,8 +147,7 @@ def test_sensor_file_chooses_the_detector_and_poses_keep_their_covariance(detect
 
 
 def test_unknown_detector_in_a_sensor_file_names_the_valid_ones(tmp_path):
-    built_in = (resources.files("cmmsim") / "sensors" / "ctrack780.toml").read_text()
-    (tmp_path / "mine.toml").write_text(built_in + '\n[detection]\ndetector = "hough"\n')
+    (tmp_path / "mine.toml").write_text(sensor_text("ctrack780") + '\n[detection]\ndetector = "hough"\n')
     with pytest.raises(SensorFileError, match=r"'maximum_likelihood', 'dual_conic' or 'grey_centroid'.*got 'hough'"):
         read_sensor_file(tmp_path / "mine.toml")
     assert list(get_args(Detection.model_fields["detector"].annotation)) == list(DETECTORS)

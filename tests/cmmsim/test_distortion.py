@@ -1,7 +1,5 @@
 """Lens distortion against OpenCV and finite differences; calibrated cameras in sensor files."""
 
-from importlib import resources
-
 import cv2
 import numpy as np
 import pytest
@@ -13,19 +11,12 @@ from cmmsim.camera import PinholeCamera
 from cmmsim.distortion import Distortion
 from cmmsim.pose import apply, rotation_exp
 from cmmsim.rig_from_file import rig_from_file
-from cmmsim.sensor_file import read_sensor_file
+from cmmsim.sensor_file import read_sensor_file, sensor_text
+from tests.cmmsim.lenses import CAMERAS
 
 LENSES = {"barrel": (-0.12, 0.03, 1e-3, -7e-4, -4e-3), "cushion": (0.15, 0.06, -8e-4, 5e-4, 0.02),
           "moustache": (-0.2, 0.25, 3e-4, 2e-4, -0.05)}
-TEXT = resources.files("cmmsim").joinpath("sensors", "ctrack780.toml").read_text(encoding="utf-8")
-CALIBRATED = """
-[rig.left]
-focal_px = [2295.0, 2301.5]
-centre_px = [1017.2, 771.9]
-distortion = [-0.11, 0.07, 4e-4, -3e-4, 0.0]
-[rig.right]
-focal_px = [2306.0, 2304.0]
-centre_px = [1030.1, 760.4]
+CALIBRATED = CAMERAS + """
 [rig.right_from_left]
 translation = [-0.91, 0.01, 0.33]
 rotation_vector = [0.02, -0.66, -0.01]
@@ -113,7 +104,7 @@ def test_a_perfect_lens_takes_the_plain_path():
 
 def test_sensor_file_with_calibrated_cameras(tmp_path):
     path = tmp_path / "mine.toml"
-    path.write_text(TEXT + CALIBRATED, encoding="utf-8")
+    path.write_text(sensor_text("ctrack780") + CALIBRATED, encoding="utf-8")
     rig = cmmsim.load_sensor(path).rig
     np.testing.assert_allclose(rig.left.matrix, [[2295.0, 0, 1017.2], [0, 2301.5, 771.9], [0, 0, 1]])
     assert rig.left.distortion == Distortion(-0.11, 0.07, 4e-4, -3e-4, 0.0)
@@ -148,6 +139,6 @@ def test_calibrated_rig_stands_where_the_toed_in_one_does():
 def test_bad_calibration_in_a_sensor_file(tmp_path, old, new, message):
     path = tmp_path / "mine.toml"
     assert old in CALIBRATED
-    path.write_text(TEXT + CALIBRATED.replace(old, new, 1), encoding="utf-8")
+    path.write_text(sensor_text("ctrack780") + CALIBRATED.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(cmmsim.SensorFileError, match=message):
         cmmsim.load_sensor(path)

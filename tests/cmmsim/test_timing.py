@@ -1,7 +1,5 @@
 """Rate, latency with jitter and dropout of a sensor, and sensor files that are based on another."""
 
-from importlib import resources
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -10,10 +8,9 @@ import cmmsim
 from cmmsim.acceptance import SensorUnderTest, common_volume, latency_test
 from cmmsim.latency import drawn_latencies, largest_latency
 from cmmsim.measurement import lost_measurement
-from cmmsim.sensor_file import Timing, read_sensor_file
+from cmmsim.sensor_file import Timing, read_sensor_file, sensor_text
 from cmmsim.tracking import Tracker
 
-COMPLETE = resources.files("cmmsim").joinpath("sensors", "ctrack780.toml").read_text(encoding="utf-8")
 DROPPING = 'name = "ctrack780"\nbased_on = "ctrack780"\nrenderer = "analytic"\n[timing]\ndropout = {}\n'
 
 
@@ -46,7 +43,8 @@ def test_the_29_hz_sensor_is_labelled_as_assumed_and_differs_in_nothing_but_its_
 
 
 def test_a_file_based_on_another_changes_single_entries_of_a_section(tmp_path):
-    (tmp_path / "base.toml").write_text(COMPLETE.replace("gain = 0.13", "gain = 0.26"), encoding="utf-8")
+    base = sensor_text("ctrack780").replace("gain = 0.13", "gain = 0.26")
+    (tmp_path / "base.toml").write_text(base, encoding="utf-8")
     mine = tmp_path / "mine.toml"
     mine.write_text('name = "mine"\nbased_on = "base.toml"\n[camera]\ndark_noise = 3.0\n[lens]\npsf_px = 0.5\n')
     found = read_sensor_file(mine)
