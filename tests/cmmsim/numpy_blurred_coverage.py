@@ -1,17 +1,5 @@
-"""Share of light in each pixel of a blurred ellipse, in plain numpy: the oracle of the compiled one.
-
-The share is the integral over the ellipse of g_i(x) g_j(y), where g_i(x) is what the point spread carries from a point
-x into pixel i. By the divergence theorem it is an integral along the rim x(t) = c + A (cos t, sin t),
-
-    share = integral of P_i(x) g_j(y) n_x ds,   P_i' = g_i,
-
-and a change of the ellipse, which moves the rim by v = dc + dA (cos t, sin t), changes it by
-
-    d share = integral of g_i(x) g_j(y) v . n ds.
-
-Both are smooth and periodic in t, so the trapezoidal rule converges exponentially once its points lie closer than the
-point spread is wide.
-"""
+"""Share of light in each pixel of a blurred ellipse, for all windows at once in plain numpy: the oracle of the compiled
+one, whose derivation holds here too (``cmmsim.blurred_coverage``)."""
 
 from __future__ import annotations
 
@@ -25,11 +13,7 @@ FEWEST_POINTS = 24
 
 
 def blurred_coverage(centres: Array, shapes: Array, size: int, psf_px: float) -> tuple[Array, Array]:
-    """Shares (n, size, size), 0 to 1, and their derivatives (n, size, size, 5) by [c_x, c_y, A_xx, A_xy, A_yy].
-
-    Parameters: centres (n, 2) px, where (0, 0) is the middle of the window's first pixel; shapes (n, 2, 2) px,
-    symmetric and positive definite; size: window side in px; psf_px: sigma of the point spread.
-    """
+    """As the product's ``blurred_coverage``."""
     count = rim_points(float(np.linalg.norm(shapes, axis=2).max(initial=0.0)), psf_px)
     angle = 2.0 * np.pi * np.arange(count) / count
     u = np.stack([np.cos(angle), np.sin(angle)])

@@ -1,14 +1,5 @@
-"""Exact share of each pixel that an ellipse covers, in plain numpy: the oracle of the compiled one.
-
-An ellipse is the image of the unit disc: centre c (2,) plus A (2,2) symmetric, in px. Seen from the disc, a pixel
-is a small parallelogram; the area they share is a sum over the parallelogram's sides (Green's theorem), each side
-giving two circle sectors and the triangle over its part inside the disc. A change of c or A moves the boundary with a
-velocity v(x) = dc + dA A^-1 (x - c), and by the transport theorem
-
-    d|disc and pixel| = integral of div v over the shared area - flux of v through the pixel's sides inside the disc,
-
-where v is linear along a side, so that its value at the middle of the part inside is exact.
-"""
+"""Exact share of each pixel that an ellipse covers, for all windows at once in plain numpy: the oracle of the compiled
+one, whose derivation holds here too (``cmmsim.ellipse_coverage``)."""
 
 from __future__ import annotations
 
@@ -22,11 +13,7 @@ SHAPE_BASIS.setflags(write=False)
 
 
 def coverage(centres: Array, shapes: Array, size: int) -> tuple[Array, Array]:
-    """Coverage (n, size, size), 0 to 1, and its derivatives (n, size, size, 5) by [c_x, c_y, A_xx, A_xy, A_yy].
-
-    Parameters: centres (n, 2) px, where (0, 0) is the middle of the window's first pixel; shapes (n, 2, 2) px,
-    symmetric and positive definite; size: window side in px.
-    """
+    """As the product's ``coverage``."""
     inverse = np.asarray(np.linalg.inv(shapes), dtype=np.float64)
     across_x, across_y = _all_sides(centres, inverse, size)
     area = _area(shapes, across_x, across_y)
@@ -44,7 +31,7 @@ def coverage(centres: Array, shapes: Array, size: int) -> tuple[Array, Array]:
 
 
 def covered_area(centres: Array, shapes: Array, size: int) -> Array:
-    """Coverage (n, size, size) as ``coverage`` gives it, without derivatives."""
+    """As the product's ``covered_area``."""
     return _area(shapes, *_all_sides(centres, np.asarray(np.linalg.inv(shapes)), size))
 
 

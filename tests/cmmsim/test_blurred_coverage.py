@@ -8,16 +8,9 @@ import cmmsim
 from cmmsim.blurred_coverage import blurred_coverage
 from cmmsim.ellipse_coverage import SHAPE_BASIS
 from cmmsim.ellipse_fit import fit_ellipses
-from cmmsim.noise import CameraNoise
+from tests.cmmsim.ellipses import NOISE, random_ellipses
 
-NOISE = CameraNoise(electrons_at_white=1600.0, gain=0.13, dark_noise=26.0, full_well=1800.0, black_level=16.0)
 SIZE = 20
-
-
-def random_ellipses(rng, count, radii=(3.8, 2.4)):
-    angle = rng.uniform(0.0, np.pi, count)
-    turn = np.stack([np.stack([np.cos(angle), -np.sin(angle)], -1), np.stack([np.sin(angle), np.cos(angle)], -1)], 1)
-    return 0.5 * (SIZE - 1) + rng.uniform(-1.0, 1.0, (count, 2)), turn @ np.diag(radii) @ turn.transpose(0, 2, 1)
 
 
 def integrated(centre, shape, psf_px, rings=120, rays=240):
@@ -33,7 +26,7 @@ def integrated(centre, shape, psf_px, rings=120, rays=240):
 
 @pytest.mark.parametrize("psf_px", [0.3, 0.5, 1.0, 2.0])
 def test_shares_match_brute_force_integration(psf_px):
-    centres, shapes = random_ellipses(np.random.default_rng(0), 3)
+    centres, shapes = random_ellipses(np.random.default_rng(0), 3, SIZE)
     shares, _ = blurred_coverage(centres, shapes, SIZE, psf_px)
     for centre, shape, share in zip(centres, shapes, shares, strict=True):
         np.testing.assert_allclose(share, integrated(centre, shape, psf_px), atol=2e-7)
@@ -42,7 +35,7 @@ def test_shares_match_brute_force_integration(psf_px):
 @pytest.mark.parametrize("psf_px", [0.05, 0.4, 1.0])
 @pytest.mark.parametrize("radii", [(1.0, 0.85), (3.8, 2.4), (7.0, 3.0)])
 def test_all_light_is_kept_however_narrow_and_small(psf_px, radii):
-    centres, shapes = random_ellipses(np.random.default_rng(1), 5, radii)
+    centres, shapes = random_ellipses(np.random.default_rng(1), 5, SIZE, radii)
     shares, _ = blurred_coverage(centres + 0.5 * SIZE, shapes, 2 * SIZE, psf_px)
     np.testing.assert_allclose(shares.sum(axis=(1, 2)), np.pi * np.prod(radii), rtol=1e-6)
     assert shares.min() > -1e-6
@@ -51,7 +44,7 @@ def test_all_light_is_kept_however_narrow_and_small(psf_px, radii):
 
 @pytest.mark.parametrize("parameter", range(5))
 def test_derivatives_match_finite_differences(parameter):
-    centres, shapes = random_ellipses(np.random.default_rng(2), 4)
+    centres, shapes = random_ellipses(np.random.default_rng(2), 4, SIZE)
     _, derivatives = blurred_coverage(centres, shapes, SIZE, 0.5)
     moved = []
     for sign in (1e-5, -1e-5):
@@ -66,7 +59,7 @@ def test_derivatives_match_finite_differences(parameter):
 
 def test_fit_of_blurred_windows_reaches_its_own_covariance_and_has_no_bias():
     rng = np.random.default_rng(3)
-    centres, shapes = random_ellipses(rng, 2000)
+    centres, shapes = random_ellipses(rng, 2000, SIZE)
     radiance = (8.0 + 220.0 * blurred_coverage(centres, shapes, SIZE, 0.6)[0]) / 255.0
     fits = fit_ellipses(NOISE.expose(radiance.astype(np.float32), rng), np.zeros((2000, 2), dtype=int), NOISE, 18,
                         psf_px=0.6)

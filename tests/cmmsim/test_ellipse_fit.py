@@ -5,21 +5,13 @@ import pytest
 
 from cmmsim.ellipse_coverage import SHAPE_BASIS, coverage
 from cmmsim.ellipse_fit import fit_ellipses
-from cmmsim.noise import CameraNoise
+from tests.cmmsim.ellipses import NOISE, random_ellipses
 
-NOISE = CameraNoise(electrons_at_white=1600.0, gain=0.13, dark_noise=26.0, full_well=1800.0, black_level=16.0)
 SIZE = 18
 
 
-def random_ellipses(rng, count, radii=(3.8, 2.4)):
-    angle = rng.uniform(0.0, np.pi, count)
-    turn = np.stack([np.stack([np.cos(angle), -np.sin(angle)], -1), np.stack([np.sin(angle), np.cos(angle)], -1)], 1)
-    centres = 0.5 * (SIZE - 1) + rng.uniform(-1.0, 1.0, (count, 2))
-    return centres, turn @ np.diag(radii) @ turn.transpose(0, 2, 1)
-
-
 def test_coverage_matches_sampling_each_pixel():
-    centres, shapes = random_ellipses(np.random.default_rng(0), 3)
+    centres, shapes = random_ellipses(np.random.default_rng(0), 3, SIZE)
     area, _ = coverage(centres, shapes, SIZE)
     fine = 50
     ticks = (np.arange(SIZE * fine) + 0.5) / fine - 0.5
@@ -33,7 +25,7 @@ def test_coverage_matches_sampling_each_pixel():
 
 @pytest.mark.parametrize("parameter", range(5))
 def test_coverage_derivatives_match_finite_differences(parameter):
-    centres, shapes = random_ellipses(np.random.default_rng(1), 4)
+    centres, shapes = random_ellipses(np.random.default_rng(1), 4, SIZE)
     _, derivatives = coverage(centres, shapes, SIZE)
     moved = []
     for sign in (1e-6, -1e-6):
@@ -47,7 +39,7 @@ def test_coverage_derivatives_match_finite_differences(parameter):
 
 
 def draw(rng, count):
-    centres, shapes = random_ellipses(rng, count)
+    centres, shapes = random_ellipses(rng, count, SIZE)
     radiance = (8.0 + 220.0 * coverage(centres, shapes, SIZE)[0]) / 255.0
     return centres, radiance.astype(np.float32)
 

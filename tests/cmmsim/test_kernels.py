@@ -13,23 +13,16 @@ import cmmsim
 from cmmsim import blur_kernel, cholesky_kernel, coverage_kernel, ellipse_fit, fit_kernel
 from cmmsim.blurred_coverage import blurred_coverage
 from cmmsim.ellipse_coverage import coverage
-from cmmsim.noise import CameraNoise
 from tests.cmmsim import numpy_blurred_coverage, numpy_coverage, numpy_fit
+from tests.cmmsim.ellipses import NOISE, random_ellipses
 
-NOISE = CameraNoise(electrons_at_white=1600.0, gain=0.13, dark_noise=26.0, full_well=1800.0, black_level=16.0)
 SIZE = 16
-
-
-def random_ellipses(rng, count, radii=(3.8, 2.4)):
-    angle = rng.uniform(0.0, np.pi, count)
-    turn = np.stack([np.stack([np.cos(angle), -np.sin(angle)], -1), np.stack([np.sin(angle), np.cos(angle)], -1)], 1)
-    return 0.5 * (SIZE - 1) + rng.uniform(-1, 1, (count, 2)), turn @ np.diag(radii) @ turn.transpose(0, 2, 1)
 
 
 @pytest.mark.parametrize("radii", [(3.8, 2.4), (0.2, 0.1), (0.5, 9.0), (1.0, 1.0), (30.0, 30.0)])
 def test_coverage_is_that_of_plain_numpy(radii):
     """In all cases of a side: within, outside, crossed once or twice; centres on pixel corners are among them."""
-    centres, shapes = random_ellipses(np.random.default_rng(0), 50, radii)
+    centres, shapes = random_ellipses(np.random.default_rng(0), 50, SIZE, radii)
     centres[:10] = np.round(2.0 * centres[:10]) / 2.0
     for found, expected in zip(coverage(centres, shapes, SIZE), numpy_coverage.coverage(centres, shapes, SIZE),
                                strict=True):
@@ -38,7 +31,7 @@ def test_coverage_is_that_of_plain_numpy(radii):
 
 @pytest.mark.parametrize("psf_px", [0.2, 0.5, 1.5])
 def test_blurred_coverage_is_that_of_plain_numpy(psf_px):
-    centres, shapes = random_ellipses(np.random.default_rng(1), 20)
+    centres, shapes = random_ellipses(np.random.default_rng(1), 20, SIZE)
     for found, expected in zip(blurred_coverage(centres, shapes, SIZE, psf_px),
                                numpy_blurred_coverage.blurred_coverage(centres, shapes, SIZE, psf_px), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-7)
@@ -46,7 +39,7 @@ def test_blurred_coverage_is_that_of_plain_numpy(psf_px):
 
 def exposed(seed, count, radii=(3.8, 2.4)):
     rng = np.random.default_rng(seed)
-    centres, shapes = random_ellipses(rng, count, radii)
+    centres, shapes = random_ellipses(rng, count, SIZE, radii)
     radiance = (8.0 + 220.0 * coverage(centres, shapes, SIZE)[0]) / 255.0
     return NOISE.expose(radiance.astype(np.float32), rng), np.tile([1000, 700], (count, 1))
 
@@ -85,7 +78,7 @@ def test_windows_without_an_ellipse_give_finite_numbers():
 
 
 def test_kernels_compute_the_same_uncompiled():
-    centres, shapes = random_ellipses(np.random.default_rng(4), 1)
+    centres, shapes = random_ellipses(np.random.default_rng(4), 1, SIZE)
     for kernel, more in ((coverage_kernel.cover_window, ()), (blur_kernel.blur_window, (0.6,))):
         results = []
         for function in (kernel, kernel.py_func):
