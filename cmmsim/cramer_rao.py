@@ -13,14 +13,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtr
 
-from .blurred_coverage import require_psf
+from .blurred_coverage import blurred_coverage
 from .ellipse_coverage import coverage, covered_area
 from .errors import CmmError
 from .noise import CameraNoise
 from .pose import Array
 
-PARTS = 3.0  # parts of a pixel to one standard deviation of the point spread: their covered shares are blurred
-REACH = 6.0  # standard deviations within which noise and point spread are followed
+REACH = 6.0  # standard deviations within which noise is followed
 TABLE_STEPS = 64  # tabulated informations in one grey value; fewer where the noise hides the rounding
 
 
@@ -28,47 +27,14 @@ def light_shares(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) 
     """Share of light (n, size, size), 0 to 1, of each pixel.
 
     Parameters: centres (n,2) px, (0, 0) is the middle of the window's first pixel; shapes (n,2,2) px, symmetric and
-    positive definite; psf_px: sigma of the point spread. Raises CmmError for one too narrow to be sampled.
+    positive definite; psf_px: sigma of the point spread. Raises CmmError for one too narrow to be followed.
     """
-    if psf_px == 0.0:
-        return covered_area(centres, shapes, size)
-    fine = _FineGrid(size, psf_px)
-    return fine.blurred(covered_area(*fine.ellipses(centres, shapes), fine.count))
+    return covered_area(centres, shapes, size) if psf_px == 0.0 else blurred_coverage(centres, shapes, size, psf_px)[0]
 
 
 def light_share_derivatives(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> tuple[Array, Array]:
     """Shares as of ``light_shares`` and derivatives (n, size, size, 5) by [c_x, c_y, A_xx, A_xy, A_yy]."""
-    if psf_px == 0.0:
-        return coverage(centres, shapes, size)
-    fine = _FineGrid(size, psf_px)
-    area, derivatives = coverage(*fine.ellipses(centres, shapes), fine.count)
-    blurred = [fine.blurred(derivatives[..., k]) for k in range(5)]
-    return fine.blurred(area), fine.parts * np.stack(blurred, axis=-1)
-
-
-class _FineGrid:
-    """A window of ``count`` parts of pixels a side, wide enough for all light that reaches ``size`` pixels.
-
-    A part counts as a point in its middle; its own extent is taken off the point spread instead.
-    """
-
-    def __init__(self, size: int, psf_px: float) -> None:
-        require_psf(psf_px)
-        self.parts = max(2, int(np.ceil(PARTS / psf_px)))
-        self._margin = int(np.ceil(REACH * psf_px))
-        self.count = (size + 2 * self._margin) * self.parts
-        middles = (np.arange(self.count) + 0.5) / self.parts - 0.5 - self._margin
-        rest = np.sqrt(psf_px**2 - 1.0 / (12.0 * self.parts**2))
-        reached = ndtr((np.arange(size + 1)[:, None] - 0.5 - middles) / rest)
-        self._weights = np.asarray(reached[1:] - reached[:-1], dtype=float) / self.parts
-
-    def ellipses(self, centres: Array, shapes: Array) -> tuple[Array, Array]:
-        """Centres and shapes in parts, from the middle of the grid's first part."""
-        return (centres + self._margin + 0.5) * self.parts - 0.5, self.parts * shapes
-
-    def blurred(self, values: Array) -> Array:
-        """Light (n, size, size) of the pixels from that (n, count, count) of the parts."""
-        return self._weights @ values @ self._weights.T
+    return coverage(centres, shapes, size) if psf_px == 0.0 else blurred_coverage(centres, shapes, size, psf_px)
 
 
 def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
