@@ -13,6 +13,8 @@ from .errors import (
     UnknownSensorError,
 )
 from .estimator import PoseEstimator, measure_frame
+from .faults import FaultGenerator, fault_bodies
+from .faulty_images import Fault, FaultyImages
 from .images import StereoFrame
 from .measurement import Measurement
 from .pose import pose_to_transform, transform_to_pose
@@ -22,10 +24,12 @@ from .sensor import Sensor, load_sensor
 from .sensor_file import built_in_names
 from .stereo_rig import StereoRig
 from .taught import Taught
+from .tracking import Tracker
 
 __all__ = [
-    "CmmError", "LostError", "Measurement", "OpenGLMissingError", "PinholeCamera", "PoseEstimator", "Sensor",
-    "SensorFileError", "ShapeError", "StereoFrame", "StereoRig", "Taught", "TeachingError", "UnknownBodyError",
-    "UnknownOptionError", "UnknownSensorError", "built_in_names", "load_sensor", "measure_frame", "pose_to_transform",
-    "require_opengl", "rod", "rod_transform", "transform_to_pose",
+    "CmmError", "Fault", "FaultGenerator", "FaultyImages", "LostError", "Measurement", "OpenGLMissingError",
+    "PinholeCamera", "PoseEstimator", "Sensor", "SensorFileError", "ShapeError", "StereoFrame", "StereoRig", "Taught",
+    "TeachingError", "Tracker", "UnknownBodyError", "UnknownOptionError", "UnknownSensorError", "built_in_names",
+    "fault_bodies", "load_sensor", "measure_frame", "pose_to_transform", "require_opengl", "rod", "rod_transform",
+    "transform_to_pose",
 ]

@@ -1,13 +1,9 @@
 """Faults of stereo images, drawn at random: what a measurement has to survive or to refuse.
 
-    from cmmsim.faults import FaultGenerator
-    from cmmsim.faulty_images import FaultyImages
-    from cmmsim.tracking import Tracker
-
-    faults = FaultGenerator(sensor.estimator)
+    faults = cmmsim.FaultGenerator(sensor.estimator)
     fault = faults.draw("false_discs", pose, np.random.default_rng(1))
-    tracker = Tracker(sensor.estimator)
-    tracker.measure(FaultyImages(sensor.look(pose), fault, sensor.noise, np.random.default_rng(2)))
+    tracker = cmmsim.Tracker(sensor.estimator)
+    tracker.measure(cmmsim.FaultyImages(sensor.look(pose), fault, sensor.noise, np.random.default_rng(2)))
 
 Faults are laid over grey values, so they can be laid over pictures from anywhere. Only bodies that hide stickers from
 both cameras consistently have to be drawn with the scene: ``sensor.add_bodies(fault_bodies())`` once, then
