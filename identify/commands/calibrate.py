@@ -106,14 +106,10 @@ def _calibrate(left: Path, right: Path, board: "Board", options: tuple[str, bool
 
 def _template(sensor: str) -> str:
     """Text of a sensor file, checked to be one."""
-    from importlib import resources
-
-    from cmmsim.sensor_file import built_in_names, read_sensor_file
+    from cmmsim.sensor_file import read_sensor_file, sensor_text
 
     read_sensor_file(sensor)
-    if sensor in built_in_names():
-        return resources.files("cmmsim").joinpath("sensors", f"{sensor}.toml").read_text(encoding="utf-8")
-    return Path(sensor).read_text(encoding="utf-8")
+    return sensor_text(sensor)
 
 
 def _write(folder: Path, found: "Calibration", template: str | None) -> None:
