@@ -12,11 +12,12 @@ from dynamics.closed_loop import prepare
 from dynamics.workspace import check_motion
 from identify.arrays import Array
 from identify.estimation import identification
-from identify.estimation.loop_parameters import check_parameter_set
+from identify.estimation.loop_parameters import NAMES, check_parameter_set
 from identify.excitation import design_trajectories
 from identify.experiment.run import excitation_run, taught_sensor, teach, untaught_sensor
 from identify.experiment.truth import read_truth, true_parameters
 from identify.files.atomic import write_text
+from identify.files.covariance_file import read_covariance, write_covariance
 from identify.files.result_file import load_result, rms_figures, save_result
 from identify.files.run_folder import RunFolder
 from identify.files.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
@@ -31,11 +32,12 @@ from identify.reporting.run_result import (
     add_truth,
     identification_entry,
     parameter_vector,
+    prediction_entry,
     sensor_entry,
     validation_entry,
 )
 from identify.scenario import Scenario, load_scenario
-from identify.validation import model_run, run_unseen
+from identify.validation import model_run, predicted_runs, run_unseen
 
 
 def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:
@@ -95,6 +97,7 @@ def identify(folder: Path, progress: Progress) -> None:
     reference = recorded_reference(seen)
     before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))
     seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
+    write_covariance(run_folder.covariance, result.names, result.covariance)
     save_result(
         run_folder.result,
         {
@@ -119,7 +122,8 @@ def validate(
     """Run plant and models on the unseen trajectories and open the truth: validation.nc, model.nc, result.json."""
     run_folder, scenario, trajectories, robot = _open(folder)
     began = time.perf_counter()
-    result = load_result(run_folder.result)
+    run_folder.require("covariance.nc")
+    result, covariance = load_result(run_folder.result), read_covariance(run_folder.covariance, NAMES)
     excitation_record, excitation_truth = recording.read(run_folder.experiment), read_truth(run_folder.experiment)
     taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
     count = workers or os.cpu_count() or 1
@@ -129,12 +133,18 @@ def validate(
     models = [parameter_vector(identification, column) for column in ("initial", "estimate")]
     records = [excitation_record, *(run.record for run in runs)]
     model_poses = [_model_poses(robot, scenario, models, seen) for seen in records]
-    drawn = [build_model_run(seen["time"].values, *pair) for seen, pair in zip(records, model_poses, strict=True)]
+    predictions = predicted_runs(robot, scenario, records[1:], models[1], covariance, trajectories.seed, progress)
+    deviations = [None, *(prediction.std for prediction in predictions)]
+    drawn = [
+        build_model_run(seen["time"].values, initial, identified, std)
+        for seen, (initial, identified), std in zip(records, model_poses, deviations, strict=True)
+    ]
     write_model_runs(run_folder.model, drawn[0], drawn[1:])
     pairs = [(excitation_record, excitation_truth), *((run.record, run.truth) for run in runs)]
     result["sensor"] = sensor_entry(pairs)
     result["validation"] = [
-        validation_entry(*pair, *poses) for pair, poses in zip(pairs[1:], model_poses[1:], strict=True)
+        validation_entry(*pair, *poses) | prediction_entry(prediction, pair[1])
+        for pair, poses, prediction in zip(pairs[1:], model_poses[1:], predictions, strict=True)
     ]
     add_truth(identification, true_parameters(excitation_truth))
     result["seconds"]["validate"] = time.perf_counter() - began

@@ -2,22 +2,26 @@
 
 import multiprocessing
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.sharedctypes import Synchronized
 
 import numpy as np
+import xarray as xr
 
 import cmmsim
 from dynamics import DynamicsError, Robot, load_robot
 from dynamics.closed_loop import Reference, simulate
 from identify.arrays import Array
-from identify.experiment.run import Experiment, run_plant
+from identify.errors import EstimationError
+from identify.estimation.pose_prediction import PosePrediction, predict_poses
+from identify.experiment.run import PREDICTION, Experiment, run_plant, stream_seed
 from identify.experiment.sensor_in_loop import make_sensor
 from identify.progress import Advance, Progress
 from identify.record.loop_setup import frame_times, model_settings
+from identify.record.recorded_run import recorded_run
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
@@ -67,6 +71,33 @@ def model_run(robot: Robot, scenario: Scenario, parameters: Array, reference: Re
         return simulate(robot, parameters, reference, model_settings(scenario)).pose
     except DynamicsError:
         return np.full_like(reference.poses, np.nan)
+
+
+def predicted_runs(
+    robot: Robot,
+    scenario: Scenario,
+    records: Sequence[xr.Dataset],
+    parameters: Array,
+    covariance: Array,
+    seed: int,
+    progress: Progress,
+) -> list[PosePrediction]:
+    """What the identified model (67,) with its covariance (67, 67) predicts for the plant on the references of records.
+
+    NaN throughout where its loop is unstable, or too little was measured to know the sensor's noise.
+    """
+    predictions = []
+    with progress.stage("predict", len(records)) as advance:
+        for number, record in enumerate(records, start=1):
+            rng = np.random.default_rng(stream_seed(seed, PREDICTION, number))
+            try:
+                prediction = predict_poses(recorded_run(record, robot, scenario), parameters, covariance, rng)
+            except (DynamicsError, EstimationError):
+                shape = (record.sizes["time"], 6)
+                prediction = PosePrediction(np.full(shape, np.nan), np.full((*shape, 6), np.nan))
+            predictions.append(prediction)
+            advance()
+    return predictions
 
 
 class _Worker:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dynamics.closed_loop import LoopFailure, simulate
+from dynamics.closed_loop import ClosedLoopRun, LoopFailure, simulate
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.output_error import OutputErrorProblem
@@ -31,11 +31,12 @@ FEWEST = 50
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Covariance (67, 67) of the estimate; mean squared whitened residual of the record, what noise alone would make of
-    it, and how that spreads from one experiment to the next; unstable: repeated experiments that ended early and were
-    left out."""
+    """Covariance (67, 67) of the estimate; information (67, 67) that the poses alone hold; mean squared whitened
+    residual of the record, what noise alone would make of it, and how that spreads from one experiment to the next;
+    unstable: repeated experiments that ended early and were left out."""
 
     covariance: Array
+    information: Array
     noise_ratio: float
     expected_noise_ratio: float
     noise_ratio_std: float
@@ -57,18 +58,20 @@ def estimate_uncertainty(
         jacobians.append(jacobian.reshape(-1, size))
     ratio = float(np.mean(np.concatenate(residuals) ** 2))
     known = problem.known_information()
-    inverse = np.linalg.inv(sum(j.T @ j for j in jacobians) + known)
+    information = np.asarray(sum(j.T @ j for j in jacobians))
+    inverse = np.linalg.inv(information + known)
     if all(run.driven for run in problem.runs):
         advance(DRAWS)
         count = sum(len(j) for j in jacobians)
-        return Uncertainty((inverse + inverse.T) / 2, ratio, 1.0, float(np.sqrt(2 / count)))
+        return Uncertainty((inverse + inverse.T) / 2, information, ratio, 1.0, float(np.sqrt(2 / count)))
     if ratio > NOISE_DECIDES:
         advance(DRAWS)
-        return Uncertainty(ratio * (inverse + inverse.T) / 2, ratio, 1.0, float(np.sqrt(2 / sum(map(len, jacobians)))))
+        covariance = ratio * (inverse + inverse.T) / 2
+        return Uncertainty(covariance, information, ratio, 1.0, float(np.sqrt(2 / sum(map(len, jacobians)))))
     scores, squares = [], []
     for _ in range(DRAWS):
         try:
-            repeated = [_repeated_poses(run, parameters, rng) for run in problem.runs]
+            repeated = [repeated_experiment(run, parameters, rng).measured for run in problem.runs]
         except LoopFailure:
             continue
         finally:
@@ -87,6 +90,7 @@ def estimate_uncertainty(
     covariance = inverse @ (np.cov(np.array(scores).T) + known) @ inverse
     return Uncertainty(
         (covariance + covariance.T) / 2,
+        information,
         ratio,
         float(np.mean(squares)),
         float(np.std(squares, ddof=1)),
@@ -94,11 +98,14 @@ def estimate_uncertainty(
     )
 
 
-def _repeated_poses(run: RecordedRun, parameters: Array, rng: np.random.Generator) -> Array:
-    """Measured poses (N, 6) of one repeated experiment whose plant is the identified model; NaN where lost."""
+def repeated_experiment(run: RecordedRun, parameters: Array, rng: np.random.Generator) -> ClosedLoopRun:
+    """A repeated experiment whose plant is the identified model and whose sensor has drawn noise; NaN where lost.
+
+    Raises LoopFailure where the loop is unstable.
+    """
     noise = rng.standard_normal(run.measured.shape) @ np.linalg.cholesky(run.covariance).T
 
     def sensor(frame: int, t: float, pose: Array) -> Array | None:
         return pose + noise[frame] if run.ok[frame] else None
 
-    return simulate(run.robot, parameters + run.payload, run.reference, run.settings, sensor).measured
+    return simulate(run.robot, parameters + run.payload, run.reference, run.settings, sensor)

@@ -26,6 +26,7 @@ from identify.estimation.base_parameters import (
     structural_regressor,
 )
 from identify.estimation.bounded_least_squares import Solution, StopCriteria, minimise
+from identify.estimation.conditioning import Conditioning, conditioning
 from identify.estimation.estimate_covariance import DRAWS, Uncertainty, estimate_uncertainty
 from identify.estimation.group_estimates import IDENTIFIABLE_SHARE, GroupEstimates, group_estimates
 from identify.estimation.loop_parameters import NAMES, StartingGuess, starting_guess
@@ -67,6 +68,7 @@ class IdentificationResult:
     covariance: Array
     identifiable: NDArray[np.bool_]
     groups: GroupEstimates
+    conditioning: Conditioning
     scale_anchor: ScaleAnchor
     base_rank: int
     iterations: int
@@ -118,10 +120,10 @@ def identify(
     rate_hz = scenario.timing.frame_rate_hz
     excited = np.concatenate([reference_regressor(robot, run.reference, rate_hz) for run in problem.runs])
     rank = rank_by_threshold(excited, settings.qr_threshold)
-    groups = group_estimates(
-        base_parameters(structural_regressor(robot)), problem.guess, searches[-1].parameters, uncertainty.covariance
-    )
-    return _result(final, warm, searches, uncertainty, groups, tested, rank, seconds)
+    base, estimate = base_parameters(structural_regressor(robot)), searches[-1].parameters
+    groups = group_estimates(base, problem.guess, estimate, uncertainty.covariance)
+    conditioned = conditioning(uncertainty.information, final.known_information(), base, problem.guess, estimate)
+    return _result(final, warm, searches, uncertainty, groups, conditioned, tested, rank, seconds)
 
 
 def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance) -> Solution:
@@ -194,6 +196,7 @@ def _result(
     searches: list[Solution],
     uncertainty: Uncertainty,
     groups: GroupEstimates,
+    conditioned: Conditioning,
     tested: Whiteness,
     rank: int,
     seconds: dict[str, float],
@@ -210,6 +213,7 @@ def _result(
         covariance=uncertainty.covariance,
         identifiable=std < IDENTIFIABLE_SHARE * problem.guess.std,
         groups=groups,
+        conditioning=conditioned,
         scale_anchor=problem.anchor,
         base_rank=rank,
         iterations=sum(one.iterations for one in searches),
@@ -219,7 +223,7 @@ def _result(
         noise_ratio=uncertainty.noise_ratio,
         expected_noise_ratio=uncertainty.expected_noise_ratio,
         whiteness=tested,
-        warnings=said + _warnings(uncertainty, tested),
+        warnings=said + _warnings(uncertainty, tested) + conditioned.warnings(),
         seconds=seconds,
     )
 

@@ -2,7 +2,7 @@
 
 Random streams of one seed: (0) exciting trajectories, (1) unseen trajectories, (2) the sensor's teaching, (3) the scale
 anchor, (4, run) the sensor's noise in each run, (5, run) the latency of its frames (the run under a payload has a
-number beyond all others).
+number beyond all others), (6, run) the noise in what is predicted of it.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ from identify.record.payload import payload_vector, store_payload
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory, check_travel
 
-TEACHING, ANCHOR, NOISE, LATENCY = 2, 3, 4, 5
+TEACHING, ANCHOR, NOISE, LATENCY, PREDICTION = 2, 3, 4, 5, 6
 PAYLOAD_RUN = 1_000_000
 
 

@@ -57,6 +57,15 @@ def rms_row(figures: dict[str, Any] | None) -> list[float]:
     return [math.nan if value is None else float(value) for value in values]
 
 
+def predicted_row(run: dict[str, Any]) -> list[float]:
+    """The six predicted standard deviations [um, urad] of a validation entry; NaN where nothing was predicted."""
+    predicted = run.get("predicted")
+    if not predicted:
+        return [math.nan] * 6
+    values = [*predicted["position_std_um"], *predicted["orientation_std_urad"]]
+    return [math.nan if value is None else float(value) for value in values]
+
+
 def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {str(key): _plain(entry) for key, entry in value.items()}

@@ -11,6 +11,7 @@ WRITTEN_BY = {
     "trajectories.json": "excite",
     "experiment.nc": "record",
     "payload.nc": "record",
+    "covariance.nc": "identify",
     "result.json": "identify",
     "validation.nc": "validate",
     "model.nc": "validate",
@@ -44,6 +45,11 @@ class RunFolder:
     def payload(self) -> Path:
         """Record and truth of the same run under a known load, netCDF; where the scale anchor is a payload."""
         return self.path / "payload.nc"
+
+    @property
+    def covariance(self) -> Path:
+        """Covariance of the estimated parameters, netCDF."""
+        return self.path / "covariance.nc"
 
     @property
     def validation(self) -> Path:

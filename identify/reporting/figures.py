@@ -1,5 +1,6 @@
 """Figures like the paper's 11, 12 and 13 and those of the errors, for print (PNG), with units on every axis."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,14 @@ from matplotlib.figure import Figure
 
 from identify.arrays import Array
 from identify.files.atomic import atomic_path
-from identify.files.result_file import rms_figures, rms_row
+from identify.files.result_file import predicted_row, rms_figures, rms_row
 from identify.reporting.goals import VALIDATION_UM, VALIDATION_URAD, is_friction_or_pid
 
 COMPONENTS = ("x", "y", "z", "α", "β", "γ")
 LETTERS = ("(a)", "(b)", "(c)", "(d)", "(e)", "(f)")
+BAND = 2.0
+"""Predicted standard deviations drawn around an error of zero: 95 % of true errors lie within."""
+
 MEASURED, INITIAL, IDENTIFIED, TRUE = "black", "tab:green", "tab:blue", "tab:red"
 
 
@@ -42,17 +46,18 @@ def fit_figure(
     identified: Array,
     title: str,
     truth: Array | None = None,
+    std: Array | None = None,
 ) -> Figure:
     """Measured (black dots), starting (green) and identified (blue) model, with the errors below; like figure 12, 13.
 
     Poses are (N, 6) [m, rad]; NaN where a measurement was lost or a model has diverged. Where the ``truth`` is given,
-    the model's error against it is drawn in red.
+    the model's error against it is drawn in red, and where ``std`` (N, 6) is, the band of ± 2 predicted deviations.
     """
     figure = _figure(13, 12)
     axes = figure.subplots(4, 3, sharex=True)
     for i in range(6):
         _fit_panel(axes[i // 3, i % 3], time, measured, initial, identified, i)
-        _error_panel(axes[2 + i // 3, i % 3], time, measured, initial, identified, truth, i)
+        _error_panel(axes[2 + i // 3, i % 3], time, measured, initial, identified, truth, std, i)
     for column in range(3):
         axes[3, column].set_xlabel("time [s]")
     axes[0, 0].legend(loc="upper right", fontsize="small")
@@ -62,7 +67,8 @@ def fit_figure(
 
 
 def validation_figure(validation: list[dict[str, Any]]) -> Figure:
-    """RMS of the identified model on each unseen trajectory, against truth and measurement, with the goals."""
+    """RMS of the identified model on each unseen trajectory, against truth and measurement, with what was predicted and
+    the goals."""
     figure = _figure(11, 7)
     panels = figure.subplots(2, 1, sharex=True)
     runs = np.arange(1, len(validation) + 1)
@@ -72,11 +78,13 @@ def validation_figure(validation: list[dict[str, Any]]) -> Figure:
             measured = [rms_row(run["measured"])[first + i] for run in validation]
             bars = axes.bar(runs + 0.25 * (i - 1), true, 0.22, label=f"{COMPONENTS[first + i]}, against truth")
             axes.plot(runs + 0.25 * (i - 1), measured, "_", color=bars.patches[0].get_facecolor(), markersize=12)
+            predicted = [predicted_row(run)[first + i] for run in validation]
+            axes.plot(runs + 0.25 * (i - 1), predicted, "kd", markersize=4, markerfacecolor="none")
         axes.axhline(limit, color="black", linestyle="--", linewidth=1, label=f"goal {limit:g} {unit}")
         axes.set_ylabel(f"RMS [{unit}]")
         axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
         axes.grid(alpha=0.3, axis="y")
-    panels[0].set_title("Identified model on unseen trajectories (dashes: against measurement)")
+    panels[0].set_title("Identified model on unseen trajectories (dashes: against measurement; diamonds: predicted)")
     panels[1].set_xlabel("unseen trajectory")
     panels[1].set_xticks(runs)
     return figure
@@ -103,6 +111,19 @@ def parameter_figure(parameters: dict[str, dict[str, Any]]) -> Figure:
         axes.set_xlabel("estimate − truth, bars ± 3 std [%]")
         axes.set_title(title)
         axes.grid(alpha=0.3, axis="x")
+    return figure
+
+
+def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
+    """Correlations (n, n) of estimates as a coloured matrix."""
+    side = max(5.0, 2.0 + 0.28 * len(names))
+    figure = _figure(side + 0.5, side)
+    axes = figure.subplots()
+    image = axes.imshow(correlations, cmap="RdBu_r", vmin=-1, vmax=1)
+    axes.set_xticks(range(len(names)), names, rotation=90, fontsize="small")
+    axes.set_yticks(range(len(names)), names, fontsize="small")
+    axes.set_title("Correlation of the identified parameters")
+    figure.colorbar(image, ax=axes, label="correlation [1]", shrink=0.8)
     return figure
 
 
@@ -134,13 +155,23 @@ def _fit_panel(axes: Axes, time: Array, measured: Array, initial: Array | None, 
 
 
 def _error_panel(
-    axes: Axes, time: Array, measured: Array, initial: Array | None, identified: Array, truth: Array | None, i: int
+    axes: Axes,
+    time: Array,
+    measured: Array,
+    initial: Array | None,
+    identified: Array,
+    truth: Array | None,
+    std: Array | None,
+    i: int,
 ) -> None:
     unit = "um" if i < 3 else "urad"
     error = 1e6 * (measured - identified)[:, i]
     axes.plot(time, error, ".", color=MEASURED, markersize=2, label="measured − identified")
     if truth is not None:
         axes.plot(time, 1e6 * (truth - identified)[:, i], color=TRUE, linewidth=1, label="true − identified")
+    if std is not None:
+        band = BAND * 1e6 * std[:, i]
+        axes.fill_between(time, -band, band, color=TRUE, alpha=0.15, linewidth=0, label=f"predicted ± {BAND:g} std")
     axes.set_title(f"error, {_rms_text(measured, initial, identified, i)}", fontsize="small")
     axes.set_ylabel(f"error of {COMPONENTS[i]} [{unit}]")
     axes.grid(alpha=0.3)

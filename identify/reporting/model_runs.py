@@ -23,10 +23,19 @@ VARIABLES: Variables = {
     "identified_orientation": (("time", "angle"), "rad", "orientation of the model with the identified parameters"),
 }
 
+PREDICTED: Variables = {
+    "std_position": (("time", "axis"), "m", "predicted deviation of the plant from the identified model"),
+    "std_orientation": (("time", "angle"), "rad", "predicted deviation of the plant from the identified model"),
+}
+"""Of unseen trajectories only: elsewhere nothing is predicted."""
 
-def build_model_run(time: ArrayLike, initial_pose: ArrayLike, identified_pose: ArrayLike) -> xr.Dataset:
+
+def build_model_run(
+    time: ArrayLike, initial_pose: ArrayLike, identified_pose: ArrayLike, std: ArrayLike | None = None
+) -> xr.Dataset:
     """Poses (N, 6) [m, rad] of both models at the frames ``time`` (N,) [s] of a run; NaN after a model has diverged.
 
+    std (N, 6): predicted deviations of the plant from the identified model, where they were predicted.
     Raises:
         RecordError: wrong shapes.
     """
@@ -37,8 +46,13 @@ def build_model_run(time: ArrayLike, initial_pose: ArrayLike, identified_pose: A
         "identified_position": identified[:, :3],
         "identified_orientation": identified[:, 3:],
     }
+    variables = VARIABLES
+    if std is not None:
+        predicted = pose_array(std, "std")
+        values |= {"std_position": predicted[:, :3], "std_orientation": predicted[:, 3:]}
+        variables = VARIABLES | PREDICTED
     finite = {name: np.where(np.isfinite(v), v, np.nan) for name, v in values.items()}
-    return described_dataset(finite, time, VARIABLES)
+    return described_dataset(finite, time, variables)
 
 
 def write_model_runs(path: Path | str, excitation: xr.Dataset, validation: Sequence[xr.Dataset] = ()) -> None:

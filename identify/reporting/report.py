@@ -11,8 +11,11 @@ import xarray as xr
 
 from identify.arrays import Array
 from identify.errors import RecordError
+from identify.estimation.correlation import correlation_matrix
+from identify.estimation.loop_parameters import NAMES
 from identify.experiment.truth import read_truth_runs, true_poses
 from identify.files.atomic import write_text
+from identify.files.covariance_file import read_covariance
 from identify.files.result_file import load_result
 from identify.files.run_folder import RunFolder
 from identify.files.trajectory_file import TrajectorySet, load_trajectories
@@ -29,14 +32,15 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 @dataclass(frozen=True)
 class ReportData:
-    """All that a report shows: the result, the records, the truth of the validation runs, the models' runs
-    and, where they are there, the trajectories."""
+    """All that a report shows: the result, the records, the truth of the validation runs, the models' runs, the
+    covariance (67, 67) of the parameters and, where they are there, the trajectories."""
 
     result: dict[str, Any]
     experiment: xr.Dataset
     validation: list[xr.Dataset]
     validation_truth: list[xr.Dataset]
     models: Mapping[str, xr.Dataset]
+    covariance: Array
     trajectories: TrajectorySet | None = None
 
 
@@ -58,7 +62,7 @@ def write_report(folder: Path | str, progress: Progress | None = None) -> Path:
         RecordError: a file of the run is damaged.
     """
     run = RunFolder(Path(folder))
-    run.require("result.json", "experiment.nc", "validation.nc", "model.nc")
+    run.require("result.json", "covariance.nc", "experiment.nc", "validation.nc", "model.nc")
     data = read_report_data(run)
     drawings = png_figures(data)
     with (progress or SilentProgress()).stage("report", len(drawings) + 1) as advance:
@@ -82,6 +86,7 @@ def read_report_data(run: RunFolder) -> ReportData:
         validation=read_runs(run.validation),
         validation_truth=read_truth_runs(run.validation),
         models=read_model_runs(run.model),
+        covariance=read_covariance(run.covariance, NAMES),
         trajectories=load_trajectories(run.trajectories) if run.trajectories.is_file() else None,
     )
     records = {EXCITATION: data.experiment}
@@ -115,9 +120,11 @@ def png_figures(data: ReportData) -> dict[str, Callable[[], Any]]:
             *_model_poses(data, first),
             title="First unseen trajectory: measurement, starting and identified model",
             truth=true_poses(data.validation_truth[0]),
+            std=_predicted_std(data, first),
         ),
         "validation_errors": lambda: figures.validation_figure(data.result["validation"]),
         "parameters": lambda: figures.parameter_figure(data.result["identification"]["parameters"]),
+        "correlation": lambda: figures.correlation_figure(*_correlations(data)),
     }
 
 
@@ -174,13 +181,14 @@ def identification_section(data: ReportData) -> Section:
         f"{count} of {len(parameters)} parameters identifiable, "
         f"{sum(bool(g['identifiable']) for g in groups.values())} of {len(groups)} groups."
     )
+    text += _conditioning_text(identification.get("conditioning"))
     warnings = identification.get("warnings", [])
     text += f" Warnings: {'; '.join(warnings)}." if warnings else ""
     return Section(
         "Parameters",
         text,
-        (tables.parameter_table(data.result), tables.group_table(data.result)),
-        (report_plots.parameter_plot(parameters),),
+        (tables.parameter_table(data.result), tables.group_table(data.result), tables.correlation_table(data.result)),
+        (report_plots.parameter_plot(parameters), report_plots.correlation_plot(*_correlations(data))),
     )
 
 
@@ -192,11 +200,12 @@ def validation_section(data: ReportData) -> Section:
         poses(record, "measured"),
         *_model_poses(data, run_name(1)),
         truth=true_poses(data.validation_truth[0]),
+        std=_predicted_std(data, run_name(1)),
     )
     return Section(
         "Validation on unseen trajectories",
         "The plots below the bars show the first unseen trajectory.",
-        (tables.validation_table(data.result),),
+        (tables.validation_table(data.result), tables.prediction_table(data.result)),
         (report_plots.validation_plot(data.result["validation"]), fit),
     )
 
@@ -230,6 +239,30 @@ def _model_poses(data: ReportData, name: str) -> tuple[Array | None, Array]:
     run = data.models[name]
     initial = poses(run, "initial")
     return (initial if np.isfinite(initial).any() else None), poses(run, "identified")
+
+
+def _predicted_std(data: ReportData, name: str) -> Array | None:
+    """Predicted deviations (N, 6) of an unseen run, where they were predicted."""
+    return poses(data.models[name], "std") if "std_position" in data.models[name] else None
+
+
+def _correlations(data: ReportData) -> tuple[Array, list[str]]:
+    """Correlations of the identified parameters, and their names."""
+    parameters = data.result["identification"]["parameters"]
+    chosen = [k for k, name in enumerate(NAMES) if parameters.get(name, {}).get("identifiable")]
+    return correlation_matrix(data.covariance[np.ix_(chosen, chosen)]), [NAMES[k] for k in chosen]
+
+
+def _conditioning_text(conditioning: dict[str, Any] | None) -> str:
+    if conditioning is None:
+        return ""
+    alone = conditioning["poses_alone"]
+    return (
+        f" Condition number of the information in units of the starting guess: {conditioning['with_guess']:.1e} with "
+        f"the guess; {'infinite' if alone is None else f'{alone:.1e}'} of the poses alone, asked for base parameters "
+        f"and gains with their common factor held, where the guess knows {conditioning['unshown']} of "
+        f"{conditioning['directions']} directions better than the poses show them."
+    )
 
 
 def _index_text(trajectories: TrajectorySet | None) -> str:

@@ -1,5 +1,6 @@
 """Interactive plots of the report, as HTML fragments that share one copy of plotly's JavaScript."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import plotly.graph_objects as go
@@ -8,7 +9,7 @@ from plotly.subplots import make_subplots
 
 from identify.arrays import Array
 from identify.files.result_file import rms_row
-from identify.reporting.figures import COMPONENTS, LETTERS
+from identify.reporting.figures import BAND, COMPONENTS, LETTERS
 from identify.reporting.goals import VALIDATION_UM, VALIDATION_URAD
 
 BLACK, GREEN, BLUE, RED = "black", "#2ca02c", "#1f77b4", "#d62728"
@@ -32,8 +33,18 @@ def trajectory_plot(time: Array, poses: Array) -> str:
     return _html(figure, 550)
 
 
-def fit_plot(time: Array, measured: Array, initial: Array | None, identified: Array, truth: Array | None = None) -> str:
-    """Six panels of poses and six of errors, like figures 12 and 13; poses (N, 6) [m, rad], NaN where there is none."""
+def fit_plot(
+    time: Array,
+    measured: Array,
+    initial: Array | None,
+    identified: Array,
+    truth: Array | None = None,
+    std: Array | None = None,
+) -> str:
+    """Six panels of poses and six of errors, like figures 12 and 13; poses (N, 6) [m, rad], NaN where there is none.
+
+    std (N, 6): predicted standard deviation of the true error, drawn as a band.
+    """
     titles = [f"{letter} {name}" for letter, name in zip(LETTERS, COMPONENTS, strict=True)]
     errors = [f"error of {name}" for name in COMPONENTS]
     figure = make_subplots(rows=4, cols=3, shared_xaxes=True, subplot_titles=titles + errors, vertical_spacing=0.05)
@@ -49,8 +60,10 @@ def fit_plot(time: Array, measured: Array, initial: Array | None, identified: Ar
         rest = [_dots(time, 1e6 * (measured - identified)[:, i], "measured − identified")]
         if truth is not None:
             rest.append(_line(time, 1e6 * (truth - identified)[:, i], "true − identified", RED))
+        if std is not None:
+            rest += _band(time, BAND * 1e6 * std[:, i])
         for trace in rest:
-            figure.add_trace(trace.update(showlegend=first), row=row + 2, col=column)
+            figure.add_trace(trace.update(showlegend=first and trace.showlegend is not False), row=row + 2, col=column)
         figure.update_yaxes(title_text="[mm]" if i < 3 else "[mrad]", row=row, col=column)
         figure.update_yaxes(title_text="[um]" if i < 3 else "[urad]", row=row + 2, col=column)
         figure.update_yaxes(range=_range(1e3 * measured[:, i]), row=row, col=column)
@@ -88,6 +101,27 @@ def parameter_plot(parameters: dict[str, dict[str, Any]]) -> str:
 
 def _line(time: Array, values: Array, name: str, colour: str) -> Any:
     return go.Scatter(x=time, y=values, name=name, mode="lines", line={"color": colour, "width": 1.3}, legendgroup=name)
+
+
+def _band(time: Array, half: Array) -> list[Any]:
+    """Lower and upper edge of the predicted band, the space between them filled."""
+    name = f"predicted ± {BAND:g} std"
+    edge = {"color": RED, "width": 0.3}
+    shared = {"x": time, "mode": "lines", "line": edge, "legendgroup": name, "hoverinfo": "skip"}
+    return [
+        go.Scatter(y=-half, showlegend=False, name=f"−{name}", **shared),
+        go.Scatter(y=half, name=name, fill="tonexty", fillcolor="rgba(214, 39, 40, 0.15)", **shared),
+    ]
+
+
+def correlation_plot(correlations: Array, names: Sequence[str]) -> str:
+    """Correlations (n, n) of estimates as a coloured matrix."""
+    labels = list(names)
+    shown = go.Heatmap(x=labels, y=labels, z=correlations, zmin=-1, zmax=1, colorscale="RdBu", reversescale=True,
+                       colorbar={"title": "correlation"})
+    figure = go.Figure(shown)
+    figure.update_yaxes(autorange="reversed")
+    return _html(figure, 200 + 20 * len(labels))
 
 
 def _dots(time: Array, values: Array, name: str) -> Any:

@@ -1,16 +1,22 @@
 """Entries of `result.json` from what the stages computed and recorded."""
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from identify.arrays import Array
+from identify.estimation.correlation import Pair, correlation_matrix, strongest_pairs
 from identify.estimation.identification import IdentificationResult
 from identify.estimation.loop_parameters import unit_of
+from identify.estimation.pose_prediction import PosePrediction
 from identify.experiment.truth import true_poses
 from identify.files.result_file import AXES, rms_figures
 from identify.record import recording
+
+STRONGEST = 10
+"""Correlations that a result lists."""
 
 
 def identification_entry(result: IdentificationResult) -> dict[str, Any]:
@@ -31,6 +37,13 @@ def identification_entry(result: IdentificationResult) -> dict[str, Any]:
             "p_value": result.whiteness.p_value,
             "p_values": dict(zip(AXES, result.whiteness.p_values, strict=True)),
         },
+        "conditioning": {
+            "with_guess": result.conditioning.with_guess,
+            "poses_alone": result.conditioning.poses_alone,
+            "directions": result.conditioning.directions,
+            "unshown": result.conditioning.unshown,
+        },
+        "strongest_correlations": [asdict(pair) for pair in _strongest(result)],
         "warnings": list(result.warnings),
         "base_rank": result.base_rank,
         "parameters": {
@@ -58,6 +71,13 @@ def identification_entry(result: IdentificationResult) -> dict[str, Any]:
             for index, name in enumerate(result.groups.names)
         },
     }
+
+
+def _strongest(result: IdentificationResult) -> list[Pair]:
+    """The strongest correlations among the parameters that are identified."""
+    chosen = np.flatnonzero(result.identifiable)
+    correlations = correlation_matrix(result.covariance[np.ix_(chosen, chosen)])
+    return strongest_pairs(correlations, [result.names[k] for k in chosen], STRONGEST)
 
 
 def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
@@ -99,4 +119,16 @@ def validation_entry(record: xr.Dataset, truth: xr.Dataset, initial: Array, iden
         "true": rms_figures(identified - true),
         "initial_measured": rms_figures(initial - measured, ok),
         "initial_true": rms_figures(initial - true),
+    }
+
+
+def prediction_entry(prediction: PosePrediction, truth: xr.Dataset) -> dict[str, Any]:
+    """How far the plant was expected from the identified model, RMS over the run, and the error found in its units."""
+    std = 1e6 * np.sqrt(np.mean(prediction.std**2, axis=0))
+    return {
+        "predicted": {
+            "position_std_um": std[:3].tolist(),
+            "orientation_std_urad": std[3:].tolist(),
+            "normalised_squared_error": prediction.normalised_squared_error(true_poses(truth)),
+        }
     }

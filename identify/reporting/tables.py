@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dynamics.parameters import unit_of
-from identify.files.result_file import AXES, rms_row
+from identify.files.result_file import AXES, predicted_row, rms_row
 from identify.reporting import paper_results
 from identify.reporting.goals import check_goals
 
@@ -108,6 +108,36 @@ def validation_table(result: dict[str, Any]) -> Table:
         ("run", *AXIS_HEADER),
         tuple(rows),
         "true: identified model against the true plant; measured: against what the sensor saw of it.",
+    )
+
+
+def prediction_table(result: dict[str, Any]) -> Table:
+    """Predicted deviation of the plant from the identified model beside the deviation found, on unseen trajectories."""
+    rows: list[tuple[str, ...]] = []
+    for number_, run in enumerate(result.get("validation", []), start=1):
+        ratio = run.get("predicted", {}).get("normalised_squared_error")
+        rows.append((f"{number_} predicted std", *map(number, predicted_row(run)), ""))
+        rows.append((f"{number_} found RMS", *_rms(rms_row(run["true"])), number(ratio)))
+    return Table(
+        "Identified model against the true plant: predicted and found",
+        ("run", *AXIS_HEADER, "normalised"),
+        tuple(rows),
+        "Predicted from the covariance of the parameters through the exact sensitivities, and from what the sensor's "
+        "noise does to the plant through the servo. Normalised: squared error in units of the predicted covariance; "
+        "one on average where the prediction is right. The runs share one set of parameters, so they stray together.",
+    )
+
+
+def correlation_table(result: dict[str, Any]) -> Table:
+    """The pairs of identified parameters that the record ties together most."""
+    pairs = result["identification"].get("strongest_correlations", [])
+    rows = tuple((f"{p['first']}, {p['second']}", f"{p['correlation']:+.4f}") for p in pairs)
+    return Table(
+        "Strongest correlations of identified parameters",
+        ("parameters", "correlation"),
+        rows,
+        "Poses show friction and gains relative to each other better than their common factor, which moves all of them "
+        "together: their ratios are known better than each of them.",
     )
 
 

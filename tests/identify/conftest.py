@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from dynamics.errors import DynamicsError
+from identify.estimation.loop_parameters import NAMES
 from identify.experiment.truth import build_truth
+from identify.files.covariance_file import write_covariance
 from identify.files.result_file import rms_figures, save_result
 from identify.files.run_folder import RunFolder
 from identify.record.recording import build_record, write, write_runs
@@ -93,6 +95,8 @@ def make_result():
     """A result with round numbers; every goal is met."""
     six = [1e-6, 2e-6, 3e-6, 10e-6, 15e-6, 20e-6]
     model_error = rms_figures(np.array([six, six]))
+    predicted = {"position_std_um": [1.5, 2.5, 3.5], "orientation_std_urad": [11.0, 16.0, 21.0],
+                 "normalised_squared_error": 0.9}
     parameters = {
         "platform.mass": parameter(24.0, 23.5, 23.5, 0.0),
         "link1.Ixx": parameter(5.23e-4, 6.3e-4, None, None, identifiable=False),
@@ -108,10 +112,16 @@ def make_result():
         "sensor": {"frames": 120, "lost_frames": 0, "stereo_frames_per_second": 20.0,
                    "position_rms_um": [5.0, 6.0, 7.0], "orientation_rms_urad": [30.0, 40.0, 50.0]},
         "identification": {"scale_anchor": "platform_mass", "iterations": 5, "stop_reason": "tolerance",
-                           "base_rank": 4, "parameters": parameters},
+                           "base_rank": 4, "parameters": parameters,
+                           "conditioning": {"with_guess": 1e9, "poses_alone": 2e11, "directions": 39, "unshown": 3},
+                           "strongest_correlations": [{"first": "joint1.coulomb", "second": "joint_pid.lp",
+                                                       "correlation": 0.98765}]},
         "before": {"position_rms_um": [None] * 3, "orientation_rms_urad": [None] * 3},
         "after": {"position_rms_um": [20.0, 21.0, 22.0], "orientation_rms_urad": [80.0, 81.0, 82.0]},
-        "validation": [{"true": model_error, "measured": rms_figures(10 * np.array([six]))} for _ in range(2)],
+        "validation": [
+            {"true": model_error, "measured": rms_figures(10 * np.array([six])), "predicted": predicted}
+            for _ in range(2)
+        ],
     }
 
 
@@ -133,8 +143,11 @@ def run_folder(tmp_path):
     write(run.experiment, record, truth)
     write_runs(run.validation, [(make_record(seed=1), truth), (make_record(seed=2), truth)])
     time = record["time"].values
-    models = [build_model_run(time, p, identified) for p in (initial, diverging, initial)]
+    std = np.full((len(time), 6), 2e-6)
+    models = [build_model_run(time, initial, identified)]
+    models += [build_model_run(time, p, identified, std) for p in (diverging, initial)]
     write_model_runs(run.model, models[0], models[1:])
+    write_covariance(run.covariance, NAMES, np.diag(np.linspace(1.0, 2.0, len(NAMES))) + 0.1)
     save_result(run.result, make_result())
     run.scenario.write_text(load_scenario("quick").to_toml(), encoding="utf-8")
     return run

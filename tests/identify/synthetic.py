@@ -24,16 +24,19 @@ def truth():
     return rss6().parameter_sets["identified"].vector
 
 
-def trajectory(seed):
-    return random_trajectory(np.random.default_rng(seed), rss6().home_pose, 0.1, 5, 0.010, 0.04)
+def trajectory(seed, size=1.0):
+    return random_trajectory(np.random.default_rng(seed), rss6().home_pose, 0.1, 5, 0.010 * size, 0.04 * size)
 
 
-def run_plant(scenario, seed, sigma=SIGMA, lost=(), parameters=None, duration_s=10.0, trajectory_seed=0):
-    """(record, run of the plant) with Gaussian noise of `sigma` (6,) and the frames `lost` not measured."""
+def run_plant(scenario, seed, sigma=SIGMA, lost=(), parameters=None, duration_s=10.0, trajectory_seed=0, size=1.0):
+    """(record, run of the plant) with Gaussian noise of `sigma` (6,) and the frames `lost` not measured.
+
+    size: of the motion, as a share of the usual box.
+    """
     rng = np.random.default_rng(seed)
     parameters = truth() if parameters is None else parameters
     times = frame_times(scenario, duration_s)
-    reference = reference_motion(trajectory(trajectory_seed), times)
+    reference = reference_motion(trajectory(trajectory_seed, size), times)
 
     def sensor(frame, t, pose):
         noise = sigma * rng.standard_normal(6)

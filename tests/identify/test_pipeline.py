@@ -14,8 +14,8 @@ from identify.reporting.goals import check_goals
 
 pytestmark = [pytest.mark.slow, pytest.mark.rendering]
 
-FILES = {"scenario.toml", "trajectories.json", "experiment.nc", "result.json", "validation.nc", "model.nc",
-         "report.html", "figures"}
+FILES = {"scenario.toml", "trajectories.json", "experiment.nc", "covariance.nc", "result.json", "validation.nc",
+         "model.nc", "report.html", "figures"}
 
 
 def cmmsim(*arguments, **environment):

@@ -14,7 +14,7 @@ from identify.reporting.model_runs import build_model_run, write_model_runs
 from identify.reporting.report import SECTIONS, read_report_data, render, write_report
 from identify.scenario import load_scenario
 
-FIGURES = {"excitation", "fit_excitation", "fit_validation", "validation_errors", "parameters"}
+FIGURES = {"excitation", "fit_excitation", "fit_validation", "validation_errors", "parameters", "correlation"}
 
 
 class Structure(HTMLParser):
@@ -49,7 +49,7 @@ def test_report_is_one_file_that_opens_offline_beside_its_figures(run_folder):
 
 
 def check_figures(folder):
-    """Five readable images with something on them."""
+    """Readable images with something on them."""
     paths = {p.stem: p for p in folder.iterdir()}
     assert set(paths) == FIGURES
     for path in paths.values():
@@ -61,7 +61,8 @@ def check_figures(folder):
 def test_report_shows_goals_parameters_and_the_papers_numbers(run_folder):
     text = render(read_report_data(run_folder))
     for shown in ("All 8 goals are met.", "joint1.coulomb", "not identifiable", "1260", "1411", "platform_mass",
-                  "timing.frame_rate_hz", "diverged", "stopped by: tolerance"):
+                  "timing.frame_rate_hz", "diverged", "stopped by: tolerance", "joint1.coulomb, joint_pid.lp",
+                  "+0.9877", "2.0e+11 of the poses alone", "1 predicted std"):
         assert shown in text, shown
 
 
@@ -100,9 +101,25 @@ def test_fit_figure_draws_what_it_is_given():
     figure = figures.fit_figure(time, identified + 3e-6, identified + 1e-3, identified, "t", truth=identified + 1e-6)
     panel = figure.axes[8]
     np.testing.assert_allclose([line.get_ydata()[0] for line in panel.lines], [3.0, 1.0])
+    assert not panel.collections, "no band where nothing was predicted"
     assert "997 um → 3 um" in panel.get_title()
     colours = [line.get_color() for line in figure.axes[2].lines]
     assert colours == ["black", "tab:green", "tab:blue"]
+
+
+def test_predicted_deviations_are_a_band_of_two_about_zero():
+    time, identified = np.arange(50) / 60, np.zeros((50, 6))
+    std = np.full((50, 6), 2e-6)
+    figure = figures.fit_figure(time, identified, None, identified, "t", truth=identified, std=std)
+    edges = figure.axes[8].collections[0].get_paths()[0].vertices[:, 1]
+    assert (edges.min(), edges.max()) == pytest.approx((-4.0, 4.0))
+
+
+def test_correlation_figure_names_every_parameter():
+    correlations = np.array([[1.0, -0.5], [-0.5, 1.0]])
+    axes = figures.correlation_figure(correlations, ["a", "b"]).axes[0]
+    assert [text.get_text() for text in axes.get_xticklabels()] == ["a", "b"]
+    np.testing.assert_array_equal(axes.images[0].get_array(), correlations)
 
 
 def test_figures_survive_lost_frames_and_a_model_that_diverged_at_once():
