@@ -16,6 +16,7 @@ from dynamics.joint_elasticity import JointElasticity
 from dynamics.loop_types import (
     PARAMETER_COUNT,
     ClosedLoopRun,
+    Controller,
     FrameTiming,
     FrictionLaw,
     LoopFailure,
@@ -33,6 +34,7 @@ from dynamics.robot import Robot
 
 __all__ = [
     "ClosedLoopRun",
+    "Controller",
     "FrameTiming",
     "FrictionLaw",
     "JointElasticity",
@@ -63,6 +65,7 @@ def simulate(
     lost: np.ndarray | None = None,
     latencies: np.ndarray | None = None,
     servo_robot: Robot | None = None,
+    controller: Controller | None = None,
     compiled: bool | None = None,
 ) -> ClosedLoopRun:
     """Run the closed loop for parameters (67,): the 64 dynamic ones, then lp, li, ld.
@@ -74,6 +77,8 @@ def simulate(
     steers nothing.
     latencies (frames,), s: of each frame's command, instead of the settings' for all; see `command_schedule`.
     servo_robot: the robot whose kinematics the servo knows, where that is another (no sensitivities then).
+    controller: takes the place of the servo: (frame, time s, measured pose (6,), desired pose (6,), desired rate (6,))
+    -> joint command (6,), rad, at every frame that is measured; the run takes the plain path.
     lost (frames,) bool: frames at which the ideal sensor measures nothing, so that a model loses what its plant lost.
     compiled: None takes the compiled path when a C compiler is at hand; False forces the plain path.
     Raises LoopFailure when the robot leaves the reachable set (an unstable loop); and before the run
@@ -99,6 +104,8 @@ def simulate(
             raise SimulationError("sensitivities need a servo that knows the robot: pass servo_robot=None")
     if settings.elasticity is not None and sensitivities:
         raise SimulationError("sensitivities are those of rigid joints: pass settings with elasticity=None")
+    if controller is not None:
+        compiled = _check_controller(controller, sensitivities, commands, compiled)
     reference.check_reach(robot)
     parameters = _check_loop_parameters(parameters)
     if start is None:
@@ -120,6 +127,7 @@ def simulate(
         lost,
         latencies,
         servo_robot or robot,
+        controller,
     )
     library = compiled_closed_loop.library(robot.geometry) if compiled in (None, True) else None
     if library is not None:
@@ -180,6 +188,20 @@ def _check_elasticity(robot: Robot, parameters: np.ndarray, settings: LoopSettin
             f"steps_per_frame is {settings.steps_per_frame}, must be >= {steps} to follow joints with "
             f"a stiffness of {elasticity.stiffness:g} N m/rad"
         )
+
+
+def _check_controller(
+    controller: object, sensitivities: bool, commands: np.ndarray | None, compiled: bool | None
+) -> bool:
+    """Raise SimulationError for what does not go with a controller; returns `compiled`: False."""
+    if not callable(controller):
+        raise SimulationError(f"controller must be a function, or None for the servo, got {shown(controller)}")
+    if sensitivities or commands is not None:
+        other = "sensitivities are those of the servo" if sensitivities else "commands take the place of any controller"
+        raise SimulationError(f"{other}: pass controller=None")
+    if compiled:
+        raise SimulationError("a controller runs on the plain path: pass compiled=None or False")
+    return False
 
 
 def _check_loop_parameters(parameters: np.ndarray) -> np.ndarray:

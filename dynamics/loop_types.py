@@ -28,6 +28,9 @@ Hold = Literal["zero", "linear"]
 # (frame index, time s, true pose (6,)) -> measured pose (6,), or None when the measurement is lost.
 PoseSensor = Callable[[int, float, np.ndarray], np.ndarray | None]
 
+# (frame index, time s, measured pose (6,), desired pose (6,), desired pose rate (6,)) -> joint command (6,), rad.
+Controller = Callable[[int, float, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
 
 @dataclass(frozen=True)
 class RateSensor:
@@ -170,6 +173,7 @@ class LoopProblem:
     lost: np.ndarray | None
     latencies: np.ndarray | None
     servo_robot: Robot
+    controller: Controller | None = None
 
     @property
     def frames(self) -> int:
@@ -268,6 +272,15 @@ def measurement(
     if measured is None:
         return None
     return floats(f"what the pose sensor returned at frame {frame}", measured, (6,), error=SimulationError)
+
+
+def own_command(controller: Controller, problem: LoopProblem, frame: int, measured: np.ndarray) -> np.ndarray:
+    """What a controller answers to a good measurement (6,), as (6,) floats. Raises SimulationError otherwise."""
+    reference = problem.reference
+    command = controller(
+        frame, frame * problem.period, measured.copy(), reference.poses[frame], reference.rates[frame]
+    )
+    return np.array(floats(f"what the controller returned at frame {frame}", command, (6,), error=SimulationError))
 
 
 def checked_latencies(latencies: object, frames: int, timing: FrameTiming) -> np.ndarray:

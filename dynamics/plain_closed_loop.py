@@ -22,6 +22,7 @@ from dynamics.loop_types import (
     empty_run,
     failure,
     measurement,
+    own_command,
 )
 from dynamics.robot import Robot
 from dynamics.stick_slip import Command, MotionStopped, State, StickSlipMotion
@@ -67,6 +68,8 @@ def run(robot: Robot, problem: LoopProblem) -> ClosedLoopRun:
             issued.append((problem.commands[frame], rest))
         elif measured is None:
             issued.append(issued[-1])
+        elif problem.controller is not None:
+            issued.append((own_command(problem.controller, problem, frame, measured), rest))
         else:
             issued.append(_servo_command(servo, frame, reference, measured, d_pose))
         result.command[frame] = issued[-1][0]
