@@ -1,7 +1,7 @@
 """Rows of kind `path_pose`: the sensor alone follows a platform along a random path of the scenario's excitation.
 
-Exposure, latency, its jitter and dropout act as the scenario says. A row is a stretch of a few frames from a random
-instant of the path. The first picture is searched as a whole, the others are tracked. Beside the error of what was
+Exposure, latency, its jitter and dropout act as the scenario says. A row is a short stretch from a random instant of
+the path. The first picture is searched as a whole, the others are tracked. Beside the error of what was
 measured it gives that of the pose in use: the last one that had arrived, held until the next one arrives.
 """
 
@@ -39,7 +39,7 @@ COLUMNS = {
 class PathPoseOptions(RowOptions):
     """How much a row looks at."""
 
-    frames: int = Field(30, ge=4, le=1_000_000, description="frames in a row")
+    stretch_s: float = Field(0.5, gt=0, le=3600, description="time along the path, at least two frames")
     teaching: Teaching = Field("exact", description="exact, or by the sensor itself, seeded by the row")
 
 
@@ -51,18 +51,19 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
     path = random_trajectory(rng, eye.sensor.home, excitation.fundamental_hz, excitation.harmonics,
                              excitation.position_amplitude_m, excitation.orientation_amplitude_rad)
     start = rng.uniform(0.0, 1.0 / excitation.fundamental_hz)
-    times: Array = start + scenario.timing.frame_period_s * np.arange(options.frames, dtype=float)
+    frames = max(2, scenario.timing.frames(options.stretch_s))
+    times: Array = start + scenario.timing.frame_period_s * np.arange(frames, dtype=float)
     poses, covariances = _measured(eye, path, times)
     ok = np.isfinite(poses[:, 0])
     if ok.sum() < 2:
-        raise EstimationError(f"{ok.sum()} of {options.frames} frames along the path gave a pose, 2 are needed")
+        raise EstimationError(f"{ok.sum()} of {frames} frames along the path gave a pose, 2 are needed")
     errors = (poses - path.pose(times))[ok]
     latencies = frame_latencies(scenario, len(times), np.random.default_rng(stream_seed(seed, LATENCY)))
     arrivals: Array = times + (scenario.timing.latency_s if latencies is None else latencies)
     used = _used_errors(path, poses[ok], arrivals[ok], scenario.timing.frame_period_s)
     stated = stated_um(covariances[ok])
     return {
-        "frames": options.frames,
+        "frames": frames,
         "lost_frames": int(np.sum(~ok)),
         "speed_rms_mm_s": 1e-3 * rms_um(path.pose_rate(times)[:, :3]),
         "position_rms_um": rms_um(errors[:, :3]),

@@ -29,12 +29,12 @@ teaches itself from images, seeded by the row (1.4 s a row)."""
 
 @dataclass(frozen=True)
 class RowSensor:
-    """A sensor and what it cannot know: truth, a teaching without error; view (3,), the unit vector in base axes from
-    the middle of the baseline to the cameras' target; rim: radiance half-way between a sticker and its ring."""
+    """A sensor and what it cannot know: truth, a teaching without error; middle (3,), that of the baseline in the base
+    frame, m; rim: radiance half-way between a sticker and its ring."""
 
     sensor: cmmsim.Sensor
     truth: cmmsim.Taught
-    view: Array
+    middle: Array
     rim: float
 
 
@@ -68,7 +68,6 @@ def _exact_sensor(file_json: str, method: str, renderer: str) -> RowSensor:
 
 
 def _built(file: SensorFile, method: str, renderer: str, taught: cmmsim.Taught | None, seed: int) -> RowSensor:
-    view = np.subtract(file.rig.target, file.rig.position)
     sensor = cmmsim.Sensor(file, seed, method, taught, renderer=renderer)
     rim = 0.5 * (file.stickers.sticker_level + file.stickers.ring_level) / 255.0
-    return RowSensor(sensor, taught or exactly_taught(file), view / np.linalg.norm(view), rim)
+    return RowSensor(sensor, taught or exactly_taught(file), np.array(file.rig.position), rim)

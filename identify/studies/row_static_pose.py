@@ -34,8 +34,9 @@ COLUMNS = {
     "stated_orientation_rms_urad": Column("urad", "the same, as the sensor's own covariance states it"),
     "mean_position_rms_um": Column("um", "error of the position averaged over the pictures of a pose"),
     "mean_orientation_rms_urad": Column("urad", "error of the orientation averaged over the pictures of a pose"),
-    "point_depth_rms_um": Column("um", "error of single stickers along the view from rig to platform"),
-    "point_lateral_rms_um": Column("um", "error of single stickers across that view, rms over both axes"),
+    "sight_m": Column("m", "distance of the stickers from the middle of the baseline, mean"),
+    "point_depth_rms_um": Column("um", "error of single stickers along the line from there to the sticker"),
+    "point_lateral_rms_um": Column("um", "error of single stickers across that line, rms over both axes"),
     "centre_rms_px": Column("px", "error of sticker centres in the images, rms over stickers, cameras and axes"),
 }
 
@@ -63,7 +64,8 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPos
 
 
 class _Look:
-    """What all pictures of one pose gave: errors (n, 6), covariances (n, 6, 6), those of points and of centres."""
+    """What the pictures of one pose gave: errors and covariances of the pose (n, 6), (n, 6, 6), and what
+    `_sticker_errors` says of all stickers in them."""
 
     def __init__(self, eye: RowSensor, pose: Array, captures: int, rng: np.random.Generator) -> None:
         estimator = eye.sensor.estimator
@@ -92,13 +94,19 @@ class _Look:
 def _sticker_errors(
     eye: RowSensor, estimator: PoseEstimator, seen: cmmsim.Measurement, pose: Array
 ) -> tuple[Array, Array]:
-    """Errors of the stickers seen: of their points (k, 3) in base axes, m, and of their centres (2 k, 2), px."""
+    """Of the stickers seen: [distance, error along the line of sight, error across it] (k, 3), m, and the errors of
+    their centres (2 k, 2), px."""
     index = np.flatnonzero(np.isin(estimator.platform.sticker_ids, seen.target_ids))
-    places = invert(eye.truth.base_from_camera) @ cmmsim.pose_to_transform(pose)
-    true = apply(places, eye.truth.platform_places[index])
-    pixels, _ = estimator.rig.project(true)
-    errors = np.concatenate([seen.left_pixels - pixels[0], seen.right_pixels - pixels[1]])
-    return (seen.points - true) @ eye.truth.base_from_camera[:3, :3].T, errors
+    places = apply(cmmsim.pose_to_transform(pose), eye.truth.platform_places[index])
+    in_camera = apply(invert(eye.truth.base_from_camera), places)
+    pixels, _ = estimator.rig.project(in_camera)
+    sight = places - eye.middle
+    distance = np.linalg.norm(sight, axis=1)
+    errors = (seen.points - in_camera) @ eye.truth.base_from_camera[:3, :3].T
+    along = np.einsum("ki,ki->k", errors, sight) / distance
+    across = np.sqrt(np.maximum(np.einsum("ki,ki->k", errors, errors) - along**2, 0.0))
+    return (np.column_stack([distance, along, across]),
+            np.concatenate([seen.left_pixels - pixels[0], seen.right_pixels - pixels[1]]))
 
 
 def _row(eye: RowSensor, looks: list[_Look], captures: int) -> Row:
@@ -107,7 +115,6 @@ def _row(eye: RowSensor, looks: list[_Look], captures: int) -> Row:
         raise EstimationError(f"no pose was found in any of {captures * len(looks)} pictures: {looks[-1].reasons[-1]}")
     means = np.array([look.errors.mean(axis=0) for look in looks if len(look.errors)])
     points = np.concatenate([look.points for look in looks])
-    depth = points @ eye.view
     stated = stated_um(np.concatenate([look.covariances for look in looks]))
     noise = eye.sensor.noise
     rim_grey: Array = np.asarray(noise.mean_grey(np.array(eye.rim)), dtype=float)
@@ -122,8 +129,9 @@ def _row(eye: RowSensor, looks: list[_Look], captures: int) -> Row:
         "stated_orientation_rms_urad": stated[1],
         "mean_position_rms_um": rms_um(means[:, :3]),
         "mean_orientation_rms_urad": rms_um(means[:, 3:]),
-        "point_depth_rms_um": rms_um(depth),
-        "point_lateral_rms_um": rms_um(points - depth[:, None] * eye.view) * float(np.sqrt(1.5)),
+        "sight_m": float(points[:, 0].mean()),
+        "point_depth_rms_um": rms_um(points[:, 1]),
+        "point_lateral_rms_um": rms_um(points[:, 2]) / float(np.sqrt(2.0)),
         "centre_rms_px": float(np.sqrt(np.mean(np.concatenate([look.centres for look in looks]) ** 2))),
     }
 

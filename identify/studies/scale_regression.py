@@ -16,6 +16,8 @@ from identify.errors import StudyError
 
 ITERATIONS = 100
 SETTLED = 1e-10
+SMALLEST = 1e-12
+"""Share of the largest square below which a square counts as that share at the start of the fit."""
 
 
 @dataclass(frozen=True)
@@ -42,15 +44,14 @@ def scale_regression(squares: Array, design: Array) -> ScaleRegression:
         raise StudyError(f"{rows} rows do not determine {columns} coefficients with an interval")
     if np.linalg.matrix_rank(design) < columns:
         raise StudyError("the factors do not vary, or not independently of each other")
-    scale = float(squares.mean())
-    if not scale > 0.0:
+    if not squares.max() > 0.0:
         raise StudyError("the figure is zero in every row")
-    beta = np.linalg.lstsq(design, np.full(rows, np.log(scale)), rcond=None)[0]
+    beta = np.linalg.lstsq(design, np.log(np.maximum(squares, SMALLEST * squares.max())), rcond=None)[0]
     for _ in range(ITERATIONS):
         ratio = squares / np.exp(design @ beta)
         step = np.linalg.lstsq(design, ratio - 1.0, rcond=None)[0]
-        beta = beta + np.clip(step, -1.0, 1.0)
-        if np.abs(step).max() < SETTLED:
+        beta = beta + step * min(1.0, 1.0 / float(np.abs(design @ step).max()))
+        if np.abs(design @ step).max() < SETTLED:
             break
     else:
         raise StudyError(f"the fit of the scale has not settled after {ITERATIONS} steps")
