@@ -17,6 +17,7 @@ from identify.commands.detectors import detectors
 from identify.commands.engines import export, verify_model
 from identify.commands.estimators import estimators
 from identify.commands.study import STUDY_HELP, study
+from identify.commands.variation import variation
 from identify.commands.workspace import workspace
 from identify.errors import IdentifyError, ScenarioError
 from identify.files.run_folder import RunFolder, new_run_folder
@@ -76,6 +77,10 @@ What its motion can show:
 \b
 Other estimators on the same record:
   cmmsim estimators --out mine           a table beside measured torques and encoders: estimators.json
+
+\b
+Other records of the same robot:
+  cmmsim variation --out mine            how estimates vary from run to run (table 5): variation.md
 
 \b
 Many rows over a grid of settings, on all cores or many machines:
@@ -227,6 +232,7 @@ app.command(help=CALIBRATE_HELP)(calibrate)
 app.command()(acceptance)
 app.command()(base_parameters)
 app.command()(estimators)
+app.command()(variation)
 app.command(help=STUDY_HELP)(study)
 
 

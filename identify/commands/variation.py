@@ -1,0 +1,97 @@
+"""The command ``cmmsim variation``. Heavy imports are late."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table as RichTable
+
+from identify.files.run_folder import RunFolder
+from identify.progress import Progress, RichProgress, SilentProgress
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from dynamics import Robot
+    from identify.reporting.tables import Table
+    from identify.scenario import Scenario
+
+
+def variation(
+    out: Annotated[Path, typer.Option("--out", help="Folder of a whole run: cmmsim run.")],
+    designed: Annotated[
+        int | None,
+        typer.Option(
+            "--designed",
+            min=3,
+            metavar="COUNT",
+            help="Record this many new runs, each on an exciting trajectory designed for it by the scenario's method, "
+            "instead of taking the unseen runs.",
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, help="Processes that render.", show_default="one a core")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no table.")] = False,
+) -> None:
+    """Identify from each of several runs alone, and see how the estimates vary (the paper's table 5).
+
+    As in the paper, from the unseen runs of validation.nc; or from newly recorded ones, which are kept as variation.nc.
+    Writes variation.json, variation.md and figures/variation.png.
+    """
+    from dynamics import load_robot
+    from identify.files.atomic import write_text
+    from identify.files.result_file import save_result
+    from identify.record import recording
+    from identify.reporting.figures import save_figure
+    from identify.reporting.variation_tables import variation_entry, variation_figure, variation_table
+    from identify.scenario import load_scenario
+    from identify.variation import identify_each
+    from identify.variation import variation as variation_of
+
+    folder = RunFolder(out)
+    folder.require("scenario.toml", *(["trajectories.json"] if designed else ["validation.nc"]))
+    progress: Progress = SilentProgress() if quiet else RichProgress()
+    scenario = load_scenario(folder.scenario)
+    robot = load_robot(scenario.robot)
+    records = (
+        _record_designed(folder, scenario, robot, designed, workers, progress)
+        if designed
+        else recording.read_runs(folder.validation)
+    )
+    found = variation_of(identify_each(records, robot, scenario, progress))
+    method = scenario.excitation.method
+    entry = variation_entry(found, f"designed: {method}" if designed else "unseen")
+    table = variation_table(found)
+    save_result(out / "variation.json", entry)
+    write_text(out / "variation.md", f"# {table.title}\n\n{table.markdown()}\n\n{table.note}\n")
+    save_figure(variation_figure(found), folder.figures / "variation.png")
+    if not quiet:
+        _print(table, *found.worst, out)
+
+
+def _record_designed(
+    folder: RunFolder, scenario: "Scenario", robot: "Robot", count: int, workers: int | None, progress: Progress
+) -> list["xr.Dataset"]:
+    from identify.files.trajectory_file import load_trajectories
+    from identify.record import recording
+    from identify.variation import designed_runs
+
+    seed = load_trajectories(folder.trajectories).seed
+    runs = designed_runs(scenario, robot, seed, count, workers or os.cpu_count() or 1, progress)
+    recording.write_runs(folder.path / "variation.nc", [(run.record, run.truth) for run in runs])
+    return [run.record for run in runs]
+
+
+def _print(table: "Table", name: str, worst: float, out: Path) -> None:
+    shown = RichTable(title=table.title, caption=table.note, box=SIMPLE_HEAD, show_edge=False, padding=0)
+    for place, title in enumerate(table.header):
+        shown.add_column(title, justify="right" if place > 1 else "left", no_wrap=not place)
+    for row in table.rows:
+        shown.add_row(*row)
+    console = Console()
+    console.print(shown)
+    console.print(f"largest: {100 * worst:.3g} % of {name}; files: {out}", highlight=False, soft_wrap=True)

@@ -1,0 +1,108 @@
+"""Variation of the estimates beside the paper's table 5: a table, a figure, and the entry of `variation.json`."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from dynamics.parameters import unit_of
+from identify.reporting.tables import Table, number
+from identify.variation import Variation
+
+GOAL_PERCENT = 5.0
+"""What every identified parameter should keep to."""
+
+PAPER_WORST_PERCENT = 24.9
+
+PAPER_PERCENT = {
+    "platform.mass": 0.48,
+    "platform.Ixx": 5.0,
+    "platform.Iyy": 24.9,
+    "platform.Izz": 8.6,
+    "link4.mass": 19.1,
+    "link5.mass": 10.1,
+    "link6.mass": 12.9,
+    "joint1.coulomb": 15.9,
+    "joint1.viscous": 11.7,
+    "joint2.coulomb": 21.4,
+    "joint2.viscous": 13.9,
+    "joint3.coulomb": 9.0,
+    "joint3.viscous": 16.4,
+    "joint4.coulomb": 17.8,
+    "joint4.viscous": 15.2,
+    "joint5.coulomb": 15.1,
+    "joint5.viscous": 21.8,
+    "joint6.coulomb": 23.4,
+    "joint6.viscous": 13.0,
+    "joint_pid.lp": 2.82,
+    "joint_pid.li": 0.44,
+    "joint_pid.ld": 3.7,
+}
+"""Table 5, as far as its rows can be told apart (in our copy a cell is missing in its left column) and as far as these
+parameters can be identified at all."""
+
+
+def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:
+    """Entry of `variation.json`: `trajectories` says which runs it is of."""
+    name, worst = found.worst
+    return {
+        "trajectories": trajectories,
+        "runs": found.runs,
+        "worst": {"parameter": name, "variation_percent": 100 * worst},
+        "goal_percent": GOAL_PERCENT,
+        "paper_worst_percent": PAPER_WORST_PERCENT,
+        "parameters": {
+            parameter: {
+                "unit": unit_of(parameter),
+                "mean": found.mean[k],
+                "variation_percent": 100 * found.variation[k],
+                "expected_percent": 100 * found.expected[k],
+                "identified_in_every_run": bool(found.identified[k]),
+                "paper_percent": PAPER_PERCENT.get(parameter),
+            }
+            for k, parameter in enumerate(found.names)
+        },
+    }
+
+
+def variation_table(found: Variation) -> Table:
+    """The parameters that every run identifies: mean, variation, what the intervals let expect, and the paper's."""
+    rows = tuple(
+        (
+            found.names[k],
+            unit_of(found.names[k]),
+            number(found.mean[k]),
+            number(100 * found.variation[k]),
+            number(100 * found.expected[k]),
+            number(PAPER_PERCENT.get(found.names[k])),
+        )
+        for k in np.flatnonzero(found.identified)
+    )
+    return Table(
+        f"Variation of {found.runs} identifications (like the paper's table 5)",
+        ("parameter", "unit", "mean", "variation [%]", "expected [%]", "paper [%]"),
+        rows,
+        "Variation: standard deviation over mean. Expected: from the standard deviations that the runs state. "
+        "Parameters that are identified in every run; the platform is weighed once for all.",
+    )
+
+
+def variation_figure(found: Variation) -> Figure:
+    """Variation of each identified parameter, with what was expected, the paper's, and both limits."""
+    shown = np.flatnonzero(found.identified)
+    figure = Figure(figsize=(9, 2.0 + 0.28 * len(shown)), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes, places = figure.subplots(), np.arange(len(shown))
+    axes.barh(places, 100 * found.variation[shown], color="tab:blue", label="variation")
+    axes.plot(100 * found.expected[shown], places, "kd", markersize=5, markerfacecolor="none", label="expected")
+    paper = [PAPER_PERCENT.get(found.names[k], np.nan) for k in shown]
+    axes.plot(paper, places, "x", color="tab:red", label="paper, its robot")
+    axes.axvline(GOAL_PERCENT, color="black", linestyle="--", linewidth=1, label=f"goal {GOAL_PERCENT:g} %")
+    axes.set_yticks(places, [found.names[k] for k in shown], fontsize="small")
+    axes.invert_yaxis()
+    axes.set_xscale("log")
+    axes.set_xlabel(f"variation of {found.runs} identifications [%]")
+    axes.grid(alpha=0.3, axis="x")
+    axes.legend(fontsize="small")
+    return figure

@@ -1,0 +1,112 @@
+"""Variation of the estimates from one trajectory to the next (the paper's table 5).
+
+The robot is identified from each of several runs alone. The paper gives its "variation measure" no formula; here it is
+the standard deviation of a parameter's estimates in per cent of their mean. Judged are the parameters that every run
+identifies. Beside it stands what each run's own interval makes one expect. All runs share one weighing of the platform
+and one teaching of the sensor, as in the paper: what is wrong with these does not vary.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from dynamics import Robot
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.estimation.identification import IdentificationResult, identify
+from identify.excitation import design_trajectories
+from identify.experiment.run import Experiment, stream_seed, taught_sensor
+from identify.progress import Progress, SilentProgress
+from identify.scenario import Scenario
+from identify.trajectory import FourierTrajectory
+from identify.validation import run_unseen
+
+FEWEST_RUNS = 3
+"""Of fewer runs a standard deviation says nothing."""
+
+DESIGN_STREAM = 7
+"""Random stream of the designed runs, beside those of the experiment."""
+
+
+@dataclass(frozen=True)
+class Variation:
+    """Of each parameter (p,), SI: mean of the estimates, their standard deviation relative to it, the same as expected
+    from the runs' own intervals, and whether every run identifies it; runs: their number."""
+
+    names: tuple[str, ...]
+    mean: Array
+    variation: Array
+    expected: Array
+    identified: NDArray[np.bool_]
+    runs: int
+
+    @property
+    def worst(self) -> tuple[str, float]:
+        """The identified parameter that varies most, and its variation.
+
+        Raises EstimationError where no parameter is identified in every run.
+        """
+        if not self.identified.any():
+            raise EstimationError(f"no parameter is identified in each of the {self.runs} runs: nothing to compare")
+        index = int(np.argmax(np.where(self.identified, self.variation, -np.inf)))
+        return self.names[index], float(self.variation[index])
+
+
+def variation(results: Sequence[IdentificationResult]) -> Variation:
+    """Variation of the estimates of several identifications of one robot.
+
+    Raises EstimationError with fewer than three.
+    """
+    check_count(len(results))
+    estimates, stds = np.array([r.estimate for r in results]), np.array([r.std for r in results])
+    mean = estimates.mean(axis=0)
+    size = np.where(mean == 0, np.nan, np.abs(mean))
+    return Variation(
+        names=results[0].names,
+        mean=mean,
+        variation=estimates.std(axis=0, ddof=1) / size,
+        expected=np.sqrt(np.mean(stds**2, axis=0)) / size,
+        identified=np.all([r.identifiable for r in results], axis=0),
+        runs=len(results),
+    )
+
+
+def check_count(runs: int) -> None:
+    """Raise EstimationError where so few runs show no variation."""
+    if runs < FEWEST_RUNS:
+        raise EstimationError(f"{runs} runs show no variation, at least {FEWEST_RUNS} are needed")
+
+
+def identify_each(
+    records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario, progress: Progress
+) -> list[IdentificationResult]:
+    """Identify from each record alone. Raises as `identify` does, and EstimationError with too few records."""
+    check_count(len(records))
+    results = []
+    with progress.stage("identify each run", len(records)) as advance:
+        for record in records:
+            results.append(identify(record, robot, scenario))
+            advance()
+    return results
+
+
+def designed_runs(
+    scenario: Scenario, robot: Robot, seed: int, count: int, workers: int, progress: Progress
+) -> list[Experiment]:
+    """Run the plant with images in the loop on `count` exciting trajectories, each designed from its own random ones.
+
+    As long as the exciting run, by the scenario's method. Raises as the stages `excite` and `record` do.
+    """
+    trajectories: list[FourierTrajectory] = []
+    own = stream_seed(seed, DESIGN_STREAM)
+    with progress.stage("design the runs", count) as advance:
+        for number in range(count):
+            designed = design_trajectories(robot, scenario, stream_seed(own, number), SilentProgress())
+            trajectories.append(designed.excitation)
+            advance()
+    lasting = scenario.with_overrides({"validation.duration_s": scenario.excitation.duration_s})
+    taught = taught_sensor(lasting, robot, own, progress).taught
+    return run_unseen(lasting, tuple(trajectories), own, taught, workers, progress)
