@@ -14,7 +14,9 @@ from identify.arrays import Array
 from identify.estimation import identification
 from identify.estimation.loop_parameters import NAMES, check_parameter_set
 from identify.excitation import design_trajectories
+from identify.experiment.plant import check_plant, plant_robot
 from identify.experiment.run import excitation_run, taught_sensor, teach, untaught_sensor
+from identify.experiment.run import true_parameters as plant_parameters
 from identify.experiment.truth import read_truth, true_parameters
 from identify.files.atomic import write_text
 from identify.files.covariance_file import read_covariance, write_covariance
@@ -174,11 +176,13 @@ def _designed(scenario: Scenario, seed: int, progress: Progress) -> TrajectorySe
     robot = load_robot(scenario.robot)
     for name in (scenario.plant.parameters, scenario.model.start_parameters):
         check_parameter_set(robot, name)
-    with progress.stage("compile the robot", 2) as advance:
-        _ = robot.functions
-        advance()
-        prepare(robot)
-        advance()
+    with progress.stage("compile the robot", 4) as advance:
+        for one in (robot, plant_robot(scenario, robot)):
+            _ = one.functions
+            advance()
+            prepare(one)
+            advance()
+    check_plant(scenario, robot, plant_parameters(robot, scenario))
     trajectories = design_trajectories(robot, scenario, seed, progress)
     _check_singularities(robot, scenario, trajectories)
     return trajectories

@@ -4,11 +4,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dynamics import Robot
-from dynamics.closed_loop import simulate
 from identify.arrays import Array
 from identify.excitation.design import design_trajectories
+from identify.experiment.plant import simulate_plant
 from identify.experiment.run import true_parameters
-from identify.record.loop_setup import frame_times, plant_settings, reference_motion
+from identify.record.loop_setup import frame_times, reference_motion
 from identify.scenario import Scenario
 from identify.validation import model_run
 
@@ -23,6 +23,6 @@ def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed:
     values, true = np.asarray(parameters, dtype=float), true_parameters(robot, scenario)
     times = frame_times(scenario, scenario.validation.duration_s)
     references = [reference_motion(path, times) for path in design_trajectories(robot, scenario, seed).validation]
-    plant = [simulate(robot, true, reference, plant_settings(scenario)).pose for reference in references]
+    plant = [simulate_plant(scenario, robot, true, reference).pose for reference in references]
     model = [model_run(robot, scenario, values, reference) for reference in references]
     return np.array(model) - np.array(plant)

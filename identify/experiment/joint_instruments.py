@@ -61,7 +61,8 @@ def measure_joints(
 
     latencies (N,): of each frame's command, s, where they differ from the timing's.
     """
-    angle, command = truth["joint_angle"].values, record["command"].values
+    at_encoder = "motor_angle" if "motor_angle" in truth else "joint_angle"
+    angle, command = truth[at_encoder].values, record["command"].values
     known = true_parameters(truth)
     gains = np.array([known[f"joint_pid.{name}"] for name in ("lp", "ld")])
     each = np.full(len(command), timing.latency_s) if latencies is None else latencies

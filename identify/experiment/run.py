@@ -14,15 +14,16 @@ import xarray as xr
 
 import cmmsim
 from dynamics import Robot, load_robot
-from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference, simulate
+from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
 from identify.estimation.loop_parameters import NAMES, starting_guess
 from identify.estimation.scale_anchor import measured_anchor, store_anchor
 from identify.excitation import design_trajectories
+from identify.experiment.plant import mismatch, plant_robot, simulate_plant
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, frame_latencies, make_sensor
 from identify.experiment.truth import build_truth
 from identify.progress import Advance, Progress, SilentProgress
 from identify.record import recording
-from identify.record.loop_setup import frame_times, plant_settings, reference_motion
+from identify.record.loop_setup import frame_times, reference_motion
 from identify.record.payload import payload_vector, store_payload
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory, check_travel
@@ -126,25 +127,24 @@ def run_plant(
     advance: Advance = lambda n=1: None,
     load: np.ndarray | None = None,
 ) -> Experiment:
-    """Run the plant along a trajectory at the frames `times` (N,) [s]; `run`: number of the run (0: excitation);
-    `load` (67,): what a known load on the platform adds to its parameters.
+    """Run the plant of the nominal `robot` along a trajectory at the frames `times` (N,) [s]; `run`: number of the run
+    (0: excitation); `load` (67,): what a known load on the platform adds to its parameters.
 
     Raises TrajectoryError before the run when the trajectory leaves the travel, LoopFailure when the loop is unstable.
     """
     check_travel(robot, trajectory, times)
     reference = reference_motion(trajectory, times)
     parameters = true_parameters(robot, scenario)
-    eye = SensorInLoop(sensor, robot, stream_seed(seed, NOISE, run), advance)
+    eye = SensorInLoop(sensor, plant_robot(scenario, robot), stream_seed(seed, NOISE, run), advance)
     loaded = parameters if load is None else parameters + load
     latencies = frame_latencies(scenario, len(times), np.random.default_rng(stream_seed(seed, LATENCY, run)))
-    sensor_in_loop = RateSensor(eye.measure)
-    done = simulate(robot, loaded, reference, plant_settings(scenario), sensor_in_loop, latencies=latencies)
+    done = simulate_plant(scenario, robot, loaded, reference, RateSensor(eye.measure), latencies)
     record = _record(scenario, robot, reference, done, eye, seed)
     settings, rng = scenario.identification, np.random.default_rng(stream_seed(seed, ANCHOR))
     store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, parameters, rng))
     if load is not None:
         store_payload(record, load)
-    return Experiment(record, _truth(robot, done, parameters))
+    return Experiment(record, _truth(scenario, robot, done, parameters))
 
 
 def true_parameters(robot: Robot, scenario: Scenario) -> np.ndarray:
@@ -176,17 +176,21 @@ def _record(
     return record.assign_attrs(sensor_seconds=eye.seconds, lost_frames="; ".join(eye.lost[:20]))
 
 
-def _truth(robot: Robot, run: ClosedLoopRun, parameters: np.ndarray) -> xr.Dataset:
-    jacobian = robot.pose_jacobian(run.pose)
-    return build_truth(
+def _truth(scenario: Scenario, robot: Robot, run: ClosedLoopRun, parameters: np.ndarray) -> xr.Dataset:
+    plant = plant_robot(scenario, robot)
+    jacobian = plant.pose_jacobian(run.pose)
+    truth = build_truth(
         time=run.time,
         pose=run.pose,
-        joint_angle=robot.inverse_kinematics(run.pose),
+        joint_angle=plant.inverse_kinematics(run.pose),
         joint_velocity=np.einsum("nij,nj->ni", jacobian, run.pose_rate),
         joint_torque=run.torque,
         parameter_names=list(NAMES),
         parameters=parameters,
+        mismatch=mismatch(scenario, robot, run),
     )
+    settings = scenario.plant.model_dump(exclude_none=True)
+    return truth.assign_attrs({f"plant_{name}": value for name, value in settings.items()})
 
 
 def _default_path(scenario: Scenario, seed: int, payload: bool) -> Path:

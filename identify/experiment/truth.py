@@ -1,5 +1,6 @@
 """The truth of a simulated run, in its own netCDF group; only validation and reports open it."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,13 @@ VARIABLES: Variables = {
     "parameter_value": (("parameter",), "SI", "true parameter of the plant and its joint controller"),
 }
 
+MISMATCH: Variables = {
+    "base_joint_error": (("joint", "axis"), "m", "true joint centre B on the base less the nominal one"),
+    "platform_joint_error": (("joint", "axis"), "m", "true joint centre A on the platform less the nominal one"),
+    "motor_angle": (("time", "joint"), "rad", "angle of the motor of an elastic joint, which its encoder reads"),
+}
+"""What is recorded of a plant only where it is not the nominal robot with rigid joints."""
+
 
 def build_truth(
     *,
@@ -31,8 +39,10 @@ def build_truth(
     joint_torque: ArrayLike,
     parameter_names: list[str],
     parameters: ArrayLike,
+    mismatch: Mapping[str, ArrayLike] | None = None,
 ) -> xr.Dataset:
-    """Truth of one run at the frames: ``time`` (N,) [s], pose and joint arrays (N, 6), parameters (p,) with names.
+    """Truth of one run at the frames: ``time`` (N,) [s], pose and joint arrays (N, 6), parameters (p,) with names;
+    ``mismatch``: values of some of `MISMATCH`.
 
     Raises:
         RecordError: wrong shapes, or numbers that are not finite.
@@ -46,9 +56,10 @@ def build_truth(
             "joint_velocity": np.asarray(joint_velocity, dtype=float),
             "joint_torque": np.asarray(joint_torque, dtype=float),
             "parameter_value": np.asarray(parameters, dtype=float),
+            **{name: np.asarray(values, dtype=float) for name, values in (mismatch or {}).items()},
         },
         time,
-        VARIABLES,
+        VARIABLES | {name: MISMATCH[name] for name in mismatch or {}},
         parameter=list(parameter_names),
     )
     truth.attrs["title"] = "Truth of the simulated experiment, not known to the estimator"
@@ -90,8 +101,9 @@ def check_truth(truth: xr.Dataset, source: str) -> xr.Dataset:
     Raises:
         RecordError: the first thing that is not so.
     """
-    check_variables(truth, VARIABLES, source)
-    for name in VARIABLES:
+    expected = VARIABLES | {name: entry for name, entry in MISMATCH.items() if name in truth}
+    check_variables(truth, expected, source)
+    for name in expected:
         check_finite(truth[name].values, name, source)
     if truth.sizes["parameter"] == 0:
         raise RecordError(f"{source} has no parameters")

@@ -1,16 +1,23 @@
 """From scenario and trajectory to the closed loop that plant and model both run."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from dynamics.closed_loop import FrameTiming, FrictionLaw, LoopSettings, Reference, ServoGains
+from dynamics.closed_loop import FrameTiming, FrictionLaw, JointElasticity, LoopSettings, Reference, ServoGains
 from identify.arrays import Array
 from identify.scenario import Model, Plant, Scenario
 from identify.trajectory import FourierTrajectory
 
 
 def plant_settings(scenario: Scenario) -> LoopSettings:
-    """The loop around the simulated real robot."""
-    return _settings(scenario, scenario.plant)
+    """The loop around the simulated real robot, whose joints may be elastic."""
+    plant = scenario.plant
+    settings = _settings(scenario, plant)
+    if plant.joint_stiffness_N_m_rad is None:
+        return settings
+    springs = JointElasticity(plant.joint_stiffness_N_m_rad, plant.motor_inertia_kg_m2, plant.joint_damping_N_m_s_rad)
+    return replace(settings, elasticity=springs)
 
 
 def model_settings(scenario: Scenario) -> LoopSettings:

@@ -5,9 +5,9 @@ from functools import cache
 import numpy as np
 
 from dynamics import Robot, load_robot
-from dynamics.closed_loop import simulate
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
-from identify.record.loop_setup import frame_times, plant_settings, reference_motion
+from identify.experiment.plant import simulate_plant
+from identify.record.loop_setup import frame_times, reference_motion
 from identify.record.recording import build_record
 from identify.scenario import load_scenario
 from identify.trajectory import random_trajectory
@@ -42,7 +42,7 @@ def run_plant(scenario, seed, sigma=SIGMA, lost=(), parameters=None, duration_s=
         noise = sigma * rng.standard_normal(6)
         return None if frame in lost else pose + noise
 
-    run = simulate(rss6(), parameters, reference, plant_settings(scenario), sensor)
+    run = simulate_plant(scenario, rss6(), parameters, reference, sensor)
     covariance = np.broadcast_to(np.diag(np.maximum(sigma, 1e-9) ** 2), (len(times), 6, 6)).copy()
     covariance[~run.measured_ok] = np.nan
     record = build_record(

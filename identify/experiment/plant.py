@@ -1,0 +1,63 @@
+"""The simulated real robot of a scenario: what it does, and where it is not the robot that servo and estimator know."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dynamics import Robot
+from dynamics.closed_loop import ClosedLoopRun, LoopSettings, PoseSensor, RateSensor, Reference, simulate
+from dynamics.geometry_error import with_geometry_error
+from identify.arrays import Array
+from identify.record.loop_setup import plant_settings
+from identify.scenario import Scenario
+
+
+def plant_robot(scenario: Scenario, nominal: Robot) -> Robot:
+    """The nominal robot with the scenario's geometry error; itself where there is none."""
+    plant = scenario.plant
+    return with_geometry_error(nominal, plant.geometry_error_m, np.random.default_rng(plant.geometry_seed))
+
+
+def check_plant(scenario: Scenario, nominal: Robot, parameters: Array) -> None:
+    """Raise dynamics.DynamicsError, with the evidence, where a plant with parameters (67,) cannot be simulated."""
+    _with_steps_enough(plant_settings(scenario), plant_robot(scenario, nominal), parameters, nominal.home_pose)
+
+
+def simulate_plant(
+    scenario: Scenario,
+    nominal: Robot,
+    parameters: Array,
+    reference: Reference,
+    sensor: PoseSensor | RateSensor | None = None,
+    latencies: Array | None = None,
+) -> ClosedLoopRun:
+    """Run the plant with parameters (67,) under a servo that knows the nominal robot; sensor None: an ideal one.
+
+    Raises what `dynamics.closed_loop.simulate` does.
+    """
+    plant = plant_robot(scenario, nominal)
+    settings = _with_steps_enough(plant_settings(scenario), plant, parameters, reference.poses[0])
+    known = None if plant is nominal else nominal
+    return simulate(plant, parameters, reference, settings, sensor, latencies=latencies, servo_robot=known)
+
+
+def mismatch(scenario: Scenario, nominal: Robot, run: ClosedLoopRun) -> dict[str, ArrayLike]:
+    """What of the plant's truth the model has no place for, by the names of `identify.experiment.truth.MISMATCH`."""
+    geometry, known = plant_robot(scenario, nominal).geometry, nominal.geometry
+    found: dict[str, ArrayLike] = {}
+    if geometry != known:
+        found["base_joint_error"] = geometry.base_joints - known.base_joints
+        found["platform_joint_error"] = geometry.platform_joints - known.platform_joints
+    if run.motor_angle is not None:
+        found["motor_angle"] = run.motor_angle
+    return found
+
+
+def _with_steps_enough(settings: LoopSettings, plant: Robot, parameters: Array, pose: Array) -> LoopSettings:
+    """The settings, with more steps a frame where elastic joints vibrate too fast for theirs."""
+    if settings.elasticity is None:
+        return settings
+    period = 1 / settings.timing.frame_rate_hz
+    needed = settings.elasticity.steps_needed(plant, parameters, pose, period, settings.friction)
+    return replace(settings, steps_per_frame=max(settings.steps_per_frame, needed))

@@ -1,0 +1,160 @@
+"""Plants that no model of the estimator can be: what the switches do, and that the residuals tell.
+
+The dynamics of these plants are proved in tests/dynamics/test_elastic_joints.py and test_geometry_error.py.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cmmsim.measurement import lost_measurement
+from dynamics.closed_loop import simulate
+from dynamics.errors import SimulationError
+from identify.accuracy.unseen import unseen_errors
+from identify.errors import RecordError, ScenarioError
+from identify.estimation.identification import identify
+from identify.estimation.whiteness import SUSPICIOUS
+from identify.experiment import run as experiment
+from identify.experiment.joint_instruments import JointInstruments, measure_joints
+from identify.experiment.plant import check_plant, plant_robot, simulate_plant
+from identify.experiment.truth import check_truth, true_poses
+from identify.record.loop_setup import frame_times, model_settings, plant_settings, reference_motion
+from identify.scenario import scenario_from_toml
+from tests.identify.synthetic import quick, rss6, run_plant, trajectory, truth
+
+ELASTIC = {"plant.joint_stiffness_N_m_rad": 1000.0}
+MISPLACED = {"plant.geometry_error_m": 1e-4}
+STRIBECK = {"plant.friction": "stribeck", "plant.static_ratio": 1.3, "plant.stribeck_velocity_rad_s": 0.05}
+
+
+class PerfectSensor:
+    """Measures the pose that it is shown."""
+
+    def __init__(self):
+        self.poses = []
+
+    def start_run(self, seed):
+        self.poses.clear()
+
+    def measure(self, pose, obstacles, pose_rate):
+        self.poses.append(pose)
+        return replace(lost_measurement("none"), pose=pose, covariance=1e-12 * np.eye(6), ok=True, reason="")
+
+
+def _short(**overrides):
+    return quick(**{"excitation.duration_s": 0.5} | overrides)
+
+
+def test_without_a_switch_the_plant_is_the_nominal_robot_bit_by_bit():
+    scenario = _short()
+    assert plant_robot(scenario, rss6()) is rss6()
+    reference = reference_motion(trajectory(0), frame_times(scenario, 0.5))
+    ours = simulate_plant(scenario, rss6(), truth(), reference)
+    plain = simulate(rss6(), truth(), reference, plant_settings(scenario))
+    np.testing.assert_array_equal(ours.pose, plain.pose)
+    np.testing.assert_array_equal(ours.command, plain.command)
+
+
+def test_the_model_knows_of_none_of_the_switches():
+    switched = quick(**ELASTIC, **MISPLACED, **STRIBECK)
+    assert model_settings(switched) == model_settings(quick())
+    assert plant_settings(switched).elasticity.stiffness == 1000.0
+
+
+def test_the_switches_stand_in_the_resolved_scenario_with_their_units():
+    switched = quick(**ELASTIC, **MISPLACED)
+    text = switched.to_toml()
+    assert scenario_from_toml(text) == switched
+    for line in ("joint_stiffness_N_m_rad = 1000.0", "[N m/rad]", "geometry_error_m = 0.0001", "motor_inertia_kg_m2"):
+        assert line in text
+    assert "joint_stiffness" not in quick().to_toml()
+
+
+@pytest.mark.parametrize(
+    ("override", "evidence"),
+    [
+        ({"plant.geometry_error_m": 2e-3}, "plant.geometry_error_m = 0.002 [m]: input should be less than or equal"),
+        ({"plant.geometry_error_m": -1e-4}, "plant.geometry_error_m = -0.0001 [m]"),
+        ({"plant.joint_stiffness_N_m_rad": 0.0}, "plant.joint_stiffness_N_m_rad = 0.0 [N m/rad]"),
+        ({"plant.joint_stiffness_N_m_rad": 2e6}, "plant.joint_stiffness_N_m_rad = 2000000.0 [N m/rad]"),
+        ({"plant.motor_inertia_kg_m2": 0.0}, "plant.motor_inertia_kg_m2 = 0.0 [kg m2]"),
+    ],
+)
+def test_impossible_plants_are_refused_in_the_scenario(override, evidence):
+    with pytest.raises(ScenarioError) as refused:
+        quick(**override)
+    assert evidence in str(refused.value)
+
+
+def test_motors_heavier_than_their_cranks_are_refused_before_a_run():
+    with pytest.raises(SimulationError, match="of crank 2 about its axis"):
+        check_plant(quick(**ELASTIC, **{"plant.motor_inertia_kg_m2": 1e-3}), rss6(), truth())
+
+
+def test_the_truth_holds_true_poses_motors_and_switches_and_the_encoders_read_the_motors():
+    """Crank angles are those of the poses that the sensor was shown; motors are ahead by torque over stiffness."""
+    scenario, sensor = _short(**ELASTIC), PerfectSensor()
+    run = experiment.run_plant(scenario, rss6(), sensor, trajectory(3), frame_times(scenario, 0.5), 0, 0)
+    np.testing.assert_array_equal(true_poses(run.truth), sensor.poses)
+    cranks, motors = run.truth["joint_angle"].values, run.truth["motor_angle"].values
+    np.testing.assert_allclose(cranks, rss6().inverse_kinematics(np.array(sensor.poses)), atol=1e-15)
+    holding = rss6().static_torque(sensor.poses[0], truth()[:64])
+    np.testing.assert_allclose((motors - cranks)[0], holding / 1000.0, rtol=1e-9)
+    assert run.truth.attrs["plant_joint_stiffness_N_m_rad"] == 1000.0
+    assert "base_joint_error" not in run.truth
+    perfect = JointInstruments(0.0, 0.0, 0.0)
+    channels = measure_joints(run.record, run.truth, scenario.timing, perfect, np.random.default_rng(0))
+    np.testing.assert_array_equal(channels["joint_angle"].values, motors)
+    with pytest.raises(RecordError, match="motor_angle are not finite"):
+        check_truth(run.truth.assign(motor_angle=run.truth["motor_angle"] * np.nan), "broken truth")
+
+
+def test_unseen_trajectories_are_run_by_the_elastic_plant():
+    """With the true parameters a rigid model misses it, and not the rigid plant with the same friction law."""
+    short = {"validation.duration_s": 1.0, "validation.count": 1, "excitation.candidates": 2}
+    rigid, elastic = (unseen_errors(truth(), rss6(), quick(**short, **switch)) for switch in ({}, ELASTIC))
+    assert np.abs(rigid).max() < 1e-8
+    assert np.abs(elastic).max() > 1e-6
+
+
+@pytest.mark.slow
+def test_the_truth_holds_the_joint_errors_of_the_plant():
+    scenario = _short(**MISPLACED)
+    sensor = PerfectSensor()
+    run = experiment.run_plant(scenario, rss6(), sensor, trajectory(3), frame_times(scenario, 0.5), 0, 0)
+    plant = plant_robot(scenario, rss6())
+    errors = plant.geometry.base_joints - rss6().geometry.base_joints
+    np.testing.assert_array_equal(run.truth["base_joint_error"].values, errors)
+    assert 0.5e-4 < errors.std() < 2e-4
+    np.testing.assert_array_equal(run.truth["joint_angle"].values, plant.inverse_kinematics(np.array(sensor.poses)))
+    assert plant_robot(scenario, rss6()).geometry == plant.geometry
+    other = scenario.with_overrides({"plant.geometry_seed": 1})
+    assert plant_robot(other, rss6()).geometry != plant.geometry
+
+
+def _identified(**switch):
+    """10 s with white noise of 5 um and 30 urad, identified with the commands that were logged."""
+    scenario = quick(**{"identification.method": "command_driven"} | switch)
+    return identify(run_plant(scenario, seed=0)[0], rss6(), scenario)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "switch",
+    [STRIBECK, ELASTIC, MISPLACED, MISPLACED | {"plant.geometry_seed": 1}],
+    ids=["stribeck friction", "elastic joints", "joints off by 0.1 mm", "joints off by 0.1 mm, another robot"],
+)
+def test_the_residuals_say_that_the_model_is_wrong(switch):
+    result = _identified(**switch)
+    assert result.whiteness.p_value < SUSPICIOUS
+    assert result.noise_ratio > 1.05
+    assert any("not white" in said and "the model is wrong" in said for said in result.warnings)
+
+
+@pytest.mark.slow
+def test_without_mismatch_they_do_not():
+    result = _identified()
+    assert result.whiteness.p_value > 0.01
+    assert abs(result.noise_ratio - 1) < 0.1
+    assert not any("wrong" in said for said in result.warnings)
