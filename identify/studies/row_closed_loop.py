@@ -36,6 +36,8 @@ COLUMNS = {
     "stated_orientation_rms_urad": Column("urad", "the same, as the sensor's own covariance states it"),
     "torque_rms_N_m": Column("N m", "torque of the joint controllers, rms over frames and joints"),
 }
+MAIN = ("tracking_position_rms_um", "tracking_orientation_rms_urad", "position_rms_um", "orientation_rms_urad",
+        "lost_frames", "torque_rms_N_m")
 
 
 class ClosedLoopOptions(RowOptions):
@@ -75,4 +77,4 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoo
     }
 
 
-CLOSED_LOOP = Kind("closed_loop", COLUMNS, ClosedLoopOptions, compute)
+CLOSED_LOOP = Kind("closed_loop", COLUMNS, MAIN, ClosedLoopOptions, compute)

@@ -33,10 +33,12 @@ class RowOptions(BaseModel):
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of row: `compute(scenario, seed, options)` gives exactly `columns`; `options`: their model."""
+    """One kind of row: `compute(scenario, seed, options)` gives exactly `columns`; `main`: those that are drawn;
+    `options`: their model."""
 
     name: str
     columns: Mapping[str, Column]
+    main: tuple[str, ...]
     options: type[RowOptions]
     compute: Callable[[Scenario, np.random.SeedSequence, Any], Row]
 

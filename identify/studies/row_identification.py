@@ -54,6 +54,8 @@ COLUMNS = {
     "unseen_position_rms_um": Column("um", "model against true plant on unseen trajectories, rms over axes"),
     "unseen_orientation_rms_urad": Column("urad", "model against true plant on unseen trajectories, rms over axes"),
 }
+MAIN = ("coulomb_std_percent", "viscous_std_percent", "gains_std_percent", "group_std_percent",
+        "unseen_position_rms_um", "unseen_orientation_rms_urad")
 
 
 class IdentificationOptions(RowOptions):
@@ -130,4 +132,4 @@ def _trajectories(scenario_toml: str, seed: int) -> TrajectorySet:
     return design_trajectories(_robot(scenario.robot), scenario, seed)
 
 
-IDENTIFICATION = Kind("identification", COLUMNS, IdentificationOptions, compute)
+IDENTIFICATION = Kind("identification", COLUMNS, MAIN, IdentificationOptions, compute)

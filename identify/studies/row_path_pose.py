@@ -34,6 +34,7 @@ COLUMNS = {
     "used_position_rms_um": Column("um", "last position that had arrived against the true one at all times"),
     "used_orientation_rms_urad": Column("urad", "last orientation that had arrived against the true one at all times"),
 }
+MAIN = ("position_rms_um", "orientation_rms_urad", "used_position_rms_um", "used_orientation_rms_urad")
 
 
 class PathPoseOptions(RowOptions):
@@ -93,4 +94,4 @@ def _used_errors(path: FourierTrajectory, poses: Array, arrivals: Array, period_
     return np.asarray(poses[in_use] - path.pose(instants), dtype=float)
 
 
-PATH_POSE = Kind("path_pose", COLUMNS, PathPoseOptions, compute)
+PATH_POSE = Kind("path_pose", COLUMNS, MAIN, PathPoseOptions, compute)

@@ -39,6 +39,8 @@ COLUMNS = {
     "point_lateral_rms_um": Column("um", "error of single stickers across that line, rms over both axes"),
     "centre_rms_px": Column("px", "error of sticker centres in the images, rms over stickers, cameras and axes"),
 }
+MAIN = ("position_rms_um", "orientation_rms_urad", "mean_position_rms_um", "mean_orientation_rms_urad",
+        "point_depth_rms_um", "centre_rms_px")
 
 
 class StaticPoseOptions(RowOptions):
@@ -136,4 +138,4 @@ def _row(eye: RowSensor, looks: list[_Look], captures: int) -> Row:
     }
 
 
-STATIC_POSE = Kind("static_pose", COLUMNS, StaticPoseOptions, compute)
+STATIC_POSE = Kind("static_pose", COLUMNS, MAIN, StaticPoseOptions, compute)

@@ -50,9 +50,10 @@ def scale_regression(squares: Array, design: Array) -> ScaleRegression:
     for _ in range(ITERATIONS):
         ratio = squares / np.exp(design @ beta)
         step = np.linalg.lstsq(design, ratio - 1.0, rcond=None)[0]
-        beta = beta + step * min(1.0, 1.0 / float(np.abs(design @ step).max()))
-        if np.abs(design @ step).max() < SETTLED:
+        change = float(np.abs(design @ step).max())
+        if change < SETTLED:
             break
+        beta = beta + step / max(1.0, change)
     else:
         raise StudyError(f"the fit of the scale has not settled after {ITERATIONS} steps")
     return ScaleRegression(beta, _sandwich(design, squares / np.exp(design @ beta) - 1.0), rows - columns)

@@ -26,15 +26,14 @@ RESOLUTION = 0.2
 class Verdict:
     """What the rows say about a law: verdict "passed", "failed" or "undecided".
 
-    statement in words; measured with its interval low to high: an exponent, or a ratio; expected; rows that counted;
-    reason where nothing could be measured.
+    statement in words; expected, as an exponent or a ratio, in words; measured with its interval low to high; rows that
+    counted; reason where nothing could be measured.
     """
 
     statement: str
     why: str
     verdict: str
-    expected: float
-    tolerance: float
+    expected: str
     measured: float | None = None
     low: float | None = None
     high: float | None = None
@@ -70,7 +69,7 @@ def _check(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     try:
         return check(law, study, frame)
     except StudyError as error:
-        return Verdict(_statement(law), law.why, "undecided", _expected(law), law.tolerance, reason=str(error))
+        return Verdict(_statement(law), law.why, "undecided", _expected(law), reason=str(error))
 
 
 def _exponent(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
@@ -91,7 +90,8 @@ def _equality(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     fit = scale_regression((values / other) ** 2, np.full((len(frame), 1), 2.0))
     low, high = fit.interval(0, CONFIDENCE)
     verdict = _decided(low <= law.tolerance and high >= -law.tolerance, 0.5 * (high - low))
-    return _verdict(law, verdict, *np.exp([fit.coefficients[0], low, high]).tolist(), len(frame))
+    measured, low, high = np.exp([fit.coefficients[0], low, high]).tolist()
+    return _verdict(law, verdict, measured, low, high, len(frame))
 
 
 def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
@@ -105,7 +105,8 @@ def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     fit = scale_regression(law_data(law, chosen) ** 2, np.column_stack([_beside(law, study, chosen), steps]))
     low, middle, high = _smallest_step(fit, len(values) - 1)
     verdict = "passed" if low > -law.tolerance else "failed" if high < -law.tolerance else "undecided"
-    return _verdict(law, verdict, *np.exp([middle, low, high]).tolist(), len(chosen))
+    measured, low, high = np.exp([middle, low, high]).tolist()
+    return _verdict(law, verdict, measured, low, high, len(chosen))
 
 
 def _smallest_step(fit: ScaleRegression, steps: int) -> tuple[float, float, float]:
@@ -152,7 +153,7 @@ def _decided(holds: bool, half: float) -> str:
 
 
 def _verdict(law: Law, verdict: str, measured: float, low: float, high: float, rows: int) -> Verdict:
-    return Verdict(_statement(law), law.why, verdict, _expected(law), law.tolerance, measured, low, high, rows)
+    return Verdict(_statement(law), law.why, verdict, _expected(law), measured, low, high, rows)
 
 
 def _statement(law: Law) -> str:
@@ -163,8 +164,11 @@ def _statement(law: Law) -> str:
     return f"{law.quantity} ~ {law.factor} ^ {law.exponent:g}"
 
 
-def _expected(law: Law) -> float:
-    return 1.0 if law.exponent is None else law.exponent
+def _expected(law: Law) -> str:
+    if law.order is not None:
+        return "ratio > 1"
+    value = "ratio 1" if law.exponent is None else f"{law.exponent:g}"
+    return f"{value} ± {law.tolerance:g}" if law.tolerance else value
 
 
 def as_entry(verdict: Verdict) -> dict[str, Any]:

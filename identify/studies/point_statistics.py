@@ -1,0 +1,45 @@
+"""Mean, spread and rms of a figure over the rows of one point of a study, with bands that hold 95 % of the time.
+
+The band of the mean is Student's; that of the rms is Student's of the logarithm of the mean square, which needs no
+assumption on how the figure is distributed but that there are rows enough. One row alone has no band.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from identify.arrays import Array
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Of `rows` rows: mean, std (n - 1), rms, and the bands of mean and rms; None with a single row."""
+
+    rows: int
+    mean: float
+    std: float | None
+    rms: float
+    mean_band: tuple[float, float] | None
+    rms_band: tuple[float, float] | None
+
+
+def point_statistics(values: Array) -> Statistics:
+    """Statistics of one figure's values (n,), n >= 1, all finite."""
+    count, mean, rms = len(values), float(np.mean(values)), float(np.sqrt(np.mean(values**2)))
+    if count < 2:
+        return Statistics(count, mean, None, rms, None, None)
+    std = float(np.std(values, ddof=1))
+    half = float(student.ppf(0.5 + 0.5 * CONFIDENCE, count - 1)) * std / np.sqrt(count)
+    return Statistics(count, mean, std, rms, (mean - half, mean + half), _rms_band(values))
+
+
+def _rms_band(values: Array) -> tuple[float, float]:
+    if not np.any(values):
+        return 0.0, 0.0
+    count, square = len(values), float(np.mean(values**2))
+    spread = float(np.linalg.norm(values**2 / square - 1.0)) / (count - 1)
+    factor = float(np.exp(0.5 * student.ppf(0.5 + 0.5 * CONFIDENCE, count - 1) * spread))
+    return float(np.sqrt(square)) / factor, float(np.sqrt(square)) * factor

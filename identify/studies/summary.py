@@ -1,0 +1,144 @@
+"""The summary of a study: `summary.json` and `summary.md`, and figures beside them.
+
+Rows that failed are counted and named, and no average has them in it.
+"""
+
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from identify.errors import ScenarioError
+from identify.files.atomic import write_text
+from identify.files.result_file import save_result
+from identify.files.versions import versions
+from identify.studies import point_statistics, theory
+from identify.studies.figures import draw
+from identify.studies.point_statistics import Statistics
+from identify.studies.rows import find_kind
+from identify.studies.study_file import Study
+from identify.studies.table import figure_names
+from identify.studies.theory import Verdict, check_laws
+from identify.studies.units import factor_unit, figure_unit, labelled
+
+JSON, MARKDOWN = "summary.json", "summary.md"
+NAMED = 20
+"""Failed rows that the summary names one by one."""
+LONGEST = 60
+"""Points in the table of `summary.md`; `summary.json` has all."""
+
+
+def write(folder: Path, study: Study, frame: pd.DataFrame) -> dict[str, Any]:
+    """Write summary.json, summary.md and figures/*.png into a study's folder; `frame` is its table.
+
+    Returns what summary.json holds. Raises OSError where it cannot be written.
+    """
+    done = frame[frame["error"] == ""]
+    names = [name for name in figure_names(frame, study) if pd.api.types.is_numeric_dtype(frame[name])]
+    points = _points(study, done, names)
+    verdicts = check_laws(study, frame)
+    entry = {
+        "name": study.name, "title": study.title, "kind": study.kind, "scenario": study.scenario, "seed": study.seed,
+        "versions": versions(),
+        "rows": {"planned": study.rows, "done": len(done), "failed": len(frame) - len(done),
+                 "missing": study.rows - len(frame)},
+        "failures": _failures(study, frame),
+        "confidence": {"bands": point_statistics.CONFIDENCE, "laws": theory.CONFIDENCE},
+        "units": {name: unit for name in [*study.factors, *names]
+                  if (unit := factor_unit(name) if name in study.factors else figure_unit(study.kind, name))},
+        "theory": [theory.as_entry(verdict) for verdict in verdicts],
+        "points": [{"factors": factors, "figures": {name: asdict(one) for name, one in figures.items()}}
+                   for factors, figures in points],
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    save_result(folder / JSON, entry)
+    shown = main_figures(study.kind, names)
+    write_text(folder / MARKDOWN, _markdown(study, entry, verdicts, points, shown))
+    draw(folder / "figures", study, done, shown, verdicts)
+    return entry
+
+
+def main_figures(kind: str, names: list[str]) -> list[str]:
+    """The figures that are shown first: a built-in kind's own choice, or the first six of one's own kind."""
+    try:
+        chosen = find_kind(kind).main
+    except ScenarioError:
+        return names[:6]
+    return [name for name in chosen if name in names]
+
+
+def _points(study: Study, done: pd.DataFrame, names: list[str]) -> list[tuple[dict[str, Any], dict[str, Statistics]]]:
+    """Factors and statistics of each point that has a row; a sample with single rows is one point as a whole."""
+    paths = list(study.factors)
+    if not len(done):
+        return []
+    if not paths or (study.sample is not None and study.repeats == 1):
+        return [({}, _statistics(done, names))]
+    return [(dict(zip(paths, values, strict=True)), _statistics(rows, names))
+            for values, rows in done.groupby(paths, sort=False)]
+
+
+def _statistics(rows: pd.DataFrame, names: list[str]) -> dict[str, Statistics]:
+    return {name: point_statistics.point_statistics(rows[name].to_numpy(dtype=float)) for name in names}
+
+
+def _failures(study: Study, frame: pd.DataFrame) -> dict[str, Any]:
+    failed = frame[frame["error"] != ""]
+    named = failed.head(NAMED)[["row", "repeat", *study.factors, "error"]]
+    return {"reasons": failed["error"].value_counts().head(NAMED).to_dict(), "first": named.to_dict("records")}
+
+
+def _markdown(
+    study: Study,
+    entry: dict[str, Any],
+    verdicts: list[Verdict],
+    points: list[tuple[dict[str, Any], dict[str, Statistics]]],
+    shown: list[str],
+) -> str:
+    rows = entry["rows"]
+    lines = [f"# {study.title or study.name}", "",
+             f"Study `{study.name}`, rows of kind `{study.kind}`, scenario `{study.scenario}`, seed {study.seed}: "
+             f"{rows['done']} rows done, {rows['failed']} failed, {rows['missing']} missing."]
+    if verdicts:
+        lines += ["", "## Theory", "", f"Intervals at {theory.CONFIDENCE:.0%}.", "",
+                  "| law | says | measured | interval | verdict |", "|---|---|---|---|---|"]
+        lines += [_law_row(verdict) for verdict in verdicts]
+    if rows["failed"]:
+        lines += ["", "## Failed rows", "", "They are in no figure below."]
+        lines += [f"- {count} x {reason}" for reason, count in entry["failures"]["reasons"].items()]
+        lines += ["", f"The first: {', '.join(str(one['row']) for one in entry['failures']['first'])}."]
+    lines += ["", "## Points", "", _bands_text(points), "", *_table(study, points, shown)]
+    return "\n".join(lines) + "\n"
+
+
+def _law_row(verdict: Verdict) -> str:
+    if verdict.measured is None:
+        return f"| {verdict.statement} | {verdict.expected} | {verdict.reason} | | {verdict.verdict} |"
+    return (f"| {verdict.statement} | {verdict.expected} | {verdict.measured:.4g} | "
+            f"{verdict.low:.4g} to {verdict.high:.4g} | {verdict.verdict} |")
+
+
+def _bands_text(points: list[tuple[dict[str, Any], dict[str, Statistics]]]) -> str:
+    if points and all(one.rows < 2 for _, figures in points for one in figures.values()):
+        return "Rms over rows. With a single repeat there is no band: `repeats` in the study file makes one."
+    return f"Rms over rows, with its {point_statistics.CONFIDENCE:.0%} band."
+
+
+def _table(study: Study, points: list[tuple[dict[str, Any], dict[str, Statistics]]], shown: list[str]) -> list[str]:
+    factors = list(points[0][0]) if points else []
+    heads = [labelled(path, factor_unit(path)) for path in factors]
+    heads += ["rows", *(labelled(name, figure_unit(study.kind, name)) for name in shown)]
+    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    for values, figures in points[:LONGEST]:
+        count = next((one.rows for one in figures.values()), 0)
+        cells = [str(values[path]) for path in factors] + [str(count), *(_cell(figures[name]) for name in shown)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines + ([f"\n{len(points) - LONGEST} more points stand in `{JSON}`."] if len(points) > LONGEST else [])
+
+
+def _cell(one: Statistics) -> str:
+    if one.rms_band is None or not all(map(math.isfinite, one.rms_band)):
+        return f"{one.rms:.4g}"
+    return f"{one.rms:.4g} ({one.rms_band[0]:.4g} to {one.rms_band[1]:.4g})"

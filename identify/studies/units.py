@@ -1,0 +1,43 @@
+"""Units of what a study varies and of what its rows say, for tables and axes."""
+
+from identify.errors import ScenarioError
+from identify.scenario import Scenario
+from identify.studies.rows import columns
+
+SENSOR_UNITS = {
+    "rig.baseline": "m", "rig.distance": "m", "rig.focal_px": "px", "rig.width": "px", "rig.height": "px",
+    "rig.position": "m", "rig.target": "m", "stickers.radius": "m", "stickers.ring_radius": "m",
+    "camera.dark_noise": "electrons", "camera.electrons_at_white": "electrons", "camera.full_well": "electrons",
+    "camera.gain": "grey values per electron", "camera.black_level": "grey values", "camera.dsnu": "electrons",
+    "camera.bit_depth": "bit", "lens.psf_px": "px", "timing.frame_rate": "Hz", "timing.exposure": "s",
+    "timing.latency": "s", "timing.latency_jitter": "s",
+}
+"""Units of the sensor file's keys that have one."""
+
+
+def factor_unit(path: str) -> str:
+    """Unit of a factor by dotted path; empty where it has none."""
+    root, _, key = path.partition(".")
+    if root == "sensor":
+        return SENSOR_UNITS.get(key, "")
+    if root == "scenario" and key.count(".") == 1:
+        section, _, name = key.partition(".")
+        extra = getattr(Scenario.model_fields[section].annotation, "model_fields", {})[name].json_schema_extra
+        unit = str(extra["unit"]) if isinstance(extra, dict) and "unit" in extra else ""
+        return "" if unit == "1" else unit
+    return "s" if key.endswith("_s") else ""
+
+
+def figure_unit(kind: str, figure: str) -> str:
+    """Unit of a figure of a built-in kind; empty where it has none, or where the kind is one's own."""
+    try:
+        known = columns(kind)
+    except ScenarioError:
+        return ""
+    unit = known[figure].unit if figure in known else ""
+    return "" if unit == "1" else unit
+
+
+def labelled(name: str, unit: str) -> str:
+    """A name with its unit in brackets."""
+    return f"{name} [{unit}]" if unit else name
