@@ -45,7 +45,7 @@ def cores() -> int:
 @contextmanager
 def local_cluster(workers: int) -> Iterator["DaskExecutor"]:
     """Workers: so many new processes on this machine."""
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    _silence_dask()
     with (
         dask.config.set(THREADS),
         LocalCluster(
@@ -68,10 +68,10 @@ def running_cluster(address: str) -> Iterator["DaskExecutor"]:
     Raises:
         StudyError: no scheduler answers there, or it has no workers.
     """
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    _silence_dask()
     try:
         client = Client(address, timeout=CONNECT_SECONDS)
-    except (OSError, TimeoutError, ValueError) as error:
+    except Exception as error:  # whatever else listens there may answer anything
         raise StudyError(
             f"no Dask scheduler answers at {address} within {CONNECT_SECONDS} s: {' '.join(str(error).split())}"
         ) from error
@@ -138,8 +138,9 @@ class DaskExecutor:
             return self._blame(cases, error)
         except Exception as error:
             self._check_cluster()
-            text = " ".join(f"{type(error).__name__}: {error}".split())
-            raise StudyError(f"the workers cannot compute rows: {text}") from error
+            causes = [error, *([error.__cause__] if error.__cause__ else [])]
+            text = " ".join("; ".join(f"{type(one).__name__}: {one}" for one in causes).split())
+            raise StudyError(f"the cluster cannot compute rows: {text}") from error
 
     def _blame(self, cases: list[Case], error: KilledWorker) -> list[Finished]:
         alone = len(cases) == 1 and not self._open
@@ -154,6 +155,12 @@ class DaskExecutor:
         self._workerless = 0 if self._client.scheduler_info()["workers"] else self._workerless + 1
         if self._workerless > WORKERLESS_SECONDS:
             raise StudyError(f"no Dask worker for {WORKERLESS_SECONDS} s; the same command goes on from here")
+
+
+def _silence_dask() -> None:
+    """What Dask notes of workers that come and go is no news for the user of a study."""
+    for name in ("distributed", "distributed.client", "distributed.core"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 class _OneThread(WorkerPlugin):

@@ -59,7 +59,9 @@ def _own(kind: str) -> RowFunction:
     try:
         function: RowFunction = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise StudyError(f"kind {kind!r} is no importable module:function: {error}") from error
+        raise StudyError(
+            f"kind {kind!r} is no importable module:function: {error}; its folder must be on PYTHONPATH"
+        ) from error
     if not callable(function):
         raise StudyError(f"kind {kind!r} is not a function")
     return function

@@ -1,0 +1,34 @@
+"""Rows for the tests of studies: figures that follow from the seed and the factors alone, and rows that misbehave."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+
+KIND = "tests.identify.study_rows:row"
+
+
+def row(scenario, seed, options):
+    """Random numbers of the row's seed, and what the factors say.
+
+    Options: `seconds` to sleep; `log`, a file that gets a line a computation; `fails`, spawn keys of rows that raise;
+    `kills`, those of rows that kill their process; `odd`, that of a row with a figure that is no number.
+    """
+    number = seed.spawn_key[0]
+    time.sleep(options.get("seconds", 0.0))
+    if "log" in options:
+        with Path(options["log"]).open("a") as file:
+            file.write(f"{number}\n")
+    if number in options.get("fails", []):
+        raise ValueError(f"row {number}\nhas no answer")
+    if number in options.get("kills", []):
+        os.kill(os.getpid(), signal.SIGKILL)
+    draws = np.random.default_rng(seed).normal(size=1000)
+    noise = scenario.sensor_changes.get("camera.dark_noise", 26.0)
+    return {
+        "error_um": float("nan") if number == options.get("odd") else noise * float(draws.mean()),
+        "spread_um": float(draws.std()),
+        "rate_hz": scenario.timing.frame_rate_hz,
+    }
