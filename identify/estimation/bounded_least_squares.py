@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from identify.arrays import Array
@@ -17,6 +18,7 @@ from identify.arrays import Array
 SHRINK, GROW = 0.25, 2.0
 POOR, GOOD = 0.25, 0.75
 SMALLEST_RADIUS = 1e-10
+AT_BOUND = 1e-12  # of the parameter's scale: what rounding may leave
 
 
 class Problem(Protocol):
@@ -42,10 +44,12 @@ class StopCriteria:
 
 @dataclass(frozen=True)
 class Solution:
-    """Parameters (p,), factor R (p, p) of J^T J there, cost after each iteration, evaluations and why it stopped."""
+    """Parameters (p,), factor R (p, p) of J^T J there, which are at their bounds (p,), cost after each iteration,
+    evaluations and why it stopped."""
 
     parameters: Array
     factor: Array
+    at_bound: NDArray[np.bool_]
     costs: tuple[float, ...]
     evaluations: int
     stop_reason: str
@@ -91,7 +95,8 @@ def minimise(
             on_iteration(len(costs) - 1, cost)
         elif radius < SMALLEST_RADIUS or predicted <= criteria.cost_tolerance * cost:
             reason = f"no step lowers the cost: predicted gain {predicted:.3g} of {cost:.6g}"
-    return Solution(parameters, factor, tuple(costs), evaluations, reason)
+    at_bound = parameters <= lower + AT_BOUND * scale
+    return Solution(parameters, factor, at_bound, tuple(costs), evaluations, reason)
 
 
 def _box_step(

@@ -1,8 +1,5 @@
 """Identification of one record: linear warm start, output error, uncertainty, identifiability.
 
-The search goes from the linear warm start through the command-driven output error, which has few local minima, to the
-closed-loop output error, whose stick-slip events make narrow ones.
-
 Sees the record, the robot's geometry and starting guess, and the scenario's model side; never the sensor, the plant's
 settings or the truth.
 """
@@ -15,7 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from dynamics import DynamicsError, Robot
+from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation import warm_start
@@ -25,24 +22,22 @@ from identify.estimation.base_parameters import (
     reference_regressor,
     structural_regressor,
 )
-from identify.estimation.bounded_least_squares import Solution, StopCriteria, minimise
+from identify.estimation.bounded_least_squares import Solution
 from identify.estimation.conditioning import Conditioning, conditioning
 from identify.estimation.estimate_covariance import DRAWS, Uncertainty, estimate_uncertainty
 from identify.estimation.group_estimates import IDENTIFIABLE_SHARE, GroupEstimates, group_estimates
-from identify.estimation.loop_parameters import NAMES, StartingGuess, starting_guess
+from identify.estimation.loop_parameters import NAMES, starting_guess
 from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_search import bounds_of, output_error_searches
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor
 from identify.estimation.whiteness import LAGS, Whiteness, whiteness
 from identify.files.dataset import POSE
-from identify.progress import Advance, Progress, SilentProgress
+from identify.progress import Progress, SilentProgress
 from identify.record.recorded_run import recorded_run
 from identify.scenario import Scenario
 
 MISFIT_STDS = 5.0
 """Standard deviations from the expected residual beyond which a warning is given."""
-
-SMALLEST_SHARE = 1e-3
-"""Lower bound of platform mass and integral gain, as a share of the starting guess."""
 
 UNCERTAINTY_STREAM = 5
 """Random stream of the repeated experiments, beside those of the experiment."""
@@ -54,10 +49,10 @@ class IdentificationResult:
 
     initial, warm_start, estimate, std (67,), covariance (67, 67); identifiable (67,) bool; groups: the same of the base
     parameters; base_rank: independent groups that the trajectory excites by the paper's rule; iterations and
-    evaluations: of all searches; stop_reason: of the last; costs: after each iteration, one tuple a search (command
-    driven, then closed loop where asked for); noise_ratio: mean squared whitened residual, to compare with
-    expected_noise_ratio, what the sensor's noise alone would leave; whiteness: test of the residuals of the model
-    driven by the logged commands.
+    evaluations: of all searches; stop_reason: of the last; searches: their names in order, and costs: after each
+    iteration, one tuple a search; active_bounds: what holds the estimate back, as "platform.Izz <= Ixx + Iyy";
+    noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what the sensor's noise alone
+    would leave; whiteness: test of the residuals of the model driven by the logged commands.
     """
 
     names: tuple[str, ...]
@@ -74,7 +69,9 @@ class IdentificationResult:
     iterations: int
     evaluations: int
     stop_reason: str
+    searches: tuple[str, ...]
     costs: tuple[tuple[float, ...], ...]
+    active_bounds: tuple[str, ...]
     noise_ratio: float
     expected_noise_ratio: float
     whiteness: Whiteness
@@ -105,37 +102,24 @@ def identify(
     warmed = time.perf_counter()
     count = 2 if settings.method == "closed_loop" else 1
     with progress.stage("identify", count * settings.max_iterations) as advance:
-        driven = problem.driven_by_commands()
-        searches = [search(driven, best_start(driven, warm), scenario, advance)]
-        if settings.method == "closed_loop":
-            searches.append(search(problem, best_start(problem, searches[0].parameters), scenario, advance))
+        searches = output_error_searches(problem, scenario, warm, advance)
     searched = time.perf_counter()
+    driven, estimate = problem.driven_by_commands(), searches[settings.method].parameters
     final = problem if settings.method == "closed_loop" else driven
     rng = np.random.default_rng([int(records[0].attrs["seed"]), UNCERTAINTY_STREAM])
     with progress.stage("uncertainty", DRAWS) as advance:
-        uncertainty = estimate_uncertainty(final, searches[-1].parameters, rng, advance)
-    tested = _whiteness(driven, searches[0].parameters)
+        uncertainty = estimate_uncertainty(final, estimate, rng, advance)
+    tested = _whiteness(driven, searches["command_driven"].parameters)
     ended = time.perf_counter()
     seconds = {"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched}
     rate_hz = scenario.timing.frame_rate_hz
     excited = np.concatenate([reference_regressor(robot, run.reference, rate_hz) for run in problem.runs])
     rank = rank_by_threshold(excited, settings.qr_threshold)
-    base, estimate = base_parameters(structural_regressor(robot)), searches[-1].parameters
+    base = base_parameters(structural_regressor(robot))
     groups = group_estimates(base, problem.guess, estimate, uncertainty.covariance)
     conditioned = conditioning(uncertainty.information, final.known_information(), base, problem.guess, estimate)
-    return _result(final, warm, searches, uncertainty, groups, conditioned, tested, rank, seconds)
-
-
-def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance) -> Solution:
-    """Minimise one output-error problem from parameters (67,); masses and gains stay positive."""
-    settings = scenario.identification
-    criteria = StopCriteria(settings.cost_tolerance, settings.parameter_tolerance, settings.max_iterations)
-    lower = np.zeros(len(NAMES))
-    for name in ("platform.mass", "joint_pid.li"):
-        lower[NAMES.index(name)] = SMALLEST_SHARE * problem.guess.values[NAMES.index(name)]
-    solution = minimise(problem, start, lower, problem.guess.std, criteria, lambda i, cost: advance())
-    advance(settings.max_iterations - solution.iterations)
-    return solution
+    active = bounds_of(problem, scenario).active(searches[settings.method].at_bound)
+    return _result(final, warm, searches, active, uncertainty, groups, conditioned, tested, rank, seconds)
 
 
 def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario) -> OutputErrorProblem:
@@ -169,31 +153,11 @@ def _whiteness(driven: OutputErrorProblem, parameters: Array) -> Whiteness:
     return whiteness(np.concatenate(residuals), np.concatenate(ok))
 
 
-def best_start(problem: OutputErrorProblem, warm: Array) -> Array:
-    """The better of warm start and starting guess; the latter's loop may be unstable."""
-    guess: StartingGuess = problem.guess
-    costs = [(problem.cost(start), index) for index, start in enumerate((warm, guess.values))]
-    cost, index = min(costs)
-    if not np.isfinite(cost):
-        raise EstimationError(
-            f"neither the warm start nor the starting guess gives a loop that runs: {_why(problem, warm)}"
-        )
-    return (warm, guess.values)[index]
-
-
-def _why(problem: OutputErrorProblem, parameters: Array) -> str:
-    try:
-        for run in problem.runs:
-            run.model_poses(parameters)
-    except DynamicsError as error:
-        return str(error)
-    return "the cost is not finite"
-
-
 def _result(
     problem: OutputErrorProblem,
     warm: Array,
-    searches: list[Solution],
+    searches: dict[str, Solution],
+    active: tuple[str, ...],
     uncertainty: Uncertainty,
     groups: GroupEstimates,
     conditioned: Conditioning,
@@ -201,7 +165,7 @@ def _result(
     rank: int,
     seconds: dict[str, float],
 ) -> IdentificationResult:
-    solution = searches[-1]
+    solution = list(searches.values())[-1]
     std = np.sqrt(np.diag(uncertainty.covariance))
     said = tuple(warning for run in problem.runs for warning in run.warnings())
     return IdentificationResult(
@@ -216,14 +180,16 @@ def _result(
         conditioning=conditioned,
         scale_anchor=problem.anchor,
         base_rank=rank,
-        iterations=sum(one.iterations for one in searches),
-        evaluations=sum(one.evaluations for one in searches),
+        iterations=sum(one.iterations for one in searches.values()),
+        evaluations=sum(one.evaluations for one in searches.values()),
         stop_reason=solution.stop_reason,
-        costs=tuple(one.costs for one in searches),
+        searches=tuple(searches),
+        costs=tuple(one.costs for one in searches.values()),
+        active_bounds=active,
         noise_ratio=uncertainty.noise_ratio,
         expected_noise_ratio=uncertainty.expected_noise_ratio,
         whiteness=tested,
-        warnings=said + _warnings(uncertainty, tested) + conditioned.warnings(),
+        warnings=said + _warnings(uncertainty, tested) + _held(active) + conditioned.warnings(),
         seconds=seconds,
     )
 
@@ -251,3 +217,10 @@ def _warnings(uncertainty: Uncertainty, tested: Whiteness) -> tuple[str, ...]:
             f"{tested.p_value:.1g}, by component {parts}): the model is wrong"
         )
     return tuple(said)
+
+
+def _held(active: tuple[str, ...]) -> tuple[str, ...]:
+    """Bounds that hold the estimate back: beyond them the record would have gone on."""
+    if not active:
+        return ()
+    return (f"the estimate is held at {len(active)} bounds, of which its intervals know nothing: {', '.join(active)}",)

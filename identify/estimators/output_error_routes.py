@@ -8,9 +8,9 @@ import numpy as np
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.estimate_covariance import estimate_uncertainty
-from identify.estimation.identification import best_start, search
 from identify.estimation.loop_parameters import NAMES, StartingGuess
 from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_search import output_error_searches
 from identify.estimation.warm_start import REWEIGHTINGS, linear_warm_start
 from identify.estimators.evidence import Estimate, Evidence
 
@@ -25,17 +25,12 @@ DRAWS_STREAM = 21
 
 def closed_loop(evidence: Evidence) -> Estimate:
     """Closed-loop output error with unknown PID, as in the paper; warm start and command-driven search before it."""
-    return _search_both(evidence, evidence.problem)
+    return _searched(evidence, evidence.problem, "closed_loop")
 
 
 def command_driven(evidence: Evidence) -> Estimate:
     """Output error of the model driven by the logged commands."""
-    began = time.perf_counter()
-    problem = evidence.problem.driven_by_commands()
-    solution = search(problem, best_start(problem, _warm(evidence, problem)), evidence.scenario, _silent)
-    seconds = time.perf_counter() - began
-    std = _std(problem, solution.parameters)
-    return Estimate(solution.parameters, std, seconds, solution.iterations, solution.evaluations, solution.stop_reason)
+    return _searched(evidence, evidence.problem, "command_driven")
 
 
 def known_pid(evidence: Evidence) -> Estimate:
@@ -45,7 +40,7 @@ def known_pid(evidence: Evidence) -> Estimate:
     values, std = evidence.problem.guess.values.copy(), evidence.problem.guess.std.copy()
     values[GAINS] = evidence.known_gains
     std[GAINS] = KNOWN * np.abs(evidence.known_gains)
-    return _search_both(evidence, replace(evidence.problem, guess=StartingGuess(values, std)))
+    return _searched(evidence, replace(evidence.problem, guess=StartingGuess(values, std)), "closed_loop")
 
 
 def warm_start_alone(evidence: Evidence) -> Estimate:
@@ -55,14 +50,15 @@ def warm_start_alone(evidence: Evidence) -> Estimate:
     return Estimate(parameters, None, time.perf_counter() - began, REWEIGHTINGS, 0)
 
 
-def _search_both(evidence: Evidence, problem: OutputErrorProblem) -> Estimate:
+def _searched(evidence: Evidence, problem: OutputErrorProblem, method: str) -> Estimate:
     began = time.perf_counter()
-    driven = problem.driven_by_commands()
-    first = search(driven, best_start(driven, _warm(evidence, problem)), evidence.scenario, _silent)
-    last = search(problem, best_start(problem, first.parameters), evidence.scenario, _silent)
+    scenario = evidence.scenario.with_overrides({"identification.method": method})
+    found = output_error_searches(problem, scenario, _warm(evidence, problem), lambda n=1: None).values()
     seconds = time.perf_counter() - began
-    counts = first.iterations + last.iterations, first.evaluations + last.evaluations
-    return Estimate(last.parameters, _std(problem, last.parameters), seconds, *counts, last.stop_reason)
+    last = list(found)[-1]
+    judged = problem if method == "closed_loop" else problem.driven_by_commands()
+    counts = sum(one.iterations for one in found), sum(one.evaluations for one in found)
+    return Estimate(last.parameters, _std(judged, last.parameters), seconds, *counts, last.stop_reason)
 
 
 def _warm(evidence: Evidence, problem: OutputErrorProblem) -> Array:
@@ -73,7 +69,3 @@ def _warm(evidence: Evidence, problem: OutputErrorProblem) -> Array:
 def _std(problem: OutputErrorProblem, parameters: Array) -> Array:
     covariance = estimate_uncertainty(problem, parameters, np.random.default_rng(DRAWS_STREAM)).covariance
     return np.asarray(np.sqrt(np.diag(covariance)).reshape(len(NAMES)), dtype=float)
-
-
-def _silent(n: int = 1) -> None:
-    pass

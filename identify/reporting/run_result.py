@@ -30,7 +30,8 @@ def identification_entry(result: IdentificationResult) -> dict[str, Any]:
         "evaluations": result.evaluations,
         "stop_reason": result.stop_reason,
         "costs": [list(costs) for costs in result.costs],
-        "searches": ["command_driven", "closed_loop"][: len(result.costs)],
+        "searches": list(result.searches),
+        "active_bounds": list(result.active_bounds),
         "noise_ratio": result.noise_ratio,
         "expected_noise_ratio": result.expected_noise_ratio,
         "whiteness": {

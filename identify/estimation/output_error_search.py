@@ -1,0 +1,131 @@
+"""The searches for the optimum of the output error, one after the other.
+
+From the linear warm start through the command-driven output error, which has few local minima, to the closed-loop
+output error, whose stick-slip events make narrow ones. Where neither the warm start nor the starting guess gives a
+model that runs, multiple shooting finds one that does.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from dynamics import DynamicsError
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.estimation.bounded_least_squares import Problem, Solution, StopCriteria, minimise
+from identify.estimation.multiple_shooting import MultipleShooting
+from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.parameter_bounds import InCoordinates, ParameterBounds, parameter_bounds
+from identify.estimation.record_segments import measured_states, segments
+from identify.progress import Advance
+from identify.scenario import Scenario
+
+CLOSE_ENOUGH = 1e-2
+"""Relative change of the cost at which multiple shooting ends: the searches after it go on from there."""
+
+
+def output_error_searches(
+    problem: OutputErrorProblem, scenario: Scenario, warm: Array, advance: Advance
+) -> dict[str, Solution]:
+    """What each search found, in their order, from the warm start (67,); the last is that of the scenario's method.
+
+    Raises:
+        EstimationError: no model that runs.
+    """
+    found = {}
+    driven = problem.driven_by_commands()
+    start = runnable_start(driven, scenario, warm)
+    if start is None:
+        found["multiple_shooting"] = shoot(driven, scenario, warm)
+        start = found["multiple_shooting"].parameters
+    found["command_driven"] = search(driven, start, scenario, advance)
+    if scenario.identification.method == "closed_loop":
+        before = found["command_driven"].parameters
+        start = runnable_start(problem, scenario, before)
+        if start is None:
+            raise EstimationError(
+                "the closed loop runs neither with what the command-driven search found nor with the starting guess: "
+                f"{_why(problem, before)}"
+            )
+        found["closed_loop"] = search(problem, start, scenario, advance)
+    return found
+
+
+def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance) -> Solution:
+    """Minimise one output-error problem from parameters (67,), within the bounds that the scenario asks for."""
+    settings = scenario.identification
+    criteria = StopCriteria(settings.cost_tolerance, settings.parameter_tolerance, settings.max_iterations)
+    solution = _within_bounds(problem, problem, start, scenario, criteria, advance)
+    advance(settings.max_iterations - solution.iterations)
+    return solution
+
+
+def shoot(problem: OutputErrorProblem, scenario: Scenario, warm: Array) -> Solution:
+    """Parameters with which the command-driven model runs, by multiple shooting from warm start or starting guess.
+
+    Raises:
+        EstimationError: no segment-wise model that runs, or none that does over the whole records.
+    """
+    settings = scenario.identification
+    criteria = StopCriteria(CLOSE_ENOUGH, settings.parameter_tolerance, settings.max_iterations)
+    chains = [segments(run) for run in problem.runs]
+    for start in _candidates(problem, scenario, warm):
+        states = [measured_states(chain, start, scenario.timing, scenario.filter) for chain in chains]
+        shooting = MultipleShooting(problem, chains, states)
+        if not np.isfinite(shooting.cost(start)):
+            continue
+        solution = _within_bounds(shooting, problem, start, scenario, criteria, lambda n=1: None)
+        if np.isfinite(problem.cost(solution.parameters)):
+            return solution
+    raise EstimationError(
+        "neither the warm start nor the starting guess gives a model that runs, nor does multiple shooting from them: "
+        f"{_why(problem, warm)}"
+    )
+
+
+def runnable_start(problem: OutputErrorProblem, scenario: Scenario, warm: Array) -> Array | None:
+    """The better of warm start and starting guess (67,), within the bounds; None where the model runs with neither."""
+    costs = [(problem.cost(start), start) for start in _candidates(problem, scenario, warm)]
+    cost, start = min(costs, key=lambda entry: entry[0])
+    return start if np.isfinite(cost) else None
+
+
+def bounds_of(problem: OutputErrorProblem, scenario: Scenario) -> ParameterBounds:
+    """The bounds of a problem's parameters that the scenario asks for."""
+    return parameter_bounds(problem.guess, scenario.identification.physical_consistency)
+
+
+def _candidates(problem: OutputErrorProblem, scenario: Scenario, warm: Array) -> list[Array]:
+    bounds = bounds_of(problem, scenario)
+    return [bounds.nearest(start) for start in (warm, problem.guess.values)]
+
+
+def _within_bounds(
+    least_squares: Problem,
+    problem: OutputErrorProblem,
+    start: Array,
+    scenario: Scenario,
+    criteria: StopCriteria,
+    advance: Advance,
+) -> Solution:
+    """Solution in the parameters of a search in the coordinates of their bounds."""
+    bounds = bounds_of(problem, scenario)
+    inverse = np.linalg.inv(bounds.matrix)
+    found = minimise(
+        InCoordinates(least_squares, bounds),
+        bounds.coordinates(start),
+        bounds.lower,
+        np.abs(inverse) @ problem.guess.std,
+        criteria,
+        lambda i, cost: advance(),
+    )
+    return replace(found, parameters=bounds.parameters(found.parameters), factor=found.factor @ inverse)
+
+
+def _why(problem: OutputErrorProblem, parameters: Array) -> str:
+    try:
+        for run in problem.runs:
+            run.model_poses(parameters)
+    except DynamicsError as error:
+        return str(error)
+    return "the cost is not finite"
