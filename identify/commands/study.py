@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -47,6 +47,7 @@ Written into the folder:
   study.json       the resolved study, with its scenario and sensor
   rows.jsonl       finished rows as they come
   study.parquet    one table: factors, figures with units, seeds, seconds, errors
+  summary.md, summary.json, figures/*.png
 
 \b
 On many machines:
@@ -95,7 +96,7 @@ def study(
     except StudyInterrupted as stopped:
         typer.echo(f"{stopped}; the same command goes on from there", err=True)
         raise typer.Exit(130) from None
-    _summarise(folder, outcome, quiet)
+    _summarise(chosen, folder, outcome, quiet)
     if outcome.failed:
         typer.echo(f"{outcome.failed} of {outcome.rows} rows failed; {outcome.first_error}", err=True)
         raise typer.Exit(SOME_ROWS_FAILED)
@@ -118,10 +119,26 @@ def _workers(scheduler: str | None, workers: int | None) -> "Workers":
     return partial(running_cluster, scheduler) if scheduler else partial(local_cluster, workers or cores())
 
 
-def _summarise(folder: Path, outcome: "Outcome", quiet: bool) -> None:
-    if not quiet:
-        again = f", {outcome.found} of them from before" if outcome.found else ""
-        typer.echo(f"{outcome.rows} rows{again}: {folder}")
+def _summarise(study: "Study", folder: Path, outcome: "Outcome", quiet: bool) -> None:
+    from identify.studies import summary
+
+    entry = summary.write(folder, study, outcome.frame)
+    if quiet:
+        return
+    again = f", {outcome.found} of them from before" if outcome.found else ""
+    console = Console()
+    for law in entry["theory"]:
+        console.print(_law_line(law), highlight=False, soft_wrap=True)
+    console.print(
+        f"{outcome.rows} rows{again}; summary.md, figures and study.parquet: {folder}", highlight=False, soft_wrap=True
+    )
+
+
+def _law_line(law: dict[str, Any]) -> str:
+    measured = law["reason"]
+    if law["measured"] is not None:
+        measured = f"{law['measured']:.4g} ({law['low']:.4g} to {law['high']:.4g}), expected {law['expected']}"
+    return f"{law['verdict']}: {law['statement']}: {measured}"
 
 
 def _list() -> None:

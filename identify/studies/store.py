@@ -20,6 +20,9 @@ from identify.studies.table import study_in
 
 STUDY, JOURNAL, TABLE, LOCK = "study.json", "rows.jsonl", "study.parquet", ".lock"
 
+WORDS = ("study.title", "study.theory", "scenario.description")
+"""What may change in a study that is continued: it decides no row."""
+
 
 def resolved(study: Study, setup: Setup) -> dict[str, Any]:
     """Everything that decides the rows of a study, as JSON has it: its file, and the scenario and sensor it names."""
@@ -70,13 +73,12 @@ def _check_content(folder: Path) -> None:
 def _claim(folder: Path, entry: dict[str, Any]) -> None:
     """Make the folder that of a study, or refuse where it is that of another."""
     for name, found in ((STUDY, _study_file(folder / STUDY)), (TABLE, study_in(folder / TABLE))):
-        if found is not None and found != entry:
+        if found is not None and (others := _differences(found, entry)):
             raise StudyError(
-                f"{folder / name} is of another study, which differs in {', '.join(_differences(found, entry)[:4])}; "
-                "name another folder with --out"
+                f"{folder / name} is of another study, which differs in {', '.join(others[:4])}; name another folder "
+                "with --out"
             )
-    if not (folder / STUDY).exists():
-        write_text(folder / STUDY, json.dumps(entry, indent=1) + "\n")
+    write_text(folder / STUDY, json.dumps(entry, indent=1) + "\n")
 
 
 def _study_file(path: Path) -> dict[str, Any] | None:
@@ -90,8 +92,8 @@ def _study_file(path: Path) -> dict[str, Any] | None:
 
 
 def _differences(one: Any, other: Any, path: str = "") -> list[str]:
-    """Paths at which two trees of JSON differ."""
+    """Paths at which two resolved studies differ in what decides their rows."""
     if isinstance(one, dict) and isinstance(other, dict):
         keys = [*one, *(key for key in other if key not in one)]
         return [d for k in keys for d in _differences(one.get(k), other.get(k), f"{path}.{k}" if path else k)]
-    return [] if one == other else [path]
+    return [] if one == other or path in WORDS else [path]
