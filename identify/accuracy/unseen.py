@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 
 from dynamics import Robot
 from identify.arrays import Array
-from identify.excitation.design import design_trajectories
+from identify.excitation.design import unseen_trajectories
 from identify.experiment.plant import simulate_plant
 from identify.experiment.run import true_parameters
 from identify.record.loop_setup import frame_times, reference_motion
@@ -22,7 +22,7 @@ def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed:
     """
     values, true = np.asarray(parameters, dtype=float), true_parameters(robot, scenario)
     times = frame_times(scenario, scenario.validation.duration_s)
-    references = [reference_motion(path, times) for path in design_trajectories(robot, scenario, seed).validation]
+    references = [reference_motion(path, times) for path in unseen_trajectories(robot, scenario, seed)]
     plant = [simulate_plant(scenario, robot, true, reference).pose for reference in references]
     model = [model_run(robot, scenario, values, reference) for reference in references]
     return np.array(model) - np.array(plant)

@@ -52,17 +52,21 @@ def design_trajectories(
         excitation, indices = _searched(robot, scenario, excitation_seed, search_seed, check, progress)
     else:
         excitation, indices = _best_random(robot, scenario, excitation_seed, check, progress)
-    unseen = admissible_trajectories(
-        robot, settings, scenario.validation.duration_s, scenario.validation.count, validation_seed, check
-    )
+    unseen = _unseen(robot, scenario, validation_seed, check)
     return TrajectorySet(
         seed=seed,
         excitation=excitation,
-        validation=tuple(unseen),
+        validation=unseen,
         observability_index=float(indices[0]),
         first_index=float(indices[1]),
         median_index=float(np.median(indices[1:])),
     )
+
+
+def unseen_trajectories(robot: RegressorRobot, scenario: Scenario, seed: int) -> tuple[FourierTrajectory, ...]:
+    """The validation trajectories of a scenario alone, the same as `design_trajectories` gives, without its search."""
+    _, validation_seed, _ = np.random.SeedSequence(seed).spawn(3)
+    return _unseen(robot, scenario, validation_seed, motion_check(robot, scenario))
 
 
 def motion_check(robot: RegressorRobot, scenario: Scenario) -> Check:
@@ -130,6 +134,13 @@ def prepare_search(robot: Robot, scenario: Scenario, candidates: list[FourierTra
     problem = SearchProblem(free, MotionConstraints(robot, scenario), value, smooth)
     order = np.argsort([-float(value(z)) for z in pool], kind="stable")
     return Search(robot, scenario, problem, [pool[k] for k in order], known)
+
+
+def _unseen(
+    robot: RegressorRobot, scenario: Scenario, seed: np.random.SeedSequence, check: Check
+) -> tuple[FourierTrajectory, ...]:
+    count, duration_s = scenario.validation.count, scenario.validation.duration_s
+    return tuple(admissible_trajectories(robot, scenario.excitation, duration_s, count, seed, check))
 
 
 def _best_random(

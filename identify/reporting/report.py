@@ -269,9 +269,9 @@ def _index_text(trajectories: TrajectorySet | None) -> str:
     if trajectories is None:
         return ""
     return (
-        f"Observability index (eq. 39): {trajectories.first_index:.3g} of the first candidate, "
-        f"{trajectories.median_index:.3g} of the middle one, {trajectories.observability_index:.3g} of the best, which "
-        f"is used. The paper, on its own geometry: from {INDEX_FIRST:g} to {INDEX_BEST:g} by a genetic algorithm."
+        f"Observability index (eq. 39): {trajectories.first_index:.3g} of the first random candidate, "
+        f"{trajectories.median_index:.3g} of the middle one, {trajectories.observability_index:.3g} of the trajectory "
+        f"that is used. The paper, on its own geometry: from {INDEX_FIRST:g} to {INDEX_BEST:g} by a genetic algorithm."
     )
 
 

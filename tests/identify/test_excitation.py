@@ -4,6 +4,7 @@ import pytest
 from dynamics import load_robot
 from identify.errors import TrajectoryError
 from identify.excitation import design_trajectories
+from identify.excitation.design import unseen_trajectories
 from identify.excitation.random_search import (
     NULL_TOLERANCE,
     observability_indices,
@@ -50,6 +51,14 @@ def test_unseen_trajectories_do_not_depend_on_the_number_of_candidates(diagonal_
     few = design_trajectories(diagonal_robot, QUICK.with_overrides({"excitation.candidates": 2}), seed=3)
     many = design_trajectories(diagonal_robot, QUICK, seed=3)
     np.testing.assert_array_equal(few.validation[0].sine, many.validation[0].sine)
+
+
+def test_unseen_trajectories_are_had_without_the_search(diagonal_robot):
+    whole, alone = design_trajectories(diagonal_robot, QUICK, 4), unseen_trajectories(diagonal_robot, QUICK, 4)
+    assert len(alone) == 2
+    for one, other in zip(whole.validation, alone, strict=True):
+        np.testing.assert_array_equal(one.sine, other.sine)
+        np.testing.assert_array_equal(one.cosine, other.cosine)
 
 
 def test_amplitude_beyond_the_travel_is_refused_with_the_reason(diagonal_robot):

@@ -70,7 +70,7 @@ def test_report_states_the_observability_index(run_folder, diagonal_robot):
     chosen = design_trajectories(diagonal_robot, load_scenario("quick"), seed=0)
     save_trajectories(run_folder.trajectories, chosen)
     text = render(read_report_data(run_folder))
-    assert f"{chosen.observability_index:.3g} of the best" in text
+    assert f"{chosen.observability_index:.3g} of the trajectory that is used" in text
     assert "from 0.38 to 1.345" in text
 
 
