@@ -21,6 +21,7 @@ SMALLEST_RADIUS_PX = 0.8
 ELLIPSE_UNKNOWNS = 5  # the first parameters: c_x, c_y, A_xx, A_xy, A_yy
 SMALLEST_START_PX = 1.2
 CONVERGED_PX = 1e-4  # a step shorter than this ends a fit
+MODEL_ERROR = 0.0025  # of the contrast: rms of what images and the model of a pixel differ by without noise
 CORE_SHARE = 0.4  # a pixel with this share of the contrast belongs to the bright spot when the fit starts
 
 
@@ -46,7 +47,7 @@ class EllipseFits:
 class FitLimits:
     """When a window counts as one whole sticker.
 
-    smallest_contrast in grey values; largest_misfit of the reduced chi-square.
+    smallest_contrast in grey values; largest_misfit of the reduced chi-square, for noise of a grey value and more.
     """
 
     smallest_contrast: float = 40.0
@@ -76,7 +77,8 @@ def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNo
                            CONVERGED_PX, float(psf_px), variances, greys[0], 1.0 / (greys[1] - greys[0]))
     fit_windows(np.ascontiguousarray(windows, dtype=float), fit_size, settings, inner, parameters, shapes, covariances,
                 misfit)
-    good = (parameters[:, 5] >= limits.smallest_contrast) & (misfit <= limits.largest_misfit)
+    good = parameters[:, 5] >= limits.smallest_contrast
+    good &= misfit <= largest_misfits(limits, noise, parameters[:, 5], parameters[:, 6])
     good &= _inside(parameters[:, :2], shapes, fit_size)
     return EllipseFits(parameters[:, :2] + inner + corners, covariances[:, :2, :2], shapes, covariances[:, 2:, 2:],
                        parameters[:, 5], misfit, good)
@@ -86,6 +88,16 @@ _LARGEST_STEP = np.array([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0])
 _LARGEST_STEP.setflags(write=False)
 _GREYS = np.arange(-64.0, 512.0, 0.25)  # at these of 255 the noise variance is tabulated
 _GREYS.setflags(write=False)
+
+
+def largest_misfits(limits: FitLimits, noise: CameraNoise, contrast: Array, ground: Array) -> Array:
+    """Largest reduced chi-square (n,) of good fits with this contrast and ground, grey values.
+
+    The fit takes each grey value's variance for that over all means. With noise below half a grey value that of an even
+    ground differs, and what is left of the model's own error shows.
+    """
+    model = (MODEL_ERROR * contrast) ** 2 / noise.variance(ground)
+    return limits.largest_misfit * (noise.rounding_excess(ground) + model)
 
 
 def _inside(centres: Array, shapes: Array, size: int) -> NDArray[np.bool_]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cmmsim.ellipse_fit import CORE_SHARE, RING_REACH, SMALLEST_RADIUS_PX, EllipseFits, FitLimits
+from cmmsim.ellipse_fit import CORE_SHARE, RING_REACH, SMALLEST_RADIUS_PX, EllipseFits, FitLimits, largest_misfits
 from tests.cmmsim.numpy_coverage import coverage
 
 
@@ -27,7 +27,8 @@ def fit_ellipses(windows, corners, noise, fit_size, limits=None, iterations=3):
             parameters = _bounded(parameters + np.clip(change, -_LARGEST_STEP, _LARGEST_STEP), fit_size)
     misfit = np.sum(weights * residuals**2, axis=(1, 2)) / np.maximum(mask.sum(axis=(1, 2)) - 7.0, 1.0)
     covariances = np.linalg.inv(normal)
-    good = (parameters[:, 5] >= limits.smallest_contrast) & (misfit <= limits.largest_misfit)
+    good = parameters[:, 5] >= limits.smallest_contrast
+    good &= misfit <= largest_misfits(limits, noise, parameters[:, 5], parameters[:, 6])
     good &= _inside(parameters, fit_size)
     return EllipseFits(parameters[:, :2] + inner_corners + corners, covariances[:, :2, :2], _shape(parameters),
                        covariances[:, 2:5, 2:5], parameters[:, 5], misfit, good)

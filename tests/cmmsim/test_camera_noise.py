@@ -1,8 +1,11 @@
 """The camera's noise recovered from its images, after EMVA 1288: photon transfer, PRNU, DSNU; bit depth, saturation."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
+from scipy.stats import norm
 
 import cmmsim
 from cmmsim.fixed_pattern import draw_pattern
@@ -39,6 +42,18 @@ def test_photon_transfer_gives_gain_and_dark_noise(tmp_path):
     assert np.sqrt(variances[0] - 1.0 / 12.0) / gain == pytest.approx(DARK_NOISE, rel=0.03)
     assert np.sqrt(dark - 1.0 / 12.0) / gain == pytest.approx(DARK_NOISE, rel=0.03)
     np.testing.assert_allclose(means, BLACK + GAIN * WHITE * np.array([0, 40, 90, 140, 190, 230]) / 255.0, atol=0.1)
+
+
+@pytest.mark.parametrize("deviation", [0.01, 0.1, 0.3, 0.5, 1.0, 3.0])
+def test_rounding_excess_is_the_largest_variance_of_rounded_numbers(deviation):
+    """Against the probabilities of the numbers, over means everywhere between two of them."""
+    noise = CameraNoise(1e6, 1e-4, deviation / 1e-4, 2e6, 0.0)
+    means, numbers = np.linspace(100.0, 101.0, 201)[:, None], np.arange(60, 142)
+    probability = norm.cdf(numbers + 0.5, means, deviation) - norm.cdf(numbers - 0.5, means, deviation)
+    variance = (probability * numbers**2).sum(axis=1) - (probability * numbers).sum(axis=1) ** 2
+    expected = variance.max() / (deviation**2 + 1.0 / 12.0)
+    assert noise.rounding_excess(np.array(0.0)) == pytest.approx(expected, rel=0.01)
+    assert replace(noise, frames=9).rounding_excess(np.array(0.0)) == pytest.approx(expected, rel=0.01)
 
 
 def test_pattern_is_recovered_from_averaged_images(tmp_path):
