@@ -1,0 +1,122 @@
+"""The command ``cmmsim study`` in this process."""
+
+import time
+
+import pytest
+
+from identify.commands import study as study_command
+from identify.errors import StudyInterrupted
+from identify.studies import dask_runner, runner
+from identify.studies.study_file import study_names
+from identify.studies.table import read_table
+from tests.identify.commands import command, one_line
+from tests.identify.study_rows import KIND
+
+TEXT = f"""
+name = "mine"
+kind = "{KIND}"
+repeats = 2
+[factors]
+sensor.camera.dark_noise = [13.0, 26.0]
+[options]
+"""
+
+
+@pytest.fixture
+def mine(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return write(tmp_path)
+
+
+def write(folder, text=TEXT):
+    path = folder / "mine.toml"
+    path.write_text(text)
+    return path
+
+
+def test_study_leaves_its_files_and_says_where(mine, tmp_path, capsys):
+    assert command("study", mine, "--workers", 0) == 0
+    folder = tmp_path / "runs" / "study-mine"
+    assert {"study.json", "rows.jsonl", "study.parquet", "summary.json", "summary.md"} <= {
+        path.name for path in folder.iterdir()
+    }
+    assert list((folder / "figures").glob("*.png"))
+    shown = capsys.readouterr()
+    assert "4 rows" in shown.out
+    assert str(folder.relative_to(tmp_path)) in shown.out
+    assert "rows of mine: 4 of 4" in shown.err
+    assert "rows/s" in shown.err
+    assert command("study", mine, "--workers", 0) == 0
+    assert "4 rows, 4 of them from before" in capsys.readouterr().out
+
+
+def test_quiet_says_nothing(mine, capsys):
+    assert command("study", mine, "--workers", 0, "--quiet", "--out", "a") == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_failed_rows_make_an_exit_status_of_their_own(tmp_path, capsys):
+    path = write(tmp_path, TEXT + "fails = [1]\n")
+    assert command("study", path, "--workers", 0, "--out", tmp_path / "a") == study_command.SOME_ROWS_FAILED
+    assert "1 of 4 rows failed; row 1: ValueError: row 1 has no answer" in capsys.readouterr().err
+    frame, _ = read_table(tmp_path / "a" / "study.parquet")
+    assert frame["error"].ne("").tolist() == [False, True, False, False]
+
+
+def test_interrupted_study_says_how_far_it_came_and_how_to_go_on(mine, monkeypatch, capsys):
+    def stop(*_):
+        raise StudyInterrupted("stopped: 2 of 4 rows are done and kept")
+
+    monkeypatch.setattr(runner, "run_study", stop)
+    assert command("study", mine, "--workers", 0) == 130
+    error = capsys.readouterr().err
+    assert error == "stopped: 2 of 4 rows are done and kept; the same command goes on from there\n"
+
+
+def test_list_names_every_built_in_study_with_its_rows(capsys):
+    assert command("study", "--list") == 0
+    shown = capsys.readouterr().out
+    assert study_names()
+    assert all(name in shown for name in study_names())
+
+
+def test_ten_million_rows_are_refused_at_once(tmp_path, capsys):
+    values = ", ".join(map(str, range(1, 11)))
+    keys = ("dsnu", "dark_noise", "black_level", "gain", "full_well", "electrons_at_white")
+    factors = "\n".join(f"sensor.camera.{name} = [{values}]" for name in keys)
+    path = write(tmp_path, f'name = "mine"\nkind = "{KIND}"\nrepeats = 10\n[factors]\n{factors}\n')
+    start = time.perf_counter()
+    assert command("study", path, "--out", tmp_path / "a") == 1
+    assert time.perf_counter() - start < 5.0
+    assert "10,000,000 rows; to run more than 100,000, say --yes" in one_line(capsys.readouterr().err)
+    assert not (tmp_path / "a").exists()
+
+
+def test_many_rows_are_run_where_confirmed(mine, monkeypatch):
+    monkeypatch.setattr(study_command, "MANY_ROWS", 3)
+    assert command("study", mine, "--workers", 0, "--quiet") == 1
+    assert command("study", mine, "--workers", 0, "--quiet", "--yes") == 0
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense", "foo://host:1"])
+def test_unreachable_scheduler_is_one_line_within_seconds(mine, monkeypatch, capsys, address):
+    monkeypatch.setattr(dask_runner, "CONNECT_SECONDS", 1)
+    start = time.perf_counter()
+    assert command("study", mine, "--scheduler", address) == 1
+    assert time.perf_counter() - start < 10.0
+    assert f"no Dask scheduler answers at {address}" in one_line(capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "evidence"),
+    [
+        (["study", "no_such_study"], ["no_such_study", "pixel_noise"]),
+        (["study"], ["STUDY", "--list"]),
+        (["study", "mine.toml", "--scheduler", "tcp://a:1", "--workers", 2], ["--workers"]),
+        (["study", "mine.toml", "--workers", 0, "--out", "mine.toml"], ["mine.toml is a file"]),
+    ],
+)
+def test_wrong_calls_are_refused(mine, capsys, arguments, evidence):
+    assert command(*arguments) in (1, 2)
+    error = capsys.readouterr().err
+    assert all(word in error for word in evidence)

@@ -1,0 +1,169 @@
+"""Study files: what they say, and what is refused before anything is computed."""
+
+import numpy as np
+import pytest
+
+from identify.errors import StudyError
+from identify.studies.design import Design, prepare
+from identify.studies.study_file import Study, load_study, study_from_toml, study_names
+from tests.identify.study_rows import KIND
+
+FACTORS = {"sensor.camera.dark_noise": [13.0, 26.0], "scenario.pose_method": ["registration", "planes"]}
+
+
+def study(**entries):
+    return Study(**{"name": "mine", "kind": KIND, "factors": FACTORS} | entries)
+
+
+def refusal(action, *arguments, **entries):
+    with pytest.raises(StudyError) as caught:
+        action(*arguments, **entries)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def toml(lines="", kind=KIND, factors="sensor.camera.dark_noise = [13.0, 26.0]"):
+    return f'name = "mine"\nkind = "{kind}"\n{lines}\n[factors]\n{factors}\n'
+
+
+def cases(chosen):
+    design = Design(chosen)
+    return [design.case(number) for number in range(len(design))]
+
+
+def test_factors_may_be_written_as_dotted_keys_tables_or_quoted_paths():
+    written = [
+        "sensor.camera.dark_noise = [13.0, 26.0]",
+        "[factors.sensor.camera]\ndark_noise = [13.0, 26.0]",
+        '"sensor.camera.dark_noise" = [13.0, 26.0]',
+    ]
+    assert len({study_from_toml(toml(factors=text)).model_dump_json() for text in written}) == 1
+
+
+def test_a_grid_has_every_combination_once_a_repeat_the_last_factor_fastest():
+    rows = cases(study(repeats=2))
+    assert [row.number for row in rows] == list(range(8))
+    assert [tuple(row.factors.values()) for row in rows[:4]] == [
+        (13.0, "registration"), (13.0, "planes"), (26.0, "registration"), (26.0, "planes"),
+    ]
+    assert [row.repeat for row in rows] == [0] * 4 + [1] * 4
+    assert [row.factors for row in rows[:4]] == [row.factors for row in rows[4:]]
+
+
+def test_seeds_are_the_children_that_numpy_spawns_in_row_order():
+    setup = prepare(study(seed=5))
+    for number, child in enumerate(np.random.SeedSequence(5).spawn(8)):
+        assert np.array_equal(setup.row_seed(number).generate_state(4), child.generate_state(4))
+
+
+def test_more_repeats_change_no_row_that_is_there_already():
+    few, many = cases(study(repeats=2)), cases(study(repeats=5))
+    assert many[: len(few)] == few
+
+
+def test_changes_hold_in_every_row_and_factors_in_their_own():
+    setup = prepare(study(changes={"sensor.rig.baseline": 0.8, "scenario.filter.order": 4}, options={"seconds": 0.0}))
+    for case in cases(study()):
+        scenario = setup.row_scenario(case)
+        assert scenario.sensor_changes == {
+            "rig.baseline": 0.8, "camera.dark_noise": case.factors["sensor.camera.dark_noise"],
+        }
+        assert (scenario.filter.order, scenario.pose_method) == (4, case.factors["scenario.pose_method"])
+
+
+def test_options_may_be_factors():
+    chosen = study(factors={"options.seconds": [0.0, 1.0]}, options={"odd": 7})
+    setup = prepare(chosen)
+    options = [setup.row_options(case) for case in cases(chosen)]
+    assert options == [{"odd": 7, "seconds": 0.0}, {"odd": 7, "seconds": 1.0}]
+
+
+def test_a_sample_is_spread_as_its_factors_say():
+    """Against the distributions' own quantiles; 2,000 points put a share within 0.05 at better than 1e-4."""
+    factors = {
+        "sensor.rig.baseline": {"low": 0.5, "high": 2.0},
+        "sensor.camera.dark_noise": {"low": 1.0, "high": 100.0, "scale": "log"},
+        "scenario.filter.order": {"low": 2, "high": 5},
+        "scenario.pose_method": ["registration", "planes"],
+    }
+    chosen = study(factors=factors, sample=2000)
+    prepare(chosen)
+    drawn = [tuple(case.factors.values()) for case in cases(chosen)]
+    baseline, dark, order, method = (np.array(column) for column in zip(*drawn, strict=True))
+    assert ((baseline >= 0.5) & (baseline < 2.0)).all()
+    assert np.mean(baseline < 1.25) == pytest.approx(0.5, abs=0.05)
+    assert np.mean(dark < 10.0) == pytest.approx(0.5, abs=0.05)
+    assert {*order.tolist()} == {2, 3, 4, 5}
+    assert [np.mean(order == k) for k in (2, 3, 4, 5)] == pytest.approx([0.25] * 4, abs=0.05)
+    assert np.mean(method == "planes") == pytest.approx(0.5, abs=0.05)
+    assert np.corrcoef(baseline, dark)[0, 1] == pytest.approx(0.0, abs=0.1)
+    assert cases(study(factors=factors, sample=50)) == cases(chosen)[:50]
+
+
+def test_built_in_studies_can_all_be_run():
+    for name in study_names():
+        prepare(load_study(name))
+
+
+@pytest.mark.parametrize(
+    ("text", "evidence"),
+    [
+        (toml("repeats = 0"), ["repeats = 0"]),
+        (toml("reapeats = 2"), ["unknown key 'reapeats'", "repeats"]),
+        (toml("seed = -1"), ["seed = -1"]),
+        (toml(factors="sensor.camera.dark_noise = []"), ["sensor.camera.dark_noise", "no values"]),
+        (toml(factors="sensor.camera.dark_noise = { low = 1.0, high = 2.0 }"), ["dark_noise", "sample = N"]),
+        (toml("sample = 5", factors="sensor.camera.dark_noise = { low = 2.0, high = 1.0 }"), ["low = 2", "high = 1"]),
+        (toml("sample = 5", factors='sensor.camera.prnu = { low = 0.0, high = 1.0, scale = "log" }'), ["positive"]),
+        (toml("[changes]\nsensor.camera.dark_noise = 1.0"), ["sensor.camera.dark_noise", "both"]),
+        ("name = 1 = 2", ["not valid TOML"]),
+    ],
+)
+def test_study_files_that_contradict_themselves_are_refused(text, evidence):
+    message = refusal(study_from_toml, text)
+    assert all(word in message for word in evidence), message
+
+
+@pytest.mark.parametrize(
+    ("entries", "evidence"),
+    [
+        ({"factors": {"sensor.camera.drk_noise": [1.0]}}, ["sensor.camera.drk_noise", "sensor.camera.dark_noise"]),
+        ({"factors": {"camera.dark_noise": [1.0]}}, ["camera.dark_noise", "nearest", "sensor.camera.dark_noise"]),
+        ({"factors": {"scenario.timing.frame_rate": [1.0]}}, ["scenario.timing.frame_rate_hz"]),
+        ({"factors": {"sensor.camera.dark_noise": [1.0, "much"]}}, ["sensor.camera.dark_noise = 'much'", "number"]),
+        ({"factors": {"sensor.camera.dark_noise": [True]}}, ["sensor.camera.dark_noise = True"]),
+        ({"factors": {"sensor.camera.dark_noise": [-1.0]}}, ["sensor.camera.dark_noise = -1.0", "greater"]),
+        ({"factors": {"sensor.camera.bit_depth": [9]}}, ["sensor.camera.bit_depth = 9", "8, 10 or 12"]),
+        ({"factors": {"scenario.filter.order": [2.5]}}, ["scenario.filter.order = 2.5", "integer"]),
+        ({"factors": {"scenario.pose_method": ["guess"]}}, ["scenario.pose_method = 'guess'", "planes"]),
+        ({"factors": {"sensor.camera": [1.0]}}, ["unknown key 'sensor.camera'"]),
+        ({"factors": {"scenario.sensor_changes": [1.0]}}, ["unknown key 'scenario.sensor_changes'"]),
+        ({"factors": {"sensor.camera.dark_noise": [1.0, 2.0, 1.0]}}, ["a value twice", "repeats"]),
+        ({"changes": {"sensor.lens.psf": 1.0}}, ["sensor.lens.psf", "sensor.lens.psf_px"]),
+        ({"changes": {"scenario.filter.cutoff_hz": 40.0}}, ["filter.cutoff_hz = 40", "Nyquist"]),
+        ({"scenario": "papper"}, ["papper", "paper", "quick"]),
+        ({"kind": "static_poses"}, ["static_poses", "static_pose", "path_pose", "module:function"]),
+        ({"kind": "tests.identify.study_rows:rou"}, ["study_rows", "rou"]),
+        ({"kind": "no_such_module:row"}, ["no_such_module", "PYTHONPATH"]),
+        ({"kind": "static_pose", "options": {"capturs": 4}}, ["capturs", "captures"]),
+        ({"kind": "static_pose", "factors": {"options.capturs": [4]}}, ["options.capturs", "options.captures"]),
+        ({"kind": "static_pose", "factors": {"options.captures": ["many"]}}, ["options.captures = 'many'"]),
+    ],
+)
+def test_keys_and_values_are_checked_before_any_row(entries, evidence):
+    message = refusal(prepare, study(**entries))
+    assert all(word in message for word in evidence), message
+
+
+def test_unknown_study_lists_the_built_in_ones():
+    message = refusal(load_study, "pixel_nois")
+    assert "pixel_nois" in message
+    assert "pixel_noise" in message
+
+
+def test_rows_of_a_huge_grid_are_counted_without_making_them():
+    huge = study(factors={f"sensor.camera.{name}": [*range(1, 101)] for name in ("dsnu", "dark_noise")}, repeats=10**9)
+    assert huge.rows == 10**13
+    last = Design(huge).case(huge.rows - 1)
+    assert last.factors == {"sensor.camera.dsnu": 100, "sensor.camera.dark_noise": 100}
+    assert last.repeat == 10**9 - 1
