@@ -25,6 +25,7 @@ from dynamics.loop_types import (
     failure,
     measurement,
 )
+from dynamics.parameters import split_parameters
 
 FAILURES = {
     1: LEFT_REACH,
@@ -124,7 +125,7 @@ def run(compiled: ctypes.CDLL, problem: LoopProblem) -> ClosedLoopRun:
 def _struct(problem: LoopProblem, schedule: CommandSchedule) -> _Problem:
     """The C struct. It borrows the arrays' memory: problem and cached schedule keep them alive during the call."""
     servo, friction = problem.settings.servo, problem.settings.friction
-    parameters, start, lost = problem.parameters, problem.start, problem.lost
+    start, lost = problem.start, problem.lost
     struct = _Problem(
         frames=problem.frames,
         law=LAWS.index(friction.name),
@@ -135,9 +136,6 @@ def _struct(problem: LoopProblem, schedule: CommandSchedule) -> _Problem:
         smoothing_velocity=friction.smoothing_velocity or 0.0,
         static_level=friction.static_level,
         stribeck_velocity=friction.stribeck_velocity or 0.0,
-        lp=parameters[64],
-        li=parameters[65],
-        ld=parameters[66],
         kp=servo.kp,
         kd=servo.kd,
         ki=servo.ki,
@@ -153,15 +151,7 @@ def _struct(problem: LoopProblem, schedule: CommandSchedule) -> _Problem:
         span_ramp=_pointer(schedule.ramp),
         span_duration=_pointer(schedule.duration),
     )
-    elasticity, rigid = problem.settings.elasticity, parameters[:52]
-    if elasticity is not None:
-        rigid = elasticity.beyond_the_springs(rigid)
-        struct.stiffness, struct.damping = elasticity.stiffness, elasticity.damping
-        struct.motor_inertia = elasticity.motor_inertia
-        struct.motor[:], struct.motor_rate[:] = start.motor_angle, start.motor_rate
-    struct.rigid[:] = rigid
-    struct.coulomb[:] = parameters[52:58]
-    struct.viscous[:] = parameters[58:64]
+    _fill_parameters(struct, problem)
     struct.pose[:] = start.pose
     struct.rate[:] = start.pose_rate
     struct.integral[:] = start.joint_integral
@@ -173,6 +163,18 @@ def _struct(problem: LoopProblem, schedule: CommandSchedule) -> _Problem:
         struct.servo_motion = cast(known.equation_of_motion, c_void_p)
         struct.servo_motion_work = cast(known.equation_of_motion_work, c_void_p)
     return struct
+
+
+def _fill_parameters(struct: _Problem, problem: LoopProblem) -> None:
+    rigid, struct.coulomb[:], struct.viscous[:], joint_pid = split_parameters(problem.parameters)
+    struct.lp, struct.li, struct.ld = joint_pid
+    elasticity, start = problem.settings.elasticity, problem.start
+    if elasticity is not None:
+        rigid = elasticity.beyond_the_springs(rigid)
+        struct.stiffness, struct.damping = elasticity.stiffness, elasticity.damping
+        struct.motor_inertia = elasticity.motor_inertia
+        struct.motor[:], struct.motor_rate[:] = start.motor_angle, start.motor_rate
+    struct.rigid[:] = rigid
 
 
 def _pointer(array: np.ndarray | None) -> "ctypes._Pointer[c_double] | None":

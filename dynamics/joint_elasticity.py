@@ -18,7 +18,7 @@ from dynamics.arrays import real
 from dynamics.errors import SimulationError
 from dynamics.friction import FrictionLaw
 from dynamics.geometry import LEGS
-from dynamics.parameters import BODY_NAMES, COULOMB, INERTIAL, RIGID_BODY, RIGID_BODY_NAMES, VISCOUS
+from dynamics.parameters import BODY_NAMES, INERTIAL, RIGID_BODY, RIGID_BODY_NAMES, split_parameters
 from dynamics.robot import Robot
 
 LARGEST_STEP = 1.0
@@ -63,10 +63,10 @@ class JointElasticity:
         per_inertia = np.zeros((12, 12))
         per_inertia[:6, :6] = jacobian @ np.linalg.solve(carried, jacobian.T)
         per_inertia[6:, 6:] = np.eye(6) / self.motor_inertia
-        lp, _, ld = parameters[64:]
-        dry = parameters[COULOMB] * friction.dry_slope(np.zeros(6), np.ones(6))
+        _, coulomb, viscous, (lp, _, ld) = split_parameters(parameters)
+        dry = coulomb * friction.dry_slope(np.zeros(6), np.ones(6))
         stiffness = _coupled(self.stiffness, np.full(6, lp))
-        damping = _coupled(self.damping, ld + parameters[VISCOUS] + dry)
+        damping = _coupled(self.damping, ld + viscous + dry)
         motion = np.block([[np.zeros((12, 12)), np.eye(12)], [-per_inertia @ stiffness, -per_inertia @ damping]])
         return max(1, ceil(frame_period * float(np.abs(np.linalg.eigvals(motion)).max()) / LARGEST_STEP))
 

@@ -45,6 +45,11 @@ def unit_of(name: str) -> str:
     return UNITS[name.rsplit(".", 1)[1]]
 
 
+def split_parameters(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Parameters (67,) as those of rigid bodies (52,), Coulomb and viscous friction (6,) each, and lp, li, ld (3,)."""
+    return values[RIGID_BODY], values[COULOMB], values[VISCOUS], values[VISCOUS.stop :]
+
+
 def check_parameters(values: ArrayLike) -> np.ndarray:
     """Return values as a float array (64,); raise ParameterError on a wrong shape, NaN, or a negative entry."""
     array = floats("parameters", values, (len(PARAMETER_NAMES),), error=ParameterError, finite=False)

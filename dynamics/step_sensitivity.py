@@ -13,7 +13,7 @@ import numpy as np
 from dynamics.friction import FrictionLaw
 from dynamics.loop_motion import Command, Evaluation, MotionFunctions, State, compliance
 from dynamics.loop_types import LENGTH
-from dynamics.parameters import COULOMB, RIGID_BODY, VISCOUS
+from dynamics.parameters import COULOMB, RIGID_BODY, VISCOUS, split_parameters
 
 LP, LI, LD = 64, 65, 66
 NO_APPROACH = 1e-9  # rad/s^2 or N m/s: an event so slow has no derivative
@@ -28,9 +28,8 @@ class StepSensitivity:
         self, functions: MotionFunctions, parameters: np.ndarray, friction: FrictionLaw, tangent: State
     ) -> None:
         self._functions = functions
-        self._rigid = parameters[RIGID_BODY]
-        self._coulomb, self._viscous = parameters[COULOMB], parameters[VISCOUS]
-        self._lp, self._li, self._ld = parameters[64:]
+        self._rigid, self._coulomb, self._viscous, joint_pid = split_parameters(parameters)
+        self._lp, self._li, self._ld = joint_pid
         self._friction = friction
         self.tangent = tangent
         self._d_time = np.zeros(tangent.pose.shape[1])

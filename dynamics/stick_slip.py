@@ -14,7 +14,7 @@ import numpy as np
 from dynamics.friction import FrictionLaw
 from dynamics.loop_motion import Command, Evaluation, MotionFunctions, State, compliance
 from dynamics.loop_types import LEFT_REACH, SINGULAR_MASS
-from dynamics.parameters import COULOMB, RIGID_BODY, VISCOUS
+from dynamics.parameters import split_parameters
 from dynamics.step_sensitivity import FRACTION, WEIGHT, StepSensitivity
 
 MAX_EVENTS_PER_SEGMENT = 400
@@ -43,9 +43,8 @@ class StickSlipMotion:
         tangent: State | None = None,
     ) -> None:
         self._functions = functions
-        self._rigid = parameters[RIGID_BODY]
-        self._coulomb, self._viscous = parameters[COULOMB], parameters[VISCOUS]
-        self._lp, self._li, self._ld = parameters[64:]
+        self._rigid, self._coulomb, self._viscous, joint_pid = split_parameters(parameters)
+        self._lp, self._li, self._ld = joint_pid
         self._friction = friction
         self._breakaway = friction.static_level * self._coulomb
         self._has_events = np.logical_and(self._coulomb > 0, friction.sticks)
