@@ -143,6 +143,13 @@ class Filter(_Section):
     cutoff_hz: float = _quantity(10.0, "Hz", "cutoff frequency", gt=0)
 
 
+class PriorValue(_Section):
+    """What is known of a parameter before the experiment, in its SI unit."""
+
+    value: float = _quantity(..., "SI", "expected value", ge=0)
+    std: float = _quantity(..., "SI", "its standard deviation", gt=0)
+
+
 class Identification(_Section):
     """Output-error estimation and its stop criteria (eq. 35)."""
 
@@ -154,6 +161,9 @@ class Identification(_Section):
     )
     anchor_std: float | None = _quantity(None, "unit of the anchor", "standard deviation of the anchor", gt=0)
     start_std: float = _quantity(1.0, "1", "standard deviation of the starting guess, relative to each value", gt=0)
+    prior: dict[str, PriorValue] = Field(
+        {}, description="parameters known better than the starting guess: { name = { value, std } }"
+    )
     physical_consistency: bool = Field(
         False, description="only masses and moments of inertia that a rigid body can have (the paper's have others)"
     )

@@ -47,6 +47,10 @@ def _toml_value(value: Any) -> str:
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(_toml_value(one) for one in value)}]"
+    if isinstance(value, BaseModel):
+        return _toml_value(dict(value))
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{json.dumps(key)} = {_toml_value(one)}' for key, one in value.items())}}}"
     return repr(value).lower() if isinstance(value, bool) else repr(value)
 
 

@@ -138,7 +138,8 @@ def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: 
             f"the scale anchor is a payload, and the {len(runs)} records have all the same load: one with and one "
             "without it are needed"
         )
-    guess = starting_guess(robot, scenario.model.start_parameters, scenario.identification.start_std)
+    settings = scenario.identification
+    guess = starting_guess(robot, scenario.model.start_parameters, settings.start_std, settings.prior)
     return OutputErrorProblem(runs, guess, anchor)
 
 

@@ -1,6 +1,8 @@
 """The 67 parameters of the closed loop, as the estimator sees them: names, units, typical sizes."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -8,8 +10,16 @@ from dynamics import Robot
 from dynamics.parameters import COULOMB_NAMES, JOINT_PID_NAMES, PARAMETER_NAMES, VISCOUS_NAMES, unit_of
 from identify.arrays import Array
 from identify.errors import ScenarioError
+from identify.scenario import PriorValue
 
 NAMES: tuple[str, ...] = PARAMETER_NAMES + JOINT_PID_NAMES
+
+VALID_NAMES = (
+    "mass, Ixx, Iyy or Izz of platform, crank1 to crank6 or link1 to link6 (platform.mass), coulomb or viscous of "
+    "joint1 to joint6, and joint_pid.lp, .li, .ld"
+)
+"""The names in one line."""
+
 
 @dataclass(frozen=True)
 class StartingGuess:
@@ -19,16 +29,24 @@ class StartingGuess:
     std: Array
 
 
-def starting_guess(robot: Robot, set_name: str, relative_std: float) -> StartingGuess:
-    """The named parameter set of the robot file, uncertain by a fraction of each parameter's size.
+def starting_guess(
+    robot: Robot, set_name: str, relative_std: float, known: Mapping[str, PriorValue] = MappingProxyType({})
+) -> StartingGuess:
+    """The named parameter set of the robot file, uncertain by a fraction of each parameter's size, but for those of
+    which a value and its standard deviation are known.
 
     Raises:
-        ScenarioError: no such set (with the valid names).
+        ScenarioError: no such set or parameter (with the valid names).
     """
     check_parameter_set(robot, set_name)
     chosen = robot.parameter_sets[set_name]
     holding_torque = float(np.abs(robot.static_torque(robot.home_pose, chosen.dynamic)).mean())
-    return StartingGuess(chosen.vector, relative_std * typical_sizes(chosen.vector, holding_torque))
+    values, std = chosen.vector.copy(), relative_std * typical_sizes(chosen.vector, holding_torque)
+    for name, prior in known.items():
+        if name not in NAMES:
+            raise ScenarioError(f"identification.prior: no parameter {name!r}; valid: {VALID_NAMES}")
+        values[index_of(name)], std[index_of(name)] = prior.value, prior.std
+    return StartingGuess(values, std)
 
 
 def check_parameter_set(robot: Robot, set_name: str) -> None:
