@@ -11,15 +11,14 @@ import numpy as np
 
 from dynamics import compiled_closed_loop, plain_closed_loop
 from dynamics.arrays import check_type, flag, floats, mask, real, shown
+from dynamics.closed_loop_run import ClosedLoopRun, LoopFailure
 from dynamics.errors import SimulationError
 from dynamics.joint_elasticity import JointElasticity
 from dynamics.loop_types import (
     PARAMETER_COUNT,
-    ClosedLoopRun,
     Controller,
     FrameTiming,
     FrictionLaw,
-    LoopFailure,
     LoopProblem,
     LoopSettings,
     PoseSensor,

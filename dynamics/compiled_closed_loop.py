@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dynamics import model
+from dynamics.closed_loop_run import ClosedLoopRun, empty_run, failure
 from dynamics.command_schedule import CommandSchedule, command_schedule
 from dynamics.compilation import load_library, open_library
 from dynamics.errors import SimulationError
@@ -17,12 +18,9 @@ from dynamics.loop_types import (
     LEFT_REACH,
     MEASURED_OUT_OF_REACH,
     SINGULAR_MASS,
-    ClosedLoopRun,
     LoopProblem,
     PoseSensor,
     RateSensor,
-    empty_run,
-    failure,
     measurement,
 )
 from dynamics.parameters import split_parameters

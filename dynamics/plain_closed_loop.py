@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 
 from dynamics import model
+from dynamics.closed_loop_run import ClosedLoopRun, empty_run, failure
 from dynamics.command_schedule import CommandSchedule, command_schedule
 from dynamics.elastic_motion import elastic_functions, with_motors
 from dynamics.geometry import Rss6Geometry
@@ -16,11 +17,8 @@ from dynamics.loop_types import (
     MEASURED_OUT_OF_REACH,
     PARAMETER_COUNT,
     START_COUNT,
-    ClosedLoopRun,
     LoopProblem,
     Reference,
-    empty_run,
-    failure,
     measurement,
     own_command,
 )
