@@ -38,6 +38,7 @@ COLUMNS = {
     "point_depth_rms_um": Column("um", "error of single stickers along the line from there to the sticker"),
     "point_lateral_rms_um": Column("um", "error of single stickers across that line, rms over both axes"),
     "centre_rms_px": Column("px", "error of sticker centres in the images, rms over stickers, cameras and axes"),
+    "disparity_rms_px": Column("px", "error of the difference of a sticker's x in both images, rms over stickers"),
 }
 MAIN = ("position_rms_um", "orientation_rms_urad", "mean_position_rms_um", "mean_orientation_rms_urad",
         "point_depth_rms_um", "centre_rms_px")
@@ -79,7 +80,7 @@ class _Look:
         self.counts = [len(one.target_ids) for one in good]
         pairs = [_sticker_errors(eye, estimator, one, pose) for one in good]
         self.points = np.concatenate([points for points, _ in pairs]) if pairs else np.zeros((0, 3))
-        self.centres = np.concatenate([centres for _, centres in pairs]) if pairs else np.zeros((0, 2))
+        self.centres = np.concatenate([centres for _, centres in pairs], axis=1) if pairs else np.zeros((2, 0, 2))
 
     def _measured(
         self, eye: RowSensor, estimator: PoseEstimator, pose: Array, rng: np.random.Generator
@@ -97,7 +98,7 @@ def _sticker_errors(
     eye: RowSensor, estimator: PoseEstimator, seen: cmmsim.Measurement, pose: Array
 ) -> tuple[Array, Array]:
     """Of the stickers seen: [distance, error along the line of sight, error across it] (k, 3), m, and the errors of
-    their centres (2 k, 2), px."""
+    their centres in both images (2, k, 2), px."""
     index = np.flatnonzero(np.isin(estimator.platform.sticker_ids, seen.target_ids))
     places = apply(cmmsim.pose_to_transform(pose), eye.truth.platform_places[index])
     in_camera = apply(invert(eye.truth.base_from_camera), places)
@@ -107,8 +108,7 @@ def _sticker_errors(
     errors = (seen.points - in_camera) @ eye.truth.base_from_camera[:3, :3].T
     along = np.einsum("ki,ki->k", errors, sight) / distance
     across = np.sqrt(np.maximum(np.einsum("ki,ki->k", errors, errors) - along**2, 0.0))
-    return (np.column_stack([distance, along, across]),
-            np.concatenate([seen.left_pixels - pixels[0], seen.right_pixels - pixels[1]]))
+    return np.column_stack([distance, along, across]), np.stack([seen.left_pixels, seen.right_pixels]) - pixels
 
 
 def _row(eye: RowSensor, looks: list[_Look], captures: int) -> Row:
@@ -117,6 +117,7 @@ def _row(eye: RowSensor, looks: list[_Look], captures: int) -> Row:
         raise EstimationError(f"no pose was found in any of {captures * len(looks)} pictures: {looks[-1].reasons[-1]}")
     means = np.array([look.errors.mean(axis=0) for look in looks if len(look.errors)])
     points = np.concatenate([look.points for look in looks])
+    centres = np.concatenate([look.centres for look in looks], axis=1)
     stated = stated_um(np.concatenate([look.covariances for look in looks]))
     noise = eye.sensor.noise
     rim_grey: Array = np.asarray(noise.mean_grey(np.array(eye.rim)), dtype=float)
@@ -134,7 +135,8 @@ def _row(eye: RowSensor, looks: list[_Look], captures: int) -> Row:
         "sight_m": float(points[:, 0].mean()),
         "point_depth_rms_um": rms_um(points[:, 1]),
         "point_lateral_rms_um": rms_um(points[:, 2]) / float(np.sqrt(2.0)),
-        "centre_rms_px": float(np.sqrt(np.mean(np.concatenate([look.centres for look in looks]) ** 2))),
+        "centre_rms_px": float(np.sqrt(np.mean(centres**2))),
+        "disparity_rms_px": float(np.sqrt(np.mean((centres[0, :, 0] - centres[1, :, 0]) ** 2))),
     }
 
 

@@ -1,0 +1,191 @@
+"""Rows of studies: the same from the same seed whatever was computed before, and right against closed forms."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import cmmsim
+from cmmsim.exact_teaching import exactly_taught
+from cmmsim.pose import invert, rotation_log
+from cmmsim.sensor_file import read_sensor_file
+from identify.errors import EstimationError, ScenarioError
+from identify.scenario import load_scenario
+from identify.studies import row_sensor, rows
+from identify.studies.row_drawn_sensor import DrawnSensor
+
+NOISELESS = {"sensor_changes.camera.noise": False, "sensor_changes.camera.bit_depth": 12,
+             "sensor_changes.camera.gain": 2.08, "sensor_changes.camera.black_level": 256.0}
+
+
+def scenario(**overrides):
+    return load_scenario("quick").with_overrides({"renderer": "analytic"} | overrides)
+
+
+def seed(number=0):
+    return np.random.SeedSequence(7, spawn_key=(number,))
+
+
+def static(number=0, settings=None, **options):
+    return rows.run("static_pose", settings or scenario(), seed(number), options)
+
+
+def test_same_seed_gives_the_same_row_and_another_one_another():
+    first, again, other = static(0), static(0), static(1)
+    assert first == again
+    assert first["position_rms_um"] != other["position_rms_um"]
+    assert list(first) == list(rows.columns("static_pose"))
+
+
+def test_row_does_not_depend_on_what_the_process_has_kept():
+    row_sensor._exact_sensor.cache_clear()
+    alone = static(0)
+    for dark_noise in (10.0, 40.0, 80.0):
+        static(1, scenario(**{"sensor_changes.camera.dark_noise": dark_noise}))
+    kept = row_sensor._exact_sensor.cache_info()
+    assert static(0) == alone
+    assert row_sensor._exact_sensor.cache_info().hits == kept.hits + 1
+    rows.run("path_pose", scenario(), seed(3), {"stretch_s": 0.1})
+    assert static(0) == alone
+
+
+def test_sensors_that_a_process_keeps_are_bounded():
+    assert row_sensor._exact_sensor.cache_info().maxsize == row_sensor.SENSORS_KEPT
+
+
+def test_seed_of_a_row_is_not_used_up():
+    given = seed()
+    static_row = rows.run("static_pose", scenario(), given, {})
+    assert given.n_children_spawned == 0
+    assert rows.run("static_pose", scenario(), given, {}) == static_row
+
+
+@pytest.mark.slow
+def test_exact_teaching_is_what_teaching_finds_to_its_own_uncertainty():
+    file = read_sensor_file("ctrack780")
+    exact, taught = exactly_taught(file), cmmsim.Sensor(file, seed=3, renderer="analytic").taught
+    error = taught.base_from_camera @ invert(exact.base_from_camera)
+    small = np.concatenate([(taught.base_from_camera - exact.base_from_camera)[:3, 3], rotation_log(error[:3, :3])])
+    assert small @ np.linalg.solve(taught.base_covariance, small) < chi2.ppf(0.9999, 6)
+    assert np.linalg.norm(taught.platform_places - exact.platform_places, axis=1).max() < 2e-5
+    assert not exact.platform_covariance.any()
+
+
+def test_camera_without_noise_leaves_hardly_an_error():
+    quiet = static(0, scenario(**NOISELESS))
+    noisy = static(0)
+    for figure in ("position_rms_um", "orientation_rms_urad", "centre_rms_px", "point_depth_rms_um"):
+        assert quiet[figure] < 0.1 * noisy[figure]
+
+
+def test_rows_agree_with_the_sensors_own_covariance():
+    many = [static(number) for number in range(40)]
+    square = sum((row["position_rms_um"] / row["stated_position_rms_um"]) ** 2 * 12 for row in many)
+    assert chi2.ppf(0.0005, 12 * 40) < square < chi2.ppf(0.9995, 12 * 40)
+
+
+def test_averaging_over_a_held_pose_takes_pictures_at_the_frame_rate():
+    held = static(0, scenario(**{"timing.frame_rate_hz": 30.0}), hold_s=0.5)
+    assert held["captures"] == 15
+    assert held["mean_position_rms_um"] < held["position_rms_um"]
+    assert static(0, captures=3, poses=2)["captures"] == 6
+
+
+@pytest.mark.slow
+def test_teaching_by_the_sensor_adds_its_own_error_and_is_seeded_by_the_row():
+    taught = static(0, captures=1, teaching="sensor")
+    assert taught == static(0, captures=1, teaching="sensor")
+    assert taught != static(0, captures=1)
+
+
+def test_lost_pictures_are_counted_and_a_row_of_none_but_those_says_why():
+    with pytest.raises(EstimationError, match=r"no pose was found in any of 4 pictures: \d+ visible stickers"):
+        static(0, scenario(**{"sensor_changes.stickers.sticker_level": 12}))
+
+
+@pytest.mark.parametrize(("latency_frames", "expected"), [(0, np.sqrt(1 / 3)), (2, np.sqrt(4 + 2 + 1 / 3))])
+def test_pose_in_use_lags_by_what_its_age_says(latency_frames, expected):
+    """A pose that is L old when it arrives and held for T is off by v sqrt(L^2 + L T + T^2 / 3) in the mean."""
+    rate = 30.0
+    settings = scenario(**NOISELESS | {"timing.frame_rate_hz": rate, "timing.latency_s": latency_frames / rate})
+    row = rows.run("path_pose", settings, seed(2), {"stretch_s": 1.0})
+    assert row["frames"] == 30
+    ratio = 1e-3 * row["used_position_rms_um"] / row["speed_rms_mm_s"] * rate
+    assert ratio == pytest.approx(expected, rel=0.06)
+    assert row["position_rms_um"] < 1.0
+
+
+def test_dropped_frames_of_a_path_are_counted():
+    settings = scenario(**{"timing.dropout": 0.4})
+    row = rows.run("path_pose", settings, seed(1), {"stretch_s": 0.5})
+    assert 3 <= row["lost_frames"] <= 22
+
+
+def test_drawn_sensor_has_the_covariance_that_it_states():
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((6, 6)) * np.repeat([1e-6, 1e-5], 3)[:, None]
+    covariance, pose, count = root @ root.T, np.arange(6.0), 3000
+    sensor = DrawnSensor(covariance)
+    sensor.start_run(5)
+    errors = np.array([sensor.measure(pose).pose - pose for _ in range(count)])
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), errors.T)
+    assert chi2.ppf(0.0005, 6 * count) < np.sum(whitened**2) < chi2.ppf(0.9995, 6 * count)
+    assert np.abs(np.corrcoef(whitened) - np.eye(6)).max() < 5 / np.sqrt(count)
+
+
+def test_drawn_sensor_loses_its_share_of_frames_without_changing_the_noise_of_others():
+    pose, covariance = np.zeros(6), 1e-12 * np.eye(6)
+    whole, losing = DrawnSensor(covariance), DrawnSensor(covariance, dropout=0.3)
+    for sensor in (whole, losing):
+        sensor.start_run(1)
+    pairs = [(whole.measure(pose), losing.measure(pose)) for _ in range(1000)]
+    assert sum(not second.ok for _, second in pairs) == pytest.approx(300, abs=60)
+    assert all(np.array_equal(first.pose, second.pose) for first, second in pairs if second.ok)
+
+
+def test_unknown_kinds_and_options_name_the_valid_ones():
+    with pytest.raises(ScenarioError, match="static_pose, path_pose, identification, closed_loop"):
+        rows.run("pose", scenario(), seed(), {})
+    with pytest.raises(ScenarioError, match=r"unknown key 'capture'; valid names: poses, captures, hold_s, teaching"):
+        rows.check_options("static_pose", {"capture": 3})
+    with pytest.raises(ScenarioError, match=r"options of static_pose: captures = 0"):
+        rows.check_options("static_pose", {"captures": 0})
+
+
+@pytest.mark.parametrize("kind", rows.KINDS)
+def test_each_kind_says_unit_and_meaning_of_its_columns_and_which_are_drawn(kind):
+    columns = rows.columns(kind)
+    assert set(rows.find_kind(kind).main) <= set(columns)
+    suffixes = {"um": "_um", "urad": "_urad", "px": "_px", "%": "_percent", "mm/s": "_mm_s", "m": "_m", "N m": "_N_m"}
+    for name, column in columns.items():
+        assert column.meaning
+        assert name.endswith(suffixes.get(column.unit, ""))
+
+
+@pytest.mark.slow
+def test_closed_loop_follows_its_reference_with_the_images_in_the_loop():
+    settings = scenario(**{"validation.duration_s": 1.0})
+    row = rows.run("closed_loop", settings, seed(0), {"teaching": "exact"})
+    assert list(row) == list(rows.columns("closed_loop"))
+    assert row["frames"] == 60
+    assert row["lost_frames"] == 0
+    assert row["position_rms_um"] < 2.0 * row["stated_position_rms_um"]
+    assert 10.0 < row["tracking_position_rms_um"] < 1e4
+    assert row == rows.run("closed_loop", settings, seed(0), {"teaching": "exact"})
+
+
+@pytest.mark.slow
+def test_identification_finds_the_parameters_to_what_it_states():
+    settings = scenario(**{"identification.method": "command_driven", "validation.count": 1})
+    found = [rows.run("identification", settings, seed(number), {}) for number in range(3)]
+    assert list(found[0]) == list(rows.columns("identification"))
+    assert found[0] == rows.run("identification", settings, seed(0), {})
+    assert all(row["unseen_position_rms_um"] < row["pose_noise_um"] for row in found)
+    assert np.sqrt(np.mean([row["normalised_error"] ** 2 for row in found])) < 1.5
+
+
+@pytest.mark.slow
+def test_identification_from_images_is_as_good_as_from_drawn_noise():
+    settings = scenario(**{"identification.method": "command_driven", "validation.count": 1})
+    drawn, images = (rows.run("identification", settings, seed(5), {"sensor": kind}) for kind in ("drawn", "images"))
+    assert images["pose_noise_um"] == pytest.approx(drawn["pose_noise_um"], rel=0.1)
+    assert images["viscous_std_percent"] == pytest.approx(drawn["viscous_std_percent"], rel=0.1)

@@ -1,0 +1,164 @@
+"""Summaries of studies against numpy and scipy; what failed is counted and named, and in no average."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.image import imread
+from scipy import stats
+
+from identify.studies import summary
+from identify.studies.law import Law
+from identify.studies.point_statistics import point_statistics
+from identify.studies.study_file import Range, Study
+
+DARK, BASELINE = "sensor.camera.dark_noise", "sensor.rig.baseline"
+POSITION, ORIENTATION = "position_rms_um", "orientation_rms_urad"
+
+
+def made_study(**changes):
+    settings = {"name": "made", "title": "Made up", "kind": "static_pose", "repeats": 8, "seed": 3,
+                "factors": {DARK: [10.0, 20.0, 40.0], BASELINE: [0.5, 1.0]},
+                "theory": [Law(figure=POSITION, factor=DARK, exponent=1.0)]}
+    return Study(**settings | changes)
+
+
+def made_table(study, failed=()):
+    """Position error 0.1 um an electron, with scatter; rows that failed have no figures, as a study's table has it."""
+    rng, count = np.random.default_rng(0), study.rows
+    points = [(dark, base) for dark in study.factors[DARK] for base in study.factors[BASELINE]]
+    dark, base = np.array([points[row % len(points)] for row in range(count)]).T
+    frame = pd.DataFrame({"row": range(count), "repeat": np.arange(count) // len(points), "seed_entropy": "3",
+                          "seed_spawn_key": range(count), DARK: dark, BASELINE: base,
+                          POSITION: 0.1 * dark * np.sqrt(rng.chisquare(12, count) / 12),
+                          ORIENTATION: 1.0 / base * np.sqrt(rng.chisquare(12, count) / 12),
+                          "lost_frames": 0.0, "seconds": 0.02, "error": ""})
+    for row in failed:
+        frame.loc[row, [POSITION, ORIENTATION, "lost_frames"]] = np.nan
+        frame.loc[row, "error"] = f"LostError: only {row % 2} stickers"
+    return frame
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Table of a study with three failed rows, what its summary returned, and the folder."""
+    study, folder = made_study(), tmp_path_factory.mktemp("study")
+    frame = made_table(study, failed=(4, 7, 9))
+    return frame, summary.write(folder, study, frame), folder
+
+
+def test_band_of_the_mean_is_students():
+    values = np.random.default_rng(0).gamma(2.0, size=12)
+    found = point_statistics(values)
+    assert (found.mean, found.std) == (pytest.approx(np.mean(values)), pytest.approx(np.std(values, ddof=1)))
+    assert found.rms == pytest.approx(np.sqrt(np.mean(values**2)))
+    expected = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    assert found.mean_band == pytest.approx(tuple(expected))
+
+
+def test_band_of_the_rms_covers_it_as_often_as_it_says():
+    rng, trials, count = np.random.default_rng(1), 2000, 20
+    figures = np.sqrt(rng.chisquare(12, (trials, count)) / 12)
+    covered = sum(low <= 1.0 <= high for low, high in (point_statistics(row).rms_band for row in figures))
+    assert stats.binom.ppf(0.001, trials, 0.95) <= covered <= stats.binom.ppf(0.999, trials, 0.95)
+
+
+def test_band_of_the_rms_agrees_with_a_bootstrap_of_many_rows():
+    values = np.sqrt(np.random.default_rng(2).chisquare(12, 300) / 12)
+    oracle = stats.bootstrap((values,), lambda v, axis: np.sqrt(np.mean(v**2, axis=axis)), rng=0).confidence_interval
+    np.testing.assert_allclose(point_statistics(values).rms_band, oracle, rtol=0.005)
+
+
+def test_one_row_has_no_band_and_zeros_have_one_of_no_width():
+    assert point_statistics(np.array([3.0])).rms_band is None
+    assert point_statistics(np.array([3.0])).std is None
+    assert point_statistics(np.zeros(5)).rms_band == (0.0, 0.0)
+
+
+def test_points_hold_the_statistics_of_their_rows_and_none_of_the_failed(written):
+    frame, entry, _ = written
+    done = frame[frame["error"] == ""]
+    assert len(entry["points"]) == 6
+    for point in entry["points"]:
+        rows = done[(done[DARK] == point["factors"][DARK]) & (done[BASELINE] == point["factors"][BASELINE])]
+        figure = point["figures"][POSITION]
+        assert figure["rows"] == len(rows)
+        assert figure["mean"] == pytest.approx(rows[POSITION].mean())
+        assert figure["rms"] == pytest.approx(np.sqrt((rows[POSITION] ** 2).mean()))
+        assert figure["rms_band"][0] < figure["rms"] < figure["rms_band"][1]
+
+
+def test_failed_rows_are_counted_and_named(written):
+    _, entry, folder = written
+    assert entry["rows"] == {"planned": 48, "done": 45, "failed": 3, "missing": 0}
+    assert entry["failures"]["reasons"] == {"LostError: only 1 stickers": 2, "LostError: only 0 stickers": 1}
+    assert [one["row"] for one in entry["failures"]["first"]] == [4, 7, 9]
+    text = (folder / "summary.md").read_text()
+    assert "45 rows done, 3 failed, 0 missing" in text
+    assert "2 x LostError: only 1 stickers" in text
+    assert "The first: 4, 7, 9." in text
+
+
+def test_json_holds_the_laws_with_numbers_and_units(written):
+    _, _, folder = written
+    stored = json.loads((folder / "summary.json").read_text())
+    law = stored["theory"][0]
+    assert law["verdict"] == "passed"
+    assert law["low"] < 1.0 < law["high"]
+    assert law["rows"] == 45
+    assert stored["units"][DARK] == "electrons"
+    assert stored["units"][POSITION] == "um"
+    assert stored["confidence"] == {"bands": 0.95, "laws": 0.99}
+    assert "| position_rms_um ~ sensor.camera.dark_noise ^ 1 | 1 |" in (folder / "summary.md").read_text()
+
+
+def test_figures_show_each_factor_two_as_a_map_and_the_laws(written):
+    folder = written[2] / "figures"
+    names = {f"by_{DARK}.png", f"by_{BASELINE}.png", "map.png", "laws.png"}
+    assert {path.name for path in folder.iterdir()} == names
+    for name in names:
+        assert np.ptp(imread(folder / name)[..., :3]) > 0.5
+
+
+def test_single_repeat_has_no_band_and_says_so(tmp_path):
+    study = made_study(repeats=1)
+    entry = summary.write(tmp_path, study, made_table(study))
+    assert entry["points"][0]["figures"][POSITION]["rms_band"] is None
+    assert "With a single repeat there is no band" in (tmp_path / "summary.md").read_text()
+
+
+def test_study_of_which_nothing_worked_says_why(tmp_path):
+    study = made_study(repeats=1)
+    entry = summary.write(tmp_path, study, made_table(study, failed=range(study.rows)))
+    assert entry["rows"]["done"] == 0
+    assert entry["points"] == []
+    assert entry["theory"][0]["verdict"] == "undecided"
+    assert "0 rows done, 6 failed" in (tmp_path / "summary.md").read_text()
+
+
+def test_interrupted_study_says_what_is_missing(tmp_path):
+    study = made_study()
+    entry = summary.write(tmp_path, study, made_table(study).head(20))
+    assert entry["rows"]["missing"] == 28
+
+
+def test_random_sample_is_summarised_as_a_whole_and_checked(tmp_path):
+    rng, count = np.random.default_rng(4), 200
+    study = made_study(sample=count, repeats=1, factors={DARK: Range(low=10.0, high=40.0), BASELINE: [0.5, 1.0]})
+    dark = rng.uniform(10.0, 40.0, count)
+    frame = pd.DataFrame({"row": range(count), "repeat": 0, "seed_entropy": "3", "seed_spawn_key": range(count),
+                          DARK: dark, BASELINE: rng.choice([0.5, 1.0], count),
+                          POSITION: 0.1 * dark * np.sqrt(rng.chisquare(12, count) / 12), "seconds": 0.1, "error": ""})
+    entry = summary.write(tmp_path, study, frame)
+    assert [point["factors"] for point in entry["points"]] == [{}]
+    assert entry["points"][0]["figures"][POSITION]["rows"] == count
+    assert entry["theory"][0]["verdict"] == "passed"
+    assert (tmp_path / "figures" / f"by_{DARK}.png").exists()
+
+
+def test_kind_of_ones_own_has_no_units_but_a_summary(tmp_path):
+    study = made_study(kind="my_rows:count", factors={DARK: [10.0, 20.0, 40.0], BASELINE: [0.5, 1.0]})
+    entry = summary.write(tmp_path, study, made_table(study))
+    assert set(entry["units"]) == {DARK, BASELINE}
+    assert entry["points"][0]["figures"][ORIENTATION]["rows"] == 8

@@ -1,0 +1,164 @@
+"""Laws of studies against figures drawn with a known exponent or ratio; coverage is counted, not assumed."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from pydantic import ValidationError
+from scipy.stats import binom
+
+from identify.errors import StudyError
+from identify.studies.law import Law
+from identify.studies.scale_regression import scale_regression
+from identify.studies.study_file import Study
+from identify.studies.theory import CONFIDENCE, check_laws
+
+LEVELS = np.array([0.5, 1.0, 2.0, 4.0])
+
+
+def drawn(rng, exponent, rows=30, freedom=12, others=(1.0,)):
+    """Rms errors of `freedom` normal numbers whose sigma is other * x ** exponent."""
+    x, other = (a.ravel() for a in np.meshgrid(np.repeat(LEVELS, rows), others))
+    squares = rng.chisquare(freedom, len(x)) / freedom
+    return pd.DataFrame({"row": range(len(x)), "x": x, "other": other, "error": "",
+                         "figure_um": other * x**exponent * np.sqrt(squares)})
+
+
+def study(*laws, factors=("x",), **settings):
+    values = {"x": LEVELS.tolist(), "other": [1.0, 5.0], "method": ["good", "bad"]}
+    return Study(name="made", kind="module:function", factors={name: values[name] for name in factors},
+                 theory=list(laws), **settings)
+
+
+def verdict(law, frame, **settings):
+    return check_laws(study(law, **settings), frame)[0]
+
+
+def power(exponent, **more):
+    return Law(figure="figure_um", factor="x", exponent=exponent, **more)
+
+
+@pytest.mark.parametrize(("freedom", "rows"), [(12, 30), (3, 40)])
+def test_interval_of_an_exponent_covers_it_as_often_as_it_says(freedom, rows):
+    rng, trials = np.random.default_rng(0), 600
+    covered = 0
+    for _ in range(trials):
+        frame = drawn(rng, -0.5, rows, freedom)
+        design = np.column_stack([np.ones(len(frame)), 2.0 * np.log(frame["x"])])
+        low, high = scale_regression(frame["figure_um"].to_numpy() ** 2, design).interval(1, 0.95)
+        covered += low <= -0.5 <= high
+    assert binom.ppf(0.001, trials, 0.95) <= covered <= binom.ppf(0.999, trials, 0.95)
+
+
+def test_verdict_holds_for_true_laws_but_for_one_in_a_hundred():
+    rng, trials = np.random.default_rng(1), 400
+    passed = sum(verdict(power(1.0), drawn(rng, 1.0)).verdict == "passed" for _ in range(trials))
+    assert binom.ppf(0.001, trials, CONFIDENCE) <= passed
+
+
+@pytest.mark.parametrize("wrong", [0.8, 1.2, 0.0])
+def test_wrong_exponent_fails(wrong):
+    found = verdict(power(wrong), drawn(np.random.default_rng(2), 1.0, rows=200))
+    assert found.verdict == "failed"
+    assert found.measured == pytest.approx(1.0, abs=0.05)
+
+
+def test_tolerance_of_the_law_widens_what_passes():
+    frame = drawn(np.random.default_rng(3), 1.0, rows=2000)
+    assert verdict(power(1.05), frame).verdict == "failed"
+    assert verdict(power(1.05, tolerance=0.06), frame).verdict == "passed"
+
+
+def test_few_rows_decide_nothing_in_favour_but_can_refute():
+    frame = drawn(np.random.default_rng(4), 1.0, rows=2, freedom=3)
+    assert verdict(power(1.0), frame).verdict == "undecided"
+    assert verdict(power(-3.0), frame).verdict == "failed"
+
+
+def test_mean_square_scales_right_though_the_figures_distribution_changes_with_the_factor():
+    rng = np.random.default_rng(5)
+    parts = [drawn(rng, -1.0, rows=400, freedom=freedom).query(f"x == {level}")
+             for level, freedom in zip(LEVELS, (1, 2, 6, 30), strict=True)]
+    frame = pd.concat(parts)
+    straight_line = np.polyfit(np.log(frame["x"]), np.log(frame["figure_um"]), 1)[0]
+    assert straight_line > -0.8
+    assert verdict(power(-1.0), frame).verdict == "passed"
+
+
+def test_other_factors_do_not_disturb_an_exponent():
+    frame = drawn(np.random.default_rng(6), 0.5, rows=60, others=(1.0, 5.0))
+    unbalanced = frame.drop(frame.query("x > 1 and other == 5 and row % 3 > 0").index)
+    found = verdict(power(0.5), unbalanced, factors=("x", "other"))
+    assert found.verdict == "passed"
+    assert found.high - found.low < 0.2
+
+
+def test_exponent_in_a_random_sample_beside_another_numeric_factor():
+    rng = np.random.default_rng(7)
+    x, other = np.exp(rng.uniform(-1, 1, (2, 800)))
+    figure = x**1.5 / other**2 * np.sqrt(rng.chisquare(12, 800) / 12)
+    frame = pd.DataFrame({"x": x, "other": other, "figure_um": figure, "error": ""})
+    found = verdict(power(1.5), frame, factors=("x", "other"), sample=800)
+    assert found.verdict == "passed"
+    assert found.high - found.low < 0.2
+
+
+def test_figures_that_must_be_equal():
+    rng = np.random.default_rng(8)
+    frame = drawn(rng, 1.0).assign(stated_um=lambda f: f["x"], small_um=lambda f: 0.7 * f["x"])
+    found = [verdict(Law(figure="figure_um", equals=name), frame) for name in ("stated_um", "small_um")]
+    assert [one.verdict for one in found] == ["passed", "failed"]
+    assert found[1].measured == pytest.approx(1 / 0.7, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("good", "bad", "expected"), [(1.0, 2.0, "passed"), (2.0, 1.0, "failed"), (1.0, 1.01, "undecided")]
+)
+def test_order_of_a_factors_values(good, bad, expected):
+    rng = np.random.default_rng(9)
+    frame = pd.concat([drawn(rng, 0.0).assign(method=name, figure_um=lambda f, s=scale: s * f["figure_um"])
+                       for name, scale in (("good", good), ("bad", bad))])
+    law = Law(figure="figure_um", factor="method", order=["good", "bad"])
+    found = verdict(law, frame, factors=("x", "method"))
+    assert found.verdict == expected
+    assert found.low <= bad / good <= found.high
+
+
+def test_rows_that_failed_do_not_count():
+    frame = drawn(np.random.default_rng(10), 1.0)
+    ruined = frame.assign(error=np.where(frame["row"] % 5 == 0, "LostError: lost", ""))
+    ruined.loc[ruined["error"] != "", "figure_um"] = np.nan
+    assert verdict(power(1.0), ruined).rows == np.sum(frame["row"] % 5 != 0)
+    assert verdict(power(1.0), ruined).verdict == "passed"
+
+
+@pytest.mark.parametrize(("law", "reason"), [
+    (Law(figure="figur_um", factor="x", exponent=1.0), "no figure 'figur_um'; they have row, x"),
+    (Law(figure="figure_um", factor="y", exponent=1.0), "no factor or figure 'y'"),
+])
+def test_law_of_what_the_rows_do_not_have_is_undecided_with_the_reason(law, reason):
+    found = verdict(law, drawn(np.random.default_rng(11), 1.0))
+    assert found.verdict == "undecided"
+    assert reason in found.text
+
+
+def test_figure_that_is_zero_or_a_factor_that_stands_still_is_undecided():
+    frame = drawn(np.random.default_rng(12), 1.0)
+    assert "zero in every row" in verdict(power(1.0), frame.assign(figure_um=0.0)).reason
+    assert "do not vary" in verdict(power(1.0), frame.assign(x=2.0)).reason
+
+
+def test_regression_needs_more_rows_than_coefficients():
+    with pytest.raises(StudyError, match="2 rows do not determine 2 coefficients"):
+        scale_regression(np.ones(2), np.array([[1.0, 0.0], [1.0, 1.0]]))
+
+
+@pytest.mark.parametrize(("fields", "message"), [
+    ({"factor": "x"}, "states one of exponent, equals and order, got none"),
+    ({"factor": "x", "exponent": 1.0, "equals": "other"}, "got exponent, equals"),
+    ({"exponent": 1.0}, "needs a factor"),
+    ({"equals": "other", "factor": "x"}, "has no factor"),
+    ({"factor": "x", "order": ["one"]}, "two values"),
+])
+def test_law_states_one_thing(fields, message):
+    with pytest.raises(ValidationError, match=message):
+        Law(figure="figure_um", **fields)
