@@ -5,7 +5,11 @@ import pytest
 
 from identify.estimation.identification import identify
 from identify.estimation.pose_prediction import PosePrediction, predict_poses
+from identify.progress import SilentProgress
 from identify.record.recorded_run import recorded_run
+from identify.reporting.run_result import prediction_entry
+from identify.validation import predicted_runs
+from tests.identify.estimator_evidence import truth_of
 from tests.identify.synthetic import quick, rss6, run_plant, truth
 
 
@@ -17,6 +21,20 @@ def test_normalised_squared_error_is_one_for_errors_of_the_stated_covariance():
     assert prediction.normalised_squared_error(errors) == pytest.approx(1.0, abs=5 * np.sqrt(2 / 24000))
     assert prediction.normalised_squared_error(2 * errors) == pytest.approx(4.0, rel=0.05)
     np.testing.assert_allclose(prediction.std[7], np.sqrt(np.diag(root @ root.T)))
+
+
+def test_where_nothing_can_be_predicted_nothing_is_said():
+    """Too many frames lost to know the sensor's noise; and a model whose loop is unstable."""
+    scenario, known = quick(), np.zeros((67, 67))
+    dark, plant = run_plant(scenario, 0, duration_s=2.0, lost=range(80))
+    good, _ = run_plant(scenario, 0, duration_s=2.0)
+    unstable = truth() * np.where(np.arange(67) >= 64, -1.0, 1.0)
+    for record, parameters in ((dark, truth()), (good, unstable)):
+        (prediction,) = predicted_runs(rss6(), scenario, [record], parameters, known, 0, SilentProgress())
+        assert prediction.std.shape == (120, 6)
+        assert np.isnan(prediction.std).all()
+        figures = prediction_entry(prediction, truth_of(plant))["predicted"]
+        assert np.isnan(figures["normalised_squared_error"])
 
 
 @pytest.mark.slow

@@ -88,3 +88,20 @@ def test_a_folder_without_runs_is_refused(tmp_path, capsys):
     assert command("variation", "--out", tmp_path) == 1
     assert "2 runs show no variation" in one_line(capsys.readouterr().err)
     assert not (tmp_path / "variation.json").exists()
+
+
+@pytest.mark.slow
+def test_designed_runs_are_recorded_with_images_and_kept(tmp_path):
+    """Three short runs, each on a trajectory of its own."""
+    folder = tmp_path / "run"
+    short = ("renderer=analytic", "excitation.fundamental_hz=0.2", "excitation.duration_s=5.0", "validation.count=1")
+    settings = [word for setting in short for word in ("--set", setting)]
+    assert command("excite", "quick", "--out", folder, "--quiet", *settings) == 0
+    assert command("variation", "--out", folder, "--designed", 3, "--workers", 1, "--quiet") == 0
+    records = recording.read_runs(folder / "variation.nc")
+    assert [record.sizes["time"] for record in records] == [300, 300, 300]
+    paths = [recording.poses(record, "reference") for record in records]
+    assert not any(np.allclose(paths[a], paths[b]) for a, b in ((0, 1), (0, 2), (1, 2)))
+    entry = json.loads((folder / "variation.json").read_text(encoding="utf-8"))
+    assert (entry["runs"], entry["trajectories"]) == (3, "designed: random")
+    assert entry["parameters"]["joint_pid.lp"]["mean"] == pytest.approx(10.5, rel=0.1)
