@@ -5,7 +5,7 @@ from typing import Literal, get_args
 
 Better = Literal["lower", "higher"]
 BETTER: tuple[str, ...] = get_args(Better)
-PROPERTY = "accuracy"
+PROPERTY = "cmmsim_accuracy"
 """Name of the user properties that carry figures in the reports of tests."""
 
 CONFIDENCE = 0.95
