@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from .convex_solid import ConvexSolid
 from .disc_layers import DiscsInView, DiscTable
 from .scene import Mesh
-from .views import NEAR, Drawable, View
+from .views import NEAR, Drawable, View, same_exposure
 
 if TYPE_CHECKING:
     from .layer_kernel import Solids
@@ -32,7 +32,7 @@ def draw_windows(drawable: Drawable, views: Sequence[View], supersampling: int,
     scene = _SCENES[drawable]
     width, height = views[0].size
     images = np.full((len(views), height, width), background, dtype=np.float32)
-    for group in _same_exposure(views):
+    for group in same_exposure(views):
         scene.draw(images, views, group, supersampling)
     return images
 
@@ -87,11 +87,3 @@ class _AnalyticScene:
 
 
 _SCENES: WeakKeyDictionary[Drawable, _AnalyticScene] = WeakKeyDictionary()
-
-
-def _same_exposure(views: Sequence[View]) -> list[list[int]]:
-    """Indices of the views, grouped by camera and exposure."""
-    groups: dict[tuple[int, int], list[int]] = {}
-    for k, view in enumerate(views):
-        groups.setdefault((id(view.camera), id(view.camera_from_bodies)), []).append(k)
-    return list(groups.values())

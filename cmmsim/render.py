@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import weakref
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import cv2
@@ -101,7 +101,7 @@ class _Atlas:
         gl.glDisable(gl.GL_BLEND)
         gl.glClearColor(background, background, background, 1.0)
         gl.glClear(gl.GL_COLOR_BUFFER_BIT | gl.GL_DEPTH_BUFFER_BIT)
-        matrix_location = self._bind_program(primitives[0])
+        self._program._bind()
         reaching, meshes = drawable.reaching(views), [(m._vaid, m.indices.size) for m in primitives]
         for k, view in enumerate(views):
             self._viewport((k % columns) * cell[0], (k // columns) * cell[1], *cell)
@@ -110,7 +110,7 @@ class _Atlas:
             for p in np.flatnonzero(reaching[k]).tolist():
                 if drawable.body_index[p] != body:
                     body = drawable.body_index[p]
-                    self._set_matrix(matrix_location, 1, gl.GL_TRUE, clip_from_bodies[body])
+                    self._set_matrix(self._matrix_location, 1, gl.GL_TRUE, clip_from_bodies[body])
                 mesh, count = meshes[p]
                 self._bind_mesh(mesh)
                 self._draw_elements(gl.GL_TRIANGLES, count, gl.GL_UNSIGNED_INT, None)
@@ -141,16 +141,23 @@ class _Atlas:
             self._frame_buffers[width, height] = _FrameBuffer(self._gl, width, height)
         return self._frame_buffers[width, height]
 
-    def _bind_program(self, primitive: Any) -> int:
-        """Binds pyrender's flat shader with all matrices identity but P; returns the place of P."""
+    @cached_property
+    def _matrix_location(self) -> int:
+        """Where the bound shader takes its matrix from."""
+        return int(self._gl.glGetUniformLocation(self._program._program_id, "P"))
+
+    @cached_property
+    def _program(self) -> Any:
+        """pyrender's flat shader with all matrices identity but P."""
         from pyrender.constants import ProgramFlags
 
-        program = self._shaders._get_primitive_program(primitive, self._flags, ProgramFlags.USE_MATERIAL)
+        anything = self._upload(Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros(3)))
+        program = self._shaders._get_primitive_program(anything, self._flags, ProgramFlags.USE_MATERIAL)
         program._bind()
         for name in ("V", "M"):
             program.set_uniform(name, np.eye(4))
         program.set_uniform("material.base_color_factor", np.ones(4))
-        return self._gl.glGetUniformLocation(program._program_id, "P")
+        return program
 
 
 class _FrameBuffer:

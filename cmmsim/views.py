@@ -41,6 +41,14 @@ class View:
         return matrix
 
 
+def same_exposure(views: Sequence[View]) -> list[list[int]]:
+    """Indices of the views, grouped by camera and exposure."""
+    groups: dict[tuple[int, int], list[int]] = {}
+    for k, view in enumerate(views):
+        groups.setdefault((id(view.camera), id(view.camera_from_bodies)), []).append(k)
+    return list(groups.values())
+
+
 class Drawable:
     """Patches of several bodies: which body each belongs to, the corners (n,8,3) of its bounding box, m, and the
     distance m from which they are usually looked at, for which discs are triangulated."""
@@ -53,15 +61,12 @@ class Drawable:
 
     def reaching(self, views: Sequence[View]) -> NDArray[np.bool_]:
         """Which patches may show in each window (n views, n patches): bounding boxes against windows."""
-        extents: dict[tuple[int, int], tuple[Array, Array]] = {}
         result = np.empty((len(views), len(self.patches)), dtype=bool)
-        for k, view in enumerate(views):
-            key = id(view.camera), id(view.camera_from_bodies)
-            if key not in extents:
-                extents[key] = self._extents(view)
-            lowest, highest = extents[key]
-            first = np.array(view.corner) - 0.5
-            result[k] = ((highest >= first) & (lowest <= first + view.size)).all(axis=1)
+        for group in same_exposure(views):
+            lowest, highest = self._extents(views[group[0]])
+            first = np.array([views[k].corner for k in group])[:, None] - 0.5
+            last = first + [[views[k].size] for k in group]
+            result[group] = ((highest >= first) & (lowest <= last)).all(axis=2)
         return result
 
     def _extents(self, view: View) -> tuple[Array, Array]:
