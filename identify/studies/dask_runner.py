@@ -6,9 +6,11 @@ this row.
 """
 
 import logging
+import math
 import os
 import queue
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from uuid import uuid4
@@ -27,14 +29,20 @@ CONNECT_SECONDS = 5
 WORKERLESS_SECONDS = 60
 """How long a cluster may be without any worker."""
 
+GONE = "the Dask scheduler is gone; the same command goes on from here with another"
+
 BATCHES_A_WORKER = 3
 """Batches on their way for each worker: one in work, and the next ones at hand."""
 
-THREADS = {
-    f"distributed.nanny.pre-spawn-environ.{name}": 1
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+LOCAL_SETTINGS = {
+    "distributed.scheduler.allowed-failures": 1,
+    **{
+        f"distributed.nanny.pre-spawn-environ.{name}": 1
+        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+    },
 }
-"""One thread a process, set before the libraries are loaded: there are as many processes as cores."""
+"""A second death of its worker makes a batch suspect, as it does not cost the batch: its rows are tried alone. One
+thread a process, set before the libraries are loaded: there are as many processes as cores."""
 
 
 def cores() -> int:
@@ -47,7 +55,7 @@ def local_cluster(workers: int) -> Iterator["DaskExecutor"]:
     """Workers: so many new processes on this machine."""
     _silence_dask()
     with (
-        dask.config.set(THREADS),
+        dask.config.set(LOCAL_SETTINGS),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
@@ -92,6 +100,7 @@ class DaskExecutor:
         self._open: dict[str, tuple[Future, list[Case]]] = {}
         self._suspects: list[Case] = []
         self._sent = self._workerless = 0
+        self._workers, self._asked = 1, -math.inf
 
     def __call__(self, setup: Setup, batches: Batches) -> Iterator[list[Finished]]:
         """Yield batches as they are done.
@@ -105,13 +114,15 @@ class DaskExecutor:
                 if finished:
                     batches.learn(finished)
                     yield finished
+        except OSError as error:
+            raise StudyError(f"{GONE}: {' '.join(str(error).split())}") from error
         finally:
             if self._open and self._client.status == "running":
                 self._client.cancel([future for future, _ in self._open.values()], force=True)
 
     def _send_more(self, setup: Setup, batches: Batches) -> bool:
         """Keep all workers busy; rows that may kill their workers come last, one at a time. False at the end."""
-        workers = max(1, len(self._client.nthreads()))
+        workers = self._count_workers()
         while len(self._open) < BATCHES_A_WORKER * workers and (cases := batches.take(workers)):
             self._send(setup, cases)
         if not self._open and self._suspects:
@@ -149,10 +160,16 @@ class DaskExecutor:
         self._suspects += cases
         return []
 
+    def _count_workers(self) -> int:
+        """How many workers there are, or were a second ago; at least one, which may be about to come."""
+        if time.monotonic() > self._asked + 1.0:
+            self._workers, self._asked = max(1, len(self._client.nthreads())), time.monotonic()
+        return self._workers
+
     def _check_cluster(self) -> None:
         if self._client.status != "running":
-            raise StudyError("the Dask scheduler is gone; the same command goes on from here with another")
-        self._workerless = 0 if self._client.scheduler_info()["workers"] else self._workerless + 1
+            raise StudyError(GONE)
+        self._workerless = 0 if self._client.nthreads() else self._workerless + 1
         if self._workerless > WORKERLESS_SECONDS:
             raise StudyError(f"no Dask worker for {WORKERLESS_SECONDS} s; the same command goes on from here")
 

@@ -68,7 +68,7 @@ def run_study(study: Study, folder: Path, progress: Progress, workers: Workers =
         try:
             _compute_pending(study.name, setup, design, journal, progress, workers)
         except KeyboardInterrupt:
-            done = int(journal.finished.sum())
+            done = sum(1 for _ in journal.rows())  # it may have come while some were being noted
             raise StudyInterrupted(f"stopped: {done} of {len(design)} rows are done and kept") from None
         frame = tidy_table(study, journal.rows())
         write_table(folder / TABLE, frame, entry)

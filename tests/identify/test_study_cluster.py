@@ -1,0 +1,199 @@
+"""Studies on real clusters of processes: the same numbers as in one process, whoever dies in the middle."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from identify.errors import StudyError
+from identify.progress import SilentProgress
+from identify.studies.dask_runner import local_cluster, running_cluster
+from identify.studies.runner import run_study
+from identify.studies.store import JOURNAL
+from identify.studies.study_file import Study
+from tests.identify.study_rows import KIND
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[2]
+DARK = "sensor.camera.dark_noise"
+PATIENCE = 120
+"""Seconds for what takes a few on a free machine."""
+
+
+def study(**options):
+    factors, options = {DARK: [13.0, 26.0, 52.0]}, {"seconds": 0.02} | options
+    return Study(name="mine", kind=KIND, factors=factors, repeats=40, seed=4, options=options)
+
+
+def process(*arguments, **more):
+    """A process of this Python, in the repository's folder, in a group of its own."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.Popen([sys.executable, *map(str, arguments)], cwd=ROOT, env=environment, start_new_session=True,
+                            stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, **more)
+
+
+def wait_for(condition, what):
+    start = time.monotonic()
+    while not condition():
+        assert time.monotonic() - start < PATIENCE, what
+        time.sleep(0.02)
+
+
+@contextmanager
+def cluster(folder, workers):
+    """A scheduler and workers, each a process of its own: address, scheduler, workers."""
+    file = folder / "scheduler.json"
+    scheduler = process("-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard",
+                        "--scheduler-file", file)
+    started = [scheduler]
+    try:
+        wait_for(lambda: file.exists() and file.read_text().endswith("}"), "scheduler")
+        address = json.loads(file.read_text())["address"]
+        for _ in range(workers):
+            started.append(process("-m", "distributed.cli.dask_worker", address, "--no-nanny", "--nthreads", 1,
+                                   "--no-dashboard", "--local-directory", folder))
+        yield address, scheduler, started[1:]
+    finally:
+        for one in started:
+            one.kill()
+            one.communicate()
+
+
+class At(SilentProgress):
+    """Does something when so many rows are done."""
+
+    def __init__(self, rows, action):
+        self._rows, self._action = rows, action
+
+    @contextmanager
+    def stage(self, name, total):
+        done = 0
+
+        def advance(n=1):
+            nonlocal done
+            if done < self._rows <= done + n:
+                self._action()
+            done += n
+
+        yield advance
+
+
+def journal(folder):
+    """Numbers of the rows that are kept."""
+    path = folder / JOURNAL
+    return [json.loads(line)["number"] for line in path.read_bytes().splitlines(keepends=True) if line.endswith(b"\n")]
+
+
+def same_numbers(one, other):
+    pd.testing.assert_frame_equal(one.drop(columns="seconds"), other.drop(columns="seconds"), check_exact=True)
+
+
+@pytest.fixture(scope="module")
+def serial(tmp_path_factory):
+    """The table of the study, computed in this process."""
+    return run_study(study(seconds=0.0), tmp_path_factory.mktemp("serial") / "a", SilentProgress()).frame
+
+
+def test_worker_killed_in_the_middle_changes_no_number(tmp_path, serial):
+    log = tmp_path / "log"
+    with cluster(tmp_path, workers=2) as (address, _, workers):
+        workers_there = partial(running_cluster, address)
+        outcome = run_study(study(log=str(log)), tmp_path / "a", At(40, workers[0].kill), workers_there)
+        assert workers[0].wait(10) == -signal.SIGKILL
+        assert workers[1].poll() is None
+    same_numbers(outcome.frame, serial)
+    assert sorted(journal(tmp_path / "a")) == list(range(120))
+    again = [number for number, times in Counter(log.read_text().split()).items() if times > 1]
+    assert len(again) <= 3 * 15, "more than the batches that the dead worker had"
+
+
+def test_lost_scheduler_is_one_line_and_the_study_goes_on_with_another(tmp_path, serial):
+    with cluster(tmp_path, workers=1) as (address, scheduler, _), pytest.raises(StudyError) as caught:
+        run_study(study(), tmp_path / "a", At(30, scheduler.kill), partial(running_cluster, address))
+    assert "\n" not in str(caught.value)
+    assert "scheduler is gone" in str(caught.value)
+    kept = len(journal(tmp_path / "a"))
+    assert 30 <= kept < 120
+    outcome = run_study(study(), tmp_path / "a", SilentProgress())
+    assert outcome.found == kept
+    same_numbers(outcome.frame, serial)
+
+
+def test_rows_that_kill_their_worker_are_errors_and_no_other_row_is(tmp_path, serial):
+    outcome = run_study(study(kills=[7]), tmp_path, SilentProgress(), partial(local_cluster, 2))
+    frame = outcome.frame
+    assert frame["error"][7].startswith("KilledWorker")
+    same_numbers(frame.drop(index=7), serial.drop(index=7))
+
+
+@pytest.fixture
+def command(tmp_path):
+    """A function that starts the command on two workers and waits until 30 rows are done: process, folder, log."""
+    folder, log, started = tmp_path / "a", tmp_path / "log", []
+    text = study(log=str(log))
+    (tmp_path / "mine.toml").write_text(
+        f'name = "mine"\nkind = "{KIND}"\nrepeats = {text.repeats}\nseed = 4\n[factors]\n'
+        f'{DARK} = {text.factors[DARK]}\n[options]\nseconds = 0.02\nlog = "{log}"\n'
+    )
+
+    def start():
+        arguments = ("study", tmp_path / "mine.toml", "--workers", 2, "--out", folder)
+        started.append(process("-m", "identify.command_line", *arguments))
+        wait_for(lambda: (folder / JOURNAL).exists() and len(journal(folder)) >= 30, "30 rows")
+        return started[-1], folder, log
+
+    yield start
+    for one in started:
+        one.kill()
+        one.communicate()
+
+
+def in_group(leader):
+    """Processes of a session that live, by the leader's number."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[3]) == leader and fields[0] != "Z":
+            found.append(stat.parent.name)
+    return found
+
+
+def test_killed_command_loses_nothing_finished_and_computes_nothing_twice(command, serial):
+    running, folder, log = command()
+    running.kill()
+    running.wait()
+    wait_for(lambda: not in_group(running.pid), "workers outlive the killed command")
+    kept = journal(folder)
+    assert 30 <= len(kept) < 120
+    outcome = run_study(study(log=str(log)), folder, SilentProgress())
+    assert outcome.found == len(kept)
+    same_numbers(outcome.frame, serial)
+    times = Counter(map(int, log.read_text().split()))
+    assert {times[number] for number in kept} == {1}
+    assert sorted(times) == list(range(120))
+
+
+def test_interrupted_command_ends_with_one_line_and_goes_on(command, serial):
+    running, folder, log = command()
+    os.killpg(running.pid, signal.SIGINT)
+    _, error = running.communicate(timeout=PATIENCE)
+    assert running.returncode == 130
+    kept = journal(folder)
+    assert error == f"stopped: {len(kept)} of 120 rows are done and kept; the same command goes on from there\n"
+    wait_for(lambda: not in_group(running.pid), "workers outlive the interrupted command")
+    outcome = run_study(study(log=str(log)), folder, SilentProgress())
+    assert outcome.found == len(kept)
+    same_numbers(outcome.frame, serial)
