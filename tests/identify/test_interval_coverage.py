@@ -43,7 +43,7 @@ def test_intervals_cover_as_often_as_they_say(rows):
     spread = np.sqrt(np.sum((sizes * (shares - share)) ** 2)) / sizes.sum()
     allowed = 0.0 if len(rows) >= 200 else 2.6 * spread
     assert LOWEST - allowed <= share <= HIGHEST + allowed, (share, spread, table(rows))
-    assert spread < 0.02, "the experiments are too few to tell"
+    assert spread < 0.03, "the experiments are too few to tell"
 
 
 def test_every_parameter_is_covered(rows):
