@@ -41,7 +41,10 @@ class AccuracySession:
             if self._save is not None:
                 check_replaceable(saved_path(self._folder, self._save))
             if self._compare is not None:
-                self._saved = find_saved(self._folder, self._compare).figures
+                saved = find_saved(self._folder, self._compare)
+                self._saved = saved.figures
+                if saved.seed != self._seed:
+                    self._remark(f"{self._compare} was saved with --accuracy-seed {saved.seed}, this is {self._seed}")
         except AccuracyError as error:
             raise pytest.UsageError(str(error)) from error
 

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from identify.accuracy import recorder, saved  # noqa: F401  before any project: NumPy cannot be loaded twice
+
 GUIDE = Path(__file__).parent / "guide"
 
 QUICK = ("-p", "no:cacheprovider", "-p", "no:hypothesispytest")  # Hypothesis would be imported anew by each

@@ -98,6 +98,12 @@ def test_new_and_missing_figures_are_told(project):
     again.stdout.fnmatch_lines(["4 of 4 figures saved as before were not measured now"])
 
 
+def test_another_seed_is_told(project):
+    project(START, "--accuracy-save", "before")
+    again = project(START, "--accuracy-compare", "before", "--accuracy-seed", "7")
+    again.stdout.fnmatch_lines(["before was saved with --accuracy-seed 0, this is 7"])
+
+
 @pytest.mark.parametrize(
     ("bias", "mean", "ratio", "exit_status"),
     [
