@@ -38,6 +38,11 @@ Examples:
   cmmsim run quick --set timing.latency_s=0.0167 --set pose_method=planes
 
 \b
+A robot that the model cannot be, which the residuals tell:
+  cmmsim run quick --set plant.geometry_error_m=1e-4         joints off by 0.1 mm
+  cmmsim run quick --set plant.joint_stiffness_N_m_rad=1000  elastic joints
+
+\b
 The stages alone, each reading what the one before wrote:
   cmmsim excite quick --out mine         scenario.toml, trajectories.json
   cmmsim record --out mine               experiment.nc
