@@ -1,8 +1,8 @@
-"""The same identification by `mujoco.sysid`, set up as its documentation shows: a modifier a parameter, its default
-optimizer, its normalisation of residuals, its intervals.
+"""The same identification by `mujoco.sysid`, set up as in its own tests: a modifier a parameter, its default optimizer,
+its normalisation of residuals, its intervals.
 
-MuJoCo steps with 1 ms, semi-implicitly (its `implicitfast`), the fastest setting that keeps the loops closed. Its state
-(the free joint of the platform) is what is compared: a sensor of MuJoCo would show the state before the last step.
+MuJoCo steps with the 1 ms of the record, semi-implicitly (`implicitfast`) or, at four times the cost, by RK4. What is
+compared is its state (the free joint of the platform): a sensor of MuJoCo would show the state before the last step.
 """
 
 import time
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from dynamics.mjcf import MjcfSolver, mjcf_text
 from tests.benchmarks.servo_estimator import Estimate
-from tests.benchmarks.servo_experiment import RATE_HZ, TIMES, robot, servo_gains, table, truth
+from tests.benchmarks.servo_experiment import RATE_HZ, TIMES, felt_commands, robot, servo_gains, table, truth
 
 BOUNDS = 0.05, 5.0
 """Of each parameter, as shares of the truth; the optimizer wants finite ones."""
@@ -24,9 +24,9 @@ PLATFORM = slice(1, 8)
 """Position and quaternion of the platform in MuJoCo's state, which begins with the time."""
 
 
-def model_spec():
-    """rss6 as an editable model of MuJoCo, its motors turned into servos."""
-    solver = MjcfSolver(timestep_s=1 / RATE_HZ)
+def model_spec(integrator="implicitfast"):
+    """rss6 as an editable model of MuJoCo, its motors turned into servos that damp the joints' rates."""
+    solver = MjcfSolver(timestep_s=1 / RATE_HZ, integrator=integrator)
     spec = mujoco.MjSpec.from_string(
         mjcf_text(robot(), table()[:64], allow_unphysical_inertia=True, solver=solver, source="true parameters")
     )
@@ -39,28 +39,22 @@ def model_spec():
     return spec
 
 
-def controls(commands):
-    """What MuJoCo's servo, which damps the joint's rate alone, must be commanded to damp the rate of the error."""
-    lp, ld = servo_gains()
-    return commands + ld / lp * RATE_HZ * np.diff(commands, axis=0, prepend=commands[:1])
-
-
 def simulated_poses(commands):
     """Poses (frames, 6) of the true robot in MuJoCo's simulation with the estimator's own settings."""
     model = model_spec().compile()
-    state, _ = rollout.rollout(model, mujoco.MjData(model), at_home(model), controls(commands)[:-1])
+    state, _ = rollout.rollout(model, mujoco.MjData(model), at_home(model), felt_commands(commands)[:-1])
     states = np.vstack([at_home(model), state[0]])[:, PLATFORM]
     turned = Rotation.from_quat(states[:, 3:], scalar_first=True)
     return np.hstack([states[:, :3], turned.as_euler("XYZ")])
 
 
-def estimate(commands, measured, guess):
+def estimate(commands, measured, guess, integrator="implicitfast"):
     """The 14 unknowns from commands (frames, 6), what was `Measured`, and a first guess (14,)."""
-    spec, free = model_spec(), unknowns(guess)
+    spec, free = model_spec(integrator), unknowns(guess)
     seen = np.hstack([measured.position, measured.quaternion])
     signal = TimeSeries.from_custom_map(TIMES, seen, [("platform_qpos", 7, SignalType.MjStateQPos)])
     sequences = sysid.ModelSequences(
-        "rss6", spec, "run", at_home(spec.compile()), TimeSeries(TIMES, controls(commands)), signal,
+        "rss6", spec, "run", at_home(spec.compile()), TimeSeries(TIMES, felt_commands(commands)), signal,
         allow_missing_sensors=True,
     )
     residual = sysid.build_residual_fn(models_sequences=[sequences])

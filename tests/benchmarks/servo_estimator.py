@@ -18,6 +18,7 @@ from tests.benchmarks.servo_experiment import (
     POSITION_STD,
     QUATERNION_STD,
     RATE_HZ,
+    felt_commands,
     parameters,
     robot,
     run,
@@ -96,7 +97,6 @@ def linear_start(commands, measured):
 def servo_torque(commands, angle, velocity):
     """Torque (n, 6) of the servo at the instants of the start; a held command counts as the mean before and after."""
     lp, ld = servo_gains()
-    felt = commands + ld / lp * RATE_HZ * np.diff(commands, axis=0, prepend=commands[:1])
-    smooth = zero_phase_filter(felt, RATE_HZ, CUTOFF_HZ)
+    smooth = zero_phase_filter(felt_commands(commands), RATE_HZ, CUTOFF_HZ)
     held = (smooth + np.roll(smooth, 1, axis=0)) / 2
     return lp * (held[EDGE:-EDGE:EVERY] - angle) - ld * velocity
