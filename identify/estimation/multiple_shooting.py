@@ -59,7 +59,7 @@ class MultipleShooting:
         size, cost = len(parameters), float(known @ known)
         condensed = np.column_stack([known_rows, known])
         for chain, states in zip(self.chains, self.states, strict=True):
-            carried, eliminated = np.eye(STATES, STATES + size + 1), []  # the first state is that of rest: it stays
+            carried, eliminated = np.eye(STATES, STATES + size + 1), []  # nothing depends on the first state: it stays
             for k, part in enumerate(chain):
                 rows = _linearised(part, parameters, states[k], None if part.ends_the_run else states[k + 1])
                 cost += float(np.sum(rows[:, -1] ** 2))
@@ -83,17 +83,18 @@ class MultipleShooting:
 
 def _linearised(part: Segment, parameters: Array, state: Array, following: Array | None) -> Array:
     """Rows of a segment's residuals and of its continuity with the `following` state, in the columns of its state, the
-    following one, the parameters, and the value."""
+    following one, the parameters, and the value. The first segment starts in equilibrium: its state does not count."""
     run = part.simulate(parameters, state, sensitivities=True)
     by_state, by_parameters, end_by_state, end_by_parameters = (
         np.asarray(one)
         for one in (run.start_sensitivity, run.pose_sensitivity, run.end_start_sensitivity, run.end_sensitivity)
     )
-    values, own = part.whitened(run.pose - part.measured), part.whitened(by_state[:, :, :STATES])
+    counts = float(part.first > 0)
+    values, own = part.whitened(run.pose - part.measured), counts * part.whitened(by_state[:, :, :STATES])
     rows = np.column_stack([own, np.zeros_like(own), part.whitened(by_parameters), values])
     if following is None:
         return rows
-    own, gap = end_by_state[:STATES, :STATES], end_state(run) - following
+    own, gap = counts * end_by_state[:STATES, :STATES], end_state(run) - following
     joint = np.column_stack([own, -np.eye(STATES), end_by_parameters[:STATES], gap])
     return np.vstack([rows, joint / part.state_std[:, None]])
 
