@@ -165,11 +165,12 @@ def test_poses_from_noise_free_images_of_pyrender(tmp_path, lens):
 @pytest.mark.slow
 @pytest.mark.parametrize("renderer", ["analytic", pytest.param("pyrender", marks=pytest.mark.rendering)])
 def test_noise_free_teaching_and_measuring_through_all_effects(tmp_path, renderer):
+    """At most 2 um and 10 urad at every pose; 0.8 um and 4 urad were the largest."""
     given = lens_sensor(tmp_path, "all", renderer, changes=[("noise = true", "noise = false")])
     sensor = cmmsim.load_sensor(tmp_path / "sensor.toml", renderer=renderer)
     sensor.teach()
-    errors, _ = pose_errors(sensor, poses_about_home(given, 12))
-    assert np.all(np.sqrt((errors**2).mean(axis=0)) < [2, 2, 2, 10, 10, 10])
+    errors, _ = pose_errors(sensor, poses_about_home(given, 40))
+    assert np.all(np.abs(errors) < [2, 2, 2, 10, 10, 10])
 
 
 @pytest.mark.slow
