@@ -3,7 +3,8 @@
 Two things keep the plant away from the model. The parameters are uncertain: their covariance C comes through the exact
 sensitivities S of the model's poses as S C S^T. And the sensor's noise goes through the servo into the plant's motion,
 which no model can foretell: its covariance is sampled by repeated experiments on the identified model, and is taken to
-be the same all along the motion.
+be the same all along the motion. What the sensor has wrong in every frame alike, such as the frames it was taught,
+moves the whole motion with it and is not predicted: no record of this sensor shows it.
 """
 
 from dataclasses import dataclass

@@ -124,7 +124,8 @@ def prediction_table(result: dict[str, Any]) -> Table:
         tuple(rows),
         "Predicted from the covariance of the parameters through the exact sensitivities, and from what the sensor's "
         "noise does to the plant through the servo. Normalised: squared error in units of the predicted covariance; "
-        "one on average where the prediction is right. The runs share one set of parameters, so they stray together.",
+        "one on average where the prediction is right. The runs share one set of parameters, so they stray together, "
+        "and the frames that the sensor was taught, whose error moves the plant as a whole and is not predicted.",
     )
 
 
