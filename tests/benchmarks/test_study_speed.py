@@ -1,0 +1,173 @@
+"""What a study costs beside its rows, and what a second core brings.
+
+Starting the cluster and the first rows of each process, which load the libraries, are not in the figures: they are some
+seconds a study, however many rows it has.
+"""
+
+import os
+import time
+from contextlib import contextmanager, nullcontext
+
+import psutil
+import pytest
+
+from identify.progress import SilentProgress
+from identify.studies.dask_runner import DaskExecutor, local_cluster
+from identify.studies.runner import Outcome, run_study
+from identify.studies.study_file import Study, load_study
+from tests.benchmarks.study_rows import EMPTY
+from tests.benchmarks.timing import (
+    WHOLE_SECOND_CORE,
+    OtherLoad,
+    fastest,
+    judge,
+    second_core_gain,
+    seconds,
+    slowness,
+)
+
+pytestmark = pytest.mark.slow
+
+SECOND_CORE = 1.8
+OVERHEAD_MS = 10.0
+SENSOR_ROWS, SENSOR_SECONDS = 10_000, 180.0
+MEASURED_ROWS = int(os.environ.get("CMMSIM_STUDY_ROWS", "2000"))
+"""Sensor rows that are really computed for the rate; 10000 makes the goal's own number."""
+
+FLAT_ROWS, FLAT_MB = 10_000, 20.0
+
+
+@pytest.fixture(scope="module")
+def one_core():
+    with local_cluster(1) as execute:
+        yield execute
+
+
+@pytest.fixture(scope="module")
+def two_cores():
+    with local_cluster(2) as execute:
+        yield execute
+
+
+class OtherLoadThanWorkers(OtherLoad):
+    """What others take, workers that live on not among them."""
+
+    def __enter__(self) -> "OtherLoadThanWorkers":
+        super().__enter__()
+        self._began, self._workers = time.perf_counter(), workers_seconds()
+        return self
+
+    def __exit__(self, *more: object) -> None:
+        super().__exit__(*more)
+        own = (workers_seconds() - self._workers) / (time.perf_counter() - self._began)
+        self.cores = max(0.0, self.cores - own)
+
+
+def workers_seconds() -> float:
+    """Time in which the children of this process kept cores busy."""
+    times = [child.cpu_times() for child in psutil.Process().children(recursive=True)]
+    return sum(one.user + one.system for one in times)
+
+
+class Runs:
+    """Studies on one executor, each in a folder of its own."""
+
+    def __init__(self, folder, execute: DaskExecutor) -> None:
+        self._folder, self._execute, self._count = folder, execute, 0
+
+    def __call__(self, study: Study, progress=None) -> Outcome:
+        self._count += 1
+        folder = self._folder / str(self._count)
+        outcome = run_study(study, folder, progress or SilentProgress(), lambda: nullcontext(self._execute))
+        assert outcome.failed == 0, outcome.first_error
+        return outcome
+
+
+def empty_rows(count: int) -> Study:
+    factors = {"sensor.camera.dark_noise": [13.0, 26.0], "scenario.pose_method": ["registration", "planes"]}
+    return Study(name="empty", kind=EMPTY, factors=factors, repeats=count // 4)
+
+
+def sensor_rows(count: int) -> Study:
+    """The built-in study of pixel noise with so many rows: four pictures of a pose each, drawn without OpenGL."""
+    study = load_study("pixel_noise")
+    return study.model_copy(update={"repeats": max(1, count // study.points)})
+
+
+def test_second_core(one_core, two_cores, tmp_path, record_property):
+    one, two = Runs(tmp_path / "one", one_core), Runs(tmp_path / "two", two_cores)
+    study = sensor_rows(400)
+    for runs in (one, two):
+        runs(sensor_rows(40))
+    with OtherLoadThanWorkers() as load:
+        best = fastest({"one": lambda: one(study), "two": lambda: two(study)}, 3)
+    gain = best["one"] / best["two"]
+    cores = second_core_gain()
+    figure = f"two cores {gain:.2f} x one (goal {SECOND_CORE} x), {study.rows} sensor rows"
+    record_property("figure", figure)
+    disturbed = "" if cores > WHOLE_SECOND_CORE else f"the second core brings a loop {cores:.2f} x"
+    judge(gain >= SECOND_CORE, figure, load, disturbed)
+
+
+def test_overhead_of_a_row(one_core, tmp_path, record_property):
+    """Wall time of a row on one core beyond what its function says it took: scenario, sending, journal, table."""
+    runs, study = Runs(tmp_path, one_core), empty_rows(1000)
+    runs(empty_rows(40))
+    spent, outcomes = [], []
+    for _ in range(3):
+        spent.append(seconds(lambda: outcomes.append(runs(study))))
+    overhead = min(
+        1e3 * (wall / study.rows - outcome.frame["row_s"].mean()) for wall, outcome in zip(spent, outcomes, strict=True)
+    )
+    slow = slowness()
+    figure = f"{overhead:.2f} ms a row (goal {OVERHEAD_MS:g} ms), machine {slow:.2f} x slower than the goals'"
+    record_property("figure", figure)
+    assert overhead / slow <= OVERHEAD_MS, figure
+
+
+def test_rate_of_sensor_rows(two_cores, tmp_path, record_property):
+    runs, study = Runs(tmp_path, two_cores), sensor_rows(MEASURED_ROWS)
+    runs(sensor_rows(40))
+    with OtherLoadThanWorkers() as load:
+        wall = seconds(lambda: runs(study))
+    slow = slowness()
+    whole = wall * SENSOR_ROWS / study.rows
+    figure = (f"{study.rows / wall:.1f} sensor rows/s on two cores, {SENSOR_ROWS} in {whole:.0f} s (goal "
+              f"{SENSOR_SECONDS:g} s), {study.rows} measured, machine {slow:.2f} x slower than the goals'")
+    record_property("figure", figure)
+    judge(whole / slow <= SENSOR_SECONDS, figure, load)
+
+
+def test_memory_is_flat(two_cores, tmp_path, record_property):
+    """From the first fifth of the rows to the last: of this process, and of the largest worker."""
+    found: dict[int, list[float]] = {}
+
+    class Watch(SilentProgress):
+        @contextmanager
+        def stage(self, name, total):
+            done = 0
+
+            def advance(n=1):
+                nonlocal done
+                for mark in (total // 5, total):
+                    if done < mark <= done + n:
+                        found[mark] = memory_mb()
+                done += n
+
+            yield advance
+
+    runs = Runs(tmp_path, two_cores)
+    runs(empty_rows(40))
+    runs(empty_rows(FLAT_ROWS), Watch())
+    early, late = found[FLAT_ROWS // 5], found[FLAT_ROWS]
+    growth = [b - a for a, b in zip(early, late, strict=True)]
+    figure = f"{growth[0]:+.1f} MB here, {growth[1]:+.1f} MB in the largest worker, over {FLAT_ROWS * 4 // 5} rows"
+    record_property("figure", figure)
+    assert max(growth) < FLAT_MB, figure
+
+
+def memory_mb() -> list[float]:
+    """Memory of this process and of the largest of its children."""
+    here = psutil.Process()
+    children = [child.memory_info().rss for child in here.children(recursive=True)]
+    return [here.memory_info().rss / 1e6, max(children) / 1e6]
