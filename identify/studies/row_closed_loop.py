@@ -20,7 +20,7 @@ from identify.experiment.truth import true_poses
 from identify.record import recording
 from identify.record.loop_setup import frame_times
 from identify.scenario import Scenario
-from identify.studies.row_columns import Column, Kind, Row, RowOptions, rms_um, stated_um
+from identify.studies.row_columns import POSE_COLUMNS, Column, Kind, Row, RowOptions, pose_figures, rms_um
 from identify.studies.row_sensor import Teaching, sensor_file, stream_seed
 
 EXPERIMENT, TRAJECTORY = 0, 1
@@ -30,10 +30,7 @@ COLUMNS = {
     "lost_frames": Column("1", "frames without a pose; they do not count in the sensor's error"),
     "tracking_position_rms_um": Column("um", "true position against the desired one, rms over frames and axes"),
     "tracking_orientation_rms_urad": Column("urad", "true orientation against the desired one, rms likewise"),
-    "position_rms_um": Column("um", "measured against true position, rms over frames and axes"),
-    "orientation_rms_urad": Column("urad", "measured against true orientation, rms over frames and axes"),
-    "stated_position_rms_um": Column("um", "the same, as the sensor's own covariance states it"),
-    "stated_orientation_rms_urad": Column("urad", "the same, as the sensor's own covariance states it"),
+    **POSE_COLUMNS,
     "torque_rms_N_m": Column("N m", "torque of the joint controllers, rms over frames and joints"),
 }
 MAIN = ("tracking_position_rms_um", "tracking_orientation_rms_urad", "position_rms_um", "orientation_rms_urad",
@@ -63,16 +60,12 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoo
     true = true_poses(run.truth)
     tracking = true - recording.poses(run.record, "reference")
     errors = (recording.poses(run.record, "measured") - true)[ok]
-    stated = stated_um(run.record["measured_covariance"].values[ok])
     return {
         "frames": len(ok),
         "lost_frames": int(np.sum(~ok)),
         "tracking_position_rms_um": rms_um(tracking[:, :3]),
         "tracking_orientation_rms_urad": rms_um(tracking[:, 3:]),
-        "position_rms_um": rms_um(errors[:, :3]),
-        "orientation_rms_urad": rms_um(errors[:, 3:]),
-        "stated_position_rms_um": stated[0],
-        "stated_orientation_rms_urad": stated[1],
+        **pose_figures(errors, run.record["measured_covariance"].values[ok]),
         "torque_rms_N_m": float(np.sqrt(np.mean(run.truth["joint_torque"].values ** 2))),
     }
 

@@ -59,3 +59,18 @@ def stated_um(covariances: Array) -> tuple[float, float]:
     """Rms standard deviation per axis of position [um] and orientation [urad] of covariances (n, 6, 6)."""
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     return 1e6 * float(np.sqrt(variances[:, :3].mean())), 1e6 * float(np.sqrt(variances[:, 3:].mean()))
+
+
+POSE_COLUMNS = {
+    "position_rms_um": Column("um", "measured against true position, rms over pictures and axes"),
+    "orientation_rms_urad": Column("urad", "measured against true orientation, rms over pictures and axes"),
+    "stated_position_rms_um": Column("um", "the same, as the sensor's own covariance states it"),
+    "stated_orientation_rms_urad": Column("urad", "the same, as the sensor's own covariance states it"),
+}
+"""What every row says that has measured poses in it."""
+
+
+def pose_figures(errors: Array, covariances: Array) -> Row:
+    """The figures of POSE_COLUMNS of errors (n, 6) [m, rad] and stated covariances (n, 6, 6), n >= 1."""
+    figures = (rms_um(errors[:, :3]), rms_um(errors[:, 3:]), *stated_um(covariances))
+    return dict(zip(POSE_COLUMNS, figures, strict=True))

@@ -1,8 +1,9 @@
 """Rows of kind `path_pose`: the sensor alone follows a platform along a random path of the scenario's excitation.
 
 Exposure, latency, its jitter and dropout act as the scenario says. A row is a short stretch from a random instant of
-the path. The first picture is searched as a whole, the others are tracked. Beside the error of what was
-measured it gives that of the pose in use: the last one that had arrived, held until the next one arrives.
+the path. The first picture is searched as a whole, the others are tracked. A measured pose counts as that in the middle
+of its exposure. Beside its error a row gives that of the pose in use: the last one that had arrived, held until the
+next one arrives. Teaching is exact unless asked for otherwise.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.experiment.sensor_in_loop import frame_latencies
 from identify.scenario import Scenario
-from identify.studies.row_columns import Column, Kind, Row, RowOptions, rms_um, stated_um
+from identify.studies.row_columns import POSE_COLUMNS, Column, Kind, Row, RowOptions, pose_figures, rms_um
 from identify.studies.row_sensor import RowSensor, Teaching, row_sensor, stream_seed
 from identify.trajectory import FourierTrajectory, random_trajectory
 
@@ -27,10 +28,7 @@ COLUMNS = {
     "frames": Column("1", "stereo pictures taken"),
     "lost_frames": Column("1", "frames without a pose; they count in no other figure but the pose in use"),
     "speed_rms_mm_s": Column("mm/s", "speed of the platform along each axis, rms over the frames"),
-    "position_rms_um": Column("um", "measured against true position in the middle of the exposure, rms over axes"),
-    "orientation_rms_urad": Column("urad", "measured against true orientation in the middle of the exposure"),
-    "stated_position_rms_um": Column("um", "the same, as the sensor's own covariance states it"),
-    "stated_orientation_rms_urad": Column("urad", "the same, as the sensor's own covariance states it"),
+    **POSE_COLUMNS,
     "used_position_rms_um": Column("um", "last position that had arrived against the true one at all times"),
     "used_orientation_rms_urad": Column("urad", "last orientation that had arrived against the true one at all times"),
 }
@@ -62,15 +60,11 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
     latencies = frame_latencies(scenario, len(times), np.random.default_rng(stream_seed(seed, LATENCY)))
     arrivals: Array = times + (scenario.timing.latency_s if latencies is None else latencies)
     used = _used_errors(path, poses[ok], arrivals[ok], scenario.timing.frame_period_s)
-    stated = stated_um(covariances[ok])
     return {
         "frames": frames,
         "lost_frames": int(np.sum(~ok)),
         "speed_rms_mm_s": 1e-3 * rms_um(path.pose_rate(times)[:, :3]),
-        "position_rms_um": rms_um(errors[:, :3]),
-        "orientation_rms_urad": rms_um(errors[:, 3:]),
-        "stated_position_rms_um": stated[0],
-        "stated_orientation_rms_urad": stated[1],
+        **pose_figures(errors, covariances[ok]),
         "used_position_rms_um": rms_um(used[:, :3]),
         "used_orientation_rms_urad": rms_um(used[:, 3:]),
     }

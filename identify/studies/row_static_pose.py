@@ -16,7 +16,7 @@ from cmmsim.pose import apply, invert
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.scenario import Scenario
-from identify.studies.row_columns import Column, Kind, Row, RowOptions, rms_um, stated_um
+from identify.studies.row_columns import POSE_COLUMNS, Column, Kind, Row, RowOptions, pose_figures, rms_um
 from identify.studies.row_sensor import RowSensor, Teaching, row_sensor, stream_seed
 
 POSES, SENSOR = 0, 1
@@ -28,10 +28,7 @@ COLUMNS = {
     "lost_frames": Column("1", "pictures in which no pose was found; they count in no other figure"),
     "stickers": Column("1", "stickers used, mean over the pictures"),
     "pixel_noise_grey": Column("grey values", "rms noise of a grey value half-way between sticker and ring"),
-    "position_rms_um": Column("um", "error of the measured position, rms over pictures and axes"),
-    "orientation_rms_urad": Column("urad", "error of the measured orientation, rms over pictures and axes"),
-    "stated_position_rms_um": Column("um", "the same, as the sensor's own covariance states it"),
-    "stated_orientation_rms_urad": Column("urad", "the same, as the sensor's own covariance states it"),
+    **POSE_COLUMNS,
     "mean_position_rms_um": Column("um", "error of the position averaged over the pictures of a pose"),
     "mean_orientation_rms_urad": Column("urad", "error of the orientation averaged over the pictures of a pose"),
     "sight_m": Column("m", "distance of the stickers from the middle of the baseline, mean"),
@@ -118,7 +115,6 @@ def _row(eye: RowSensor, looks: list[_Look], captures: int) -> Row:
     means = np.array([look.errors.mean(axis=0) for look in looks if len(look.errors)])
     points = np.concatenate([look.points for look in looks])
     centres = np.concatenate([look.centres for look in looks], axis=1)
-    stated = stated_um(np.concatenate([look.covariances for look in looks]))
     noise = eye.sensor.noise
     rim_grey: Array = np.asarray(noise.mean_grey(np.array(eye.rim)), dtype=float)
     return {
@@ -126,10 +122,7 @@ def _row(eye: RowSensor, looks: list[_Look], captures: int) -> Row:
         "lost_frames": captures * len(looks) - len(errors),
         "stickers": float(np.mean([count for look in looks for count in look.counts])),
         "pixel_noise_grey": float(np.sqrt(noise.variance(rim_grey))),
-        "position_rms_um": rms_um(errors[:, :3]),
-        "orientation_rms_urad": rms_um(errors[:, 3:]),
-        "stated_position_rms_um": stated[0],
-        "stated_orientation_rms_urad": stated[1],
+        **pose_figures(errors, np.concatenate([look.covariances for look in looks])),
         "mean_position_rms_um": rms_um(means[:, :3]),
         "mean_orientation_rms_urad": rms_um(means[:, 3:]),
         "sight_m": float(points[:, 0].mean()),
