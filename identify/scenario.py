@@ -253,12 +253,17 @@ class Scenario(_Section):
 
     def _check_filter(self) -> None:
         nyquist, cutoff = self.timing.frame_rate_hz / 2, self.filter.cutoff_hz
+        highest = self.excitation.fundamental_hz * self.excitation.harmonics
+        if nyquist <= highest:
+            raise ValueError(
+                f"timing.frame_rate_hz = {self.timing.frame_rate_hz:g} Hz is not above twice the highest harmonic of "
+                f"the excitation, {highest:g} Hz"
+            )
         if cutoff >= nyquist:
             raise ValueError(
                 f"filter.cutoff_hz = {cutoff:g} Hz is not below the Nyquist frequency {nyquist:g} Hz "
                 f"of timing.frame_rate_hz = {self.timing.frame_rate_hz:g} Hz"
             )
-        highest = self.excitation.fundamental_hz * self.excitation.harmonics
         if cutoff <= highest:
             raise ValueError(
                 f"filter.cutoff_hz = {cutoff:g} Hz would remove the excitation, "

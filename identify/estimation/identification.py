@@ -106,7 +106,8 @@ def identify(
     searched = time.perf_counter()
     driven, estimate = problem.driven_by_commands(), searches[settings.method].parameters
     final = problem if settings.method == "closed_loop" else driven
-    rng = np.random.default_rng([int(records[0].attrs["seed"]), UNCERTAINTY_STREAM])
+    seed = int(records[0].attrs.get("seed", 0))  # a record of a real robot has none
+    rng = np.random.default_rng([seed, UNCERTAINTY_STREAM])
     with progress.stage("uncertainty", DRAWS) as advance:
         uncertainty = estimate_uncertainty(final, estimate, rng, advance)
     tested = _whiteness(driven, searches["command_driven"].parameters)

@@ -1,6 +1,6 @@
 """One record as the estimator needs it: what was asked of the robot, what was measured, and the model's side of it.
 
-A record that cannot carry an identification is refused here, by name.
+A record that cannot carry an identification is refused, see `record_checks`.
 """
 
 from dataclasses import dataclass, replace
@@ -12,16 +12,18 @@ from numpy.typing import NDArray
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, LoopSettings, Reference, simulate
 from identify.arrays import Array
-from identify.errors import EstimationError
-from identify.files.dataset import POSE
-from identify.record.filtering import padding_samples
+from identify.files.dataset import check_variables
 from identify.record.loop_setup import model_settings
 from identify.record.payload import recorded_payload
-from identify.record.recording import poses
-from identify.scenario import Scenario, scenario_from_toml
-
-MINIMUM_GOOD_SHARE = 0.5
-"""Share of frames that must have been measured."""
+from identify.record.record_checks import (
+    check_channels,
+    check_length,
+    check_origin,
+    check_reference,
+    checked_covariance,
+)
+from identify.record.recording import VARIABLES, poses
+from identify.scenario import Scenario
 
 LONG_GAP_S = 0.5
 """Lost frames in a row beyond this time are flagged: the model runs through them unobserved."""
@@ -106,21 +108,23 @@ def recorded_run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> Record
     """A record, checked, with the model side of the scenario.
 
     Raises:
-        RecordError: no such poses, a bad payload.
-        EstimationError: another robot, timing or servo; too short, too many lost frames, a constant or missing channel.
+        RecordError: something is missing or of a wrong shape, a bad payload.
+        EstimationError: another robot, timing or servo; too short, too many lost frames, a constant channel, numbers
+            that are not finite, a reference that stands still or is faster than the frames can show.
     """
-    _check_origin(record, robot, scenario)
+    check_variables(record, VARIABLES, "the record")
+    check_origin(record, robot, scenario)
+    check_length(record.sizes["time"], scenario)
+    reference = recorded_reference(record)
+    check_reference(reference, scenario)
     ok = record["measured_ok"].values.astype(bool)
     measured, logged = poses(record, "measured"), np.asarray(record["command"].values, dtype=float)
-    _check_length(len(ok), scenario)
-    _check_channels(measured, logged, ok)
-    covariance = record["measured_covariance"].values[ok].mean(axis=0)
-    if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] <= 0:
-        raise EstimationError("the record's mean measured_covariance is not positive definite")
+    check_channels(measured, logged, ok)
+    covariance = checked_covariance(record["measured_covariance"].values[ok])
     return RecordedRun(
         robot=robot,
         settings=model_settings(scenario),
-        reference=recorded_reference(record),
+        reference=reference,
         measured=measured,
         ok=ok,
         covariance=covariance,
@@ -133,54 +137,3 @@ def recorded_reference(record: xr.Dataset) -> Reference:
     """Reference motion of a record."""
     rates = np.hstack([record["reference_velocity"].values, record["reference_orientation_rate"].values])
     return Reference(poses(record, "reference"), rates)
-
-
-def _check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
-    """The record must be of this robot, and made with the timing and the servo that the model is to have."""
-    if record.attrs.get("robot") != robot.name:
-        raise EstimationError(f"the record is of robot {record.attrs.get('robot')!r}, not of {robot.name!r}")
-    recorded = scenario_from_toml(str(record.attrs.get("scenario", "")), "scenario in the record")
-    for section in ("timing", "servo"):
-        theirs, ours = getattr(recorded, section).model_dump(), getattr(scenario, section).model_dump()
-        for key, value in theirs.items():
-            if value != ours[key]:
-                raise EstimationError(
-                    f"the record was made with {section}.{key} = {value!r}, the scenario says {ours[key]!r}"
-                )
-    steps = np.diff(np.asarray(record["time"].values, dtype=float)) * scenario.timing.frame_rate_hz
-    if len(steps) and np.abs(steps - 1).max() > 1e-3:
-        worst = int(np.abs(steps - 1).argmax())
-        raise EstimationError(
-            f"frames {worst} and {worst + 1} are {steps[worst]:.3f} periods of {scenario.timing.frame_rate_hz:g} Hz "
-            "apart: frames are missing in the record; keep lost ones with measured_ok = 0"
-        )
-
-
-def _check_length(frames: int, scenario: Scenario) -> None:
-    timing, filtering = scenario.timing, scenario.filter
-    needed = max(
-        padding_samples(timing.frame_rate_hz, filtering.cutoff_hz, filtering.order) + 1,
-        timing.frames(1 / (scenario.excitation.fundamental_hz * scenario.excitation.harmonics)),
-    )
-    if frames < needed:
-        raise EstimationError(
-            f"the record has {frames} frames ({frames / timing.frame_rate_hz:.3g} s), at least {needed} are needed: "
-            "one period of the highest harmonic, and what the filter takes at its ends"
-        )
-
-
-def _check_channels(measured: Array, logged: Array, ok: NDArray[np.bool_]) -> None:
-    if ok.mean() < MINIMUM_GOOD_SHARE:
-        raise EstimationError(
-            f"only {ok.sum()} of {len(ok)} frames were measured; at least {MINIMUM_GOOD_SHARE:.0%} are needed"
-        )
-    channels = [*zip(POSE, measured[ok].T, strict=True)]
-    channels += [(f"command of joint {k + 1}", column) for k, column in enumerate(logged.T)]
-    for name, values in channels:
-        if not np.isfinite(values).all():
-            raise EstimationError(
-                f"{name} is not finite in {np.sum(~np.isfinite(values))} frames that count as measured, the first "
-                f"is good frame {np.flatnonzero(~np.isfinite(values))[0]}"
-            )
-        if np.ptp(values) == 0:
-            raise EstimationError(f"{name} is {values[0]:g} in every frame: nothing moved, or the channel is dead")

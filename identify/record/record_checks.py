@@ -1,0 +1,113 @@
+"""What a record must be to carry an identification: of this robot, long enough, moving, and whole.
+
+Each check raises EstimationError with what it found.
+"""
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+
+from dynamics import Robot
+from dynamics.closed_loop import Reference
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.files.dataset import POSE
+from identify.record.filtering import SPLINE_DEGREE, padding_samples
+from identify.scenario import Scenario, scenario_from_toml
+
+MINIMUM_GOOD_SHARE = 0.5
+"""Share of frames that must have been measured."""
+
+REFERENCE_GAP = 0.05
+"""Share of its travel by which a reference may differ from the integral of its rate."""
+
+ROUNDING = 1e-9
+"""m or rad: difference that means nothing where the travel is none."""
+
+
+def check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
+    """The record must be of this robot, and made with the timing and the servo that the model is to have."""
+    if record.attrs.get("robot") != robot.name:
+        raise EstimationError(f"the record is of robot {record.attrs.get('robot')!r}, not of {robot.name!r}")
+    recorded = scenario_from_toml(str(record.attrs.get("scenario", "")), "scenario in the record")
+    for section in ("timing", "servo"):
+        theirs, ours = getattr(recorded, section).model_dump(), getattr(scenario, section).model_dump()
+        for key, value in theirs.items():
+            if value != ours[key]:
+                raise EstimationError(
+                    f"the record was made with {section}.{key} = {value!r}, the scenario says {ours[key]!r}"
+                )
+    steps = np.diff(np.asarray(record["time"].values, dtype=float)) * scenario.timing.frame_rate_hz
+    if len(steps) and not np.abs(steps - 1).max() <= 1e-3:
+        worst = int(np.abs(steps - 1).argmax())
+        raise EstimationError(
+            f"frames {worst} and {worst + 1} are {steps[worst]:.3f} periods of {scenario.timing.frame_rate_hz:g} Hz "
+            "apart: frames are missing in the record; keep lost ones with measured_ok = 0"
+        )
+
+
+def check_reference(reference: Reference, scenario: Scenario) -> None:
+    """The reference must move, and its poses must be what its rates make of the first: a motion faster than half the
+    frame rate looks like a slow one in the poses."""
+    poses, rates = reference.poses, reference.rates
+    travel = np.ptp(poses, axis=0)
+    if not travel.any():
+        raise EstimationError("the reference is the same pose in every frame: nothing was asked to move")
+    if len(poses) <= SPLINE_DEGREE:
+        return
+    times = np.arange(len(poses)) * scenario.timing.frame_period_s
+    gap = np.ptp(make_interp_spline(times, rates, k=SPLINE_DEGREE).antiderivative()(times) - poses, axis=0)
+    worst = int(np.argmax(gap - REFERENCE_GAP * travel))
+    if gap[worst] > REFERENCE_GAP * travel[worst] + ROUNDING:
+        raise EstimationError(
+            f"the reference's {POSE[worst]} travels {travel[worst]:.3g}, and its rate makes it another motion, up to "
+            f"{gap[worst]:.3g} away: it has harmonics above half of {scenario.timing.frame_rate_hz:g} Hz, or the rate "
+            "is not its derivative"
+        )
+
+
+def check_length(frames: int, scenario: Scenario) -> None:
+    """One period of the highest harmonic, and what the filter takes at its ends."""
+    timing, filtering = scenario.timing, scenario.filter
+    needed = max(
+        padding_samples(timing.frame_rate_hz, filtering.cutoff_hz, filtering.order) + 1,
+        timing.frames(1 / (scenario.excitation.fundamental_hz * scenario.excitation.harmonics)),
+    )
+    if frames < needed:
+        raise EstimationError(
+            f"the record has {frames} frames ({frames / timing.frame_rate_hz:.3g} s), at least {needed} are needed: "
+            "one period of the highest harmonic, and what the filter takes at its ends"
+        )
+
+
+def check_channels(measured: Array, logged: Array, ok: NDArray[np.bool_]) -> None:
+    """Enough measured poses (N, 6), and no pose or command (N, 6) that is dead or not finite."""
+    if ok.mean() < MINIMUM_GOOD_SHARE:
+        raise EstimationError(
+            f"only {ok.sum()} of {len(ok)} frames were measured; at least {MINIMUM_GOOD_SHARE:.0%} are needed"
+        )
+    channels = [*zip(POSE, measured[ok].T, strict=True)]
+    channels += [(f"command of joint {k + 1}", column) for k, column in enumerate(logged.T)]
+    for name, values in channels:
+        if not np.isfinite(values).all():
+            raise EstimationError(
+                f"{name} is not finite in {np.sum(~np.isfinite(values))} frames that count as measured, the first "
+                f"is good frame {np.flatnonzero(~np.isfinite(values))[0]}"
+            )
+        if np.ptp(values) == 0:
+            raise EstimationError(f"{name} is {values[0]:g} in every frame: nothing moved, or the channel is dead")
+
+
+def checked_covariance(covariances: Array) -> Array:
+    """Mean (6, 6) of the covariances (n, 6, 6) of the good frames."""
+    unknown = np.flatnonzero(~np.isfinite(covariances).all(axis=(1, 2)))
+    if len(unknown):
+        raise EstimationError(
+            f"measured_covariance is not finite in {len(unknown)} frames that count as measured, the first is good "
+            f"frame {unknown[0]}"
+        )
+    mean = covariances.mean(axis=0)
+    if np.linalg.eigvalsh(mean)[0] <= 0:
+        raise EstimationError("the record's mean measured_covariance is not positive definite")
+    return np.asarray(mean, dtype=float)

@@ -1,0 +1,84 @@
+"""Records as a user might bring them, spoilt in one thing each: refused by name, before anything is computed."""
+
+import numpy as np
+import pytest
+
+from dynamics.errors import DynamicsError
+from identify.errors import EstimationError, RecordError, ScenarioError
+from identify.estimation.identification import identify
+from identify.record.recorded_run import recorded_run
+from tests.identify.synthetic import quick, rss6, run_plant
+
+
+@pytest.fixture(scope="module")
+def record():
+    return run_plant(quick(), seed=1, duration_s=3.0)[0]
+
+
+def with_values(record, **values):
+    return record.assign({name: (record[name].dims, array) for name, array in values.items()})
+
+
+def alias(record):
+    """A reference with 59 Hz in x, which looks like 1 Hz in 60 frames a second."""
+    t = record["time"].values
+    position, velocity = record["reference_position"].values.copy(), record["reference_velocity"].values.copy()
+    position[:, 0] = 0.005 * np.sin(2 * np.pi * 59 * t)
+    velocity[:, 0] = 0.005 * 2 * np.pi * 59 * np.cos(2 * np.pi * 59 * t)
+    return with_values(record, reference_position=position, reference_velocity=velocity)
+
+
+def standstill(record):
+    still = {name: np.zeros_like(record[name].values) for name in ("reference_velocity", "reference_orientation_rate")}
+    for name in ("reference_position", "reference_orientation"):
+        still[name] = np.repeat(record[name].values[:1], record.sizes["time"], axis=0)
+    return with_values(record, **still)
+
+
+def unknown_covariance(record):
+    covariance = record["measured_covariance"].values.copy()
+    covariance[7] = np.nan
+    return with_values(record, measured_covariance=covariance)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "says"),
+    [
+        (lambda r: r.drop_vars("command"), RecordError, "the record lacks command"),
+        (lambda r: r.drop_vars(["measured_ok", "reference_velocity"]), RecordError, "reference_velocity, measured_ok"),
+        (lambda r: r.isel(time=slice(0, 0)), RecordError, "the record has no time"),
+        (lambda r: r.isel(time=slice(0, 1)), EstimationError, "1 frames .0.0167 s., at least 120 are needed"),
+        (lambda r: r.assign_coords(time=r["time"].where(r["time"] > 1)), EstimationError, "nan periods of 60"),
+        (lambda r: r.assign_coords(time=r["time"] * 1.01), EstimationError, r"1.010 periods of 60 Hz"),
+        (unknown_covariance, EstimationError, "measured_covariance is not finite in 1 frames .*good frame 7"),
+        (lambda r: r.assign(reference_position=r["reference_position"].where(r["time"] > 1)), DynamicsError, "is nan"),
+        (standstill, EstimationError, "same pose in every frame: nothing was asked to move"),
+        (alias, EstimationError, "the reference's x travels 0.01, .*harmonics above half of 60 Hz"),
+        (lambda r: with_values(r, reference_velocity=1e3 * r["reference_velocity"].values), EstimationError,
+         "or the rate is not its derivative"),
+        (lambda r: r.assign(measured_position=1e3 * r["measured_position"]), DynamicsError, "cannot reach"),
+    ],
+    ids=["channel", "channels", "empty", "one frame", "time NaN", "rate", "covariance NaN", "reference NaN",
+         "standstill", "alias", "rate not in m/s", "millimetres"],
+)
+def test_what_is_wrong_with_a_record_is_said(record, spoil, error, says):
+    with pytest.raises(error, match=says):
+        identify(spoil(record), rss6(), quick())
+
+
+def test_a_reference_that_moves_one_way_only_is_no_fault(record):
+    one_way = {"reference_position": record["reference_position"].values * [1, 0, 0] + [0, 0, 0.2],
+               "reference_velocity": record["reference_velocity"].values * [1, 0, 0]}
+    recorded_run(with_values(record, **one_way), rss6(), quick())
+
+
+def test_a_frame_rate_below_twice_the_highest_harmonic_is_refused_with_the_scenario():
+    with pytest.raises(ScenarioError, match=r"frame_rate_hz = 0.9 Hz is not above twice the highest .* 0.5 Hz"):
+        quick(**{"timing.frame_rate_hz": 0.9, "filter.cutoff_hz": 0.4})
+
+
+def test_a_record_of_a_real_robot_has_no_seed(record):
+    real = record.copy()
+    real.attrs = {name: value for name, value in record.attrs.items() if name != "seed"}
+    once = quick(**{"identification.method": "command_driven", "identification.max_iterations": 1})
+    assert np.all(np.isfinite(identify(real, rss6(), once).estimate))
