@@ -12,6 +12,8 @@ static int frame_command(context *c, servo *v, int k, const state *s, measure_fn
     } else if (p->lost && p->lost[k]) {
         good = 0;
         for (int i = 0; i < N; i++) measured[i] = NAN;
+    } else if (p->noise) {
+        for (int i = 0; i < N; i++) measured[i] += p->noise[N * k + i];
     }
     v->elapsed += p->frame_period;
     memcpy(out->measured + N * k, measured, sizeof measured);

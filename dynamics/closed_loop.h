@@ -55,6 +55,7 @@ typedef struct {
     const double *reference_rate;       /* (frames, 6) */
     const double *logged_commands;      /* (frames, 6), or NULL: the servo computes them */
     const signed char *lost;            /* (frames) 1 where the ideal sensor measures nothing, or NULL */
+    const double *noise;                /* (frames, 6) added to what the ideal sensor measures, or NULL */
     const int *first_span, *span_command, *span_steps; /* which command acts when: see command_schedule.py */
     const double *span_ramp, *span_duration;
     motion_fn servo_motion; /* equation of motion of the robot that the servo knows, or NULL: of this one */

@@ -62,6 +62,7 @@ def simulate(
     start_sensitivities: bool = False,
     commands: np.ndarray | None = None,
     lost: np.ndarray | None = None,
+    noise: np.ndarray | None = None,
     latencies: np.ndarray | None = None,
     servo_robot: Robot | None = None,
     controller: Controller | None = None,
@@ -79,6 +80,7 @@ def simulate(
     controller: takes the place of the servo: (frame, time s, measured pose (6,), desired pose (6,), desired rate (6,))
     -> joint command (6,), rad, at every frame that is measured; the run takes the plain path.
     lost (frames,) bool: frames at which the ideal sensor measures nothing, so that a model loses what its plant lost.
+    noise (frames, 6), m and rad: added to the poses that the ideal sensor measures elsewhere.
     compiled: None takes the compiled path when a C compiler is at hand; False forces the plain path.
     Raises LoopFailure when the robot leaves the reachable set (an unstable loop); and before the run
     UnreachablePoseError where reference or start do, ParameterError, SimulationError, SingularPoseError.
@@ -95,6 +97,8 @@ def simulate(
         commands = np.ascontiguousarray(floats("commands", commands, reference.poses.shape, error=SimulationError))
     if lost is not None:
         lost = mask("lost", lost, len(reference.poses), SimulationError).astype(np.int8)
+    if noise is not None:
+        noise = _checked_noise(noise, reference, sensor)
     if latencies is not None:
         latencies = checked_latencies(latencies, len(reference.poses), settings.timing)
     if servo_robot is not None:
@@ -124,6 +128,7 @@ def simulate(
         start_sensitivities,
         commands,
         lost,
+        noise,
         latencies,
         servo_robot or robot,
         controller,
@@ -134,6 +139,12 @@ def simulate(
     if compiled:
         raise SimulationError("compiled=True, but no C compiler was found")
     return plain_closed_loop.run(robot, problem)
+
+
+def _checked_noise(noise: np.ndarray, reference: Reference, sensor: object) -> np.ndarray:
+    if sensor is not None:
+        raise SimulationError("noise is for the ideal sensor: a sensor that is given adds its own")
+    return np.ascontiguousarray(floats("noise", noise, reference.poses.shape, error=SimulationError))
 
 
 def prepare(robot: Robot) -> bool:

@@ -171,6 +171,7 @@ class LoopProblem:
     start_sensitivities: bool
     commands: np.ndarray | None
     lost: np.ndarray | None
+    noise: np.ndarray | None
     latencies: np.ndarray | None
     servo_robot: Robot
     controller: Controller | None = None

@@ -110,7 +110,9 @@ def _measure(problem: LoopProblem, frame: int, state: State) -> np.ndarray | Non
     pose, rate = state.pose[:6], state.rate[:6]
     if problem.sensor is not None:
         return measurement(problem.sensor, frame, frame * problem.period, pose.copy(), rate.copy())
-    return None if problem.lost is not None and problem.lost[frame] else pose
+    if problem.lost is not None and problem.lost[frame]:
+        return None
+    return pose if problem.noise is None else pose + problem.noise[frame]
 
 
 def _servo_command(

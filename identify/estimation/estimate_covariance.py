@@ -104,8 +104,6 @@ def repeated_experiment(run: RecordedRun, parameters: Array, rng: np.random.Gene
     Raises LoopFailure where the loop is unstable.
     """
     noise = rng.standard_normal(run.measured.shape) @ np.linalg.cholesky(run.covariance).T
-
-    def sensor(frame: int, t: float, pose: Array) -> Array | None:
-        return pose + noise[frame] if run.ok[frame] else None
-
-    return simulate(run.robot, parameters + run.payload, run.reference, run.settings, sensor)
+    return simulate(
+        run.robot, parameters + run.payload, run.reference, run.settings, lost=~run.ok, noise=noise
+    )

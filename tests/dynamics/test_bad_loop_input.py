@@ -160,6 +160,12 @@ BAD_ARGUMENTS = {
         {"lost": np.zeros(5, dtype=bool), "sensor": _ideal},
         "lost is for the ideal sensor: a sensor returns None at the frames that it loses",
     ),
+    "noise of one frame": ({"noise": np.zeros(6)}, r"noise must have shape \(5, 6\), got \(6,\)"),
+    "noise that is no number": ({"noise": np.full((5, 6), np.inf)}, r"noise\[0, 0\] is inf, must be finite"),
+    "noise beside a sensor": (
+        {"noise": np.zeros((5, 6)), "sensor": _ideal},
+        "noise is for the ideal sensor: a sensor that is given adds its own",
+    ),
     "sensitivities of a sensor": ({"sensitivities": True, "sensor": _ideal}, "sensitivities need the ideal sensor"),
     "sensitivities in words": ({"sensitivities": "all"}, "sensitivities is 'all', must be True or False"),
     "sensitivities counted": ({"sensitivities": 67}, "sensitivities is 67, must be True or False"),

@@ -89,6 +89,21 @@ def test_compiled_run_equals_plain_run_with_lost_frames(robot, identified, make_
 
 
 @pytest.mark.parametrize("compiled", [True, False])
+def test_noise_of_the_ideal_sensor_is_a_sensor_with_that_noise(
+    robot, identified, make_reference, make_settings, compiled
+):
+    """Rows of noise, with frames lost, do what a sensor that adds them and answers None does."""
+    settings, reference = make_settings(latency_s=0.4 * PERIOD), make_reference(12)
+    noise, lost = 2e-5 * np.sin(np.arange(12)[:, None] + np.arange(6)), np.isin(np.arange(12), (0, 5))
+    asked = closed_loop.simulate(
+        robot, identified, reference, settings, _sensor({0, 5}), compiled=compiled
+    )
+    drawn = closed_loop.simulate(robot, identified, reference, settings, noise=noise, lost=lost, compiled=compiled)
+    for name in ("pose", "measured", "measured_ok", "command"):
+        np.testing.assert_array_equal(getattr(drawn, name), getattr(asked, name), err_msg=name)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
 def test_ideal_sensor_with_lost_frames_is_a_sensor_that_loses_them(
     robot, identified, make_reference, make_settings, compiled
 ):
