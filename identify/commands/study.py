@@ -50,9 +50,9 @@ Written into the folder:
   summary.md, summary.json, figures/*.png
 
 \b
-On many machines:
+On many machines, all with cmmsim and with the files that the scenario names:
   dask scheduler                                  on one
-  dask worker tcp://HOST:8786 --nthreads 1        on each, once a core, with cmmsim installed
+  dask worker tcp://HOST:8786 --nthreads 1        on each, once a core
   cmmsim study STUDY --scheduler tcp://HOST:8786
 
 Exit status: {SOME_ROWS_FAILED} where rows failed (they say why in the column error), 130 after Ctrl-C.
@@ -122,7 +122,13 @@ def _workers(scheduler: str | None, workers: int | None) -> "Workers":
 def _summarise(study: "Study", folder: Path, outcome: "Outcome", quiet: bool) -> None:
     from identify.studies import summary
 
-    entry = summary.write(folder, study, outcome.frame)
+    try:
+        entry = summary.write(folder, study, outcome.frame)
+    except OSError as error:
+        raise StudyError(
+            f"the summary in {folder} cannot be written: {error.strerror or error}; all rows are kept, and the same "
+            "command writes it again"
+        ) from error
     if quiet:
         return
     again = f", {outcome.found} of them from before" if outcome.found else ""

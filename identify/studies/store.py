@@ -78,7 +78,10 @@ def _claim(folder: Path, entry: dict[str, Any]) -> None:
                 f"{folder / name} is of another study, which differs in {', '.join(others[:4])}; name another folder "
                 "with --out"
             )
-    write_text(folder / STUDY, json.dumps(entry, indent=1) + "\n")
+    try:
+        write_text(folder / STUDY, json.dumps(entry, indent=1) + "\n")
+    except OSError as error:
+        raise StudyError(f"{folder / STUDY} cannot be written: {error.strerror}") from error
 
 
 def _study_file(path: Path) -> dict[str, Any] | None:
