@@ -6,7 +6,7 @@ import pytest
 
 from identify.commands import study as study_command
 from identify.errors import StudyInterrupted
-from identify.studies import dask_runner, runner
+from identify.studies import dask_runner, runner, summary
 from identify.studies.study_file import study_names
 from identify.studies.table import read_table
 from tests.identify.commands import command, one_line
@@ -28,6 +28,12 @@ def mine(tmp_path, monkeypatch):
     return write(tmp_path)
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """No figures: they take longer than the rows."""
+    monkeypatch.setattr(summary, "write", lambda *_: {"theory": []})
+
+
 def write(folder, text=TEXT):
     path = folder / "mine.toml"
     path.write_text(text)
@@ -46,16 +52,20 @@ def test_study_leaves_its_files_and_says_where(mine, tmp_path, capsys):
     assert str(folder.relative_to(tmp_path)) in shown.out
     assert "rows of mine: 4 of 4" in shown.err
     assert "rows/s" in shown.err
+
+
+def test_a_study_that_is_done_says_so(mine, undrawn, capsys):
+    assert command("study", mine, "--workers", 0) == 0
     assert command("study", mine, "--workers", 0) == 0
     assert "4 rows, 4 of them from before" in capsys.readouterr().out
 
 
-def test_quiet_says_nothing(mine, capsys):
+def test_quiet_says_nothing(mine, undrawn, capsys):
     assert command("study", mine, "--workers", 0, "--quiet", "--out", "a") == 0
     assert capsys.readouterr() == ("", "")
 
 
-def test_failed_rows_make_an_exit_status_of_their_own(tmp_path, capsys):
+def test_failed_rows_make_an_exit_status_of_their_own(tmp_path, undrawn, capsys):
     path = write(tmp_path, TEXT + "fails = [1]\n")
     assert command("study", path, "--workers", 0, "--out", tmp_path / "a") == study_command.SOME_ROWS_FAILED
     assert "1 of 4 rows failed; row 1: ValueError: row 1 has no answer" in capsys.readouterr().err
@@ -92,7 +102,7 @@ def test_ten_million_rows_are_refused_at_once(tmp_path, capsys):
     assert not (tmp_path / "a").exists()
 
 
-def test_many_rows_are_run_where_confirmed(mine, monkeypatch):
+def test_many_rows_are_run_where_confirmed(mine, undrawn, monkeypatch):
     monkeypatch.setattr(study_command, "MANY_ROWS", 3)
     assert command("study", mine, "--workers", 0, "--quiet") == 1
     assert command("study", mine, "--workers", 0, "--quiet", "--yes") == 0
