@@ -60,13 +60,9 @@ def estimate_uncertainty(
     known = problem.known_information()
     information = np.asarray(sum(j.T @ j for j in jacobians))
     inverse = np.linalg.inv(information + known)
-    if all(run.driven for run in problem.runs):
+    if ratio > NOISE_DECIDES or all(run.driven for run in problem.runs):
         advance(DRAWS)
-        count = sum(len(j) for j in jacobians)
-        return Uncertainty((inverse + inverse.T) / 2, information, ratio, 1.0, float(np.sqrt(2 / count)))
-    if ratio > NOISE_DECIDES:
-        advance(DRAWS)
-        covariance = ratio * (inverse + inverse.T) / 2
+        covariance = (ratio if ratio > NOISE_DECIDES else 1.0) * (inverse + inverse.T) / 2
         return Uncertainty(covariance, information, ratio, 1.0, float(np.sqrt(2 / sum(map(len, jacobians)))))
     scores, squares = [], []
     for _ in range(DRAWS):
