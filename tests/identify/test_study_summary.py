@@ -48,6 +48,12 @@ def written(tmp_path_factory):
     return frame, summary.write(folder, study, frame), folder
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Figures take longest, and these tests do not look at them."""
+    monkeypatch.setattr(summary, "draw", lambda *arguments: None)
+
+
 def test_band_of_the_mean_is_students():
     values = np.random.default_rng(0).gamma(2.0, size=12)
     found = point_statistics(values)
@@ -121,14 +127,14 @@ def test_figures_show_each_factor_two_as_a_map_and_the_laws(written):
         assert np.ptp(imread(folder / name)[..., :3]) > 0.5
 
 
-def test_single_repeat_has_no_band_and_says_so(tmp_path):
+def test_single_repeat_has_no_band_and_says_so(tmp_path, undrawn):
     study = made_study(repeats=1)
     entry = summary.write(tmp_path, study, made_table(study))
     assert entry["points"][0]["figures"][POSITION]["rms_band"] is None
     assert "With a single repeat there is no band" in (tmp_path / "summary.md").read_text()
 
 
-def test_study_of_which_nothing_worked_says_why(tmp_path):
+def test_study_of_which_nothing_worked_says_why(tmp_path, undrawn):
     study = made_study(repeats=1)
     entry = summary.write(tmp_path, study, made_table(study, failed=range(study.rows)))
     assert entry["rows"]["done"] == 0
@@ -137,7 +143,7 @@ def test_study_of_which_nothing_worked_says_why(tmp_path):
     assert "0 rows done, 6 failed" in (tmp_path / "summary.md").read_text()
 
 
-def test_interrupted_study_says_what_is_missing(tmp_path):
+def test_interrupted_study_says_what_is_missing(tmp_path, undrawn):
     study = made_study()
     entry = summary.write(tmp_path, study, made_table(study).head(20))
     assert entry["rows"]["missing"] == 28
@@ -157,7 +163,7 @@ def test_random_sample_is_summarised_as_a_whole_and_checked(tmp_path):
     assert (tmp_path / "figures" / f"by_{DARK}.png").exists()
 
 
-def test_kind_of_ones_own_has_no_units_but_a_summary(tmp_path):
+def test_kind_of_ones_own_has_no_units_but_a_summary(tmp_path, undrawn):
     study = made_study(kind="my_rows:count", factors={DARK: [10.0, 20.0, 40.0], BASELINE: [0.5, 1.0]})
     entry = summary.write(tmp_path, study, made_table(study))
     assert set(entry["units"]) == {DARK, BASELINE}
