@@ -39,6 +39,10 @@ A study file:
   sensor.camera.dark_noise = [13.0, 26.0, 52.0]   # a key of the sensor file
   sensor.rig.baseline = [0.5, 1.0, 2.0]
   options.captures = [1, 16]                      # an option of the kind
+  [[theory]]                                      # a law that the summary checks; or equals = , or order =
+  figure = "mean_position_rms_um"
+  factor = "options.captures"
+  exponent = -0.5
 With sample = N at the top: N points drawn at random instead, where a factor may also be
   sensor.rig.baseline = {{ low = 0.5, high = 2.0, scale = "log" }}
 

@@ -15,6 +15,11 @@
     options.captures = [1, 4, 16]
     # sensor.rig.baseline = { low = 0.5, high = 2.0, scale = "log" }   # only in a sample
 
+    [[theory]]                                    # a law that the summary checks; see identify.studies.law
+    figure = "mean_position_rms_um"
+    factor = "options.captures"
+    exponent = -0.5
+
 Keys are dotted paths: ``scenario.`` and a key of a scenario, ``sensor.`` and a key of a sensor file, ``options.`` and
 an option of the kind.
 """
