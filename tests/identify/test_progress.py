@@ -7,11 +7,11 @@ from identify.files.atomic import atomic_path, write_text
 from identify.progress import RichProgress, SilentProgress
 
 
-def shown(terminal, fail=False):
+def shown(terminal, fail=False, rate=""):
     stream = io.StringIO()
     console = Console(file=stream, force_terminal=terminal, width=100)
     try:
-        with RichProgress(console).stage("record", 4) as advance:
+        with RichProgress(console, rate).stage("record", 4) as advance:
             advance()
             advance(n=2)
             if fail:
@@ -31,6 +31,12 @@ def test_elsewhere_one_plain_line_a_stage():
     assert text.startswith("record: 3 of 4 in ")
     assert text.count("\n") == 1
     assert "\x1b" not in text
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_rate_is_shown_where_asked_for(terminal):
+    assert " rows/s" in shown(terminal, rate="rows/s")
+    assert "/s" not in shown(terminal)
 
 
 def test_failed_stage_claims_nothing():

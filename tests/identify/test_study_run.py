@@ -14,7 +14,9 @@ from identify.errors import StudyError, StudyInterrupted
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
 from identify.studies import runner
-from identify.studies.computation import compute
+from identify.studies.batches import BATCH_SECONDS, LARGEST_BATCH, Batches
+from identify.studies.computation import Finished, compute
+from identify.studies.design import Case
 from identify.studies.runner import run_study
 from identify.studies.store import JOURNAL, LOCK, STUDY, TABLE
 from identify.studies.study_file import Study
@@ -64,6 +66,21 @@ def stopping_after(rows, error):
             pass
 
     return Workers
+
+
+@pytest.mark.parametrize(("row_seconds", "workers"), [(1e-5, 1), (0.004, 2), (0.1, 8), (30.0, 3)])
+def test_batches_hold_every_row_once_and_a_quarter_second_of_work(row_seconds, workers):
+    batches, sizes, numbers = Batches((Case(number, 0, {}) for number in range(5000)), 5000), [], []
+    while cases := batches.take(workers):
+        batches.learn([Finished(case.number, {}, row_seconds) for case in cases])
+        sizes.append(len(cases))
+        numbers += [case.number for case in cases]
+    assert numbers == list(range(5000))
+    settled = sizes[20 : len(sizes) // 2]
+    assert max(sizes) <= max(1, BATCH_SECONDS / row_seconds)
+    assert max(sizes) <= LARGEST_BATCH
+    assert all(size >= min(0.9 * BATCH_SECONDS / row_seconds - 1, 50) or size == 1 for size in settled)
+    assert sizes[-1] <= max(1, 5000 // workers // 100)
 
 
 def test_table_has_a_row_each_with_factors_seed_and_figures(whole):
