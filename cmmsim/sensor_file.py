@@ -243,6 +243,8 @@ def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None)
     source = f"sensor file {name}" + (f" with changes to {', '.join(changes)}" if changes else "")
     content = _content(name)
     for path, value in dotted(changes or {}).items():
+        if path == "based_on":
+            raise SensorFileError(f"{source}: based_on = {value!r} cannot be changed; name another sensor")
         _replace(content, path, value, source)
     try:
         return _with_stickers(SensorFile.model_validate(content), source)

@@ -71,7 +71,8 @@ _FINITE = ConfigDict(allow_inf_nan=False)
 @lru_cache(maxsize=8)
 def _keys(options: type[BaseModel] | None) -> dict[str, FieldInfo]:
     found = _leaves(Scenario, "scenario.") | _leaves(SensorFile, "sensor.")
-    del found[f"scenario.{SENSOR_CHANGES}"]
+    for path in (f"scenario.{SENSOR_CHANGES}", "sensor.based_on"):
+        del found[path]
     return found | (_leaves(options, "options.") if options is not None else {})
 
 

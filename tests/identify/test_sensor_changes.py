@@ -70,6 +70,7 @@ def test_resolved_scenario_with_changes_reads_back_equal(paper):
         ({"camera.dark_noise.rms": 1.0}, ["'dark_noise'", "a value, not a section"]),
         ({"camera.dark_noise": "much"}, ["camera.dark_noise", "'much'"]),
         ({"camera.dark_noise": -1.0}, ["camera.dark_noise", "-1.0"]),
+        ({"based_on": "ctrack780_29hz"}, ["based_on", "ctrack780_29hz", "another sensor"]),
         ({"lens.focus": 1.0}, ["lens.focus", "psf_px", "vignetting"]),
     ],
 )
