@@ -7,6 +7,8 @@ spread as those of the real record do. With W the information of data and prior,
 W^-1 (cov(J^T r) + prior information) W^-1. A model driven by the logged commands has white residuals, and W^-1 is all.
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,20 +66,7 @@ def estimate_uncertainty(
         advance(DRAWS)
         covariance = (ratio if ratio > NOISE_DECIDES else 1.0) * (inverse + inverse.T) / 2
         return Uncertainty(covariance, information, ratio, 1.0, float(np.sqrt(2 / sum(map(len, jacobians)))))
-    scores, squares = [], []
-    for _ in range(DRAWS):
-        try:
-            repeated = [repeated_experiment(run, parameters, rng).measured for run in problem.runs]
-        except LoopFailure:
-            continue
-        finally:
-            advance()
-        drawn = [
-            (residual + run.whiten(run.measured - poses)).ravel()
-            for run, residual, poses in zip(problem.runs, residuals, repeated, strict=True)
-        ]
-        scores.append(sum(r @ j for r, j in zip(drawn, jacobians, strict=True)))
-        squares.append(np.mean(np.concatenate(drawn) ** 2))
+    scores, squares = _repeated_scores(problem, parameters, residuals, jacobians, rng, advance)
     if len(scores) < FEWEST:
         raise EstimationError(
             f"{DRAWS - len(scores)} of {DRAWS} repeated experiments on the identified model ended in an unstable loop: "
@@ -92,6 +81,36 @@ def estimate_uncertainty(
         float(np.std(squares, ddof=1)),
         DRAWS - len(scores),
     )
+
+
+def _repeated_scores(
+    problem: OutputErrorProblem,
+    parameters: Array,
+    residuals: list[Array],
+    jacobians: list[Array],
+    rng: np.random.Generator,
+    advance: Advance,
+) -> tuple[list[Array], list[float]]:
+    """Scores J^T r and mean squared residuals of the repeated experiments whose loop is stable."""
+
+    def repeat(draws: np.random.Generator) -> tuple[Array, float] | None:
+        try:
+            repeated = [repeated_experiment(run, parameters, draws).measured for run in problem.runs]
+        except LoopFailure:
+            return None
+        drawn = [
+            (residual + run.whiten(run.measured - poses)).ravel()
+            for run, residual, poses in zip(problem.runs, residuals, repeated, strict=True)
+        ]
+        score = np.asarray(sum(r @ j for r, j in zip(drawn, jacobians, strict=True)))
+        return score, float(np.mean(np.concatenate(drawn) ** 2))
+
+    found = []
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # the compiled loop runs without Python's lock
+        for result in pool.map(repeat, rng.spawn(DRAWS)):
+            found += [result] if result else []
+            advance()
+    return [score for score, _ in found], [square for _, square in found]
 
 
 def repeated_experiment(run: RecordedRun, parameters: Array, rng: np.random.Generator) -> ClosedLoopRun:
