@@ -20,7 +20,7 @@ from tests.benchmarks.timing import OtherLoad, judge, slowness
 pytestmark = [pytest.mark.slow, pytest.mark.rendering]
 # Stereo frames a second on two free cores of the machine of timing.REFERENCE_SECONDS.
 GOALS = {"analytic": 300.0, "pyrender": 60.0}
-TIMES_STRAIGHTFORWARD = {"analytic": 20.0, "pyrender": 5.0}
+TIMES_STRAIGHTFORWARD = {"analytic": 20.0, "pyrender": 8.0}
 BATCH, BATCHES = 20, 30
 MEMORY_FRAMES = {"analytic": 10_000, "pyrender": 3_000}
 KEPT = []  # what must live as long as OpenGL is used
@@ -73,7 +73,7 @@ def test_against_a_straightforward_pipeline(sensor, record_property):
     """Rounds alternate and the fastest of each counts. The other pipeline measures the same poses, only worse.
 
     20 times is the goal of the sensor and reached by the analytic renderer; drawing finely with pyrender's meshes is
-    bound by the software rasteriser, and 9 times was seen.
+    bound by the software rasteriser, and 16 times was the most that was seen.
     """
     from tests.benchmarks.straightforward_sensor import StraightforwardSensor
 
