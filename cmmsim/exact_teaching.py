@@ -10,6 +10,7 @@ from .rig_from_file import rig_from_file
 from .scene import placed_stickers
 from .sensor_file import SensorFile
 from .taught import Taught
+from .taught_setup import setup_of
 
 
 def exactly_taught(file: SensorFile) -> Taught:
@@ -18,4 +19,4 @@ def exactly_taught(file: SensorFile) -> Taught:
     platform, base = (placed_stickers(marked_body(name, section), file.stickers, stream)
                       for stream, (name, section) in enumerate((("platform", file.platform), ("base", file.base))))
     return Taught(file.name, invert(camera_from_base), np.zeros((6, 6)), platform, np.zeros((len(platform), 3, 3)),
-                  np.zeros((6, 6)), base)
+                  np.zeros((6, 6)), base, setup_of(file))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from .rig_from_file import rig_from_file
 from .scene import Mesh, scene_body, solid_mesh
 from .sensor_file import SensorFile, Timing, read_sensor_file
 from .taught import Taught
+from .taught_setup import require_taught_for, setup_of
 from .teaching import Progress, Teacher
 from .tracking import Tracker
 from .views import Drawable
@@ -41,7 +43,8 @@ TEACHING_STREAM, RUN_STREAM, DROPOUT_STREAM = 0, 1, 2
 class Sensor:
     """A stereo optical CMM that looks at a posed platform.
 
-    It teaches itself on first use, or takes what another sensor of the same file was taught.
+    It teaches itself on first use, or takes what a sensor with the same cameras, planes and stickers was taught; raises
+    TeachingError, naming what differs, for what another one was taught.
     """
 
     def __init__(self, file: SensorFile, seed: int = 0, method: str = "registration", taught: Taught | None = None,
@@ -50,8 +53,6 @@ class Sensor:
             raise UnknownOptionError("method", method, METHODS)
         if renderer is not None and renderer not in RENDERER_NAMES:
             raise UnknownOptionError("renderer", renderer, RENDERER_NAMES)
-        if taught is not None and taught.sensor_name != file.name:
-            raise ShapeError(f"taught belongs to sensor {taught.sensor_name!r}, not to {file.name!r}")
         self._file, self._seed, self._progress = file, seed, progress
         self.method = method
         self.rig, self._camera_from_base = rig_from_file(file.rig)
@@ -60,6 +61,8 @@ class Sensor:
         self.noise = CameraNoise(**{("enabled" if k == "noise" else k): v for k, v in figures.items()})
         self.optics = Optics(**file.lens.model_dump())
         self.platform, self.base = marked_body("platform", file.platform), marked_body("base", file.base)
+        if taught is not None:
+            require_taught_for(taught, file, len(self.platform.nominal))
         self._scene = [scene_body(body, section, file.stickers, stream) for stream, (body, section)
                        in enumerate(((self.platform, file.platform), (self.base, file.base)))]
         self._obstacles: dict[str, Mesh] = {}
@@ -118,7 +121,8 @@ class Sensor:
         if self._taught is None:
             teacher = Teacher(self._camera, self.rig, self.noise, self.settings, self.platform, self.base)
             rng = np.random.default_rng([self._seed, TEACHING_STREAM])
-            self._taught = teacher.teach(self.name, self.home, rng, progress or self._progress)
+            found = teacher.teach(self.name, self.home, rng, progress or self._progress)
+            self._taught = replace(found, setup=setup_of(self._file))
         return self._taught
 
     def start_run(self, seed: int) -> None:
@@ -222,9 +226,9 @@ def load_sensor(name: str | Path, seed: int = 0, method: str = "registration", t
     """Sensor of a built-in name or of a TOML file.
 
     Parameters: seed of teaching and of the first run's noise; method "registration" or "planes"; taught: the result of
-    an earlier teaching of the same sensor; progress(done, total), called while teaching; renderer: "pyrender",
-    "analytic" or "auto" instead of what the file says; changes: other entries than the file's, by dotted key as
-    ``{"camera.dark_noise": 40.0}``.
-    Raises UnknownSensorError, SensorFileError, UnknownOptionError.
+    an earlier teaching of the same cameras and bodies; progress(done, total), called while teaching; renderer:
+    "pyrender", "analytic" or "auto" instead of what the file says; changes: other entries than the file's, by dotted
+    key as ``{"camera.dark_noise": 40.0}``.
+    Raises UnknownSensorError, SensorFileError, UnknownOptionError, and TeachingError for what another one was taught.
     """
     return Sensor(read_sensor_file(name, changes), seed, method, taught, progress, renderer)

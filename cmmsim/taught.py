@@ -16,7 +16,8 @@ class Taught:
 
     sensor_name; base_from_camera (4,4) and base_covariance (6,6) of its small error [dt, dphi]; platform_places (n,3)
     sticker coordinates in platform axes, m, and place_covariances (n,3,3); platform_covariance (6,6): error of the
-    platform frame itself, in platform axes; base_places (k,3) sticker coordinates in base axes, m.
+    platform frame itself, in platform axes; base_places (k,3) sticker coordinates in base axes, m. setup: what of the
+    sensor file this holds for, see :mod:`cmmsim.taught_setup`; empty for one put together by hand.
     """
 
     sensor_name: str
@@ -26,6 +27,7 @@ class Taught:
     place_covariances: Array
     platform_covariance: Array
     base_places: Array
+    setup: str = ""
 
     def __post_init__(self) -> None:
         if self.base_from_camera.shape != (4, 4) or self.platform_places.ndim != 2:
