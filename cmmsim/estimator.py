@@ -14,7 +14,7 @@ from .matching import candidate_pairs
 from .measurement import Measurement, lost_measurement
 from .noise import CameraNoise
 from .observation import DetectionSettings, StickerObservation, observe
-from .pose import Array, compose_covariance, pose_covariance, transform_to_pose
+from .pose import Array, compose_covariance, finite_array, pose_covariance, transform_to_pose
 from .pose_methods import METHODS, Solution, by_planes
 from .stereo_rig import StereoRig
 from .taught import Taught
@@ -69,12 +69,17 @@ def measure_frame(frame: StereoFrame, estimator: PoseEstimator, expected: Array 
     """Measure a stereo frame from any source.
 
     ``expected`` (4,4) is a rough camera_from_platform; without it the stickers are searched in the whole images.
-    Raises ShapeError for images of another bit depth than the estimator's cameras have.
+    Raises ShapeError for images of another size or bit depth than the estimator's cameras have.
     """
-    for name, image in (("left", frame.left), ("right", frame.right)):
+    for name, image, camera in zip(("left", "right"), (frame.left, frame.right), estimator.rig.cameras, strict=True):
+        if image.shape != (camera.height, camera.width):
+            raise ShapeError(f"the {name} image is {image.shape[1]} x {image.shape[0]} px, but its camera has "
+                             f"{camera.width} x {camera.height} px")
         if image.dtype != estimator.noise.image_type:
             raise ShapeError(f"the {name} image is {image.dtype}, but the camera's bit_depth "
                              f"{estimator.noise.bit_depth} makes {estimator.noise.image_type}")
+    if expected is not None:
+        expected = finite_array(expected, (4, 4), "the expected camera_from_platform must be (4,4) and finite")
     images = FrameImages(frame)
     try:
         return estimator.measure(images, estimator.locate(images) if expected is None else expected)[0]

@@ -24,6 +24,8 @@ class StereoFrame:
     def __post_init__(self) -> None:
         for name in ("left", "right"):
             image = getattr(self, name)
+            if not isinstance(image, np.ndarray):
+                raise ShapeError(f"the {name} image must be an array (height, width), got {type(image).__name__}")
             if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
                 raise ShapeError(f"the {name} image must be (height, width) uint8 or uint16, got {image.shape} "
                                  f"{image.dtype}")

@@ -14,13 +14,38 @@ from numpy.typing import ArrayLike, NDArray
 from .errors import ShapeError
 
 Array = NDArray[np.float64]
+SHOWN_CHARACTERS = 120  # of what is refused
+
+
+def finite_array(values: ArrayLike, shape: tuple[int, ...], wanted: str) -> Array:
+    """Values as an array of that shape. Raises ShapeError, which says what is ``wanted``, for anything else than
+    finite real numbers."""
+    try:
+        found = np.asarray(values)
+        numbers = found.astype(float) if found.dtype.kind in "fiubO" else None
+    except (TypeError, ValueError, OverflowError):  # ragged, or objects that are no numbers
+        numbers = None
+    if numbers is None:
+        raise ShapeError(f"{wanted}, got {_shown(values)}")
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        raise ShapeError(f"{wanted}, got shape {numbers.shape}: {_shown(numbers)}")
+    return numbers
+
+
+def _shown(values: object) -> str:
+    """Values on one line, cut where they are many."""
+    text = " ".join(str(values).split())
+    return text if len(text) <= SHOWN_CHARACTERS else f"{text[:SHOWN_CHARACTERS - 3]}..."
+
+
+def checked_pose(pose: ArrayLike) -> Array:
+    """The pose (6,) as an array of its own. Raises ShapeError when it is not six finite numbers."""
+    return finite_array(pose, (6,), "a pose is six finite numbers [x y z alpha beta gamma]")
 
 
 def pose_to_transform(pose: ArrayLike) -> Array:
     """Transform (4,4) of a pose (6,). Raises ShapeError when the pose is not six finite numbers."""
-    values = np.asarray(pose, dtype=float)
-    if values.shape != (6,) or not np.all(np.isfinite(values)):
-        raise ShapeError(f"a pose is six finite numbers [x y z alpha beta gamma], got shape {values.shape}: {values}")
+    values = checked_pose(pose)
     (ca, cb, cg), (sa, sb, sg) = np.cos(values[3:]), np.sin(values[3:])
     transform = np.eye(4)
     transform[:3, :3] = [

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.spatial import HalfspaceIntersection
+from scipy.spatial import HalfspaceIntersection, QhullError
 
+from .errors import SensorFileError
 from .marked_body import MarkedBody
+from .plane_frame import PLANE_NAMES
 from .pose import Array
 from .sensor_file import Body, Stickers, unit
 
@@ -110,13 +112,26 @@ def rod_transform(start: Array, end: Array) -> Array:
 
 
 def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
-    """Convex solid of the sunk sticker planes and the cuts."""
+    """Convex solid of the sunk sticker planes and the cuts. Raises SensorFileError where they enclose none."""
     normals = [*body.normals, *(unit(c.normal) for c in section.cuts)]
     points = [*(d * n - SUNK * n for n, d in zip(body.normals, body.offsets, strict=True)),
               *(np.array(c.point) for c in section.cuts)]
     half_spaces = np.array([[*n, -(n @ p)] for n, p in zip(normals, points, strict=True)])
     inside = body.nominal.mean(axis=0) - 0.01 * body.normals.sum(axis=0)
-    return trimesh.convex.convex_hull(HalfspaceIntersection(half_spaces, inside).intersections)
+    outside = half_spaces @ [*inside, 1.0]
+    if outside.max() >= 0.0:
+        side = [*(f"plane {name}" for name in PLANE_NAMES), *(f"cut {k + 1}" for k in range(len(section.cuts)))]
+        raise SensorFileError(f"{body.name}: the middle of its stickers, {np.round(inside, 4).tolist()} m, lies "
+                              f"{outside.max():.4f} m outside of {side[outside.argmax()]}: the stickers do not sit on "
+                              "the solid that its planes and cuts enclose")
+    try:
+        corners = HalfspaceIntersection(half_spaces, inside).intersections
+        if not np.isfinite(corners).all():
+            raise SensorFileError(f"{body.name}: its planes and cuts enclose no solid, it is open on a side")
+        return trimesh.convex.convex_hull(corners)
+    except QhullError as error:
+        reason = str(error).strip().splitlines()[0]
+        raise SensorFileError(f"{body.name}: its planes and cuts enclose no solid: {reason}") from error
 
 
 def _sticker(place: Array, axes: Array, stickers: Stickers) -> DiscStack:

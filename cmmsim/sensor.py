@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from .blob_search import SMALLEST_STEP
 from .ellipse_fit import FitLimits
-from .errors import ShapeError, UnknownBodyError, UnknownOptionError
+from .errors import CmmError, UnknownBodyError, UnknownOptionError
 from .estimator import PoseEstimator
 from .image_formation import ImageFormation
 from .images import StereoFrame, StereoImages
@@ -23,7 +24,7 @@ from .measurement import Measurement, lost_measurement
 from .noise import CameraNoise
 from .observation import DetectionSettings
 from .optics import Optics
-from .pose import Array, pose_to_transform
+from .pose import Array, checked_pose, finite_array
 from .pose_methods import METHODS
 from .renderers import RENDERER_NAMES, Renderer, choose_renderer
 from .rig_from_file import rig_from_file
@@ -53,7 +54,7 @@ class Sensor:
             raise UnknownOptionError("method", method, METHODS)
         if renderer is not None and renderer not in RENDERER_NAMES:
             raise UnknownOptionError("renderer", renderer, RENDERER_NAMES)
-        self._file, self._seed, self._progress = file, seed, progress
+        self._file, self._seed, self._progress = file, _checked_seed(seed), progress
         self.method = method
         self.rig, self._camera_from_base = rig_from_file(file.rig)
         self._true_rig = self.rig
@@ -129,8 +130,9 @@ class Sensor:
         """Begin a new run: new noise, and the next measurement searches the whole images.
 
         Every frame has a noise stream of its own, so that a dropped one changes nothing in the others.
+        Raises CmmError for a seed that is no whole number from 0 on.
         """
-        self._run_seed, self._frame = seed, 0
+        self._run_seed, self._frame = _checked_seed(seed), 0
         self._dropout_rng = np.random.default_rng([seed, DROPOUT_STREAM])
         if self._tracker is not None:
             self._tracker.forget()
@@ -200,24 +202,32 @@ class Sensor:
 
     def _checked(self, pose: ArrayLike,
                  obstacles: Mapping[str, Array] | None) -> tuple[Array, np.random.Generator, Mapping[str, Array]]:
-        pose_to_transform(pose)  # raises for anything but six finite numbers
+        checked = checked_pose(pose)
+        placed = {}
         for name, place in (obstacles or {}).items():
             if name not in self._obstacles:
                 raise UnknownBodyError(name, self._obstacles)
-            if np.shape(place) != (4, 4) or not np.all(np.isfinite(place)):
-                raise ShapeError(f"obstacle {name!r}: base_from_body must be (4,4) and finite, got {np.shape(place)}")
+            placed[name] = finite_array(place, (4, 4), f"obstacle {name!r}: base_from_body must be (4,4) and finite")
         rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
         self._frame += 1
-        return np.asarray(pose, dtype=float), rng, obstacles or {}
+        return checked, rng, placed
+
+
+def _checked_seed(seed: int) -> int:
+    """The seed. Raises CmmError unless it is a whole number from 0 on."""
+    try:
+        number = operator.index(seed)
+    except TypeError:
+        number = -1
+    if number < 0:
+        raise CmmError(f"a seed is a whole number from 0 on, got {seed!r}")
+    return number
 
 
 def _checked_rate(pose_rate: ArrayLike | None) -> Array | None:
     if pose_rate is None:
         return None
-    values = np.asarray(pose_rate, dtype=float)
-    if values.shape != (6,) or not np.isfinite(values).all():
-        raise ShapeError(f"a pose rate is six finite numbers, m/s and rad/s, got {np.asarray(pose_rate).tolist()}")
-    return values
+    return finite_array(pose_rate, (6,), "a pose rate is six finite numbers, m/s and rad/s")
 
 
 def load_sensor(name: str | Path, seed: int = 0, method: str = "registration", taught: Taught | None = None,

@@ -152,13 +152,26 @@ class Stickers(_Section):
     radius: Positive
     ring_radius: Positive
     placement: tuple[NotNegative, NotNegative] = (0.0, 0.0)
-    placement_seed: int = 0
+    placement_seed: Annotated[int, Field(ge=0)] = 0
     sticker_level: Level
     ring_level: Level
     body_level: Level
     obstacle_level: Level
     background_level: Level = 0
     per_plane: Annotated[int, Field(ge=3)] | None = None
+
+    @model_validator(mode="after")
+    def _bright_on_dark(self) -> Stickers:
+        if self.ring_radius < self.radius:
+            raise ValueError(f"ring_radius {self.ring_radius:g} m must be at least radius {self.radius:g} m: "
+                             "stickers are found as bright discs within dark rings")
+        if self.sticker_level <= self.ring_level:
+            raise ValueError(f"sticker_level {self.sticker_level} must be above ring_level {self.ring_level}: "
+                             "stickers are found as bright discs within dark rings")
+        if self.placement[0] > self.placement[1]:
+            raise ValueError(f"placement {list(self.placement)} m is the smallest and the largest distance, in this "
+                             "order")
+        return self
 
 
 class HalfSpace(_Section):
@@ -225,12 +238,20 @@ def built_in_names() -> list[str]:
 
 
 def sensor_text(name: str | Path) -> str:
-    """Text of the sensor file of a built-in name or a path. Raises UnknownSensorError for a name that is neither."""
+    """Text of the sensor file of a built-in name or a path.
+
+    Raises UnknownSensorError for a name that is neither, SensorFileError for a file that cannot be read.
+    """
     if str(name) in built_in_names():
         return resources.files(__package__).joinpath("sensors", f"{name}.toml").read_text(encoding="utf-8")
-    if not Path(name).is_file():
-        raise UnknownSensorError(str(name), built_in_names())
-    return Path(name).read_text(encoding="utf-8")
+    try:
+        if not Path(name).is_file():
+            raise UnknownSensorError(str(name), built_in_names())
+        return Path(name).read_text(encoding="utf-8")
+    except OSError as error:
+        raise SensorFileError(f"cannot read sensor file {str(name)[:200]}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise SensorFileError(f"sensor file {name} is not text, so it cannot be TOML: {error}") from error
 
 
 def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None) -> SensorFile:
@@ -240,6 +261,7 @@ def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None)
     the file. Raises UnknownSensorError for a name that is neither, SensorFileError (with the valid names) for a bad
     content.
     """
+    _require_keys(name, changes)
     source = f"sensor file {name}" + (f" with changes to {', '.join(changes)}" if changes else "")
     content = _content(name)
     for path, value in dotted(changes or {}).items():
@@ -251,6 +273,21 @@ def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None)
     except ValidationError as error:
         lines = "; ".join(_explain(e) for e in error.errors())
         raise SensorFileError(f"{source}: {lines}") from error
+
+
+def _require_keys(name: str | Path, changes: object) -> None:
+    """Raise SensorFileError for changes that are no tables with names for keys."""
+    if changes is None:
+        return
+    if not isinstance(changes, Mapping):
+        raise SensorFileError(f"sensor file {name}: changes = {changes!r} must be given by key, as "
+                              "{'camera.dark_noise': 40.0}")
+    for key, value in changes.items():
+        if not isinstance(key, str):
+            raise SensorFileError(f"sensor file {name}: key {key!r} of the changes is no name such as "
+                                  "'camera.dark_noise'")
+        if isinstance(value, Mapping):
+            _require_keys(name, value)
 
 
 def _with_stickers(file: SensorFile, source: str) -> SensorFile:
@@ -328,6 +365,8 @@ def _explain(error: Any) -> str:
     where = ".".join(str(part) for part in error["loc"])
     if error["type"] == "extra_forbidden":
         return f"unknown key {where!r}, valid are {', '.join(_valid_keys(error['loc'][:-1]))}"
+    if error["type"] == "missing":
+        return f"{where}: {error['msg']}"  # what was got instead is the whole section
     if error["type"] == "value_error":
         return f"{where}: {error['ctx']['error']}"
     return f"{where}: {error['msg']} (got {error['input']!r})"
@@ -348,5 +387,5 @@ def unit(vector: Vector3 | Array) -> Array:
     values = np.asarray(vector, dtype=float)
     length = float(np.linalg.norm(values))
     if length < 1e-9:
-        raise SensorFileError(f"a direction must not be zero, got {list(values)}")
+        raise SensorFileError(f"a direction must not be zero, got {values.tolist()}")
     return values / length

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import cmmsim
+from cmmsim.exact_teaching import exactly_taught
 from cmmsim.scene import rod, rod_transform
-from cmmsim.sensor_file import sensor_text
+from cmmsim.sensor_file import read_sensor_file, sensor_text
 
 TEXT = sensor_text("ctrack780")
 
@@ -66,3 +67,92 @@ def test_rod_reaches_from_point_to_point():
     tip = rod_transform(start, end) @ [0.0, 0.0, length, 1.0]
     np.testing.assert_allclose(tip[:3], end, atol=1e-15)
     assert rod(length, 0.01).bounds[1, 2] == pytest.approx(length)
+
+
+def one_line(error):
+    """The refusal's text, which is one line and not a whole file."""
+    text = str(error.value)
+    assert "\n" not in text
+    assert len(text) < 500
+    return text
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"stickers.placement": [0.002, 0.001]}, r"placement \[0.002, 0.001\] m is the smallest and the largest"),
+    ({"stickers.placement_seed": -4}, r"placement_seed: .*\(got -4\)"),
+    ({"stickers.ring_radius": 0.002}, "ring_radius 0.002 m must be at least radius 0.003 m"),
+    ({"stickers.sticker_level": 8}, "sticker_level 8 must be above ring_level 8"),
+    ({"platform.planes.A.stickers": [[1, 0], [2, 0], [3, 0]]}, "platform: the middle of its stickers.*outside of"),
+    ({"platform.cuts": []}, "platform: its planes and cuts enclose no solid"),
+    ({"platform.planes.B.normal": [0, 0, 0]}, r"must not be zero, got \[0.0, 0.0, 0.0\]"),
+    ({3: 4}, "key 3 of the changes is no name"),
+    ({"rig": {3: 4}}, "key 3 of the changes is no name"),
+    ([1], r"changes = \[1\] must be given by key"),
+    ({"based_on": "nothing"}, "based_on = 'nothing' cannot be changed"),
+])
+def test_bad_changes(changes, message):
+    with pytest.raises(cmmsim.SensorFileError, match=message) as error:
+        cmmsim.load_sensor("ctrack780", changes=changes)
+    one_line(error)
+
+
+@pytest.mark.parametrize("content", [bytes(range(256)), b"\xff\xfen\x00a\x00"])
+def test_a_file_that_is_no_text_is_refused(tmp_path, content):
+    (tmp_path / "mine.toml").write_bytes(content)
+    with pytest.raises(cmmsim.SensorFileError, match=r"mine.toml is not text") as error:
+        cmmsim.load_sensor(tmp_path / "mine.toml")
+    one_line(error)
+
+
+def test_a_name_that_no_file_can_have_is_refused():
+    with pytest.raises(cmmsim.SensorFileError, match=r"cannot read sensor file xxx.*: File name too long") as error:
+        cmmsim.load_sensor("x" * 5000)
+    one_line(error)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, None, "1"])
+def test_bad_seed(seed):
+    with pytest.raises(cmmsim.CmmError, match="a seed is a whole number from 0 on, got") as error:
+        cmmsim.load_sensor("ctrack780", seed=seed)
+    one_line(error)
+
+
+@pytest.mark.parametrize("pose", ["home", ["0"] * 6, np.zeros(6) * 1j, [[0.0], [1.0, 2.0]], None, [None] * 6, {},
+                                  np.zeros((6, 1)), [10**400] * 6, np.full((200, 200), np.nan)])
+def test_what_is_no_pose(pose):
+    with pytest.raises(cmmsim.ShapeError, match="six finite numbers") as error:
+        cmmsim.pose_to_transform(pose)
+    one_line(error)
+
+
+@pytest.mark.parametrize("image", [None, [[1]], np.zeros((8, 8)), np.zeros((8, 8, 3), dtype=np.uint8)])
+def test_what_is_no_image(image):
+    good = np.zeros((8, 8), dtype=np.uint8)
+    for name, pair in (("left", (image, good)), ("right", (good, image))):
+        with pytest.raises(cmmsim.ShapeError, match=f"the {name} image must be") as error:
+            cmmsim.StereoFrame(*pair)
+        one_line(error)
+
+
+@pytest.mark.parametrize("shape", [(768, 1024), (0, 0), (2048, 1536), (1536, 2047)])
+def test_images_of_another_size_are_refused(exact, shape):
+    good, bad = np.zeros((1536, 2048), dtype=np.uint8), np.zeros(shape, dtype=np.uint8)
+    for name, pair in (("left", (bad, good)), ("right", (good, bad))):
+        message = rf"the {name} image is {shape[1]} x {shape[0]} px, but its camera has 2048 x 1536"
+        with pytest.raises(cmmsim.ShapeError, match=message) as error:
+            cmmsim.measure_frame(cmmsim.StereoFrame(*pair), exact.estimator)
+        one_line(error)
+
+
+@pytest.mark.parametrize("expected", [np.zeros(6), np.eye(3), np.full((4, 4), np.nan), "here"])
+def test_bad_expected_pose(exact, expected):
+    dark = np.zeros((1536, 2048), dtype=np.uint8)
+    with pytest.raises(cmmsim.ShapeError, match=r"expected camera_from_platform must be \(4,4\)") as error:
+        cmmsim.measure_frame(cmmsim.StereoFrame(dark, dark), exact.estimator, expected)
+    one_line(error)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """A sensor that is taught without drawing anything."""
+    return cmmsim.load_sensor("ctrack780", taught=exactly_taught(read_sensor_file("ctrack780")), renderer="analytic")
