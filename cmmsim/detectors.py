@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .detected_centres import DetectedCentres
-from .dual_conic import detect_by_dual_conic
+from .dual_conic import EDGE_PX, detect_by_dual_conic
 from .ellipse_fit import FitLimits, fit_ellipses
 from .errors import UnknownOptionError
 from .grey_centroid import detect_by_centroid
@@ -32,11 +32,13 @@ class DetectWindows(Protocol):
 @dataclass(frozen=True)
 class Detector:
     """name; detect; bias_px: rms error of a centre without noise, at the built-in sensors' radius (3.8 px, 45 degrees,
-    sharp images). It differs from place to place within a pixel, so it acts like noise that detect does not state."""
+    sharp images). It differs from place to place within a pixel, so it acts like noise that detect does not state.
+    margin_px: how much wider than for the maximum-likelihood fit a window must be on each side."""
 
     name: str
     detect: DetectWindows
     bias_px: float
+    margin_px: int = 0
 
 
 def detect_by_maximum_likelihood(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
@@ -48,7 +50,7 @@ def detect_by_maximum_likelihood(windows: NDArray, corners: NDArray[np.integer],
 
 DETECTORS = {d.name: d for d in (
     Detector("maximum_likelihood", detect_by_maximum_likelihood, 0.0),
-    Detector("dual_conic", detect_by_dual_conic, 0.004),
+    Detector("dual_conic", detect_by_dual_conic, 0.004, EDGE_PX),
     Detector("grey_centroid", detect_by_centroid, 0.009),
 )}
 DEFAULT_DETECTOR = "maximum_likelihood"

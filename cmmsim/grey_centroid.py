@@ -75,10 +75,11 @@ def bright_spots(windows: NDArray, corners: NDArray[np.integer], size: int) -> B
     return BrightSpots(parts, corners + first, contrast, weights, within, _centroids(weights), spreads)
 
 
-def whole_inside(centres: Array, spreads: Array, size: int) -> NDArray[np.bool_]:
-    """Whether ellipses with these centres (n,2) and second moments (n,2,2) lie wholly inside their windows."""
+def whole_inside(centres: Array, spreads: Array, size: int, margin: float = 0.0) -> NDArray[np.bool_]:
+    """Whether ellipses with these centres (n,2) and second moments (n,2,2) lie wholly inside their windows, ``margin``
+    px away from the sides."""
     reach = 2.0 * np.sqrt(np.maximum(np.diagonal(spreads, axis1=1, axis2=2), 0.0))
-    return np.all((centres - reach > -0.5) & (centres + reach < size - 0.5) & (reach > 0.0), axis=1)
+    return np.all((centres - reach > margin - 0.5) & (centres + reach < size - margin - 0.5) & (reach > 0.0), axis=1)
 
 
 def _weights(windows: Array, threshold: float) -> tuple[Array, Array]:

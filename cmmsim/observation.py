@@ -84,12 +84,13 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
     facing = np.stack([-np.einsum("ni,ni->n", c, t) > GRAZING * np.linalg.norm(c, axis=1)
                        for c, t in zip(centres, turned, strict=True)])
     index = np.flatnonzero(np.all(valid & facing, axis=0))
-    corners = np.rint(pixels[:, index] - 0.5 * (settings.window_size - 1)).astype(int)
+    detector = find_detector(settings.detector)
+    window_size, fit_size = settings.window_size + 2 * detector.margin_px, settings.fit_size + 2 * detector.margin_px
+    corners = np.rint(pixels[:, index] - 0.5 * (window_size - 1)).astype(int)
     if len(index) == 0:
         return StickerObservation(index, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    windows = _evenly_lit(images.windows(corners, settings.window_size), corners, rig, noise, settings)
-    detector = find_detector(settings.detector)
-    fits = detector.detect(windows.reshape(-1, *windows.shape[2:]), corners.reshape(-1, 2), noise, settings.fit_size,
+    windows = _evenly_lit(images.windows(corners, window_size), corners, rig, noise, settings)
+    fits = detector.detect(windows.reshape(-1, *windows.shape[2:]), corners.reshape(-1, 2), noise, fit_size,
                            settings.limits, psf_px=settings.optics.psf_px)
     seen_at = fits.centres.reshape(2, -1, 2) - np.stack(
         [centre_offset(camera, c[index], t[index], settings.radius)

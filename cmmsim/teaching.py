@@ -4,6 +4,9 @@ The base stands still: its stickers are averaged over many exposures. The platfo
 pose its stickers are observed, all observations are laid onto each other by registration, and the planes are put
 through the mean constellation. Different poses put the stickers on different parts of a pixel, so that what is left of
 the image formation's own error averages out as well.
+
+Whatever detector the sensor measures with, the centres are those of the maximum-likelihood fit, which is the one
+without a bias: the base is seen in one pose only, so that another detector's bias would stay in every pose.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from .detectors import DEFAULT_DETECTOR
 from .errors import LostError, TeachingError
 from .estimator import FEWEST_NOMINAL, NOMINAL_TOLERANCE, points_in_frame
 from .labelling import find_layout
@@ -87,7 +91,7 @@ class Teacher:
         limits = replace(self.settings.limits, largest_misfit=np.inf)
         noise = replace(self.noise, frames=quality.exposures)
         settings = replace(self.settings, window_size=window_size, limits=limits, largest_ray_gap=np.inf,
-                           centre_error_px=self.camera.centre_error_px(quality))
+                           detector=DEFAULT_DETECTOR, centre_error_px=self.camera.centre_error_px(quality))
         seen = observe(self.camera.look(pose, rng, quality=quality), self.rig, noise, settings, expected, places,
                        body.sticker_normals)
         if len(seen.index) < len(places):

@@ -51,7 +51,8 @@ def test_no_windows_no_centres(detector):
 def test_covariance_is_that_of_sampled_noise(detector, condition):
     """Normalised squared error of what the noise does to a centre: 2 within 12 %, where 800 draws allow some 7 %."""
     _, clean, noisy, noise = drawn(condition, 800, 1)
-    found, without = (detector.detect(w, corners(800), noise, FIT, NO_LIMIT, condition.psf_px) for w in (noisy, clean))
+    size = FIT + 2 * detector.margin_px
+    found, without = (detector.detect(w, corners(800), noise, size, NO_LIMIT, condition.psf_px) for w in (noisy, clean))
     assert found.good.all()
     change = found.centres - without.centres
     squared = np.einsum("ni,nij,nj->n", change, np.linalg.inv(found.covariances), change)
@@ -144,6 +145,33 @@ def test_sensor_file_chooses_the_detector_and_poses_keep_their_covariance(detect
     errors = np.array([m.pose for m in found]) - path
     squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv([m.covariance for m in found]), errors)
     assert squared.mean() == pytest.approx(6.0, rel=0.25)  # neighbouring frames share their places within a pixel
+
+
+@pytest.mark.parametrize("radius_px", [3.8, 4.4, 4.8, 5.2])
+def test_lines_of_the_dual_conic_that_the_window_cuts_off_move_no_good_centre(radius_px):
+    """Discs so large that their rims come near the window's sides: exact to the stated bias, or not good."""
+    centres, clean, _, noise = drawn(Condition(radius_px, np.pi / 4.0, 0.027), 200, 8)
+    dual_conic = find_detector("dual_conic")
+    seen = {size: dual_conic.detect(clean, corners(200), noise, size) for size in (12, 12 + 2 * dual_conic.margin_px)}
+    for found in seen.values():
+        assert np.all(np.abs(found.centres - centres)[found.good] < 5.0 * dual_conic.bias_px)
+    assert seen[12 + 2 * dual_conic.margin_px].good.all()
+
+
+@EVERY
+def test_poses_of_a_sensor_that_taught_itself_keep_their_covariance(detector):
+    """Squared pose errors, normalised by the stated covariance and that of teaching, with each detector."""
+    sensor = Sensor(read_sensor_file("ctrack780", {"detection.detector": detector.name}), renderer="analytic")
+    rng = np.random.default_rng(5)
+    steps = np.cumsum(rng.uniform(-1.0, 1.0, (30, 6)) * ([0.0015] * 3 + [0.005] * 3), axis=0)
+    path = sensor.home + np.vstack([np.zeros(6), steps])
+    found = [sensor.measure(pose) for pose in path]
+    assert all(m.ok for m in found)
+    errors = np.array([m.pose for m in found]) - path
+    stated = np.array([m.covariance + sensor.taught.calibration_covariance(m.pose) for m in found])
+    squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(stated), errors)
+    assert 3.0 < squared.mean() < 9.0  # the mean of 31 scatters by 0.6, and one teaching is in all of them
+    assert squared[0] < 22.5  # at home: 1 in 1,000
 
 
 def test_unknown_detector_in_a_sensor_file_names_the_valid_ones(tmp_path):
