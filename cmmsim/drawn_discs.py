@@ -20,6 +20,7 @@ from .sensor import Sensor
 from .sensor_file import SensorFile
 
 TOGETHER = 100  # discs drawn at once
+LARGEST_RADIUS_PX = 50.0
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,9 @@ class Condition:
         if not (self.radius_px >= 1.0 and 0.0 <= self.tilt <= 1.4 and 0.0 < self.noise < 1.0):
             raise CmmError("a condition needs radius >= 1 px, tilt 0 to 1.4 rad (80 degrees) and noise between 0 and 1 "
                            f"of the contrast, got {self}")
+        if self.radius_px > LARGEST_RADIUS_PX:
+            raise CmmError(f"radius {self.radius_px:g} px is more than {LARGEST_RADIUS_PX:g} px: time and memory grow "
+                           "with its square, and errors only fall with its root")
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,8 @@ from .taught import Taught
 NOMINAL_TOLERANCE = 0.003  # m: nominal places are known to about a millimetre
 TAUGHT_TOLERANCE = 0.0005  # m: taught places are known to microns, points in a whole image to tenths of a millimetre
 FEWEST_NOMINAL, FEWEST_TAUGHT = 6, 4
-SEARCH_WINDOW_PX = 24
+SEARCH_WINDOW_PX = 24  # at least
+SEARCH_ROOM_PX = 8  # a bright spot's rough centre differs from a prediction of it
 
 
 @dataclass(frozen=True)
@@ -89,8 +90,8 @@ def measure_frame(frame: StereoFrame, estimator: PoseEstimator, expected: Array 
 
 def points_in_frame(frame: StereoFrame, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings) -> Array:
     """Points (m,3) in the camera frame that may be stickers; true and false pairings together."""
-    left, right = find_ellipses(frame, noise, SEARCH_WINDOW_PX, settings.fit_size, settings.limits,
-                                settings.optics.psf_px)
+    window_size = max(SEARCH_WINDOW_PX, settings.window_size + SEARCH_ROOM_PX)
+    left, right = find_ellipses(frame, noise, window_size, settings.fit_size, settings.limits, settings.optics.psf_px)
     if not len(left.centres) or not len(right.centres):
         raise LostError(f"{len(left.centres)} bright spots in the left image and {len(right.centres)} in the right, "
                         f"at least {FEWEST_TAUGHT} in each needed")

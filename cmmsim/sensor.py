@@ -15,16 +15,16 @@ from numpy.typing import ArrayLike
 
 from .blob_search import SMALLEST_STEP
 from .ellipse_fit import FitLimits
-from .errors import CmmError, UnknownBodyError, UnknownOptionError
+from .errors import CmmError, TeachingError, UnknownBodyError, UnknownOptionError
 from .estimator import PoseEstimator
 from .image_formation import ImageFormation
 from .images import StereoFrame, StereoImages
-from .marked_body import marked_body
+from .marked_body import MarkedBody, marked_body
 from .measurement import Measurement, lost_measurement
 from .noise import CameraNoise
 from .observation import DetectionSettings
 from .optics import Optics
-from .pose import Array, checked_pose, finite_array
+from .pose import Array, checked_pose, finite_array, pose_to_transform
 from .pose_methods import METHODS
 from .renderers import RENDERER_NAMES, Renderer, choose_renderer
 from .rig_from_file import rig_from_file
@@ -36,8 +36,9 @@ from .teaching import Progress, Teacher
 from .tracking import Tracker
 from .views import Drawable
 from .virtual_camera import Quality, VirtualStereoCamera
+from .window_sizes import WindowSizes, largest_radius, radius_at, window_sizes
 
-SHARP_SIZES, BLURRED_SIZES = (14, 12), (16, 14)  # px, of windows and of what is fitted in them
+SMALLEST_CORNER = 0.001  # volume that the unit normals of three planes span: of a cube's corner it is 1
 TEACHING_STREAM, RUN_STREAM, DROPOUT_STREAM = 0, 1, 2
 
 
@@ -84,13 +85,22 @@ class Sensor:
 
     @cached_property
     def settings(self) -> DetectionSettings:
-        """How stickers are looked for in windows; blurred ones need a wider view."""
+        """How stickers are looked for in windows."""
         limits = FitLimits(smallest_contrast=SMALLEST_STEP * self.noise.white_level)
-        sharp = self.optics.psf_px == 0.0 and self.timing.exposure == 0.0
-        window_size, fit_size = SHARP_SIZES if sharp else BLURRED_SIZES
-        return DetectionSettings(window_size, fit_size, radius=self._file.stickers.radius,
+        sizes = self._window_sizes
+        return DetectionSettings(sizes.window, sizes.fit, radius=self._file.stickers.radius,
                                  detector=self._file.detection.detector, limits=limits, optics=self.optics,
                                  centre_error_px=self._camera.centre_error_px(Quality()))
+
+    @cached_property
+    def _window_sizes(self) -> WindowSizes:
+        """Large and blurred stickers need a wider view."""
+        radius, place = self._file.stickers.radius, self._camera_from_base
+        at_target = radius_at(self.rig, place, np.array(self._file.rig.target), radius)
+        at_teaching = max(largest_radius(self.rig, place, self.base, radius),
+                          largest_radius(self.rig, place @ pose_to_transform(self.home), self.platform, radius))
+        blurred = self.optics.psf_px > 0.0 or self.timing.exposure > 0.0
+        return window_sizes(at_target, at_teaching, self.optics.psf_px, blurred)
 
     @property
     def timing(self) -> Timing:
@@ -120,7 +130,10 @@ class Sensor:
     def teach(self, progress: Progress | None = None) -> Taught:
         """Teach the frames of base and platform if that has not been done; ``progress(done, total)`` is called."""
         if self._taught is None:
-            teacher = Teacher(self._camera, self.rig, self.noise, self.settings, self.platform, self.base)
+            for body in (self.platform, self.base):
+                _require_corner(body)
+            teacher = Teacher(self._camera, self.rig, self.noise, self.settings, self.platform, self.base,
+                              self._window_sizes.plan())
             rng = np.random.default_rng([self._seed, TEACHING_STREAM])
             found = teacher.teach(self.name, self.home, rng, progress or self._progress)
             self._taught = replace(found, setup=setup_of(self._file))
@@ -211,6 +224,14 @@ class Sensor:
         rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
         self._frame += 1
         return checked, rng, placed
+
+
+def _require_corner(body: MarkedBody) -> None:
+    """Raise TeachingError unless the three planes of a body meet in one point, which its frame hangs on."""
+    volume = abs(float(np.linalg.det(body.normals)))
+    if volume < SMALLEST_CORNER:
+        raise TeachingError(f"{body.name}: planes A, B and C meet in no point, so no frame can be taught: their unit "
+                            f"normals span a volume of {volume:.1g}, at least {SMALLEST_CORNER:g} is needed")
 
 
 def _checked_seed(seed: int) -> int:

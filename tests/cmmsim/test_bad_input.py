@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import cmmsim
+from cmmsim.drawn_discs import Condition
 from cmmsim.exact_teaching import exactly_taught
 from cmmsim.scene import rod, rod_transform
 from cmmsim.sensor_file import read_sensor_file, sensor_text
@@ -149,6 +150,19 @@ def test_bad_expected_pose(exact, expected):
     dark = np.zeros((1536, 2048), dtype=np.uint8)
     with pytest.raises(cmmsim.ShapeError, match=r"expected camera_from_platform must be \(4,4\)") as error:
         cmmsim.measure_frame(cmmsim.StereoFrame(dark, dark), exact.estimator, expected)
+    one_line(error)
+
+
+def test_planes_that_meet_in_no_point_cannot_be_taught():
+    sensor = cmmsim.load_sensor("ctrack780", changes={"platform.planes.B.normal": [0.0, 0.0, 1.0]}, renderer="analytic")
+    with pytest.raises(cmmsim.TeachingError, match=r"planes A, B and C meet in no point.*volume of 0") as error:
+        sensor.teach()
+    one_line(error)
+
+
+def test_discs_too_large_to_compare_detectors_on_are_refused():
+    with pytest.raises(cmmsim.CmmError, match="radius 500 px is more than 50 px: time and memory") as error:
+        Condition(500.0, 0.0, 0.01)
     one_line(error)
 
 
