@@ -16,8 +16,8 @@ Calibrate a stereo camera from pictures of a board: real photographs, or rendere
 
 Both cameras take a picture of the board at the same time, 10 to 30 times. Move the board all over both images and
 into their corners, and tilt it by 30 degrees and more to all sides. LEFT and RIGHT are folders of the pictures; the
-order of the sorted file names makes the pairs. A picture may be PNG, JPEG, TIFF, BMP, PGM or WebP, grey or coloured,
-8 or 16 bit.
+first file name of one folder goes with the first of the other and so on, in lexicographic order: img10 stands before
+img2, so number them img02, img10. A picture may be PNG, JPEG, TIFF, BMP, PGM or WebP, grey or coloured, 8 or 16 bit.
 
 \b
 The board is a TOML file:
@@ -32,7 +32,8 @@ The board is a TOML file:
 Examples:
   cmmsim calibrate photos/left photos/right --board board.toml --out mine
   cmmsim calibrate photos/left photos/right --board board.toml --out mine --sensor ctrack780 --distortion radial2
-  cmmsim calibrate --render 20 --sensor ctrack780 --out pictures     render pictures to try it with
+  cmmsim calibrate --render 20 --out pictures     render pictures to try it with, by the cameras of ctrack780
+  cmmsim calibrate --render 20 --sensor mine.toml --out pictures     the same by other cameras
   cmmsim calibrate pictures/left pictures/right --board pictures/board.toml --out mine
 
 \b
@@ -53,7 +54,12 @@ def calibrate(
     out: Annotated[Path, typer.Option("--out", help="Output folder, new or empty.")] = Path("runs/calibration"),
     sensor: Annotated[
         str | None,
-        typer.Option("--sensor", metavar="NAME|FILE", help="Sensor whose file takes the cameras, or which renders."),
+        typer.Option(
+            "--sensor",
+            metavar="NAME|FILE",
+            help="Optional: sensor whose file takes the cameras; with --render, whose cameras render, ctrack780 "
+            "where it is left out.",
+        ),
     ] = None,
     distortion: Annotated[
         str, typer.Option("--distortion", help="Free terms: none, radial2 (k1, k2) or brown5 (k1, k2, p1, p2, k3).")
@@ -63,7 +69,8 @@ def calibrate(
         int, typer.Option("--min-images", min=3, help="Fewest pairs that must show the board to both cameras.")
     ] = 3,
     render: Annotated[
-        int | None, typer.Option("--render", min=1, help="Render this many pairs of pictures instead, and stop.")
+        int | None,
+        typer.Option("--render", min=1, help="Render this many pairs of pictures instead, and stop."),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rendered poses and of their noise.")] = 0,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary.")] = False,

@@ -24,7 +24,8 @@ RADII_PX, NOISES_PERCENT, TILTS_DEG = (2.5, 5.0, 10.0), (0.2, 1.0, 5.0), (0.0, 3
 def detectors(
     sensor: Annotated[str, typer.Argument(help="Built-in sensor (ctrack780) or path of a TOML file.")] = "ctrack780",
     radius: Annotated[
-        list[float] | None, typer.Option(help="Long half axis of the disc, px; repeatable.", show_default="2.5, 5, 10")
+        list[float] | None,
+        typer.Option(help="Long half axis of the disc, 1 to 50 px; repeatable.", show_default="2.5, 5, 10"),
     ] = None,
     noise: Annotated[
         list[float] | None,
