@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike
 
 from .blob_search import SMALLEST_STEP
 from .ellipse_fit import FitLimits
-from .errors import CmmError, TeachingError, UnknownBodyError, UnknownOptionError
+from .errors import CmmError, UnknownBodyError, UnknownOptionError
 from .estimator import PoseEstimator
 from .image_formation import ImageFormation
 from .images import StereoFrame, StereoImages
-from .marked_body import MarkedBody, marked_body
+from .marked_body import marked_body, require_corner
 from .measurement import Measurement, lost_measurement
 from .noise import CameraNoise
 from .observation import DetectionSettings
@@ -38,7 +38,6 @@ from .views import Drawable
 from .virtual_camera import Quality, VirtualStereoCamera
 from .window_sizes import WindowSizes, largest_radius, radius_at, window_sizes
 
-SMALLEST_CORNER = 0.001  # volume that the unit normals of three planes span: of a cube's corner it is 1
 TEACHING_STREAM, RUN_STREAM, DROPOUT_STREAM = 0, 1, 2
 
 
@@ -131,7 +130,7 @@ class Sensor:
         """Teach the frames of base and platform if that has not been done; ``progress(done, total)`` is called."""
         if self._taught is None:
             for body in (self.platform, self.base):
-                _require_corner(body)
+                require_corner(body)
             teacher = Teacher(self._camera, self.rig, self.noise, self.settings, self.platform, self.base,
                               self._window_sizes.plan())
             rng = np.random.default_rng([self._seed, TEACHING_STREAM])
@@ -224,14 +223,6 @@ class Sensor:
         rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
         self._frame += 1
         return checked, rng, placed
-
-
-def _require_corner(body: MarkedBody) -> None:
-    """Raise TeachingError unless the three planes of a body meet in one point, which its frame hangs on."""
-    volume = abs(float(np.linalg.det(body.normals)))
-    if volume < SMALLEST_CORNER:
-        raise TeachingError(f"{body.name}: planes A, B and C meet in no point, so no frame can be taught: their unit "
-                            f"normals span a volume of {volume:.1g}, at least {SMALLEST_CORNER:g} is needed")
 
 
 def _checked_seed(seed: int) -> int:

@@ -57,6 +57,7 @@ def test_table_shows_bound_and_errors_and_a_figure_is_drawn(done):
 
 @pytest.mark.parametrize(("options", "message"), [
     (["--radius", "0.2"], "radius_px=0.2"),
+    (["--radius", "500"], "radius 500 px is more than 50 px"),
     (["--tilt", "85"], "80 degrees"),
     (["--noise", "0.1"], "less than that of rounding"),
     (["--psf", "0.01"], r"0\.01 px"),
