@@ -30,9 +30,13 @@ class Taught:
     setup: str = ""
 
     def __post_init__(self) -> None:
-        if self.base_from_camera.shape != (4, 4) or self.platform_places.ndim != 2:
-            raise ShapeError(f"taught base_from_camera {self.base_from_camera.shape} must be (4,4) and "
-                             f"platform_places {self.platform_places.shape} must be (n,3)")
+        stickers, base_stickers = len(self.platform_places), len(self.base_places)
+        shapes = {"base_from_camera": (4, 4), "base_covariance": (6, 6), "platform_places": (stickers, 3),
+                  "place_covariances": (stickers, 3, 3), "platform_covariance": (6, 6),
+                  "base_places": (base_stickers, 3)}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise ShapeError(f"taught {name} must have the shape {shape}, got {getattr(self, name).shape}")
         for name in self.__dataclass_fields__:
             if isinstance(value := getattr(self, name), np.ndarray):
                 value.setflags(write=False)

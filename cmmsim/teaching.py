@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .detectors import DEFAULT_DETECTOR
 from .errors import LostError, TeachingError
@@ -96,8 +97,14 @@ class Teacher:
                        body.sticker_normals)
         if len(seen.index) < len(places):
             missing = np.setdiff1d(np.arange(len(places)), seen.index)
-            raise LostError(f"{body.name}: stickers {', '.join(body.sticker_ids[missing])} not seen by both cameras")
+            raise LostError(f"{body.name}: stickers {', '.join(body.sticker_ids[missing])} not seen by both cameras"
+                            + self._outside(body, missing, apply(expected, places)))
         return seen
+
+    def _outside(self, body: MarkedBody, missing: NDArray[np.int_], points: Array) -> str:
+        """Which of the missing stickers no window could have found, for they lie beside an image."""
+        outside = missing[~self.rig.project(points)[1].all(axis=0)[missing]]
+        return f"; {', '.join(body.sticker_ids[outside])} lie outside of an image" if len(outside) else ""
 
     def _platform_views(self, rough: Array, path: Array, rng: np.random.Generator,
                         report: Callable[[int], None]) -> list[StickerObservation]:

@@ -47,6 +47,7 @@ def test_a_sensor_based_on_another_takes_what_that_was_taught():
     assert load(name="ctrack780_29hz").taught is TAUGHT
 
 
+@pytest.mark.rendering
 def test_teaching_states_its_setup(taught):
     assert taught.setup == TAUGHT.setup
     assert load(taught=pickle.loads(pickle.dumps(taught))).taught.setup == TAUGHT.setup
@@ -69,3 +70,8 @@ def test_one_kept_from_before_setups_were_stated_still_loads():
     again.__dict__.clear()
     again.__dict__.update(state)
     assert load(taught=again).taught is again
+
+
+def test_arrays_of_another_shape_are_refused():
+    with pytest.raises(cmmsim.ShapeError, match=r"place_covariances must have the shape \(17, 3, 3\), got \(18"):
+        replace(TAUGHT, platform_places=TAUGHT.platform_places[1:])

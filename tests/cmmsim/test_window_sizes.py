@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import cmmsim
+from cmmsim.pose import apply
 
 WIDE_RINGS = {"stickers.ring_radius": 0.012}
 LARGER = [
@@ -53,3 +54,12 @@ def test_larger_stickers_are_taught_and_measured_with_a_true_covariance(changes,
     spread = np.array([m.covariance for m in found]) + sensor.taught.calibration_covariance(sensor.home)
     squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(spread), errors)
     assert squared.mean() == pytest.approx(6.0, abs=1.0), squared.mean()
+
+
+def test_teaching_names_the_stickers_that_no_image_shows():
+    """One metre from the middle of platform and base, the lower stickers of the base lie below both images."""
+    sensor = load({"rig.distance": 1.0})
+    below = [str(sensor.base.sticker_ids[k]) for k in np.flatnonzero(
+        ~sensor.rig.project(apply(sensor._camera_from_base, sensor.base.nominal))[1].all(axis=0))]
+    with pytest.raises(cmmsim.TeachingError, match=f"; {', '.join(below)} lie outside of an image"):
+        sensor.teach()
