@@ -16,7 +16,8 @@ class DetectedCentres:
 
     centres (n,2); covariances (n,2,2) px², what the pixel noise does to the centres to first order; good (n,) whether
     the window holds one whole bright spot. shapes (n,2,2) px and shape_covariances (n,3,3) px² of A_xx, A_xy, A_yy
-    where a detector states them. Values of windows that are not good are finite but mean nothing.
+    where a detector states them, as misfits (n,), the reduced chi-square of the grey values. Values of windows that are
+    not good are finite but mean nothing.
     """
 
     centres: Array
@@ -24,6 +25,7 @@ class DetectedCentres:
     good: NDArray[np.bool_]
     shapes: Array | None = None
     shape_covariances: Array | None = None
+    misfits: Array | None = None
 
 
 def no_centres() -> DetectedCentres:

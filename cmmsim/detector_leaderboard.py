@@ -116,7 +116,8 @@ def _by_window(find: Callable[[NDArray[np.uint8]], tuple[float, float] | None], 
 
 
 def detect_by_blobs(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                    limits: FitLimits | None = None, psf_px: float = 0.0) -> DetectedCentres:
+                    limits: FitLimits | None = None, psf_px: float = 0.0,
+                    smears: Array | None = None) -> DetectedCentres:
     """``cv2.SimpleBlobDetector`` with its filters of shape switched off: the largest bright blob."""
     settings = cv2.SimpleBlobDetector.Params()
     settings.filterByCircularity = settings.filterByConvexity = settings.filterByInertia = False
@@ -131,7 +132,8 @@ def detect_by_blobs(windows: NDArray, corners: NDArray[np.integer], noise: Camer
 
 
 def detect_by_contour(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                      limits: FitLimits | None = None, psf_px: float = 0.0) -> DetectedCentres:
+                      limits: FitLimits | None = None, psf_px: float = 0.0,
+                      smears: Array | None = None) -> DetectedCentres:
     """``cv2.fitEllipse`` on the longest contour of the window thresholded after Otsu."""
 
     def find(window: NDArray[np.uint8]) -> tuple[float, float] | None:

@@ -14,18 +14,20 @@ from .ellipse_fit import FitLimits, fit_ellipses
 from .errors import UnknownOptionError
 from .grey_centroid import detect_by_centroid
 from .noise import CameraNoise
+from .pose import Array
 
 
 class DetectWindows(Protocol):
     """Ellipse centres in n windows with one bright spot each."""
 
     def __call__(self, windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                 limits: FitLimits | None = None, psf_px: float = 0.0) -> DetectedCentres:
+                 limits: FitLimits | None = None, psf_px: float = 0.0, smears: Array | None = None) -> DetectedCentres:
         """Detect.
 
         Parameters: windows (n, h, h) grey values; corners (n, 2) the full-image pixel (x, y) of each window's first
         pixel; noise: the camera's noise; fit_size: side in px of the part around the bright spot that is looked at;
-        limits: when a window counts as one whole sticker; psf_px: sigma of the Gaussian point spread.
+        limits: when a window counts as one whole sticker; psf_px: sigma of the Gaussian point spread; smears
+        (n, 2) px: how far each spot moves during the exposure, for whose middle the centres are.
         """
 
 
@@ -42,10 +44,11 @@ class Detector:
 
 
 def detect_by_maximum_likelihood(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                                 limits: FitLimits | None = None, psf_px: float = 0.0) -> DetectedCentres:
+                                 limits: FitLimits | None = None, psf_px: float = 0.0,
+                                 smears: Array | None = None) -> DetectedCentres:
     """Centres of the maximum-likelihood fit of a blurred ellipse. Parameters as of ``DetectWindows``."""
-    fits = fit_ellipses(windows, corners, noise, fit_size, limits, psf_px=psf_px)
-    return DetectedCentres(fits.centres, fits.covariances, fits.good, fits.shapes, fits.shape_covariances)
+    fits = fit_ellipses(windows, corners, noise, fit_size, limits, psf_px=psf_px, smears=smears)
+    return DetectedCentres(fits.centres, fits.covariances, fits.good, fits.shapes, fits.shape_covariances, fits.misfit)
 
 
 DETECTORS = {d.name: d for d in (

@@ -36,8 +36,10 @@ SMALLEST_CONDITION = 1e-9  # reciprocal condition below which the lines do not d
 
 
 def detect_by_dual_conic(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                         limits: FitLimits | None = None, psf_px: float = 0.0) -> DetectedCentres:
-    """Centres by the dual conic. Parameters as of ``DetectWindows``; the point spread only widens the rim."""
+                         limits: FitLimits | None = None, psf_px: float = 0.0,
+                         smears: Array | None = None) -> DetectedCentres:
+    """Centres by the dual conic. Parameters as of ``DetectWindows``; the point spread only widens the rim, and smears
+    play no part."""
     limits = limits or FitLimits()
     if len(windows) == 0:
         return no_centres()

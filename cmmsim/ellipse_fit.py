@@ -1,6 +1,7 @@
 """Maximum-likelihood fit of a bright ellipse on a dark ground to the grey values of many windows at once.
 
-Model of a pixel: ground + contrast * (exact share of the pixel covered by the ellipse, blurred by the point spread).
+Model of a pixel: ground + contrast * (exact share of the pixel covered by the ellipse, blurred by the point spread and,
+where it is known, by the movement during the exposure).
 Gauss-Newton on the seven parameters [c_x, c_y, A_xx, A_xy, A_yy, contrast, ground], weighted by the camera's noise
 variance at the fitted grey value. The inverse of the normal matrix is the covariance of the parameters.
 """
@@ -20,6 +21,7 @@ RING_REACH = 2.4  # pixels beyond this many sticker radii may lie outside the da
 SMALLEST_RADIUS_PX = 0.8
 ELLIPSE_UNKNOWNS = 5  # the first parameters: c_x, c_y, A_xx, A_xy, A_yy
 SMALLEST_START_PX = 1.2
+SMEAR_STEP_PX = 0.2  # between two places of a moving ellipse whose light is added; one that moves less stands still
 CONVERGED_PX = 1e-4  # a step shorter than this ends a fit
 MODEL_ERROR = 0.0025  # of the contrast: rms of what images and the model of a pixel differ by without noise
 CORE_SHARE = 0.4  # a pixel with this share of the contrast belongs to the bright spot when the fit starts
@@ -55,12 +57,14 @@ class FitLimits:
 
 
 def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                 limits: FitLimits | None = None, iterations: int = 8, psf_px: float = 0.0) -> EllipseFits:
+                 limits: FitLimits | None = None, iterations: int = 8, psf_px: float = 0.0,
+                 smears: Array | None = None) -> EllipseFits:
     """Fit one ellipse in each window.
 
     Parameters: windows (n, h, h) grey values; corners (n, 2) the full-image pixel (x, y) of each window's first pixel;
     noise: the camera's noise; fit_size: side in px of the part around the bright spot that is fitted; psf_px:
-    sigma of the Gaussian point spread that blurs the ellipse. Raises CmmError for one too narrow to be followed.
+    sigma of the Gaussian point spread that blurs the ellipse; smears (n, 2) px: how far each spot moves during the
+    exposure, whose middle the centre is for. Raises CmmError for one too narrow to be followed.
     """
     require_psf(psf_px)
     limits = limits or FitLimits()
@@ -74,9 +78,11 @@ def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNo
     variances = noise.variance(greys)
     largest_step = _LARGEST_STEP * [1.0, 1.0, 1.0, 1.0, 1.0, scale, scale]
     settings = FitSettings(CORE_SHARE, RING_REACH, SMALLEST_START_PX, SMALLEST_RADIUS_PX, largest_step, iterations,
-                           CONVERGED_PX, float(psf_px), variances, greys[0], 1.0 / (greys[1] - greys[0]))
-    fit_windows(np.ascontiguousarray(windows, dtype=float), fit_size, settings, inner, parameters, shapes, covariances,
-                misfit)
+                           CONVERGED_PX, float(psf_px), SMEAR_STEP_PX, variances, greys[0],
+                           1.0 / (greys[1] - greys[0]))
+    moved = np.zeros((n, 2)) if smears is None else np.ascontiguousarray(smears, dtype=float)
+    fit_windows(np.ascontiguousarray(windows, dtype=float), moved, fit_size, settings, inner, parameters, shapes,
+                covariances, misfit)
     good = parameters[:, 5] >= limits.smallest_contrast
     good &= misfit <= largest_misfits(limits, noise, parameters[:, 5], parameters[:, 6])
     good &= _inside(parameters[:, :2], shapes, fit_size)

@@ -47,10 +47,15 @@ class PoseEstimator:
         places = self.taught.platform_places
         return find_layout(places, points, TAUGHT_TOLERANCE, FEWEST_TAUGHT, "platform")[0]
 
-    def measure(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
-        """Measurement near an expected camera_from_platform (4,4), and the measured one. Raises LostError."""
+    def measure(self, images: StereoImages, expected: Array,
+                swept: tuple[Array, Array] | None = None) -> tuple[Measurement, Array]:
+        """Measurement near an expected camera_from_platform (4,4), and the measured one. Raises LostError.
+
+        ``swept``: expected ones at the beginning and the end of the exposure. Where stickers are smeared over more than
+        half a pixel and it is not told, a pose without point spread is worse than its covariance.
+        """
         seen = observe(images, self.rig, self.noise, self.settings, expected, self.taught.platform_places,
-                       self.platform.sticker_normals)
+                       self.platform.sticker_normals, swept)
         camera_from_platform, covariance, used = self._solve(seen)
         base_from_platform = self.taught.base_from_camera @ camera_from_platform
         spread = compose_covariance(self.taught.base_from_camera, covariance)

@@ -18,7 +18,8 @@ UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
 class FitSettings(NamedTuple):
     """core_share: a pixel with this share of the contrast belongs to the bright spot when the fit starts; ring_reach:
     radii of the ellipse within which pixels are fitted; smallest_start and smallest radius px; largest_step (7,);
-    iterations at most, and the step in px below which they end; psf_px of the point spread, or 0; variances of grey
+    iterations at most, and the step in px below which they end; psf_px of the point spread, or 0; smear_step px between
+    two places of a moving ellipse whose light is added; variances of grey
     values from ``first_grey`` on, ``entries_a_grey`` for each."""
 
     core_share: float
@@ -29,6 +30,7 @@ class FitSettings(NamedTuple):
     iterations: int
     converged: float
     psf_px: float
+    smear_step: float
     variances: np.ndarray
     first_grey: float
     entries_a_grey: float
@@ -178,8 +180,38 @@ def set_shape(parameters: np.ndarray, shape: np.ndarray) -> None:
 
 
 @compiled
-def fit_window(window: np.ndarray, settings: FitSettings, parameters: np.ndarray, shape: np.ndarray,
-               covariance: np.ndarray) -> float:
+def light_of_still(centre_x: float, centre_y: float, shape: np.ndarray, psf_px: float, shares: np.ndarray,
+                   derivatives: np.ndarray) -> None:
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that stands still."""
+    if psf_px > 0.0:
+        blur_window(centre_x, centre_y, shape, psf_px, shares, derivatives)
+    else:
+        cover_window(centre_x, centre_y, shape, shares, derivatives)
+
+
+@compiled
+def light_of_moving(parameters: np.ndarray, shape: np.ndarray, smear: np.ndarray, settings: FitSettings,
+                    shares: np.ndarray, derivatives: np.ndarray) -> None:
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that moves evenly by ``smear`` (2,) px during
+    the exposure, by the midpoint rule; its parameters are those in the middle."""
+    count = math.ceil(math.hypot(smear[0], smear[1]) / settings.smear_step)
+    if count <= 1:
+        light_of_still(parameters[0], parameters[1], shape, settings.psf_px, shares, derivatives)
+        return
+    total, changes = np.zeros_like(shares), np.zeros_like(derivatives)
+    for k in range(count):
+        part = (k + 0.5) / count - 0.5
+        light_of_still(parameters[0] + part * smear[0], parameters[1] + part * smear[1], shape, settings.psf_px, shares,
+                       derivatives)
+        total += shares
+        changes += derivatives
+    shares[:] = total / count
+    derivatives[:] = changes / count
+
+
+@compiled
+def fit_window(window: np.ndarray, smear: np.ndarray, settings: FitSettings, parameters: np.ndarray,
+               shape: np.ndarray, covariance: np.ndarray) -> float:
     """Gauss-Newton from ``parameters`` (7,), which it moves; returns the reduced chi-square.
 
     It ends when the ellipse moves by less than ``converged`` px: the normal matrix and the misfit of that last step
@@ -193,10 +225,7 @@ def fit_window(window: np.ndarray, settings: FitSettings, parameters: np.ndarray
     freedom = max(mask_ring(parameters, shape, settings.ring_reach, mask) - UNKNOWNS, 1)
     misfit = 0.0
     for iteration in range(settings.iterations + 1):
-        if settings.psf_px > 0.0:
-            blur_window(parameters[0], parameters[1], shape, settings.psf_px, shares, derivatives)
-        else:
-            cover_window(parameters[0], parameters[1], shape, shares, derivatives)
+        light_of_moving(parameters, shape, smear, settings, shares, derivatives)
         misfit = accumulate(window, mask, shares, derivatives, parameters[5], parameters[6], settings, normal, right)
         for k in range(UNKNOWNS):
             normal[k, k] += 1e-9
@@ -213,9 +242,10 @@ def fit_window(window: np.ndarray, settings: FitSettings, parameters: np.ndarray
 
 
 @compiled
-def fit_windows(windows: np.ndarray, size: int, settings: FitSettings, corners: np.ndarray, parameters: np.ndarray,
-                shapes: np.ndarray, covariances: np.ndarray, misfits: np.ndarray) -> None:
-    """Fit the part of ``size`` px around the bright spot of each window (n,h,h) of floats.
+def fit_windows(windows: np.ndarray, smears: np.ndarray, size: int, settings: FitSettings, corners: np.ndarray,
+                parameters: np.ndarray, shapes: np.ndarray, covariances: np.ndarray, misfits: np.ndarray) -> None:
+    """Fit the part of ``size`` px around the bright spot of each window (n,h,h) of floats, which moved by ``smears``
+    (n,2) px during the exposure.
 
     Fills the corners (n,2) of these parts, and in their px the parameters (n,7), shapes (n,2,2), covariances (n,m,m) of
     the first m parameters and misfits (n,).
@@ -227,5 +257,5 @@ def fit_windows(windows: np.ndarray, size: int, settings: FitSettings, corners: 
         top = min(max(int(np.rint(spot[3] - 0.5 * (size - 1))), 0), room)
         part = windows[k, top:top + size, left:left + size]
         start_ellipse(part, settings, parameters[k])
-        misfits[k] = fit_window(part, settings, parameters[k], shapes[k], covariances[k])
+        misfits[k] = fit_window(part, smears[k], settings, parameters[k], shapes[k], covariances[k])
         corners[k, 0], corners[k, 1] = left, top

@@ -44,8 +44,9 @@ class BrightSpots:
 
 
 def detect_by_centroid(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                       limits: FitLimits | None = None, psf_px: float = 0.0) -> DetectedCentres:
-    """Grey centroids. Parameters as of ``DetectWindows``; the point spread plays no part."""
+                       limits: FitLimits | None = None, psf_px: float = 0.0,
+                       smears: Array | None = None) -> DetectedCentres:
+    """Grey centroids. Parameters as of ``DetectWindows``; neither the point spread nor smears play a part."""
     limits = limits or FitLimits()
     if len(windows) == 0:
         return no_centres()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from .detected_centres import DetectedCentres
 from .detectors import DEFAULT_DETECTOR, find_detector
 from .eccentricity import centre_offset
-from .ellipse_fit import FitLimits
+from .ellipse_fit import SMEAR_STEP_PX, FitLimits
 from .images import StereoImages, Windows
 from .noise import CameraNoise
 from .optics import Optics
@@ -18,6 +18,7 @@ from .pose import Array, apply
 from .stereo_rig import StereoRig
 from .triangulation import triangulate
 
+LONGEST_SMEAR_PX = 8.0  # about the size of a sticker
 GRAZING = 0.15  # cosine between a sticker's normal and the view below which it is not looked for
 
 
@@ -27,7 +28,8 @@ class DetectionSettings:
     the two rays of a sticker in units of its noise (one degree of freedom, so 25 is five sigma); centre_error_px: rms
     error of a centre that is not noise, such as the image formation's own; it is added to the noise's covariance, as
     is the detector's; detector: name of the one that is taken;
-    optics: point spread and vignetting of the cameras as known."""
+    optics: point spread and vignetting of the cameras as known; exposed_share: share of the time from frame to frame
+    during which the cameras are exposed."""
 
     window_size: int = 16
     fit_size: int = 14
@@ -37,6 +39,7 @@ class DetectionSettings:
     centre_error_px: float = 0.0
     detector: str = DEFAULT_DETECTOR
     optics: Optics = field(default_factory=Optics)
+    exposed_share: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -76,8 +79,12 @@ class StickerObservation:
 
 
 def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings,
-            camera_from_body: Array, places: Array, normals: Array) -> StickerObservation:
-    """Observe stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose of the body."""
+            camera_from_body: Array, places: Array, normals: Array,
+            swept: tuple[Array, Array] | None = None) -> StickerObservation:
+    """Observe stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose of the body.
+
+    ``swept``: camera_from_body at the beginning and at the end of the exposure, where they are thought to be known.
+    """
     centres = [apply(move @ camera_from_body, places) for move in rig.from_camera]
     turned = [normals @ (move @ camera_from_body)[:3, :3].T for move in rig.from_camera]
     pixels, valid = rig.project(apply(camera_from_body, places))
@@ -90,8 +97,13 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
     if len(index) == 0:
         return StickerObservation(index, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     windows = _evenly_lit(images.windows(corners, window_size), corners, rig, noise, settings)
-    fits = detector.detect(windows.reshape(-1, *windows.shape[2:]), corners.reshape(-1, 2), noise, fit_size,
-                           settings.limits, psf_px=settings.optics.psf_px)
+
+    def detect(smears: Array | None) -> DetectedCentres:
+        return detector.detect(windows.reshape(-1, *windows.shape[2:]), corners.reshape(-1, 2), noise, fit_size,
+                               settings.limits, psf_px=settings.optics.psf_px, smears=smears)
+
+    smears = None if swept is None else _smears(rig, swept, places[index])
+    fits = detect(None) if smears is None else _likelier(detect(None), detect(smears))
     seen_at = fits.centres.reshape(2, -1, 2) - np.stack(
         [centre_offset(camera, c[index], t[index], settings.radius)
          for camera, c, t in zip(rig.cameras, centres, turned, strict=True)])
@@ -103,6 +115,23 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
     outlines = _outlines(fits, settings.centre_error_px**2)
     return StickerObservation(index, seen_at[0], seen_at[1], seen.points, seen.covariances, outlines).selected(
         good & (seen.ray_gap < settings.largest_ray_gap))
+
+
+def _smears(rig: StereoRig, swept: tuple[Array, Array], places: Array) -> Array | None:
+    """Movement (2k, 2) px of k stickers in both images during the exposure.
+
+    None where it is too short to show, or so long that it cannot be told.
+    """
+    first, last = (rig.project(apply(pose, places))[0] for pose in swept)
+    longest = float(np.linalg.norm(last - first, axis=-1).max())
+    return (last - first).reshape(-1, 2) if SMEAR_STEP_PX < longest < LONGEST_SMEAR_PX else None
+
+
+def _likelier(still: DetectedCentres, moving: DetectedCentres) -> DetectedCentres:
+    """What agrees better with the images: the movement is only expected, and the platform may have stopped."""
+    if still.misfits is None or moving.misfits is None:
+        return still
+    return moving if np.median(moving.misfits - still.misfits) < 0.0 else still
 
 
 def _outlines(fits: DetectedCentres, systematic: float) -> Outlines | None:

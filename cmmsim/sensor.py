@@ -89,7 +89,8 @@ class Sensor:
         sizes = self._window_sizes
         return DetectionSettings(sizes.window, sizes.fit, radius=self._file.stickers.radius,
                                  detector=self._file.detection.detector, limits=limits, optics=self.optics,
-                                 centre_error_px=self._camera.centre_error_px(Quality()))
+                                 centre_error_px=self._camera.centre_error_px(Quality()),
+                                 exposed_share=self.timing.exposure * self.timing.frame_rate)
 
     @cached_property
     def _window_sizes(self) -> WindowSizes:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from .errors import LostError
 from .estimator import PoseEstimator
 from .images import StereoImages
 from .measurement import Measurement, lost_measurement
-from .pose import Array, invert
+from .pose import Array, invert, rotation_exp, rotation_log
 
 # A tracked frame that shows less than this share of the stickers seen before is searched as a whole too: most windows
 # may have been laid beside their stickers.
@@ -17,7 +19,8 @@ class Tracker:
     """Remembers the last two measured poses.
 
     A frame in which the prediction fails is searched as a whole at once; where that finds fewer stickers, what the
-    prediction found stands.
+    prediction found stands. What moves is fitted as the exposure smears it, as fast as it moved since the last frame;
+    the first frame of a run, and the first after a loss, are taken to be at rest.
     """
 
     def __init__(self, estimator: PoseEstimator) -> None:
@@ -57,15 +60,38 @@ class Tracker:
         if self._last is None:
             return None
         try:
-            return self._estimator.measure(images, self._predicted())
+            if self._step_before is not None:
+                return self._estimator.measure(images, self._predicted(), self._swept(self._predicted()))
+            found = self._estimator.measure(images, self._last)
+            swept = self._swept(found[1])
+            return found if swept is None else self._estimator.measure(images, found[1], swept)
         except LostError:
             return None
 
     def _found(self, images: StereoImages) -> tuple[Measurement, Array]:
-        """The measurement after a search of the whole images without any prior."""
-        return self._estimator.measure(images, self._estimator.locate(images))
+        """The measurement after a search of the whole images, with no prior for where the platform is."""
+        found = self._estimator.locate(images)
+        return self._estimator.measure(images, found, self._swept(found))
+
+    def _swept(self, middle: Array) -> tuple[Array, Array] | None:
+        """camera_from_platform (4,4) at the beginning and the end of an exposure about ``middle``.
+
+        As fast as since the last frame; None where there was none or the exposure takes no time.
+        """
+        share = self._estimator.settings.exposed_share
+        if self._last is None or share == 0.0:
+            return None
+        step = invert(self._last) @ middle
+        return middle @ part_of_step(step, -0.5 * share), middle @ part_of_step(step, 0.5 * share)
 
     def _predicted(self) -> Array:
         """camera_from_platform (4,4) if the last movement goes on."""
         assert self._last is not None
         return self._last if self._step_before is None else self._last @ self._step_before
+
+
+def part_of_step(step: Array, share: float) -> Array:
+    """A ``share`` of a small movement (4,4), to first order."""
+    part = np.eye(4)
+    part[:3, :3], part[:3, 3] = rotation_exp(share * rotation_log(step[:3, :3])), share * step[:3, 3]
+    return part

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 import cmmsim
+from cmmsim.cramer_rao import light_shares
+from cmmsim.ellipse_fit import fit_ellipses
 from cmmsim.motion_blur import LARGEST_STEP_PX, sub_frame_poses
+from tests.cmmsim.ellipses import NOISE, random_ellipses
 from tests.cmmsim.lenses import expected_centres, lens_sensor, pose_errors, poses_about_home
 
 EXPOSURE = [("exposure = 0.0", "exposure = 0.004")]
@@ -73,6 +76,53 @@ def test_constant_velocity_does_not_move_the_measured_pose(tmp_path, lens, longe
         errors, (m,) = pose_errors(sensor, pose[None], pose_rate=rate_of(sensor, pose, longest_px))
         assert len(m.target_ids) == 18
         assert np.all(np.abs(errors) < [2, 2, 2, 10, 10, 10])
+
+
+@pytest.mark.parametrize("smear", [(0.0, 0.0), (0.9, 0.0), (-0.7, 1.5), (0.0, 3.1)])
+@pytest.mark.parametrize("psf_px", [0.0, 0.5])
+def test_fit_of_noise_free_smeared_windows_is_exact(smear, psf_px):
+    """Light added up over four times as many places as the fit takes; centres of the middle, shapes of the disc."""
+    centres, shapes = random_ellipses(np.random.default_rng(2), 30, 20)
+    parts = (np.arange(44) + 0.5) / 44 - 0.5
+    share = np.mean([light_shares(centres + part * np.array(smear), shapes, 20, psf_px) for part in parts], axis=0)
+    windows, moved = NOISE.mean_grey((8.0 + 220.0 * share) / 255.0), np.tile(smear, (30, 1))
+    fits = fit_ellipses(windows, np.zeros((30, 2), dtype=int), NOISE, 20, psf_px=psf_px, smears=moved)
+    assert fits.good.all()
+    assert np.abs(fits.centres - centres).max() < 1e-3
+    assert np.abs(fits.shapes - shapes).max() < 4e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("speed", [0.2, 0.3])
+def test_tracked_frames_of_a_moving_platform_keep_their_covariance(tmp_path, speed):
+    """Squared pose errors along y in units of the stated covariance, with 2 ms of exposure through a sharp lens: after
+    the first frame of each run, whose movement nobody can know."""
+    sensor = lens_sensor(tmp_path, changes=[("exposure = 0.0", "exposure = 0.002")])
+    rate, squared = np.array([0.0, speed, 0.0, 0.0, 0.0, 0.0]), []
+    for run, start in enumerate(poses_about_home(sensor, 8)):
+        sensor.start_run(run)
+        path = start + np.outer(np.arange(-4, 5) / 60.0, rate) - [0.0, start[1], 0.0, 0.0, 0.0, 0.0]
+        for pose in path:
+            m = sensor.measure(pose, pose_rate=rate)
+            assert m.ok, m.reason
+            if not np.array_equal(pose, path[0]):
+                squared.append((m.pose - pose) @ np.linalg.solve(m.covariance, m.pose - pose))
+    assert len(squared) == 64
+    assert 4.5 < np.mean(squared) < 7.5  # the mean of 64 scatters by 0.43
+
+
+def test_a_platform_that_has_stopped_is_not_taken_for_moving(tmp_path):
+    """The images show no smear where the last frames make one of 1.3 px likely."""
+    sensor = lens_sensor(tmp_path, changes=[("exposure = 0.0", "exposure = 0.008")])
+    squared = []
+    for run in range(8):
+        sensor.start_run(run)
+        for y in (0.0, 0.002, 0.004):
+            pose = sensor.home + np.array([0.0, y, 0.0, 0.0, 0.0, 0.0])
+            m = sensor.measure(pose)
+            assert len(m.target_ids) >= 17
+            squared.append((m.pose - pose) @ np.linalg.solve(m.covariance, m.pose - pose))
+    assert 3.5 < np.mean(squared) < 8.5  # the mean of 24 scatters by 0.7
 
 
 def test_whole_image_is_blurred_as_its_windows_are(tmp_path):
