@@ -103,7 +103,7 @@ class Teacher:
 
     def _outside(self, body: MarkedBody, missing: NDArray[np.int_], points: Array) -> str:
         """Which of the missing stickers no window could have found, for they lie beside an image."""
-        outside = missing[~self.rig.project(points)[1].all(axis=0)[missing]]
+        outside = missing[~np.all(self.rig.project(points[missing])[1], axis=0)]
         return f"; {', '.join(body.sticker_ids[outside])} lie outside of an image" if len(outside) else ""
 
     def _platform_views(self, rough: Array, path: Array, rng: np.random.Generator,
