@@ -157,8 +157,14 @@ class Sensor:
         self._build_again()
 
     def shift_camera(self, side: int, shift_px: tuple[float, float]) -> None:
-        """Move the true principal point of one camera (0 left, 1 right) by (x, y) px; the estimator is not told."""
-        self._true_rig = self._true_rig.shifted(side, shift_px)
+        """Move the true principal point of one camera (0 left, 1 right) by (x, y) px; the estimator is not told.
+
+        Raises UnknownOptionError for another side, ShapeError for anything but two finite numbers.
+        """
+        if side not in (0, 1):
+            raise UnknownOptionError("side", side, ("0 (left)", "1 (right)"))
+        x, y = finite_array(shift_px, (2,), "a shift of a camera is two finite numbers, px").tolist()
+        self._true_rig = self._true_rig.shifted(side, (x, y))
         self._build_again()
 
     def look(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None,

@@ -166,6 +166,17 @@ def test_discs_too_large_to_compare_detectors_on_are_refused():
     one_line(error)
 
 
+@pytest.mark.parametrize(("side", "shift", "message"), [
+    (2, (1.0, 0.0), r"unknown side 2: valid are 0 \(left\), 1 \(right\)"),
+    (0, (np.nan, 0.0), "a shift of a camera is two finite numbers"),
+    (0, 3.0, "a shift of a camera is two finite numbers"),
+])
+def test_bad_camera_shift(exact, side, shift, message):
+    with pytest.raises(cmmsim.CmmError, match=message) as error:
+        exact.shift_camera(side, shift)
+    one_line(error)
+
+
 @pytest.fixture(scope="module")
 def exact():
     """A sensor that is taught without drawing anything."""
