@@ -21,7 +21,7 @@ RING_REACH = 2.4  # pixels beyond this many sticker radii may lie outside the da
 SMALLEST_RADIUS_PX = 0.8
 ELLIPSE_UNKNOWNS = 5  # the first parameters: c_x, c_y, A_xx, A_xy, A_yy
 SMALLEST_START_PX = 1.2
-SMEAR_STEP_PX = 0.2  # between two places of a moving ellipse whose light is added; one that moves less stands still
+SMEAR_STEP_PX = 0.2  # or half a point spread: between two places of a moving ellipse whose light is added
 CONVERGED_PX = 1e-4  # a step shorter than this ends a fit
 MODEL_ERROR = 0.0025  # of the contrast: rms of what images and the model of a pixel differ by without noise
 CORE_SHARE = 0.4  # a pixel with this share of the contrast belongs to the bright spot when the fit starts
@@ -78,7 +78,7 @@ def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNo
     variances = noise.variance(greys)
     largest_step = _LARGEST_STEP * [1.0, 1.0, 1.0, 1.0, 1.0, scale, scale]
     settings = FitSettings(CORE_SHARE, RING_REACH, SMALLEST_START_PX, SMALLEST_RADIUS_PX, largest_step, iterations,
-                           CONVERGED_PX, float(psf_px), SMEAR_STEP_PX, variances, greys[0],
+                           CONVERGED_PX, float(psf_px), max(SMEAR_STEP_PX, 0.5 * psf_px), variances, greys[0],
                            1.0 / (greys[1] - greys[0]))
     moved = np.zeros((n, 2)) if smears is None else np.ascontiguousarray(smears, dtype=float)
     fit_windows(np.ascontiguousarray(windows, dtype=float), moved, fit_size, settings, inner, parameters, shapes,

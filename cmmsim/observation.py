@@ -19,6 +19,7 @@ from .stereo_rig import StereoRig
 from .triangulation import triangulate
 
 LONGEST_SMEAR_PX = 8.0  # about the size of a sticker
+SHORTEST_SMEAR = 1.5  # standard deviations of the point spread: shorter ones do not change what the fit finds
 GRAZING = 0.15  # cosine between a sticker's normal and the view below which it is not looked for
 
 
@@ -102,7 +103,7 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
         return detector.detect(windows.reshape(-1, *windows.shape[2:]), corners.reshape(-1, 2), noise, fit_size,
                                settings.limits, psf_px=settings.optics.psf_px, smears=smears)
 
-    smears = None if swept is None else _smears(rig, swept, places[index])
+    smears = None if swept is None else _smears(rig, swept, places[index], settings.optics.psf_px)
     fits = detect(None) if smears is None else _likelier(detect(None), detect(smears))
     seen_at = fits.centres.reshape(2, -1, 2) - np.stack(
         [centre_offset(camera, c[index], t[index], settings.radius)
@@ -117,14 +118,15 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
         good & (seen.ray_gap < settings.largest_ray_gap))
 
 
-def _smears(rig: StereoRig, swept: tuple[Array, Array], places: Array) -> Array | None:
+def _smears(rig: StereoRig, swept: tuple[Array, Array], places: Array, psf_px: float) -> Array | None:
     """Movement (2k, 2) px of k stickers in both images during the exposure.
 
-    None where it is too short to show, or so long that it cannot be told.
+    None where it is too short to show beside the point spread, or so long that it cannot be told.
     """
     first, last = (rig.project(apply(pose, places))[0] for pose in swept)
+    shortest = max(SMEAR_STEP_PX, SHORTEST_SMEAR * psf_px)
     longest = float(np.linalg.norm(last - first, axis=-1).max())
-    return (last - first).reshape(-1, 2) if SMEAR_STEP_PX < longest < LONGEST_SMEAR_PX else None
+    return (last - first).reshape(-1, 2) if shortest < longest < LONGEST_SMEAR_PX else None
 
 
 def _likelier(still: DetectedCentres, moving: DetectedCentres) -> DetectedCentres:
