@@ -18,6 +18,7 @@ from .pose import Array
 
 BIT_DEPTHS = (8, 10, 12)
 ROUNDING_TERMS = 50  # of a series, which leave 0.002 of 0.25 without noise
+NO_SWING = 1.5  # grey values squared: beyond, rounding_excess is 1 to 1e-11
 GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 
 
@@ -90,6 +91,8 @@ class CameraNoise:
         s² + 1/12, but the pixels of an even ground share theirs.
         """
         usual = replace(self, frames=1).variance(np.asarray(mean_grey, dtype=float))
+        if np.all(usual > NO_SWING):
+            return np.ones(usual.shape)
         spread = usual[..., None] - 1.0 / 12.0
         k = np.arange(1, ROUNDING_TERMS + 1)
         swing = np.exp(-2.0 * np.pi**2 * k**2 * spread) * (4.0 * spread + 1.0 / (np.pi * k) ** 2)

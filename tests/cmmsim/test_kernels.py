@@ -56,6 +56,17 @@ def test_fit_takes_the_steps_of_plain_numpy(monkeypatch, radii):
     np.testing.assert_allclose(ours.covariances, theirs.covariances, rtol=1e-9, atol=1e-12)
 
 
+def test_windows_fitted_together_are_those_fitted_alone():
+    """A second thread takes half of many windows; which one fits a window changes nothing."""
+    windows, corners = exposed(5, 37)
+    together = ellipse_fit.fit_ellipses(windows, corners, NOISE, 14)
+    for k in range(37):
+        alone = ellipse_fit.fit_ellipses(windows[k:k + 1], corners[k:k + 1], NOISE, 14)
+        np.testing.assert_array_equal(together.centres[k], alone.centres[0])
+        np.testing.assert_array_equal(together.covariances[k], alone.covariances[0])
+        assert together.misfit[k] == alone.misfit[0]
+
+
 def test_fit_stops_no_earlier_than_the_noise_allows():
     """Against twelve steps: nearly all within a hundredth of a standard deviation, and the covariance with them; some
     one in a thousand windows creep, because the share of a pixel has kinks in its second derivatives."""
