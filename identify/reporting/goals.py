@@ -6,11 +6,11 @@ from typing import Any
 
 from identify.files.result_file import rms_row
 
-VALIDATION_UM, VALIDATION_URAD = 5.0, 25.0
+VALIDATION_UM, VALIDATION_URAD = 2.0, 10.0
 SENSOR_UM, SENSOR_URAD = 20.0, 100.0
-FRAMES_PER_SECOND = 15.0
+FRAMES_PER_SECOND = 60.0
 PARAMETER_FRACTION, PARAMETER_STDS = 0.05, 3.0
-SECONDS = {"paper": 600.0, "quick": 90.0}
+SECONDS = {"paper": 180.0, "quick": 90.0}
 
 
 @dataclass(frozen=True)

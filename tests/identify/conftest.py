@@ -93,7 +93,7 @@ def make_truth(samples=120, names=("platform.mass", "joint1.coulomb"), values=(2
 
 def make_result():
     """A result with round numbers; every goal is met."""
-    six = [1e-6, 2e-6, 3e-6, 10e-6, 15e-6, 20e-6]
+    six = [1e-6, 1.4e-6, 1.8e-6, 4e-6, 6e-6, 8e-6]
     model_error = rms_figures(np.array([six, six]))
     predicted = {"position_std_um": [1.5, 2.5, 3.5], "orientation_std_urad": [11.0, 16.0, 21.0],
                  "normalised_squared_error": 0.9}
@@ -109,7 +109,7 @@ def make_result():
         "seed": 0,
         "versions": {"cmmsim": "0.1.0"},
         "seconds": {"excite": 1.0, "record": 30.0},
-        "sensor": {"frames": 120, "lost_frames": 0, "stereo_frames_per_second": 20.0,
+        "sensor": {"frames": 120, "lost_frames": 0, "stereo_frames_per_second": 70.0,
                    "position_rms_um": [5.0, 6.0, 7.0], "orientation_rms_urad": [30.0, 40.0, 50.0]},
         "identification": {"scale_anchor": "platform_mass", "iterations": 5, "stop_reason": "tolerance",
                            "base_rank": 4, "parameters": parameters,

@@ -58,20 +58,20 @@ def test_damaged_result_is_named(tmp_path, text):
 def test_good_result_meets_every_goal(result):
     assert len(goals(result)) == 8
     assert all(goal.passed for goal in goals(result).values())
-    assert goals(result)["unseen position"].value == pytest.approx(3.0)
+    assert goals(result)["unseen position"].value == pytest.approx(1.8)
     assert goals(result)["sensor orientation"].value == 50.0
 
 
 @pytest.mark.parametrize(
     ("change", "missed"),
     [
-        (lambda r: r["validation"][1]["true"].update(position_rms_um=[1, 5.1, 1]), "unseen position"),
-        (lambda r: r["validation"][1]["true"].update(orientation_rms_urad=[1, 1, 25.1]), "unseen orientation"),
+        (lambda r: r["validation"][1]["true"].update(position_rms_um=[1, 2.1, 1]), "unseen position"),
+        (lambda r: r["validation"][1]["true"].update(orientation_rms_urad=[1, 1, 10.1]), "unseen orientation"),
         (lambda r: r["validation"][0]["true"].update(position_rms_um=[None, 1, 1]), "unseen position"),
         (lambda r: r["sensor"].update(position_rms_um=[20.1, 1, 1]), "sensor position"),
         (lambda r: r["sensor"].update(orientation_rms_urad=[1, 100.1, 1]), "sensor orientation"),
         (lambda r: r["sensor"].update(lost_frames=1), "lost frames"),
-        (lambda r: r["sensor"].update(stereo_frames_per_second=14.9), "stereo frames"),
+        (lambda r: r["sensor"].update(stereo_frames_per_second=59.9), "stereo frames"),
         (lambda r: r["seconds"].update(validate=60.0), "whole run"),
         (lambda r: r["identification"]["parameters"]["joint_pid.lp"].update(estimate=11.6), "friction and PID outside"),
     ],
@@ -121,9 +121,9 @@ def test_tables_show_our_numbers_beside_the_papers(result):
     assert table.rows[5] == ("gamma [urad]", "diverged", "82", "2800", "725")
     validation = validation_table(result)
     assert validation.header[1] == "x [um]"
-    assert validation.rows[0][:4] == ("1 true", "1", "2", "3")
+    assert validation.rows[0][:4] == ("1 true", "1", "1.4", "1.8")
     assert len(validation.rows) == 2 * 2 + 10
-    assert sensor_table(result).rows[0][:4] == ("120", "0", "20", "5")
+    assert sensor_table(result).rows[0][:4] == ("120", "0", "70", "5")
 
 
 def test_starting_models_figures_stand_beside_the_identified_ones(result):
