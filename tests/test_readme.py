@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from identify import command_line
+from identify.accuracy.saved import read_saved
+from identify.accuracy.table import markdown_table
 from identify.command_line import app
 from identify.files.result_file import load_result
 from identify.reporting.goals import check_goals
@@ -71,6 +73,11 @@ def test_the_dynamics_reach_their_goals(dynamics_figures):
     assert found["sensitivities_plain_runs"] <= 15
     assert found["two_cores_gain"] >= 1.8
     assert found["first_compilation_s"] <= 20
+
+
+def test_the_table_of_accuracy_is_the_saved_one():
+    wanted = markdown_table(read_saved(ROOT / ".readme" / "accuracy.json").figures)
+    assert wanted.strip() in README, f"the README wants this table:\n{wanted}"
 
 
 def test_its_export_command_writes_what_mujoco_loads(monkeypatch, capfd, tmp_path):
