@@ -2,10 +2,8 @@
 
 import os
 import pickle
-import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -217,30 +215,3 @@ def test_teaching_is_repeatable_and_unbiased(seed, moving_path):
     assert np.all(np.isfinite(errors))
     assert np.all(np.abs(errors.mean(axis=0)) * AXES < [2, 2, 2, 10, 10, 10])
     assert np.all(np.sqrt((errors**2).mean(axis=0)) * AXES < [6, 6, 6, 40, 40, 40])
-
-
-@pytest.mark.slow
-def test_speed_of_rendering_and_measuring(sensor, moving_path):
-    """At least 15 stereo frames a second; the best of three tries, other work may share the machine."""
-    path = moving_path(60)
-    sensor.measure(path[0])
-    rates = []
-    for _ in range(3):
-        start = time.perf_counter()
-        for pose in path:
-            sensor.measure(pose)
-        rates.append(len(path) / (time.perf_counter() - start))
-    assert max(rates) > 15.0, rates
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow(sensor, moving_path):
-    """Resident memory after 3,000 frames against that after 200."""
-    path = moving_path(200)
-    sizes = []
-    for _ in range(15):
-        for pose in path:
-            sensor.measure(pose)
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-        sizes.append(pages * resource.getpagesize() / 2**20)
-    assert sizes[-1] - sizes[0] < 5.0, sizes  # MiB
