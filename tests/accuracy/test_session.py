@@ -26,7 +26,7 @@ def table(result):
     lines = result.outlines
     start = next(i for i, line in enumerate(lines) if line.strip("=") == " accuracy ")
     ends = ("=", "saved", "not saved", "worse", "[")
-    return [line for line in lines[start + 1 :] if not line.startswith(ends) and " passed" not in line]
+    return [line for line in lines[start + 1 :] if line and not line.startswith(ends) and " passed" not in line]
 
 
 def test_the_table_shows_value_interval_unit_limit_and_margin(project):
