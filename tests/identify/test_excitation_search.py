@@ -25,7 +25,9 @@ from identify.trajectory import random_trajectory
 SMALL = load_scenario("quick").with_overrides(
     {"excitation.harmonics": 3, "excitation.candidates": 6, "excitation.generations": 8, "validation.count": 1}
 )
-CONTESTS = [("observability", 324)] + ([("information", 150)] if os.environ.get("ALL_SEARCHES") else [])
+ALL = bool(os.environ.get("ALL_SEARCHES"))
+SEEDED = ["evolutionary"] + ([pytest.param("gradient", marks=pytest.mark.slow)] if ALL else [])
+CONTESTS = [("observability", 324)] + ([("information", 150)] if ALL else [])
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +78,7 @@ def test_searches_beat_the_random_trajectories_they_begin_with(robot):
     np.testing.assert_array_equal(climbed.validation[0].sine, drawn.validation[0].sine)
 
 
-@pytest.mark.parametrize("method", ["evolutionary", pytest.param("gradient", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("method", SEEDED)
 def test_seed_decides_what_is_found(robot, method):
     (_, a), (_, b), (_, c) = (designed.__wrapped__(robot, method, seed) for seed in (0, 0, 1))
     np.testing.assert_array_equal(a.excitation.sine, b.excitation.sine)

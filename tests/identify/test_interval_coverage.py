@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 ALL = os.environ.get("ALL_COVERAGE")
 """A file that keeps the rows of all experiments, so that a stopped test goes on where it was."""
 
-COUNT = 200 if ALL else 20
+COUNT = 200 if ALL else 10
 HALF_WIDTH = norm.ppf(0.975)
 LOWEST, HIGHEST = 0.93, 0.97
 
