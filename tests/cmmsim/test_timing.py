@@ -1,5 +1,7 @@
 """Rate, latency with jitter and dropout of a sensor, and sensor files that are based on another."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -161,10 +163,13 @@ def test_the_prediction_goes_on_through_missed_frames():
     expected = []
 
     class Estimator:
+        settings = SimpleNamespace(exposed_share=0.0)
+
         def locate(self, images):
             return _at(images)
 
-        def measure(self, images, predicted):
+        def measure(self, images, predicted, swept=None):
+            assert swept is None
             expected.append(predicted[0, 3])
             good = lost_measurement("stands for a good one")
             return good, _at(images)
