@@ -13,8 +13,10 @@ QUICK = ("-p", "no:cacheprovider", "-p", "no:hypothesispytest")  # Hypothesis wo
 
 
 @pytest.fixture
-def project(pytester):
-    """(body of the tests, *options) -> the outcome of pytest on a file with these tests."""
+def project(pytester, monkeypatch):
+    """(body of the tests, *options) -> the outcome of pytest on a file with these tests; as if not in a worker."""
+    for name in ("PYTEST_XDIST_WORKER", "PYTEST_XDIST_WORKER_COUNT", "PYTEST_XDIST_TESTRUNUID"):
+        monkeypatch.delenv(name, raising=False)
 
     def run(body, *options):
         head = "import numpy as np\nimport pytest\nRNG = np.random.default_rng(0)\n"
