@@ -190,6 +190,17 @@ def light_of_still(centre_x: float, centre_y: float, shape: np.ndarray, psf_px: 
 
 
 @compiled
+def add_light(shares: np.ndarray, derivatives: np.ndarray, weight: float, to_shares: np.ndarray,
+              to_derivatives: np.ndarray) -> None:
+    """Add shares (h, w) and derivatives (h, w, 5), weighted, to others; whole-array sums would compile for seconds."""
+    for row in range(shares.shape[0]):
+        for column in range(shares.shape[1]):
+            to_shares[row, column] += weight * shares[row, column]
+            for k in range(derivatives.shape[2]):
+                to_derivatives[row, column, k] += weight * derivatives[row, column, k]
+
+
+@compiled
 def light_of_moving(parameters: np.ndarray, shape: np.ndarray, smear: np.ndarray, settings: FitSettings,
                     shares: np.ndarray, derivatives: np.ndarray) -> None:
     """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that moves evenly by ``smear`` (2,) px during
@@ -198,15 +209,15 @@ def light_of_moving(parameters: np.ndarray, shape: np.ndarray, smear: np.ndarray
     if count <= 1:
         light_of_still(parameters[0], parameters[1], shape, settings.psf_px, shares, derivatives)
         return
-    total, changes = np.zeros_like(shares), np.zeros_like(derivatives)
+    total, changes = np.zeros(shares.shape), np.zeros(derivatives.shape)
     for k in range(count):
         part = (k + 0.5) / count - 0.5
         light_of_still(parameters[0] + part * smear[0], parameters[1] + part * smear[1], shape, settings.psf_px, shares,
                        derivatives)
-        total += shares
-        changes += derivatives
-    shares[:] = total / count
-    derivatives[:] = changes / count
+        add_light(shares, derivatives, 1.0, total, changes)
+    shares[:] = 0.0
+    derivatives[:] = 0.0
+    add_light(total, changes, 1.0 / count, shares, derivatives)
 
 
 @compiled

@@ -89,8 +89,7 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
     centres = [apply(move @ camera_from_body, places) for move in rig.from_camera]
     turned = [normals @ (move @ camera_from_body)[:3, :3].T for move in rig.from_camera]
     pixels, valid = rig.project(apply(camera_from_body, places))
-    facing = np.stack([-np.einsum("ni,ni->n", c, t) > GRAZING * np.linalg.norm(c, axis=1)
-                       for c, t in zip(centres, turned, strict=True)])
+    facing = np.stack([faces_camera(c, t) for c, t in zip(centres, turned, strict=True)])
     index = np.flatnonzero(np.all(valid & facing, axis=0))
     detector = find_detector(settings.detector)
     window_size, fit_size = settings.window_size + 2 * detector.margin_px, settings.fit_size + 2 * detector.margin_px
@@ -116,6 +115,11 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
     outlines = _outlines(fits, settings.centre_error_px**2)
     return StickerObservation(index, seen_at[0], seen_at[1], seen.points, seen.covariances, outlines).selected(
         good & (seen.ray_gap < settings.largest_ray_gap))
+
+
+def faces_camera(centres: Array, normals: Array) -> NDArray[np.bool_]:
+    """Whether a camera sees stickers with centres (n,3) m and normals (n,3), camera axes, not at grazing incidence."""
+    return np.asarray(-np.einsum("ni,ni->n", centres, normals) > GRAZING * np.linalg.norm(centres, axis=1))
 
 
 def _smears(rig: StereoRig, swept: tuple[Array, Array], places: Array, psf_px: float) -> Array | None:

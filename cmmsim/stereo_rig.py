@@ -54,7 +54,7 @@ class StereoRig:
         essential = np.cross(np.eye(3), shift) @ rotation
         return np.linalg.inv(self.right.matrix).T @ essential @ np.linalg.inv(self.left.matrix)
 
-    def project(self, points: Array) -> tuple[Array, Array]:
+    def project(self, points: Array) -> tuple[Array, NDArrayBool]:
         """Pixels (2, n, 2) of points (n, 3) in C for the left and right camera, and their validity (2, n)."""
         seen = [camera.project(apply(move, points))
                 for camera, move in zip(self.cameras, self.from_camera, strict=True)]

@@ -61,7 +61,8 @@ class Tracker:
             return None
         try:
             if self._step_before is not None:
-                return self._estimator.measure(images, self._predicted(), self._swept(self._predicted()))
+                predicted = self._predicted()
+                return self._estimator.measure(images, predicted, self._swept(predicted))
             found = self._estimator.measure(images, self._last)
             swept = self._swept(found[1])
             return found if swept is None else self._estimator.measure(images, found[1], swept)

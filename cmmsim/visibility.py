@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import LostError
 from .marked_body import MarkedBody, marked_body
-from .observation import GRAZING, DetectionSettings, observe
+from .observation import DetectionSettings, faces_camera, observe
 from .pose import Array, apply, compose_covariance, invert, pose_covariance, pose_to_transform
 from .pose_methods import by_planes, by_registration
 from .rig_from_file import rig_from_file
@@ -50,8 +50,7 @@ class SightLines:
             pixels, ahead = camera.project(places)
             inside = np.all((pixels >= EDGE_PX) & (pixels <= (camera.width - 1 - EDGE_PX,
                                                               camera.height - 1 - EDGE_PX)), axis=1)
-            facing = -np.einsum("ni,ni->n", places, normals) > GRAZING * np.linalg.norm(places, axis=1)
-            seen &= ahead & inside & facing
+            seen &= ahead & inside & faces_camera(places, normals)
         return seen
 
 

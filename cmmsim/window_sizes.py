@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .marked_body import MarkedBody
-from .observation import GRAZING
+from .observation import faces_camera
 from .outlines import sticker_outlines
 from .pose import Array, apply
 from .stereo_rig import StereoRig
@@ -64,8 +64,7 @@ def largest_radius(rig: StereoRig, camera_from_body: Array, body: MarkedBody, ra
     normals = body.sticker_normals
     seen = np.all(rig.project(apply(camera_from_body, body.nominal))[1], axis=0)
     for move in rig.from_camera:
-        middles = apply(move @ camera_from_body, body.nominal)
-        turned = normals @ (move @ camera_from_body)[:3, :3].T
-        seen &= -np.einsum("ni,ni->n", middles, turned) > GRAZING * np.linalg.norm(middles, axis=1)
+        placed = move @ camera_from_body
+        seen &= faces_camera(apply(placed, body.nominal), normals @ placed[:3, :3].T)
     _, shapes = sticker_outlines(rig, camera_from_body, body.nominal[seen], normals[seen], radius)
     return float(np.linalg.eigvalsh(shapes).max(initial=0.0))

@@ -3,8 +3,9 @@
 import casadi as ca
 import numpy as np
 
+from cmmsim.observation import GRAZING
 from cmmsim.pose import apply, pose_to_transform
-from cmmsim.visibility import EDGE_PX, GRAZING, SightLines
+from cmmsim.visibility import EDGE_PX, SightLines
 from dynamics.rotation import rotation_matrix
 from identify.arrays import Array
 from identify.errors import TrajectoryError

@@ -32,7 +32,8 @@ LAST = ("seconds", "error")
 
 def tidy_table(study: Study, finished: Iterable[Finished]) -> pd.DataFrame:
     """The table of a study's finished rows, ordered by row. A factor whose values are lists has them as JSON text."""
-    count, design = len(Design(study)), Design(study)
+    design = Design(study)
+    count = len(design)
     figures: dict[str, Array] = {}
     seconds, errors = np.full(count, np.nan), [""] * count
     for row in finished:
@@ -118,7 +119,8 @@ def to_xarray(frame: pd.DataFrame, study: Study) -> xr.Dataset:
     wanted = {path: [plain(value) for value in lists[path]] for path in lists if path in view.dims}
     view = view.reindex(wanted | {"repeat": np.arange(study.repeats)})
     if study.sample is not None:
-        cases = [Design(study).case(point) for point in range(study.points)]
+        design = Design(study)
+        cases = [design.case(point) for point in range(study.points)]
         view = view.reindex(point=np.arange(study.points))
         view = view.assign_coords({path: ("point", [plain(c.factors[path]) for c in cases]) for path in study.factors})
     return view.assign_attrs(name=study.name, title=study.title, kind=study.kind)

@@ -150,4 +150,5 @@ def test_kernels_compile_within_fifteen_seconds(tmp_path, taught, record_propert
                                            env=environment).stdout) for _ in range(2))
     record_property("compile_seconds", round(cold, 1))
     assert warm < 0.3 * cold
-    judge(cold <= 15.0, f"kernels took {cold:.1f} s to compile, goal 15", load)
+    goal = 15.0 * slowness()
+    judge(cold <= goal, f"kernels took {cold:.1f} s to compile, goal {goal:.1f}", load)
