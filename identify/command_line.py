@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table as RichTable
 
 from identify.commands.acceptance import acceptance
 from identify.commands.base_parameters import base_parameters
@@ -22,6 +20,7 @@ from identify.commands.workspace import workspace
 from identify.errors import IdentifyError, ScenarioError
 from identify.files.run_folder import RunFolder, new_run_folder
 from identify.progress import Progress, RichProgress, SilentProgress
+from identify.reporting.terminal import print_table
 from identify.scenario import Scenario, load_scenario, scenario_names
 
 HELP = """
@@ -262,17 +261,11 @@ def print_summary(folder: RunFolder) -> None:
     from identify.reporting.tables import goals_table
 
     table = goals_table(load_result(folder.result))
-    shown = RichTable(title=table.title, caption=table.note, show_edge=False)
-    for name in table.header[:4]:
-        shown.add_column(name, no_wrap=True)
-    for row in table.rows:
-        shown.add_row(*row[:4])
-    console = Console()
-    console.print(shown)
+    print_table(table.header[:4], [row[:4] for row in table.rows], ("goal", ""), table.title, table.note)
     for goal, *_, met, detail in table.rows:
         if met != "met":
-            console.print(f"missed: {goal}: {detail}", highlight=False, soft_wrap=True)
-    console.print(f"report: {folder.report}", highlight=False, soft_wrap=True)
+            typer.echo(f"missed: {goal}: {detail}")
+    typer.echo(f"report: {folder.report}")
 
 
 def _toml_or_text(text: str) -> Any:

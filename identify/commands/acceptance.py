@@ -97,8 +97,6 @@ def _write(folder: Path, entry: dict[str, Any], run: Any, limit_um: float) -> No
 
 def _print_summary(entry: dict[str, Any], folder: Path) -> None:
     """One line a test, and where the report is."""
-    from rich.console import Console
-
     lines = []
     if (test := entry.get("vdi_2634_1")) is not None:
         lines.append(f"length error: largest {test['largest_error_um']:+.1f} um, limit ± {test['limit_um']:g} um: "
@@ -112,4 +110,4 @@ def _print_summary(entry: dict[str, Any], folder: Path) -> None:
         low, high = test["mean_interval_ms"]
         lines.append(f"latency: {test['mean_ms']:.4f} ms ({low:.4f} to {high:.4f}), largest {test['max_ms']:.4f} ms")
     for line in [*lines, f"report: {folder / 'acceptance.md'}"]:
-        Console().print(line, highlight=False, soft_wrap=True)
+        typer.echo(line)

@@ -7,6 +7,7 @@ import typer
 
 from identify.errors import OutputFolderError, ScenarioError
 from identify.progress import Progress, RichProgress, SilentProgress
+from identify.reporting.terminal import print_table
 
 if TYPE_CHECKING:
     from cmmsim.calibration import Board, Calibration
@@ -169,18 +170,13 @@ def _render(folder: Path, sensor: str, board: "Board | None", count: int, seed: 
 
 
 def _print_summary(found: "Calibration", folder: Path) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     from cmmsim.calibration import PARAMETER_NAMES
 
     count = sum(len(view.rms_px) == 2 for view in found.used)
-    table = Table(title=f"{count} pairs, sigma {found.adjustment.sigma_px:.3g} px", show_edge=False)
-    for name in ("parameter", "estimate", "std"):
-        table.add_column(name, no_wrap=True, justify="left" if name == "parameter" else "right")
-    for name, value, std in zip(PARAMETER_NAMES, found.values, found.std, strict=True):
-        table.add_row(name, f"{value:.6g}", f"{std:.2g}" if std > 0.0 else "fixed")
-    Console().print(table)
+    rows = [(name, f"{value:.6g}", f"{std:.2g}" if std > 0.0 else "fixed")
+            for name, value, std in zip(PARAMETER_NAMES, found.values, found.std, strict=True)]
+    title = f"{count} pairs, sigma {found.adjustment.sigma_px:.3g} px"
+    print_table(("parameter", "estimate", "std"), rows, ("parameter",), title)
     for name, reason in found.rejected.items():
         typer.echo(f"not used: {name}: {reason}")
     for line in found.warnings:

@@ -3,17 +3,17 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table as RichTable
+import typer
 
 from identify.progress import Progress
+from identify.reporting.terminal import print_table
 from identify.scenario import Scenario
 
 if TYPE_CHECKING:
     from identify.excitation.comparison import Comparison, Entry
 
 PAPER = "the paper, with its own robot and geometry: index 0.38 at the start, 1.345 after 324 generations"
+HEADER = ("method", "value", "eq. 39", "D", "seconds", "values", "gradients", "stopped")
 
 
 def compare(scenario: Scenario, seed: int, folder: Path, progress: Progress, quiet: bool) -> None:
@@ -39,23 +39,15 @@ def compare(scenario: Scenario, seed: int, folder: Path, progress: Progress, qui
 def print_comparison(found: "Comparison", folder: Path) -> None:
     """One row a method, and what is nearest to its limit."""
     title = f"criterion {found.criterion}, seed {found.seed}, {found.candidates} random candidates"
-    table = RichTable(title=title, caption=PAPER, box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    for name in ("method", "value", "eq. 39", "D", "seconds", "values", "gradients", "stopped"):
-        table.add_column(name, justify="left" if name in ("method", "stopped") else "right")
-    for entry in found.entries:
-        table.add_row(*_row(entry))
-    console = Console()
-    console.print(table)
+    print_table(HEADER, map(_row, found.entries), ("method", "stopped"), title, PAPER)
     for entry in found.entries:
         nearest = sorted(entry.worst, key=lambda worst: -worst.share)
         used = ", ".join(f"{worst.name} {100 * worst.share:.2f} %" for worst in nearest)
-        console.print(f"{entry.method}: share of each limit used: {used}", highlight=False, soft_wrap=True)
-    console.print(
+        typer.echo(f"{entry.method}: share of each limit used: {used}")
+    typer.echo(
         f"value: what was maximised (information: D of the linearised loop). D: factor by which a run narrows the "
         f"prior, simulated loop; - where it is unstable. Candidates and functions: {found.preparation_seconds:.1f} s. "
-        f"Files: {folder}",
-        highlight=False,
-        soft_wrap=True,
+        f"Files: {folder}"
     )
 
 

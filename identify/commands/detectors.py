@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table as RichTable
 
 from identify.progress import RichProgress, SilentProgress
+from identify.reporting.terminal import print_table
 
 if TYPE_CHECKING:
     from cmmsim.detector_leaderboard import Score
@@ -106,33 +104,30 @@ def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
 def _print(scores: list["Score"], sensor: str, folder: Path) -> None:
     """One row a condition: the bound, then the rms error of each detector; the working point's row in words below."""
     names = list(dict.fromkeys(score.detector for score in scores))
-    rows = [scores[k : k + len(names)] for k in range(0, len(scores), len(names))]
-    table = RichTable(
-        title=f"rms error of a sticker's centre, px; first row: working point of {sensor}",
-        caption="* without the windows it lost" if any(score.lost for score in scores) else None,
-        box=SIMPLE_HEAD,
-        show_edge=False,
-        padding=0,
+    together = [scores[k : k + len(names)] for k in range(0, len(scores), len(names))]
+    print_table(
+        ("radius\npx", "tilt\n°", "noise\n%", "psf\npx", "bound", *(name.replace("_", " ") for name in names)),
+        map(_cells, together),
+        (),
+        f"rms error of a sticker's centre, px; first row: working point of {sensor}",
+        "* without the windows it lost" if any(score.lost for score in scores) else None,
     )
-    for name in ("radius\npx", "tilt\n°", "noise\n%", "psf\npx", "bound", *(n.replace("_", " ") for n in names)):
-        table.add_column(name, justify="right")
-    for row in rows:
-        seen, cells = _columns(row[0].condition), [f"{s.rms_px:.5f}{'*' if s.lost else ''}" for s in row]
-        table.add_row(
-            f"{seen['radius_px']:.3g}",
-            f"{seen['tilt_deg']:.0f}",
-            f"{seen['noise_percent']:.2g}",
-            f"{seen['psf_px']:.2g}",
-            f"{row[0].bound_px:.5f}",
-            *cells,
-        )
-    console = Console()
-    console.print(table)
-    for s in rows[0]:
-        console.print(
+    for s in together[0]:
+        typer.echo(
             f"{s.detector}: {s.ratio:.3f} times the bound at the working point, 95 % interval {s.ratio_low:.3f} to "
-            f"{s.ratio_high:.3f}; {s.bias_px:.5f} px without noise",
-            highlight=False,
-            soft_wrap=True,
+            f"{s.ratio_high:.3f}; {s.bias_px:.5f} px without noise"
         )
-    console.print(f"files: {folder}", highlight=False, soft_wrap=True)
+    typer.echo(f"files: {folder}")
+
+
+def _cells(scores: list["Score"]) -> tuple[str, ...]:
+    """A row of the table: the scores of all detectors under one condition."""
+    seen = _columns(scores[0].condition)
+    return (
+        f"{seen['radius_px']:.3g}",
+        f"{seen['tilt_deg']:.0f}",
+        f"{seen['noise_percent']:.2g}",
+        f"{seen['psf_px']:.2g}",
+        f"{scores[0].bound_px:.5f}",
+        *(f"{score.rms_px:.5f}{'*' if score.lost else ''}" for score in scores),
+    )

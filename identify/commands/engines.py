@@ -4,11 +4,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.table import Table as RichTable
 
 from identify.errors import OutputFolderError, VerificationError
 from identify.progress import Progress, RichProgress, SilentProgress
+from identify.reporting.terminal import print_table
 
 if TYPE_CHECKING:
     from dynamics import Robot
@@ -72,7 +71,7 @@ def mjcf(
         advance()
     if not quiet:
         for line in [*_changes(chosen_robot, chosen.values), f"model: {path}"]:
-            Console().print(line, highlight=False, soft_wrap=True)
+            typer.echo(line)
 
 
 def _changes(robot: "Robot", parameters: "Array") -> list[str]:
@@ -126,9 +125,7 @@ def verify_model(
 def _print_verdict(entry: dict[str, Any], folder: Path) -> None:
     found, goal, paper = entry["difference"], entry["goal"], entry["paper"]
     title = f"{entry['robot']}: MuJoCo {entry['mujoco']['version']} against this model"
-    table = RichTable(title=title, show_edge=False)
-    for name in ("largest difference", "unit", "value", "goal", "paper"):
-        table.add_column(name, no_wrap=True)
+    rows = []
     for label, key in (
         ("position, whole run", "position_max_um"),
         ("position, steady", "position_steady_um"),
@@ -136,12 +133,11 @@ def _print_verdict(entry: dict[str, Any], folder: Path) -> None:
         ("angle, steady", "angle_steady_urad"),
     ):
         limit = f"{goal[key]:g}" if key in goal else ""
-        table.add_row(label, key.rpartition("_")[2], f"{found[key]:.2g}", limit, f"{paper[key]:g}")
-    table.add_row("torque, whole run", "N m", f"{found['torque_max_nm']:.2g}", "", "")
-    table.add_row("MuJoCo's loop closure", "um", f"{found['closure_max_um']:.2g}", "", "")
-    console = Console()
-    console.print(table)
-    console.print(f"figure: {folder / 'figure8.png'}", highlight=False, soft_wrap=True)
+        rows.append((label, key.rpartition("_")[2], f"{found[key]:.2g}", limit, f"{paper[key]:g}"))
+    rows.append(("torque, whole run", "N m", f"{found['torque_max_nm']:.2g}", "", ""))
+    rows.append(("MuJoCo's loop closure", "um", f"{found['closure_max_um']:.2g}", "", ""))
+    print_table(("largest difference", "unit", "value", "goal", "paper"), rows, ("largest difference", "unit"), title)
+    typer.echo(f"figure: {folder / 'figure8.png'}")
 
 
 def _write(path: Path, text: str) -> None:

@@ -6,12 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table as RichTable
 
 from identify.files.run_folder import RunFolder
 from identify.progress import RichProgress, SilentProgress
+from identify.reporting.terminal import print_table
 
 if TYPE_CHECKING:
     from identify.estimator_comparison import Score
@@ -106,25 +104,19 @@ def _entry(score: "Score") -> dict[str, Any]:
 
 
 def _print(scores: list["Score"], out: Path) -> None:
-    table = RichTable(
-        title="estimators on one record, against one truth",
-        caption="groups: RMS and median relative error of the base parameters that the record shows; gains: RMS of "
+    print_table(
+        HEADER,
+        [(score.title, *_figures(score)) for score in scores],
+        ("estimator",),
+        "estimators on one record, against one truth",
+        "groups: RMS and median relative error of the base parameters that the record shows; gains: RMS of "
         "those of the joint PID; position, orientation: model against true plant on unseen trajectories, RMS of the "
         "worst axis and run; evals: simulated runs of the model",
-        box=SIMPLE_HEAD,
-        show_edge=False,
-        padding=0,
     )
-    for place, name in enumerate(HEADER):
-        table.add_column(name, justify="right" if place else "left", no_wrap=not place)
-    for score in scores:
-        table.add_row(score.title, *_figures(score))
-    console = Console()
-    console.print(table)
     for score in scores:
         if score.note:
-            console.print(f"{score.title}: {score.note}", highlight=False, soft_wrap=True)
-    console.print(f"files: {out}", highlight=False, soft_wrap=True)
+            typer.echo(f"{score.title}: {score.note}")
+    typer.echo(f"files: {out}")
 
 
 def _figures(score: "Score") -> list[str]:

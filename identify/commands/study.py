@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table as RichTable
 
 from identify.errors import StudyError, StudyInterrupted
 from identify.progress import RichProgress, SilentProgress
+from identify.reporting.terminal import print_table
 
 if TYPE_CHECKING:
     from identify.studies.runner import Outcome, Workers
@@ -154,10 +154,6 @@ def _law_line(law: dict[str, Any]) -> str:
 def _list() -> None:
     from identify.studies.study_file import load_study, study_names
 
-    table = RichTable(show_edge=False)
-    for title in ("study", "rows", "what it asks"):
-        table.add_column(title, justify="right" if title == "rows" else "left", no_wrap=title != "what it asks")
-    for name in study_names():
-        found = load_study(name)
-        table.add_row(name, f"{found.rows:,}", found.title)
-    Console().print(table)
+    studies = [(name, load_study(name)) for name in study_names()]
+    rows = [(name, f"{found.rows:,}", found.title) for name, found in studies]
+    print_table(("study", "rows", "what it asks"), rows, ("study", "what it asks"))

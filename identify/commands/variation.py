@@ -5,12 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table as RichTable
 
 from identify.files.run_folder import RunFolder
 from identify.progress import Progress, RichProgress, SilentProgress
+from identify.reporting.terminal import print_table
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -87,11 +85,5 @@ def _record_designed(
 
 
 def _print(table: "Table", name: str, worst: float, out: Path) -> None:
-    shown = RichTable(title=table.title, caption=table.note, box=SIMPLE_HEAD, show_edge=False, padding=0)
-    for place, title in enumerate(table.header):
-        shown.add_column(title, justify="right" if place > 1 else "left", no_wrap=not place)
-    for row in table.rows:
-        shown.add_row(*row)
-    console = Console()
-    console.print(shown)
-    console.print(f"largest: {100 * worst:.3g} % of {name}; files: {out}", highlight=False, soft_wrap=True)
+    print_table(table.header, table.rows, ("parameter", "unit"), table.title, table.note)
+    typer.echo(f"largest: {100 * worst:.3g} % of {name}; files: {out}")
