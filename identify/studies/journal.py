@@ -1,7 +1,8 @@
 """The finished rows of a study in an append-only file: JSON lines, on the disk before the next rows are begun.
 
 A line is complete or it does not count. Whatever ends the program, a line that was written stays, and a torn last one
-is cut off when the file is opened again.
+is cut off when the file is opened again. Rows beyond those of the study, of repeats that it had before, stay too, but
+nobody is told of them.
 """
 
 import json
@@ -62,16 +63,18 @@ class Journal:
     def rows(self) -> Iterator[Finished]:
         """The finished rows in the order in which they were done."""
         for row, _ in self._complete_lines():
-            yield row
+            if row.number < len(self.finished):
+                yield row
 
     def pending(self) -> Iterator[int]:
         """Numbers of the rows that are still to be done, ascending; those that are done meanwhile may be among them."""
         return (number for number in range(len(self.finished)) if not self.finished[number])
 
     def _note(self, row: Finished) -> None:
-        if not 0 <= row.number < len(self.finished):
-            raise StudyError(f"{self.path} has row {row.number}, but the study has {len(self.finished)} rows")
-        self.finished[row.number] = True
+        if row.number < 0:
+            raise StudyError(f"{self.path} is damaged: it has row {row.number}")
+        if row.number < len(self.finished):
+            self.finished[row.number] = True
 
     def _complete_lines(self) -> Iterator[tuple[Finished, int]]:
         """Rows with the place where each line ends, up to the end of the file or to a torn last line."""

@@ -20,8 +20,9 @@ from identify.studies.table import study_in
 
 STUDY, JOURNAL, TABLE, LOCK = "study.json", "rows.jsonl", "study.parquet", ".lock"
 
-WORDS = ("study.title", "study.theory", "scenario.description")
-"""What may change in a study that is continued: it decides no row."""
+MAY_CHANGE = ("study.title", "study.theory", "study.repeats", "scenario.description")
+"""What may change in a study that is continued: it decides no row that is there. Further repeats have rows of their own
+after all others; with fewer, the rows beyond stay in the journal and count for nothing."""
 
 
 def resolved(study: Study, setup: Setup) -> dict[str, Any]:
@@ -99,4 +100,4 @@ def _differences(one: Any, other: Any, path: str = "") -> list[str]:
     if isinstance(one, dict) and isinstance(other, dict):
         keys = [*one, *(key for key in other if key not in one)]
         return [d for k in keys for d in _differences(one.get(k), other.get(k), f"{path}.{k}" if path else k)]
-    return [] if one == other or path in WORDS else [path]
+    return [] if one == other or path in MAY_CHANGE else [path]

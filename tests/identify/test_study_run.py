@@ -211,7 +211,12 @@ def test_factors_that_contradict_each_other_in_one_row_are_an_error_of_this_row(
 
 @pytest.mark.parametrize(
     ("other", "differs"),
-    [({"seed": 5}, "study.seed"), ({"repeats": 4}, "study.repeats"), ({"factors": {DARK: [1.0]}}, "study.factors.")],
+    [
+        ({"seed": 5}, "study.seed"),
+        ({"seed": 5, "repeats": 4}, "study.seed; name"),
+        ({"factors": {DARK: [1.0]}}, "study.factors."),
+        ({"factors": FACTORS | {DARK: [13.0, 26.0, 52.0, 99.0]}, "repeats": 4}, f"study.factors.{DARK}; name"),
+    ],
 )
 def test_the_folder_of_another_study_is_refused(tmp_path, other, differs):
     run(tmp_path)
@@ -220,6 +225,51 @@ def test_the_folder_of_another_study_is_refused(tmp_path, other, differs):
         run(tmp_path, study(**other))
     assert (tmp_path / JOURNAL).read_bytes() == before
     run(tmp_path, study(title="another title"))
+
+
+def test_more_repeats_are_added_to_those_that_are_there(whole, tmp_path):
+    """The same table as that of a study that had them from the start, and no row is computed twice."""
+    log, more = tmp_path / "log", {"repeats": 5}
+    chosen = study(options={"log": str(log)})
+    few = run(tmp_path / "a", chosen)
+    same_numbers(few.frame, whole[1].frame)
+    many = run(tmp_path / "a", chosen.model_copy(update=more))
+    assert (few.rows, many.found, many.rows) == (18, 18, 30)
+    same_numbers(many.frame[:18], few.frame)
+    assert sorted(map(int, log.read_text().split())) == list(range(30))
+    same_numbers(many.frame, run(tmp_path / "b", study(**more)).frame)
+    assert read_table(tmp_path / "a" / TABLE)[1].repeats == 5
+
+
+def test_more_repeats_of_a_sample_look_at_the_same_points(tmp_path):
+    chosen = study(factors={DARK: {"low": 1.0, "high": 50.0}}, sample=4, repeats=1)
+    one = run(tmp_path, chosen).frame
+    three = run(tmp_path, chosen.model_copy(update={"repeats": 3})).frame
+    same_numbers(three[:4], one)
+    assert three[DARK].tolist() == 3 * one[DARK].tolist()
+    assert len(set(three["seed_spawn_key"])) == 12
+
+
+def test_fewer_repeats_leave_the_others_out_of_the_table_but_lose_none(whole, tmp_path):
+    """Also of a study that was stopped, which so ends with the repeats that it has."""
+    log = tmp_path / "log"
+    chosen = study(options={"log": str(log)})
+    with pytest.raises(StudyInterrupted):
+        run_study(chosen, tmp_path / "a", SilentProgress(), stopping_after(13, KeyboardInterrupt()))
+    two = run(tmp_path / "a", chosen.model_copy(update={"repeats": 2}))
+    assert (two.found, two.rows) == (12, 12)
+    same_numbers(two.frame, whole[1].frame[:12])
+    three = run(tmp_path / "a", chosen)
+    assert three.found == 13
+    same_numbers(three.frame, whole[1].frame)
+    assert sorted(map(int, log.read_text().split())) == list(range(18))
+
+
+def test_a_study_stopped_while_repeats_were_added_says_how_many_rows_of_these_are_done(tmp_path):
+    run(tmp_path)
+    with pytest.raises(StudyInterrupted, match="20 of 24 rows are done"):
+        run_study(study(repeats=4), tmp_path, SilentProgress(), stopping_after(2, KeyboardInterrupt()))
+    assert run(tmp_path, study(repeats=4)).found == 20
 
 
 def test_a_changed_sensor_file_makes_another_study(tmp_path):
