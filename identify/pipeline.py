@@ -1,6 +1,5 @@
 """The stages of a run, each reading what the one before wrote into the run folder."""
 
-import os
 import time
 from pathlib import Path
 
@@ -128,8 +127,7 @@ def validate(
     result, covariance = load_result(run_folder.result), read_covariance(run_folder.covariance, NAMES)
     excitation_record, excitation_truth = recording.read(run_folder.experiment), read_truth(run_folder.experiment)
     taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
-    count = workers or os.cpu_count() or 1
-    runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, count, progress)
+    runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, workers, progress)
     recording.write_runs(run_folder.validation, [(unseen.record, unseen.truth) for unseen in runs])
     identification = result["identification"]
     models = [parameter_vector(identification, column) for column in ("initial", "estimate")]

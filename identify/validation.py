@@ -1,6 +1,7 @@
 """Validation: plant and models run trajectories the estimator never saw (section 4.3)."""
 
 import multiprocessing
+import os
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -42,14 +43,14 @@ def run_unseen(
     trajectories: tuple[FourierTrajectory, ...],
     seed: int,
     taught: cmmsim.Taught,
-    workers: int,
+    workers: int | None,
     progress: Progress,
 ) -> list[Experiment]:
-    """Run the plant with images in the loop on every trajectory, in `workers` processes; results do not depend on them.
+    """Run the plant with images in the loop on every trajectory, in `workers` processes, None: one a core.
 
-    Every run has its own noise stream, and all share what the sensor was taught.
+    Every run has its own noise stream, and all share what the sensor was taught: results do not depend on the workers.
     """
-    runs = PlantRuns(scenario, seed, taught)
+    runs, workers = PlantRuns(scenario, seed, taught), workers or os.cpu_count() or 1
     numbers = range(1, len(trajectories) + 1)
     frames = len(frame_times(scenario, scenario.validation.duration_s)) * len(trajectories)
     with progress.stage("validate", frames) as advance:

@@ -94,11 +94,12 @@ def identify_each(
 
 
 def designed_runs(
-    scenario: Scenario, robot: Robot, seed: int, count: int, workers: int, progress: Progress
+    scenario: Scenario, robot: Robot, seed: int, count: int, workers: int | None, progress: Progress
 ) -> list[Experiment]:
     """Run the plant with images in the loop on `count` exciting trajectories, each designed from its own random ones.
 
-    As long as the exciting run, by the scenario's method. Raises as the stages `excite` and `record` do.
+    As long as the exciting run, by the scenario's method; workers as in `run_unseen`. Raises as the stages `excite` and
+    `record` do.
     """
     trajectories: list[FourierTrajectory] = []
     own = stream_seed(seed, DESIGN_STREAM)

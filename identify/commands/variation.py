@@ -1,6 +1,5 @@
 """The command ``cmmsim variation``. Heavy imports are late."""
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -79,7 +78,7 @@ def _record_designed(
     from identify.variation import designed_runs
 
     seed = load_trajectories(folder.trajectories).seed
-    runs = designed_runs(scenario, robot, seed, count, workers or os.cpu_count() or 1, progress)
+    runs = designed_runs(scenario, robot, seed, count, workers, progress)
     recording.write_runs(folder.path / "variation.nc", [(run.record, run.truth) for run in runs])
     return [run.record for run in runs]
 
