@@ -27,6 +27,10 @@ Run a study: a scenario varied over factors, row by row, on all cores or on many
 STUDY is a built-in name (--list) or a TOML file. What is finished stays in the folder: after Ctrl-C, or whatever ends
 the program, the same command goes on where it stopped. The same study gives the same figures however it is run.
 
+Bands too wide? The same command with more repeats, by --repeats or in the file, adds to what is there. With fewer, the
+others are left out of the table and the summary, but none is lost. Title and laws may change too; any other change
+makes another study, which needs another folder.
+
 \b
 A study file:
   name = "noise_and_baseline"
@@ -73,6 +77,9 @@ def study(
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Use a running Dask cluster: tcp://HOST:8786.")
     ] = None,
+    repeats: Annotated[
+        int | None, typer.Option(min=1, help="Rows at each point.", show_default="what the study says")
+    ] = None,
     workers: Annotated[
         int | None,
         typer.Option(min=0, help="Processes on this machine; 0: none but this one.", show_default="one a core"),
@@ -92,6 +99,8 @@ def study(
     from identify.studies.study_file import load_study
 
     chosen = load_study(name)
+    if repeats is not None:
+        chosen = chosen.model_copy(update={"repeats": repeats})
     if chosen.rows > MANY_ROWS and not yes:
         raise StudyError(f"study {chosen.name!r} has {chosen.rows:,} rows; to run more than {MANY_ROWS:,}, say --yes")
     folder = out or Path("runs") / f"study-{chosen.name}"
@@ -136,6 +145,7 @@ def _summarise(study: "Study", folder: Path, outcome: "Outcome", quiet: bool) ->
     if quiet:
         return
     again = f", {outcome.found} of them from before" if outcome.found else ""
+    again += f" ({outcome.beyond} more, of further repeats, are kept)" if outcome.beyond else ""
     console = Console()
     for law in entry["theory"]:
         console.print(_law_line(law), highlight=False, soft_wrap=True)

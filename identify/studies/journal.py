@@ -1,8 +1,8 @@
 """The finished rows of a study in an append-only file: JSON lines, on the disk before the next rows are begun.
 
 A line is complete or it does not count. Whatever ends the program, a line that was written stays, and a torn last one
-is cut off when the file is opened again. Rows beyond those of the study, of repeats that it had before, stay too, but
-nobody is told of them.
+is cut off when the file is opened again. Rows beyond those of the study, of repeats that it had before, stay too; they
+are only counted, as `beyond`.
 """
 
 import json
@@ -23,7 +23,7 @@ class Journal:
     """Finished rows of a study with ``rows`` rows; a context that closes the file."""
 
     def __init__(self, path: Path, rows: int) -> None:
-        self.path = path
+        self.path, self.beyond = path, 0
         self._file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         self.finished: NDArray[np.bool_] = np.zeros(rows, dtype=bool)
         self._end = 0
@@ -75,6 +75,8 @@ class Journal:
             raise StudyError(f"{self.path} is damaged: it has row {row.number}")
         if row.number < len(self.finished):
             self.finished[row.number] = True
+        else:
+            self.beyond += 1
 
     def _complete_lines(self) -> Iterator[tuple[Finished, int]]:
         """Rows with the place where each line ends, up to the end of the file or to a torn last line."""

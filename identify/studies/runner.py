@@ -26,12 +26,16 @@ Workers = Callable[[], AbstractContextManager[Executor]]
 
 @dataclass(frozen=True)
 class Outcome:
-    """A study that is done: its table, how many rows it has, how many of them were found done, and how many failed."""
+    """A study that is done: its table, how many rows it has, how many of them were found done, and how many failed.
+
+    beyond: rows that its folder keeps of repeats which it no longer has.
+    """
 
     frame: pd.DataFrame
     rows: int
     found: int
     failed: int
+    beyond: int
 
     @property
     def first_error(self) -> str:
@@ -72,7 +76,7 @@ def run_study(study: Study, folder: Path, progress: Progress, workers: Workers =
             raise StudyInterrupted(f"stopped: {done} of {len(design)} rows are done and kept") from None
         frame = tidy_table(study, journal.rows())
         write_table(folder / TABLE, frame, entry)
-    return Outcome(frame, len(design), found, int((frame["error"] != "").sum()))
+    return Outcome(frame, len(design), found, int((frame["error"] != "").sum()), journal.beyond)
 
 
 def _compute_pending(

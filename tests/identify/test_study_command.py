@@ -60,6 +60,17 @@ def test_a_study_that_is_done_says_so(mine, undrawn, capsys):
     assert "4 rows, 4 of them from before" in capsys.readouterr().out
 
 
+def test_repeats_are_added_in_the_same_folder(mine, tmp_path, undrawn, capsys):
+    assert command("study", mine, "--workers", 0) == 0
+    assert command("study", mine, "--workers", 0, "--repeats", 3) == 0
+    assert "6 rows, 4 of them from before" in capsys.readouterr().out
+    frame, study = read_table(tmp_path / "runs" / "study-mine" / "study.parquet")
+    assert (len(frame), study.repeats) == (6, 3)
+    assert command("study", mine, "--workers", 0) == 0
+    assert "4 rows, 4 of them from before (2 more, of further repeats, are kept)" in capsys.readouterr().out
+    assert command("study", mine, "--repeats", 0) == 2
+
+
 def test_quiet_says_nothing(mine, undrawn, capsys):
     assert command("study", mine, "--workers", 0, "--quiet", "--out", "a") == 0
     assert capsys.readouterr() == ("", "")

@@ -257,10 +257,10 @@ def test_fewer_repeats_leave_the_others_out_of_the_table_but_lose_none(whole, tm
     with pytest.raises(StudyInterrupted):
         run_study(chosen, tmp_path / "a", SilentProgress(), stopping_after(13, KeyboardInterrupt()))
     two = run(tmp_path / "a", chosen.model_copy(update={"repeats": 2}))
-    assert (two.found, two.rows) == (12, 12)
+    assert (two.found, two.rows, two.beyond) == (12, 12, 1)
     same_numbers(two.frame, whole[1].frame[:12])
     three = run(tmp_path / "a", chosen)
-    assert three.found == 13
+    assert (three.found, three.beyond) == (13, 0)
     same_numbers(three.frame, whole[1].frame)
     assert sorted(map(int, log.read_text().split())) == list(range(18))
 
