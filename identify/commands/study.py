@@ -58,7 +58,7 @@ Written into the folder:
   summary.md, summary.json, figures/*.png
 
 \b
-On many machines, all with cmmsim and with the files that the scenario names:
+On many machines, all with the same cmmsim and with the files that the scenario names:
   dask scheduler                                  on one
   dask worker tcp://HOST:8786 --nthreads 1        on each, once a core
   cmmsim study STUDY --scheduler tcp://HOST:8786

@@ -16,12 +16,14 @@ from contextlib import contextmanager
 from uuid import uuid4
 
 import dask
-from distributed import Client, Future, KilledWorker, LocalCluster, WorkerPlugin
+from distributed import Client, Future, KilledWorker, LocalCluster, WorkerPlugin, get_worker
 
 from identify.errors import StudyError
+from identify.files.versions import versions
 from identify.studies.batches import Batches
 from identify.studies.computation import Finished, compute
 from identify.studies.design import Case, Setup
+from identify.studies.worker_versions import check_workers, product_version, require_product
 
 CONNECT_SECONDS = 5
 """How long a scheduler may take to answer."""
@@ -74,7 +76,7 @@ def running_cluster(address: str) -> Iterator["DaskExecutor"]:
     """Workers: those of a cluster that is running.
 
     Raises:
-        StudyError: no scheduler answers there, or it has no workers.
+        StudyError: no scheduler answers there, or it has no workers, or one with another version of cmmsim.
     """
     _silence_dask()
     try:
@@ -88,6 +90,10 @@ def running_cluster(address: str) -> Iterator["DaskExecutor"]:
             client.wait_for_workers(1, timeout=CONNECT_SECONDS)
         except TimeoutError as error:
             raise StudyError(f"the Dask scheduler at {address} has no workers; start some with: dask worker") from error
+        try:
+            check_workers(client.run(versions, on_error="return"))
+        except OSError as error:
+            raise _gone(error) from error
         yield DaskExecutor(client)
 
 
@@ -115,7 +121,7 @@ class DaskExecutor:
                     batches.learn(finished)
                     yield finished
         except OSError as error:
-            raise StudyError(f"{GONE}: {' '.join(str(error).split())}") from error
+            raise _gone(error) from error
         finally:
             if self._open and self._client.status == "running":
                 self._client.cancel([future for future, _ in self._open.values()], force=True)
@@ -131,7 +137,8 @@ class DaskExecutor:
 
     def _send(self, setup: Setup, cases: list[Case]) -> None:
         self._sent += 1
-        future = self._client.submit(compute, setup, cases, key=f"{self._name}-{self._sent}", pure=False)
+        key = f"{self._name}-{self._sent}"
+        future = self._client.submit(_compute_alike, product_version(), setup, cases, key=key, pure=False)
         self._open[future.key] = (future, cases)
         future.add_done_callback(self._done.put)
 
@@ -147,6 +154,8 @@ class DaskExecutor:
             return list(future.result())
         except KilledWorker as error:
             return self._blame(cases, error)
+        except StudyError:
+            raise
         except Exception as error:
             self._check_cluster()
             causes = [error, *([error.__cause__] if error.__cause__ else [])]
@@ -172,6 +181,20 @@ class DaskExecutor:
         self._workerless = 0 if self._client.nthreads() else self._workerless + 1
         if self._workerless > WORKERLESS_SECONDS:
             raise StudyError(f"no Dask worker for {WORKERLESS_SECONDS} s; the same command goes on from here")
+
+
+def _compute_alike(version: str, setup: Setup, cases: list[Case]) -> list[Finished]:
+    """Compute rows on a worker, which may have come after the others were checked.
+
+    Raises:
+        StudyError: it has another version of cmmsim than the study's.
+    """
+    require_product(get_worker().address, product_version(), version)
+    return compute(setup, cases)
+
+
+def _gone(error: OSError) -> StudyError:
+    return StudyError(f"{GONE}: {' '.join(str(error).split())}")
 
 
 def _silence_dask() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,15 +12,18 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from identify.errors import StudyError
+from identify.files.versions import versions
 from identify.progress import SilentProgress
 from identify.studies.dask_runner import local_cluster, running_cluster
 from identify.studies.runner import run_study
 from identify.studies.store import JOURNAL
 from identify.studies.study_file import Study
+from identify.studies.worker_versions import OtherVersionsWarning
 from tests.identify.study_rows import KIND
 
 pytestmark = pytest.mark.slow
@@ -35,11 +39,25 @@ def study(**options):
     return Study(name="mine", kind=KIND, factors=factors, repeats=40, seed=4, options=options)
 
 
-def process(*arguments, **more):
-    """A process of this Python, in the repository's folder, in a group of its own."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.Popen([sys.executable, *map(str, arguments)], cwd=ROOT, env=environment, start_new_session=True,
-                            stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, **more)
+def process(*arguments, before=ROOT):
+    """A process of this Python, in a group of its own; what is in the folder `before` it finds first."""
+    environment = os.environ | {"PYTHONPATH": f"{before}:{ROOT}"}
+    return subprocess.Popen([sys.executable, *map(str, arguments)], cwd=before, env=environment, start_new_session=True,
+                            stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+def worker(address, folder, before=ROOT):
+    return process("-m", "distributed.cli.dask_worker", address, "--no-nanny", "--nthreads", 1, "--no-dashboard",
+                   "--local-directory", folder, before=before)
+
+
+def other_versions(folder, **packages):
+    """A folder that makes a process believe that it has these versions of packages."""
+    for name, version in packages.items():
+        metadata = folder / f"{name}-{version}.dist-info" / "METADATA"
+        metadata.parent.mkdir(parents=True)
+        metadata.write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    return folder
 
 
 def wait_for(condition, what):
@@ -50,21 +68,20 @@ def wait_for(condition, what):
 
 
 @contextmanager
-def cluster(folder, workers):
-    """A scheduler and workers, each a process of its own: address, scheduler, workers."""
+def cluster(folder, workers, before=ROOT):
+    """A scheduler and workers, each a process of its own: address, scheduler, workers; `before`: see `process`."""
     file = folder / "scheduler.json"
     scheduler = process("-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard",
                         "--scheduler-file", file)
-    started = [scheduler]
+    there = []
     try:
         wait_for(lambda: file.exists() and file.read_text().endswith("}"), "scheduler")
         address = json.loads(file.read_text())["address"]
         for _ in range(workers):
-            started.append(process("-m", "distributed.cli.dask_worker", address, "--no-nanny", "--nthreads", 1,
-                                   "--no-dashboard", "--local-directory", folder))
-        yield address, scheduler, started[1:]
+            there.append(worker(address, folder, before))
+        yield address, scheduler, there
     finally:
-        for one in started:
+        for one in [scheduler, *there]:
             one.kill()
             one.communicate()
 
@@ -134,6 +151,44 @@ def test_rows_that_kill_their_worker_are_errors_and_no_other_row_is(tmp_path, se
     frame = outcome.frame
     assert frame["error"][7].startswith("KilledWorker")
     same_numbers(frame.drop(index=7), serial.drop(index=7))
+
+
+def test_workers_with_another_version_of_the_product_are_refused_at_the_start(tmp_path):
+    there = other_versions(tmp_path / "there", cmmsim="9.8.7")
+    with cluster(tmp_path, 1, there) as (address, _, _), pytest.raises(StudyError) as caught:
+        run_study(study(), tmp_path / "a", SilentProgress(), partial(running_cluster, address))
+    here = versions()["cmmsim"]
+    assert re.fullmatch(rf"worker tcp://\S+ has cmmsim 9.8.7, here is {here}; install .*", str(caught.value))
+    assert journal(tmp_path / "a") == []
+
+
+def test_worker_that_comes_later_with_another_version_computes_no_row(tmp_path):
+    there, late = other_versions(tmp_path / "there", cmmsim="9.8.7"), []
+    with cluster(tmp_path, 1) as (address, _, workers):
+        come = At(1, lambda: late.append(worker(address, tmp_path, there)))
+        with pytest.raises(StudyError, match=r"worker tcp://\S+ has cmmsim 9\.8\.7, here is \S+; install"):
+            run_study(study(seconds=0.5), tmp_path / "a", come, partial(running_cluster, address))
+        workers += late
+    assert 1 <= len(journal(tmp_path / "a")) < 120
+
+
+def test_worker_that_lacks_the_product_is_named(tmp_path):
+    (tmp_path / "there" / "identify").mkdir(parents=True)
+    (tmp_path / "there" / "identify" / "__init__.py").write_text("raise ImportError('none here')\n")
+    message = r"worker tcp://\S+ cannot run cmmsim \S+: ImportError\('none here'\)$"
+    with cluster(tmp_path, 1, tmp_path / "there") as (address, _, _), pytest.raises(StudyError, match=message):
+        run_study(study(), tmp_path / "a", SilentProgress(), partial(running_cluster, address))
+
+
+def test_other_versions_of_other_packages_are_one_warning(tmp_path, serial):
+    there = other_versions(tmp_path / "there", numpy="1.2.3", casadi="0.1")
+    with cluster(tmp_path, 2, there) as (address, _, _), pytest.warns(OtherVersionsWarning) as caught:
+        outcome = run_study(study(), tmp_path / "a", SilentProgress(), partial(running_cluster, address))
+    assert len(caught) == 1
+    text = str(caught[0].message)
+    assert re.search(rf"numpy 1.2.3 on tcp://\S+( and 1 more)?, here {np.__version__}; casadi 0.1 on tcp://", text)
+    assert "scipy" not in text
+    same_numbers(outcome.frame, serial)
 
 
 @pytest.fixture
