@@ -33,12 +33,14 @@ FEWEST = 50
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Covariance (67, 67) of the estimate; information (67, 67) that the poses alone hold; mean squared whitened
-    residual of the record, what noise alone would make of it, and how that spreads from one experiment to the next;
-    unstable: repeated experiments that ended early and were left out."""
+    """Covariance (67, 67) of the estimate, were there no bounds; information (67, 67) that the poses alone hold;
+    gradient (67,): J^T r of poses and all that is known beside them, at the estimate; mean squared whitened residual of
+    the record, what noise alone would make of it, and how that spreads from one experiment to the next; unstable:
+    repeated experiments that ended early and were left out."""
 
     covariance: Array
     information: Array
+    gradient: Array
     noise_ratio: float
     expected_noise_ratio: float
     noise_ratio_std: float
@@ -59,23 +61,27 @@ def estimate_uncertainty(
         residuals.append(residual)
         jacobians.append(jacobian.reshape(-1, size))
     ratio = float(np.mean(np.concatenate(residuals) ** 2))
-    known = problem.known_information()
+    known, known_rows = problem.known(parameters)
+    gradient = np.asarray(known @ known_rows + sum(r.ravel() @ j for r, j in zip(residuals, jacobians, strict=True)))
+    prior = known_rows.T @ known_rows
     information = np.asarray(sum(j.T @ j for j in jacobians))
-    inverse = np.linalg.inv(information + known)
+    inverse = np.linalg.inv(information + prior)
     if ratio > NOISE_DECIDES or all(run.driven for run in problem.runs):
         advance(DRAWS)
         covariance = (ratio if ratio > NOISE_DECIDES else 1.0) * (inverse + inverse.T) / 2
-        return Uncertainty(covariance, information, ratio, 1.0, float(np.sqrt(2 / sum(map(len, jacobians)))))
+        spread = float(np.sqrt(2 / sum(map(len, jacobians))))
+        return Uncertainty(covariance, information, gradient, ratio, 1.0, spread)
     scores, squares = _repeated_scores(problem, parameters, residuals, jacobians, rng, advance)
     if len(scores) < FEWEST:
         raise EstimationError(
             f"{DRAWS - len(scores)} of {DRAWS} repeated experiments on the identified model ended in an unstable loop: "
             "its servo cannot bear the sensor's noise, and no interval can be given"
         )
-    covariance = inverse @ (np.cov(np.array(scores).T) + known) @ inverse
+    covariance = inverse @ (np.cov(np.array(scores).T) + prior) @ inverse
     return Uncertainty(
         (covariance + covariance.T) / 2,
         information,
+        gradient,
         ratio,
         float(np.mean(squares)),
         float(np.std(squares, ddof=1)),

@@ -13,6 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from dynamics import Robot
+from dynamics.parameters import JOINT_PID_NAMES
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation import warm_start
@@ -22,6 +23,7 @@ from identify.estimation.base_parameters import (
     reference_regressor,
     structural_regressor,
 )
+from identify.estimation.bounded_intervals import BoundedEstimate, bounded_estimate
 from identify.estimation.bounded_least_squares import Solution
 from identify.estimation.conditioning import Conditioning, conditioning
 from identify.estimation.estimate_covariance import DRAWS, Uncertainty, estimate_uncertainty
@@ -47,10 +49,11 @@ UNCERTAINTY_STREAM = 5
 class IdentificationResult:
     """What one record says about the 67 parameters, in the order of `names`; SI.
 
-    initial, warm_start, estimate, std (67,), covariance (67, 67); identifiable (67,) bool; groups: the same of the base
-    parameters; base_rank: independent groups that the trajectory excites by the paper's rule; iterations and
-    evaluations: of all searches; stop_reason: of the last; searches: their names in order, and costs: after each
-    iteration, one tuple a search; active_bounds: what holds the estimate back, as "platform.Izz <= Ixx + Iyy";
+    initial, warm_start, estimate, std (67,), covariance (67, 67), the last two as they were without bounds; intervals
+    (67, 2): 95 %, cut at the bounds; identifiable (67,) bool; groups, group_intervals: the same of the base parameters;
+    base_rank: independent groups that the trajectory excites by the paper's rule; iterations and evaluations: of all
+    searches; stop_reason: of the last; searches: their names in order, and costs: after each iteration, one tuple a
+    search; active_bounds: what holds the estimate back, as "platform.Izz <= Ixx + Iyy";
     noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what the sensor's noise alone
     would leave; whiteness: test of the residuals of the model driven by the logged commands.
     """
@@ -61,8 +64,10 @@ class IdentificationResult:
     estimate: Array
     std: Array
     covariance: Array
+    intervals: Array
     identifiable: NDArray[np.bool_]
     groups: GroupEstimates
+    group_intervals: Array
     conditioning: Conditioning
     scale_anchor: ScaleAnchor
     base_rank: int
@@ -104,8 +109,8 @@ def identify(
     with progress.stage("identify", count * settings.max_iterations) as advance:
         searches = output_error_searches(problem, scenario, warm, advance)
     searched = time.perf_counter()
-    driven, estimate = problem.driven_by_commands(), searches[settings.method].parameters
-    final = problem if settings.method == "closed_loop" else driven
+    driven, solution = problem.driven_by_commands(), searches[settings.method]
+    estimate, final = solution.parameters, problem if settings.method == "closed_loop" else driven
     seed = int(records[0].attrs.get("seed", 0))  # a record of a real robot has none
     rng = np.random.default_rng([seed, UNCERTAINTY_STREAM])
     with progress.stage("uncertainty", DRAWS) as advance:
@@ -118,9 +123,17 @@ def identify(
     rank = rank_by_threshold(excited, settings.qr_threshold)
     base = base_parameters(structural_regressor(robot))
     groups = group_estimates(base, problem.guess, estimate, uncertainty.covariance)
-    conditioned = conditioning(uncertainty.information, final.known_information(), base, problem.guess, estimate)
-    active = bounds_of(problem, scenario).active(searches[settings.method].at_bound)
-    return _result(final, warm, searches, active, uncertainty, groups, conditioned, tested, rank, seconds)
+    known = final.known_information()
+    conditioned = conditioning(uncertainty.information, known, base, problem.guess, estimate)
+    bounded = bounded_estimate(
+        estimate,
+        solution.at_bound,
+        uncertainty.gradient,
+        uncertainty.information + known,
+        uncertainty.covariance,
+        bounds_of(problem, scenario),
+    )
+    return _result(final, warm, searches, bounded, uncertainty, groups, conditioned, tested, rank, seconds)
 
 
 def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario) -> OutputErrorProblem:
@@ -159,7 +172,7 @@ def _result(
     problem: OutputErrorProblem,
     warm: Array,
     searches: dict[str, Solution],
-    active: tuple[str, ...],
+    bounded: BoundedEstimate,
     uncertainty: Uncertainty,
     groups: GroupEstimates,
     conditioned: Conditioning,
@@ -177,8 +190,10 @@ def _result(
         estimate=solution.parameters,
         std=std,
         covariance=uncertainty.covariance,
+        intervals=bounded.intervals(np.eye(len(NAMES))),
         identifiable=std < IDENTIFIABLE_SHARE * problem.guess.std,
         groups=groups,
+        group_intervals=bounded.intervals(np.pad(groups.combinations, ((0, 0), (0, len(JOINT_PID_NAMES))))),
         conditioning=conditioned,
         scale_anchor=problem.anchor,
         base_rank=rank,
@@ -187,11 +202,11 @@ def _result(
         stop_reason=solution.stop_reason,
         searches=tuple(searches),
         costs=tuple(one.costs for one in searches.values()),
-        active_bounds=active,
+        active_bounds=bounded.active_bounds,
         noise_ratio=uncertainty.noise_ratio,
         expected_noise_ratio=uncertainty.expected_noise_ratio,
         whiteness=tested,
-        warnings=said + _warnings(uncertainty, tested) + _held(active) + conditioned.warnings(),
+        warnings=said + _warnings(uncertainty, tested) + bounded.warnings() + conditioned.warnings(),
         seconds=seconds,
     )
 
@@ -220,9 +235,3 @@ def _warnings(uncertainty: Uncertainty, tested: Whiteness) -> tuple[str, ...]:
         )
     return tuple(said)
 
-
-def _held(active: tuple[str, ...]) -> tuple[str, ...]:
-    """Bounds that hold the estimate back: beyond them the record would have gone on."""
-    if not active:
-        return ()
-    return (f"the estimate is held at {len(active)} bounds, of which its intervals know nothing: {', '.join(active)}",)

@@ -56,9 +56,15 @@ class ParameterBounds:
         """Parameters (p,) of coordinates (p,)."""
         return np.asarray(self.matrix @ coordinates, dtype=float)
 
-    def active(self, at_bound: NDArray[np.bool_]) -> tuple[str, ...]:
-        """Statements of the coordinates (p,) that are at their bounds."""
-        return tuple(self.statements[k] for k in np.flatnonzero(at_bound))
+    def least(self, rows: Array) -> Array:
+        """Least values (n,) that rows (n, p) @ parameters take within the bounds; -inf where there is none."""
+        weights = rows @ self.matrix
+        return np.where((weights >= 0).all(axis=1), weights @ self.lower, -np.inf)
+
+    def balanced(self, gradient: Array, at_bound: NDArray[np.bool_]) -> Array:
+        """The part (p,) of a cost's gradient (p,) that the coordinates (p,) at their bounds balance."""
+        multipliers = np.where(at_bound, np.maximum(self.matrix.T @ gradient, 0.0), 0.0)
+        return np.asarray(np.linalg.solve(self.matrix.T, multipliers), dtype=float)
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ def validation_figure(validation: list[dict[str, Any]]) -> Figure:
 
 
 def parameter_figure(parameters: dict[str, dict[str, Any]]) -> Figure:
-    """Relative error of every identifiable parameter with ± 3 standard deviations, friction and gains apart."""
+    """Relative error of every identifiable parameter with its 95 % interval, friction and gains apart."""
     shown = {name: p for name, p in parameters.items() if p["identifiable"] and p["true"] and p["estimate"] is not None}
     groups = (
         ("friction and joint controller", [n for n in shown if is_friction_or_pid(n)]),
@@ -101,17 +101,23 @@ def parameter_figure(parameters: dict[str, dict[str, Any]]) -> Figure:
     for axes, (title, names) in zip(figure.subplots(1, 2), groups, strict=True):
         true = np.array([abs(shown[n]["true"]) for n in names])
         error = np.array([shown[n]["estimate"] - shown[n]["true"] for n in names])
-        std = np.array([shown[n]["std"] or 0.0 for n in names])
+        bars = np.array([interval_bars(shown[n]) for n in names]).reshape(-1, 2).T
         rows = np.arange(len(names))
         axes.axvspan(-5, 5, color="tab:green", alpha=0.1)
         axes.axvline(0, color="black", linewidth=1)
-        axes.errorbar(100 * error / true, rows, xerr=300 * std / true, fmt="o", color=IDENTIFIED, capsize=3)
+        axes.errorbar(100 * error / true, rows, xerr=100 * bars / true, fmt="o", color=IDENTIFIED, capsize=3)
         axes.set_yticks(rows, names, fontsize="small")
         axes.invert_yaxis()
-        axes.set_xlabel("estimate − truth, bars ± 3 std [%]")
+        axes.set_xlabel("estimate − truth, bars: 95 % interval [%]")
         axes.set_title(title)
         axes.grid(alpha=0.3, axis="x")
     return figure
+
+
+def interval_bars(parameter: dict[str, Any]) -> tuple[float, float]:
+    """How far an entry's interval goes below and above its estimate; zeros where it has none."""
+    low, high = parameter.get("interval") or (parameter["estimate"], parameter["estimate"])
+    return parameter["estimate"] - low, high - parameter["estimate"]
 
 
 def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:

@@ -9,7 +9,7 @@ from plotly.subplots import make_subplots
 
 from identify.arrays import Array
 from identify.files.result_file import rms_row
-from identify.reporting.figures import BAND, COMPONENTS, LETTERS
+from identify.reporting.figures import BAND, COMPONENTS, LETTERS, interval_bars
 from identify.reporting.goals import VALIDATION_UM, VALIDATION_URAD
 
 BLACK, GREEN, BLUE, RED = "black", "#2ca02c", "#1f77b4", "#d62728"
@@ -87,15 +87,16 @@ def validation_plot(validation: list[dict[str, Any]]) -> str:
 
 
 def parameter_plot(parameters: dict[str, dict[str, Any]]) -> str:
-    """Relative error of every identifiable parameter with bars of ± 3 standard deviations."""
+    """Relative error of every identifiable parameter with its 95 % interval."""
     shown = {n: p for n, p in parameters.items() if p["identifiable"] and p["true"] and p["estimate"] is not None}
     error = [100 * (p["estimate"] - p["true"]) / abs(p["true"]) for p in shown.values()]
-    bars = [300 * (p["std"] or 0.0) / abs(p["true"]) for p in shown.values()]
-    trace = go.Scatter(x=list(shown), y=error, error_y={"type": "data", "array": bars}, mode="markers",
-                       marker_color=BLUE, showlegend=False)
+    bars = [[100 * one / abs(p["true"]) for one in interval_bars(p)] for p in shown.values()]
+    below, above = [one[0] for one in bars], [one[1] for one in bars]
+    trace = go.Scatter(x=list(shown), y=error, error_y={"type": "data", "array": above, "arrayminus": below},
+                       mode="markers", marker_color=BLUE, showlegend=False)
     figure = go.Figure(trace)
     figure.add_hrect(y0=-5, y1=5, fillcolor=GREEN, opacity=0.1, line_width=0)
-    figure.update_yaxes(title_text="estimate − truth, bars ± 3 std [%]")
+    figure.update_yaxes(title_text="estimate − truth, bars: 95 % interval [%]")
     return _html(figure, 450)
 
 

@@ -55,6 +55,7 @@ def identification_entry(result: IdentificationResult) -> dict[str, Any]:
                 "warm_start": result.warm_start[index],
                 "estimate": result.estimate[index],
                 "std": result.std[index],
+                "interval": result.intervals[index].tolist(),
                 "identifiable": bool(result.identifiable[index]),
             }
             for index, name in enumerate(result.names)
@@ -67,6 +68,7 @@ def identification_entry(result: IdentificationResult) -> dict[str, Any]:
                 "true": None,
                 "estimate": result.groups.estimate[index],
                 "std": result.groups.std[index],
+                "interval": result.group_intervals[index].tolist(),
                 "identifiable": bool(result.groups.identifiable[index]),
             }
             for index, name in enumerate(result.groups.names)

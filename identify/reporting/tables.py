@@ -45,7 +45,7 @@ def goals_table(result: dict[str, Any]) -> Table:
 
 
 def parameter_table(result: dict[str, Any], identifiable_only: bool = False) -> Table:
-    """Parameters, like table 2: starting guess, truth, estimate and standard deviation."""
+    """Parameters, like table 2: starting guess, truth, estimate, standard deviation and interval."""
     rows = []
     for name, p in result["identification"]["parameters"].items():
         if not p["identifiable"] and identifiable_only:
@@ -55,9 +55,11 @@ def parameter_table(result: dict[str, Any], identifiable_only: bool = False) -> 
     anchor = result["identification"]["scale_anchor"]
     return Table(
         "Parameters (like the paper's table 2)",
-        ("parameter", "unit", "initial", "true", "estimate", "std", "error [%]", ""),
+        ("parameter", "unit", "initial", "true", "estimate", "std", "95 % interval", "error [%]", ""),
         tuple(rows),
         f"The overall scale is fixed by: {anchor}. A parameter that no motion shows has no estimate. "
+        "The interval ends where no such value can exist, and allows for bounds that hold the estimate; the standard "
+        "deviation knows of none. "
         "With the scenario's default parameter sets, initial and true are the two columns of the paper's table 2.",
     )
 
@@ -71,7 +73,7 @@ def group_table(result: dict[str, Any]) -> Table:
     )
     return Table(
         "Groups of parameters that no motion can separate",
-        ("group", "initial", "true", "estimate", "std", "error [%]", ""),
+        ("group", "initial", "true", "estimate", "std", "95 % interval", "error [%]", ""),
         rows,
         "In the SI unit of the first parameter of each sum. A group may be known where none of its members is.",
     )
@@ -174,11 +176,12 @@ def _rms(values: list[float]) -> list[str]:
     return [number(value) if math.isfinite(value) else "diverged" for value in values]
 
 
-def _shown(entry: dict[str, Any]) -> tuple[str, str, str]:
-    """Estimate, standard deviation and error; dashes for what is not identified, so that nobody quotes it."""
+def _shown(entry: dict[str, Any]) -> tuple[str, str, str, str]:
+    """Estimate, deviation, interval and error; dashes for what is not identified, so that nobody quotes it."""
     if not entry["identifiable"]:
-        return "-", "-", "-"
-    return number(entry["estimate"]), number(entry["std"]), _percent(entry)
+        return "-", "-", "-", "-"
+    interval = " to ".join(map(number, entry.get("interval", [None])))
+    return number(entry["estimate"]), number(entry["std"]), interval, _percent(entry)
 
 
 def _percent(parameter: dict[str, Any]) -> str:

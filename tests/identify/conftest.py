@@ -126,7 +126,9 @@ def make_result():
 
 
 def parameter(initial, true, estimate, std, identifiable=True):
-    return {"initial": initial, "true": true, "estimate": estimate, "std": std, "identifiable": identifiable}
+    interval = [max(estimate - 1.96 * std, 0.0), estimate + 1.96 * std] if identifiable else None
+    return {"initial": initial, "true": true, "estimate": estimate, "std": std, "interval": interval,
+            "identifiable": identifiable}
 
 
 @pytest.fixture

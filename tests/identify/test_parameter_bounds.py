@@ -55,7 +55,7 @@ def searched(problem, physical):
         np.ones(67),
         StopCriteria(1e-14, 1e-10, 200),
     )
-    return bounds.parameters(found.parameters), bounds.active(found.at_bound)
+    return bounds.parameters(found.parameters), tuple(np.array(bounds.statements)[found.at_bound])
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -128,5 +128,8 @@ def test_bodies_that_exist_are_identified_as_such(seed):
     physical_inertias(physical.estimate[:64])
     assert physical.active_bounds
     assert any("held at" in warning for warning in physical.warnings)
+    known, true = physical.identifiable, flat_platform()
+    assert np.all(physical.intervals[:, 0] >= 0)
+    assert np.mean((physical.intervals[:, 0] <= true)[known] & (true <= physical.intervals[:, 1])[known]) > 0.8
     assert physical.noise_ratio < plain.noise_ratio + 0.005
     assert load_scenario("paper").identification.physical_consistency is False

@@ -137,6 +137,15 @@ def test_parameter_figure_leaves_out_what_is_not_identifiable(result):
     assert labels == ["joint1.coulomb", "joint1.viscous", "joint_pid.lp", "platform.mass"]
 
 
+def test_bars_of_a_parameter_span_its_interval():
+    """One that a bound cuts off reaches less far down than up."""
+    entry = {"true": 2.0, "estimate": 1.0, "std": 3.0, "interval": [0.5, 6.0], "identifiable": True}
+    figure = figures.parameter_figure({"link1.mass": entry})
+    segments = [line.get_segments()[0] for line in figure.axes[1].collections]
+    np.testing.assert_allclose([segment[:, 0] for segment in segments], [[100 * -1.5 / 2, 100 * 4.0 / 2]])
+    assert figures.interval_bars({"estimate": 1.0}) == (0.0, 0.0)
+
+
 def test_missing_stage_is_named_with_the_command_that_does_it(run_folder):
     run_folder.validation.unlink()
     with pytest.raises(OutputFolderError, match=r"no validation\.nc; write it with: cmmsim validate --out"):

@@ -133,8 +133,8 @@ def test_starting_models_figures_stand_beside_the_identified_ones(result):
 
 def test_parameter_that_is_not_identifiable_has_no_number(result):
     rows = {row[0]: row for row in parameter_table(result).rows}
-    assert rows["link1.Ixx"][4:] == ("-", "-", "-", "not identifiable")
-    assert rows["joint1.coulomb"][1:] == ("N m", "0", "0.104", "0.105", "0.001", "+0.96", "")
+    assert rows["link1.Ixx"][4:] == ("-", "-", "-", "-", "not identifiable")
+    assert rows["joint1.coulomb"][1:] == ("N m", "0", "0.104", "0.105", "0.001", "0.103 to 0.107", "+0.96", "")
     assert "link1.Ixx" not in {row[0] for row in parameter_table(result, identifiable_only=True).rows}
 
 
