@@ -10,12 +10,21 @@ Two implementations, tested to be equal: compiled C (see `closed_loop.h`) and pl
 import numpy as np
 
 from dynamics import compiled_closed_loop, plain_closed_loop
-from dynamics.arrays import check_type, flag, floats, mask, real, shown
+from dynamics.arrays import check_type, flag
 from dynamics.closed_loop_run import ClosedLoopRun, LoopFailure
 from dynamics.errors import SimulationError
 from dynamics.joint_elasticity import JointElasticity
+from dynamics.loop_checks import (
+    check_elasticity,
+    check_kinds,
+    check_start_pose,
+    check_together,
+    checked_loop_parameters,
+    checked_lost,
+    checked_rows,
+)
+from dynamics.loop_equilibrium import equilibrium
 from dynamics.loop_types import (
-    PARAMETER_COUNT,
     Controller,
     FrameTiming,
     FrictionLaw,
@@ -28,7 +37,6 @@ from dynamics.loop_types import (
     StartState,
     checked_latencies,
 )
-from dynamics.parameters import JOINT_PID_NAMES, check_parameters
 from dynamics.robot import Robot
 
 __all__ = [
@@ -85,153 +93,61 @@ def simulate(
     Raises LoopFailure when the robot leaves the reachable set (an unstable loop); and before the run
     UnreachablePoseError where reference or start do, ParameterError, SimulationError, SingularPoseError.
     """
-    _check_kinds(robot, reference, settings, sensor)
+    check_kinds(robot, reference, settings, sensor, servo_robot, controller)
     start_sensitivities = flag("start_sensitivities", start_sensitivities, SimulationError)
     sensitivities = flag("sensitivities", sensitivities, SimulationError) or start_sensitivities
     compiled = None if compiled is None else flag("compiled", compiled, SimulationError)
-    if sensor is not None and sensitivities:
-        raise SimulationError("sensitivities need the ideal sensor: pass sensor=None")
-    if sensor is not None and lost is not None:
-        raise SimulationError("lost is for the ideal sensor: a sensor returns None at the frames that it loses")
-    if commands is not None:
-        commands = np.ascontiguousarray(floats("commands", commands, reference.poses.shape, error=SimulationError))
-    if lost is not None:
-        lost = mask("lost", lost, len(reference.poses), SimulationError).astype(np.int8)
-    if noise is not None:
-        noise = _checked_noise(noise, reference, sensor)
-    if latencies is not None:
-        latencies = checked_latencies(latencies, len(reference.poses), settings.timing)
-    if servo_robot is not None:
-        check_type("servo_robot", servo_robot, Robot, SimulationError)
-        if sensitivities:
-            raise SimulationError("sensitivities need a servo that knows the robot: pass servo_robot=None")
-    if settings.elasticity is not None and sensitivities:
-        raise SimulationError("sensitivities are those of rigid joints: pass settings with elasticity=None")
-    if controller is not None:
-        compiled = _check_controller(controller, sensitivities, commands, compiled)
     reference.check_reach(robot)
-    parameters = _check_loop_parameters(parameters)
-    if start is None:
-        start = equilibrium(robot, parameters, reference.poses[0], settings.servo, servo_robot, settings.elasticity)
-    else:
-        check_type("start", start, StartState, SimulationError)
-        _check_start_pose(robot, parameters, start.pose)
-    _check_elasticity(robot, parameters, settings, start)
+    frames, parameters = len(reference.poses), checked_loop_parameters(parameters)
     problem = LoopProblem(
         robot,
         parameters,
         reference,
         settings,
-        start,
+        _start(robot, parameters, reference, settings, start, servo_robot),
         sensor,
         sensitivities,
         start_sensitivities,
-        commands,
-        lost,
-        noise,
-        latencies,
-        servo_robot or robot,
-        controller,
+        commands=checked_rows("commands", commands, frames),
+        lost=checked_lost(lost, frames),
+        noise=checked_rows("noise", noise, frames),
+        latencies=None if latencies is None else checked_latencies(latencies, frames, settings.timing),
+        servo_robot=servo_robot or robot,
+        controller=controller,
     )
-    library = compiled_closed_loop.library(robot.geometry) if compiled in (None, True) else None
+    check_together(problem, servo_robot, compiled)
+    check_elasticity(problem)
+    return _run(problem, compiled)
+
+
+def _start(
+    robot: Robot,
+    parameters: np.ndarray,
+    reference: Reference,
+    settings: LoopSettings,
+    start: StartState | None,
+    servo_robot: Robot | None,
+) -> StartState:
+    """The start that was given, checked, or rest at the first reference pose."""
+    if start is None:
+        return equilibrium(robot, parameters, reference.poses[0], settings.servo, servo_robot, settings.elasticity)
+    check_type("start", start, StartState, SimulationError)
+    check_start_pose(robot, parameters, start.pose)
+    return start
+
+
+def _run(problem: LoopProblem, compiled: bool | None) -> ClosedLoopRun:
+    """Take the compiled path or the plain one; a user's controller is called on the plain one."""
+    wanted = compiled is not False and problem.controller is None
+    library = compiled_closed_loop.library(problem.robot.geometry) if wanted else None
     if library is not None:
         return compiled_closed_loop.run(library, problem)
     if compiled:
         raise SimulationError("compiled=True, but no C compiler was found")
-    return plain_closed_loop.run(robot, problem)
-
-
-def _checked_noise(noise: np.ndarray, reference: Reference, sensor: object) -> np.ndarray:
-    if sensor is not None:
-        raise SimulationError("noise is for the ideal sensor: a sensor that is given adds its own")
-    return np.ascontiguousarray(floats("noise", noise, reference.poses.shape, error=SimulationError))
+    return plain_closed_loop.run(problem.robot, problem)
 
 
 def prepare(robot: Robot) -> bool:
     """Compile the loop of a robot if that has not been done; False where no C compiler is at hand."""
     check_type("robot", robot, Robot, SimulationError)
     return compiled_closed_loop.library(robot.geometry) is not None
-
-
-def equilibrium(
-    robot: Robot,
-    parameters: np.ndarray,
-    pose: np.ndarray,
-    servo: ServoGains,
-    servo_robot: Robot | None = None,
-    elasticity: JointElasticity | None = None,
-) -> StartState:
-    """State of rest at a pose (6,), friction unloaded, for parameters (67,); servo_robot as in `simulate`.
-
-    The holding torque is linear in the dynamic parameters. Raises what `simulate` raises before a run.
-    """
-    check_type("robot", robot, Robot, SimulationError)
-    check_type("servo", servo, ServoGains, SimulationError)
-    parameters, pose = _check_loop_parameters(parameters), floats("pose", pose, (6,))
-    li, rest = parameters[65], np.zeros(6)
-    _check_start_pose(robot, parameters, pose)
-    angles = robot.inverse_kinematics(pose)
-    torque_map = np.linalg.solve(robot.joint_jacobian(pose).T, robot.regressor(pose, rest, rest))
-    integral = torque_map @ parameters[:64] / li
-    sensitivity = np.zeros((6, PARAMETER_COUNT))
-    sensitivity[:, :64] = torque_map / li
-    sensitivity[:, 65] = -integral / li
-    motors = {}
-    if elasticity is not None:
-        angles = angles + li * integral / elasticity.stiffness
-        motors = {"motor_angle": angles, "motor_rate": rest}
-    known = servo_robot or robot
-    servo_integral = np.linalg.solve(known.pose_jacobian(pose), angles) / servo.ki if servo.ki else np.zeros(6)
-    return StartState(pose, rest, integral, servo_integral, angles[None], pose, sensitivity, **motors)
-
-
-def _check_elasticity(robot: Robot, parameters: np.ndarray, settings: LoopSettings, start: StartState) -> None:
-    elasticity = settings.elasticity
-    if elasticity is None:
-        return
-    if start.motor_angle is None or start.motor_rate is None:
-        raise SimulationError("a start with elastic joints needs motor_angle and motor_rate")
-    period = 1 / settings.timing.frame_rate_hz
-    steps = elasticity.steps_needed(robot, parameters, start.pose, period, settings.friction)
-    if settings.steps_per_frame < steps:
-        raise SimulationError(
-            f"steps_per_frame is {settings.steps_per_frame}, must be >= {steps} to follow joints with "
-            f"a stiffness of {elasticity.stiffness:g} N m/rad"
-        )
-
-
-def _check_controller(
-    controller: object, sensitivities: bool, commands: np.ndarray | None, compiled: bool | None
-) -> bool:
-    """Raise SimulationError for what does not go with a controller; returns `compiled`: False."""
-    if not callable(controller):
-        raise SimulationError(f"controller must be a function, or None for the servo, got {shown(controller)}")
-    if sensitivities or commands is not None:
-        other = "sensitivities are those of the servo" if sensitivities else "commands take the place of any controller"
-        raise SimulationError(f"{other}: pass controller=None")
-    if compiled:
-        raise SimulationError("a controller runs on the plain path: pass compiled=None or False")
-    return False
-
-
-def _check_loop_parameters(parameters: np.ndarray) -> np.ndarray:
-    values = floats("loop parameters", parameters, (PARAMETER_COUNT,), error=SimulationError, finite=False)
-    check_parameters(values[:64])
-    lp, li, ld = JOINT_PID_NAMES
-    for name, value in ((lp, values[64]), (ld, values[66])):
-        real(name, value, SimulationError, least=0)
-    real(li, values[65], SimulationError, above=0)
-    return values
-
-
-def _check_start_pose(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> None:
-    robot.static_torque(pose, parameters[:64])  # refuses a pose out of reach or singular, with the evidence
-    robot.pose_rate(pose, np.zeros(6))  # refuses Euler angles at their singularity
-
-
-def _check_kinds(robot: Robot, reference: Reference, settings: LoopSettings, sensor: object) -> None:
-    for name, value, kind in (("robot", robot, Robot), ("reference", reference, Reference)):
-        check_type(name, value, kind, SimulationError)
-    check_type("settings", settings, LoopSettings, SimulationError)
-    if sensor is not None and not callable(sensor) and not isinstance(sensor, RateSensor):
-        raise SimulationError(f"sensor must be a function of frame, time and pose, or None, got {shown(sensor)}")
