@@ -8,6 +8,10 @@ from dataclasses import dataclass
 from identify.studies.design import Case, Setup
 from identify.studies.kinds import row_function
 
+FIRST = ("row", "repeat", "seed_entropy", "seed_spawn_key")
+LAST = ("seconds", "error")
+"""Columns of a study's table before its factors and behind its figures."""
+
 
 @dataclass(frozen=True)
 class Finished:
@@ -28,7 +32,8 @@ def _compute(setup: Setup, case: Case) -> Finished:
     start = time.perf_counter()
     try:
         figures = _checked(
-            row_function(setup.kind)(setup.row_scenario(case), setup.row_seed(case.number), setup.row_options(case))
+            row_function(setup.kind)(setup.row_scenario(case), setup.row_seed(case.number), setup.row_options(case)),
+            {*FIRST, *case.factors, *LAST},
         )
     except Exception as error:
         text = " ".join(f"{type(error).__name__}: {error}".split())
@@ -36,8 +41,11 @@ def _compute(setup: Setup, case: Case) -> Finished:
     return Finished(case.number, figures, time.perf_counter() - start)
 
 
-def _checked(figures: Mapping[str, float]) -> dict[str, float]:
-    """Figures as plain numbers; one that is none is an error of the row, so that no average hides it."""
+def _checked(figures: Mapping[str, float], taken: set[str]) -> dict[str, float]:
+    """Figures as plain numbers; one that is none is an error of the row, so that no average hides it, and so is one
+    that no column of the table is left for."""
+    if hidden := sorted(taken & set(figures)):
+        raise ValueError(f"a figure must not be called {hidden[0]!r}: the table has a column of this name")
     plain = {name: float(value) for name, value in figures.items()}
     for name, value in plain.items():
         if not math.isfinite(value):

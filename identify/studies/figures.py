@@ -13,9 +13,11 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 from identify.arrays import Array
 from identify.reporting.figures import save_figure
 from identify.studies.law import Law
+from identify.studies.point_statistics import CONFIDENCE as BANDS
 from identify.studies.point_statistics import point_statistics
 from identify.studies.study_file import Study
-from identify.studies.theory import Verdict, law_data
+from identify.studies.theory import CONFIDENCE as LAWS
+from identify.studies.theory import Verdict, law_data, with_data
 from identify.studies.units import factor_unit, figure_unit, labelled
 
 LEAST_SPAN = 2.0
@@ -44,20 +46,22 @@ def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str])
     figure, panels = _panels(len(shown))
     others = [other for other in study.factors if other != path]
     for axes, name in zip(panels, shown, strict=True):
+        have = done.dropna(subset=[name])
         if study.sample is not None:
-            axes.plot(_shown(done[path]), done[name], ".", markersize=4)
+            axes.plot(_shown(have[path]), have[name], ".", markersize=4)
         else:
-            for label, rows in _curves(done, others):
+            for label, rows in _curves(have, others):
                 _curve(axes, rows[path], rows[name].to_numpy(dtype=float), label)
         law = next((one for one in study.theory if (one.figure, one.per, one.factor) == (name, None, path)), None)
         if law is not None and law.exponent is not None:
-            _theory_line(axes, done[path], done[name].to_numpy(dtype=float), law.exponent)
-        _scale(axes, done[path], done[name])
+            _theory_line(axes, have[path], have[name].to_numpy(dtype=float), law.exponent)
+        _scale(axes, have[path], have[name])
         axes.set_xlabel(labelled(path, factor_unit(path)))
         axes.set_ylabel(labelled(name, figure_unit(study.kind, name)))
         if axes.get_legend_handles_labels()[1]:
             axes.legend(fontsize="small")
-    figure.suptitle(f"{study.title or study.name}: rms over rows, 95 % band")
+    what = f"rms over rows, {BANDS:.0%} band" if study.sample is None else "single rows"
+    figure.suptitle(f"{study.title or study.name}: {what}")
     return figure
 
 
@@ -88,23 +92,26 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
     for axes, (law, verdict) in zip(panels, laws, strict=True):
         factor = str(law.factor)
         others = [path for path in study.factors if path != factor and factor in study.factors]
-        for label, rows in _curves(done, others):
+        have = with_data(law, done)
+        for label, rows in _curves(have, others):
             _curve(axes, _levels(study, rows, factor), law_data(law, rows), label)
-        _theory_line(axes, done[factor], law_data(law, done), law.exponent or 0.0)
-        _scale(axes, done[factor], pd.Series(law_data(law, done)))
+        _theory_line(axes, have[factor], law_data(law, have), law.exponent or 0.0)
+        _scale(axes, have[factor], pd.Series(law_data(law, have)))
         axes.set_title(f"{verdict.verdict}: {verdict.measured:.3g} ({verdict.low:.3g} to {verdict.high:.3g})",
                        fontsize="small")
         unit = factor_unit(factor) if factor in study.factors else figure_unit(study.kind, factor)
         axes.set_xlabel(labelled(factor, unit))
         axes.set_ylabel(labelled(law.quantity, figure_unit(study.kind, law.figure) if law.per is None else ""))
         axes.legend(fontsize="small")
-    figure.suptitle(f"{study.title or study.name}: measured exponent and its 99 % interval")
+    figure.suptitle(f"{study.title or study.name}: measured exponent and its {LAWS:.0%} interval")
     return figure
 
 
 def _levels(study: Study, rows: pd.DataFrame, factor: str) -> pd.Series:
-    """The factor's value in each row; where it is a figure, its mean over the rows of a point."""
-    return rows[factor] if factor in study.factors else rows.groupby(list(study.factors))[factor].transform("mean")
+    """The factor's value in each row; where it is a figure, its mean over the rows of a point, if there are several."""
+    if factor in study.factors or not study.factors:
+        return rows[factor]
+    return rows.groupby(list(study.factors))[factor].transform("mean")
 
 
 def _panels(count: int) -> tuple[Figure, list[Axes]]:
@@ -121,7 +128,9 @@ def _panels(count: int) -> tuple[Figure, list[Axes]]:
 def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFrame]]:
     """Rows of each setting of the other factors, with a label; all together where there are too many."""
     groups = list(done.groupby(others, sort=False)) if others else []
-    if not 1 < len(groups) <= MOST_CURVES:
+    if len(groups) > MOST_CURVES:
+        return [(f"rows of all {len(groups)} other settings", done)]
+    if len(groups) < 2:
         return [("", done)]
     return [(", ".join(f"{path.rpartition('.')[2]} {value}" for path, value in zip(others, values, strict=True)), rows)
             for values, rows in groups]
@@ -137,8 +146,8 @@ def _curve(axes: Axes, levels: pd.Series, values: Array, label: str) -> None:
 
 
 def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) -> None:
-    """The power law with that exponent through the middle of the data."""
-    x = factor.to_numpy(dtype=float)
+    """The power law with that exponent through the middle of the data; none where the factor has no powers."""
+    x = pd.to_numeric(factor, errors="coerce").to_numpy(dtype=float)
     if not np.all(x > 0.0):
         return
     level = np.sqrt(np.mean((values / x**exponent) ** 2))

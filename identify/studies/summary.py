@@ -81,7 +81,9 @@ def _points(study: Study, done: pd.DataFrame, names: list[str]) -> list[tuple[di
 
 
 def _statistics(rows: pd.DataFrame, names: list[str]) -> dict[str, Statistics]:
-    return {name: point_statistics.point_statistics(rows[name].to_numpy(dtype=float)) for name in names}
+    """Of each figure, over the rows that have it."""
+    values = {name: rows[name].dropna().to_numpy(dtype=float) for name in names}
+    return {name: point_statistics.point_statistics(found) for name, found in values.items() if len(found)}
 
 
 def _failures(study: Study, frame: pd.DataFrame) -> dict[str, Any]:
@@ -122,7 +124,7 @@ def _law_row(verdict: Verdict) -> str:
 
 def _bands_text(points: list[tuple[dict[str, Any], dict[str, Statistics]]]) -> str:
     if points and all(one.rows < 2 for _, figures in points for one in figures.values()):
-        return "Rms over rows. With a single repeat there is no band: `repeats` in the study file makes one."
+        return "Rms over rows. With a single repeat there is no band: the same command with --repeats 10 adds some."
     return f"Rms over rows, with its {point_statistics.CONFIDENCE:.0%} band."
 
 
@@ -132,13 +134,15 @@ def _table(study: Study, points: list[tuple[dict[str, Any], dict[str, Statistics
     heads += ["rows", *(labelled(name, figure_unit(study.kind, name)) for name in shown)]
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for values, figures in points[:LONGEST]:
-        count = next((one.rows for one in figures.values()), 0)
-        cells = [str(values[path]) for path in factors] + [str(count), *(_cell(figures[name]) for name in shown)]
+        count = max((one.rows for one in figures.values()), default=0)
+        cells = [str(values[path]) for path in factors] + [str(count), *(_cell(figures.get(name)) for name in shown)]
         lines.append(f"| {' | '.join(cells)} |")
     return lines + ([f"\n{len(points) - LONGEST} more points stand in `{JSON}`."] if len(points) > LONGEST else [])
 
 
-def _cell(one: Statistics) -> str:
+def _cell(one: Statistics | None) -> str:
+    if one is None:
+        return "none"
     if one.rms_band is None or not all(map(math.isfinite, one.rms_band)):
         return f"{one.rms:.4g}"
     return f"{one.rms:.4g} ({one.rms_band[0]:.4g} to {one.rms_band[1]:.4g})"

@@ -2,7 +2,7 @@
 
 Columns: ``row``, ``repeat``, the seed as ``seed_entropy`` and ``seed_spawn_key`` (what ``numpy.random.SeedSequence``
 takes), one a factor under its dotted path, one a figure with its unit in the name, ``seconds`` and ``error``. A row
-that failed has NaN figures and says why in ``error``.
+that failed has NaN figures and says why in ``error``; a figure that rows of one's own do not all have is NaN in others.
 """
 
 import json
@@ -20,14 +20,11 @@ from identify.arrays import Array
 from identify.errors import StudyError
 from identify.files.atomic import atomic_path
 from identify.files.versions import versions
-from identify.studies.computation import Finished
+from identify.studies.computation import FIRST, LAST, Finished
 from identify.studies.design import Design
 from identify.studies.study_file import Study
 
 STUDY_KEY, VERSIONS_KEY = b"cmmsim.study", b"cmmsim.versions"
-
-FIRST = ("row", "repeat", "seed_entropy", "seed_spawn_key")
-LAST = ("seconds", "error")
 
 
 def tidy_table(study: Study, finished: Iterable[Finished]) -> pd.DataFrame:

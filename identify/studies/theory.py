@@ -55,19 +55,32 @@ def check_laws(study: Study, frame: pd.DataFrame) -> list[Verdict]:
     return [_check(law, study, done) for law in study.theory]
 
 
-def law_data(law: Law, frame: pd.DataFrame) -> Array:
-    """The quantity of a law (n,) in each row. Raises StudyError where the rows do not have it, with what they have."""
-    for name in (law.figure, law.per, law.equals):
-        if name is not None and name not in frame.columns:
+def with_data(law: Law, frame: pd.DataFrame) -> pd.DataFrame:
+    """The rows that have all figures of a law. Raises StudyError where none has one of them, with what they have."""
+    needed = [name for name in (law.figure, law.per, law.equals) if name is not None]
+    for name in needed:
+        if name not in frame.columns:
             raise StudyError(f"the rows have no figure {name!r}; they have {', '.join(map(str, frame.columns))}")
+    return frame.dropna(subset=needed)
+
+
+def law_data(law: Law, frame: pd.DataFrame) -> Array:
+    """The quantity of a law (n,) in each row, all of which have it. Raises StudyError where it is divided by zero."""
     values = frame[law.figure].to_numpy(dtype=float)
-    return values if law.per is None else values / frame[law.per].to_numpy(dtype=float)
+    return values if law.per is None else values / _divisor(law.per, frame)
+
+
+def _divisor(name: str, frame: pd.DataFrame) -> Array:
+    values = frame[name].to_numpy(dtype=float)
+    if zeros := int(np.sum(values == 0.0)):
+        raise StudyError(f"{name} is zero in {zeros} of {len(values)} rows, and nothing can be divided by it")
+    return values
 
 
 def _check(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     check = _exponent if law.exponent is not None else _equality if law.equals is not None else _order
     try:
-        return check(law, study, frame)
+        return check(law, study, with_data(law, frame))
     except StudyError as error:
         return Verdict(_statement(law), law.why, "undecided", _expected(law), reason=str(error))
 
@@ -85,9 +98,8 @@ def _exponent(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
 
 def _equality(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     """The ratio of two figures of the same rows."""
-    values = law_data(law, frame)
-    other = frame[law.equals].to_numpy(dtype=float)
-    fit = scale_regression((values / other) ** 2, np.full((len(frame), 1), 2.0))
+    ratios = law_data(law, frame) / _divisor(str(law.equals), frame)
+    fit = scale_regression(ratios**2, np.full((len(frame), 1), 2.0))
     low, high = fit.interval(0, CONFIDENCE)
     verdict = _decided(low <= law.tolerance and high >= -law.tolerance, 0.5 * (high - low))
     measured, low, high = np.exp([fit.coefficients[0], low, high]).tolist()

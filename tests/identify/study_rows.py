@@ -14,7 +14,8 @@ def row(scenario, seed, options):
     """Random numbers of the row's seed, and what the factors say.
 
     Options: `seconds` to sleep; `log`, a file that gets a line a computation; `fails`, spawn keys of rows that raise;
-    `kills`, those of rows that kill their process; `odd`, that of a row with a figure that is no number.
+    `kills`, those of rows that kill their process; `odd`, that of a row with a figure that is no number; `also`, the
+    name of one more figure.
     """
     number = seed.spawn_key[0]
     time.sleep(options.get("seconds", 0.0))
@@ -31,4 +32,5 @@ def row(scenario, seed, options):
         "error_um": float("nan") if number == options.get("odd") else noise * float(draws.mean()),
         "spread_um": float(draws.std()),
         "rate_hz": scenario.timing.frame_rate_hz,
+        **({options["also"]: 1.0} if "also" in options else {}),
     }

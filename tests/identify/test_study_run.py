@@ -203,6 +203,14 @@ def test_a_failing_row_says_why_and_the_others_go_on(whole, tmp_path):
     same_numbers(frame[~failed], whole[1].frame[~failed])
 
 
+@pytest.mark.parametrize("name", ["row", "seconds", DARK])
+def test_a_figure_that_would_hide_a_column_is_an_error_of_the_row(tmp_path, name):
+    frame = run(tmp_path, study(options={"also": name}, repeats=1)).frame
+    words = f"ValueError: a figure must not be called {name!r}: the table has a column of this name"
+    assert set(frame["error"]) == {words}
+    assert frame["row"].tolist() == list(range(6))
+
+
 def test_factors_that_contradict_each_other_in_one_row_are_an_error_of_this_row(tmp_path):
     chosen = study(factors={"scenario.filter.cutoff_hz": [10.0, 40.0], "scenario.timing.frame_rate_hz": [60.0, 100.0]})
     frame = run(tmp_path, chosen).frame

@@ -141,6 +141,14 @@ def test_law_of_what_the_rows_do_not_have_is_undecided_with_the_reason(law, reas
     assert reason in found.text
 
 
+@pytest.mark.parametrize("law", [power(1.0, per="other"), Law(figure="figure_um", equals="other")])
+def test_nothing_is_divided_by_zero(law):
+    frame = drawn(np.random.default_rng(13), 1.0).assign(other=lambda rows: rows["row"] % 4.0)
+    found = verdict(law, frame)
+    assert found.verdict == "undecided"
+    assert found.reason == "other is zero in 30 of 120 rows, and nothing can be divided by it"
+
+
 def test_figure_that_is_zero_or_a_factor_that_stands_still_is_undecided():
     frame = drawn(np.random.default_rng(12), 1.0)
     assert "zero in every row" in verdict(power(1.0), frame.assign(figure_um=0.0)).reason
