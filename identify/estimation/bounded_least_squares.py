@@ -44,11 +44,10 @@ class StopCriteria:
 
 @dataclass(frozen=True)
 class Solution:
-    """Parameters (p,), factor R (p, p) of J^T J there, which are at their bounds (p,), cost after each iteration,
-    evaluations and why it stopped."""
+    """Parameters (p,), which are at their bounds (p,), cost after each iteration, evaluations of the model and why it
+    stopped."""
 
     parameters: Array
-    factor: Array
     at_bound: NDArray[np.bool_]
     costs: tuple[float, ...]
     evaluations: int
@@ -73,12 +72,9 @@ def minimise(
     cost, factor, residual = problem.linearise(parameters)
     costs, evaluations, reason = [cost], 1, ""
     while not reason:
-        if len(costs) > criteria.max_iterations:
-            reason = f"stopped after max_iterations = {criteria.max_iterations}"
-            break
         step, predicted = _box_step(factor, residual, parameters, lower, scale, radius)
         trial = np.maximum(parameters + step, lower)
-        evaluations += 1
+        evaluations += predicted > 0
         new_cost = problem.cost(trial) if predicted > 0 else cost
         ratio = (cost - new_cost) / predicted if predicted > 0 else 0.0
         largest = float(np.abs(step / scale).max())
@@ -88,15 +84,18 @@ def minimise(
             if largest < 0.9 * tried:
                 change = _relative_change(step, parameters, scale)
                 reason = _converged(cost, new_cost, change, criteria)
-            parameters = trial
-            cost, factor, residual = problem.linearise(parameters)
-            evaluations += 1
+            if not reason and len(costs) >= criteria.max_iterations:
+                reason = f"stopped after max_iterations = {criteria.max_iterations}"
+            parameters, cost = trial, new_cost
             costs.append(cost)
             on_iteration(len(costs) - 1, cost)
+            if not reason:
+                cost, factor, residual = problem.linearise(parameters)
+                evaluations += 1
         elif radius < SMALLEST_RADIUS or predicted <= criteria.cost_tolerance * cost:
             reason = f"no step lowers the cost: predicted gain {predicted:.3g} of {cost:.6g}"
     at_bound = parameters <= lower + AT_BOUND * scale
-    return Solution(parameters, factor, at_bound, tuple(costs), evaluations, reason)
+    return Solution(parameters, at_bound, tuple(costs), evaluations, reason)
 
 
 def _box_step(

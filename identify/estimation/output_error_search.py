@@ -110,16 +110,15 @@ def _within_bounds(
 ) -> Solution:
     """Solution in the parameters of a search in the coordinates of their bounds."""
     bounds = bounds_of(problem, scenario)
-    inverse = np.linalg.inv(bounds.matrix)
     found = minimise(
         InCoordinates(least_squares, bounds),
         bounds.coordinates(start),
         bounds.lower,
-        np.abs(inverse) @ problem.guess.std,
+        np.abs(np.linalg.inv(bounds.matrix)) @ problem.guess.std,
         criteria,
         lambda i, cost: advance(),
     )
-    return replace(found, parameters=bounds.parameters(found.parameters), factor=found.factor @ inverse)
+    return replace(found, parameters=bounds.parameters(found.parameters))
 
 
 def _why(problem: OutputErrorProblem, parameters: Array) -> str:

@@ -68,8 +68,10 @@ def estimate(commands, measured, guess):
     began = time.perf_counter()
     lower = SMALLEST_SHARE * guess
     start = np.maximum(linear_start(commands, measured), lower)
-    solution = minimise(ServoProblem(commands, measured), start, lower, guess, CRITERIA)
-    half_widths = 1.96 * standard_deviations(solution.factor)
+    problem = ServoProblem(commands, measured)
+    solution = minimise(problem, start, lower, guess, CRITERIA)
+    _, factor, _ = problem.linearise(solution.parameters)
+    half_widths = 1.96 * standard_deviations(factor)
     return Estimate(solution.parameters, half_widths, time.perf_counter() - began)
 
 

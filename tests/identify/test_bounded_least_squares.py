@@ -1,6 +1,7 @@
 """The search is checked against scipy's own solver and against problems whose minimum is known."""
 
 import numpy as np
+import pytest
 from scipy.optimize import least_squares, nnls
 
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
@@ -88,3 +89,30 @@ def test_the_stop_reason_names_the_criterion():
     two = minimise(exponential(), np.array([0.5, 4.0]), np.zeros(2), np.ones(2), StopCriteria(1e-15, 1e-15, 2))
     assert "max_iterations = 2" in two.stop_reason
     assert two.iterations == 2
+
+
+class Counted:
+    """A problem that remembers what it was asked for."""
+
+    def __init__(self, problem):
+        self.problem, self.calls = problem, []
+
+    def cost(self, parameters):
+        self.calls.append("cost")
+        return self.problem.cost(parameters)
+
+    def linearise(self, parameters):
+        self.calls.append("linearise")
+        return self.problem.linearise(parameters)
+
+
+@pytest.mark.parametrize("criteria", [(1e-3, 1e-12, 50), (1e-15, 1e-15, 2), (0.0, 0.0, 200)])
+def test_every_linearisation_is_stepped_from(criteria):
+    """However the search ends: converged, after the iterations allowed, or without a step that lowers the cost."""
+    problem = Counted(exponential())
+    found = minimise(problem, np.array([0.5, 4.0]), np.zeros(2), np.ones(2), StopCriteria(*criteria))
+    stuck = found.stop_reason.startswith("no step")
+    assert stuck == (criteria[0] == 0)
+    assert problem.calls.count("linearise") == found.iterations + stuck
+    assert found.evaluations == len(problem.calls)
+    assert found.costs[-1] == exponential().cost(found.parameters)

@@ -54,7 +54,8 @@ def test_every_base_parameter_and_gain_is_recovered_to_a_millionth():
     assert len(groups) == 37
     assert groups.max() < 1e-6, dict(zip(base.expressions(), groups, strict=True))
     assert gains.max() < 1e-6
-    covariance = np.linalg.inv(solution.factor.T @ solution.factor)[:64, :64]
+    _, factor, _ = problem.linearise(solution.parameters)
+    covariance = np.linalg.inv(factor.T @ factor)[:64, :64]
     after = np.einsum("gi,ij,gj->g", base.combinations, covariance, base.combinations)
     before = base.combinations**2 @ problem.guess.std[:64] ** 2
     assert (after / before).max() < 1e-9, "share of the starting guess in an estimate"
