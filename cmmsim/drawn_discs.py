@@ -17,7 +17,7 @@ from .pose import Array, apply, pose_to_transform
 from .projected_disc import project_discs
 from .rig_from_file import rig_from_file
 from .sensor import Sensor
-from .sensor_file import SensorFile
+from .sensor_schema import SensorFile
 
 TOGETHER = 100  # discs drawn at once
 LARGEST_RADIUS_PX = 50.0

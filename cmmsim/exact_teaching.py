@@ -8,7 +8,7 @@ from .marked_body import marked_body
 from .pose import invert
 from .rig_from_file import rig_from_file
 from .scene import placed_stickers
-from .sensor_file import SensorFile
+from .sensor_schema import SensorFile
 from .taught import Taught
 from .taught_setup import setup_of
 

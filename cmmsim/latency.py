@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .pose import Array
-from .sensor_file import Timing
+from .sensor_schema import Timing
 
 WIDEST = 3.0  # standard deviations: no frame's latency is farther from the mean
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .errors import ShapeError, TeachingError
 from .plane_frame import PLANE_NAMES, frame_from_planes
 from .pose import Array
-from .sensor_file import Body, StickerPlane, unit
+from .sensor_schema import Body, StickerPlane, unit
 
 SMALLEST_CORNER = 0.001  # volume that the unit normals of three planes span: of a cube's corner it is 1
 

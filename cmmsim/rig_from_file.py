@@ -10,7 +10,7 @@ from .camera import PinholeCamera
 from .distortion import Distortion
 from .errors import SensorFileError
 from .pose import Array, rotation_exp
-from .sensor_file import Calibrated, Rig, RightFromLeft
+from .sensor_schema import Calibrated, Rig, RightFromLeft
 from .stereo_rig import StereoRig, placed_rig, toed_in_rig
 
 BORDER_POINTS = 65  # along each side of the image, asked whether the distortion model holds there

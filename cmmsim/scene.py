@@ -13,7 +13,7 @@ from .errors import SensorFileError
 from .marked_body import MarkedBody
 from .plane_frame import PLANE_NAMES
 from .pose import Array
-from .sensor_file import Body, Stickers, unit
+from .sensor_schema import Body, Stickers, unit
 
 SUNK = 0.0003  # m the solid surface lies below the sticker planes
 RING_SUNK = 0.0001  # m the dark ring lies below its sticker

@@ -29,7 +29,8 @@ from .pose_methods import METHODS
 from .renderers import RENDERER_NAMES, Renderer, choose_renderer
 from .rig_from_file import rig_from_file
 from .scene import Mesh, scene_body, solid_mesh
-from .sensor_file import SensorFile, Timing, read_sensor_file
+from .sensor_file import read_sensor_file
+from .sensor_schema import SensorFile, Timing
 from .taught import Taught
 from .taught_setup import require_taught_for, setup_of
 from .teaching import Progress, Teacher

@@ -9,7 +9,8 @@ import json
 from typing import Any
 
 from .errors import TeachingError
-from .sensor_file import SensorFile, dotted
+from .sensor_changes import dotted
+from .sensor_schema import SensorFile
 from .taught import Taught
 
 SHOWN_CHANGES, SHOWN_CHARACTERS = 3, 40

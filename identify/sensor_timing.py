@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 if TYPE_CHECKING:
-    from cmmsim.sensor_file import Timing as SensorTiming
+    from cmmsim.sensor_schema import Timing as SensorTiming
 
 NAMES = {
     "frame_rate_hz": "frame_rate",
@@ -38,7 +38,7 @@ def timing_in_file(sensor: str, changes: Mapping[str, Any]) -> tuple[dict[str, f
 
 def by_dotted_key(changes: Mapping[str, Any]) -> dict[str, Any]:
     """A scenario's ``[sensor_changes]``, also as tables in tables, by dotted key of the sensor's file."""
-    from cmmsim.sensor_file import dotted
+    from cmmsim.sensor_changes import dotted
 
     return dotted(changes)
 
@@ -49,7 +49,7 @@ def sensor_timing(timing: Mapping[str, Any]) -> "SensorTiming":
     Raises:
         ValueError: values that contradict each other.
     """
-    from cmmsim.sensor_file import Timing as SensorTiming
+    from cmmsim.sensor_schema import Timing as SensorTiming
 
     try:
         return SensorTiming(**{theirs: timing[ours] for ours, theirs in NAMES.items()})

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..pose import Array
-from ..sensor_file import Body, HalfSpace, Planes, Platform, Rig, SensorFile, StickerPlane
+from ..sensor_schema import Body, HalfSpace, Planes, Platform, Rig, SensorFile, StickerPlane
 
 H = TypeVar("H", bound=HalfSpace)
 SLOPE = np.deg2rad(15.0)

@@ -17,7 +17,7 @@ from ..render import require_opengl
 from ..renderers import PYRENDER, choose_renderer
 from ..rig_from_file import rig_from_file
 from ..sensor import Sensor
-from ..sensor_file import Platform, SensorFile
+from ..sensor_schema import Platform, SensorFile
 from ..taught import Taught
 from .artefact import artefact_file
 from .errors import AcceptanceError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..marked_body import MarkedBody
-from ..sensor_file import Platform
+from ..sensor_schema import Platform
 from .artefact import HALF_RIDGE, SIDE, StickerRow, board
 from .artefact_sensor import part_of_body
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..pose import Array
 from ..sensor import Sensor
-from ..sensor_file import Platform
+from ..sensor_schema import Platform
 from .artefact import StickerRow, board, facing_rotation
 from .artefact_sensor import SensorUnderTest, estimator_of, locate, observe_stickers, pose_in_base
 from .errors import AcceptanceError

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..pose import Array, apply, invert
 from ..rig_from_file import rig_from_file
-from ..sensor_file import Rig
+from ..sensor_schema import Rig
 from ..stereo_rig import StereoRig
 from .errors import AcceptanceError
 

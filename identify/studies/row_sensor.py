@@ -14,7 +14,8 @@ import numpy as np
 
 import cmmsim
 from cmmsim.exact_teaching import exactly_taught
-from cmmsim.sensor_file import SensorFile, read_sensor_file
+from cmmsim.sensor_file import read_sensor_file
+from cmmsim.sensor_schema import SensorFile
 from identify.arrays import Array
 from identify.scenario import Scenario
 from identify.sensor_timing import sensor_timing

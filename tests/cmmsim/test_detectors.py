@@ -11,7 +11,8 @@ from cmmsim.drawn_discs import Condition, draw_discs, random_ellipses, scene_of
 from cmmsim.ellipse_fit import FitLimits
 from cmmsim.errors import CmmError, SensorFileError, UnknownOptionError
 from cmmsim.sensor import Sensor
-from cmmsim.sensor_file import Detection, SensorFile, read_sensor_file, sensor_text
+from cmmsim.sensor_file import read_sensor_file, sensor_text
+from cmmsim.sensor_schema import Detection, SensorFile
 
 SCENE = scene_of(read_sensor_file("ctrack780"))
 SIZE, FIT = 18, 14

@@ -12,6 +12,7 @@ from cmmsim.distortion import Distortion
 from cmmsim.pose import apply, rotation_exp
 from cmmsim.rig_from_file import rig_from_file
 from cmmsim.sensor_file import read_sensor_file, sensor_text
+from cmmsim.sensor_schema import RightFromLeft
 from tests.cmmsim.lenses import CAMERAS
 
 LENSES = {"barrel": (-0.12, 0.03, 1e-3, -7e-4, -4e-3), "cushion": (0.15, 0.06, -8e-4, 5e-4, 0.02),
@@ -120,7 +121,7 @@ def test_calibrated_rig_stands_where_the_toed_in_one_does():
     section = read_sensor_file("ctrack780").rig
     rig, camera_from_base = rig_from_file(section)
     rotation = cv2.Rodrigues(rig.right_from_left[:3, :3])[0].ravel()
-    again = section.model_copy(update={"right_from_left": cmmsim.sensor_file.RightFromLeft(
+    again = section.model_copy(update={"right_from_left": RightFromLeft(
         translation=tuple(rig.right_from_left[:3, 3]), rotation_vector=tuple(rotation))})
     same, place = rig_from_file(again)
     np.testing.assert_allclose(same.right_from_left, rig.right_from_left, atol=1e-14)

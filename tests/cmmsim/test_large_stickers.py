@@ -9,7 +9,8 @@ import pytest
 from cmmsim.observation import DetectionSettings, observe
 from cmmsim.pose import apply, pose_to_transform
 from cmmsim.sensor import Sensor
-from cmmsim.sensor_file import SensorFile, read_sensor_file
+from cmmsim.sensor_file import read_sensor_file
+from cmmsim.sensor_schema import SensorFile
 
 PLACES = {"A": [[0.12, 0.0], [-0.05, 0.12], [-0.08, -0.12]], "B": [[0.05, -0.06], [0.12, -0.06], [0.2, -0.06]],
           "C": [[-0.05, -0.06], [-0.12, -0.06], [-0.2, -0.06]]}

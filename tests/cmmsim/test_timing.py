@@ -10,7 +10,8 @@ import cmmsim
 from cmmsim.acceptance import SensorUnderTest, common_volume, latency_test
 from cmmsim.latency import drawn_latencies, largest_latency
 from cmmsim.measurement import lost_measurement
-from cmmsim.sensor_file import Timing, read_sensor_file, sensor_text
+from cmmsim.sensor_file import read_sensor_file, sensor_text
+from cmmsim.sensor_schema import Timing
 from cmmsim.tracking import Tracker
 
 DROPPING = 'name = "ctrack780"\nbased_on = "ctrack780"\nrenderer = "analytic"\n[timing]\ndropout = {}\n'
