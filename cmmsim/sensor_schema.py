@@ -131,7 +131,10 @@ class Lens(_Section):
 
 
 class Detection(_Section):
-    """detector: which one finds the centres of stickers in windows."""
+    """detector: which one finds the centres of stickers in windows when poses are measured.
+
+    Teaching always takes the maximum-likelihood one, whichever is named here; see :mod:`cmmsim.teaching`.
+    """
 
     detector: Literal["maximum_likelihood", "dual_conic", "grey_centroid"] = "maximum_likelihood"
 
