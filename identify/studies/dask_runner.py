@@ -23,7 +23,7 @@ from identify.files.versions import versions
 from identify.studies.batches import Batches
 from identify.studies.computation import Finished, compute
 from identify.studies.design import Case, Setup
-from identify.studies.worker_versions import check_workers, product_version, require_product
+from identify.studies.same_versions import check_workers, product_version, require_product
 
 CONNECT_SECONDS = 5
 """How long a scheduler may take to answer."""

@@ -1,6 +1,7 @@
 """The folder of a study: whose it is, who works on it, and what is done.
 
-``study.json`` is the resolved study, ``rows.jsonl`` its finished rows, ``study.parquet`` the table made of them.
+``study.json`` is the resolved study with the versions of the software that began it, ``rows.jsonl`` its finished rows,
+``study.parquet`` the table made of them.
 """
 
 import fcntl
@@ -13,12 +14,15 @@ from typing import Any
 from cmmsim.sensor_file import read_sensor_file
 from identify.errors import StudyError
 from identify.files.atomic import write_text
+from identify.files.versions import versions
 from identify.studies.design import Setup
 from identify.studies.journal import Journal
+from identify.studies.same_versions import check_folder
 from identify.studies.study_file import Study
 from identify.studies.table import study_in
 
 STUDY, JOURNAL, TABLE, LOCK = "study.json", "rows.jsonl", "study.parquet", ".lock"
+VERSIONS = "versions"
 
 MAY_CHANGE = ("study.title", "study.theory", "study.repeats", "scenario.description")
 """What may change in a study that is continued: it decides no row that is there. Further repeats have rows of their own
@@ -43,7 +47,7 @@ def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Jour
 
     Raises:
         StudyError: the folder is of another study, in use, holds something else or cannot be made; one of its files
-            is damaged.
+            is damaged; rows would be added to those of another version of cmmsim.
     """
     _check_content(folder)
     try:
@@ -56,8 +60,10 @@ def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Jour
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise StudyError(f"study folder {folder} is in use by another process; wait, or name another") from None
-        _claim(folder, entry)
+        begun = _claim(folder, entry)
         with Journal(folder / JOURNAL, rows) as journal:
+            if not journal.finished.all():
+                check_folder(folder, begun)
             yield journal
 
 
@@ -71,18 +77,26 @@ def _check_content(folder: Path) -> None:
             raise StudyError(f"study folder {folder} holds {others[0]} and no {STUDY}; name another with --out")
 
 
-def _claim(folder: Path, entry: dict[str, Any]) -> None:
-    """Make the folder that of a study, or refuse where it is that of another."""
-    for name, found in ((STUDY, _study_file(folder / STUDY)), (TABLE, study_in(folder / TABLE))):
+def _claim(folder: Path, entry: dict[str, Any]) -> dict[str, str]:
+    """Make the folder that of a study, or refuse where it is that of another; versions that began its rows."""
+    here = _study_file(folder / STUDY)
+    stored: dict[str, str] | None = here.pop(VERSIONS, None) if here else None
+    begun = stored if stored and _has_rows(folder) else versions()
+    for name, found in ((STUDY, here), (TABLE, study_in(folder / TABLE))):
         if found is not None and (others := _differences(found, entry)):
             raise StudyError(
                 f"{folder / name} is of another study, which differs in {', '.join(others[:4])}; name another folder "
                 "with --out"
             )
     try:
-        write_text(folder / STUDY, json.dumps(entry, indent=1) + "\n")
+        write_text(folder / STUDY, json.dumps(entry | {VERSIONS: begun}, indent=1) + "\n")
     except OSError as error:
         raise StudyError(f"{folder / STUDY} cannot be written: {error.strerror}") from error
+    return begun
+
+
+def _has_rows(folder: Path) -> bool:
+    return (folder / JOURNAL).exists() and (folder / JOURNAL).stat().st_size > 0
 
 
 def _study_file(path: Path) -> dict[str, Any] | None:

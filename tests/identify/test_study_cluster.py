@@ -21,9 +21,9 @@ from identify.files.versions import versions
 from identify.progress import SilentProgress
 from identify.studies.dask_runner import local_cluster, running_cluster
 from identify.studies.runner import run_study
+from identify.studies.same_versions import OtherVersionsWarning
 from identify.studies.store import JOURNAL
 from identify.studies.study_file import Study
-from identify.studies.worker_versions import OtherVersionsWarning
 from tests.identify.study_rows import KIND
 
 pytestmark = pytest.mark.slow
@@ -186,7 +186,7 @@ def test_other_versions_of_other_packages_are_one_warning(tmp_path, serial):
         outcome = run_study(study(), tmp_path / "a", SilentProgress(), partial(running_cluster, address))
     assert len(caught) == 1
     text = str(caught[0].message)
-    assert re.search(rf"numpy 1.2.3 on tcp://\S+( and 1 more)?, here {np.__version__}; casadi 0.1 on tcp://", text)
+    assert re.search(rf"numpy 1.2.3 \(tcp://\S+( and 1 more)?\), here {np.__version__}; casadi 0.1 \(tcp://", text)
     assert "scipy" not in text
     same_numbers(outcome.frame, serial)
 

@@ -1,4 +1,4 @@
-"""Whether the machines of a cluster run the same software as this one: with another a row may have other figures there.
+"""Whether all rows of a study are computed by the same software, wherever and whenever: with another they may differ.
 
 Another cmmsim is refused, for its rows are those of another simulation. Other versions of what it computes with change
 figures by little, or not at all, and are warned of.
@@ -7,13 +7,14 @@ figures by little, or not at all, and are warned of.
 import warnings
 from collections.abc import Mapping
 from functools import cache
+from pathlib import Path
 
 from identify.errors import StudyError
 from identify.files.versions import versions
 
 
 class OtherVersionsWarning(UserWarning):
-    """Workers compute with other versions of packages than this machine has."""
+    """Some rows are computed with other versions of packages than are installed here."""
 
 
 @cache
@@ -37,8 +38,21 @@ def check_workers(there: Mapping[str, dict[str, str] | Exception]) -> None:
             found[worker] = answer
         elif not isinstance(answer, OSError):
             raise StudyError(f"worker {worker} cannot run cmmsim {product_version()}: {' '.join(str(answer).split())}")
-    if text := _others(versions(), found):
-        warnings.warn(f"figures may differ a little where versions do: {text}", OtherVersionsWarning, stacklevel=2)
+    _warn_of_others(found)
+
+
+def check_folder(folder: Path, begun: dict[str, str]) -> None:
+    """Compare with the versions here those that began a study to which rows are added.
+
+    Raises:
+        StudyError: its rows are of another cmmsim.
+    """
+    if begun["cmmsim"] != product_version():
+        raise StudyError(
+            f"study folder {folder} has rows of cmmsim {begun['cmmsim']}, here is {product_version()}; go on with that "
+            "version, or name another folder with --out"
+        )
+    _warn_of_others({str(folder): begun})
 
 
 def require_product(worker: str, there: str, here: str) -> None:
@@ -47,14 +61,16 @@ def require_product(worker: str, there: str, here: str) -> None:
         raise StudyError(f"worker {worker} has cmmsim {there}, here is {here}; install the same on all machines")
 
 
-def _others(here: Mapping[str, str], there: Mapping[str, Mapping[str, str]]) -> str:
-    """Packages in other versions than here, each with the workers that have it; empty where there are none."""
-    workers: dict[tuple[str, str], list[str]] = {}
-    for worker, theirs in there.items():
+def _warn_of_others(there: Mapping[str, Mapping[str, str]]) -> None:
+    """One warning of all packages with other versions than here, each with the places where it has it."""
+    here, places = versions(), dict[tuple[str, str], list[str]]()
+    for place, theirs in there.items():
         for package, version in theirs.items():
             if version != here.get(package, version):
-                workers.setdefault((package, version), []).append(worker)
-    return "; ".join(
-        f"{package} {version} on {first}{f' and {len(more)} more' if more else ''}, here {here[package]}"
-        for (package, version), (first, *more) in workers.items()
-    )
+                places.setdefault((package, version), []).append(place)
+    if places:
+        text = "; ".join(
+            f"{package} {version} ({first}{f' and {len(more)} more' if more else ''}), here {here[package]}"
+            for (package, version), (first, *more) in places.items()
+        )
+        warnings.warn(f"figures may differ a little where versions do: {text}", OtherVersionsWarning, stacklevel=3)
