@@ -105,9 +105,7 @@ def identify(
         problem.runs, scenario.timing, scenario.filter, problem.guess, problem.anchor
     )
     warmed = time.perf_counter()
-    count = 2 if settings.method == "closed_loop" else 1
-    with progress.stage("identify", count * settings.max_iterations) as advance:
-        searches = output_error_searches(problem, scenario, warm, advance)
+    searches = output_error_searches(problem, scenario, warm, progress)
     searched = time.perf_counter()
     driven, solution = problem.driven_by_commands(), searches[settings.method]
     estimate, final = solution.parameters, problem if settings.method == "closed_loop" else driven

@@ -17,7 +17,7 @@ from identify.estimation.multiple_shooting import MultipleShooting
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.parameter_bounds import InCoordinates, ParameterBounds, parameter_bounds
 from identify.estimation.record_segments import measured_states, segments
-from identify.progress import Advance
+from identify.progress import Advance, Progress
 from identify.scenario import Scenario
 
 CLOSE_ENOUGH = 1e-2
@@ -25,7 +25,7 @@ CLOSE_ENOUGH = 1e-2
 
 
 def output_error_searches(
-    problem: OutputErrorProblem, scenario: Scenario, warm: Array, advance: Advance
+    problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress: Progress
 ) -> dict[str, Solution]:
     """What each search found, in their order, from the warm start (67,); the last is that of the scenario's method.
 
@@ -36,18 +36,15 @@ def output_error_searches(
     driven = problem.driven_by_commands()
     start = runnable_start(driven, scenario, warm)
     if start is None:
-        found["multiple_shooting"] = shoot(driven, scenario, warm)
+        found["multiple_shooting"] = shoot(driven, scenario, warm, progress)
         start = found["multiple_shooting"].parameters
-    found["command_driven"] = search(driven, start, scenario, advance)
-    if scenario.identification.method == "closed_loop":
-        before = found["command_driven"].parameters
-        start = runnable_start(problem, scenario, before)
-        if start is None:
-            raise EstimationError(
-                "the closed loop runs neither with what the command-driven search found nor with the starting guess: "
-                f"{_why(problem, before)}"
-            )
-        found["closed_loop"] = search(problem, start, scenario, advance)
+    settings = scenario.identification
+    closed_loop = settings.method == "closed_loop"
+    with progress.stage("identify", (2 if closed_loop else 1) * settings.max_iterations) as advance:
+        found["command_driven"] = search(driven, start, scenario, advance)
+        if closed_loop:
+            start = _closed_loop_start(problem, scenario, found["command_driven"].parameters)
+            found["closed_loop"] = search(problem, start, scenario, advance)
     return found
 
 
@@ -60,7 +57,7 @@ def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advanc
     return solution
 
 
-def shoot(problem: OutputErrorProblem, scenario: Scenario, warm: Array) -> Solution:
+def shoot(problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress: Progress) -> Solution:
     """Parameters with which the command-driven model runs, by multiple shooting from warm start or starting guess.
 
     Raises:
@@ -74,7 +71,9 @@ def shoot(problem: OutputErrorProblem, scenario: Scenario, warm: Array) -> Solut
         shooting = MultipleShooting(problem, chains, states)
         if not np.isfinite(shooting.cost(start)):
             continue
-        solution = _within_bounds(shooting, problem, start, scenario, criteria, lambda n=1: None)
+        with progress.stage("multiple shooting", settings.max_iterations) as advance:
+            solution = _within_bounds(shooting, problem, start, scenario, criteria, advance)
+            advance(settings.max_iterations - solution.iterations)
         if np.isfinite(problem.cost(solution.parameters)):
             return solution
     raise EstimationError(
@@ -93,6 +92,17 @@ def runnable_start(problem: OutputErrorProblem, scenario: Scenario, warm: Array)
 def bounds_of(problem: OutputErrorProblem, scenario: Scenario) -> ParameterBounds:
     """The bounds of a problem's parameters that the scenario asks for."""
     return parameter_bounds(problem.guess, scenario.identification.physical_consistency)
+
+
+def _closed_loop_start(problem: OutputErrorProblem, scenario: Scenario, driven: Array) -> Array:
+    """The better of what the command-driven search found (67,) and the starting guess, for the closed loop."""
+    start = runnable_start(problem, scenario, driven)
+    if start is None:
+        raise EstimationError(
+            "the closed loop runs neither with what the command-driven search found nor with the starting guess: "
+            f"{_why(problem, driven)}"
+        )
+    return start
 
 
 def _candidates(problem: OutputErrorProblem, scenario: Scenario, warm: Array) -> list[Array]:

@@ -13,6 +13,7 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
 from identify.estimation.warm_start import REWEIGHTINGS, linear_warm_start
 from identify.estimators.evidence import Estimate, Evidence
+from identify.progress import SilentProgress
 
 GAINS = slice(64, 67)
 
@@ -53,7 +54,7 @@ def warm_start_alone(evidence: Evidence) -> Estimate:
 def _searched(evidence: Evidence, problem: OutputErrorProblem, method: str) -> Estimate:
     began = time.perf_counter()
     scenario = evidence.scenario.with_overrides({"identification.method": method})
-    found = output_error_searches(problem, scenario, _warm(evidence, problem), lambda n=1: None).values()
+    found = output_error_searches(problem, scenario, _warm(evidence, problem), SilentProgress()).values()
     seconds = time.perf_counter() - began
     last = list(found)[-1]
     judged = problem if method == "closed_loop" else problem.driven_by_commands()

@@ -1,5 +1,6 @@
 """Multiple shooting: the segments of the right model make up its run, and a model that does not run is brought to."""
 
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 
@@ -13,6 +14,7 @@ from identify.estimation.loop_parameters import StartingGuess
 from identify.estimation.multiple_shooting import MultipleShooting
 from identify.estimation.output_error_search import output_error_searches, runnable_start, search, shoot
 from identify.estimation.record_segments import STATES, end_state, measured_states, segments
+from identify.progress import SilentProgress
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
 
 SMOOTHED = {f"{side}.{key}": value for side in ("plant", "model") for key, value in
@@ -106,6 +108,13 @@ def test_condensing_takes_the_step_of_the_whole_problem():
     assert distance(moved, expected[size:], scale) < 3e-3
 
 
+def with_unstable_guess(problem):
+    """Parameters whose loop is unstable, and the problem that starts from them."""
+    unstable = problem.guess.values.copy()
+    unstable[64:] = [10.0, 24.0, 0.02]
+    return unstable, replace(problem, guess=replace(problem.guess, values=unstable))
+
+
 @pytest.mark.slow
 def test_a_model_that_does_not_run_is_brought_to_the_optimum():
     """No friction and gains far off make an unstable loop: no search can start there, and no warm start is at hand.
@@ -113,14 +122,15 @@ def test_a_model_that_does_not_run_is_brought_to_the_optimum():
     scenario = quick()
     record, _ = run_plant(scenario, seed=1)
     problem = output_error_problem([record], rss6(), scenario)
-    unstable = problem.guess.values.copy()
-    unstable[64:] = [10.0, 24.0, 0.02]
-    problem = replace(problem, guess=replace(problem.guess, values=unstable))
+    unstable, problem = with_unstable_guess(problem)
     driven = problem.driven_by_commands()
     with pytest.raises(DynamicsError, match="unstable"):
         search(driven, unstable, scenario, silent)
     assert runnable_start(driven, scenario, unstable) is None
-    found = output_error_searches(problem, scenario, unstable, silent)
+    progress = Stages()
+    found = output_error_searches(problem, scenario, unstable, progress)
+    assert [name for name, _, _ in progress.seen] == ["multiple shooting", "identify"]
+    assert all(sum(steps) == total for _, total, steps in progress.seen)
     assert list(found) == ["multiple_shooting", "command_driven", "closed_loop"]
     for name, judged in (("command_driven", driven), ("closed_loop", problem)):
         from_truth = search(judged, truth(), scenario, silent)
@@ -133,4 +143,28 @@ def test_a_model_that_no_segment_bears_is_named():
     wild[64:] *= [1e4, 1e4, 1e-4]
     hopeless = replace(problem, guess=replace(problem.guess, values=wild))
     with pytest.raises(EstimationError, match=r"nor does multiple shooting.*frame"):
-        shoot(hopeless, scenario, wild)
+        shoot(hopeless, scenario, wild, SilentProgress())
+
+
+class Stages:
+    """Progress that keeps each stage's name, total and steps, one entry a call of its `advance`."""
+
+    def __init__(self):
+        self.seen = []
+
+    @contextmanager
+    def stage(self, name, total):
+        steps = []
+        self.seen.append((name, total, steps))
+        yield lambda n=1: steps.append(n)
+
+
+def test_the_bar_moves_with_every_iteration_and_ends_full():
+    scenario, problem, _ = recorded(2.0, {"identification.max_iterations": 3})
+    unstable, problem = with_unstable_guess(problem)
+    progress = Stages()
+    found = shoot(problem, scenario, unstable, progress)
+    (name, total, steps), = progress.seen
+    assert (name, total, sum(steps)) == ("multiple shooting", 3, 3)
+    assert found.iterations >= 2
+    assert steps[: found.iterations] == [1] * found.iterations

@@ -19,6 +19,7 @@ from identify.estimation.identification import output_error_problem
 from identify.estimation.loop_parameters import StartingGuess, typical_sizes
 from identify.estimation.output_error_search import output_error_searches, search
 from identify.estimation.warm_start import linear_warm_start
+from identify.progress import SilentProgress
 from identify.scenario import load_scenario
 from tests.identify.synthetic import rss6, run_plant, truth
 
@@ -62,7 +63,7 @@ def test_the_optimum_does_not_depend_on_the_starting_guess(recorded, spread):
     for seed in range(STARTS):
         problem = replace(stated, guess=drawn_guess(spread, seed))
         warm = linear_warm_start(problem.runs, scenario.timing, scenario.filter, problem.guess, problem.anchor)
-        found = output_error_searches(problem, scenario, warm, silent)["closed_loop"]
+        found = output_error_searches(problem, scenario, warm, SilentProgress())["closed_loop"]
         assert "max_iterations" not in found.stop_reason
         from_truth = search(problem, truth(), scenario, silent)
         excess.append(found.costs[-1] - from_truth.costs[-1])
