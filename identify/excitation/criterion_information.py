@@ -1,7 +1,7 @@
 """D-optimality of the output error's information, through the closed loop and with the sensor's covariance.
 
 With J = d(poses)/d(67 parameters) of the simulated closed loop at the starting guess, Sigma the covariance that the
-sensor states, and what is known before (starting guess and scale anchor),
+sensor states, and what is known before (starting guess, the scenario's prior of single parameters, scale anchor),
 
     W = sum over frames J^T Sigma^-1 J + prior,      D = (det(S W S))^(1 / (2 67)),      S = diag(prior deviations).
 
@@ -36,13 +36,14 @@ class Knowledge:
 
 
 def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
-    """The scenario's starting guess, anchor and sensor."""
-    guess = starting_guess(robot, scenario.model.start_parameters, scenario.identification.start_std)
+    """The scenario's starting guess with its prior, anchor and sensor."""
+    settings = scenario.identification
+    guess = starting_guess(robot, scenario.model.start_parameters, settings.start_std, settings.prior)
     prior = np.eye(len(NAMES))
-    anchor = scenario.identification.scale_anchor
+    anchor = settings.scale_anchor
     if anchor in MEASURED_PARAMETER:
         place = index_of(MEASURED_PARAMETER[anchor])
-        std = scenario.identification.anchor_std or DEFAULT_STD[anchor]
+        std = settings.anchor_std or DEFAULT_STD[anchor]
         prior[place, place] += (guess.std[place] / std) ** 2
     covariance = expected_covariance(
         scenario.sensor, robot.home_pose, scenario.pose_method, changes=scenario.sensor_changes

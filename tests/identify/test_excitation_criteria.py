@@ -128,20 +128,27 @@ def test_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
         assert np.linalg.norm(seen - linear) < 0.02 * np.linalg.norm(seen), name
 
 
-def test_information_is_the_determinant_of_rows_and_prior(robot, known):
+@pytest.mark.parametrize("prior", [{}, {"link4.mass": (1.2, 0.01)}], ids=["guess alone", "a link weighed"])
+def test_information_is_the_determinant_of_rows_and_prior(robot, known, prior):
     """By the singular values of whitened sensitivities over prior rows, with another whitening."""
     _, _, trajectory = drawn(robot, 9)
+    values, std = robot.parameter_sets["initial"].vector.copy(), known.guess.std.copy()
+    for name, (value, deviation) in prior.items():
+        values[NAMES.index(name)], std[NAMES.index(name)] = value, deviation
     run = simulate(
-        robot, known.guess.values, reference_motion(trajectory, frame_times(SCENARIO, 10.0)),
-        model_settings(SCENARIO), sensitivities=True,
+        robot, values, reference_motion(trajectory, frame_times(SCENARIO, 10.0)), model_settings(SCENARIO),
+        sensitivities=True,
     )
-    values, vectors = np.linalg.eigh(known.covariance)
-    rows = (np.diag(values**-0.5) @ vectors.T @ run.pose_sensitivity).reshape(-1, 67) * known.guess.std
+    eigenvalues, vectors = np.linalg.eigh(known.covariance)
+    rows = (np.diag(eigenvalues**-0.5) @ vectors.T @ run.pose_sensitivity).reshape(-1, 67) * std
     anchor = np.zeros((1, 67))
-    anchor[0, NAMES.index("platform.mass")] = known.guess.std[NAMES.index("platform.mass")] / 0.005
+    anchor[0, NAMES.index("platform.mass")] = std[NAMES.index("platform.mass")] / 0.005
     singular = np.linalg.svd(np.vstack([rows, np.eye(67), anchor]), compute_uv=False)
     expected = np.mean(np.log(singular))
-    assert log_information(robot, SCENARIO, known, trajectory) == pytest.approx(expected, rel=1e-6)
+    entries = {name: {"value": value, "std": deviation} for name, (value, deviation) in prior.items()}
+    scenario = SCENARIO.with_overrides({"identification.prior": entries})
+    found = log_information(robot, scenario, knowledge(robot, scenario), trajectory)
+    assert found == pytest.approx(expected, rel=1e-6)
 
 
 def test_longer_runs_inform_more(robot, known):
