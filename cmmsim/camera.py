@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from .arguments import finite_array
 from .distortion import Distortion, NDArrayBool
 from .errors import CmmError
 from .pose import Array
@@ -32,6 +33,8 @@ class PinholeCamera:
     distortion: Distortion = field(default_factory=Distortion)
 
     def __post_init__(self) -> None:
+        figures = (self.focal_px, self.centre_x_px, self.centre_y_px, self.width, self.height, self.aspect)
+        finite_array(figures, (6,), "a camera's focal length, principal point, size and aspect are finite numbers")
         if self.focal_px <= 0.0 or self.aspect <= 0.0 or self.width < 1 or self.height < 1:
             raise CmmError(f"camera needs a positive focal length, aspect and size, got {self}")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from .arguments import finite_array, require_kind
 from .blob_search import find_ellipses
 from .consistency import consistent
 from .errors import LostError, ShapeError, UnknownOptionError
@@ -14,7 +15,7 @@ from .matching import candidate_pairs
 from .measurement import Measurement, lost_measurement
 from .noise import CameraNoise
 from .observation import DetectionSettings, StickerObservation, observe
-from .pose import Array, compose_covariance, finite_array, pose_covariance, transform_to_pose
+from .pose import Array, compose_covariance, pose_covariance, transform_to_pose
 from .pose_methods import METHODS, Solution, by_planes
 from .stereo_rig import StereoRig
 from .taught import Taught
@@ -75,8 +76,11 @@ def measure_frame(frame: StereoFrame, estimator: PoseEstimator, expected: Array 
     """Measure a stereo frame from any source.
 
     ``expected`` (4,4) is a rough camera_from_platform; without it the stickers are searched in the whole images.
-    Raises ShapeError for images of another size or bit depth than the estimator's cameras have.
+    Raises ShapeError for images of another size or bit depth than the estimator's cameras have, and CmmError for
+    what is no frame or no estimator.
     """
+    require_kind(frame, StereoFrame, "a frame must be a StereoFrame(left, right)")
+    require_kind(estimator, PoseEstimator, "an estimator must be a PoseEstimator, such as sensor.estimator")
     for name, image, camera in zip(("left", "right"), (frame.left, frame.right), estimator.rig.cameras, strict=True):
         if image.shape != (camera.height, camera.width):
             raise ShapeError(f"the {name} image is {image.shape[1]} x {image.shape[0]} px, but its camera has "

@@ -18,6 +18,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from .arguments import require_kind
 from .errors import UnknownOptionError
 from .estimator import PoseEstimator
 from .fault_marks import DiscMark, FillMark, GlintMark, PlateMark
@@ -40,6 +41,7 @@ class FaultGenerator:
     """Draws faults where an estimator's stickers are; ``kinds`` are the names."""
 
     def __init__(self, estimator: PoseEstimator) -> None:
+        require_kind(estimator, PoseEstimator, "an estimator must be a PoseEstimator, such as sensor.estimator")
         self._rig, self._platform, self._taught = estimator.rig, estimator.platform, estimator.taught
         self._radius = estimator.settings.radius
         self._drawn: dict[str, Callable[[Array, np.random.Generator], Fault]] = {
@@ -60,7 +62,7 @@ class FaultGenerator:
 
     def draw(self, kind: str, pose: Array, rng: np.random.Generator) -> Fault:
         """A fault of that kind for the platform at a pose (6,). Raises UnknownOptionError with the valid kinds."""
-        if kind not in self._drawn:
+        if kind not in self.kinds:
             raise UnknownOptionError("fault", kind, self.kinds)
         return self._drawn[kind](np.asarray(pose, dtype=float), rng)
 

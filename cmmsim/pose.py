@@ -11,31 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import ShapeError
+from .arguments import finite_array
 
 Array = NDArray[np.float64]
-SHOWN_CHARACTERS = 120  # of what is refused
-
-
-def finite_array(values: ArrayLike, shape: tuple[int, ...], wanted: str) -> Array:
-    """Values as an array of that shape. Raises ShapeError, which says what is ``wanted``, for anything else than
-    finite real numbers."""
-    try:
-        found = np.asarray(values)
-        numbers = found.astype(float) if found.dtype.kind in "fiubO" else None
-    except (TypeError, ValueError, OverflowError):  # ragged, or objects that are no numbers
-        numbers = None
-    if numbers is None:
-        raise ShapeError(f"{wanted}, got {_shown(values)}")
-    if numbers.shape != shape or not np.isfinite(numbers).all():
-        raise ShapeError(f"{wanted}, got shape {numbers.shape}: {_shown(numbers)}")
-    return numbers
-
-
-def _shown(values: object) -> str:
-    """Values on one line, cut where they are many."""
-    text = " ".join(str(values).split())
-    return text if len(text) <= SHOWN_CHARACTERS else f"{text[:SHOWN_CHARACTERS - 3]}..."
 
 
 def checked_pose(pose: ArrayLike) -> Array:
@@ -57,13 +35,15 @@ def pose_to_transform(pose: ArrayLike) -> Array:
     return transform
 
 
-def transform_to_pose(transform: Array) -> Array:
-    """Pose (6,) of a transform (4,4); beta lies in [-pi/2, pi/2]."""
-    r = transform[:3, :3]
+def transform_to_pose(transform: ArrayLike) -> Array:
+    """Pose (6,) of a transform (4,4); beta lies in [-pi/2, pi/2]. Raises ShapeError when it is not 4x4 finite numbers.
+    """
+    values = finite_array(transform, (4, 4), "a transform must be (4,4) and finite")
+    r = values[:3, :3]
     alpha = np.arctan2(-r[1, 2], r[2, 2])
     beta = np.arctan2(r[0, 2], np.hypot(r[1, 2], r[2, 2]))
     gamma = np.arctan2(-r[0, 1], r[0, 0])
-    return np.array([*transform[:3, 3], alpha, beta, gamma])
+    return np.array([*values[:3, 3], alpha, beta, gamma])
 
 
 def invert(transform: Array) -> Array:

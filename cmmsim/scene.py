@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import HalfspaceIntersection, QhullError
 
-from .errors import SensorFileError
+from .arguments import finite_array
+from .errors import CmmError, SensorFileError
 from .marked_body import MarkedBody
 from .plane_frame import PLANE_NAMES
 from .pose import Array
@@ -95,19 +96,26 @@ def solid_mesh(mesh: trimesh.Trimesh, level: float) -> Mesh:
 
 
 def rod(length: float, radius: float) -> trimesh.Trimesh:
-    """A cylinder from the origin to (0, 0, length), m: a crank or a link between two points."""
+    """A cylinder from the origin to (0, 0, length), m: a crank or a link between two points.
+
+    Raises ShapeError where length or radius is no finite number, CmmError where it is not above zero.
+    """
+    sizes = finite_array((length, radius), (2,), "length and radius of a rod are two finite numbers, m")
+    if sizes.min() <= 0.0:
+        raise CmmError(f"length and radius of a rod must be above 0 m, got {length:g} and {radius:g}")
     mesh = trimesh.creation.cylinder(radius=radius, height=length, sections=24)
     mesh.apply_translation([0.0, 0.0, 0.5 * length])
     return mesh
 
 
-def rod_transform(start: Array, end: Array) -> Array:
-    """base_from_body (4,4) of a rod that begins at ``start`` (3,) and points to ``end`` (3,), m."""
-    z = unit(np.asarray(end, dtype=float) - np.asarray(start, dtype=float))
+def rod_transform(start: ArrayLike, end: ArrayLike) -> Array:
+    """base_from_body (4,4) of a rod that begins at ``start`` (3,) and points to ``end`` (3,), m. Raises ShapeError."""
+    begin = finite_array(start, (3,), "the start of a rod is three finite numbers, m")
+    z = unit(finite_array(end, (3,), "the end of a rod is three finite numbers, m") - begin)
     x = unit(np.cross(z, np.eye(3)[np.argmin(np.abs(z))]))
     transform = np.eye(4)
     transform[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    transform[:3, 3] = start
+    transform[:3, 3] = begin
     return transform
 
 

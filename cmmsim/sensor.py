@@ -13,6 +13,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
+from .arguments import finite_array, require_kind
 from .blob_search import SMALLEST_STEP
 from .ellipse_fit import FitLimits
 from .errors import CmmError, UnknownBodyError, UnknownOptionError
@@ -24,7 +25,7 @@ from .measurement import Measurement, lost_measurement
 from .noise import CameraNoise
 from .observation import DetectionSettings
 from .optics import Optics
-from .pose import Array, checked_pose, finite_array, pose_to_transform
+from .pose import Array, checked_pose, pose_to_transform
 from .pose_methods import METHODS
 from .renderers import RENDERER_NAMES, Renderer, choose_renderer
 from .rig_from_file import rig_from_file
@@ -51,10 +52,13 @@ class Sensor:
 
     def __init__(self, file: SensorFile, seed: int = 0, method: str = "registration", taught: Taught | None = None,
                  progress: Progress | None = None, renderer: str | None = None) -> None:
+        require_kind(file, SensorFile, "a sensor is made of a SensorFile; load_sensor takes a name or a path")
         if method not in METHODS:
             raise UnknownOptionError("method", method, METHODS)
         if renderer is not None and renderer not in RENDERER_NAMES:
             raise UnknownOptionError("renderer", renderer, RENDERER_NAMES)
+        if progress is not None and not callable(progress):
+            raise CmmError(f"progress must be a function of the steps done and their number, got {progress!r}")
         self._file, self._seed, self._progress = file, _checked_seed(seed), progress
         self.method = method
         self.rig, self._camera_from_base = rig_from_file(file.rig)
@@ -64,6 +68,7 @@ class Sensor:
         self.optics = Optics(**file.lens.model_dump())
         self.platform, self.base = marked_body("platform", file.platform), marked_body("base", file.base)
         if taught is not None:
+            require_kind(taught, Taught, "taught must be what another sensor's teach() returned")
             require_taught_for(taught, file, len(self.platform.nominal))
         self._scene = [scene_body(body, section, file.stickers, stream) for stream, (body, section)
                        in enumerate(((self.platform, file.platform), (self.base, file.base)))]
@@ -152,7 +157,14 @@ class Sensor:
             self._tracker.forget()
 
     def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
-        """Register further rigid bodies (meshes in m) that may hide stickers; drawn where ``obstacles`` says."""
+        """Register further rigid bodies (meshes in m) that may hide stickers; drawn where ``obstacles`` says.
+
+        Raises CmmError for anything but meshes by name.
+        """
+        require_kind(meshes, Mapping, "bodies must be meshes by name, as {'link': rod(0.3, 0.01)}")
+        for name, mesh in meshes.items():
+            require_kind(name, str, "the name of a body must be text")
+            require_kind(mesh, trimesh.Trimesh, f"body {name!r} must be a trimesh.Trimesh")
         level = self._file.stickers.obstacle_level / 255.0
         self._obstacles.update({name: solid_mesh(mesh, level) for name, mesh in meshes.items()})
         self._build_again()
@@ -174,7 +186,8 @@ class Sensor:
 
         Parameters: pose (6,) of the platform in the middle of the exposure; obstacles: name -> base_from_body (4,4),
         they stand still; pose_rate (6,), m/s and rad/s: the time derivative of the pose, which blurs the image when
-        the sensor's exposure is not zero. Raises ShapeError, UnknownBodyError, and CmmError for too long a blur.
+        the sensor's exposure is not zero. Raises ShapeError, UnknownBodyError, and CmmError for too long a blur or for
+        obstacles that are no transforms by name.
         """
         return self._camera.look(*self._checked(pose, obstacles), pose_rate=_checked_rate(pose_rate))
 
@@ -223,8 +236,10 @@ class Sensor:
     def _checked(self, pose: ArrayLike,
                  obstacles: Mapping[str, Array] | None) -> tuple[Array, np.random.Generator, Mapping[str, Array]]:
         checked = checked_pose(pose)
-        placed = {}
-        for name, place in (obstacles or {}).items():
+        placed: dict[str, Array] = {}
+        obstacles = {} if obstacles is None else obstacles
+        require_kind(obstacles, Mapping, "obstacles must be transforms by name, as {'link': base_from_body}, or None")
+        for name, place in obstacles.items():
             if name not in self._obstacles:
                 raise UnknownBodyError(name, self._obstacles)
             placed[name] = finite_array(place, (4, 4), f"obstacle {name!r}: base_from_body must be (4,4) and finite")

@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from copy import deepcopy
 from functools import lru_cache
 from importlib import resources
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
+from .arguments import require_kind
 from .errors import SensorFileError, UnknownSensorError
 from .sensor_changes import change, require_keys
 from .sensor_schema import SensorFile
@@ -27,8 +29,10 @@ def built_in_names() -> list[str]:
 def sensor_text(name: str | Path) -> str:
     """Text of the sensor file of a built-in name or a path.
 
-    Raises UnknownSensorError for a name that is neither, SensorFileError for a file that cannot be read.
+    Raises UnknownSensorError for a name that is neither, SensorFileError for a file that cannot be read, and CmmError
+    for what is neither text nor a path.
     """
+    require_kind(name, (str, PathLike), "a sensor must be a built-in name or the path of a TOML file")
     if str(name) in built_in_names():
         return resources.files(__package__).joinpath("sensors", f"{name}.toml").read_text(encoding="utf-8")
     try:

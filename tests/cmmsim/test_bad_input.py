@@ -10,6 +10,7 @@ from cmmsim.scene import rod, rod_transform
 from cmmsim.sensor_file import read_sensor_file, sensor_text
 
 TEXT = sensor_text("ctrack780")
+DARK = cmmsim.StereoFrame(*np.zeros((2, 1536, 2048), dtype=np.uint8))
 
 
 def write(tmp_path, text):
@@ -123,6 +124,40 @@ def test_bad_seed(seed):
 def test_what_is_no_pose(pose):
     with pytest.raises(cmmsim.ShapeError, match="six finite numbers") as error:
         cmmsim.pose_to_transform(pose)
+    one_line(error)
+
+
+@pytest.mark.parametrize(("call", "message"), [
+    (lambda s: cmmsim.load_sensor(None), "a sensor must be .* name or the path .*, got None of type NoneType"),
+    (lambda s: cmmsim.load_sensor(b"ctrack780"), "got b'ctrack780' of type bytes"),
+    (lambda s: cmmsim.load_sensor("ctrack780", taught=3), "taught must be what .*, got 3 of type int"),
+    (lambda s: cmmsim.load_sensor("ctrack780", progress=3), "progress must be a function .*, got 3"),
+    (lambda s: cmmsim.load_sensor("ctrack780", method=[]), r"unknown method \[\]: valid are planes, registration"),
+    (lambda s: cmmsim.Sensor("ctrack780"), "made of a SensorFile; .*, got ctrack780 of type str"),
+    (lambda s: s.look(s.home, 3), "obstacles must be transforms by name.*, got 3 of type int"),
+    (lambda s: s.measure(s.home, [np.eye(4)]), r"obstacles must be .*, got \[array.* of type list"),
+    (lambda s: s.capture(s.home, 0), "obstacles must be .*, got 0 of type int"),
+    (lambda s: s.add_bodies(None), "bodies must be meshes by name.*, got None of type NoneType"),
+    (lambda s: s.add_bodies({"rod": 3}), "body 'rod' must be a trimesh.Trimesh, got 3 of type int"),
+    (lambda s: s.add_bodies({3: rod(0.1, 0.01)}), "the name of a body must be text, got 3 of type int"),
+    (lambda s: cmmsim.measure_frame(None, s.estimator), "a frame must be a StereoFrame.*, got None"),
+    (lambda s: cmmsim.measure_frame(DARK, s), "an estimator must be a PoseEstimator.* of type Sensor"),
+    (lambda s: cmmsim.FaultGenerator(s), "an estimator must be a PoseEstimator.* of type Sensor"),
+    (lambda s: cmmsim.FaultGenerator(s.estimator).draw([], s.home, None), r"unknown fault \[\]: valid are black"),
+    (lambda s: cmmsim.transform_to_pose(np.eye(3)), r"a transform must be \(4,4\) and finite, got shape \(3, 3\)"),
+    (lambda s: cmmsim.transform_to_pose("home"), r"a transform must be \(4,4\) and finite, got home"),
+    (lambda s: cmmsim.transform_to_pose(np.full((4, 4), np.nan)), "a transform must be"),
+    (lambda s: rod("long", 0.01), r"length and radius of a rod are two finite numbers, m, got \('long', 0.01\)"),
+    (lambda s: rod(0.1, -0.01), "length and radius of a rod must be above 0 m, got 0.1 and -0.01"),
+    (lambda s: rod_transform(None, np.ones(3)), "the start of a rod is three finite numbers"),
+    (lambda s: rod_transform(np.zeros(3), np.ones(2)), r"end of a rod is three finite numbers, m, got shape \(2,\)"),
+    (lambda s: cmmsim.PinholeCamera("wide", 9.0, 9.0, 20, 20), "a camera's focal length, .* are finite numbers"),
+    (lambda s: cmmsim.PinholeCamera(np.nan, 9.0, 9.0, 20, 20), "a camera's focal length, .* are finite numbers"),
+])
+def test_arguments_of_the_wrong_kind(exact, call, message):
+    """One line with what was got, where Python would complain of an attribute or an index somewhere inside."""
+    with pytest.raises(cmmsim.CmmError, match=message) as error:
+        call(exact)
     one_line(error)
 
 
