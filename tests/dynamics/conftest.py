@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +18,22 @@ BOX = np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])
 @pytest.fixture(scope="session")
 def robot() -> dynamics.Robot:
     return dynamics.load_robot("rss6")
+
+
+@pytest.fixture
+def load_changed(tmp_path: Path) -> Callable[[dict[str, str]], dynamics.Robot]:
+    """The robot of rss6.toml with passages of the file replaced."""
+
+    def changed(replacements: dict[str, str]) -> dynamics.Robot:
+        text = (resources.files("dynamics") / "robots" / "rss6.toml").read_text(encoding="utf-8")
+        for old, new in replacements.items():
+            assert old in text
+            text = text.replace(old, new, 1)
+        path = tmp_path / "changed.toml"
+        path.write_text(text, encoding="utf-8")
+        return dynamics.load_robot(path)
+
+    return changed
 
 
 @pytest.fixture(scope="session")
