@@ -27,7 +27,7 @@ def check(path: str, values: list[Any], options: type[BaseModel] | None) -> None
     """
     if options is None and path.startswith("options."):
         return
-    known = _keys(options)
+    known = valid_keys(options)
     if path not in known:
         raise StudyError(f"unknown key {path!r}; the nearest are {', '.join(_nearest(path, known))}")
     field = known[path]
@@ -44,7 +44,7 @@ def check(path: str, values: list[Any], options: type[BaseModel] | None) -> None
 
 def is_integer(path: str, options: type[BaseModel] | None) -> bool:
     """Whether the values of a path are integers."""
-    field = _keys(options).get(path)
+    field = valid_keys(options).get(path)
     return field is not None and field.annotation is int
 
 
@@ -69,7 +69,8 @@ _FINITE = ConfigDict(allow_inf_nan=False)
 
 
 @lru_cache(maxsize=8)
-def _keys(options: type[BaseModel] | None) -> dict[str, FieldInfo]:
+def valid_keys(options: type[BaseModel] | None) -> dict[str, FieldInfo]:
+    """Every dotted path that a study may vary, with its field; `options`: as in :func:`check`."""
     found = _leaves(Scenario, "scenario.") | _leaves(SensorFile, "sensor.")
     for path in (f"scenario.{SENSOR_CHANGES}", "sensor.based_on"):
         del found[path]

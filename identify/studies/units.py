@@ -6,13 +6,16 @@ from identify.studies.rows import columns
 
 SENSOR_UNITS = {
     "rig.baseline": "m", "rig.distance": "m", "rig.focal_px": "px", "rig.width": "px", "rig.height": "px",
-    "rig.position": "m", "rig.target": "m", "stickers.radius": "m", "stickers.ring_radius": "m",
+    "rig.position": "m", "rig.target": "m", "rig.left.focal_px": "px", "rig.left.centre_px": "px",
+    "rig.right.focal_px": "px", "rig.right.centre_px": "px", "rig.right_from_left.translation": "m",
+    "rig.right_from_left.rotation_vector": "rad", "stickers.radius": "m", "stickers.ring_radius": "m",
+    "stickers.placement": "m",
     "camera.dark_noise": "electrons", "camera.electrons_at_white": "electrons", "camera.full_well": "electrons",
     "camera.gain": "grey values per electron", "camera.black_level": "grey values", "camera.dsnu": "electrons",
     "camera.bit_depth": "bit", "lens.psf_px": "px", "timing.frame_rate": "Hz", "timing.exposure": "s",
     "timing.latency": "s", "timing.latency_jitter": "s",
 }
-"""Units of the sensor file's keys that have one."""
+"""Units of the sensor file's keys that have one, but for the shapes of the bodies."""
 
 
 def factor_unit(path: str) -> str:

@@ -5,7 +5,9 @@ import pytest
 
 from identify.errors import StudyError
 from identify.studies.design import Design, prepare
+from identify.studies.keys import valid_keys
 from identify.studies.study_file import Study, load_study, study_from_toml, study_names
+from identify.studies.units import SENSOR_UNITS
 from tests.identify.study_rows import KIND
 
 FACTORS = {"sensor.camera.dark_noise": [13.0, 26.0], "scenario.pose_method": ["registration", "planes"]}
@@ -98,6 +100,17 @@ def test_a_sample_is_spread_as_its_factors_say():
     assert np.mean(method == "planes") == pytest.approx(0.5, abs=0.05)
     assert np.corrcoef(baseline, dark)[0, 1] == pytest.approx(0.0, abs=0.1)
     assert cases(study(factors=factors, sample=50)) == cases(chosen)[:50]
+
+
+def test_every_key_of_a_sensor_has_its_unit_or_needs_none():
+    """So that a new key is not drawn without its unit, and no unit stands for a key that is gone."""
+    without = {"timing.dropout", "camera.noise", "camera.prnu", "camera.pattern_seed", "lens.vignetting",
+               "stickers.placement_seed", "stickers.per_plane", "rig.left.distortion", "rig.right.distortion",
+               *(f"stickers.{what}_level" for what in ("sticker", "ring", "body", "obstacle", "background"))}
+    sections = ("timing", "rig", "camera", "lens", "stickers")
+    keys = {path.removeprefix("sensor.") for path in valid_keys(None) if path.startswith("sensor.")}
+    assert {key for key in keys if key.partition(".")[0] in sections} == {*SENSOR_UNITS} | without
+    assert all(SENSOR_UNITS[key] == "px" for key in SENSOR_UNITS if key.endswith("_px"))
 
 
 def test_built_in_studies_can_all_be_run():
