@@ -27,6 +27,9 @@ NOISE_DECIDES = 3.0
 """Mean squared whitened residual beyond which the model's error, not the noise, decides: noise is not propagated then,
 and the covariance is that of white residuals of the size found."""
 
+MISFIT_STDS = 5.0
+"""Standard deviations from the expected residual beyond which a warning is given."""
+
 FEWEST = 50
 """Repetitions that must have run to their end."""
 
@@ -45,6 +48,23 @@ class Uncertainty:
     expected_noise_ratio: float
     noise_ratio_std: float
     unstable: int = 0
+
+    def warnings(self) -> tuple[str, ...]:
+        """A misfit that the sensor's noise does not explain (a local minimum, or a model that is wrong), and a model
+        whose loop is close to unstable."""
+        said = []
+        if abs(self.noise_ratio - self.expected_noise_ratio) > MISFIT_STDS * self.noise_ratio_std:
+            said.append(
+                f"the model misses the record by {self.noise_ratio:.3f} times the noise variance, noise alone gives "
+                f"{self.expected_noise_ratio:.3f} ± {self.noise_ratio_std:.3f}: the model or the stated covariance is "
+                "wrong, and the intervals are too"
+            )
+        if self.unstable:
+            said.append(
+                f"{self.unstable} of {DRAWS} repeated experiments on the identified model were unstable and are left "
+                "out of the intervals"
+            )
+        return tuple(said)
 
 
 def estimate_uncertainty(

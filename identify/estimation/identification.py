@@ -23,7 +23,7 @@ from identify.estimation.base_parameters import (
     reference_regressor,
     structural_regressor,
 )
-from identify.estimation.bounded_intervals import BoundedEstimate, bounded_estimate
+from identify.estimation.bounded_intervals import bounded_estimate
 from identify.estimation.bounded_least_squares import Solution
 from identify.estimation.conditioning import Conditioning, conditioning
 from identify.estimation.estimate_covariance import DRAWS, Uncertainty, estimate_uncertainty
@@ -33,13 +33,9 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import bounds_of, output_error_searches
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor
 from identify.estimation.whiteness import LAGS, Whiteness, whiteness
-from identify.files.dataset import POSE
 from identify.progress import Progress, SilentProgress
 from identify.record.recorded_run import recorded_run
 from identify.scenario import Scenario
-
-MISFIT_STDS = 5.0
-"""Standard deviations from the expected residual beyond which a warning is given."""
 
 UNCERTAINTY_STREAM = 5
 """Random stream of the repeated experiments, beside those of the experiment."""
@@ -97,41 +93,23 @@ def identify(
         EstimationError: too many lost frames, or no model that runs from the starting guess or the warm start.
     """
     progress = progress or SilentProgress()
-    settings = scenario.identification
     records = [record] if isinstance(record, xr.Dataset) else list(record)
     problem = output_error_problem(records, robot, scenario)
     began = time.perf_counter()
-    warm = warm_start.linear_warm_start(
-        problem.runs, scenario.timing, scenario.filter, problem.guess, problem.anchor
-    )
+    warm = warm_start.linear_warm_start(problem.runs, scenario.timing, scenario.filter, problem.guess, problem.anchor)
     warmed = time.perf_counter()
     searches = output_error_searches(problem, scenario, warm, progress)
     searched = time.perf_counter()
-    driven, solution = problem.driven_by_commands(), searches[settings.method]
-    estimate, final = solution.parameters, problem if settings.method == "closed_loop" else driven
+    method, driven = scenario.identification.method, problem.driven_by_commands()
     seed = int(records[0].attrs.get("seed", 0))  # a record of a real robot has none
     rng = np.random.default_rng([seed, UNCERTAINTY_STREAM])
     with progress.stage("uncertainty", DRAWS) as advance:
-        uncertainty = estimate_uncertainty(final, estimate, rng, advance)
+        judged = problem if method == "closed_loop" else driven
+        uncertainty = estimate_uncertainty(judged, searches[method].parameters, rng, advance)
     tested = _whiteness(driven, searches["command_driven"].parameters)
     ended = time.perf_counter()
     seconds = {"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched}
-    rate_hz = scenario.timing.frame_rate_hz
-    excited = np.concatenate([reference_regressor(robot, run.reference, rate_hz) for run in problem.runs])
-    rank = rank_by_threshold(excited, settings.qr_threshold)
-    base = base_parameters(structural_regressor(robot))
-    groups = group_estimates(base, problem.guess, estimate, uncertainty.covariance)
-    known = final.known_information()
-    conditioned = conditioning(uncertainty.information, known, base, problem.guess, estimate)
-    bounded = bounded_estimate(
-        estimate,
-        solution.at_bound,
-        uncertainty.gradient,
-        uncertainty.information + known,
-        uncertainty.covariance,
-        bounds_of(problem, scenario),
-    )
-    return _result(final, warm, searches, bounded, uncertainty, groups, conditioned, tested, rank, seconds)
+    return _result(problem, scenario, warm, searches, uncertainty, tested, seconds)
 
 
 def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario) -> OutputErrorProblem:
@@ -168,33 +146,42 @@ def _whiteness(driven: OutputErrorProblem, parameters: Array) -> Whiteness:
 
 def _result(
     problem: OutputErrorProblem,
+    scenario: Scenario,
     warm: Array,
     searches: dict[str, Solution],
-    bounded: BoundedEstimate,
     uncertainty: Uncertainty,
-    groups: GroupEstimates,
-    conditioned: Conditioning,
     tested: Whiteness,
-    rank: int,
     seconds: dict[str, float],
 ) -> IdentificationResult:
-    solution = list(searches.values())[-1]
+    """What the searches and their uncertainty say of parameters and groups."""
+    robot, guess, solution = problem.runs[0].robot, problem.guess, searches[scenario.identification.method]
+    base, known = base_parameters(structural_regressor(robot)), problem.known_information()
     std = np.sqrt(np.diag(uncertainty.covariance))
-    said = tuple(warning for run in problem.runs for warning in run.warnings())
+    groups = group_estimates(base, guess, solution.parameters, uncertainty.covariance)
+    conditioned = conditioning(uncertainty.information, known, base, guess, solution.parameters)
+    bounded = bounded_estimate(
+        solution.parameters,
+        solution.at_bound,
+        uncertainty.gradient,
+        uncertainty.information + known,
+        uncertainty.covariance,
+        bounds_of(problem, scenario),
+    )
+    of_the_records = (warning for run in problem.runs for warning in run.warnings())
     return IdentificationResult(
         names=NAMES,
-        initial=problem.guess.values,
+        initial=guess.values,
         warm_start=warm,
         estimate=solution.parameters,
         std=std,
         covariance=uncertainty.covariance,
         intervals=bounded.intervals(np.eye(len(NAMES))),
-        identifiable=std < IDENTIFIABLE_SHARE * problem.guess.std,
+        identifiable=std < IDENTIFIABLE_SHARE * guess.std,
         groups=groups,
         group_intervals=bounded.intervals(np.pad(groups.combinations, ((0, 0), (0, len(JOINT_PID_NAMES))))),
         conditioning=conditioned,
         scale_anchor=problem.anchor,
-        base_rank=rank,
+        base_rank=_excited_rank(problem, scenario),
         iterations=sum(one.iterations for one in searches.values()),
         evaluations=sum(one.evaluations for one in searches.values()),
         stop_reason=solution.stop_reason,
@@ -204,32 +191,19 @@ def _result(
         noise_ratio=uncertainty.noise_ratio,
         expected_noise_ratio=uncertainty.expected_noise_ratio,
         whiteness=tested,
-        warnings=said + _warnings(uncertainty, tested) + bounded.warnings() + conditioned.warnings(),
+        warnings=(
+            *of_the_records,
+            *uncertainty.warnings(),
+            *tested.warnings(),
+            *bounded.warnings(),
+            *conditioned.warnings(),
+        ),
         seconds=seconds,
     )
 
 
-def _warnings(uncertainty: Uncertainty, tested: Whiteness) -> tuple[str, ...]:
-    """A misfit that the sensor's noise does not explain (a local minimum, or a model that is wrong), or a model whose
-    loop is close to unstable."""
-    said = []
-    noise_ratio, expected = uncertainty.noise_ratio, uncertainty.expected_noise_ratio
-    spread = uncertainty.noise_ratio_std
-    if abs(noise_ratio - expected) > MISFIT_STDS * spread:
-        said.append(
-            f"the model misses the record by {noise_ratio:.3f} times the noise variance, noise alone gives "
-            f"{expected:.3f} ± {spread:.3f}: the model or the stated covariance is wrong, and the intervals are too"
-        )
-    if uncertainty.unstable:
-        said.append(
-            f"{uncertainty.unstable} of {DRAWS} repeated experiments on the identified model were unstable and are "
-            "left out of the intervals"
-        )
-    if tested.suspicious:
-        parts = ", ".join(f"{name} {p:.1g}" for name, p in zip(POSE, tested.p_values, strict=True))
-        said.append(
-            "the residuals of the model driven by the logged commands are not white (probability "
-            f"{tested.p_value:.1g}, by component {parts}): the model is wrong"
-        )
-    return tuple(said)
-
+def _excited_rank(problem: OutputErrorProblem, scenario: Scenario) -> int:
+    """Independent groups that the records' references excite, by the paper's rule."""
+    rate_hz = scenario.timing.frame_rate_hz
+    excited = [reference_regressor(run.robot, run.reference, rate_hz) for run in problem.runs]
+    return rank_by_threshold(np.concatenate(excited), scenario.identification.qr_threshold)

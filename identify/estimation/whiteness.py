@@ -15,6 +15,7 @@ from scipy.stats import chi2
 
 from identify.arrays import Array
 from identify.errors import EstimationError
+from identify.files.dataset import POSE
 
 LAGS = 10
 """Lags tested, in frames."""
@@ -36,6 +37,16 @@ class Whiteness:
     def suspicious(self) -> bool:
         """Whether chance does not explain the correlations."""
         return self.p_value < SUSPICIOUS
+
+    def warnings(self) -> tuple[str, ...]:
+        """One line where chance does not explain the correlations."""
+        if not self.suspicious:
+            return ()
+        parts = ", ".join(f"{name} {p:.1g}" for name, p in zip(POSE, self.p_values, strict=True))
+        return (
+            "the residuals of the model driven by the logged commands are not white (probability "
+            f"{self.p_value:.1g}, by component {parts}): the model is wrong",
+        )
 
 
 def whiteness(residuals: Array, ok: NDArray[np.bool_], lags: int = LAGS) -> Whiteness:
