@@ -5,6 +5,7 @@ import pytest
 
 from dynamics.closed_loop import equilibrium, simulate
 from identify.errors import EstimationError, RecordError
+from identify.estimation.estimate_covariance import estimate_uncertainty
 from identify.estimation.identification import identify, output_error_problem
 from identify.estimation.loop_parameters import NAMES, starting_guess
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor, store_anchor
@@ -176,6 +177,20 @@ def test_sensitivities_in_the_residuals_match_finite_differences(scenario):
         difference = problem.model_poses(truth() + step) - problem.model_poses(truth() - step)
         expected = problem.whiten(difference) / (2 * step[index])
         assert np.abs(jacobian[:, :, index] - expected).max() < 2e-3 * np.abs(expected).max(), name
+
+
+def test_the_gradient_of_the_whole_cost_matches_finite_differences(scenario):
+    """Of poses, starting guess and anchor together, off the optimum."""
+    record, _ = run_plant(scenario, seed=1)
+    problem = output_error_problem([record], rss6(), scenario).driven_by_commands()
+    at = 1.01 * truth()
+    gradient = estimate_uncertainty(problem, at, np.random.default_rng(0)).gradient
+    for name in ("platform.mass", "platform.Ixx", "joint2.viscous", "joint_pid.ld"):
+        index = NAMES.index(name)
+        step = np.zeros(67)
+        step[index] = 1e-4 * truth()[index]
+        slope = (problem.cost(at + step) - problem.cost(at - step)) / (2 * step[index])
+        assert 2 * gradient[index] == pytest.approx(slope, rel=5e-3), name
 
 
 def test_records_that_do_not_fit_are_refused(scenario):
