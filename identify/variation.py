@@ -4,16 +4,23 @@ The robot is identified from each of several runs alone. The paper gives its "va
 the standard deviation of a parameter's estimates in per cent of their mean. Judged are the parameters that every run
 identifies. Beside it stands what each run's own interval makes one expect. All runs share one weighing of the platform
 and one teaching of the sensor, as in the paper: what is wrong with these does not vary.
+
+What varies most are the masses of the links of `rss6`, which accelerations show. By the information of designed runs
+at the true parameters (noise in the servo left out), the worst is known to 4.6, 3.5 and 3.1 % from 20, 40 and 60 s at
+the paper's fundamental of 0.1 Hz, and to 2.4 % from 20 s at 0.3 Hz: faster is worth more than longer.
 """
 
+import multiprocessing
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from dynamics import Robot
+from dynamics import Robot, load_robot
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.identification import IdentificationResult, identify
@@ -101,13 +108,19 @@ def designed_runs(
     As long as the exciting run, by the scenario's method; workers as in `run_unseen`. Raises as the stages `excite` and
     `record` do.
     """
-    trajectories: list[FourierTrajectory] = []
     own = stream_seed(seed, DESIGN_STREAM)
-    with progress.stage("design the runs", count) as advance:
-        for number in range(count):
-            designed = design_trajectories(robot, scenario, stream_seed(own, number), SilentProgress())
-            trajectories.append(designed.excitation)
+    seeds, trajectories = [stream_seed(own, number) for number in range(count)], []
+    with (
+        progress.stage("design the runs", count) as advance,
+        ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool,
+    ):
+        for trajectory in pool.map(partial(_designed, scenario), seeds):
+            trajectories.append(trajectory)
             advance()
     lasting = scenario.with_overrides({"validation.duration_s": scenario.excitation.duration_s})
     taught = taught_sensor(lasting, robot, own, progress).taught
     return run_unseen(lasting, tuple(trajectories), own, taught, workers, progress)
+
+
+def _designed(scenario: Scenario, seed: int) -> FourierTrajectory:
+    return design_trajectories(load_robot(scenario.robot), scenario, seed, SilentProgress()).excitation

@@ -30,7 +30,8 @@ def variation(
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option("--workers", min=1, help="Processes that render.", show_default="one a core")
+        int | None,
+        typer.Option("--workers", min=1, help="Processes that design and render.", show_default="one a core"),
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no table.")] = False,
 ) -> None:
@@ -38,6 +39,10 @@ def variation(
 
     As in the paper, from the unseen runs of validation.nc; or from newly recorded ones, which are kept as variation.nc.
     Writes variation.json, variation.md and figures/variation.png.
+
+    The masses of the links vary most: only what accelerates shows them. Fast trajectories tell more of them than long
+    ones: cmmsim excite paper --set excitation.fundamental_hz=0.3 --out fast, then cmmsim variation --out fast
+    --designed 10.
     """
     from dynamics import load_robot
     from identify.files.atomic import write_text
