@@ -12,7 +12,7 @@ from identify.estimation.loop_parameters import StartingGuess, index_of
 from identify.estimation.parameter_bounds import InCoordinates, ParameterBounds, parameter_bounds
 
 CRITERIA = StopCriteria(1e-12, 1e-9, 200)
-DRAWS = 800
+DRAWS = 500
 LOWEST = 0.95 - 3 * np.sqrt(0.95 * 0.05 / DRAWS)
 """What chance makes of 95 % in so many draws, in one of a thousand tests."""
 
