@@ -7,7 +7,8 @@ and one teaching of the sensor, as in the paper: what is wrong with these does n
 
 What varies most are the masses of the links of `rss6`, which accelerations show. By the information of designed runs
 at the true parameters (noise in the servo left out), the worst is known to 4.6, 3.5 and 3.1 % from 20, 40 and 60 s at
-the paper's fundamental of 0.1 Hz, and to 2.4 % from 20 s at 0.3 Hz: faster is worth more than longer.
+the paper's fundamental of 0.1 Hz, and to 2.4 % from 20 s at 0.3 Hz, which uses the whole velocity limit of 2 rad/s:
+faster is worth more than longer.
 """
 
 import multiprocessing

@@ -107,8 +107,8 @@ def test_a_folder_without_runs_is_refused(tmp_path, capsys):
 def test_every_identified_parameter_varies_by_5_percent_at_most(tmp_path):
     """Runs of 20 s with images, each on a fast trajectory of its own; the goal for table 5.
 
-    All ten of the best of three climbs with ALL_VARIATION=1 (several minutes). Otherwise three of one climb: they have
-    to be expected within the goal, and to vary as their intervals say, but for one chance in a thousand.
+    All ten, each the best of three climbs, with ALL_VARIATION=1 (several minutes); otherwise three, of one climb each.
+    Their own intervals let expect no more, and they vary no more than these say, but for one chance in a thousand.
     """
     folder = tmp_path / "run"
     fast = ["renderer=analytic", "excitation.fundamental_hz=0.3"] + ([] if ALL else ["excitation.candidates=1"])
@@ -122,8 +122,8 @@ def test_every_identified_parameter_varies_by_5_percent_at_most(tmp_path):
     assert set(found) == IDENTIFIED
     chance = np.sqrt(chi2.ppf(1 - 1e-3 / len(found), RUNS - 1) / (RUNS - 1))
     for name, seen in found.items():
-        assert seen["expected_percent"] <= 5.0, (name, seen)
-        assert seen["variation_percent"] <= (5.0 if ALL else chance * seen["expected_percent"]), (name, seen)
+        assert max(seen["expected_percent"], seen["variation_percent"]) <= 5.0, (name, seen)
+        assert seen["variation_percent"] <= chance * seen["expected_percent"], (name, seen)
 
 
 def check_recorded(path):
