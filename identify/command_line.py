@@ -19,7 +19,7 @@ from identify.commands.variation import variation
 from identify.commands.workspace import workspace
 from identify.errors import IdentifyError, ScenarioError
 from identify.files.run_folder import RunFolder, new_run_folder
-from identify.progress import Progress, RichProgress, SilentProgress
+from identify.progress import terminal_progress
 from identify.reporting.terminal import print_table
 from identify.scenario import Scenario, load_scenario, scenario_names
 
@@ -170,7 +170,7 @@ def run(
     """Do the whole experiment: excite, record, identify, validate, report."""
     chosen = _scenario(scenario, settings)
     folder = new_run_folder(out or Path("runs") / f"{chosen.name}-{seed}")
-    _pipeline().run(chosen, seed, folder.path, _progress(quiet), workers)
+    _pipeline().run(chosen, seed, folder.path, terminal_progress(quiet), workers)
     if not quiet:
         print_summary(folder)
 
@@ -193,37 +193,37 @@ def excite(
     if compare:
         from identify.commands import compare_excitation
 
-        compare_excitation.compare(chosen, seed, folder.path, _progress(quiet), quiet)
+        compare_excitation.compare(chosen, seed, folder.path, terminal_progress(quiet), quiet)
         return
-    _pipeline().excite(chosen, seed, folder.path, _progress(quiet))
+    _pipeline().excite(chosen, seed, folder.path, terminal_progress(quiet))
 
 
 @app.command()
 def record(out: RunFolderOption, workers: Workers = None, quiet: Quiet = False) -> None:
     """Run the plant with images in the loop on the exciting trajectory: writes experiment.nc."""
     RunFolder(out).require("scenario.toml", "trajectories.json")
-    _pipeline().record(out, _progress(quiet), workers)
+    _pipeline().record(out, terminal_progress(quiet), workers)
 
 
 @app.command()
 def identify(out: RunFolderOption, quiet: Quiet = False) -> None:
     """Estimate the parameters from the record: writes result.json."""
     RunFolder(out).require("scenario.toml", "trajectories.json", "experiment.nc")
-    _pipeline().identify(out, _progress(quiet))
+    _pipeline().identify(out, terminal_progress(quiet))
 
 
 @app.command()
 def validate(out: RunFolderOption, workers: Workers = None, quiet: Quiet = False) -> None:
     """Judge the identified model on unseen trajectories: writes validation.nc and completes result.json."""
     RunFolder(out).require("scenario.toml", "trajectories.json", "experiment.nc", "result.json")
-    _pipeline().validate(out, _progress(quiet), workers)
+    _pipeline().validate(out, terminal_progress(quiet), workers)
 
 
 @app.command()
 def report(out: RunFolderOption, quiet: Quiet = False) -> None:
     """Draw the figures and write report.html, one file that opens offline."""
     RunFolder(out).require("result.json", "experiment.nc", "validation.nc", "model.nc")
-    _pipeline().report(out, _progress(quiet))
+    _pipeline().report(out, terminal_progress(quiet))
     if not quiet:
         print_summary(RunFolder(out))
 
@@ -277,10 +277,6 @@ def _toml_or_text(text: str) -> Any:
 
 def _scenario(name: str, settings: list[str] | None) -> Scenario:
     return load_scenario(name).with_overrides(parse_settings(settings))
-
-
-def _progress(quiet: bool) -> Progress:
-    return SilentProgress() if quiet else RichProgress()
 
 
 def _pipeline() -> Any:

@@ -80,6 +80,11 @@ class RichProgress:
         self._console.print(f"{name}: {done} of {total} in {seconds:.1f} s{rate}", highlight=False, soft_wrap=True)
 
 
+def terminal_progress(quiet: bool, rate: str = "") -> Progress:
+    """What a command shows: bars, with `rate` as the unit of the steps' rate, or nothing where it is to be quiet."""
+    return SilentProgress() if quiet else RichProgress(rate=rate)
+
+
 class _RateColumn(ProgressColumn):
     """Steps a second."""
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from identify.progress import RichProgress, SilentProgress
+from identify.progress import terminal_progress
 
 DEFAULT_LIMIT_UM = 50.0  # published static limit of the C-Track 780
 
@@ -64,7 +64,7 @@ def acceptance(
     standards = chosen_standards(standard)
     run = prepare(sensor, seed, renderer, volume, standards)
     folder = new_run_folder(out or Path("runs") / f"acceptance-{run.under_test.file.name}-{seed}").path
-    do(run, standards, SilentProgress() if quiet else RichProgress())
+    do(run, standards, terminal_progress(quiet))
     entry = acceptance_entry(run, limit_um)
     _write(folder, entry, run, limit_um)
     if not quiet:

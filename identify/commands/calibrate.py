@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from identify.errors import OutputFolderError, ScenarioError
-from identify.progress import Progress, RichProgress, SilentProgress
+from identify.progress import Progress, terminal_progress
 from identify.reporting.terminal import print_table
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def calibrate(
     from identify.files.run_folder import new_run_folder
 
     folder = new_run_folder(out).path
-    progress = SilentProgress() if quiet else RichProgress()
+    progress = terminal_progress(quiet)
     if render is not None:
         if left is not None or right is not None:
             raise ScenarioError("--render makes pictures and reads none: leave out LEFT and RIGHT")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from identify.progress import RichProgress, SilentProgress
+from identify.progress import terminal_progress
 from identify.reporting.terminal import print_table
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def detectors(
     grid = product(radius or RADII_PX, tilt or TILTS_DEG, noise or NOISES_PERCENT, psf or [at_work.psf_px])
     swept = [Condition(r, np.radians(t), n / 100.0, p) for r, t, n, p in grid]
     folder = new_run_folder(out or Path("runs") / f"detectors-{file.name}").path
-    progress = SilentProgress() if quiet else RichProgress()
+    progress = terminal_progress(quiet)
     with progress.stage("detectors", 1 + len(swept)) as advance:
         rng = np.random.default_rng(seed)
         scores = compete(scene_of(file), [at_work, *swept], draws, rng, report=lambda done, total: advance())

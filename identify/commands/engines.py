@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from identify.errors import OutputFolderError, VerificationError
-from identify.progress import Progress, RichProgress, SilentProgress
+from identify.progress import terminal_progress
 from identify.reporting.terminal import print_table
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def mjcf(
     from dynamics.mjcf import mjcf_text
     from identify.files.parameter_choice import choose_parameters
 
-    with _progress(quiet).stage("export", 1) as advance:
+    with terminal_progress(quiet).stage("export", 1) as advance:
         chosen_robot = load_robot(robot)
         chosen = choose_parameters(chosen_robot, parameters)
         allowed = allow_unphysical_inertia
@@ -108,7 +108,7 @@ def verify_model(
 
     chosen = load_robot(robot)
     folder = new_run_folder(out or Path("runs") / f"verify-{chosen.name}").path
-    runs = model_verification.verify(chosen, _progress(quiet))
+    runs = model_verification.verify(chosen, terminal_progress(quiet))
     entry = model_verification.verification_entry(chosen, runs)
     save_result(folder / "verification.json", entry)
     save_figure(figure_8(runs), folder / "figure8.png")
@@ -148,7 +148,3 @@ def _write(path: Path, text: str) -> None:
     except (OSError, ValueError) as error:  # ValueError: a robot's name that no file can have
         reason = (error.strerror if isinstance(error, OSError) else None) or error
         raise OutputFolderError(f"cannot write {path}: {reason}; name another file with --out") from None
-
-
-def _progress(quiet: bool) -> Progress:
-    return SilentProgress() if quiet else RichProgress()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from identify.files.run_folder import RunFolder
-from identify.progress import RichProgress, SilentProgress
+from identify.progress import terminal_progress
 from identify.reporting.terminal import print_table
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def _scores(
     evidence = Evidence(problem, scenario, joint_channels(read_channels(channels), record), true[64:])
     unseen = zip(recording.read_runs(folder.validation), read_truth_runs(folder.validation), strict=True)
     asked = examination(evidence, true, list(unseen))
-    return compare(evidence, asked, chosen, SilentProgress() if quiet else RichProgress())
+    return compare(evidence, asked, chosen, terminal_progress(quiet))
 
 
 def _entry(score: "Score") -> dict[str, Any]:

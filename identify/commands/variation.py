@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from identify.files.run_folder import RunFolder
-from identify.progress import Progress, RichProgress, SilentProgress
+from identify.progress import Progress, terminal_progress
 from identify.reporting.terminal import print_table
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def variation(
 
     folder = RunFolder(out)
     folder.require("scenario.toml", *(["trajectories.json"] if designed else ["validation.nc"]))
-    progress: Progress = SilentProgress() if quiet else RichProgress()
+    progress = terminal_progress(quiet)
     scenario = load_scenario(folder.scenario)
     robot = load_robot(scenario.robot)
     records = (

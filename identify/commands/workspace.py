@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from identify.progress import RichProgress, SilentProgress
+from identify.progress import terminal_progress
 
 
 def workspace(
@@ -26,7 +26,7 @@ def workspace(
 
     chosen = load_robot(robot)
     folder = new_run_folder(out or Path("runs") / f"workspace-{chosen.name}").path
-    found = map_workspace(chosen, SilentProgress() if quiet else RichProgress())
+    found = map_workspace(chosen, terminal_progress(quiet))
     folder.mkdir(parents=True, exist_ok=True)
     save_figure(travel_figure(found), folder / "travel.png")
     save_figure(conditioning_figure(found), folder / "conditioning.png")

@@ -4,7 +4,7 @@ import pytest
 from rich.console import Console
 
 from identify.files.atomic import atomic_path, write_text
-from identify.progress import RichProgress, SilentProgress
+from identify.progress import RichProgress, SilentProgress, terminal_progress
 
 
 def shown(terminal, fail=False, rate=""):
@@ -48,6 +48,16 @@ def test_silent_progress_takes_the_same_calls(capfd):
         advance()
         advance(n=2)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(("quiet", "said"), [(True, ""), (False, "rows/s")])
+def test_a_quiet_command_shows_nothing_and_another_its_rate(capfd, quiet, said):
+    with terminal_progress(quiet, rate="rows/s").stage("record", 4) as advance:
+        advance()
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert said in err
+    assert bool(err) is not quiet
 
 
 def test_file_appears_whole_or_not_at_all(tmp_path):
