@@ -36,7 +36,10 @@ def frame_latencies(scenario: Scenario, frames: int, rng: np.random.Generator) -
 
 
 class PoseSensor(Protocol):
-    """What measures in the loop: `cmmsim.Sensor`, or one that answers as it does."""
+    """What measures in the loop: `cmmsim.Sensor`, or one that answers as it does.
+
+    One that says `sees_bodies = False` is not told where cranks and links are, which takes time.
+    """
 
     def start_run(self, seed: int) -> None:
         """Begin a new run with noise of its own."""
@@ -57,6 +60,7 @@ class SensorInLoop:
 
     def __init__(self, sensor: PoseSensor, robot: Robot, seed: int, advance: Advance = lambda n=1: None) -> None:
         self._sensor, self._robot, self._advance = sensor, robot, advance
+        self._sees_bodies = getattr(sensor, "sees_bodies", True)
         self.covariances: list[Array] = []
         self.lost: list[str] = []
         self.seconds = 0.0
@@ -67,7 +71,7 @@ class SensorInLoop:
 
         The rate blurs the picture of an exposure that is not instantaneous.
         """
-        bodies = robot_transforms(self._robot, pose)
+        bodies = robot_transforms(self._robot, pose) if self._sees_bodies else None
         began = time.perf_counter()
         measured = self._sensor.measure(pose, bodies, rate)
         self.seconds += time.perf_counter() - began

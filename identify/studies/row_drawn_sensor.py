@@ -15,6 +15,8 @@ from identify.arrays import Array
 class DrawnSensor:
     """Measures as a `cmmsim.Sensor` does, with Gaussian noise of one covariance (6, 6) [m, rad] and with dropout."""
 
+    sees_bodies = False
+
     def __init__(self, covariance: Array, dropout: float = 0.0) -> None:
         self._covariance, self._dropout = covariance, dropout
         self._factor = np.linalg.cholesky(covariance)
