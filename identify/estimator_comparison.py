@@ -23,6 +23,7 @@ from identify.errors import EstimationError
 from identify.estimation.base_parameters import base_parameters, structural_regressor
 from identify.estimation.estimate_covariance import estimate_uncertainty
 from identify.estimation.group_estimates import group_estimates
+from identify.estimation.identifiability import IDENTIFIABLE_SHARE, identifiability
 from identify.estimators.evidence import Evidence
 from identify.estimators.registry import Estimator
 from identify.experiment.truth import true_poses
@@ -97,7 +98,10 @@ def examination(evidence: Evidence, true: Array, unseen: Sequence[tuple[xr.Datas
     base = base_parameters(structural_regressor(robot))
     driven = evidence.problem.driven_by_commands()
     covariance = estimate_uncertainty(driven, true, np.random.default_rng(0)).covariance
-    shown: NDArray[np.bool_] = group_estimates(base, evidence.problem.guess, true, covariance).identifiable
+    guess = evidence.problem.guess
+    groups = group_estimates(base, guess, identifiability(guess, robot), true, covariance)
+    # A relative error says nothing of a difference that almost vanishes.
+    shown: NDArray[np.bool_] = groups.identifiable & (groups.std < IDENTIFIABLE_SHARE * np.abs(groups.estimate))
     if not shown.any():
         raise EstimationError("the record shows no base parameter: there is nothing to compare")
     return Examination(robot, evidence.scenario, true, base.combinations[shown], tuple(unseen))

@@ -1,8 +1,7 @@
 """What an identification says about the base parameters: the combinations that a record can show.
 
 A group's estimate and standard deviation follow from those of its parameters by linear propagation; it is often known
-well where none of its members is. A group is called identified when the record at least halves what was unknown of it,
-and leaves less than half of its value in doubt.
+well where none of its members is.
 """
 
 from dataclasses import dataclass
@@ -10,12 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dynamics.parameters import JOINT_PID_NAMES
 from identify.arrays import Array
 from identify.estimation.base_parameters import BaseParameters
+from identify.estimation.identifiability import Identifiability
 from identify.estimation.loop_parameters import StartingGuess
-
-IDENTIFIABLE_SHARE = 0.5
-"""A quantity counts as identified when the record at least halves the standard deviation of the starting guess."""
 
 
 @dataclass(frozen=True)
@@ -34,21 +32,22 @@ class GroupEstimates:
     identifiable: NDArray[np.bool_]
 
 
+def group_rows(base: BaseParameters) -> Array:
+    """The groups as combinations (rank, 67) of all parameters: the gains of the joint PID belong to none."""
+    return np.pad(base.combinations, ((0, 0), (0, len(JOINT_PID_NAMES))))
+
+
 def group_estimates(
-    base: BaseParameters, guess: StartingGuess, estimate: Array, covariance: Array
+    base: BaseParameters, guess: StartingGuess, criterion: Identifiability, estimate: Array, covariance: Array
 ) -> GroupEstimates:
-    """Estimates of the groups from parameters (67,) and their covariance (67, 67); the PID gains come after the 64."""
-    rows = base.combinations
-    count = rows.shape[1]
-    values = rows @ estimate[:count]
-    std = np.sqrt(np.einsum("gi,ij,gj->g", rows, covariance[:count, :count], rows))
-    before = np.sqrt((rows**2) @ guess.std[:count] ** 2)
+    """Estimates of the groups from parameters (67,) and their covariance (67, 67)."""
+    rows = group_rows(base)
     return GroupEstimates(
         names=base.group_names(),
         expressions=base.expressions(),
-        combinations=rows,
-        initial=rows @ guess.values[:count],
-        estimate=values,
-        std=std,
-        identifiable=(std < IDENTIFIABLE_SHARE * before) & (std < IDENTIFIABLE_SHARE * np.abs(values)),
+        combinations=base.combinations,
+        initial=rows @ guess.values,
+        estimate=rows @ estimate,
+        std=np.sqrt(np.einsum("gi,ij,gj->g", rows, covariance, rows)),
+        identifiable=criterion.judge(rows, covariance),
     )

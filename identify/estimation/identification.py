@@ -13,7 +13,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from dynamics import Robot
-from dynamics.parameters import JOINT_PID_NAMES
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation import warm_start
@@ -27,7 +26,8 @@ from identify.estimation.bounded_intervals import bounded_estimate
 from identify.estimation.bounded_least_squares import Solution
 from identify.estimation.conditioning import Conditioning, conditioning
 from identify.estimation.estimate_covariance import DRAWS, Uncertainty, estimate_uncertainty
-from identify.estimation.group_estimates import IDENTIFIABLE_SHARE, GroupEstimates, group_estimates
+from identify.estimation.group_estimates import GroupEstimates, group_estimates, group_rows
+from identify.estimation.identifiability import identifiability
 from identify.estimation.loop_parameters import NAMES, starting_guess
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import bounds_of, output_error_searches
@@ -156,8 +156,8 @@ def _result(
     """What the searches and their uncertainty say of parameters and groups."""
     robot, guess, solution = problem.runs[0].robot, problem.guess, searches[scenario.identification.method]
     base, known = base_parameters(structural_regressor(robot)), problem.known_information()
-    std = np.sqrt(np.diag(uncertainty.covariance))
-    groups = group_estimates(base, guess, solution.parameters, uncertainty.covariance)
+    criterion = identifiability(guess, robot)
+    groups = group_estimates(base, guess, criterion, solution.parameters, uncertainty.covariance)
     conditioned = conditioning(uncertainty.information, known, base, guess, solution.parameters)
     bounded = bounded_estimate(
         solution.parameters,
@@ -173,12 +173,12 @@ def _result(
         initial=guess.values,
         warm_start=warm,
         estimate=solution.parameters,
-        std=std,
+        std=np.sqrt(np.diag(uncertainty.covariance)),
         covariance=uncertainty.covariance,
         intervals=bounded.intervals(np.eye(len(NAMES))),
-        identifiable=std < IDENTIFIABLE_SHARE * guess.std,
+        identifiable=criterion.judge(np.eye(len(NAMES)), uncertainty.covariance),
         groups=groups,
-        group_intervals=bounded.intervals(np.pad(groups.combinations, ((0, 0), (0, len(JOINT_PID_NAMES))))),
+        group_intervals=bounded.intervals(group_rows(base)),
         conditioning=conditioned,
         scale_anchor=problem.anchor,
         base_rank=_excited_rank(problem, scenario),

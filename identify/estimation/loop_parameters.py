@@ -40,8 +40,8 @@ def starting_guess(
     """
     check_parameter_set(robot, set_name)
     chosen = robot.parameter_sets[set_name]
-    holding_torque = float(np.abs(robot.static_torque(robot.home_pose, chosen.dynamic)).mean())
-    values, std = chosen.vector.copy(), relative_std * typical_sizes(chosen.vector, holding_torque)
+    torque = holding_torque(robot, chosen.dynamic)
+    values, std = chosen.vector.copy(), relative_std * typical_sizes(chosen.vector, torque)
     for name, prior in known.items():
         if name not in NAMES:
             raise ScenarioError(f"identification.prior: no parameter {name!r}; valid: {VALID_NAMES}")
@@ -56,13 +56,18 @@ def check_parameter_set(robot: Robot, set_name: str) -> None:
         raise ScenarioError(f"robot {robot.name} has no parameter set {set_name!r}; it has {valid}")
 
 
-def typical_sizes(values: Array, holding_torque: float) -> Array:
+def holding_torque(robot: Robot, dynamic: Array) -> float:
+    """Mean torque [N m] that the joints hold at the home pose, with dynamic parameters (64,)."""
+    return float(np.abs(robot.static_torque(robot.home_pose, dynamic)).mean())
+
+
+def typical_sizes(values: Array, torque: float) -> Array:
     """Size (67,) of each parameter: its own value, and for friction [N m, N m s/rad] the holding torque [N m].
 
     A specification says little about friction; a joint that rubs more than it carries would be called broken.
     """
     friction = np.isin(NAMES, COULOMB_NAMES + VISCOUS_NAMES)
-    return np.where(friction, holding_torque, np.where(values > 0, values, 1.0))
+    return np.where(friction, torque, np.where(values > 0, values, 1.0))
 
 
 def index_of(name: str) -> int:
@@ -70,4 +75,4 @@ def index_of(name: str) -> int:
     return NAMES.index(name)
 
 
-__all__ = ["NAMES", "StartingGuess", "index_of", "starting_guess", "typical_sizes", "unit_of"]
+__all__ = ["NAMES", "StartingGuess", "holding_torque", "index_of", "starting_guess", "typical_sizes", "unit_of"]

@@ -67,6 +67,7 @@ def test_a_record_that_hardly_moves_is_called_poorly_conditioned():
     assert little.conditioning.poses_alone > POOR
     assert little.conditioning.unshown > plain.conditioning.unshown
     assert any("poorly conditioned" in warning for warning in little.warnings)
+    assert little.groups.identifiable.sum() < plain.groups.identifiable.sum()
 
 
 @pytest.mark.slow

@@ -47,11 +47,14 @@ def test_intervals_cover_as_often_as_they_say(rows):
 
 
 def test_every_parameter_is_covered(rows):
-    """No single interval fails more often than one in a thousand chances, shared by all of them, would have it."""
+    """No single interval holds the truth more seldom, or more often, than one in a thousand chances, shared by both
+    sides of all of them, would have it."""
     found = table(rows)
-    limit = 1e-3 / len(found)
-    failing = {name: seen for name, seen in found.items() if binom.cdf(seen["hits"], seen["count"], 0.95) < limit}
-    assert not failing, failing
+    limit = 1e-3 / (2 * len(found))
+    too_narrow = {name: seen for name, seen in found.items() if binom.cdf(seen["hits"], seen["count"], 0.95) < limit}
+    too_wide = {name: seen for name, seen in found.items() if binom.sf(seen["hits"] - 1, seen["count"], 0.95) < limit}
+    assert not too_narrow, too_narrow
+    assert not too_wide, too_wide
 
 
 def test_the_same_is_identified_in_every_experiment(rows):
@@ -59,6 +62,13 @@ def test_the_same_is_identified_in_every_experiment(rows):
     for name in ("joint1.coulomb", "joint6.viscous", "joint_pid.ld", "platform.Izz"):
         assert all(row["quantities"][name][2] for row in rows), name
     assert not any(row["quantities"]["crank1.Ixx"][2] for row in rows)
+
+
+def test_what_is_identified_is_not_chosen_by_the_noise_of_the_estimates(rows):
+    """A quantity is identified in all experiments or in none, but for few whose deviation is close to the limit."""
+    found = table(rows)
+    now_and_then = {name: seen["count"] for name, seen in found.items() if seen["count"] < len(rows)}
+    assert len(now_and_then) <= 2, now_and_then
 
 
 def table(rows):

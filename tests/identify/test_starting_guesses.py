@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from identify.estimation.identification import output_error_problem
-from identify.estimation.loop_parameters import StartingGuess, typical_sizes
+from identify.estimation.loop_parameters import StartingGuess, holding_torque, typical_sizes
 from identify.estimation.output_error_search import output_error_searches, search
 from identify.estimation.warm_start import linear_warm_start
 from identify.progress import SilentProgress
@@ -42,8 +42,7 @@ def drawn_guess(spread, seed):
     while np.any(low := factors < SMALLEST_FACTOR):
         factors[low] = 1 + spread * rng.standard_normal(low.sum())
     values = truth() * factors
-    holding_torque = float(np.abs(rss6().static_torque(rss6().home_pose, values[:64])).mean())
-    return StartingGuess(values, typical_sizes(values, holding_torque))
+    return StartingGuess(values, typical_sizes(values, holding_torque(rss6(), values[:64])))
 
 
 @pytest.fixture(scope="module", params=["ctrack780", "ctrack780_29hz"])
