@@ -51,7 +51,8 @@ class IdentificationResult:
     searches; stop_reason: of the last; searches: their names in order, and costs: after each iteration, one tuple a
     search; active_bounds: what holds the estimate back, as "platform.Izz <= Ixx + Iyy";
     noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what the sensor's noise alone
-    would leave; whiteness: test of the residuals of the model driven by the logged commands.
+    would leave, give or take noise_ratio_std; whiteness: test of the residuals of the model driven by the logged
+    commands.
     """
 
     names: tuple[str, ...]
@@ -75,6 +76,7 @@ class IdentificationResult:
     active_bounds: tuple[str, ...]
     noise_ratio: float
     expected_noise_ratio: float
+    noise_ratio_std: float
     whiteness: Whiteness
     warnings: tuple[str, ...]
     seconds: dict[str, float]
@@ -190,6 +192,7 @@ def _result(
         active_bounds=bounded.active_bounds,
         noise_ratio=uncertainty.noise_ratio,
         expected_noise_ratio=uncertainty.expected_noise_ratio,
+        noise_ratio_std=uncertainty.noise_ratio_std,
         whiteness=tested,
         warnings=(
             *of_the_records,
