@@ -1,7 +1,7 @@
 """Scenarios as text: TOML with units, and the reasons for a refusal in one line."""
 
 import json
-from typing import Any
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -74,13 +74,16 @@ def _within(path: list[str]) -> str:
 
 
 def _owner(path: list[str], model: type[BaseModel]) -> type[BaseModel] | None:
+    """The model whose field the path's last part names; a part of the path may be the key of a mapping to models."""
     owner: Any = model
     for part in path[:-1]:
-        field = owner.model_fields.get(part)
-        owner = field.annotation if field is not None else None
-        if not (isinstance(owner, type) and issubclass(owner, BaseModel)):
+        if get_origin(owner) is dict:
+            owner = get_args(owner)[1]
+        elif isinstance(owner, type) and issubclass(owner, BaseModel) and part in owner.model_fields:
+            owner = owner.model_fields[part].annotation
+        else:
             return None
-    return owner
+    return owner if isinstance(owner, type) and issubclass(owner, BaseModel) else None
 
 
 def _siblings(path: list[str], model: type[BaseModel]) -> list[str]:

@@ -10,6 +10,7 @@ import xarray as xr
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.estimation.loop_parameters import NAMES, index_of
+from identify.scenario_checks import check_moments
 
 ADDED = {
     "payload_mass": ("platform.mass", "kg"),
@@ -37,7 +38,7 @@ def recorded_payload(record: xr.Dataset) -> Array:
     """The load (67,) of a record; zero where it states none.
 
     Raises:
-        RecordError: some but not all of its figures, or one that is no finite number >= 0.
+        RecordError: some but not all of its figures, one that is no finite number >= 0, or moments of no body.
     """
     given = [name for name in ADDED if name in record.attrs]
     if not given:
@@ -48,4 +49,8 @@ def recorded_payload(record: xr.Dataset) -> Array:
         if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.number) or not 0 <= value < 1e6:
             raise RecordError(f"the record's attribute {name} is {value!r}, must be a number >= 0 in {unit}")
         added[index_of(parameter)] = float(value)
+    try:
+        check_moments({name: float(record.attrs[name]) for name in ADDED if name != "payload_mass"})
+    except ValueError as error:
+        raise RecordError(f"the record's attribute {error}") from None
     return added

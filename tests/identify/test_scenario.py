@@ -3,6 +3,7 @@ import tomllib
 import pytest
 
 from identify.errors import ScenarioError
+from identify.estimation.loop_parameters import NAMES
 from identify.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
 
 
@@ -165,6 +166,36 @@ def test_duration_must_be_whole_frames():
     message = refusal({"validation.duration_s": 5.01})
     assert "300.6 frames" in message
     assert "60 Hz" in message
+
+
+@pytest.mark.parametrize(
+    ("prior", "evidence"),
+    [
+        ({"foo": {"value": 1.0, "std": 0.1}}, ["no parameter 'foo'", "coulomb or viscous of joint1 to joint6"]),
+        ({"link7.Izz": {"value": 1.0, "std": 0.1}}, ["no parameter 'link7.Izz'"]),
+        ({"platform": {"mass": {"value": 1.0, "std": 0.1}}}, ["no parameter 'platform'", '{"platform.…" = {value']),
+        ({"platform.mass": {"value": 1.0}}, ["identification.prior.platform.mass.std is missing"]),
+        ({"platform.mass": {"value": 1.0, "std": 0.1, "a": 1}}, ["platform.mass.a'", "platform.mass]: value, std"]),
+        ({"platform.mass": {"value": 1.0, "std": -0.1}}, ["platform.mass.std = -0.1 [SI]"]),
+        (7, ["identification.prior = 7"]),
+    ],
+)
+def test_what_is_known_beforehand_is_checked_with_the_scenario(prior, evidence):
+    message = refusal({"identification.prior": prior})
+    assert all(part in message for part in evidence), message
+
+
+def test_every_parameter_of_the_closed_loop_may_be_known_beforehand():
+    known = {name: {"value": 1.0, "std": 0.1} for name in NAMES}
+    assert len(load_scenario("paper").with_overrides({"identification.prior": known}).identification.prior) == 67
+
+
+def test_a_load_that_no_body_has_is_refused_and_a_flat_one_is_not():
+    message = refusal({"payload.Ixx_kg_m2": 100.0})
+    assert "payload: Ixx_kg_m2 = 100 kg m2 exceeds Iyy_kg_m2 0.02 + Izz_kg_m2 0.04 kg m2" in message
+    assert "mass_kg = 0.0" in refusal({"payload.mass_kg": 0.0})
+    flat = {"payload.Ixx_kg_m2": 0.1, "payload.Iyy_kg_m2": 0.2, "payload.Izz_kg_m2": 0.1 + 0.2}
+    assert load_scenario("paper").with_overrides(flat).payload.Izz_kg_m2 == pytest.approx(0.3)
 
 
 def test_smoothed_friction_needs_its_velocity_and_the_exact_law_has_none():
