@@ -10,6 +10,7 @@ from dynamics import Robot, load_robot
 from dynamics.closed_loop import prepare
 from dynamics.workspace import check_motion
 from identify.arrays import Array
+from identify.errors import EstimationError
 from identify.estimation import identification
 from identify.estimation.loop_parameters import NAMES, check_parameter_set
 from identify.excitation import design_trajectories
@@ -26,6 +27,8 @@ from identify.files.versions import versions
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.loop_setup import frame_times
+from identify.record.record_checks import check_length, check_trajectory
+from identify.record.recorded_robot import check_robot
 from identify.record.recorded_run import recorded_reference
 from identify.reporting.model_runs import build_model_run, write_model_runs
 from identify.reporting.report import write_report
@@ -89,10 +92,10 @@ def identify(folder: Path, progress: Progress) -> None:
     """Estimate the parameters from the record; writes result.json (without the truth)."""
     run_folder, scenario, trajectories, robot = _open(folder)
     began = time.perf_counter()
-    seen = recording.read(run_folder.experiment)
     payload_files = _payload_files(run_folder, scenario)
     run_folder.require(*(file.name for file in payload_files))
-    loaded = [recording.read(file) for file in payload_files]
+    plan = scenario, trajectories, robot
+    seen, *loaded = [_read_record(file, *plan) for file in (run_folder.experiment, *payload_files)]
     result = identification.identify([seen, *loaded], robot, scenario, progress)
     measured, ok = recording.poses(seen, "measured"), seen["measured_ok"].values.astype(bool)
     reference = recorded_reference(seen)
@@ -125,7 +128,8 @@ def validate(
     began = time.perf_counter()
     run_folder.require("covariance.nc")
     result, covariance = load_result(run_folder.result), read_covariance(run_folder.covariance, NAMES)
-    excitation_record, excitation_truth = recording.read(run_folder.experiment), read_truth(run_folder.experiment)
+    excitation_record = _read_record(run_folder.experiment, scenario, trajectories, robot)
+    excitation_truth = read_truth(run_folder.experiment)
     taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
     runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, workers, progress)
     recording.write_runs(run_folder.validation, [(unseen.record, unseen.truth) for unseen in runs])
@@ -164,6 +168,17 @@ def _open(folder: Path) -> tuple[RunFolder, Scenario, TrajectorySet, Robot]:
     return run_folder, scenario, load_trajectories(run_folder.trajectories), load_robot(scenario.robot)
 
 
+def _read_record(file: Path, scenario: Scenario, trajectories: TrajectorySet, robot: Robot) -> xr.Dataset:
+    """The record of a file, which must be of the folder's robot and trajectory."""
+    record = recording.read(file)
+    try:
+        check_robot(record, robot)
+        check_trajectory(record, trajectories.excitation, scenario)
+    except EstimationError as error:
+        raise EstimationError(f"{file}: {error}") from None
+    return record
+
+
 def _payload_files(run_folder: RunFolder, scenario: Scenario) -> list[Path]:
     """The file of the run under a load, where the scenario asks for one."""
     return [run_folder.payload] if scenario.identification.scale_anchor == "payload" else []
@@ -171,6 +186,7 @@ def _payload_files(run_folder: RunFolder, scenario: Scenario) -> list[Path]:
 
 def _designed(scenario: Scenario, seed: int, progress: Progress) -> TrajectorySet:
     """Trajectories that stay clear of limits and singularities; compiles the robot on first use."""
+    check_length(scenario.timing.frames(scenario.excitation.duration_s), scenario, "excitation.duration_s gives")
     robot = load_robot(scenario.robot)
     for name in (scenario.plant.parameters, scenario.model.start_parameters):
         check_parameter_set(robot, name)

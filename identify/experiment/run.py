@@ -25,6 +25,7 @@ from identify.progress import Advance, Progress, SilentProgress
 from identify.record import recording
 from identify.record.loop_setup import frame_times, reference_motion
 from identify.record.payload import payload_vector, store_payload
+from identify.record.recorded_robot import store_robot
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory, check_travel
 
@@ -173,6 +174,7 @@ def _record(
         seed=seed,
         frame_rate_hz=scenario.timing.frame_rate_hz,
     )
+    store_robot(record, robot)
     return record.assign_attrs(sensor_seconds=eye.seconds, lost_frames="; ".join(eye.lost[:20]))
 
 

@@ -14,7 +14,11 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.files.dataset import POSE
 from identify.record.filtering import SPLINE_DEGREE, padding_samples
+from identify.record.loop_setup import frame_times
+from identify.record.recorded_robot import check_robot
+from identify.record.recording import poses
 from identify.scenario import Scenario, scenario_from_toml
+from identify.trajectory import FourierTrajectory
 
 MINIMUM_GOOD_SHARE = 0.5
 """Share of frames that must have been measured."""
@@ -23,13 +27,12 @@ REFERENCE_GAP = 0.05
 """Share of its travel by which a reference may differ from the integral of its rate."""
 
 ROUNDING = 1e-9
-"""m or rad: difference that means nothing where the travel is none."""
+"""m or rad: difference that means nothing, of a reference from its trajectory or from one that stands still."""
 
 
 def check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
     """The record must be of this robot, and made with the timing and the servo that the model is to have."""
-    if record.attrs.get("robot") != robot.name:
-        raise EstimationError(f"the record is of robot {record.attrs.get('robot')!r}, not of {robot.name!r}")
+    check_robot(record, robot)
     recorded = scenario_from_toml(str(record.attrs.get("scenario", "")), "scenario in the record")
     for section in ("timing", "servo"):
         theirs, ours = getattr(recorded, section).model_dump(), getattr(scenario, section).model_dump()
@@ -44,6 +47,24 @@ def check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
         raise EstimationError(
             f"frames {worst} and {worst + 1} are {steps[worst]:.3f} periods of {scenario.timing.frame_rate_hz:g} Hz "
             "apart: frames are missing in the record; keep lost ones with measured_ok = 0"
+        )
+
+
+def check_trajectory(record: xr.Dataset, trajectory: FourierTrajectory, scenario: Scenario) -> None:
+    """The record's reference must be the exciting trajectory (eq. 37) at the frames that the scenario asks for."""
+    asked = frame_times(scenario, scenario.excitation.duration_s)
+    if record.sizes["time"] != len(asked):
+        raise EstimationError(
+            f"the record has {record.sizes['time']} frames, and the scenario asks for {len(asked)} "
+            f"(excitation.duration_s = {scenario.excitation.duration_s:g} s): it is of another experiment"
+        )
+    gap = np.abs(poses(record, "reference") - trajectory.pose(asked))
+    if not gap.max() <= ROUNDING:
+        frame, worst = np.unravel_index(int(np.argmax(gap)), gap.shape)
+        raise EstimationError(
+            f"the record's reference is not the exciting trajectory: its {POSE[worst]} differs by "
+            f"{gap[frame, worst]:.3g} {'m' if worst < 3 else 'rad'} at t = {asked[frame]:.2f} s: it is of another "
+            "experiment"
         )
 
 
@@ -67,7 +88,7 @@ def check_reference(reference: Reference, scenario: Scenario) -> None:
         )
 
 
-def check_length(frames: int, scenario: Scenario) -> None:
+def check_length(frames: int, scenario: Scenario, what: str = "the record has") -> None:
     """One period of the highest harmonic, and what the filter takes at its ends."""
     timing, filtering = scenario.timing, scenario.filter
     needed = max(
@@ -76,7 +97,7 @@ def check_length(frames: int, scenario: Scenario) -> None:
     )
     if frames < needed:
         raise EstimationError(
-            f"the record has {frames} frames ({frames / timing.frame_rate_hz:.3g} s), at least {needed} are needed: "
+            f"{what} {frames} frames ({frames / timing.frame_rate_hz:.3g} s), at least {needed} are needed: "
             "one period of the highest harmonic, and what the filter takes at its ends"
         )
 

@@ -62,7 +62,8 @@ def build_record(
     """Record of one run: ``time`` (N,) [s], poses, rates and ``command`` (N, 6), covariance (N, 6, 6), ok (N,).
 
     Raises:
-        RecordError: wrong shapes, or numbers that are not finite where a measurement was not lost.
+        RecordError: wrong shapes, numbers that are not finite where a measurement was not lost, or a `measured_ok`
+            that is neither 1 nor 0.
     """
     reference, rate = pose_array(reference_pose, "reference_pose"), pose_array(reference_rate, "reference_rate")
     measured = pose_array(measured_pose, "measured_pose")
@@ -75,7 +76,7 @@ def build_record(
             "measured_position": measured[:, :3],
             "measured_orientation": measured[:, 3:],
             "measured_covariance": np.asarray(measured_covariance, dtype=float),
-            "measured_ok": np.asarray(measured_ok).astype(np.int8),
+            "measured_ok": np.asarray(measured_ok, dtype=np.int8),
             "command": np.asarray(command, dtype=float),
         },
         time,
@@ -165,7 +166,14 @@ def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
         RecordError: the first thing that is not so.
     """
     check_variables(record, VARIABLES, source)
-    ok = record["measured_ok"].values.astype(bool)
+    stated = record["measured_ok"].values
+    strange = np.flatnonzero((stated != 0) & (stated != 1))
+    if len(strange):
+        raise RecordError(
+            f"{source}: measured_ok must be 1 or 0, it is {stated[strange[0]]} in frame {strange[0]}"
+            + (f" and wrong in {len(strange) - 1} more" if len(strange) > 1 else "")
+        )
+    ok = stated.astype(bool)
     for name in VARIABLES:
         values = record[name].values
         check_finite(values[ok] if name in MAY_BE_LOST else values, name, source)

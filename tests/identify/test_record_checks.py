@@ -6,6 +6,7 @@ import pytest
 from dynamics.errors import DynamicsError
 from identify.errors import EstimationError, RecordError, ScenarioError
 from identify.estimation.identification import identify
+from identify.record.payload import recorded_payload
 from identify.record.recorded_run import recorded_run
 from tests.identify.synthetic import quick, rss6, run_plant
 
@@ -64,6 +65,13 @@ def unknown_covariance(record):
 def test_what_is_wrong_with_a_record_is_said(record, spoil, error, says):
     with pytest.raises(error, match=says):
         identify(spoil(record), rss6(), quick())
+
+
+def test_a_load_of_moments_that_no_body_has_is_refused_by_name(record):
+    load = {"payload_mass": 8.0, "payload_Ixx": 100.0, "payload_Iyy": 0.02, "payload_Izz": 0.04}
+    with pytest.raises(RecordError, match=r"attribute payload_Ixx = 100 kg m2 exceeds .*0.02 .*0.04"):
+        recorded_payload(record.assign_attrs(load))
+    assert recorded_payload(record.assign_attrs(load | {"payload_Ixx": 0.02})).sum() == pytest.approx(8.08)
 
 
 def test_a_reference_that_moves_one_way_only_is_no_fault(record):
