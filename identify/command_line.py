@@ -14,6 +14,7 @@ from identify.commands.calibrate import CALIBRATE_HELP, calibrate
 from identify.commands.detectors import detectors
 from identify.commands.engines import export, verify_model
 from identify.commands.estimators import estimators
+from identify.commands.stopping import stoppable
 from identify.commands.study import STUDY_HELP, study
 from identify.commands.variation import variation
 from identify.commands.workspace import workspace
@@ -237,7 +238,7 @@ app.command()(acceptance)
 app.command()(base_parameters)
 app.command()(estimators)
 app.command()(variation)
-app.command(help=STUDY_HELP)(study)
+app.command(help=STUDY_HELP)(stoppable(study))
 
 
 def parse_settings(settings: list[str] | None) -> dict[str, Any]:

@@ -13,7 +13,7 @@ HEAVY = {
     "pyrender": {"cmmsim/render.py"},
     "mujoco": {"dynamics/mujoco_engine.py"},
     "dask": {"identify/studies/dask_runner.py"},
-    "distributed": {"identify/studies/dask_runner.py"},
+    "distributed": {"identify/studies/dask_executor.py", "identify/studies/dask_runner.py"},
     "rerun": set(),
 }
 

@@ -35,7 +35,9 @@ def _compute(setup: Setup, case: Case) -> Finished:
             row_function(setup.kind)(setup.row_scenario(case), setup.row_seed(case.number), setup.row_options(case)),
             {*FIRST, *case.factors, *LAST},
         )
-    except Exception as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # also sys.exit() ends the row and not the study
         text = " ".join(f"{type(error).__name__}: {error}".split())
         return Finished(case.number, {}, time.perf_counter() - start, text)
     return Finished(case.number, figures, time.perf_counter() - start)

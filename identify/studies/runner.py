@@ -12,6 +12,7 @@ from identify.progress import Progress
 from identify.studies.batches import Batches
 from identify.studies.computation import Finished, compute
 from identify.studies.design import Design, Setup, prepare
+from identify.studies.interrupts import raise_noted
 from identify.studies.journal import Journal
 from identify.studies.store import TABLE, open_folder, resolved
 from identify.studies.study_file import Study
@@ -87,6 +88,7 @@ def _compute_pending(
         return
     batches = Batches((design.case(number) for number in journal.pending()), left)
     with workers() as execute, progress.stage(f"rows of {name}", left) as advance:
+    raise_noted()
         for finished in execute(setup, batches):
             journal.append(finished)
             advance(len(finished))

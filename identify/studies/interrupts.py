@@ -1,0 +1,78 @@
+"""Ctrl-C: one that comes at a bad moment is neither lost nor does it leave anything half done."""
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+class Noting:
+    """A handler of Ctrl-C that raises KeyboardInterrupt, and keeps in mind that it came: an import may swallow the
+    exception, or make another error of it."""
+
+    def __init__(self) -> None:
+        self.came = False
+
+    def __call__(self, *_: object) -> None:
+        """Handle the signal."""
+        self.came = True
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def noted() -> Iterator[Noting]:
+    """Ctrl-C is noted in the block, for :func:`raise_noted`."""
+    noting = Noting()
+    if not _is_ours():
+        yield noting
+        return
+    old = signal.signal(signal.SIGINT, noting)
+    try:
+        yield noting
+    finally:
+        signal.signal(signal.SIGINT, old)
+
+
+def raise_noted() -> None:
+    """Raise KeyboardInterrupt once more if there was one since :func:`noted`; call it before long work begins."""
+    handler = signal.getsignal(signal.SIGINT)
+    if isinstance(handler, Noting) and handler.came:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """Ctrl-C waits until the block has ended."""
+    if not _is_ours():
+        yield
+        return
+    came = False
+
+    def wait(*_: object) -> None:
+        nonlocal came
+        came = True
+
+    old = signal.signal(signal.SIGINT, wait)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, old)
+        if came:
+            signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
+def deaf_offspring() -> Iterator[None]:
+    """Threads and processes that are started in the block, and those that they start, never hear Ctrl-C: it is for the
+    main process, which ends them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _is_ours() -> bool:
+    """Whether Ctrl-C may be handled here: in the main thread, and where nobody, such as nohup, has turned it off."""
+    in_main = threading.current_thread() is threading.main_thread()
+    return in_main and signal.getsignal(signal.SIGINT) not in (signal.SIG_IGN, None)
