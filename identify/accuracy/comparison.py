@@ -1,9 +1,9 @@
-"""Figures of this session beside those of a saved one: what got worse, and by how much."""
+"""Figures of this session beside those of a saved one: what got worse, what is held to another limit, what is gone."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from identify.accuracy.figure import Figure, with_unit
+from identify.accuracy.figure import Figure, percent, with_unit
 
 Key = tuple[str, str]
 
@@ -27,6 +27,15 @@ class Comparison:
         return ""
 
     @property
+    def limit_change(self) -> str:
+        """One line: name, limit and the saved one, where they differ; or nothing."""
+        now, saved = (
+            "none" if figure.limit is None else with_unit(figure.limit_text, figure.unit)
+            for figure in (self.now, self.saved)
+        )
+        return "" if now == saved else f"{self.now.test}: the limit of {self.now.name} is {now}, was {saved}"
+
+    @property
     def change(self) -> float:
         """Growth of the value as a share of the saved one's size; infinite from zero to anything else."""
         grown = self.now.value - self.saved.value
@@ -47,10 +56,20 @@ class Comparison:
     def regression(self) -> str:
         """One line: name, both values and the change."""
         now, saved = (with_unit(f"{figure.value:.6g}", self.now.unit) for figure in (self.now, self.saved))
-        return f"{self.now.test}: {self.now.name} is {now}, was {saved}, {self.change:+.1%}"
+        return f"{self.now.test}: {self.now.name} is {now}, was {saved}, {percent(self.change, '+.1')}"
 
 
 def compare(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[Key, Comparison]:
     """Pairs of figures by their key; figures that have no partner are left out."""
     before = {figure.key: figure for figure in saved}
     return {figure.key: Comparison(figure, before[figure.key]) for figure in figures if figure.key in before}
+
+
+def missing(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[str, list[str]]:
+    """Names of the saved figures that are not among these, by their test."""
+    measured = {figure.key for figure in figures}
+    gone: dict[str, list[str]] = {}
+    for figure in saved:
+        if figure.key not in measured:
+            gone.setdefault(figure.test, []).append(figure.name)
+    return gone

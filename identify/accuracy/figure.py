@@ -56,6 +56,16 @@ class Figure:
         return self.limit is not None and self.sign * (self.best - self.limit) > 0
 
     @property
+    def undecided(self) -> bool:
+        """Whether the interval holds the limit: good enough or not, the sample does not tell."""
+        return self.limit is not None and not self.beyond_limit and self.sign * (self.worst - self.limit) > 0
+
+    @property
+    def limit_text(self) -> str:
+        """The limit behind its relation, without a unit; nothing where there is none."""
+        return "" if self.limit is None else f"{'≤' if self.better == 'lower' else '≥'} {self.limit:.4g}"
+
+    @property
     def margin(self) -> float | None:
         """Distance of the value from the limit as a share of the limit, negative beyond it; None without a limit."""
         return self.sign * (self.limit - self.value) / abs(self.limit) if self.limit else None
@@ -83,3 +93,8 @@ class Figure:
 def with_unit(text: str, unit: str) -> str:
     """A number's text with its unit behind it."""
     return f"{text} {unit}".rstrip()
+
+
+def percent(share: float, form: str) -> str:
+    """A share in per cent, its number in a form such as ".0" or "+.1"; a hundredfold or more by its power of ten."""
+    return f"{share:{form}%}" if abs(share) < 100 else f"{100 * share:{form}e}%"

@@ -13,6 +13,7 @@ from identify.accuracy.session import AccuracySession
 from identify.accuracy.testbed import (
     DEFAULT_SCENARIO,
     MARKER,
+    check_options,
     cmmsim_robot,
     cmmsim_scenario,
     cmmsim_seed,
@@ -31,14 +32,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options of the group `accuracy`."""
     group = parser.getgroup("accuracy", "accuracy benchmarks (cmmsim)")
     add = group.addoption
-    add("--accuracy-save", metavar="NAME", help="save the figures of a session that passes, replacing NAME")
+    add("--accuracy-save", metavar="NAME", help="save the figures of a session that passes; NAME may hold no others")
     add("--accuracy-compare", metavar="NAME", help="show saved figures and the change from them in the table")
     add(
         "--accuracy-fail",
         metavar="RATIO",
         type=ratio,
         help="fail when a figure is worse than the one compared with by more than RATIO of it, such as 0.1 "
-        "(a sample: when both intervals say so)",
+        "(a sample: when both intervals say so), or when its test ran or was skipped and did not record it",
     )
     add("--accuracy-dir", metavar="DIR", help="folder of saved figures (default: .accuracy in the root directory)")
     add("--accuracy-seed", metavar="N", type=seed, default=0, help="seed of the testbed's fixtures (default: 0)")
@@ -52,13 +53,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Declare the marker, and follow the session where its reports arrive."""
+    """Declare the marker; check the options and follow the session where its reports arrive."""
     config.addinivalue_line(
         "markers",
         f"{MARKER}(scenario=..., robot=..., sensor=...): what the cmmsim_ fixtures of a test load; built-in names, "
         "or files beside the test's file",
     )
     if not hasattr(config, "workerinput"):
+        check_options(config)
         config.pluginmanager.register(AccuracySession(config), "cmmsim_accuracy_session")
 
 

@@ -43,6 +43,9 @@ class Accuracy:
         if len(numbers) < 2:
             raise AccuracyError(f"{name}: a sample needs at least 2 values, got {len(numbers)}")
         mean, interval = mean_interval(numbers)
+        if not np.isfinite([mean, *interval]).all():
+            low, high = interval
+            raise AccuracyError(f"{name}: the interval of the mean is {low:.4g} .. {high:.4g}, not finite")
         self._keep(name, unit, limit, better, value=mean, interval=interval, count=len(numbers))
 
     def _keep(self, name: str, unit: str, limit: float | None, better: Better, **found: Any) -> None:
@@ -63,10 +66,17 @@ class Accuracy:
 
 
 def mean_interval(values: NDArray[np.float64]) -> tuple[float, tuple[float, float]]:
-    """Mean of values (n,), n >= 2, and the interval that holds the true mean with probability CONFIDENCE."""
-    count, mean = len(values), float(np.mean(values))
-    reach = float(stdtrit(count - 1, 0.5 + 0.5 * CONFIDENCE) * np.std(values, ddof=1) / np.sqrt(count))
-    return mean, (mean - reach, mean + reach)
+    """Mean of values (n,), n >= 2, and the interval that holds the true mean with probability CONFIDENCE.
+
+    An end beyond the largest float is infinite.
+    """
+    count, (_, exponent) = len(values), np.frexp(np.abs(values).max())
+    scaled = np.ldexp(values, -exponent)  # exactly, to within +-1: no square of them overflows
+    mean = np.mean(scaled)
+    reach = stdtrit(count - 1, 0.5 + 0.5 * CONFIDENCE) * np.std(scaled, ddof=1) / np.sqrt(count)
+    with np.errstate(over="ignore"):
+        mean, low, high = np.ldexp([mean, mean - reach, mean + reach], exponent).tolist()
+    return mean, (low, high)
 
 
 def _numbers(name: object, what: str, given: ArrayLike, dimensions: int) -> NDArray[np.float64]:
@@ -81,8 +91,10 @@ def _numbers(name: object, what: str, given: ArrayLike, dimensions: int) -> NDAr
         raise AccuracyError(f"{name}: {what} must be {wanted}, got {given!r:.80}")
     if array.ndim != dimensions:
         raise AccuracyError(f"{name}: {what} must be {wanted}, got an array of shape {array.shape}")
-    bad = np.flatnonzero(~np.isfinite(array))
+    with np.errstate(over="ignore"):
+        numbers = array.astype(float)
+    bad = np.flatnonzero(~np.isfinite(numbers))
     if len(bad):
         where = f"[{bad[0]}]" if dimensions else ""
-        raise AccuracyError(f"{name}: {what}{where} is {array.flat[bad[0]]}, not a finite number")
-    return array.astype(float)
+        raise AccuracyError(f"{name}: {what}{where} is {numbers.flat[bad[0]]}, not a finite number")
+    return numbers

@@ -7,16 +7,18 @@ from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from json import JSONDecodeError, dumps, loads
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
+from identify.accuracy.comparison import missing
 from identify.accuracy.errors import AccuracyError
 from identify.accuracy.figure import CONFIDENCE, Figure
 from identify.files.atomic import write_text
 from identify.files.versions import versions
 
 FORMAT, SCHEMA = "cmmsim accuracy", 1
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 def _now() -> str:
@@ -46,8 +48,10 @@ class SavedSession:
 
 def saved_path(folder: Path, name: str) -> Path:
     """File of a name in a folder. Raises AccuracyError for a name that could not be one everywhere."""
+    if name.endswith(".json"):
+        raise AccuracyError(f"{name!r} is no name for saved figures: {name.removesuffix('.json')!r} makes that file")
     if not NAME.fullmatch(name):
-        raise AccuracyError(f"{name!r} is no name for saved figures: letters, digits, '.', '_' and '-' are")
+        raise AccuracyError(f"{name!r} is no name for saved figures: up to 100 letters, digits, '.', '_' and '-' are")
     return folder / f"{name}.json"
 
 
@@ -69,7 +73,9 @@ def read_saved(path: Path) -> SavedSession:
     """The session in a file. Raises AccuracyError for a file that holds none, or one of another version."""
     try:
         content = loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, JSONDecodeError) as error:
+    except OSError as error:
+        raise AccuracyError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (UnicodeDecodeError, JSONDecodeError) as error:
         raise AccuracyError(f"{path} cannot be read as JSON: {error}") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise AccuracyError(f"{path} holds no accuracy figures (no entry format = {FORMAT!r})")
@@ -84,14 +90,26 @@ def read_saved(path: Path) -> SavedSession:
     return session
 
 
-def check_replaceable(path: Path) -> None:
-    """Raise AccuracyError where saving would replace a file that is not one of saved figures."""
-    if path.exists():
-        read_saved(path)
+def check_writable(path: Path) -> None:
+    """Raise AccuracyError where nothing can be saved, or what would be replaced is no file of saved figures."""
+    try:
+        with TemporaryFile(dir=next(place for place in path.parents if place.exists())):
+            pass
+        if path.exists():
+            read_saved(path)
+    except OSError as error:
+        raise AccuracyError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
 def save(path: Path, session: SavedSession) -> None:
-    """Write a session, whole or not at all. Raises AccuracyError."""
+    """Write a session, whole or not at all. Raises AccuracyError, also where it would lose figures of another."""
+    lost = missing(session.figures, read_saved(path).figures) if path.exists() else {}
+    if lost:
+        names = "; ".join(f"{test}: {', '.join(figures)}" for test, figures in lost.items())
+        raise AccuracyError(
+            f"not saved as {session.name}: {path} holds figures that were not measured now ({names}); "
+            "take another name, or remove that file"
+        )
     try:
         write_text(path, dumps(asdict(session), indent=2, allow_nan=False, ensure_ascii=False) + "\n")
     except OSError as error:

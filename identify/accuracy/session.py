@@ -9,10 +9,13 @@ from typing import Any
 
 import pytest
 
-from identify.accuracy.comparison import Comparison, Key, compare
+from identify.accuracy.comparison import Comparison, Key, compare, missing
 from identify.accuracy.errors import AccuracyError
 from identify.accuracy.figure import PROPERTY, Figure
 from identify.accuracy.table import terminal_table
+
+WHY_MISSING = {None: "did not run", "passed": "passed without", "skipped": "was skipped", "failed": "failed"}
+"""What is said of the test of a figure that was not measured, by the outcome."""
 
 
 class AccuracySession:
@@ -20,6 +23,7 @@ class AccuracySession:
 
     def __init__(self, config: pytest.Config) -> None:
         self._figures: dict[str, list[Figure]] = {}
+        self._outcomes: dict[str, str] = {}
         self._remarks: list[tuple[str, bool]] = []
         folder, base = config.getoption("accuracy_dir"), config.rootpath / ".accuracy"
         self._folder = config.invocation_params.dir / folder if folder else base
@@ -35,11 +39,11 @@ class AccuracySession:
             raise pytest.UsageError("--accuracy-fail needs --accuracy-compare NAME: worse than what?")
         if self._save is None and self._compare is None:
             return
-        from identify.accuracy.saved import check_replaceable, find_saved, saved_path
+        from identify.accuracy.saved import check_writable, find_saved, saved_path
 
         try:
             if self._save is not None:
-                check_replaceable(saved_path(self._folder, self._save))
+                check_writable(saved_path(self._folder, self._save))
             if self._compare is not None:
                 saved = find_saved(self._folder, self._compare)
                 self._saved = saved.figures
@@ -58,8 +62,15 @@ class AccuracySession:
         """Figures beside the saved ones."""
         return dict(compare(self.figures, self._saved))
 
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        """Take the outcome of a module that is skipped as a whole."""
+        if report.outcome != "passed":
+            self._outcomes[report.nodeid] = report.outcome
+
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Take the figures from a test's last report."""
+        """Take the outcome from each report of a test, and the figures from the last."""
+        if report.when == "setup" or report.outcome != "passed":
+            self._outcomes[report.nodeid] = report.outcome
         if report.when == "teardown":
             found = [_figure(value) for name, value in report.user_properties if name == PROPERTY]
             if found:
@@ -84,17 +95,38 @@ class AccuracySession:
             terminalreporter.write_line(remark, red=bad)
 
     def _judge(self, session: pytest.Session) -> None:
-        comparisons = self.comparisons
-        gone = len({figure.key for figure in self._saved} - set(comparisons))
-        if gone:
-            self._remark(f"{gone} of {len(self._saved)} figures saved as {self._compare} were not measured now")
-        if self._ratio is None:
-            return
-        for pair in comparisons.values():
+        self._tell_missing(session)
+        for pair in self.comparisons.values():
+            if pair.limit_change:
+                self._remark(pair.limit_change)
+            if self._ratio is None:
+                continue
             if pair.mismatch:
                 self._fail(session, f"{pair.now.test}: {pair.now.name} cannot be compared: {pair.mismatch}")
             elif pair.worse_by_more_than(self._ratio):
                 self._fail(session, f"worse by more than {self._ratio:.0%}: {pair.regression}")
+
+    def _tell_missing(self, session: pytest.Session) -> None:
+        """Name the saved figures that were not measured; fail, if asked to, where their test was run or skipped."""
+        gone = missing(self.figures, self._saved)
+        if not gone:
+            return
+        count = sum(map(len, gone.values()))
+        self._remark(f"{count} of {len(self._saved)} figures saved as {self._compare} were not measured now:")
+        for test, names in gone.items():
+            outcome = self._outcome(test)
+            line = f"  {test}: {', '.join(names)} (the test {WHY_MISSING.get(outcome, outcome)})"
+            if outcome is None or self._ratio is None:
+                self._remark(line)
+            else:
+                self._fail(session, line)
+
+    def _outcome(self, test: str) -> str | None:
+        """Outcome of a test or its module, None if it did not run. With --dist loadgroup its reports name a group."""
+        for node, outcome in self._outcomes.items():
+            if node == test or node.startswith(f"{test}@") or test.startswith(f"{node}::"):
+                return outcome
+        return None
 
     def _keep(self, session: pytest.Session) -> None:
         from identify.accuracy.saved import SavedSession, save, saved_path

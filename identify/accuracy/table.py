@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 
 from identify.accuracy.comparison import Comparison, Key
-from identify.accuracy.figure import CONFIDENCE, Figure
+from identify.accuracy.figure import CONFIDENCE, Figure, percent
 
 Row = tuple[str, ...]
+UNDECIDED = "undecided"
 HEADER: Row = ("figure", "value", f"{CONFIDENCE:.0%} interval", "unit", "limit", "margin")
 
 
@@ -27,6 +28,8 @@ def terminal_table(
     lines = [_aligned(header, widths)]
     for (test, _), group_rows in zip(tests, rows, strict=True):
         lines += [test, *(_aligned(row, widths) for row in group_rows)]
+    if any(figure.undecided for figure in figures):
+        lines.append(f"{UNDECIDED}: passed, as the interval holds the limit; more values would tell")
     return lines
 
 
@@ -39,10 +42,9 @@ def markdown_table(figures: Sequence[Figure]) -> str:
 
 def _cells(figure: Figure) -> Row:
     interval = "" if figure.interval is None else f"{figure.interval[0]:.4g} .. {figure.interval[1]:.4g}"
-    relation = "≤" if figure.better == "lower" else "≥"
-    limit = "" if figure.limit is None else f"{relation} {figure.limit:.4g}"
-    margin = "" if figure.margin is None else f"{figure.margin:.0%}"
-    return f"{figure.value:.4g}", interval, figure.unit, limit, margin + (" FAILED" if figure.beyond_limit else "")
+    margin = "" if figure.margin is None else percent(figure.margin, ".0")
+    mark = "FAILED" if figure.beyond_limit else UNDECIDED if figure.undecided else ""
+    return f"{figure.value:.4g}", interval, figure.unit, figure.limit_text, f"{margin} {mark}".strip()
 
 
 def _compared(comparison: Comparison | None) -> Row:
@@ -50,7 +52,7 @@ def _compared(comparison: Comparison | None) -> Row:
         return "", "new"
     if comparison.mismatch:
         return "", comparison.mismatch
-    return f"{comparison.saved.value:.4g}", f"{comparison.change:+.1%}"
+    return f"{comparison.saved.value:.4g}", percent(comparison.change, "+.1")
 
 
 def _aligned(row: Row, widths: Sequence[int]) -> str:

@@ -6,7 +6,9 @@ that do not by `--accuracy-sensor mine.toml`. Nothing heavy is imported before a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from hashlib import sha256
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +24,25 @@ if TYPE_CHECKING:
 MARKER = "cmmsim"
 CHOICES = ("scenario", "robot", "sensor")
 DEFAULT_SCENARIO = "quick"
+
+
+def check_options(config: pytest.Config) -> None:
+    """Raise pytest.UsageError where the command line names a scenario, robot or sensor that cannot be loaded."""
+    chosen = _from_options(config)
+    if not chosen:
+        return
+    from cmmsim.errors import CmmError
+    from cmmsim.sensor_file import read_sensor_file
+    from dynamics import DynamicsError, load_robot
+    from identify import IdentifyError, load_scenario
+
+    load: dict[str, Callable[[str], object]]
+    load = {"scenario": load_scenario, "robot": load_robot, "sensor": read_sensor_file}
+    for what, name in chosen.items():
+        try:
+            load[what](name)
+        except (CmmError, DynamicsError, IdentifyError) as error:
+            raise pytest.UsageError(f"--accuracy-{what}: {error}") from error
 
 
 def node_id(item: pytest.Item) -> str:
@@ -80,18 +101,25 @@ def cmmsim_sensor(
 
 def _choices(request: pytest.FixtureRequest) -> dict[str, str]:
     """Names or files of what this test uses: from the command line, replaced by its markers, the closest last."""
-    start = request.config.invocation_params.dir
-    given = {what: request.config.getoption(f"accuracy_{what}") for what in CHOICES}
-    chosen = {what: _file_or_name(start, name) for what, name in given.items() if name is not None}
+    chosen = _from_options(request.config)
     for mark in reversed(list(request.node.iter_markers(MARKER))):
         unknown = [repr(key) for key in mark.kwargs if key not in CHOICES] + [repr(value) for value in mark.args]
         if unknown:
             raise AccuracyError(f"marker {MARKER}: {', '.join(unknown)} unknown; it takes {', '.join(CHOICES)}")
+        for what, name in mark.kwargs.items():
+            if not isinstance(name, str | PathLike):
+                raise AccuracyError(f"marker {MARKER}: {what} is {name!r}, must be a built-in name or a file")
         chosen |= {what: _file_or_name(request.path.parent, name) for what, name in mark.kwargs.items()}
     return chosen
 
 
-def _file_or_name(folder: Path, name: str | Path) -> str:
+def _from_options(config: pytest.Config) -> dict[str, str]:
+    start = config.invocation_params.dir
+    given = {what: config.getoption(f"accuracy_{what}") for what in CHOICES}
+    return {what: _file_or_name(start, name) for what, name in given.items() if name is not None}
+
+
+def _file_or_name(folder: Path, name: str | PathLike[str]) -> str:
     """The file of that name in the folder, or else the name as it is, which may be a built-in one."""
     path = folder / name
     return str(path) if path.is_file() else str(name)

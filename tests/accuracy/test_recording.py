@@ -37,6 +37,8 @@ def test_a_value_beyond_its_limit_fails(project, value, limit, better, passes):
         ("[9.0, 11.0]", 23.0, "higher", False),
         ("[9.0, 11.0] * 1000", 9.97, "lower", True),
         ("[9.0, 11.0] * 1000", 9.95, "lower", False),
+        ("[1e160, 1.01e160, 1.02e160]", 2.0, "lower", False),  # whose squares overflow
+        ("[1.7e308, 1.7e308]", 2.0, "lower", False),
         ("[5, 5, 5]", 5, "lower", True),
         ("[5, 5, 5]", 4.9, "lower", False),
     ],
@@ -55,6 +57,14 @@ def test_the_interval_is_students(subtests):
             mean, interval = mean_interval(values)
             assert mean == pytest.approx(values.mean())
             assert interval == pytest.approx((low, high))
+
+
+@pytest.mark.parametrize("power", [-1000, -600, 0, 520, 1000])
+def test_the_interval_scales_with_the_values(power):
+    """By powers of two, which change no digit: of squares that vanish and of those that overflow too."""
+    values = np.random.default_rng(4).normal(3.0, 2.0, 20)
+    mean, interval = mean_interval(values)
+    assert mean_interval(np.ldexp(values, power)) == (np.ldexp(mean, power), tuple(np.ldexp(interval, power)))
 
 
 def test_the_interval_holds_the_true_mean_in_95_of_100_samples():
@@ -106,6 +116,8 @@ def test_a_failure_says_everything_and_points_at_the_users_line(project):
         ("sample('x', 1.0)", "x: values must be a row of numbers, got an array of shape ()"),
         ("sample('x', np.ones((50, 6)))", "x: values must be a row of numbers, got an array of shape (50, 6)"),
         ("sample('x', [1.0, 2.0, float('inf')])", "x: values[2] is inf, not a finite number"),
+        ("sample('x', [-1.7e308, 1.7e308])", "x: the interval of the mean is -inf .. inf, not finite"),
+        ("record('x', np.longdouble('1e400'))", "x: value is inf, not a finite number"),
         ("sample('x', ['a', 'b'])", "x: values must be a row of numbers, got ['a', 'b']"),
         ("sample('x', [[1], [2, 3]])", "x: values must be a row of numbers, got rows of different lengths"),
     ],

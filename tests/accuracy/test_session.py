@@ -95,7 +95,7 @@ def test_new_and_missing_figures_are_told(project):
     project(START, "--accuracy-save", "before")
     again = project("def test_new(accuracy): accuracy.record('new', 1.0)", "--accuracy-compare", "before")
     assert [line for line in again.outlines if line.startswith("  new") and line.endswith("  new")]
-    again.stdout.fnmatch_lines(["4 of 4 figures saved as before were not measured now"])
+    again.stdout.fnmatch_lines(["4 of 4 figures saved as before were not measured now:"])
 
 
 def test_another_seed_is_told(project):
@@ -169,7 +169,12 @@ def test_an_interrupted_session_saves_nothing(project, pytester):
     ("options", "says"),
     [
         (["--accuracy-compare", "befor"], "no accuracy figures are saved as 'befor' in *.accuracy; saved are: before"),
-        (["--accuracy-save", "../x"], "'../x' is no name for saved figures: letters, digits, '.', '_' and '-' are"),
+        (["--accuracy-save", "../x"], "'../x' is no name for saved figures: up to 100 letters, digits, *"),
+        (["--accuracy-save", "x" * 300], "'xxx*' is no name for saved figures: up to 100 letters, digits, *"),
+        (["--accuracy-save", "full.json"], "'full.json' is no name for saved figures: 'full' makes that file"),
+        (["--accuracy-save", "x", "--accuracy-dir", "test_mine.py"], "/*/x.json cannot be written: Not a directory"),
+        (["--accuracy-save", "x", "--accuracy-dir", "/proc/none"], "/proc/none/x.json cannot be written: *"),
+        (["--accuracy-save", "x", "--accuracy-dir", "y" * 300], "/*/x.json cannot be written: File name too long"),
         (["--accuracy-fail", "0.1"], "--accuracy-fail needs --accuracy-compare NAME: worse than what?"),
         (["--accuracy-fail", "-1"], "*argument --accuracy-fail: RATIO is -1, must be 0 or more, such as 0.1 for 10 %"),
         (["--accuracy-fail", "ten"], "*argument --accuracy-fail: invalid ratio value: 'ten'"),
@@ -209,11 +214,10 @@ def test_a_file_that_is_none_is_one_line_and_is_not_replaced(project, pytester, 
     assert path.read_text() == text
 
 
-def test_a_folder_that_cannot_be_written_fails_the_session_in_one_line(project, pytester):
-    (pytester.path / "taken").write_text("")
-    done = project(START, "--accuracy-save", "before", "--accuracy-dir", "taken")
+def test_a_folder_that_is_lost_meanwhile_fails_the_session_in_one_line(project, pytester):
+    done = project(START + "\ndef test_z(): open('.accuracy', 'w').close()", "--accuracy-save", "before")
     assert done.ret == 1
-    done.stdout.fnmatch_lines(["*taken/before.json cannot be written: *"])
+    done.stdout.fnmatch_lines(["*.accuracy/before.json cannot be written: *"])
 
 
 def test_the_folder_can_be_chosen(project, pytester):
@@ -233,7 +237,8 @@ def test_saved_figures_become_a_markdown_table(project, pytester, capsys):
     ]
     assert lines[2].startswith("| pose [planes] | ")
     assert lines[4] == "| bias | 0.002 |  | px | ≤ 0.003 | 33% |"
-    assert "no.json cannot be read" in main(["no.json"])
+    assert main(["no.json"]) == "no.json cannot be read: No such file or directory"
+    assert main([str(pytester.path)]).endswith(" cannot be read: Is a directory")
     assert main([]).startswith("usage: ")
 
 

@@ -75,12 +75,28 @@ def test_markers_and_options_choose_built_in_names_or_files(project, pytester):
         ("'mine'", "AccuracyError: marker cmmsim: 'mine' unknown; it takes scenario, robot, sensor"),
         ("scenario='papper'", "ScenarioError: scenario 'papper' is neither built in (paper, quick) nor a file"),
         ("robot='rss7'", "RobotFileError: *rss7*rss6*"),
+        ("sensor=5", "AccuracyError: marker cmmsim: sensor is 5, must be a built-in name or a file"),
+        ("robot=None", "AccuracyError: marker cmmsim: robot is None, must be a built-in name or a file"),
     ],
 )
 def test_what_does_not_exist_is_one_line_with_the_valid_names(project, marker, says):
     done = project(f"@pytest.mark.cmmsim({marker})\ndef test_it(cmmsim_robot): pass")
     done.assert_outcomes(errors=1)
     done.stdout.fnmatch_lines([f"E  *{says}"])
+
+
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [
+        ("--accuracy-scenario", "scenario 'nosuch' is neither built in (paper, quick) nor a file"),
+        ("--accuracy-robot", "unknown robot `nosuch`; built-in robots: rss6; *"),
+        ("--accuracy-sensor", "unknown sensor 'nosuch': neither a built-in name (ctrack780, ctrack780_29hz) nor *"),
+    ],
+)
+def test_options_are_checked_though_no_test_uses_them(project, option, says):
+    done = project("def test_it(): pass", option, "nosuch")
+    assert done.ret == pytest.ExitCode.USAGE_ERROR
+    done.stderr.fnmatch_lines([f"ERROR: {option}: {says}"])
 
 
 def test_starting_pytest_imports_nothing_heavy(pytester):
