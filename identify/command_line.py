@@ -19,9 +19,10 @@ from identify.commands.study import STUDY_HELP, study
 from identify.commands.variation import variation
 from identify.commands.workspace import workspace
 from identify.errors import IdentifyError, ScenarioError
+from identify.files.result_file import load_result
 from identify.files.run_folder import RunFolder, new_run_folder
 from identify.progress import terminal_progress
-from identify.reporting.terminal import print_table
+from identify.reporting.terminal import print_warnings
 from identify.scenario import Scenario, load_scenario, scenario_names
 
 HELP = """
@@ -111,7 +112,7 @@ Settings = Annotated[
 Workers = Annotated[
     int | None, typer.Option("--workers", min=1, help="Processes that render.", show_default="one a core")
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary; warnings stay.")]
 
 
 def main() -> None:
@@ -168,12 +169,16 @@ def run(
     workers: Workers = None,
     quiet: Quiet = False,
 ) -> None:
-    """Do the whole experiment: excite, record, identify, validate, report."""
+    """Do the whole experiment: excite, record, identify, validate, report.
+
+    A goal that is missed is said, and does not change the exit status.
+    """
     chosen = _scenario(scenario, settings)
     folder = new_run_folder(out or Path("runs") / f"{chosen.name}-{seed}")
     _pipeline().run(chosen, seed, folder.path, terminal_progress(quiet), workers)
+    _warn(folder)
     if not quiet:
-        print_summary(folder)
+        _summary().print_goals(load_result(folder.result), folder.report)
 
 
 @app.command()
@@ -209,8 +214,12 @@ def record(out: RunFolderOption, workers: Workers = None, quiet: Quiet = False) 
 @app.command()
 def identify(out: RunFolderOption, quiet: Quiet = False) -> None:
     """Estimate the parameters from the record: writes result.json."""
-    RunFolder(out).require("scenario.toml", "trajectories.json", "experiment.nc")
+    folder = RunFolder(out)
+    folder.require("scenario.toml", "trajectories.json", "experiment.nc")
     _pipeline().identify(out, terminal_progress(quiet))
+    _warn(folder)
+    if not quiet:
+        _summary().print_identification(load_result(folder.result), folder.result)
 
 
 @app.command()
@@ -223,10 +232,11 @@ def validate(out: RunFolderOption, workers: Workers = None, quiet: Quiet = False
 @app.command()
 def report(out: RunFolderOption, quiet: Quiet = False) -> None:
     """Draw the figures and write report.html, one file that opens offline."""
-    RunFolder(out).require("result.json", "experiment.nc", "validation.nc", "model.nc")
+    folder = RunFolder(out)
+    folder.require("result.json", "experiment.nc", "validation.nc", "model.nc")
     _pipeline().report(out, terminal_progress(quiet))
     if not quiet:
-        print_summary(RunFolder(out))
+        _summary().print_goals(load_result(folder.result), folder.report)
 
 
 app.command("verify-model")(verify_model)
@@ -256,19 +266,6 @@ def parse_settings(settings: list[str] | None) -> dict[str, Any]:
     return overrides
 
 
-def print_summary(folder: RunFolder) -> None:
-    """Print the goals of a run with their values, and where its report is."""
-    from identify.files.result_file import load_result
-    from identify.reporting.tables import goals_table
-
-    table = goals_table(load_result(folder.result))
-    print_table(table.header[:4], [row[:4] for row in table.rows], ("goal", ""), table.title, table.note)
-    for goal, *_, met, detail in table.rows:
-        if met != "met":
-            typer.echo(f"missed: {goal}: {detail}")
-    typer.echo(f"report: {folder.report}")
-
-
 def _toml_or_text(text: str) -> Any:
     try:
         return tomllib.loads(f"value = {text}")["value"]
@@ -278,6 +275,18 @@ def _toml_or_text(text: str) -> Any:
 
 def _scenario(name: str, settings: list[str] | None) -> Scenario:
     return load_scenario(name).with_overrides(parse_settings(settings))
+
+
+def _warn(folder: RunFolder) -> None:
+    """Say what the identification warns of."""
+    print_warnings(load_result(folder.result)["identification"].get("warnings", []))
+
+
+def _summary() -> Any:
+    """What a run says of itself, imported late as the stages are."""
+    from identify.reporting import run_summary
+
+    return run_summary
 
 
 def _pipeline() -> Any:

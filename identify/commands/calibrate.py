@@ -7,7 +7,7 @@ import typer
 
 from identify.errors import OutputFolderError, ScenarioError
 from identify.progress import Progress, terminal_progress
-from identify.reporting.terminal import print_table
+from identify.reporting.terminal import print_table, print_warnings
 
 if TYPE_CHECKING:
     from cmmsim.calibration import Board, Calibration
@@ -74,7 +74,7 @@ def calibrate(
         typer.Option("--render", min=1, help="Render this many pairs of pictures instead, and stop."),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rendered poses and of their noise.")] = 0,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary; warnings stay.")] = False,
 ) -> None:
     """Calibrate a stereo camera from pictures of a board, or render such pictures."""
     from cmmsim.calibration import read_board
@@ -94,6 +94,7 @@ def calibrate(
     template = None if sensor is None else _template(sensor)
     found = _calibrate(left, right, read_board(board), (distortion, fix_aspect, min_images), progress)
     _write(folder, found, template)
+    print_warnings(found.warnings)
     if not quiet:
         _print_summary(found, folder)
 
@@ -179,6 +180,4 @@ def _print_summary(found: "Calibration", folder: Path) -> None:
     print_table(("parameter", "estimate", "std"), rows, ("parameter",), title)
     for name, reason in found.rejected.items():
         typer.echo(f"not used: {name}: {reason}")
-    for line in found.warnings:
-        typer.echo(f"warning: {line}", err=True)
     typer.echo(f"calibration: {folder}")

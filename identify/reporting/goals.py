@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from identify.estimation.estimate_covariance import MISFIT_STDS
+from identify.estimation.whiteness import SUSPICIOUS
 from identify.files.result_file import rms_row
 
 VALIDATION_UM, VALIDATION_URAD = 2.0, 10.0
@@ -32,7 +34,23 @@ class Goal:
 
 def check_goals(result: dict[str, Any]) -> list[Goal]:
     """The goals that the parts of a result allow to judge; accuracy is that of the worst axis of the worst run."""
-    return [*_validation(result), *_sensor(result), *_parameters(result), *_time(result)]
+    parts = (_validation, _sensor, explanation_goals, _parameters, _time)
+    return [goal for part in parts for goal in part(result)]
+
+
+def explanation_goals(result: dict[str, Any]) -> list[Goal]:
+    """Whether the model explains the record: what it leaves is as large as noise alone makes it, and is white."""
+    found, goals = result.get("identification", {}), []
+    if "noise_ratio_std" in found:
+        keys = ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")
+        ratio, expected, std = (math.nan if found[key] is None else found[key] for key in keys)
+        text = f"residuals {ratio:.3f} times the noise variance, noise alone gives {expected:.3f} ± {std:.3f}"
+        goals.append(Goal("misfit of the record", abs(ratio - expected) / std, "<=", MISFIT_STDS, "std", text))
+    if "whiteness" in found:
+        chance = found["whiteness"]["p_value"]
+        text = "probability that chance correlates the residuals as much, of the model driven by the logged commands"
+        goals.append(Goal("white residuals", math.nan if chance is None else chance, ">=", SUSPICIOUS, "", text))
+    return goals
 
 
 def _validation(result: dict[str, Any]) -> list[Goal]:

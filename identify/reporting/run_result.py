@@ -34,6 +34,7 @@ def identification_entry(result: IdentificationResult) -> dict[str, Any]:
         "active_bounds": list(result.active_bounds),
         "noise_ratio": result.noise_ratio,
         "expected_noise_ratio": result.expected_noise_ratio,
+        "noise_ratio_std": result.noise_ratio_std,
         "whiteness": {
             "p_value": result.whiteness.p_value,
             "p_values": dict(zip(AXES, result.whiteness.p_values, strict=True)),

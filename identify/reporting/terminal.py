@@ -1,10 +1,17 @@
-"""Tables at the terminal, all in one look: 80 columns must do, since that is what a pipe gets."""
+"""Tables at the terminal, all in one look: 80 columns must do, since that is what a pipe gets. And warnings."""
 
 from collections.abc import Collection, Iterable, Sequence
 
+import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table as RichTable
+
+
+def print_warnings(warnings: Iterable[str]) -> None:
+    """One line each on standard error, `warning: ...`; they are no summary, and a quiet command gives them too."""
+    for warning in warnings:
+        typer.echo(f"warning: {' '.join(warning.split())}", err=True)
 
 
 def print_table(

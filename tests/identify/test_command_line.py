@@ -9,19 +9,63 @@ from identify.errors import OutputFolderError, ScenarioError
 from identify.files.result_file import load_result, save_result
 from identify.files.run_folder import RunFolder, new_run_folder
 from tests.identify.commands import command, one_line
+from tests.identify.conftest import make_result
 
 
 @pytest.fixture
 def calls(monkeypatch):
-    """The stages, replaced by notes of their calls."""
+    """The stages, replaced by notes of their calls; a run leaves a result, as the real one does."""
     made = []
 
     def stage(name):
         return lambda *arguments: made.append((name, *arguments))
 
-    names = ("run", "excite", "record", "identify", "validate", "report")
-    monkeypatch.setattr(command_line, "_pipeline", lambda: SimpleNamespace(**{n: stage(n) for n in names}))
+    def run(scenario, seed, folder, *more):
+        made.append(("run", scenario, seed, folder, *more))
+        save_result(RunFolder(folder).result, warned(make_result()))
+
+    names = ("excite", "record", "identify", "validate", "report")
+    monkeypatch.setattr(command_line, "_pipeline", lambda: SimpleNamespace(run=run, **{n: stage(n) for n in names}))
     return made
+
+
+def warned(result):
+    """The result of a plant that the model cannot be."""
+    result["identification"] |= {"noise_ratio": 1.356, "whiteness": {"p_value": 0.0}, "warnings": ["not white", "a\nb"],
+                                 "groups": {"platform.mass": {"identifiable": True}}}
+    return result
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_identify_warns_on_standard_error_even_where_it_is_quiet(calls, run_folder, capfd, quiet):
+    run_folder.trajectories.write_text("{}")
+    save_result(run_folder.result, warned(load_result(run_folder.result)))
+    assert command("identify", "--out", run_folder.path, *["--quiet"] * quiet) == 0
+    out, err = capfd.readouterr()
+    assert err == "warning: not white\nwarning: a b\n"
+    if quiet:
+        assert out == ""
+    else:
+        assert "identified: 4 of 5 parameters and 1 of 1 groups" in out
+        assert "1.356 times the noise variance, noise alone gives 1.100 ± 0.040" in out
+        assert "the model does NOT explain the record" in out
+        assert str(run_folder.result) in out
+
+
+def test_identify_says_that_the_model_explains_the_record(calls, run_folder, capfd):
+    run_folder.trajectories.write_text("{}")
+    assert command("identify", "--out", run_folder.path) == 0
+    out, err = capfd.readouterr()
+    assert err == ""
+    assert "the model explains the record" in out
+
+
+def test_a_run_of_a_wrong_plant_warns_and_misses_its_goals(calls, tmp_path, capfd):
+    assert command("run", "quick", "--out", tmp_path / "new") == 0
+    out, err = capfd.readouterr()
+    assert err == "warning: not white\nwarning: a b\n"
+    assert "missed: misfit of the record: residuals 1.356 times the noise variance" in out
+    assert "missed: white residuals: " in out
 
 
 def test_run_passes_scenario_seed_folder_and_workers(calls, tmp_path):

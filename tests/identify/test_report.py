@@ -60,7 +60,7 @@ def check_figures(folder):
 
 def test_report_shows_goals_parameters_and_the_papers_numbers(run_folder):
     text = render(read_report_data(run_folder))
-    for shown in ("All 8 goals are met.", "joint1.coulomb", "not identifiable", "1260", "1411", "platform_mass",
+    for shown in ("All 10 goals are met.", "joint1.coulomb", "not identifiable", "1260", "1411", "platform_mass",
                   "timing.frame_rate_hz", "diverged", "stopped by: tolerance", "joint1.coulomb, joint_pid.lp",
                   "+0.9877", "2.0e+11 of the poses alone", "1 predicted std"):
         assert shown in text, shown

@@ -56,10 +56,11 @@ def test_damaged_result_is_named(tmp_path, text):
 
 
 def test_good_result_meets_every_goal(result):
-    assert len(goals(result)) == 8
+    assert len(goals(result)) == 10
     assert all(goal.passed for goal in goals(result).values())
     assert goals(result)["unseen position"].value == pytest.approx(1.8)
     assert goals(result)["sensor orientation"].value == 50.0
+    assert goals(result)["misfit of the record"].value == pytest.approx(2.5)
 
 
 @pytest.mark.parametrize(
@@ -74,6 +75,11 @@ def test_good_result_meets_every_goal(result):
         (lambda r: r["sensor"].update(stereo_frames_per_second=59.9), "stereo frames"),
         (lambda r: r["seconds"].update(validate=60.0), "whole run"),
         (lambda r: r["identification"]["parameters"]["joint_pid.lp"].update(estimate=11.6), "friction and PID outside"),
+        (lambda r: r["identification"].update(noise_ratio=1.31), "misfit of the record"),
+        (lambda r: r["identification"].update(noise_ratio=0.89), "misfit of the record"),
+        (lambda r: r["identification"].update(noise_ratio=None), "misfit of the record"),
+        (lambda r: r["identification"]["whiteness"].update(p_value=9e-5), "white residuals"),
+        (lambda r: r["identification"]["whiteness"].update(p_value=None), "white residuals"),
     ],
 )
 def test_each_goal_is_missed_alone(result, change, missed):
