@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from identify.arrays import Array
     from identify.estimation.base_parameters import BaseParameters
 
 THRESHOLD = 1e-3
@@ -31,10 +32,10 @@ def base_parameters(
 
     matrix = base.structural_regressor(load_robot(robot))
     found = base.base_parameters(matrix)
-    singular = base.rank_by_singular_values(matrix)
+    singular, angle = base.rank_by_singular_values(matrix), angle_to_singular_vectors(matrix, found)
     counts = {10**d: base.rank_by_threshold(matrix / 10**d, THRESHOLD) for d in DECADES}
     if out is not None:
-        write_text(out, json.dumps(_entries(found, singular), indent=2) + "\n")
+        write_text(out, json.dumps(_entries(found, singular, angle), indent=2) + "\n")
     for expression in found.expressions():
         typer.echo(expression)
     typer.echo(f"unseen: {', '.join(found.unseen) or 'none'}")
@@ -42,6 +43,7 @@ def base_parameters(
         f"{found.rank} base parameters of {len(found.names)} by pivoted QR, {singular} by singular values; columns of "
         f"length one leave {found.gap[1]:.1e} outside the others where independent, {found.gap[0]:.1e} where not"
     )
+    typer.echo(f"the same groups from singular vectors: largest angle between what both span {angle:.1e} rad")
     tried = ", ".join(f"{count} in units of {unit:g} N" for unit, count in counts.items())
     left = len(found.names) - len(found.unseen)
     typer.echo(
@@ -50,9 +52,29 @@ def base_parameters(
     )
 
 
-def _entries(found: "BaseParameters", singular: int) -> dict[str, Any]:
+def angle_to_singular_vectors(matrix: "Array", found: "BaseParameters") -> float:
+    """Largest angle [rad] between what the groups span and the row space of a regression matrix (rows, p) by its
+    singular vectors, with columns of length one; pi / 2 where one has a direction more than the other."""
+    import numpy as np
+    from scipy.linalg import orth, subspace_angles
+
+    from identify.estimation.base_parameters import DEPENDENT
+
+    lengths = np.linalg.norm(matrix, axis=0)
+    scale = np.where(lengths > DEPENDENT * lengths.max(), lengths, 1.0)
+    groups, rows = found.combinations / scale, orth((matrix / scale).T, rcond=DEPENDENT)
+    return float(subspace_angles(groups.T, rows).max()) if len(groups) == rows.shape[1] else np.pi / 2
+
+
+def _entries(found: "BaseParameters", singular: int, angle: float) -> dict[str, Any]:
     groups = [
         {"name": name, "expression": text, "coefficients": {found.names[k]: row[k] for k in row.nonzero()[0]}}
         for name, text, row in zip(found.group_names(), found.expressions(), found.combinations, strict=True)
     ]
-    return {"rank": found.rank, "rank_by_singular_values": singular, "unseen": list(found.unseen), "groups": groups}
+    return {
+        "rank": found.rank,
+        "rank_by_singular_values": singular,
+        "angle_to_singular_vectors_rad": angle,
+        "unseen": list(found.unseen),
+        "groups": groups,
+    }

@@ -1,6 +1,7 @@
 """Base parameters against the inverse dynamics, singular values and what mechanics says."""
 
 import json
+from dataclasses import replace
 from importlib import resources
 
 import numpy as np
@@ -10,6 +11,7 @@ from typer.testing import CliRunner
 from dynamics import load_robot
 from dynamics.parameters import PARAMETER_NAMES
 from identify.command_line import app
+from identify.commands.base_parameters import angle_to_singular_vectors
 from identify.errors import EstimationError
 from identify.estimation.base_parameters import (
     base_parameters,
@@ -65,6 +67,17 @@ def test_rank_and_space_are_those_of_the_singular_values(found):
     assert np.abs(groups @ rows.T @ rows - groups).max() < 1e-9 * np.abs(groups).max()
 
 
+def test_the_angle_to_the_singular_vectors_is_that_by_which_a_group_is_wrong():
+    """Columns of length 3 and 4, and one that no motion shows: a group turned towards it by 0.1 rad."""
+    matrix = np.array([[3.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 0.0]])
+    right = base_parameters(matrix, ("crank1.Izz", "crank2.Izz", "crank3.Izz"))
+    assert angle_to_singular_vectors(matrix, right) < 1e-12
+    turned = right.combinations + np.array([[0.0, 0.0, np.tan(0.1) / 3.0], [0.0, 0.0, 0.0]])
+    assert angle_to_singular_vectors(matrix, replace(right, combinations=turned)) == pytest.approx(0.1, rel=1e-9)
+    one_less = replace(right, combinations=right.combinations[:1])
+    assert angle_to_singular_vectors(matrix, one_less) == pytest.approx(np.pi / 2)
+
+
 def test_gravity_across_the_crank_axes_separates_mass_from_inertia(found, tmp_path):
     """On a slope a crank's weight turns it, so its mass is no longer tied to its inertia."""
     matrix = structural_regressor(leaning(tmp_path))
@@ -103,6 +116,8 @@ def test_the_command_prints_and_writes_the_groups(tmp_path):
     done = CliRunner().invoke(app, ["base-parameters", "rss6", "--out", str(file)])
     assert done.exit_code == 0, done.output
     assert "crank1.Izz + 0.0009 crank1.mass" in done.output
+    assert "the same groups from singular vectors: largest angle between what both span" in done.output
     written = json.loads(file.read_text())
     assert written["rank"] == written["rank_by_singular_values"] == len(written["groups"]) == 37
+    assert written["angle_to_singular_vectors_rad"] < 1e-9
     assert written["groups"][-1]["name"] == "joint6.viscous"
