@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
 from identify.errors import StudyError, StudyInterrupted
 from identify.progress import RichProgress, SilentProgress
@@ -21,6 +20,9 @@ MANY_ROWS = 100_000
 SOME_ROWS_FAILED = 3
 """Exit status of a study that is done, but in which rows failed."""
 
+A_LAW_FAILED = 4
+"""Exit status of a study whose rows are all done and contradict a law that it states."""
+
 STUDY_HELP = f"""
 Run a study: a scenario varied over factors, row by row, on all cores or on many machines.
 
@@ -34,7 +36,7 @@ makes another study, which needs another folder.
 \b
 A study file:
   name = "noise_and_baseline"
-  kind = "static_pose"                            # what a row is; or module:function of your own
+  kind = "static_pose"                            # what a row is (--kinds); or module:function of your own
   scenario = "paper"
   repeats = 10
   [changes]                                       # in every row
@@ -51,10 +53,17 @@ With sample = N at the top: N points drawn at random instead, where a factor may
   sensor.rig.baseline = {{ low = 0.5, high = 2.0, scale = "log" }}
 
 \b
+A row of your own, in a module on PYTHONPATH:
+  def run(scenario, seed, options):               # without options: run(scenario, seed)
+      rng = numpy.random.default_rng(seed)        # seed: numpy.random.SeedSequence
+      return {{"error_um": ...}}                    # numbers, units in their names
+
+\b
 Written into the folder:
   study.json       the resolved study, with its scenario and sensor
   rows.jsonl       finished rows as they come
   study.parquet    one table: factors, figures with units, seeds, seconds, errors
+  study.nc         the figures by factors and repeat, for xarray.open_dataset
   summary.md, summary.json, figures/*.png
 
 \b
@@ -63,7 +72,13 @@ On many machines, all with the same cmmsim and with the files that the scenario 
   dask worker tcp://HOST:8786 --nthreads 1        on each, once a core
   cmmsim study STUDY --scheduler tcp://HOST:8786
 
-Exit status: {SOME_ROWS_FAILED} where rows failed (they say why in the column error), 130 after Ctrl-C.
+\b
+Exit status:
+  0    all rows are done, and none contradicts a law; laws may be undecided where rows are few
+  {SOME_ROWS_FAILED}    rows failed: they say why in the column error
+  {A_LAW_FAILED}    all rows are done, and a law failed: its 99 % interval excludes what it states
+  130  after Ctrl-C
+  1, 2 it cannot be run: one line says why
 """
 
 
@@ -86,11 +101,17 @@ def study(
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help=f"Do run more than {MANY_ROWS} rows.")] = False,
     list_: Annotated[bool, typer.Option("--list", help="Only list the built-in studies.")] = False,
+    kinds: Annotated[
+        bool, typer.Option("--kinds", help="Only list the kinds of row, with their options and figures.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar and no summary.")] = False,
 ) -> None:
     """Run or continue a study."""
     if list_:
         _list()
+        return
+    if kinds:
+        _list_kinds()
         return
     if name is None:
         raise typer.BadParameter("name a built-in study or a TOML file, or ask for --list", param_hint="STUDY")
@@ -109,10 +130,10 @@ def study(
     except StudyInterrupted as stopped:
         typer.echo(f"{stopped}; the same command goes on from there", err=True)
         raise typer.Exit(130) from None
-    _summarise(chosen, folder, outcome, quiet)
-    if outcome.failed:
-        typer.echo(f"{outcome.failed} of {outcome.rows} rows failed; {outcome.first_error}", err=True)
-        raise typer.Exit(SOME_ROWS_FAILED)
+    laws = _summary(chosen, folder, outcome)
+    if not quiet:
+        _print_summary(folder, outcome, laws)
+    _exit(outcome, laws)
 
 
 def _run(study: "Study", folder: Path, scheduler: str | None, workers: int | None, quiet: bool) -> "Outcome":
@@ -132,26 +153,37 @@ def _workers(scheduler: str | None, workers: int | None) -> "Workers":
     return partial(running_cluster, scheduler) if scheduler else partial(local_cluster, workers or cores())
 
 
-def _summarise(study: "Study", folder: Path, outcome: "Outcome", quiet: bool) -> None:
+def _summary(study: "Study", folder: Path, outcome: "Outcome") -> list[dict[str, Any]]:
+    """Write the summary; the laws with their verdicts."""
     from identify.studies import summary
 
     try:
-        entry = summary.write(folder, study, outcome.frame)
+        return list(summary.write(folder, study, outcome.frame)["theory"])
     except OSError as error:
         raise StudyError(
             f"the summary in {folder} cannot be written: {error.strerror or error}; all rows are kept, and the same "
             "command writes it again"
         ) from error
-    if quiet:
-        return
+
+
+def _print_summary(folder: Path, outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
+    for law in laws:
+        typer.echo(_law_line(law))
     again = f", {outcome.found} of them from before" if outcome.found else ""
     again += f" ({outcome.beyond} more, of further repeats, are kept)" if outcome.beyond else ""
-    console = Console()
-    for law in entry["theory"]:
-        console.print(_law_line(law), highlight=False, soft_wrap=True)
-    console.print(
-        f"{outcome.rows} rows{again}; summary.md, figures and study.parquet: {folder}", highlight=False, soft_wrap=True
-    )
+    typer.echo(f"{outcome.rows} rows{again}; summary.md, figures and study.parquet: {folder}")
+
+
+def _exit(outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
+    """An exit status of its own, and a line on standard error, where rows or laws failed."""
+    broken = [law for law in laws if law["verdict"] == "failed"]
+    if broken:
+        typer.echo(f"{len(broken)} of {len(laws)} laws failed; {_law_line(broken[0])}", err=True)
+    if outcome.failed:
+        typer.echo(f"{outcome.failed} of {outcome.rows} rows failed; {outcome.first_error}", err=True)
+        raise typer.Exit(SOME_ROWS_FAILED)
+    if broken:
+        raise typer.Exit(A_LAW_FAILED)
 
 
 def _law_line(law: dict[str, Any]) -> str:
@@ -167,3 +199,21 @@ def _list() -> None:
     studies = [(name, load_study(name)) for name in study_names()]
     rows = [(name, f"{found.rows:,}", found.title) for name, found in studies]
     print_table(("study", "rows", "what it asks"), rows, ("study", "what it asks"))
+
+
+def _list_kinds() -> None:
+    from identify.studies.rows import KINDS
+    from identify.studies.units import factor_unit
+
+    for kind in KINDS.values():
+        typer.echo(f"{kind.name}: {kind.what}\n")
+        options = [
+            (f"options.{name}", str(field.default), factor_unit(f"options.{name}"), str(field.description))
+            for name, field in kind.options.model_fields.items()
+        ]
+        print_table(("option", "default", "unit", "what it is"), options, ("option", "default", "unit", "what it is"))
+        figures = [
+            (name, "" if column.unit == "1" else column.unit, column.meaning) for name, column in kind.columns.items()
+        ]
+        print_table(("figure", "unit", "what it is"), figures, ("figure", "unit", "what it is"))
+        typer.echo()

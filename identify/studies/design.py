@@ -16,6 +16,7 @@ from identify.errors import ScenarioError, StudyError
 from identify.scenario import Scenario, load_scenario
 from identify.studies.keys import check, is_integer, options_in, overrides
 from identify.studies.kinds import check_kind, options_model
+from identify.studies.law_names import check_law_names
 from identify.studies.study_file import Range, Study
 
 SAMPLE_STREAM = 1
@@ -96,12 +97,12 @@ class Design:
 
 
 def prepare(study: Study) -> Setup:
-    """Check a study's keys, values and kind, and load what its rows share.
+    """Check a study's keys, values, kind and laws, and load what its rows share.
 
     The first row is checked as a whole. Values that contradict each other only in other rows are errors of these.
 
     Raises:
-        StudyError: an unknown kind, key or option with the valid ones, or a wrong value.
+        StudyError: an unknown kind, key, option, or figure or factor of a law, with the valid ones; a wrong value.
         ScenarioError: no such scenario, or changes that contradict it.
     """
     check_kind(study.kind, study.options)
@@ -111,12 +112,13 @@ def prepare(study: Study) -> Setup:
             raise StudyError(f"changes.{path}: what holds in every row stands in [options]")
         check(path, [value], model)
     for path, values in study.factors.items():
-        _check_factor(path, values)
         check(path, [values.low, values.high] if isinstance(values, Range) else values, model)
+        _check_factor(path, values)
     setup = Setup(study.kind, _scenario(study.scenario, overrides(study.changes)), study.options, study.seed)
     first = Design(study).case(0)
     setup.row_scenario(first)
     check_kind(study.kind, setup.row_options(first))
+    check_law_names(study)
     return setup
 
 
@@ -128,5 +130,10 @@ def _scenario(name: str, changes: Mapping[str, Any]) -> Scenario:
 
 
 def _check_factor(path: str, values: list[Any] | Range) -> None:
-    if isinstance(values, list) and len({repr(value) for value in values}) < len(values):
+    if not isinstance(values, list):
+        return
+    kinds = {"number" if type(value) in (int, float) else type(value).__name__ for value in values}
+    if len(kinds) > 1:
+        raise StudyError(f"factors.{path} = {values} has values of several kinds: {', '.join(sorted(kinds))}")
+    if len({repr(value) for value in values}) < len(values):
         raise StudyError(f"factors.{path} = {values} has a value twice; repeats = N computes every point N times")

@@ -29,7 +29,9 @@ def check(path: str, values: list[Any], options: type[BaseModel] | None) -> None
         return
     known = valid_keys(options)
     if path not in known:
-        raise StudyError(f"unknown key {path!r}; the nearest are {', '.join(_nearest(path, known))}")
+        own = [key for key in known if path.startswith("options.") and key.startswith("options.")]
+        valid = f"the kind has {', '.join(own)}" if own else f"the nearest are {', '.join(_nearest(path, known))}"
+        raise StudyError(f"unknown key {path!r}; {valid}")
     field = known[path]
     # As in JSON, so that a list is a tuple's spelling but a text or a truth value is no number.
     annotation: Any = Annotated[field.annotation, field]

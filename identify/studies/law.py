@@ -1,5 +1,7 @@
 """A law that a study's rows should follow, as a study file states it."""
 
+from typing import Any
+
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
@@ -18,7 +20,7 @@ class Law(BaseModel):
     factor: str | None = Field(None, description="factor by dotted path")
     exponent: float | None = Field(None, description="the figure grows as this power of the factor")
     equals: str | None = Field(None, description="figure of the same rms")
-    order: list[str | int | float] | None = Field(None, description="values of the factor, the smallest rms first")
+    order: list[Any] | None = Field(None, description="values of the factor, the smallest rms first")
     tolerance: float = Field(0.0, ge=0, description="by how much the law itself may be off")
     why: str = Field("", description="where the law comes from")
 

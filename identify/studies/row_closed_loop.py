@@ -70,4 +70,5 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoo
     }
 
 
-CLOSED_LOOP = Kind("closed_loop", COLUMNS, MAIN, ClosedLoopOptions, compute)
+WHAT = "the robot follows an unseen trajectory with the images in the loop"
+CLOSED_LOOP = Kind("closed_loop", WHAT, COLUMNS, MAIN, ClosedLoopOptions, compute)

@@ -34,9 +34,10 @@ class RowOptions(BaseModel):
 @dataclass(frozen=True)
 class Kind:
     """One kind of row: `compute(scenario, seed, options)` gives exactly `columns`; `main`: those that are drawn;
-    `options`: their model."""
+    `options`: their model; `what`: what a row is, in a sentence."""
 
     name: str
+    what: str
     columns: Mapping[str, Column]
     main: tuple[str, ...]
     options: type[RowOptions]

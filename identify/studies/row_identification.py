@@ -16,6 +16,7 @@ from pydantic import Field
 
 from cmmsim.visibility import expected_covariance
 from dynamics import Robot, load_robot
+from dynamics.closed_loop import Reference, simulate
 from dynamics.parameters import COULOMB_NAMES, JOINT_PID_NAMES, VISCOUS_NAMES
 from identify.arrays import Array
 from identify.estimation.identification import IdentificationResult
@@ -25,7 +26,7 @@ from identify.experiment.run import Experiment, excitation_run, run_plant, taugh
 from identify.experiment.truth import true_poses
 from identify.files.trajectory_file import TrajectorySet
 from identify.progress import SilentProgress
-from identify.record.loop_setup import frame_times
+from identify.record.loop_setup import frame_times, model_settings
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, scenario_from_toml
 from identify.studies.row_columns import Column, Kind, Row, RowOptions, rms_um, stated_um
@@ -51,6 +52,9 @@ COLUMNS = {
     "normalised_error": Column("1", "error of those over its stated standard deviation, rms; 1 where stated well"),
     "noise_ratio": Column("1", "mean squared whitened residual; 1 where noise is all that is left"),
     "iterations": Column("1", "iterations of all searches"),
+    "prediction_rms_um": Column("um", "identified model against the true one on unseen trajectories, neither with "
+                                      "noise: position, rms over axes"),
+    "stated_prediction_rms_um": Column("um", "the same, as the covariance of the parameters states it"),
     "unseen_position_rms_um": Column("um", "model against true plant on unseen trajectories, rms over axes"),
     "unseen_orientation_rms_urad": Column("urad", "model against true plant on unseen trajectories, rms over axes"),
 }
@@ -80,7 +84,9 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Identific
     unseen = [run_plant(scenario, robot, sensor, trajectory, times, number, run)
               for run, trajectory in enumerate(trajectories.validation, start=1)]
     errors = np.concatenate([_model_errors(robot, scenario, result.estimate, one) for one in unseen])
-    return (_record_figures(experiment) | _parameter_figures(result, true_parameters(robot, scenario))
+    truth = true_parameters(robot, scenario)
+    return (_record_figures(experiment) | _parameter_figures(result, truth)
+            | _prediction_figures(robot, scenario, result, truth, [recorded_reference(one.record) for one in unseen])
             | {"unseen_position_rms_um": rms_um(errors[:, :3]), "unseen_orientation_rms_urad": rms_um(errors[:, 3:])})
 
 
@@ -110,6 +116,25 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
     }
 
 
+def _prediction_figures(
+    robot: Robot, scenario: Scenario, result: IdentificationResult, truth: Array, references: list[Reference]
+) -> Row:
+    """What the error of the parameters (67,), and their covariance, make of the model's positions on references.
+
+    Every direction in which the parameters can err counts as much as it shows; so the figure has the scatter of many
+    errors, where that of a few parameters that err together has the scatter of hardly two.
+    """
+    squares, stated = [], []
+    for reference in references:
+        model = simulate(robot, result.estimate, reference, model_settings(scenario), sensitivities=True)
+        assert model.pose_sensitivity is not None
+        slopes = model.pose_sensitivity[:, :3]
+        squares.append(np.mean((model.pose - model_run(robot, scenario, truth, reference))[:, :3] ** 2))
+        stated.append(np.mean(np.einsum("nip,pq,niq->ni", slopes, result.covariance, slopes, optimize=True)))
+    return {"prediction_rms_um": 1e6 * float(np.sqrt(np.mean(squares))),
+            "stated_prediction_rms_um": 1e6 * float(np.sqrt(np.mean(stated)))}
+
+
 def _model_errors(robot: Robot, scenario: Scenario, parameters: Array, unseen: Experiment) -> Array:
     """Poses (N, 6) of the identified model less the true ones."""
     return model_run(robot, scenario, parameters, recorded_reference(unseen.record)) - true_poses(unseen.truth)
@@ -132,4 +157,5 @@ def _trajectories(scenario_toml: str, seed: int) -> TrajectorySet:
     return design_trajectories(_robot(scenario.robot), scenario, seed)
 
 
-IDENTIFICATION = Kind("identification", COLUMNS, MAIN, IdentificationOptions, compute)
+WHAT = "a record of the exciting trajectory, the parameters identified from it, and their errors"
+IDENTIFICATION = Kind("identification", WHAT, COLUMNS, MAIN, IdentificationOptions, compute)

@@ -88,4 +88,5 @@ def _used_errors(path: FourierTrajectory, poses: Array, arrivals: Array, period_
     return np.asarray(poses[in_use] - path.pose(instants), dtype=float)
 
 
-PATH_POSE = Kind("path_pose", COLUMNS, MAIN, PathPoseOptions, compute)
+WHAT = "the sensor alone follows a platform along a random path, with the scenario's timing"
+PATH_POSE = Kind("path_pose", WHAT, COLUMNS, MAIN, PathPoseOptions, compute)

@@ -133,4 +133,5 @@ def _row(eye: RowSensor, looks: list[_Look], captures: int) -> Row:
     }
 
 
-STATIC_POSE = Kind("static_pose", COLUMNS, MAIN, StaticPoseOptions, compute)
+WHAT = "the sensor alone looks at a platform that stands still, at a pose drawn in the box"
+STATIC_POSE = Kind("static_pose", WHAT, COLUMNS, MAIN, StaticPoseOptions, compute)

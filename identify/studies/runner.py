@@ -14,9 +14,9 @@ from identify.studies.computation import Finished, compute
 from identify.studies.design import Design, Setup, prepare
 from identify.studies.interrupts import raise_noted
 from identify.studies.journal import Journal
-from identify.studies.store import TABLE, open_folder, resolved
+from identify.studies.store import TABLE, VIEW, open_folder, resolved
 from identify.studies.study_file import Study
-from identify.studies.table import tidy_table, write_table
+from identify.studies.table import tidy_table, write_table, write_view
 
 Executor = Callable[[Setup, Batches], Iterator[list[Finished]]]
 """Computes batches until there are none left, and yields them as they are done, in any order."""
@@ -77,6 +77,7 @@ def run_study(study: Study, folder: Path, progress: Progress, workers: Workers =
             raise StudyInterrupted(f"stopped: {done} of {len(design)} rows are done and kept") from None
         frame = tidy_table(study, journal.rows())
         write_table(folder / TABLE, frame, entry)
+        write_view(folder / VIEW, frame, study)
     return Outcome(frame, len(design), found, int((frame["error"] != "").sum()), journal.beyond)
 
 
@@ -87,8 +88,8 @@ def _compute_pending(
     if not left:
         return
     batches = Batches((design.case(number) for number in journal.pending()), left)
-    with workers() as execute, progress.stage(f"rows of {name}", left) as advance:
     raise_noted()
+    with workers() as execute, progress.stage(f"rows of {name}", left) as advance:
         for finished in execute(setup, batches):
             journal.append(finished)
             advance(len(finished))

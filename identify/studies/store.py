@@ -1,7 +1,7 @@
 """The folder of a study: whose it is, who works on it, and what is done.
 
 ``study.json`` is the resolved study with the versions of the software that began it, ``rows.jsonl`` its finished rows,
-``study.parquet`` the table made of them.
+``study.parquet`` the table made of them, ``study.nc`` their figures by factors.
 """
 
 import fcntl
@@ -21,7 +21,7 @@ from identify.studies.same_versions import check_folder
 from identify.studies.study_file import Study
 from identify.studies.table import study_in
 
-STUDY, JOURNAL, TABLE, LOCK = "study.json", "rows.jsonl", "study.parquet", ".lock"
+STUDY, JOURNAL, TABLE, VIEW, LOCK = "study.json", "rows.jsonl", "study.parquet", "study.nc", ".lock"
 VERSIONS = "versions"
 
 MAY_CHANGE = ("study.title", "study.theory", "study.repeats", "scenario.description")

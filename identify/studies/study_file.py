@@ -26,11 +26,11 @@ an option of the kind.
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError, field_validator, model_validator
 
 from identify.errors import StudyError
 from identify.scenario_text import one_line
@@ -43,11 +43,21 @@ class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
+def _finite(value: Any) -> int | float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ValueError(f"{value!r} is no finite number")
+    return value
+
+
+# Not a union that pydantic resolves: it would complain once a member.
+Bound = Annotated[int | float, PlainValidator(_finite)]
+
+
 class Range(_Table):
     """A factor of a random sample, drawn evenly between two bounds or evenly between their logarithms."""
 
-    low: int | float
-    high: int | float
+    low: Bound
+    high: Bound
     scale: Literal["linear", "log"] = "linear"
 
     @model_validator(mode="after")
@@ -82,7 +92,8 @@ class Study(_Table):
     @field_validator("factors", mode="before")
     @classmethod
     def _factors_by_path(cls, tables: Any) -> Any:
-        return _by_path(tables, keep=Range.model_fields.keys())
+        found = _by_path(tables, keep=("low", "high"))
+        return {path: _factor(path, value) for path, value in found.items()} if isinstance(found, dict) else found
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Study":
@@ -146,12 +157,24 @@ def study_from_toml(text: str, source: str = "study") -> Study:
         raise StudyError(f"{source}: {one_line(error, Study)}") from error
 
 
-def _by_path(tables: Any, keep: Any = (), section: str = "") -> Any:
-    """Tables in tables as one table by dotted path; a table with nothing but the keys ``keep`` is a value."""
+def _factor(path: str, value: Any) -> Any:
+    """A list or a range; anything else is a ValueError in words."""
+    if isinstance(value, (list, Range)):
+        return value
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{path} = {value!r} is no list of values; to hold it in every row write it under [changes]")
+    try:
+        return Range.model_validate(value)
+    except ValidationError as error:
+        raise ValueError(f"{path}: {one_line(error, Range)}") from error
+
+
+def _by_path(tables: Any, keep: Collection[str] = (), section: str = "") -> Any:
+    """Tables in tables as one table by dotted path; a table with one of the keys ``keep`` is a value."""
     if not isinstance(tables, Mapping):
         return tables
     found: dict[str, Any] = {}
     for key, value in tables.items():
-        nested = isinstance(value, Mapping) and not (keep and value and set(value) <= set(keep))
+        nested = isinstance(value, Mapping) and value and not set(value) & set(keep)
         found |= _by_path(value, keep, f"{section}{key}.") if nested else {f"{section}{key}": value}
     return found

@@ -21,7 +21,7 @@ from identify.studies.rows import find_kind
 from identify.studies.study_file import Study
 from identify.studies.table import figure_names
 from identify.studies.theory import Verdict, check_laws
-from identify.studies.units import factor_unit, figure_unit, labelled
+from identify.studies.units import factor_unit, figure_unit, labelled, unit_of
 
 JSON, MARKDOWN = "summary.json", "summary.md"
 NAMED = 20
@@ -46,8 +46,7 @@ def write(folder: Path, study: Study, frame: pd.DataFrame) -> dict[str, Any]:
                  "missing": study.rows - len(frame)},
         "failures": _failures(study, frame),
         "confidence": {"bands": point_statistics.CONFIDENCE, "laws": theory.CONFIDENCE},
-        "units": {name: unit for name in [*study.factors, *names]
-                  if (unit := factor_unit(name) if name in study.factors else figure_unit(study.kind, name))},
+        "units": {name: unit for name in [*study.factors, *names] if (unit := unit_of(name, study))},
         "theory": [theory.as_entry(verdict) for verdict in verdicts],
         "points": [{"factors": factors, "figures": {name: asdict(one) for name, one in figures.items()}}
                    for factors, figures in points],
@@ -70,14 +69,17 @@ def main_figures(kind: str, names: list[str]) -> list[str]:
 
 
 def _points(study: Study, done: pd.DataFrame, names: list[str]) -> list[tuple[dict[str, Any], dict[str, Statistics]]]:
-    """Factors and statistics of each point that has a row; a sample with single rows is one point as a whole."""
+    """Factors and statistics of each point that has a row, those of a grid in its order and those of a sample by size.
+
+    A sample with single rows is one point as a whole.
+    """
     paths = list(study.factors)
     if not len(done):
         return []
     if not paths or (study.sample is not None and study.repeats == 1):
         return [({}, _statistics(done, names))]
     return [(dict(zip(paths, values, strict=True)), _statistics(rows, names))
-            for values, rows in done.groupby(paths, sort=False)]
+            for values, rows in done.groupby(paths, sort=study.sample is not None)]
 
 
 def _statistics(rows: pd.DataFrame, names: list[str]) -> dict[str, Statistics]:
@@ -135,9 +137,14 @@ def _table(study: Study, points: list[tuple[dict[str, Any], dict[str, Statistics
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for values, figures in points[:LONGEST]:
         count = max((one.rows for one in figures.values()), default=0)
-        cells = [str(values[path]) for path in factors] + [str(count), *(_cell(figures.get(name)) for name in shown)]
+        cells = [_value(values[path]) for path in factors] + [str(count), *(_cell(figures.get(name)) for name in shown)]
         lines.append(f"| {' | '.join(cells)} |")
     return lines + ([f"\n{len(points) - LONGEST} more points stand in `{JSON}`."] if len(points) > LONGEST else [])
+
+
+def _value(value: Any) -> str:
+    """A factor's value; a drawn number with as many digits as a reader wants."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _cell(one: Statistics | None) -> str:

@@ -19,10 +19,12 @@ import xarray as xr
 from identify.arrays import Array
 from identify.errors import StudyError
 from identify.files.atomic import atomic_path
+from identify.files.netcdf import write_groups
 from identify.files.versions import versions
 from identify.studies.computation import FIRST, LAST, Finished
 from identify.studies.design import Design
 from identify.studies.study_file import Study
+from identify.studies.units import unit_of
 
 STUDY_KEY, VERSIONS_KEY = b"cmmsim.study", b"cmmsim.versions"
 
@@ -75,13 +77,13 @@ def write_table(path: Path, frame: pd.DataFrame, entry: dict[str, Any]) -> None:
         raise StudyError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
-def read_table(path: Path) -> tuple[pd.DataFrame, Study]:
-    """A study's table and the study.
+def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
+    """A study's table and the study, of its `study.parquet`.
 
     Raises:
         StudyError: no such file, no Parquet, or not of a study.
     """
-    entry = study_in(path)
+    entry = study_in(Path(path))
     if entry is None:
         raise StudyError(f"no table {path}")
     return pd.read_parquet(path), Study.model_validate(entry["study"])
@@ -103,7 +105,7 @@ def study_in(path: Path) -> dict[str, Any] | None:
 
 
 def to_xarray(frame: pd.DataFrame, study: Study) -> xr.Dataset:
-    """The figures by factors and repeat; NaN where a row failed or is not done.
+    """The figures by factors and repeat, with their units as ``attrs``; NaN where a row failed or is not done.
 
     Dimensions are one a factor (its dotted path) and ``repeat`` for a grid, ``point`` and ``repeat`` for a sample,
     whose factors are coordinates of ``point``.
@@ -120,4 +122,22 @@ def to_xarray(frame: pd.DataFrame, study: Study) -> xr.Dataset:
         cases = [design.case(point) for point in range(study.points)]
         view = view.reindex(point=np.arange(study.points))
         view = view.assign_coords({path: ("point", [plain(c.factors[path]) for c in cases]) for path in study.factors})
+    for name, variable in view.variables.items():
+        if unit := unit_of(str(name), study):
+            variable.attrs["units"] = unit
     return view.assign_attrs(name=study.name, title=study.title, kind=study.kind)
+
+
+def write_view(path: Path, frame: pd.DataFrame, study: Study) -> None:
+    """Write the view of :func:`to_xarray` as netCDF, whole or not at all; `xarray.open_dataset` reads it.
+
+    A "/" in a name is a group there, so it is written as "_per_".
+
+    Raises:
+        StudyError: it cannot be written.
+    """
+    try:
+        view = to_xarray(frame, study)
+        write_groups(path, {"": view.rename({name: str(name).replace("/", "_per_") for name in view.data_vars})})
+    except OSError as error:
+        raise StudyError(f"{path} cannot be written: {error.strerror or error}") from error

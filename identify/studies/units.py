@@ -3,6 +3,7 @@
 from identify.errors import ScenarioError
 from identify.scenario import Scenario
 from identify.studies.rows import columns
+from identify.studies.study_file import Study
 
 SENSOR_UNITS = {
     "rig.baseline": "m", "rig.distance": "m", "rig.focal_px": "px", "rig.width": "px", "rig.height": "px",
@@ -39,6 +40,13 @@ def figure_unit(kind: str, figure: str) -> str:
         return ""
     unit = known[figure].unit if figure in known else ""
     return "" if unit == "1" else unit
+
+
+def unit_of(name: str, study: Study) -> str:
+    """Unit of a column of a study's table, a factor or a figure; empty where it has none."""
+    if name == "seconds":
+        return "s"
+    return factor_unit(name) if name in study.factors else figure_unit(study.kind, name)
 
 
 def labelled(name: str, unit: str) -> str:

@@ -6,7 +6,7 @@ import pytest
 
 from identify.commands import study as study_command
 from identify.errors import StudyInterrupted
-from identify.studies import dask_runner, runner, summary
+from identify.studies import dask_runner, rows, runner, summary
 from identify.studies.study_file import study_names
 from identify.studies.table import read_table
 from tests.identify.commands import command, one_line
@@ -84,6 +84,34 @@ def test_failed_rows_make_an_exit_status_of_their_own(tmp_path, undrawn, capsys)
     assert frame["error"].ne("").tolist() == [False, True, False, False]
 
 
+@pytest.mark.parametrize(("law", "status"), [
+    ("exponent = 3.0", study_command.A_LAW_FAILED),
+    ("exponent = 0.0", 0),
+])
+def test_a_law_that_fails_makes_an_exit_status_of_its_own(tmp_path, capsys, law, status):
+    """The figure is the standard deviation of 1,000 normal numbers, whatever the factor."""
+    theory = f'[[theory]]\nfigure = "spread_um"\nfactor = "sensor.camera.dark_noise"\n{law}\n'
+    path = write(tmp_path, TEXT.replace("[options]", theory))
+    assert command("study", path, "--workers", 0, "--quiet", "--repeats", 4, "--out", tmp_path / "a") == status
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert ("1 of 1 laws failed; failed: spread_um ~" in shown.err) == (status != 0)
+
+
+def test_rows_that_failed_and_undecided_laws_have_their_own_status(tmp_path, capsys):
+    theory = '[[theory]]\nfigure = "error_um"\nfactor = "sensor.camera.dark_noise"\nexponent = 1.0\n'
+    path = write(tmp_path, TEXT.replace("[options]", theory))
+    assert command("study", path, "--workers", 0, "--out", tmp_path / "a") == 0
+    assert "undecided: error_um" in capsys.readouterr().out
+    both = write(tmp_path, TEXT.replace("[options]", "[options]\nfails = [1]") + theory.replace("1.0", "9.0"))
+    assert command("study", both, "--workers", 0, "--out", tmp_path / "b") == study_command.SOME_ROWS_FAILED
+
+
+def test_brackets_in_names_are_shown_as_they_are(mine, undrawn, capsys):
+    assert command("study", mine, "--workers", 0, "--out", "a[bold]") == 0
+    assert "study.parquet: a[bold]\n" in capsys.readouterr().out
+
+
 def test_interrupted_study_says_how_far_it_came_and_how_to_go_on(mine, monkeypatch, capsys):
     def stop(*_):
         raise StudyInterrupted("stopped: 2 of 4 rows are done and kept")
@@ -99,6 +127,18 @@ def test_list_names_every_built_in_study_with_its_rows(capsys):
     shown = capsys.readouterr().out
     assert study_names()
     assert all(name in shown for name in study_names())
+
+
+def test_kinds_are_listed_with_their_options_and_figures(capsys):
+    assert command("study", "--kinds") == 0
+    shown = capsys.readouterr().out
+    assert all(f"{name}: {kind.what}" in shown for name, kind in rows.KINDS.items())
+    lines = [line.split() for line in shown.splitlines() if line]
+    for kind in rows.KINDS.values():
+        assert all([name, column.unit] == [line[0], line[1]] for name, column in kind.columns.items()
+                   for line in lines if line[0] == name and column.unit not in ("1", "grey values", "N m"))
+        assert {*kind.columns, *(f"options.{name}" for name in kind.options.model_fields)} <= {one[0] for one in lines}
+    assert ["options.stretch_s", "0.5", "s"] in [line[:3] for line in lines]
 
 
 def test_ten_million_rows_are_refused_at_once(tmp_path, capsys):

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from identify.errors import StudyError
+from identify.studies.computation import compute
 from identify.studies.design import Design, prepare
 from identify.studies.keys import valid_keys
+from identify.studies.law import Law
 from identify.studies.study_file import Study, load_study, study_from_toml, study_names
 from identify.studies.units import SENSOR_UNITS
 from tests.identify.study_rows import KIND
@@ -129,12 +131,20 @@ def test_built_in_studies_can_all_be_run():
         (toml("sample = 5", factors="sensor.camera.dark_noise = { low = 2.0, high = 1.0 }"), ["low = 2", "high = 1"]),
         (toml("sample = 5", factors='sensor.camera.prnu = { low = 0.0, high = 1.0, scale = "log" }'), ["positive"]),
         (toml("[changes]\nsensor.camera.dark_noise = 1.0"), ["sensor.camera.dark_noise", "both"]),
+        (toml(factors="sensor.rig.baseline = 1.0"), ["sensor.rig.baseline = 1.0 is no list", "[changes]"]),
+        (toml(factors="sensor.rig.baseline = {}"), ["sensor.rig.baseline", "low is missing"]),
+        (toml("sample = 5", factors="sensor.rig.baseline = { low = 1.0, high = inf }"), ["high: inf is no finite"]),
+        (toml("sample = 5", factors="sensor.rig.baseline = { low = true, high = 2 }"), ["low: True is no finite"]),
+        (toml("sample = 5", factors="sensor.rig.baseline = { low = 1.0, hgh = 2.0 }"), ["'hgh'", "low, high, scale"]),
+        (toml("sample = 5", factors='sensor.rig.baseline = { low = 1, high = 2, scale = "lg" }'),
+         ["sensor.rig.baseline", "scale = 'lg'", "'linear' or 'log'"]),
         ("name = 1 = 2", ["not valid TOML"]),
     ],
 )
 def test_study_files_that_contradict_themselves_are_refused(text, evidence):
     message = refusal(study_from_toml, text)
     assert all(word in message for word in evidence), message
+    assert not any(word in message for word in ("function-", "list[", "Range", "valid list"))
 
 
 @pytest.mark.parametrize(
@@ -160,12 +170,74 @@ def test_study_files_that_contradict_themselves_are_refused(text, evidence):
         ({"kind": "no_such_module:row"}, ["no_such_module", "PYTHONPATH"]),
         ({"kind": "static_pose", "options": {"capturs": 4}}, ["capturs", "captures"]),
         ({"kind": "static_pose", "factors": {"options.capturs": [4]}}, ["options.capturs", "options.captures"]),
+        ({"kind": "path_pose", "factors": {"options.zz": [4]}}, ["'options.zz'", "stretch_s, options.teaching"]),
+        ({"factors": {"options.mixed": [1, 2.5, "two"]}}, ["options.mixed", "several kinds: number, str"]),
         ({"kind": "static_pose", "factors": {"options.captures": ["many"]}}, ["options.captures = 'many'"]),
     ],
 )
 def test_keys_and_values_are_checked_before_any_row(entries, evidence):
     message = refusal(prepare, study(**entries))
     assert all(word in message for word in evidence), message
+
+
+def plain_row(scenario, seed):
+    """A row of a study without options."""
+    return {"rate_hz": scenario.timing.frame_rate_hz, "draw": float(np.random.default_rng(seed).normal())}
+
+
+def wrong_row(scenario):
+    """No row: it takes no seed."""
+
+
+def own(name):
+    return f"{plain_row.__module__}:{name}"
+
+
+def test_a_function_of_ones_own_needs_no_options_where_the_study_has_none():
+    chosen = study(kind=own("plain_row"))
+    figures = compute(prepare(chosen), cases(chosen)[:1])[0].figures
+    draw = np.random.default_rng(np.random.SeedSequence(0).spawn(1)[0]).normal()
+    assert figures == {"rate_hz": 60.0, "draw": draw}
+
+
+@pytest.mark.parametrize(
+    ("entries", "evidence"),
+    [
+        ({"kind": own("wrong_row")}, ["wrong_row' takes (scenario);", "(scenario, seed) or (scenario, seed, options)"]),
+        ({"kind": own("plain_row"), "options": {"odd": 1}}, ["plain_row' takes no options, got odd"]),
+        ({"kind": own("plain_row"), "factors": {"options.odd": [1]}}, ["plain_row' takes no options, got odd"]),
+    ],
+)
+def test_functions_with_other_arguments_are_refused_before_any_row(entries, evidence):
+    message = refusal(prepare, study(**entries))
+    assert all(word in message for word in evidence), message
+
+
+LAW = {"figure": "position_rms_um", "factor": "sensor.camera.dark_noise", "exponent": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("law", "evidence"),
+    [
+        ({"figure": "posishun_rms_um"}, ["figure = 'posishun_rms_um'", "static_pose", "position_rms_um"]),
+        ({"per": "sight"}, ["per = 'sight'", "sight_m"]),
+        ({"factor": None, "exponent": None, "equals": "stated_position_um"}, ["equals", "stated_position_rms_um"]),
+        ({"factor": "sensor.camera.dsnu"}, ["factor = 'sensor.camera.dsnu'", "sensor.camera.dark_noise"]),
+        ({"factor": "pixel_noise"}, ["factor = 'pixel_noise'", "pixel_noise_grey"]),
+        ({"exponent": None, "order": [26.0, 14.0]}, ["order has 14.0", "[13.0, 26.0]"]),
+    ],
+)
+def test_laws_of_what_a_kind_does_not_measure_or_a_study_does_not_vary_are_refused_before_any_row(law, evidence):
+    right = Law(**LAW)
+    prepare(study(kind="static_pose", theory=[right, Law(**LAW | {"factor": "pixel_noise_grey"})]))
+    message = refusal(prepare, study(kind="static_pose", theory=[right, Law(**LAW | law)]))
+    assert all(word in message for word in ["[[theory]] 2", *evidence]), message
+
+
+def test_figures_of_a_kind_of_ones_own_are_not_known_before_its_rows_but_its_factors_are():
+    prepare(study(theory=[Law(**LAW | {"figure": "any_um"}), Law(**LAW | {"factor": "any_m"})]))
+    message = refusal(prepare, study(theory=[Law(**LAW | {"factor": "sensor.camera.drk_noise"})]))
+    assert "the nearest are sensor.camera.dark_noise" in message
 
 
 def test_unknown_study_lists_the_built_in_ones():

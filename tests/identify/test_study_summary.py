@@ -214,6 +214,16 @@ def test_random_sample_is_summarised_as_a_whole_and_checked(tmp_path):
     assert (tmp_path / "figures" / f"by_{DARK}.png").exists()
 
 
+def test_points_of_a_sample_stand_in_order_with_digits_to_read(tmp_path, undrawn):
+    study = made_study(sample=3, repeats=2, factors={DARK: Range(low=10.0, high=40.0)}, theory=[])
+    drawn = [31.23456789012345, 12.0, 25.5]
+    frame = pd.DataFrame({"row": range(6), "repeat": [0] * 3 + [1] * 3, "seed_entropy": "3", "seed_spawn_key": range(6),
+                          DARK: drawn * 2, POSITION: 1.0, "seconds": 0.1, "error": ""})
+    summary.write(tmp_path, study, frame)
+    lines = (tmp_path / "summary.md").read_text().splitlines()
+    assert [line.split("|")[1].strip() for line in lines[-3:]] == ["12", "25.5", "31.2346"]
+
+
 def test_kind_of_ones_own_has_no_units_but_a_summary(tmp_path, undrawn):
     study = made_study(kind="my_rows:count", factors={DARK: [10.0, 20.0, 40.0], BASELINE: [0.5, 1.0]})
     entry = summary.write(tmp_path, study, made_table(study))
