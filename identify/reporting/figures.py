@@ -121,10 +121,14 @@ def interval_bars(parameter: dict[str, Any]) -> tuple[float, float]:
 
 
 def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
-    """Correlations (n, n) of estimates as a coloured matrix."""
+    """Correlations (n, n) of estimates as a coloured matrix; a line of text where nothing is identified."""
     side = max(5.0, 2.0 + 0.28 * len(names))
     figure = _figure(side + 0.5, side)
     axes = figure.subplots()
+    if not names:
+        axes.set_axis_off()
+        axes.set_title("No parameter is identified: no correlations")
+        return figure
     image = axes.imshow(correlations, cmap="RdBu_r", vmin=-1, vmax=1)
     axes.set_xticks(range(len(names)), names, rotation=90, fontsize="small")
     axes.set_yticks(range(len(names)), names, fontsize="small")

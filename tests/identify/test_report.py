@@ -1,4 +1,5 @@
 import re
+import warnings
 from html.parser import HTMLParser
 
 import numpy as np
@@ -120,6 +121,13 @@ def test_correlation_figure_names_every_parameter():
     axes = figures.correlation_figure(correlations, ["a", "b"]).axes[0]
     assert [text.get_text() for text in axes.get_xticklabels()] == ["a", "b"]
     np.testing.assert_array_equal(axes.images[0].get_array(), correlations)
+
+
+def test_without_identified_parameters_a_correlation_figure_says_so_and_warns_of_nothing():
+    with warnings.catch_warnings(action="error"):
+        axes = figures.correlation_figure(np.zeros((0, 0)), []).axes[0]
+    assert axes.get_title() == "No parameter is identified: no correlations"
+    assert not axes.images
 
 
 def test_figures_survive_lost_frames_and_a_model_that_diverged_at_once():
