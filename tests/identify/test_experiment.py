@@ -3,6 +3,8 @@
 That images decide the pose (one camera shifted by 0.1 px) is proved in tests/cmmsim/test_measuring.py.
 """
 
+import json
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -112,6 +114,7 @@ def test_run_experiment_returns_what_it_writes(scenario, tmp_path):
     assert "truth" not in " ".join(map(str, record.data_vars))
     assert abs(record.attrs["scale_anchor_value"] - 23.5) < 5 * record.attrs["scale_anchor_std"]
     assert record.attrs["scale_anchor_value"] != 23.5
+    assert json.loads(record.attrs["robot_geometry"])["crank_length"] == 0.06
 
 
 def test_a_trajectory_beyond_the_travel_is_refused_before_the_run(scenario, sensor):

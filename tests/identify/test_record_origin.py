@@ -7,10 +7,18 @@ import numpy as np
 import pytest
 
 from dynamics import load_robot
+from identify import pipeline
 from identify.errors import EstimationError, RecordError
 from identify.estimation.identification import identify
+from identify.estimation.loop_parameters import NAMES
+from identify.files.covariance_file import write_covariance
+from identify.files.result_file import load_result, save_result
+from identify.files.run_folder import RunFolder
+from identify.files.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
+from identify.progress import SilentProgress
 from identify.record.record_checks import check_trajectory
 from identify.record.recorded_robot import check_robot, store_robot
+from identify.record.recording import read, write
 from tests.identify.synthetic import quick, rss6, run_plant, trajectory
 
 SCENARIO = quick(**{"excitation.duration_s": 2.0})
@@ -63,6 +71,37 @@ def test_a_record_that_states_no_geometry_is_known_by_the_robots_name(record):
     check_robot(bare, rss6())
     with pytest.raises(EstimationError, match="is of robot 'rss7', not of 'rss6'"):
         check_robot(bare.assign_attrs(robot="rss7"), rss6())
+
+
+def folder_of(path, chosen, record):
+    """A run folder as it is before validation, with this exciting trajectory and this record."""
+    run = RunFolder(path)
+    run.scenario.write_text(SCENARIO.to_toml())
+    save_trajectories(run.trajectories, TrajectorySet(0, chosen, (trajectory(5),), 1.0, 1.0, 1.0))
+    write(run.experiment, record)
+    write_covariance(run.covariance, NAMES, np.eye(len(NAMES)))
+    save_result(run.result, {})
+    return run
+
+
+@pytest.mark.parametrize("stage", [pipeline.identify, pipeline.validate])
+def test_a_stage_refuses_a_record_that_is_not_of_its_folder(record, tmp_path, stage):
+    run = folder_of(tmp_path, trajectory(1), record)
+    with pytest.raises(EstimationError, match=rf"{run.experiment}: the record's reference is not the exciting"):
+        stage(run.path, SilentProgress())
+    assert load_result(run.result) == {}
+
+
+def test_a_folder_takes_the_record_of_its_own_trajectory_as_json_keeps_it(record, tmp_path):
+    run = folder_of(tmp_path, trajectory(0), record)
+    check_trajectory(read(run.experiment), load_trajectories(run.trajectories).excitation, SCENARIO)
+
+
+def test_a_run_too_short_to_identify_from_is_refused_before_anything_is_computed(tmp_path):
+    short = quick(**{"excitation.duration_s": 0.5})
+    with pytest.raises(EstimationError, match=r"duration_s gives 30 frames .0.5 s., at least 120 are needed"):
+        pipeline.excite(short, 0, tmp_path / "new", SilentProgress())
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(

@@ -85,6 +85,19 @@ def test_wrong_shape_is_named(make_record, name, shape):
     assert str(shape[0]) in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("frames", "value", "says"),
+    [([5], 7, "it is 7 in frame 5$"), ([3, 9, 11], -1, "it is -1 in frame 3 and wrong in 2 more"),
+     ([0], np.nan, "it is nan in frame 0")],
+)
+def test_a_frame_was_measured_or_lost_and_nothing_else(make_record, frames, value, says):
+    record = make_record()
+    stated = record["measured_ok"].values.astype(float if np.isnan(value) else int)
+    stated[frames] = value
+    with pytest.raises(RecordError, match=f"mine: measured_ok must be 1 or 0, {says}"):
+        recording.check_record(record.assign(measured_ok=("time", stated)), "mine")
+
+
 def test_time_must_increase(make_record):
     with pytest.raises(RecordError, match="time does not increase"):
         make_record(time=np.zeros(120))
