@@ -1,13 +1,12 @@
 """What the tests of the plugin share: projects of one file, run by pytest."""
 
 import textwrap
-from pathlib import Path
 
 import pytest
 
 from identify.accuracy import recorder, saved  # noqa: F401  before any project: NumPy cannot be loaded twice
 
-GUIDE = Path(__file__).parent / "guide"
+collect_ignore = ["guide"]  # an outsider's files: test_guide.py runs them as an outsider would
 
 QUICK = ("-p", "no:cacheprovider", "-p", "no:hypothesispytest")  # Hypothesis would be imported anew by each
 
@@ -24,12 +23,3 @@ def project(pytester, monkeypatch):
         return pytester.runpytest_inprocess(*QUICK, *options)
 
     return run
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
-    """The files of the guide are as an outsider writes them: what marks of this project they deserve stands here."""
-    for item in items:
-        if item.path.parent == GUIDE:
-            item.add_marker("slow")
-            item.add_marker("rendering")
