@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from identify.errors import StudyError, StudyInterrupted
-from identify.progress import RichProgress, SilentProgress
+from identify.progress import terminal_progress
 from identify.reporting.terminal import print_table
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def study(
 def _run(study: "Study", folder: Path, scheduler: str | None, workers: int | None, quiet: bool) -> "Outcome":
     from identify.studies.runner import run_study
 
-    progress = SilentProgress() if quiet else RichProgress(rate="rows/s")
+    progress = terminal_progress(quiet, rate="rows/s")
     return run_study(study, folder, progress, _workers(scheduler, workers))
 
 
