@@ -1,0 +1,88 @@
+"""What the study of the distance should measure, from geometry and the Cramér-Rao bound alone.
+
+No picture is made and no detector runs. A blurred edge of length dl with normal n tells where it is along n, with an
+information that is the same for every px of it; so the information of a sticker's centre is the integral of n n^T dl
+along its rim as each camera sees it. Its inverse goes through the triangulation of both cameras' pixels.
+"""
+
+import numpy as np
+import pytest
+
+import cmmsim
+from cmmsim.pose import apply, invert
+from identify.studies.computation import compute
+from identify.studies.design import Design, prepare
+from identify.studies.row_sensor import row_sensor
+from identify.studies.scale_regression import scale_regression
+from identify.studies.study_file import load_study
+from identify.studies.table import tidy_table
+from identify.studies.theory import CONFIDENCE
+
+POSES, RIM_POINTS, STEP_M = 6, 60, 1e-4
+DEPTH, DISPARITY = "point_depth_rms_um", "disparity_rms_px"
+
+
+def rim_information(rim):
+    """Integrals (..., 2, 2) of n n^T dl along closed image curves (..., n, 2), px."""
+    along = 0.5 * (np.roll(rim, -1, axis=-2) - np.roll(rim, 1, axis=-2))
+    normal = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    return np.einsum("...ni,...nj,...n->...ij", normal, normal, 1.0 / np.linalg.norm(along, axis=-1))
+
+
+def sticker_bounds(eye, radius, pose):
+    """Of every sticker at a pose: distance, variances of the error along the sight and of the disparity, to a scale."""
+    rig, places = eye.sensor.estimator.rig, eye.truth.platform_places
+    centres = apply(invert(eye.truth.base_from_camera), apply(cmmsim.pose_to_transform(pose), places))
+    angles = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
+    circle = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    planes = np.array([name[0] for name in eye.sensor.estimator.platform.sticker_ids])
+    middle = apply(invert(eye.truth.base_from_camera), eye.middle[None])[0]
+    for plane in np.unique(planes):
+        own = centres[planes == plane]
+        axes = np.linalg.svd(own - own.mean(axis=0))[2][:2]
+        for centre in own:
+            information = rim_information(rig.project(centre + circle @ axes)[0])
+            moved = [rig.project(centre + sign * STEP_M * np.eye(3))[0] for sign in (1, -1)]
+            slopes = (moved[0] - moved[1]).transpose(0, 2, 1) / (2.0 * STEP_M)
+            point = np.linalg.inv(np.einsum("cia,cij,cjb->ab", slopes, information, slopes))
+            sight = centre - middle
+            distance = np.linalg.norm(sight)
+            yield distance, sight @ point @ sight / distance**2, np.linalg.inv(information)[:, 0, 0].sum()
+
+
+@pytest.fixture(scope="module")
+def expected():
+    """Exponents of the depth error, and of its ratio to the disparity's, in the distance; and the study."""
+    study = load_study("distance")
+    setup, design, points = prepare(study), Design(study), []
+    for point in range(study.points):
+        scenario = setup.row_scenario(design.case(point))
+        eye, rng = row_sensor(scenario, "exact", 0), np.random.default_rng(0)
+        box = np.repeat((scenario.excitation.position_amplitude_m, scenario.excitation.orientation_amplitude_rad), 3)
+        poses = eye.sensor.home + box * rng.uniform(-1.0, 1.0, (POSES, 6))
+        radius = study.changes["sensor.stickers.radius"]
+        distance, depth, disparity = np.array([one for pose in poses for one in sticker_bounds(eye, radius, pose)]).T
+        points.append(np.log([distance.mean(), np.sqrt(depth.mean()), np.sqrt(depth.mean() / disparity.mean())]))
+    logs = np.array(points)
+    return (*(float(np.polyfit(logs[:, 0], logs[:, k], 1)[0]) for k in (1, 2)), study)
+
+
+def test_tolerances_of_the_laws_are_what_geometry_takes_from_them(expected):
+    depth, ratio, study = expected
+    stated = {law.per: law for law in study.theory if law.figure == DEPTH}
+    assert stated[None].exponent - depth == pytest.approx(stated[None].tolerance, abs=0.006)
+    assert stated[DISPARITY].exponent - ratio == pytest.approx(stated[DISPARITY].tolerance, abs=0.003)
+
+
+@pytest.mark.slow
+def test_pictures_and_detector_measure_what_geometry_says(expected):
+    """Without any tolerance: the interval itself must hold the expected exponent."""
+    depth, ratio, study = expected
+    design = Design(study)
+    rows = tidy_table(study, compute(prepare(study), [design.case(row) for row in range(len(design))]))
+    regressors = np.column_stack([np.ones(len(rows)), 2.0 * np.log(rows["sight_m"])])
+    for values, exponent in ((rows[DEPTH], depth), (rows[DEPTH] / rows[DISPARITY], ratio)):
+        fit = scale_regression(values.to_numpy() ** 2, regressors)
+        low, high = fit.interval(1, CONFIDENCE)
+        assert low <= exponent <= high
+        assert high - low < 0.1
