@@ -168,6 +168,12 @@ class Identification(Section):
     def _of_parameters(cls, prior: Any) -> Any:
         return check_parameter_names(prior)
 
+    @model_validator(mode="after")
+    def _anchor_measures_what_is_stated(self) -> "Identification":
+        if self.anchor_std is not None and self.scale_anchor in ("payload", "prior"):
+            raise ValueError(f"anchor_std = {self.anchor_std:g}: the anchor {self.scale_anchor} measures no parameter")
+        return self
+
 
 class Payload(Section):
     """The known load that the platform carries in the second run, where the scale anchor is a payload."""

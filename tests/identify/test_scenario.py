@@ -190,6 +190,12 @@ def test_every_parameter_of_the_closed_loop_may_be_known_beforehand():
     assert len(load_scenario("paper").with_overrides({"identification.prior": known}).identification.prior) == 67
 
 
+@pytest.mark.parametrize("anchor", ["payload", "prior"])
+def test_an_anchor_that_measures_nothing_has_no_deviation(anchor):
+    message = refusal({"identification.scale_anchor": anchor, "identification.anchor_std": 0.1})
+    assert f"identification: anchor_std = 0.1: the anchor {anchor} measures no parameter" in message
+
+
 def test_a_load_that_no_body_has_is_refused_and_a_flat_one_is_not():
     message = refusal({"payload.Ixx_kg_m2": 100.0})
     assert "payload: Ixx_kg_m2 = 100 kg m2 exceeds Iyy_kg_m2 0.02 + Izz_kg_m2 0.04 kg m2" in message
