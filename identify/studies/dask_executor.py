@@ -27,6 +27,8 @@ ANSWER_SECONDS = 30
 
 GONE = "the Dask scheduler is gone; the same command goes on from here with another"
 
+KILLED = "KilledWorker: the process that computed this row died, and died again when it computed this row alone"
+
 BATCHES_A_WORKER = 3
 """Batches on their way for each worker: one in work, and the next ones at hand."""
 
@@ -84,8 +86,8 @@ class DaskExecutor:
         _, cases = self._open.pop(future.key)
         try:
             return self._result(future)
-        except KilledWorker as error:
-            return self._blame(cases, error)
+        except KilledWorker:
+            return self._blame(cases)
         except StudyError:
             raise
         except Exception as error:
@@ -103,12 +105,12 @@ class DaskExecutor:
             except TimeoutError:
                 self._check_cluster()
 
-    def _blame(self, cases: list[Case], error: KilledWorker) -> list[Finished]:
+    def _blame(self, cases: list[Case]) -> list[Finished]:
         """Make rows suspects, or the one an error that was alone and has lost its worker for the second time."""
         self._deaths.update(case.number for case in cases)
         alone = len(cases) == 1 and not self._open
         if alone and self._deaths[cases[0].number] > 1:
-            return [Finished(cases[0].number, {}, 0.0, f"KilledWorker: {error}")]
+            return [Finished(cases[0].number, {}, 0.0, KILLED)]
         self._suspects += cases
         return []
 

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -14,8 +15,9 @@ def row(scenario, seed, options):
     """Random numbers of the row's seed, and what the factors say.
 
     Options: `seconds` to sleep; `log`, a file that gets a line a computation; `fails`, spawn keys of rows that raise;
-    `kills`, those of rows that kill their process; `odd`, that of a row with a figure that is no number; `also`, the
-    name of one more figure.
+    `exits`, those of rows that call sys.exit; `kills`, those of rows that kill their process; `interrupt`, that of a
+    row during which Ctrl-C comes; `odd`, that of a row with a figure that is no number; `also`, the name of one more
+    figure.
     """
     number = seed.spawn_key[0]
     time.sleep(options.get("seconds", 0.0))
@@ -24,6 +26,10 @@ def row(scenario, seed, options):
             file.write(f"{number}\n")
     if number in options.get("fails", []):
         raise ValueError(f"row {number}\nhas no answer")
+    if number in options.get("exits", []):
+        sys.exit("bye")
+    if number == options.get("interrupt"):
+        signal.raise_signal(signal.SIGINT)
     if number in options.get("kills", []):
         os.kill(os.getpid(), signal.SIGKILL)
     draws = np.random.default_rng(seed).normal(size=1000)

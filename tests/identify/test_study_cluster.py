@@ -19,6 +19,7 @@ import pytest
 from identify.errors import StudyError
 from identify.files.versions import versions
 from identify.progress import SilentProgress
+from identify.studies import dask_runner
 from identify.studies.dask_runner import local_cluster, running_cluster
 from identify.studies.runner import run_study
 from identify.studies.same_versions import OtherVersionsWarning
@@ -146,11 +147,14 @@ def test_lost_scheduler_is_one_line_and_the_study_goes_on_with_another(tmp_path,
     same_numbers(outcome.frame, serial)
 
 
-def test_rows_that_kill_their_worker_are_errors_and_no_other_row_is(tmp_path, serial):
-    outcome = run_study(study(kills=[7]), tmp_path, SilentProgress(), partial(local_cluster, 2))
+def test_rows_that_end_their_worker_are_errors_and_no_other_row_is(tmp_path, serial, monkeypatch):
+    """Also where there is no other worker, and Dask gives it up before it has started again, as on a busy machine."""
+    monkeypatch.setitem(dask_runner.LOCAL_SETTINGS, "distributed.deploy.lost-worker-timeout", "50 ms")
+    outcome = run_study(study(kills=[7], exits=[3]), tmp_path, SilentProgress(), partial(local_cluster, 1))
     frame = outcome.frame
     assert frame["error"][7].startswith("KilledWorker")
-    same_numbers(frame.drop(index=7), serial.drop(index=7))
+    assert frame["error"][3] == "SystemExit: bye"
+    same_numbers(frame.drop(index=[3, 7]), serial.drop(index=[3, 7]))
 
 
 def test_workers_with_another_version_of_the_product_are_refused_at_the_start(tmp_path):
@@ -193,7 +197,8 @@ def test_other_versions_of_other_packages_are_one_warning(tmp_path, serial):
 
 @pytest.fixture
 def command(tmp_path):
-    """A function that starts the command on two workers and waits until 30 rows are done: process, folder, log."""
+    """A function that starts the command on so many workers and waits until 30 rows are done, or for the condition
+    given, of the process: process, folder, log."""
     folder, log, started = tmp_path / "a", tmp_path / "log", []
     text = study(log=str(log))
     (tmp_path / "mine.toml").write_text(
@@ -201,10 +206,13 @@ def command(tmp_path):
         f'{DARK} = {text.factors[DARK]}\n[options]\nseconds = 0.02\nlog = "{log}"\n'
     )
 
-    def start():
-        arguments = ("study", tmp_path / "mine.toml", "--workers", 2, "--out", folder)
+    def rows_done(_):
+        return (folder / JOURNAL).exists() and len(journal(folder)) >= 30
+
+    def start(workers, until=rows_done):
+        arguments = ("study", tmp_path / "mine.toml", "--workers", workers, "--out", folder)
         started.append(process("-m", "identify.command_line", *arguments))
-        wait_for(lambda: (folder / JOURNAL).exists() and len(journal(folder)) >= 30, "30 rows")
+        wait_for(lambda: until(started[-1]), until.__name__)
         return started[-1], folder, log
 
     yield start
@@ -226,8 +234,16 @@ def in_group(leader):
     return found
 
 
+def starts_workers(command):
+    """Whether processes of workers are there; they need seconds until they compute."""
+    try:
+        return any("spawn_main" in Path(f"/proc/{one}/cmdline").read_text() for one in in_group(command.pid))
+    except OSError:
+        return False
+
+
 def test_killed_command_loses_nothing_finished_and_computes_nothing_twice(command, serial):
-    running, folder, log = command()
+    running, folder, log = command(workers=2)
     running.kill()
     running.wait()
     wait_for(lambda: not in_group(running.pid), "workers outlive the killed command")
@@ -242,7 +258,7 @@ def test_killed_command_loses_nothing_finished_and_computes_nothing_twice(comman
 
 
 def test_interrupted_command_ends_with_one_line_and_goes_on(command, serial):
-    running, folder, log = command()
+    running, folder, log = command(workers=1)
     os.killpg(running.pid, signal.SIGINT)
     _, error = running.communicate(timeout=PATIENCE)
     assert running.returncode == 130
@@ -252,3 +268,14 @@ def test_interrupted_command_ends_with_one_line_and_goes_on(command, serial):
     outcome = run_study(study(log=str(log)), folder, SilentProgress())
     assert outcome.found == len(kept)
     same_numbers(outcome.frame, serial)
+
+
+def test_command_interrupted_while_its_workers_start_ends_with_one_line(command):
+    """Also the processes that start get the signal, as from a terminal; none of them says anything, or stays."""
+    running, folder, _ = command(workers=1, until=starts_workers)
+    os.killpg(running.pid, signal.SIGINT)
+    _, error = running.communicate(timeout=PATIENCE)
+    assert error == "stopped: 0 of 120 rows are done and kept; the same command goes on from there\n"
+    assert running.returncode == 130
+    assert journal(folder) == []
+    wait_for(lambda: not in_group(running.pid), "workers outlive the interrupted command")

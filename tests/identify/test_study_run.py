@@ -203,6 +203,18 @@ def test_a_failing_row_says_why_and_the_others_go_on(whole, tmp_path):
     same_numbers(frame[~failed], whole[1].frame[~failed])
 
 
+def test_a_row_that_exits_the_program_is_an_error_of_this_row(whole, tmp_path):
+    frame = run(tmp_path, study(options={"exits": [2]})).frame
+    assert frame["error"][2] == "SystemExit: bye"
+    same_numbers(frame.drop(index=2), whole[1].frame.drop(index=2))
+
+
+def test_ctrl_c_in_a_row_stops_the_study_and_is_no_error_of_the_row(whole, tmp_path):
+    with pytest.raises(StudyInterrupted, match=r"stopped: \d+ of 18 rows are done"):
+        run(tmp_path, study(options={"interrupt": 7}))
+    assert set(journal_rows(tmp_path)) <= set(range(7))
+
+
 @pytest.mark.parametrize("name", ["row", "seconds", DARK])
 def test_a_figure_that_would_hide_a_column_is_an_error_of_the_row(tmp_path, name):
     frame = run(tmp_path, study(options={"also": name}, repeats=1)).frame

@@ -1,0 +1,122 @@
+"""Ctrl-C at a bad moment: held, noted, not heard by the processes of workers, and one line for the user."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+import typer
+
+from identify.commands.stopping import stoppable
+from identify.errors import StudyInterrupted
+from identify.progress import SilentProgress
+from identify.studies import study_file
+from identify.studies.interrupts import deaf_offspring, held, noted, raise_noted
+from identify.studies.runner import run_study
+from identify.studies.study_file import Study
+from tests.identify.commands import command
+from tests.identify.study_rows import KIND
+
+LINE = "stopped: what is done is kept; the same command goes on from there\n"
+
+
+def ctrl_c():
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def swallowed():
+    """Ctrl-C during something that catches everything, as some imports do."""
+    try:
+        ctrl_c()
+    except BaseException:
+        return
+    raise AssertionError("no KeyboardInterrupt")
+
+
+def broken_import():
+    """Ctrl-C during an import that makes another error of it."""
+    try:
+        ctrl_c()
+    except BaseException as error:
+        raise ImportError("half of a library") from error
+
+
+def blocked(status):
+    """Whether a process does not hear Ctrl-C, from its /proc/PID/status."""
+    mask = next(line for line in status.splitlines() if line.startswith("SigBlk:")).split()[1]
+    return bool(int(mask, 16) >> (signal.SIGINT - 1) & 1)
+
+
+def test_held_ctrl_c_waits_for_the_end_of_the_block():
+    done = []
+
+    @held()
+    def block():
+        ctrl_c()
+        done.append("the rest of the block")
+
+    with pytest.raises(KeyboardInterrupt):
+        block()
+    assert done == ["the rest of the block"]
+    with pytest.raises(KeyboardInterrupt):
+        ctrl_c()
+
+
+def test_noted_ctrl_c_is_raised_again_where_it_was_swallowed():
+    with noted():
+        raise_noted()
+        swallowed()
+        with pytest.raises(KeyboardInterrupt):
+            raise_noted()
+    raise_noted()
+
+
+def test_swallowed_ctrl_c_begins_no_row(tmp_path):
+    def workers():
+        raise AssertionError("workers are started")
+
+    study = Study(name="mine", kind=KIND, factors={"sensor.camera.dark_noise": [13.0]})
+    with noted():
+        swallowed()
+        with pytest.raises(StudyInterrupted, match="0 of 1 rows are done"):
+            run_study(study, tmp_path, SilentProgress(), workers)
+
+
+@pytest.mark.parametrize("happens", [ctrl_c, broken_import])
+def test_ctrl_c_in_a_command_is_one_line(happens, capsys):
+    with pytest.raises(typer.Exit) as caught:
+        stoppable(happens)()
+    assert caught.value.exit_code == 130
+    assert capsys.readouterr().err == LINE
+
+
+def test_other_errors_of_a_command_stay_what_they_are(capsys):
+    def fails():
+        raise ImportError("no library")
+
+    with pytest.raises(ImportError, match="no library"):
+        stoppable(fails)()
+    assert capsys.readouterr().err == ""
+
+
+def test_ctrl_c_before_the_study_is_read_is_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(study_file, "load_study", lambda _: broken_import())
+    assert command("study", "pixel_noise") == 130
+    assert capsys.readouterr().err == LINE
+
+
+def test_processes_of_threads_that_are_started_deaf_do_not_hear_ctrl_c():
+    seen = []
+
+    def start():
+        shown = "print(open('/proc/self/status').read())"
+        seen.append(subprocess.run([sys.executable, "-c", shown], capture_output=True, text=True, check=True).stdout)
+
+    with deaf_offspring():
+        thread = threading.Thread(target=start)
+        thread.start()
+    thread.join()
+    start()
+    assert [blocked(status) for status in seen] == [True, False]
