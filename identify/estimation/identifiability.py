@@ -32,20 +32,22 @@ FRICTION_SHARE = 0.1
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What the starting guess leaves of each parameter, std (67,), and its size (67,); SI."""
+    """What the starting guess leaves of each parameter, std (67,), and its size (67,), SI; model_holds: whether noise,
+    and not an error of the model, makes most of the residuals (`misfit`): with another model nothing is identified."""
 
     std: Array
     sizes: Array
+    model_holds: bool = True
 
     def judge(self, rows: Array, covariance: Array) -> NDArray[np.bool_]:
         """Whether each quantity rows (n, 67) @ parameters is identified, with the estimate's covariance (67, 67)."""
         left = np.sqrt(np.einsum("gi,ij,gj->g", rows, covariance, rows))
         before, size = np.sqrt(rows**2 @ self.std**2), np.sqrt(rows**2 @ self.sizes**2)
-        return np.asarray(left < IDENTIFIABLE_SHARE * np.minimum(before, size))
+        return self.model_holds & (left < IDENTIFIABLE_SHARE * np.minimum(before, size))
 
 
-def identifiability(guess: StartingGuess, robot: Robot) -> Identifiability:
+def identifiability(guess: StartingGuess, robot: Robot, model_holds: bool = True) -> Identifiability:
     """The criterion that follows from a starting guess; a guess of zero, other than of friction, has the size 1."""
     friction = np.isin(NAMES, COULOMB_NAMES + VISCOUS_NAMES)
     unsaid = np.where(friction, FRICTION_SHARE * holding_torque(robot, guess.values[: len(robot.parameter_names)]), 1.0)
-    return Identifiability(guess.std, np.where(guess.values != 0, np.abs(guess.values), unsaid))
+    return Identifiability(guess.std, np.where(guess.values != 0, np.abs(guess.values), unsaid), model_holds)

@@ -29,6 +29,7 @@ from identify.estimation.estimate_covariance import DRAWS, Uncertainty, estimate
 from identify.estimation.group_estimates import GroupEstimates, group_estimates, group_rows
 from identify.estimation.identifiability import identifiability
 from identify.estimation.loop_parameters import NAMES, starting_guess
+from identify.estimation.misfit import Misfit, misfit_of_white
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import bounds_of, output_error_searches
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor
@@ -108,10 +109,11 @@ def identify(
     with progress.stage("uncertainty", DRAWS) as advance:
         judged = problem if method == "closed_loop" else driven
         uncertainty = estimate_uncertainty(judged, searches[method].parameters, rng, advance)
-    tested = _whiteness(driven, searches["command_driven"].parameters)
+    residuals, ok = _driven_residuals(driven, searches["command_driven"].parameters)
+    tested, driven_misfit = whiteness(residuals, ok), misfit_of_white(residuals[ok])
     ended = time.perf_counter()
     seconds = {"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched}
-    return _result(problem, scenario, warm, searches, uncertainty, tested, seconds)
+    return _result(problem, scenario, warm, searches, uncertainty, tested, driven_misfit, seconds)
 
 
 def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario) -> OutputErrorProblem:
@@ -135,15 +137,16 @@ def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: 
     return OutputErrorProblem(runs, guess, anchor)
 
 
-def _whiteness(driven: OutputErrorProblem, parameters: Array) -> Whiteness:
-    """Whiteness of all command-driven residuals, one record after the other, with a gap of all lags between them."""
+def _driven_residuals(driven: OutputErrorProblem, parameters: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """All command-driven residuals (N, 6), NaN where lost, and the good frames (N,): one record after the other, with a
+    gap of all lags of the whiteness test between them."""
     gap, residuals, ok = np.full((LAGS, 6), np.nan), [], []
     for run in driven.runs:
         rows = np.full(run.measured.shape, np.nan)
         rows[run.ok] = run.whiten(run.model_poses(parameters) - run.measured)
         residuals += [rows, gap]
         ok += [run.ok, np.zeros(LAGS, dtype=bool)]
-    return whiteness(np.concatenate(residuals), np.concatenate(ok))
+    return np.concatenate(residuals), np.concatenate(ok)
 
 
 def _result(
@@ -153,12 +156,15 @@ def _result(
     searches: dict[str, Solution],
     uncertainty: Uncertainty,
     tested: Whiteness,
+    driven_misfit: Misfit,
     seconds: dict[str, float],
 ) -> IdentificationResult:
     """What the searches and their uncertainty say of parameters and groups."""
     robot, guess, solution = problem.runs[0].robot, problem.guess, searches[scenario.identification.method]
     base, known = base_parameters(structural_regressor(robot)), problem.known_information()
-    criterion = identifiability(guess, robot)
+    # An error of the model that the closed loop hides shows where the logged commands drive it.
+    hidden = driven_misfit.decides and not uncertainty.misfit.decides
+    criterion = identifiability(guess, robot, model_holds=not (hidden or uncertainty.misfit.decides))
     groups = group_estimates(base, guess, criterion, solution.parameters, uncertainty.covariance)
     conditioned = conditioning(uncertainty.information, known, base, guess, solution.parameters)
     bounded = bounded_estimate(
@@ -190,13 +196,14 @@ def _result(
         searches=tuple(searches),
         costs=tuple(one.costs for one in searches.values()),
         active_bounds=bounded.active_bounds,
-        noise_ratio=uncertainty.noise_ratio,
-        expected_noise_ratio=uncertainty.expected_noise_ratio,
-        noise_ratio_std=uncertainty.noise_ratio_std,
+        noise_ratio=uncertainty.misfit.found,
+        expected_noise_ratio=uncertainty.misfit.expected,
+        noise_ratio_std=uncertainty.misfit.std,
         whiteness=tested,
         warnings=(
             *of_the_records,
             *uncertainty.warnings(),
+            *(driven_misfit.warnings("driven by the logged commands, the model") if hidden else ()),
             *tested.warnings(),
             *bounded.warnings(),
             *conditioned.warnings(),

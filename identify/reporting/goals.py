@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from identify.estimation.estimate_covariance import MISFIT_STDS
+from identify.estimation.misfit import MISFIT_STDS
 from identify.estimation.whiteness import SUSPICIOUS
 from identify.files.result_file import rms_row
 

@@ -153,6 +153,27 @@ def test_the_residuals_say_that_the_model_is_wrong(switch):
 
 
 @pytest.mark.slow
+def test_elastic_joints_that_the_closed_loop_hides_leave_nothing_identified():
+    """The closed loop explains the record, with wrong parameters; the model driven by the commands does not."""
+    result = _identified(**ELASTIC, **{"identification.method": "closed_loop"})
+    assert result.noise_ratio < 1.2
+    assert not result.identifiable.any()
+    assert any("driven by the logged commands, the model misses" in said for said in result.warnings)
+
+
+@pytest.mark.slow
+def test_intervals_hold_though_joints_are_off_by_a_third_of_a_millimetre():
+    """The misfit is as large as the noise; intervals of white noise would miss by 4.5 standard deviations."""
+    result = _identified(**MISPLACED | {"plant.geometry_error_m": 3e-4})
+    assert 1.5 < result.noise_ratio < 3
+    known = result.identifiable
+    errors = ((result.estimate - truth()) / result.std)[known]
+    assert known.sum() >= 20
+    assert np.sqrt(np.mean(errors**2)) < 1.3
+    assert np.abs(errors).max() < 3
+
+
+@pytest.mark.slow
 def test_without_mismatch_they_do_not():
     result = _identified()
     assert result.whiteness.p_value > 0.01

@@ -93,12 +93,13 @@ def test_a_record_of_a_real_robot_has_no_seed(record):
 
 
 def test_commands_of_swapped_joints_leave_no_estimate_that_looks_good(record):
-    """The model cannot follow: it is said, and the intervals are as wide as the misfit."""
-    settings = {"identification.method": "command_driven", "identification.max_iterations": 2}
+    """The model cannot follow: it is said, and nothing is identified."""
+    settings = {"identification.method": "command_driven"}
     good = identify(record, rss6(), quick(**settings))
     swapped = with_values(record, command=record["command"].values[:, [1, 0, 2, 3, 4, 5]])
-    wrong = identify(swapped, rss6(), quick(**settings))
+    wrong = identify(swapped, rss6(), quick(**settings, **{"identification.max_iterations": 2}))
     assert wrong.noise_ratio > 100
     assert "the model or the stated covariance is wrong" in wrong.warnings[0]
-    assert wrong.identifiable.sum() < good.identifiable.sum() / 2
-    assert wrong.groups.identifiable.sum() < good.groups.identifiable.sum() / 2
+    assert good.identifiable.sum() > 10
+    assert not wrong.identifiable.any()
+    assert not wrong.groups.identifiable.any()

@@ -1,0 +1,76 @@
+"""An error of the model that noise does not explain: found, told from chance, and brought into the intervals."""
+
+import numpy as np
+import pytest
+
+from identify.estimation.identification import identify
+from identify.estimation.misfit import Misfit, coloured_score_covariance, misfit_of_white
+from tests.identify.synthetic import quick, rss6, run_plant
+
+LASTING = 0.9
+
+
+def lasting(rng, frames):
+    """Six residuals of variance one that follow each other with the correlation LASTING (an AR(1) process)."""
+    rows = np.empty((frames, 6))
+    rows[0] = rng.standard_normal(6)
+    for k in range(1, frames):
+        rows[k] = LASTING * rows[k - 1] + np.sqrt(1 - LASTING**2) * rng.standard_normal(6)
+    return rows
+
+
+def test_it_is_the_double_sum_over_the_frames_with_gaps_left_out():
+    rng = np.random.default_rng(0)
+    ok = rng.random(41) > 0.1
+    residuals, jacobian = rng.standard_normal((ok.sum(), 6)), rng.standard_normal((ok.sum(), 6, 3))
+    rows, slopes = np.zeros((41, 6)), np.zeros((41, 6, 3))
+    rows[ok], slopes[ok] = residuals, jacobian
+    total = np.zeros((3, 3))
+    for i in range(41):
+        for j in range(41):
+            first, second = max(i - j, 0), max(j - i, 0)
+            pairs = rows[first : 41 - second].T @ rows[second : 41 - first] / ok.sum()
+            total += max(1 - abs(i - j) / (0.2 * 41), 0) * slopes[i].T @ pairs @ slopes[j]
+    np.testing.assert_allclose(coloured_score_covariance(residuals, jacobian, ok), total, rtol=1e-9, atol=1e-9)
+
+
+def test_scores_of_lasting_residuals_spread_as_it_says_and_four_times_as_far_as_white_ones():
+    """The spread of drawn scores is the oracle. Fading correlations lack a part that grows with their length."""
+    rng, frames = np.random.default_rng(1), 600
+    ok = np.ones(frames, dtype=bool)
+    wave = np.sin(2 * np.pi * np.arange(frames) / 200)[:, None, None] * rng.standard_normal((6, 1))
+    drawn = [lasting(rng, frames) for _ in range(300)]
+    spread = np.std([np.tensordot(r, wave, 2)[0] for r in drawn])
+    said = np.sqrt(np.mean([coloured_score_covariance(r, wave, ok)[0, 0] for r in drawn]))
+    white = np.sqrt(np.sum(wave**2))
+    assert spread > 3.5 * white
+    assert 0.85 * spread < said < 1.05 * spread
+
+
+def test_of_chance_nothing_is_the_models():
+    """One in a thousand of right models is above the limit; what is above belongs to the model only from there on."""
+    inside, outside = Misfit(1.1, 1.0, 0.0325), Misfit(1.1, 1.0, 0.0320)
+    assert (inside.significant, inside.share_of_model, inside.warnings()) == (False, 0.0, ())
+    assert outside.share_of_model == pytest.approx(1 / 11)
+    assert "intervals are widened" in outside.warnings()[0]
+    rng = np.random.default_rng(2)
+    assert sum(misfit_of_white(rng.standard_normal((60, 6))).significant for _ in range(2000)) <= 10
+
+
+def test_a_large_misfit_decides_and_a_small_one_blames_the_covariance():
+    assert Misfit(3.3, 1.05, 0.02).decides
+    assert not Misfit(3.1, 1.05, 0.02).decides
+    assert "nothing counts as identified" in Misfit(3.3, 1.05, 0.02).warnings()[0]
+    assert "too wide" in Misfit(0.8, 1.0, 0.03).warnings()[0]
+    assert not Misfit(0.8, 1.0, 0.03).significant
+
+
+def test_frames_marked_as_lost_afterwards_leave_nothing_identified():
+    """The servo had them, the model's has not: 20 frames are enough to miss the record by far more than the noise."""
+    record = run_plant(quick(), seed=0, duration_s=3.0)[0]
+    record["measured_ok"][90:110] = 0
+    result = identify(record, rss6(), quick(**{"identification.max_iterations": 5}))
+    assert result.noise_ratio > 10
+    assert not result.identifiable.any()
+    assert not result.groups.identifiable.any()
+    assert "nothing counts as identified" in result.warnings[0]
