@@ -1,11 +1,13 @@
 """PNG figures of a study: figures against each factor with bands, two factors as a map, and the laws."""
 
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
@@ -22,6 +24,8 @@ from identify.studies.units import factor_unit, figure_unit, labelled
 
 LEAST_SPAN = 2.0
 """Smallest ratio of the ends of a logarithmic axis: small differences shall look small."""
+LETTERS_PER_INCH = 10.0
+"""Letters of a title, a little fewer than there is room for."""
 MOST_CURVES = 6
 """Settings of the other factors that are drawn as curves of their own; more are drawn as one."""
 
@@ -61,7 +65,7 @@ def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str])
         if axes.get_legend_handles_labels()[1]:
             axes.legend(fontsize="small")
     what = f"rms over rows, {BANDS:.0%} band" if study.sample is None else "single rows"
-    figure.suptitle(f"{study.title or study.name}: {what}")
+    _title(figure, f"{study.title or study.name}: {what}")
     return figure
 
 
@@ -82,7 +86,7 @@ def map_figure(study: Study, done: pd.DataFrame, paths: tuple[str, str], shown: 
         axes.set_xlabel(labelled(paths[1], factor_unit(paths[1])))
         axes.set_ylabel(labelled(paths[0], factor_unit(paths[0])))
         figure.colorbar(picture, ax=axes, label=labelled(name, figure_unit(study.kind, name)))
-    figure.suptitle(f"{study.title or study.name}: rms over rows")
+    _title(figure, f"{study.title or study.name}: rms over rows")
     return figure
 
 
@@ -97,13 +101,13 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
             _curve(axes, _levels(study, rows, factor), law_data(law, rows), label)
         _theory_line(axes, have[factor], law_data(law, have), law.exponent or 0.0)
         _scale(axes, have[factor], pd.Series(law_data(law, have)))
-        axes.set_title(f"{verdict.verdict}: {verdict.measured:.3g} ({verdict.low:.3g} to {verdict.high:.3g})",
+        axes.set_title(f"{verdict.verdict}: {verdict.measured:.4g} ({verdict.low:.4g} to {verdict.high:.4g})",
                        fontsize="small")
         unit = factor_unit(factor) if factor in study.factors else figure_unit(study.kind, factor)
         axes.set_xlabel(labelled(factor, unit))
         axes.set_ylabel(labelled(law.quantity, figure_unit(study.kind, law.figure) if law.per is None else ""))
         axes.legend(fontsize="small")
-    figure.suptitle(f"{study.title or study.name}: measured exponent and its {LAWS:.0%} interval")
+    _title(figure, f"{study.title or study.name}: measured exponent and its {LAWS:.0%} interval")
     return figure
 
 
@@ -123,6 +127,11 @@ def _panels(count: int) -> tuple[Figure, list[Axes]]:
     for axes in panels[count:]:
         axes.set_visible(False)
     return figure, panels[:count]
+
+
+def _title(figure: Figure, text: str) -> None:
+    """A title above all panels, in as many lines as the width of the figure asks for."""
+    figure.suptitle("\n".join(wrap(text, round(LETTERS_PER_INCH * figure.get_figwidth()))))
 
 
 def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFrame]]:
@@ -163,14 +172,21 @@ def _scale(axes: Axes, factor: pd.Series, values: pd.Series) -> None:
         if factor.nunique() <= 12:
             axes.set_xticks(sorted(factor.unique()), [f"{value:.4g}" for value in sorted(factor.unique())], minor=False)
             axes.xaxis.set_minor_locator(NullLocator())
+        else:
+            _plain_ticks(axes.xaxis)
     if (values > 0).all():
         axes.set_yscale("log")
         low, high = axes.get_ylim()
         widen = max(1.0, np.sqrt(LEAST_SPAN * low / high))
         axes.set_ylim(low / widen, high * widen)
-        for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
-            ticks(FuncFormatter(lambda value, place: f"{value:.3g}"))
+        _plain_ticks(axes.yaxis)
     axes.grid(alpha=0.3, which="both")
+
+
+def _plain_ticks(axis: Axis) -> None:
+    """Numbers as one writes them, where matplotlib would write powers of ten."""
+    for ticks in (axis.set_major_formatter, axis.set_minor_formatter):
+        ticks(FuncFormatter(lambda value, place: f"{value:.4g}"))
 
 
 def _shown(values: pd.Series) -> Any:

@@ -9,9 +9,11 @@ from matplotlib.image import imread
 from scipy import stats
 
 from identify.studies import summary
+from identify.studies.figures import laws_figure
 from identify.studies.law import Law
 from identify.studies.point_statistics import point_statistics
 from identify.studies.study_file import Range, Study
+from identify.studies.theory import check_laws
 
 DARK, BASELINE = "sensor.camera.dark_noise", "sensor.rig.baseline"
 POSITION, ORIENTATION = "position_rms_um", "orientation_rms_urad"
@@ -135,6 +137,17 @@ def test_figures_show_each_factor_two_as_a_map_and_the_laws(written):
     assert {path.name for path in folder.iterdir()} == names
     for name in names:
         assert np.ptp(imread(folder / name)[..., :3]) > 0.5
+
+
+def test_long_title_stays_within_the_figure_of_a_single_law():
+    study = made_study(title="How far the measured position is from the true one against the noise of the pixels")
+    frame = made_table(study)
+    figure = laws_figure(study, frame, [(study.theory[0], check_laws(study, frame)[0])])
+    figure.canvas.draw()
+    title = figure.texts[0].get_window_extent()
+    assert title.x0 > 0.0
+    assert title.x1 < figure.bbox.width
+    assert title.y0 > figure.axes[0].title.get_window_extent().y1
 
 
 def test_single_repeat_has_no_band_and_says_so(tmp_path, undrawn):
