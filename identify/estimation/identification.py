@@ -93,7 +93,8 @@ def identify(
 
     Raises:
         RecordError: the record misses something, or belongs to another robot or frame rate.
-        EstimationError: too many lost frames, or no model that runs from the starting guess or the warm start.
+        EstimationError: no robot or scenario, too many lost frames, or no model that runs from the starting guess or
+            the warm start.
     """
     progress = progress or SilentProgress()
     records = [record] if isinstance(record, xr.Dataset) else list(record)
@@ -121,8 +122,11 @@ def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: 
 
     Raises:
         RecordError: no scale anchor, or no such poses.
-        EstimationError: a record that does not fit, or cannot carry an identification.
+        EstimationError: no robot or scenario; a record that does not fit, or cannot carry an identification.
     """
+    for given, kind, loader in ((robot, Robot, "dynamics.load_robot"), (scenario, Scenario, "identify.load_scenario")):
+        if not isinstance(given, kind):
+            raise EstimationError(f"{given!r} is no {kind.__name__}: {loader}(name or path) gives one")
     if not records:
         raise EstimationError("no record to identify from")
     runs = tuple(recorded_run(record, robot, scenario) for record in records)

@@ -16,7 +16,7 @@ import xarray as xr
 
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
-from identify.estimation.loop_parameters import NAMES, index_of
+from identify.estimation.loop_parameters import NAMES, index_of, unit_of
 
 MEASURED_PARAMETER = {"platform_mass": "platform.mass", "joint_gain": "joint_pid.lp"}
 """Anchors that measure a parameter."""
@@ -71,19 +71,29 @@ def read_anchor(record: xr.Dataset) -> ScaleAnchor:
     """The anchor's measurement of a record.
 
     Raises:
-        RecordError: the record has none: the scale of its parameters is free.
+        RecordError: the record has none, so that the scale of its parameters is free; or a measured value or standard
+            deviation that is no finite number > 0.
     """
     name = record.attrs.get("scale_anchor")
-    if name in ANCHORS and name not in MEASURED_PARAMETER:
-        return ScaleAnchor(str(name))
-    value, std = (_number(record.attrs.get(f"scale_anchor_{key}")) for key in ("value", "std"))
-    if name not in ANCHORS or not 0 < std < np.inf or not np.isfinite(value):
+    if name not in ANCHORS:
         raise RecordError(
             f"the record holds no scale anchor (attributes scale_anchor, scale_anchor_value, scale_anchor_std), found "
             f"{name!r}; valid anchors: {', '.join(ANCHORS)}"
         )
-    return ScaleAnchor(str(name), value, std)
+    if name not in MEASURED_PARAMETER:
+        return ScaleAnchor(str(name))
+    return ScaleAnchor(str(name), _positive(record, "scale_anchor_value"), _positive(record, "scale_anchor_std"))
 
 
-def _number(value: object) -> float:
-    return float(value) if isinstance(value, int | float | np.number) else np.nan
+def _positive(record: xr.Dataset, attribute: str) -> float:
+    """A record's attribute that must be a finite number > 0."""
+    value = record.attrs.get(attribute)
+    number = float(value) if isinstance(value, int | float | np.number) and not isinstance(value, bool) else np.nan
+    if not 0 < number < np.inf:
+        anchor = record.attrs["scale_anchor"]
+        measured = MEASURED_PARAMETER[anchor]
+        raise RecordError(
+            f"the record's attribute {attribute} is {value!r}, must be a finite number > 0 in {unit_of(measured)}: the "
+            f"scale anchor {anchor} measures {measured}"
+        )
+    return number
