@@ -139,6 +139,23 @@ def test_wrong_choices_name_the_valid_ones(setting, words, tmp_path):
     assert all(word in done.stderr for word in words), done.stderr
 
 
+def test_a_plant_that_the_model_cannot_be_is_said_and_judged(tmp_path):
+    """Joints off by 0.1 mm: the run does its work, warns even where it is quiet, and misses the goal of white
+    residuals."""
+    choices = ("renderer=analytic", "plant.geometry_error_m=1e-4", "validation.count=1", "validation.duration_s=2")
+    settings = [word for choice in choices for word in ("--set", choice)]
+    done = cmmsim("run", "quick", "--out", tmp_path / "run", "--quiet", *settings)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
+    warnings = done.stderr.splitlines()
+    assert all(line.startswith("warning: ") for line in warnings), done.stderr
+    assert any("are not white" in line for line in warnings), done.stderr
+    result = load_result(tmp_path / "run" / "result.json")
+    assert "white residuals" in [goal.name for goal in check_goals(result) if not goal.passed]
+    told = cmmsim("report", "--out", tmp_path / "run")
+    assert "missed: white residuals" in told.stdout
+
+
 def test_an_existing_folder_is_refused_and_untouched(tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     done = cmmsim("run", "quick", "--out", tmp_path)
