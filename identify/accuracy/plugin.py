@@ -32,7 +32,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options of the group `accuracy`."""
     group = parser.getgroup("accuracy", "accuracy benchmarks (cmmsim)")
     add = group.addoption
-    add("--accuracy-save", metavar="NAME", help="save the figures of a session that passes; NAME may hold no others")
+    add("--accuracy-save", metavar="NAME", help="save the figures of a session that passes, unless NAME holds others")
     add("--accuracy-compare", metavar="NAME", help="show saved figures and the change from them in the table")
     add(
         "--accuracy-fail",
