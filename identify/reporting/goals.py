@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from identify.estimation.misfit import MISFIT_STDS
+from identify.estimation.misfit import SIGNIFICANT
 from identify.estimation.whiteness import SUSPICIOUS
 from identify.files.result_file import rms_row
 
@@ -39,13 +39,13 @@ def check_goals(result: dict[str, Any]) -> list[Goal]:
 
 
 def explanation_goals(result: dict[str, Any]) -> list[Goal]:
-    """Whether the model explains the record: what it leaves is as large as noise alone makes it, and is white."""
+    """Whether the model explains the record: what it leaves is no larger than noise alone makes it, and is white."""
     found, goals = result.get("identification", {}), []
     if "noise_ratio_std" in found:
         keys = ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")
         ratio, expected, std = (math.nan if found[key] is None else found[key] for key in keys)
         text = f"residuals {ratio:.3f} times the noise variance, noise alone gives {expected:.3f} ± {std:.3f}"
-        goals.append(Goal("misfit of the record", abs(ratio - expected) / std, "<=", MISFIT_STDS, "std", text))
+        goals.append(Goal("misfit of the record", (ratio - expected) / std, "<=", SIGNIFICANT, "std", text))
     if "whiteness" in found:
         chance = found["whiteness"]["p_value"]
         text = "probability that chance correlates the residuals as much, of the model driven by the logged commands"
