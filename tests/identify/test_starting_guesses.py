@@ -6,7 +6,7 @@ as truth x (1 + s N(0, 1)) with s of 15 % and 50 %. Factors below 0.2 are drawn 
 
 That prior moves with the guess, and with it the optimum, a little. So each search is held against one from the truth
 under the same prior: the same optimum has the same cost, to 0.1; one standard deviation away in any direction it is
-higher by 1.
+higher by 1. And it has the same parameters: each one that the record identifies, to half a standard deviation.
 """
 
 import os
@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from identify.estimation.identifiability import identifiability
 from identify.estimation.identification import output_error_problem
 from identify.estimation.loop_parameters import StartingGuess, holding_torque, typical_sizes
 from identify.estimation.output_error_search import output_error_searches, search
@@ -31,6 +32,9 @@ MISSES = 1 if STARTS == 25 else 0
 
 SMALLEST_FACTOR = 0.2
 
+SAME_COST, SAME_PARAMETERS = 0.1, 0.5
+"""How far the same optimum may be away: in cost, and in standard deviations of any identified parameter."""
+
 
 def silent(n=1):
     pass
@@ -43,6 +47,15 @@ def drawn_guess(spread, seed):
         factors[low] = 1 + spread * rng.standard_normal(low.sum())
     values = truth() * factors
     return StartingGuess(values, typical_sizes(values, holding_torque(rss6(), values[:64])))
+
+
+def distance(problem, parameters, others):
+    """Largest difference of two estimates (67,) among the identified parameters, in standard deviations."""
+    _, factor, _ = problem.linearise(others)
+    covariance = np.linalg.inv(factor.T @ factor)
+    known = identifiability(problem.guess, rss6()).judge(np.eye(67), covariance)
+    assert known.sum() >= 20
+    return float(np.max((np.abs(parameters - others) / np.sqrt(np.diag(covariance)))[known]))
 
 
 @pytest.fixture(scope="module", params=["ctrack780", "ctrack780_29hz"])
@@ -58,7 +71,7 @@ def recorded(request):
 def test_the_optimum_does_not_depend_on_the_starting_guess(recorded, spread):
     """24 of 25 starting guesses, or all of the few that are drawn without ALL_STARTS=1, reach the same optimum."""
     scenario, stated = recorded
-    excess = []
+    excess, apart = [], []
     for seed in range(STARTS):
         problem = replace(stated, guess=drawn_guess(spread, seed))
         warm = linear_warm_start(problem.runs, scenario.timing, scenario.filter, problem.guess, problem.anchor)
@@ -66,4 +79,6 @@ def test_the_optimum_does_not_depend_on_the_starting_guess(recorded, spread):
         assert "max_iterations" not in found.stop_reason
         from_truth = search(problem, truth(), scenario, silent)
         excess.append(found.costs[-1] - from_truth.costs[-1])
-    assert np.sum(np.array(excess) > 0.1) <= MISSES, excess
+        apart.append(distance(problem, found.parameters, from_truth.parameters))
+    reached = (np.array(excess) <= SAME_COST) & (np.array(apart) <= SAME_PARAMETERS)  # False where one of them is NaN
+    assert np.sum(~reached) <= MISSES, list(zip(excess, apart, strict=True))
