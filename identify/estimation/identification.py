@@ -32,6 +32,7 @@ from identify.estimation.loop_parameters import NAMES, starting_guess
 from identify.estimation.misfit import Misfit, misfit_of_white
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import bounds_of, output_error_searches
+from identify.estimation.prior_support import rests_on_prior
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor
 from identify.estimation.whiteness import LAGS, Whiteness, whiteness
 from identify.progress import Progress, SilentProgress
@@ -47,7 +48,8 @@ class IdentificationResult:
     """What one record says about the 67 parameters, in the order of `names`; SI.
 
     initial, warm_start, estimate, std (67,), covariance (67, 67), the last two as they were without bounds; intervals
-    (67, 2): 95 %, cut at the bounds; identifiable (67,) bool; groups, group_intervals: the same of the base parameters;
+    (67, 2): 95 %, cut at the bounds; identifiable (67,) bool; rests_on_prior (67,) bool: identified, but only with what
+    the guess says of other parameters; groups, group_intervals: what the record says of the base parameters;
     base_rank: independent groups that the trajectory excites by the paper's rule; iterations and evaluations: of all
     searches; stop_reason: of the last; searches: their names in order, and costs: after each iteration, one tuple a
     search; active_bounds: what holds the estimate back, as "platform.Izz <= Ixx + Iyy";
@@ -64,6 +66,7 @@ class IdentificationResult:
     covariance: Array
     intervals: Array
     identifiable: NDArray[np.bool_]
+    rests_on_prior: NDArray[np.bool_]
     groups: GroupEstimates
     group_intervals: Array
     conditioning: Conditioning
@@ -169,6 +172,7 @@ def _result(
     # An error of the model that the closed loop hides shows where the logged commands drive it.
     hidden = driven_misfit.decides and not uncertainty.misfit.decides
     criterion = identifiability(guess, robot, model_holds=not (hidden or uncertainty.misfit.decides))
+    identifiable = criterion.judge(np.eye(len(NAMES)), uncertainty.covariance)
     groups = group_estimates(base, guess, criterion, solution.parameters, uncertainty.covariance)
     conditioned = conditioning(uncertainty.information, known, base, guess, solution.parameters)
     bounded = bounded_estimate(
@@ -188,7 +192,8 @@ def _result(
         std=np.sqrt(np.diag(uncertainty.covariance)),
         covariance=uncertainty.covariance,
         intervals=bounded.intervals(np.eye(len(NAMES))),
-        identifiable=criterion.judge(np.eye(len(NAMES)), uncertainty.covariance),
+        identifiable=identifiable,
+        rests_on_prior=identifiable & rests_on_prior(base, problem.anchor, solution.parameters, criterion.sizes),
         groups=groups,
         group_intervals=bounded.intervals(group_rows(base)),
         conditioning=conditioned,

@@ -178,7 +178,7 @@ def identification_section(data: ReportData) -> Section:
     count = sum(bool(p["identifiable"]) for p in parameters.values())
     text = (
         f"{identification['iterations']} iterations, stopped by: {identification['stop_reason']}. "
-        f"{count} of {len(parameters)} parameters identifiable, "
+        f"{count} of {len(parameters)} parameters identifiable, {_on_guess(parameters)}"
         f"{sum(bool(g['identifiable']) for g in groups.values())} of {len(groups)} groups."
     )
     text += _conditioning_text(identification.get("conditioning"))
@@ -251,6 +251,12 @@ def _correlations(data: ReportData) -> tuple[Array, list[str]]:
     parameters = data.result["identification"]["parameters"]
     chosen = [k for k, name in enumerate(NAMES) if parameters.get(name, {}).get("identifiable")]
     return correlation_matrix(data.covariance[np.ix_(chosen, chosen)]), [NAMES[k] for k in chosen]
+
+
+def _on_guess(parameters: dict[str, Any]) -> str:
+    """How many estimates rest on the starting guess of others; empty where none does."""
+    count = sum(bool(p.get("rests_on_prior")) for p in parameters.values())
+    return f"{count} of them only with what the starting guess says of others, " if count else ""
 
 
 def _conditioning_text(conditioning: dict[str, Any] | None) -> str:

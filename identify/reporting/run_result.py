@@ -58,6 +58,7 @@ def identification_entry(result: IdentificationResult) -> dict[str, Any]:
                 "std": result.std[index],
                 "interval": result.intervals[index].tolist(),
                 "identifiable": bool(result.identifiable[index]),
+                "rests_on_prior": bool(result.rests_on_prior[index]),
             }
             for index, name in enumerate(result.names)
         },

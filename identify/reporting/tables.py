@@ -11,6 +11,7 @@ from identify.reporting.goals import check_goals
 
 AXIS_UNITS = ("um", "um", "um", "urad", "urad", "urad")
 NOT_SHOWN = "not identifiable"
+ON_GUESS = "rests on the starting guess"
 AXIS_HEADER = tuple(f"{axis} [{unit}]" for axis, unit in zip(AXES, AXIS_UNITS, strict=True))
 
 
@@ -50,7 +51,7 @@ def parameter_table(result: dict[str, Any], identifiable_only: bool = False) -> 
     for name, p in result["identification"]["parameters"].items():
         if not p["identifiable"] and identifiable_only:
             continue
-        remark = "" if p["identifiable"] else NOT_SHOWN
+        remark = (ON_GUESS if p.get("rests_on_prior") else "") if p["identifiable"] else NOT_SHOWN
         rows.append((name, unit_of(name), number(p["initial"]), number(p["true"]), *_shown(p), remark))
     anchor = result["identification"]["scale_anchor"]
     return Table(
@@ -58,6 +59,8 @@ def parameter_table(result: dict[str, Any], identifiable_only: bool = False) -> 
         ("parameter", "unit", "initial", "true", "estimate", "std", "95 % interval", "error [%]", ""),
         tuple(rows),
         f"The overall scale is fixed by: {anchor}. A parameter that no motion shows has no estimate. "
+        f"One that {ON_GUESS} is shown only in sums with others: it follows from what the guess says of those, and its "
+        "interval holds the truth where the guess's standard deviations do; the sums stand among the groups. "
         "The interval ends where no such value can exist, and allows for bounds that hold the estimate; the standard "
         "deviation knows of none. "
         "With the scenario's default parameter sets, initial and true are the two columns of the paper's table 2.",
@@ -75,7 +78,9 @@ def group_table(result: dict[str, Any]) -> Table:
         "Groups of parameters that no motion can separate",
         ("group", "initial", "true", "estimate", "std", "95 % interval", "error [%]", ""),
         rows,
-        "In the SI unit of the first parameter of each sum. A group may be known where none of its members is.",
+        "In the SI unit of the first parameter of each sum. A group may be known where none of its members is; but for "
+        f"the common scale no group {ON_GUESS}. Its size is that of its members: of a difference that almost vanishes "
+        "the relative error says nothing.",
     )
 
 
