@@ -19,7 +19,7 @@ from identify.studies.computation import Finished, compute
 from identify.studies.design import Case, Setup
 from identify.studies.same_versions import product_version, require_product
 
-WORKERLESS_SECONDS = 120
+WORKERLESS_SECONDS = 180
 """How long a cluster may be without any worker; one that starts again needs its time on a busy machine."""
 
 ANSWER_SECONDS = 30

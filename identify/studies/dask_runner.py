@@ -20,20 +20,24 @@ from identify.studies.same_versions import check_workers
 CONNECT_SECONDS = 5
 """How long a scheduler may take to answer at first."""
 
+START_SECONDS = 60
+"""How long a study waits for all workers of a local cluster before it begins with those that have started."""
+
 CLOSE_SECONDS = 20
 """How long a local cluster may take to end; what is left of it then ends with this process."""
 
 LOCAL_SETTINGS = {
     "distributed.scheduler.allowed-failures": 0,
-    "distributed.deploy.lost-worker-timeout": "30 s",
+    "distributed.deploy.lost-worker-timeout": "90 s",
     **{
         f"distributed.nanny.pre-spawn-environ.{name}": 1
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
     },
 }
 """The first death of its worker makes a batch suspect, as it does not cost the batch: its rows are tried alone. A
-worker that has not started again by itself within the time is given up, and another one started. One thread a process,
-set before the libraries are loaded: there are as many processes as cores."""
+worker that has not started again by itself within the time, far more than it needs on a busy machine, is given up, and
+another one started; giving it up sooner would end it with its next rows. One thread a process, set before the libraries
+are loaded: there are as many processes as cores."""
 
 
 def cores() -> int:
@@ -47,8 +51,10 @@ def local_cluster(workers: int) -> Iterator[DaskExecutor]:
     _silence_dask()
     with dask.config.set(LOCAL_SETTINGS), _empty_cluster(workers) as cluster, Client(cluster) as client:
         client.register_plugin(_OneThread(), name="one thread")
-        keep_all = PeriodicCallback(partial(cluster.scale, workers), 1000)
-        cluster.loop.add_callback(keep_all.start)
+        cluster.scale(workers)
+        cluster.loop.add_callback(PeriodicCallback(partial(cluster.scale, workers), 1000).start)
+        with suppress(TimeoutError):  # those that are there begin, and where there are none, the executor says so
+            client.wait_for_workers(workers, timeout=START_SECONDS)
         yield DaskExecutor(client)
 
 

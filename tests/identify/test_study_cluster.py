@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
+import dask
 import numpy as np
 import pandas as pd
 import pytest
@@ -19,7 +20,6 @@ import pytest
 from identify.errors import StudyError
 from identify.files.versions import versions
 from identify.progress import SilentProgress
-from identify.studies import dask_runner
 from identify.studies.dask_runner import local_cluster, running_cluster
 from identify.studies.runner import run_study
 from identify.studies.same_versions import OtherVersionsWarning
@@ -147,10 +147,11 @@ def test_lost_scheduler_is_one_line_and_the_study_goes_on_with_another(tmp_path,
     same_numbers(outcome.frame, serial)
 
 
-def test_rows_that_end_their_worker_are_errors_and_no_other_row_is(tmp_path, serial, monkeypatch):
-    """Also where there is no other worker, and Dask gives it up before it has started again, as on a busy machine."""
-    monkeypatch.setitem(dask_runner.LOCAL_SETTINGS, "distributed.deploy.lost-worker-timeout", "50 ms")
-    outcome = run_study(study(kills=[7], exits=[3]), tmp_path, SilentProgress(), partial(local_cluster, 1))
+def test_rows_that_end_their_worker_are_errors_and_no_other_row_is(tmp_path, serial):
+    """Also where there is no other worker, and it needs longer to start again than Dask is told elsewhere to wait for
+    it, as on a busy machine."""
+    with dask.config.set({"distributed.deploy.lost-worker-timeout": "50 ms"}):
+        outcome = run_study(study(kills=[7], exits=[3]), tmp_path, SilentProgress(), partial(local_cluster, 1))
     frame = outcome.frame
     assert frame["error"][7].startswith("KilledWorker")
     assert frame["error"][3] == "SystemExit: bye"
