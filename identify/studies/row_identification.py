@@ -86,7 +86,8 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Identific
     errors = np.concatenate([_model_errors(robot, scenario, result.estimate, one) for one in unseen])
     truth = true_parameters(robot, scenario)
     return (_record_figures(experiment) | _parameter_figures(result, truth)
-            | _prediction_figures(robot, scenario, result, truth, [recorded_reference(one.record) for one in unseen])
+            | prediction_figures(robot, scenario, (result.estimate, result.covariance), truth,
+                                 [recorded_reference(one.record) for one in unseen])
             | {"unseen_position_rms_um": rms_um(errors[:, :3]), "unseen_orientation_rms_urad": rms_um(errors[:, 3:])})
 
 
@@ -116,21 +117,23 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
     }
 
 
-def _prediction_figures(
-    robot: Robot, scenario: Scenario, result: IdentificationResult, truth: Array, references: list[Reference]
+def prediction_figures(
+    robot: Robot, scenario: Scenario, estimated: tuple[Array, Array], truth: Array, references: list[Reference]
 ) -> Row:
-    """What the error of the parameters (67,), and their covariance, make of the model's positions on references.
+    """What the error of parameters (67,), estimated with a covariance (67, 67), makes of the model's positions on
+    references, and what the covariance states of it.
 
     Every direction in which the parameters can err counts as much as it shows; so the figure has the scatter of many
     errors, where that of a few parameters that err together has the scatter of hardly two.
     """
+    estimate, covariance = estimated
     squares, stated = [], []
     for reference in references:
-        model = simulate(robot, result.estimate, reference, model_settings(scenario), sensitivities=True)
+        model = simulate(robot, estimate, reference, model_settings(scenario), sensitivities=True)
         assert model.pose_sensitivity is not None
         slopes = model.pose_sensitivity[:, :3]
         squares.append(np.mean((model.pose - model_run(robot, scenario, truth, reference))[:, :3] ** 2))
-        stated.append(np.mean(np.einsum("nip,pq,niq->ni", slopes, result.covariance, slopes, optimize=True)))
+        stated.append(np.mean(np.einsum("nip,pq,niq->ni", slopes, covariance, slopes, optimize=True)))
     return {"prediction_rms_um": 1e6 * float(np.sqrt(np.mean(squares))),
             "stated_prediction_rms_um": 1e6 * float(np.sqrt(np.mean(stated)))}
 

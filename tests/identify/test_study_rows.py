@@ -8,10 +8,14 @@ import cmmsim
 from cmmsim.exact_teaching import exactly_taught
 from cmmsim.pose import invert, rotation_log
 from cmmsim.sensor_file import read_sensor_file
+from dynamics import load_robot
+from dynamics.closed_loop import Reference
 from identify.errors import EstimationError, ScenarioError
+from identify.experiment.run import true_parameters
 from identify.scenario import load_scenario
 from identify.studies import row_sensor, rows
 from identify.studies.row_drawn_sensor import DrawnSensor
+from identify.studies.row_identification import prediction_figures
 
 NOISELESS = {"sensor_changes.camera.noise": False, "sensor_changes.camera.bit_depth": 12,
              "sensor_changes.camera.gain": 2.08, "sensor_changes.camera.black_level": 256.0}
@@ -171,6 +175,21 @@ def test_closed_loop_follows_its_reference_with_the_images_in_the_loop():
     assert row["position_rms_um"] < 2.0 * row["stated_position_rms_um"]
     assert 10.0 < row["tracking_position_rms_um"] < 1e4
     assert row == rows.run("closed_loop", settings, seed(0), {"teaching": "exact"})
+
+
+def test_covariance_of_one_known_error_states_what_that_error_makes_of_the_prediction():
+    """An error d with the covariance d d^T: what is stated is exact but for the curvature of the model."""
+    settings = scenario()
+    robot = load_robot(settings.robot)
+    poses = np.tile(robot.home_pose, (60, 1))
+    poses[:, :3] += 0.002 * np.sin(np.arange(60)[:, None] / np.array([5.0, 7.0, 9.0]))
+    references = [Reference(poses, np.gradient(poses, settings.timing.frame_period_s, axis=0))]
+    truth = true_parameters(robot, settings)
+    error = 1e-4 * truth * np.random.default_rng(0).normal(size=len(truth))
+    estimated = truth + error, np.outer(error, error)
+    found = prediction_figures(robot, settings, estimated, truth, references)
+    assert found["prediction_rms_um"] > 0.01
+    assert found["stated_prediction_rms_um"] == pytest.approx(found["prediction_rms_um"], rel=0.01)
 
 
 @pytest.mark.slow
