@@ -108,10 +108,11 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
     true_groups = groups.combinations @ truth[: groups.combinations.shape[1]]
     seen = groups.identifiable
     normalised = (groups.estimate - true_groups)[seen] / groups.std[seen]
+    if seen.any():  # a wrong model identifies nothing, and the row has its other figures all the same
+        row["group_std_percent"] = 100.0 * float(np.median(groups.std[seen] / np.abs(true_groups[seen])))
+        row["normalised_error"] = float(np.sqrt(np.mean(normalised**2)))
     return row | {
         "identified_groups": int(seen.sum()),
-        "group_std_percent": 100.0 * float(np.median(groups.std[seen] / np.abs(true_groups[seen]))),
-        "normalised_error": float(np.sqrt(np.mean(normalised**2))),
         "noise_ratio": result.noise_ratio,
         "iterations": result.iterations,
     }
