@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from dynamics import Robot
 from identify.arrays import Array
@@ -41,6 +42,10 @@ from identify.scenario import Scenario
 
 UNCERTAINTY_STREAM = 5
 """Random stream of the repeated experiments, beside those of the experiment."""
+
+
+one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
+"""The many small matrices of a search lose by a second thread: a fifth of the time on free cores, half on busy ones."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +91,7 @@ class IdentificationResult:
     seconds: dict[str, float]
 
 
+@one_thread
 def identify(
     record: xr.Dataset | Sequence[xr.Dataset],
     robot: Robot,
