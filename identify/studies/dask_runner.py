@@ -9,6 +9,8 @@ from multiprocessing import active_children, resource_tracker
 
 import dask
 from distributed import Client, LocalCluster, WorkerPlugin
+from distributed.comm import parse_address
+from distributed.comm.registry import get_backend
 from tornado.ioloop import PeriodicCallback
 
 from identify.errors import StudyError
@@ -100,6 +102,7 @@ def running_cluster(address: str) -> Iterator[DaskExecutor]:
     """
     _silence_dask()
     try:
+        get_backend(parse_address(address)[0])  # a client of no such kind would go on trying in the background
         client = Client(address, timeout=CONNECT_SECONDS)
     except Exception as error:  # whatever else listens there may answer anything
         raise StudyError(
