@@ -8,7 +8,6 @@ variance at the fitted grey value. The inverse of the normal matrix is the covar
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -102,9 +101,12 @@ def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNo
 def _in_two_threads(fit: Callable[[slice], None], count: int) -> None:
     """Fit windows 0 to count, which know nothing of each other, half of them in a second thread where that pays.
 
-    The thread is a new one each time: it costs 50 us, and a lasting one would be missing in forked processes.
+    The thread is a new one each time: it costs 50 us, and a lasting one would be missing in forked processes. Where
+    NUMBA_NUM_THREADS or the machine allows one thread only, as with a process a core, there is no second one.
     """
-    if count < FEWEST_FOR_A_THREAD or os.cpu_count() == 1:
+    from numba.core.config import NUMBA_NUM_THREADS  # slow to load, as the kernels above
+
+    if count < FEWEST_FOR_A_THREAD or NUMBA_NUM_THREADS == 1:
         fit(slice(0, count))
         return
     other = threading.Thread(target=fit, args=(slice(count // 2, count),))
