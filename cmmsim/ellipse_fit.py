@@ -104,7 +104,7 @@ def _in_two_threads(fit: Callable[[slice], None], count: int) -> None:
     The thread is a new one each time: it costs 50 us, and a lasting one would be missing in forked processes. Where
     NUMBA_NUM_THREADS or the machine allows one thread only, as with a process a core, there is no second one.
     """
-    from numba.core.config import NUMBA_NUM_THREADS  # slow to load, as the kernels above
+    from numba.core.config import NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # set when it loads, which is slow
 
     if count < FEWEST_FOR_A_THREAD or NUMBA_NUM_THREADS == 1:
         fit(slice(0, count))
