@@ -107,15 +107,12 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
     groups = result.groups
     true_groups = groups.combinations @ truth[: groups.combinations.shape[1]]
     seen = groups.identifiable
-    normalised = (groups.estimate - true_groups)[seen] / groups.std[seen]
+    row["identified_groups"] = int(seen.sum())
     if seen.any():  # a wrong model identifies nothing, and the row has its other figures all the same
+        normalised = (groups.estimate - true_groups)[seen] / groups.std[seen]
         row["group_std_percent"] = 100.0 * float(np.median(groups.std[seen] / np.abs(true_groups[seen])))
         row["normalised_error"] = float(np.sqrt(np.mean(normalised**2)))
-    return row | {
-        "identified_groups": int(seen.sum()),
-        "noise_ratio": result.noise_ratio,
-        "iterations": result.iterations,
-    }
+    return row | {"noise_ratio": result.noise_ratio, "iterations": result.iterations}
 
 
 def prediction_figures(
