@@ -102,17 +102,24 @@ def rows_of_many_sensors(count: int) -> Study:
     return load_study("pixel_noise").model_copy(update={"factors": factors, "sample": count, "repeats": 1})
 
 
+def rows_of_five_poses(count: int) -> Study:
+    """The same rows with five poses each. Rows of one pose are so short that the process which hands them out, with
+    2 ms a row, does a tenth of their work: it has a core of its own only where there is one worker."""
+    study = sensor_rows(count)
+    return study.model_copy(update={"options": {**study.options, "poses": 5}})
+
+
 def test_second_core(one_core, two_cores, tmp_path, record_property):
     one, two = Runs(tmp_path / "one", one_core), Runs(tmp_path / "two", two_cores)
-    study = sensor_rows(400)
+    study = rows_of_five_poses(100)
     for runs in (one, two):
         runs(sensor_rows(40))
-    before = second_core_gain()
+    loops = [second_core_gain()]
     with OtherLoadThanWorkers() as load:
-        best = fastest({"one": lambda: one(study), "two": lambda: two(study)}, 3)
-    gain = best["one"] / best["two"]
-    cores = min(before, second_core_gain())
-    figure = f"two cores {gain:.2f} x one (goal {SECOND_CORE} x), {study.rows} sensor rows"
+        best = fastest({"one": lambda: one(study), "two": lambda: two(study),
+                        "loop": lambda: loops.append(second_core_gain())}, 3)
+    gain, cores = best["one"] / best["two"], min(loops)
+    figure = f"two cores {gain:.2f} x one (goal {SECOND_CORE} x), {study.rows} sensor rows, a loop {cores:.2f} x"
     record_property("figure", figure)
     disturbed = "" if cores > WHOLE_SECOND_CORE else f"the second core brings a loop {cores:.2f} x"
     judge(gain >= SECOND_CORE, figure, load, disturbed)
