@@ -20,6 +20,7 @@ from scipy.stats import norm
 
 from identify.arrays import Array
 from identify.estimation.parameter_bounds import ParameterBounds
+from identify.estimation.propagation import combined_std
 
 HALF_WIDTH = float(norm.ppf(0.975))
 """Of a 95 % interval, in standard deviations."""
@@ -40,7 +41,7 @@ class BoundedEstimate:
 
     def intervals(self, rows: Array) -> Array:
         """95 % intervals (n, 2) of the quantities rows (n, p) @ parameters, cut at the least value allowed."""
-        half = HALF_WIDTH * np.sqrt(np.einsum("gi,ij,gj->g", rows, self.covariance, rows))
+        half = HALF_WIDTH * combined_std(rows, self.covariance)
         centres = np.stack([rows @ self.estimate, rows @ self.unheld])
         low = np.maximum(centres.min(axis=0) - half, self.bounds.least(rows))
         return np.stack([low, centres.max(axis=0) + half], axis=1)
@@ -55,8 +56,7 @@ class BoundedEstimate:
         if not self.at_bound.any():
             return ()
         beyond = self.bounds.lower - self.bounds.coordinates(self.unheld)
-        back = np.linalg.inv(self.bounds.matrix)
-        std = np.sqrt(np.einsum("gi,ij,gj->g", back, self.covariance, back))
+        std = combined_std(np.asarray(np.linalg.inv(self.bounds.matrix), dtype=float), self.covariance)
         said = ", ".join(
             f"{self.bounds.statements[k]} ({max(beyond[k] / std[k], 0):.2g})" for k in np.flatnonzero(self.at_bound)
         )

@@ -14,6 +14,7 @@ from identify.arrays import Array
 from identify.estimation.base_parameters import BaseParameters
 from identify.estimation.identifiability import Identifiability
 from identify.estimation.loop_parameters import StartingGuess
+from identify.estimation.propagation import combined_std
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,6 @@ def group_estimates(
         combinations=base.combinations,
         initial=rows @ guess.values,
         estimate=rows @ estimate,
-        std=np.sqrt(np.einsum("gi,ij,gj->g", rows, covariance, rows)),
+        std=combined_std(rows, covariance),
         identifiable=criterion.judge(rows, covariance),
     )

@@ -22,6 +22,7 @@ from dynamics import Robot
 from dynamics.parameters import COULOMB_NAMES, VISCOUS_NAMES
 from identify.arrays import Array
 from identify.estimation.loop_parameters import NAMES, StartingGuess, holding_torque
+from identify.estimation.propagation import combined_std
 
 IDENTIFIABLE_SHARE = 0.5
 """Of the guess's standard deviation and of the size: what the record may leave of an identified quantity."""
@@ -41,7 +42,7 @@ class Identifiability:
 
     def judge(self, rows: Array, covariance: Array) -> NDArray[np.bool_]:
         """Whether each quantity rows (n, 67) @ parameters is identified, with the estimate's covariance (67, 67)."""
-        left = np.sqrt(np.einsum("gi,ij,gj->g", rows, covariance, rows))
+        left = combined_std(rows, covariance)
         before, size = np.sqrt(rows**2 @ self.std**2), np.sqrt(rows**2 @ self.sizes**2)
         return self.model_holds & (left < IDENTIFIABLE_SHARE * np.minimum(before, size))
 
