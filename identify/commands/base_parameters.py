@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from identify.arrays import Array
     from identify.estimation.base_parameters import BaseParameters
 
 THRESHOLD = 1e-3
@@ -32,7 +31,7 @@ def base_parameters(
 
     matrix = base.structural_regressor(load_robot(robot))
     found = base.base_parameters(matrix)
-    singular, angle = base.rank_by_singular_values(matrix), angle_to_singular_vectors(matrix, found)
+    singular, angle = base.rank_by_singular_values(matrix), base.angle_to_singular_vectors(matrix, found)
     counts = {10**d: base.rank_by_threshold(matrix / 10**d, THRESHOLD) for d in DECADES}
     if out is not None:
         write_text(out, json.dumps(_entries(found, singular, angle), indent=2) + "\n")
@@ -50,20 +49,6 @@ def base_parameters(
         f"the paper's rule (|R_ii| > {THRESHOLD:g}, unscaled): {tried}: it depends on the units. Deleting only the "
         f"unseen ones leaves {left}, {left + 3} with the joint PID's gains (the paper's table lists 49)"
     )
-
-
-def angle_to_singular_vectors(matrix: "Array", found: "BaseParameters") -> float:
-    """Largest angle [rad] between what the groups span and the row space of a regression matrix (rows, p) by its
-    singular vectors, with columns of length one; pi / 2 where one has a direction more than the other."""
-    import numpy as np
-    from scipy.linalg import orth, subspace_angles
-
-    from identify.estimation.base_parameters import DEPENDENT
-
-    lengths = np.linalg.norm(matrix, axis=0)
-    scale = np.where(lengths > DEPENDENT * lengths.max(), lengths, 1.0)
-    groups, rows = found.combinations / scale, orth((matrix / scale).T, rcond=DEPENDENT)
-    return float(subspace_angles(groups.T, rows).max()) if len(groups) == rows.shape[1] else np.pi / 2
 
 
 def _entries(found: "BaseParameters", singular: int, angle: float) -> dict[str, Any]:

@@ -10,7 +10,7 @@ the same whatever motion shows them.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import qr
+from scipy.linalg import orth, qr, subspace_angles
 
 from dynamics import Robot
 from dynamics.closed_loop import Reference
@@ -121,6 +121,15 @@ def rank_by_singular_values(matrix: Array) -> int:
     lengths = np.linalg.norm(matrix, axis=0)
     singular = np.linalg.svd(matrix / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
     return int(np.sum(singular > DEPENDENT * singular[0]))
+
+
+def angle_to_singular_vectors(matrix: Array, found: BaseParameters) -> float:
+    """Largest angle [rad] between what the groups span and the row space of a regression matrix (rows, p) by its
+    singular vectors, with columns of length one; pi / 2 where one has a direction more than the other."""
+    lengths = np.linalg.norm(matrix, axis=0)
+    scale = np.where(lengths > DEPENDENT * lengths.max(), lengths, 1.0)
+    groups, rows = found.combinations / scale, orth((matrix / scale).T, rcond=DEPENDENT)
+    return float(subspace_angles(groups.T, rows).max()) if len(groups) == rows.shape[1] else np.pi / 2
 
 
 def rank_by_threshold(matrix: Array, threshold: float) -> int:

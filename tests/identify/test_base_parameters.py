@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 from dynamics import load_robot
 from dynamics.parameters import PARAMETER_NAMES
 from identify.command_line import app
-from identify.commands.base_parameters import angle_to_singular_vectors
 from identify.errors import EstimationError
 from identify.estimation.base_parameters import (
+    angle_to_singular_vectors,
     base_parameters,
     rank_by_singular_values,
     rank_by_threshold,
