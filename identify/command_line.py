@@ -176,9 +176,9 @@ def run(
     chosen = _scenario(scenario, settings)
     folder = new_run_folder(out or Path("runs") / f"{chosen.name}-{seed}")
     _pipeline().run(chosen, seed, folder.path, terminal_progress(quiet), workers)
-    _warn(folder)
+    result = _warned(folder)
     if not quiet:
-        _summary().print_goals(load_result(folder.result), folder.report)
+        _summary().print_goals(result, folder.report)
 
 
 @app.command()
@@ -217,9 +217,9 @@ def identify(out: RunFolderOption, quiet: Quiet = False) -> None:
     folder = RunFolder(out)
     folder.require("scenario.toml", "trajectories.json", "experiment.nc")
     _pipeline().identify(out, terminal_progress(quiet))
-    _warn(folder)
+    result = _warned(folder)
     if not quiet:
-        _summary().print_identification(load_result(folder.result), folder.result)
+        _summary().print_identification(result, folder.result)
 
 
 @app.command()
@@ -277,9 +277,11 @@ def _scenario(name: str, settings: list[str] | None) -> Scenario:
     return load_scenario(name).with_overrides(parse_settings(settings))
 
 
-def _warn(folder: RunFolder) -> None:
-    """Say what the identification warns of."""
-    print_warnings(load_result(folder.result)["identification"].get("warnings", []))
+def _warned(folder: RunFolder) -> dict[str, Any]:
+    """The result of a run; says what its identification warns of."""
+    result = load_result(folder.result)
+    print_warnings(result["identification"].get("warnings", []))
+    return result
 
 
 def _summary() -> Any:

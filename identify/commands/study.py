@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from identify.commands.stopping import STOPPED
 from identify.errors import StudyError, StudyInterrupted
 from identify.progress import terminal_progress
 from identify.reporting.terminal import print_table
@@ -77,7 +78,7 @@ Exit status:
   0    all rows are done, and none contradicts a law; laws may be undecided where rows are few
   {SOME_ROWS_FAILED}    rows failed: they say why in the column error
   {A_LAW_FAILED}    all rows are done, and a law failed: its 99 % interval excludes what it states
-  130  after Ctrl-C
+  {STOPPED}  after Ctrl-C
   1, 2 it cannot be run: one line says why
 """
 
@@ -129,7 +130,7 @@ def study(
         outcome = _run(chosen, folder, scheduler, workers, quiet)
     except StudyInterrupted as stopped:
         typer.echo(f"{stopped}; the same command goes on from there", err=True)
-        raise typer.Exit(130) from None
+        raise typer.Exit(STOPPED) from None
     laws = _summary(chosen, folder, outcome)
     if not quiet:
         _print_summary(folder, outcome, laws)
