@@ -14,13 +14,14 @@ from identify.commands.calibrate import CALIBRATE_HELP, calibrate
 from identify.commands.detectors import detectors
 from identify.commands.engines import export, verify_model
 from identify.commands.estimators import estimators
-from identify.commands.stopping import stoppable
+from identify.commands.stopping import STOPPED, stoppable
 from identify.commands.study import STUDY_HELP, study
 from identify.commands.variation import variation
 from identify.commands.workspace import workspace
 from identify.errors import IdentifyError, ScenarioError
 from identify.files.result_file import load_result
 from identify.files.run_folder import RunFolder, new_run_folder
+from identify.interrupts import honoured
 from identify.progress import terminal_progress
 from identify.reporting.terminal import print_warnings
 from identify.scenario import Scenario, load_scenario, scenario_names
@@ -119,10 +120,11 @@ def main() -> None:
     """Run the command; a known error is one line on standard error and exit status 1."""
     warnings.showwarning = _show_warning
     try:
-        app()
+        with honoured():
+            app()
     except KeyboardInterrupt:
         typer.echo("aborted", err=True)
-        raise SystemExit(130) from None
+        raise SystemExit(STOPPED) from None
     except Exception as error:
         if not is_known(error):
             raise

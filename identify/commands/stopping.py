@@ -6,7 +6,7 @@ from typing import ParamSpec
 
 import typer
 
-from identify.studies.interrupts import noted
+from identify.interrupts import noted
 
 STOPPED = 130
 """Exit status after Ctrl-C."""

@@ -16,6 +16,7 @@ from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.excitation.motion import motion
 from identify.excitation.search import SearchProblem, SearchResult
+from identify.interrupts import honoured, raise_noted
 from identify.progress import Advance
 
 MOST_ITERATIONS = 150
@@ -29,13 +30,11 @@ INTERIOR = 0.98
 FAR = 0.5
 """A limit of which a start uses less than this share is left out at first."""
 
-INTERRUPTED = ("NonIpopt_Exception_Thrown", "User_Requested_Stop")
-"""What CasADi makes of Ctrl-C; nothing in the problem calls back to Python, where other exceptions could come from."""
-
 ALWAYS = "box"
 """The limit that always counts: without it a criterion grows without end."""
 
 
+@honoured()
 def climb(problem: SearchProblem, starts: list[Array], advance: Advance = lambda n=1: None) -> list[SearchResult]:
     """What IPOPT finds from each of the starts (z), best first; `advance` per start.
 
@@ -60,10 +59,9 @@ def _climb_from(problem: SearchProblem, z: Array) -> SearchResult:
     while True:
         solver = _solver(problem, counted)
         done, stats = solver(x0=z, lbg=-1.0, ubg=1.0), solver.stats()
+        raise_noted()  # IPOPT takes Ctrl-C for an evaluation that failed
         values, gradients = values + int(stats["n_call_nlp_f"]), gradients + int(stats["n_call_nlp_grad_f"])
         iterations, reason = iterations + int(stats["iter_count"]), str(stats["return_status"])
-        if reason in INTERRUPTED:
-            raise KeyboardInterrupt
         found = np.array(done["x"]).ravel()
         if not np.isfinite(found).all() or not np.isfinite(float(done["f"])):
             return SearchResult(z, -np.inf, values, gradients, iterations, reason)

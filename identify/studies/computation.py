@@ -5,6 +5,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from identify.interrupts import raise_noted
 from identify.studies.design import Case, Setup
 from identify.studies.kinds import row_function
 
@@ -38,6 +39,7 @@ def _compute(setup: Setup, case: Case) -> Finished:
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # also sys.exit() ends the row and not the study
+        raise_noted()
         text = " ".join(f"{type(error).__name__}: {error}".split())
         return Finished(case.number, {}, time.perf_counter() - start, text)
     return Finished(case.number, figures, time.perf_counter() - start)

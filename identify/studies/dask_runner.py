@@ -15,8 +15,8 @@ from tornado.ioloop import PeriodicCallback
 
 from identify.errors import StudyError
 from identify.files.versions import versions
+from identify.interrupts import deaf_offspring, held
 from identify.studies.dask_executor import DaskExecutor, gone
-from identify.studies.interrupts import deaf_offspring, held
 from identify.studies.same_versions import check_workers
 
 CONNECT_SECONDS = 5

@@ -8,11 +8,11 @@ from pathlib import Path
 import pandas as pd
 
 from identify.errors import StudyInterrupted
+from identify.interrupts import honoured, raise_noted
 from identify.progress import Progress
 from identify.studies.batches import Batches
 from identify.studies.computation import Finished, compute
 from identify.studies.design import Design, Setup, prepare
-from identify.studies.interrupts import raise_noted
 from identify.studies.journal import Journal
 from identify.studies.store import TABLE, VIEW, open_folder, resolved
 from identify.studies.study_file import Study
@@ -71,7 +71,8 @@ def run_study(study: Study, folder: Path, progress: Progress, workers: Workers =
     with open_folder(folder, entry, len(design)) as journal:
         found = int(journal.finished.sum())
         try:
-            _compute_pending(study.name, setup, design, journal, progress, workers)
+            with honoured():
+                _compute_pending(study.name, setup, design, journal, progress, workers)
         except KeyboardInterrupt:
             done = sum(1 for _ in journal.rows())  # it may have come while some were being noted
             raise StudyInterrupted(f"stopped: {done} of {len(design)} rows are done and kept") from None

@@ -16,8 +16,8 @@ def row(scenario, seed, options):
 
     Options: `seconds` to sleep; `log`, a file that gets a line a computation; `fails`, spawn keys of rows that raise;
     `exits`, those of rows that call sys.exit; `kills`, those of rows that kill their process; `interrupt`, that of a
-    row during which Ctrl-C comes; `odd`, that of a row with a figure that is no number; `also`, the name of one more
-    figure.
+    row during which Ctrl-C comes; `disguise`, whether that row makes another error of it; `odd`, that of a row with a
+    figure that is no number; `also`, the name of one more figure.
     """
     number = seed.spawn_key[0]
     time.sleep(options.get("seconds", 0.0))
@@ -29,7 +29,12 @@ def row(scenario, seed, options):
     if number in options.get("exits", []):
         sys.exit("bye")
     if number == options.get("interrupt"):
-        signal.raise_signal(signal.SIGINT)
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            if options.get("disguise"):
+                raise SystemError("an exception is set") from None
+            raise
     if number in options.get("kills", []):
         os.kill(os.getpid(), signal.SIGKILL)
     draws = np.random.default_rng(seed).normal(size=1000)

@@ -11,9 +11,9 @@ import typer
 
 from identify.commands.stopping import stoppable
 from identify.errors import StudyInterrupted
+from identify.interrupts import deaf_offspring, held, honoured, noted, raise_noted
 from identify.progress import SilentProgress
 from identify.studies import study_file
-from identify.studies.interrupts import deaf_offspring, held, noted, raise_noted
 from identify.studies.runner import run_study
 from identify.studies.study_file import Study
 from tests.identify.commands import command
@@ -73,6 +73,28 @@ def test_noted_ctrl_c_is_raised_again_where_it_was_swallowed():
     raise_noted()
 
 
+@pytest.mark.parametrize("happens", [ctrl_c, broken_import, swallowed])
+def test_ctrl_c_leaves_the_block_whatever_became_of_it(happens):
+    with pytest.raises(KeyboardInterrupt), honoured():
+        happens()
+    with pytest.raises(ImportError, match="no library"), honoured():
+        raise ImportError("no library")
+
+
+def test_ctrl_c_of_an_inner_block_is_noted_in_the_outer_one():
+    with noted() as outer:
+        with pytest.raises(KeyboardInterrupt), honoured():
+            broken_import()
+        assert outer.came
+
+
+def test_ctrl_c_that_became_another_error_in_a_row_is_no_error_of_the_row(tmp_path):
+    options = {"interrupt": 1, "disguise": True}
+    chosen = Study(name="mine", kind=KIND, repeats=3, factors={"sensor.camera.dark_noise": [13.0]}, options=options)
+    with pytest.raises(StudyInterrupted, match="1 of 3 rows are done"):
+        run_study(chosen, tmp_path, SilentProgress())
+
+
 def test_swallowed_ctrl_c_begins_no_row(tmp_path):
     def workers():
         raise AssertionError("workers are started")
@@ -99,6 +121,13 @@ def test_other_errors_of_a_command_stay_what_they_are(capsys):
     with pytest.raises(ImportError, match="no library"):
         stoppable(fails)()
     assert capsys.readouterr().err == ""
+
+
+def test_ctrl_c_that_became_another_error_in_any_command_is_one_line(monkeypatch, capsys):
+    monkeypatch.setattr("identify.scenario.load_scenario", lambda _: broken_import())
+    monkeypatch.setattr("identify.command_line.load_scenario", lambda _: broken_import())
+    assert command("excite", "quick") == 130
+    assert capsys.readouterr().err == "aborted\n"
 
 
 def test_ctrl_c_before_the_study_is_read_is_one_line(monkeypatch, capsys):

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 class Noting:
     """A handler of Ctrl-C that raises KeyboardInterrupt, and keeps in mind that it came: an import may swallow the
-    exception, or make another error of it."""
+    exception, or make another error of it, and so may CasADi where it turns a matrix into an array."""
 
     def __init__(self) -> None:
         self.came = False
@@ -21,12 +21,13 @@ class Noting:
 
 @contextmanager
 def noted() -> Iterator[Noting]:
-    """Ctrl-C is noted in the block, for :func:`raise_noted`."""
-    noting = Noting()
+    """Ctrl-C is noted in the block, for :func:`raise_noted`; in a block inside another, for both."""
+    old = signal.getsignal(signal.SIGINT)
+    noting = old if isinstance(old, Noting) else Noting()
     if not _is_ours():
         yield noting
         return
-    old = signal.signal(signal.SIGINT, noting)
+    signal.signal(signal.SIGINT, noting)
     try:
         yield noting
     finally:
@@ -38,6 +39,19 @@ def raise_noted() -> None:
     handler = signal.getsignal(signal.SIGINT)
     if isinstance(handler, Noting) and handler.came:
         raise KeyboardInterrupt
+
+
+@contextmanager
+def honoured() -> Iterator[None]:
+    """Ctrl-C leaves the block as KeyboardInterrupt, also where foreign code swallowed it or made another error."""
+    with noted() as noting:
+        try:
+            yield
+        except Exception:
+            if not noting.came:
+                raise
+        if noting.came:
+            raise KeyboardInterrupt
 
 
 @contextmanager
