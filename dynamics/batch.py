@@ -32,7 +32,7 @@ def simulate_batch(
     A single vector (67,), reference or start serves all runs. Results are those of `simulate`, in order, and do not
     depend on `workers` (default: one a core). Raises what `simulate` raises, for the first run that fails.
     """
-    threads = (os.cpu_count() or 1) if workers is None else whole("workers", workers, SimulationError, least=1)
+    threads = len(os.sched_getaffinity(0)) if workers is None else whole("workers", workers, SimulationError, least=1)
     shapes: tuple[Shape, Shape] = (PARAMETER_COUNT,), ("N", PARAMETER_COUNT)
     vectors = np.atleast_2d(floats("loop parameters", parameters, *shapes, error=SimulationError, finite=False))
     given = _listed("references", references, Reference)

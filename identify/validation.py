@@ -1,7 +1,6 @@
 """Validation: plant and models run trajectories the estimator never saw (section 4.3)."""
 
 import multiprocessing
-import os
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -16,6 +15,7 @@ import cmmsim
 from dynamics import DynamicsError, Robot, load_robot
 from dynamics.closed_loop import Reference, simulate
 from identify.arrays import Array
+from identify.cores import cores
 from identify.errors import EstimationError
 from identify.estimation.pose_prediction import PosePrediction, predict_poses
 from identify.experiment.run import PREDICTION, Experiment, run_plant, stream_seed
@@ -50,7 +50,7 @@ def run_unseen(
 
     Every run has its own noise stream, and all share what the sensor was taught: results do not depend on the workers.
     """
-    runs, workers = PlantRuns(scenario, seed, taught), workers or os.cpu_count() or 1
+    runs, workers = PlantRuns(scenario, seed, taught), workers or cores()
     numbers = range(1, len(trajectories) + 1)
     frames = len(frame_times(scenario, scenario.validation.duration_s)) * len(trajectories)
     with progress.stage("validate", frames) as advance:

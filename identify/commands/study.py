@@ -149,7 +149,8 @@ def _workers(scheduler: str | None, workers: int | None) -> "Workers":
         from identify.studies.runner import in_this_process
 
         return in_this_process
-    from identify.studies.dask_runner import cores, local_cluster, running_cluster
+    from identify.cores import cores
+    from identify.studies.dask_runner import local_cluster, running_cluster
 
     return partial(running_cluster, scheduler) if scheduler else partial(local_cluster, workers or cores())
 

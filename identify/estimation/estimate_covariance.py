@@ -8,7 +8,6 @@ W^-1 (cov(J^T r) + prior information) W^-1. A model driven by the logged command
 Where either misses the record by more than noise explains, what its error does to the scores is added (`misfit`).
 """
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -16,6 +15,7 @@ import numpy as np
 
 from dynamics.closed_loop import ClosedLoopRun, LoopFailure, simulate
 from identify.arrays import Array
+from identify.cores import cores
 from identify.errors import EstimationError
 from identify.estimation.misfit import Misfit, coloured_score_covariance, misfit_of_white
 from identify.estimation.output_error import OutputErrorProblem
@@ -122,7 +122,7 @@ def _repeated_scores(
         return score, float(np.mean(np.concatenate(drawn) ** 2))
 
     results = []
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # the compiled loop runs without Python's lock
+    with ThreadPoolExecutor(cores()) as pool:  # the compiled loop runs without Python's lock
         for result in pool.map(repeat, rng.spawn(DRAWS)):
             results += [result] if result else []
             advance()

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from dynamics import Robot
 from identify.arrays import Array
+from identify.cores import one_thread
 from identify.errors import EstimationError
 from identify.estimation import warm_start
 from identify.estimation.base_parameters import (
@@ -42,10 +42,6 @@ from identify.scenario import Scenario
 
 UNCERTAINTY_STREAM = 5
 """Random stream of the repeated experiments, beside those of the experiment."""
-
-
-one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
-"""The many small matrices of a search lose by a second thread: a fifth of the time on free cores, half on busy ones."""
 
 
 @dataclass(frozen=True)

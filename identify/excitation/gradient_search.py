@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from identify.arrays import Array
+from identify.cores import one_thread
 from identify.errors import TrajectoryError
 from identify.excitation.motion import motion
 from identify.excitation.search import SearchProblem, SearchResult
@@ -58,8 +59,7 @@ def _climb_from(problem: SearchProblem, z: Array) -> SearchResult:
     values = gradients = iterations = 0
     while True:
         solver = _solver(problem, counted)
-        done, stats = solver(x0=z, lbg=-1.0, ubg=1.0), solver.stats()
-        raise_noted()  # IPOPT takes Ctrl-C for an evaluation that failed
+        done, stats = _solve(solver, z)
         values, gradients = values + int(stats["n_call_nlp_f"]), gradients + int(stats["n_call_nlp_grad_f"])
         iterations, reason = iterations + int(stats["iter_count"]), str(stats["return_status"])
         found = np.array(done["x"]).ravel()
@@ -70,6 +70,14 @@ def _climb_from(problem: SearchProblem, z: Array) -> SearchResult:
         if not broken:
             return SearchResult(admissible, float(problem.value(admissible)), values, gradients, iterations, reason)
         counted, z = counted | broken, INTERIOR * admissible
+
+
+@one_thread
+def _solve(solver: ca.Function, z: Array) -> tuple[dict[str, ca.DM], dict[str, Any]]:
+    """What IPOPT finds from z, and its statistics."""
+    done = solver(x0=z, lbg=-1.0, ubg=1.0)
+    raise_noted()  # IPOPT takes Ctrl-C for an evaluation that failed
+    return done, solver.stats()
 
 
 def _used(problem: SearchProblem, z: Array, share: float) -> set[str]:

@@ -1,7 +1,6 @@
 """Clusters that compute a study: a local one of one process a core, or one that is running already."""
 
 import logging
-import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
@@ -40,11 +39,6 @@ LOCAL_SETTINGS = {
 worker that has not started again by itself within the time, far more than it needs on a busy machine, is given up, and
 another one started; giving it up sooner would end it with its next rows. One thread a process, set before the libraries
 are loaded: there are as many processes as cores."""
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0))
 
 
 @contextmanager

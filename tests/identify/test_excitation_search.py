@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from dynamics import load_robot
 from identify import command_line
@@ -133,6 +134,21 @@ def test_interrupted_comparison_leaves_no_file(tmp_path, monkeypatch):
         command_line.main()
     assert stopped.value.code == 130
     assert not out.exists() or not list(out.iterdir())
+
+
+@pytest.mark.slow
+def test_threads_of_linear_algebra_do_not_change_what_is_found(robot):
+    """IPOPT's own rounds otherwise with two threads, by enough to end elsewhere."""
+    scenario = load_scenario("paper")
+    candidate = random_trajectory(np.random.default_rng(0), robot.home_pose, 0.1, 5, 0.01, 0.04)
+    search = prepare_search(robot, scenario, [candidate])
+    climb(search.problem, search.candidates)  # IPOPT's library is loaded by its first use
+    found = []
+    for threads in (1, 2):
+        with threadpool_limits(limits=threads, user_api="blas"):
+            assert {pool["num_threads"] for pool in threadpool_info() if "casadi" in pool["filepath"]} == {threads}
+            found.append(climb(search.problem, search.candidates)[0].z)
+    np.testing.assert_array_equal(*found)
 
 
 @pytest.mark.parametrize("seconds", [0.3, 0.7, 1.0])
