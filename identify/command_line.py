@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from identify.commands.acceptance import acceptance
 from identify.commands.base_parameters import base_parameters
@@ -14,14 +15,14 @@ from identify.commands.calibrate import CALIBRATE_HELP, calibrate
 from identify.commands.detectors import detectors
 from identify.commands.engines import export, verify_model
 from identify.commands.estimators import estimators
-from identify.commands.stopping import STOPPED, stoppable
+from identify.commands.stopping import stoppable
 from identify.commands.study import STUDY_HELP, study
 from identify.commands.variation import variation
 from identify.commands.workspace import workspace
 from identify.errors import IdentifyError, ScenarioError
 from identify.files.result_file import load_result
 from identify.files.run_folder import RunFolder, new_run_folder
-from identify.interrupts import honoured
+from identify.interrupts import STOPPED
 from identify.progress import terminal_progress
 from identify.reporting.terminal import print_warnings
 from identify.scenario import Scenario, load_scenario, scenario_names
@@ -94,8 +95,26 @@ Many rows over a grid of settings, on all cores or many machines:
   cmmsim study --list                    the built-in studies
 """
 
+
+
+class _Commands(TyperGroup):
+    """Says when Ctrl-C has ended a command; typer alone would end it without a word."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            typer.echo("aborted", err=True)
+            raise typer.Exit(STOPPED) from None
+
+
 app = typer.Typer(
-    name="cmmsim", help=HELP, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None
+    name="cmmsim",
+    cls=_Commands,
+    help=HELP,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
 )
 
 ScenarioArgument = Annotated[
@@ -120,11 +139,7 @@ def main() -> None:
     """Run the command; a known error is one line on standard error and exit status 1."""
     warnings.showwarning = _show_warning
     try:
-        with honoured():
-            app()
-    except KeyboardInterrupt:
-        typer.echo("aborted", err=True)
-        raise SystemExit(STOPPED) from None
+        app()
     except Exception as error:
         if not is_known(error):
             raise
@@ -298,7 +313,3 @@ def _pipeline() -> Any:
     from identify import pipeline
 
     return pipeline
-
-
-if __name__ == "__main__":
-    main()

@@ -5,6 +5,9 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+STOPPED = 130
+"""Exit status of a command after Ctrl-C."""
+
 
 class Noting:
     """A handler of Ctrl-C that raises KeyboardInterrupt, and keeps in mind that it came: an import may swallow the

@@ -6,10 +6,7 @@ from typing import ParamSpec
 
 import typer
 
-from identify.interrupts import noted
-
-STOPPED = 130
-"""Exit status after Ctrl-C."""
+from identify.interrupts import STOPPED, noted
 
 P = ParamSpec("P")
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from identify.commands.stopping import STOPPED
 from identify.errors import StudyError, StudyInterrupted
+from identify.interrupts import STOPPED
 from identify.progress import terminal_progress
 from identify.reporting.terminal import print_table
 

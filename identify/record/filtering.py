@@ -1,13 +1,13 @@
 """Zero-phase Butterworth filter (section 4.2) and derivatives of filtered signals.
 
 Forward and reverse filtering squares the magnitude: ``order`` is that of one pass, as in Matlab's filtfilt, so the
-gain at the cutoff is 1/2.
+gain at the cutoff is 1/2. The parts of scipy are loaded on first use: every command reads scenarios, which ask here for
+the padding.
 """
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.interpolate import make_interp_spline
-from scipy.signal import butter, sosfiltfilt
 
 from identify.arrays import Array
 from identify.errors import FilterError
@@ -31,8 +31,8 @@ def zero_phase_filter(samples: ArrayLike, rate_hz: float, cutoff_hz: float, orde
             f"a record of {len(values)} samples is too short for a Butterworth filter of order {order} with cutoff "
             f"{cutoff_hz:g} Hz at {rate_hz:g} Hz: more than {padding} samples are needed"
         )
-    sections = butter(order, cutoff_hz, fs=rate_hz, output="sos")
-    return np.asarray(sosfiltfilt(sections, values, axis=0, padlen=padding), dtype=float)
+    sections = scipy.signal.butter(order, cutoff_hz, fs=rate_hz, output="sos")
+    return np.asarray(scipy.signal.sosfiltfilt(sections, values, axis=0, padlen=padding), dtype=float)
 
 
 def check_cutoff(rate_hz: float, cutoff_hz: float) -> None:
@@ -79,7 +79,7 @@ def spline_derivatives(samples: ArrayLike, rate_hz: float) -> tuple[Array, Array
     if len(values) <= SPLINE_DEGREE:
         raise FilterError(f"derivatives need more than {SPLINE_DEGREE} samples, got {len(values)}")
     t = np.arange(len(values)) / rate_hz
-    spline = make_interp_spline(t, values, k=SPLINE_DEGREE)
+    spline = scipy.interpolate.make_interp_spline(t, values, k=SPLINE_DEGREE)
     return spline(t, nu=1), spline(t, nu=2)
 
 

@@ -2,14 +2,14 @@
 
 import sys
 
-from identify import command_line
+from identify.__main__ import main
 
 
 def command(*arguments):
     """Exit status of the command in this process."""
     old, sys.argv = sys.argv, ["cmmsim", *map(str, arguments)]
     try:
-        command_line.main()
+        main()
     except SystemExit as exit_:
         return exit_.code or 0
     finally:

@@ -190,7 +190,7 @@ def test_new_folder_may_be_absent_or_empty_but_no_file(tmp_path):
 
 def test_command_starts_in_a_process_of_its_own():
     made = subprocess.run(
-        [sys.executable, "-m", "identify.command_line", "--version"], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "identify", "--version"], capture_output=True, text=True, check=True
     )
     assert made.stdout.startswith("cmmsim 0.")
 

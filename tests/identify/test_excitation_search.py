@@ -11,7 +11,6 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from dynamics import load_robot
-from identify import command_line
 from identify.errors import TrajectoryError
 from identify.excitation import design_trajectories
 from identify.excitation.comparison import compare_methods
@@ -22,6 +21,7 @@ from identify.excitation.motion import sample_times
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
 from identify.trajectory import random_trajectory
+from tests.identify.commands import command
 
 SMALL = load_scenario("quick").with_overrides(
     {"excitation.harmonics": 3, "excitation.candidates": 6, "excitation.generations": 8, "validation.count": 1}
@@ -106,14 +106,11 @@ def test_robot_without_geometry_is_refused_by_name(diagonal_robot):
         designed.__wrapped__(diagonal_robot, "gradient")
 
 
-def test_command_compares_and_leaves_its_files(tmp_path, monkeypatch, capsys):
+def test_command_compares_and_leaves_its_files(tmp_path, capsys):
     out = tmp_path / "compared"
     settings = ["excitation.harmonics=2", "excitation.candidates=5", "excitation.generations=2"]
     arguments = [part for text in settings for part in ("--set", text)]
-    monkeypatch.setattr("sys.argv", ["cmmsim", "excite", "quick", "--compare", "--out", str(out), *arguments])
-    with pytest.raises(SystemExit) as ended:
-        command_line.main()
-    assert ended.value.code == 0
+    assert command("excite", "quick", "--compare", "--out", out, *arguments) == 0
     assert sorted(path.name for path in out.iterdir()) == ["comparison.json", "comparison.png"]
     compared = json.loads((out / "comparison.json").read_text())
     assert [entry["method"] for entry in compared["entries"]] == ["random", "evolutionary", "gradient"]
@@ -129,10 +126,7 @@ def test_interrupted_comparison_leaves_no_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr("identify.excitation.comparison.compare_methods", interrupted)
     out = tmp_path / "compared"
-    monkeypatch.setattr("sys.argv", ["cmmsim", "excite", "quick", "--compare", "--quiet", "--out", str(out)])
-    with pytest.raises(SystemExit) as stopped:
-        command_line.main()
-    assert stopped.value.code == 130
+    assert command("excite", "quick", "--compare", "--quiet", "--out", out) == 130
     assert not out.exists() or not list(out.iterdir())
 
 

@@ -20,7 +20,7 @@ FILES = {"scenario.toml", "trajectories.json", "experiment.nc", "covariance.nc",
 
 def cmmsim(*arguments, **environment):
     """Run the command line in a process of its own."""
-    command = [sys.executable, "-m", "identify.command_line", *map(str, arguments)]
+    command = [sys.executable, "-m", "identify", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, env={**os.environ, **environment}, check=False)
 
 

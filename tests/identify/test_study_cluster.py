@@ -212,7 +212,7 @@ def command(tmp_path):
 
     def start(workers, until=rows_done):
         arguments = ("study", tmp_path / "mine.toml", "--workers", workers, "--out", folder)
-        started.append(process("-m", "identify.command_line", *arguments))
+        started.append(process("-m", "identify", *arguments))
         wait_for(lambda: until(started[-1]), until.__name__)
         return started[-1], folder, log
 

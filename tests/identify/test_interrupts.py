@@ -130,6 +130,20 @@ def test_ctrl_c_that_became_another_error_in_any_command_is_one_line(monkeypatch
     assert capsys.readouterr().err == "aborted\n"
 
 
+def test_ctrl_c_while_the_libraries_are_loaded_is_one_line(monkeypatch, capsys):
+    class Slow:
+        @staticmethod
+        def find_spec(name, path, target=None):
+            if name == "identify.command_line":
+                broken_import()
+
+    monkeypatch.delattr("identify.command_line")
+    monkeypatch.delitem(sys.modules, "identify.command_line")
+    monkeypatch.setattr(sys, "meta_path", [Slow, *sys.meta_path])
+    assert command("--help") == 130
+    assert capsys.readouterr() == ("", "aborted\n")
+
+
 def test_ctrl_c_before_the_study_is_read_is_one_line(monkeypatch, capsys):
     monkeypatch.setattr(study_file, "load_study", lambda _: broken_import())
     assert command("study", "pixel_noise") == 130

@@ -1,0 +1,21 @@
+"""The command ``cmmsim`` from its first line on: Ctrl-C ends it in one line, also while the libraries are loaded."""
+
+import sys
+
+from identify.interrupts import STOPPED, honoured
+
+
+def main() -> None:
+    """Run the command; exit status and one line on standard error where Ctrl-C ends it."""
+    try:
+        with honoured():
+            from identify import command_line
+
+            command_line.main()
+    except KeyboardInterrupt:
+        sys.stderr.write("aborted\n")
+        raise SystemExit(STOPPED) from None
+
+
+if __name__ == "__main__":
+    main()
