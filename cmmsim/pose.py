@@ -12,8 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .arguments import finite_array
+from .errors import ShapeError
 
 Array = NDArray[np.float64]
+
+RIGID = 1e-6
+"""By how much entries of what is given as a rigid transform may be off one: single precision passes."""
 
 
 def checked_pose(pose: ArrayLike) -> Array:
@@ -35,10 +39,23 @@ def pose_to_transform(pose: ArrayLike) -> Array:
     return transform
 
 
+def checked_transform(transform: ArrayLike, name: str = "a transform") -> Array:
+    """The transform (4,4) as an array of its own. Raises ShapeError, with the ``name``, when it is not 4x4 finite
+    numbers or no rigid motion: transposed, scaled or mirrored."""
+    values = finite_array(transform, (4, 4), f"{name} must be (4,4) and finite")
+    rotation, last = values[:3, :3], values[3]
+    if np.abs(last - [0.0, 0.0, 0.0, 1.0]).max() > RIGID:
+        raise ShapeError(f"{name} must have the last row [0 0 0 1], got {last.tolist()}; is it transposed?")
+    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if error > RIGID or np.linalg.det(rotation) < 0.0:
+        raise ShapeError(f"{name} must be rigid: its rotation R has |R^T R - I| = {error:.3g} (at most {RIGID:g}) and "
+                         f"determinant {np.linalg.det(rotation):.6g} (1)")
+    return values
+
+
 def transform_to_pose(transform: ArrayLike) -> Array:
-    """Pose (6,) of a transform (4,4); beta lies in [-pi/2, pi/2]. Raises ShapeError when it is not 4x4 finite numbers.
-    """
-    values = finite_array(transform, (4, 4), "a transform must be (4,4) and finite")
+    """Pose (6,) of a transform (4,4); beta lies in [-pi/2, pi/2]. Raises ShapeError when it is no rigid transform."""
+    values = checked_transform(transform)
     r = values[:3, :3]
     alpha = np.arctan2(-r[1, 2], r[2, 2])
     beta = np.arctan2(r[0, 2], np.hypot(r[1, 2], r[2, 2]))

@@ -25,7 +25,7 @@ from .measurement import Measurement, lost_measurement
 from .noise import CameraNoise
 from .observation import DetectionSettings
 from .optics import Optics
-from .pose import Array, checked_pose, pose_to_transform
+from .pose import Array, checked_pose, checked_transform, pose_to_transform
 from .pose_methods import METHODS
 from .renderers import RENDERER_NAMES, Renderer, choose_renderer
 from .rig_from_file import rig_from_file
@@ -242,7 +242,7 @@ class Sensor:
         for name, place in obstacles.items():
             if name not in self._obstacles:
                 raise UnknownBodyError(name, self._obstacles)
-            placed[name] = finite_array(place, (4, 4), f"obstacle {name!r}: base_from_body must be (4,4) and finite")
+            placed[name] = checked_transform(place, f"obstacle {name!r}: base_from_body")
         rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
         self._frame += 1
         return checked, rng, placed

@@ -10,6 +10,7 @@ from cmmsim.scene import rod, rod_transform
 from cmmsim.sensor_file import read_sensor_file, sensor_text
 
 TEXT = sensor_text("ctrack780")
+MOVED = cmmsim.pose_to_transform([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
 DARK = cmmsim.StereoFrame(*np.zeros((2, 1536, 2048), dtype=np.uint8))
 
 
@@ -61,6 +62,8 @@ def test_bad_obstacles(sensor):
         sensor.measure(sensor.home, obstacles={"crank9": np.eye(4)})
     with pytest.raises(cmmsim.ShapeError, match=r"crank1.*\(4,4\)"):
         sensor.measure(sensor.home, obstacles={"crank1": np.eye(3)})
+    with pytest.raises(cmmsim.ShapeError, match=r"obstacle 'crank1': .*the last row \[0 0 0 1\]"):
+        sensor.measure(sensor.home, obstacles={"crank1": MOVED.T})
 
 
 def test_rod_reaches_from_point_to_point():
@@ -147,6 +150,9 @@ def test_what_is_no_pose(pose):
     (lambda s: cmmsim.transform_to_pose(np.eye(3)), r"a transform must be \(4,4\) and finite, got shape \(3, 3\)"),
     (lambda s: cmmsim.transform_to_pose("home"), r"a transform must be \(4,4\) and finite, got home"),
     (lambda s: cmmsim.transform_to_pose(np.full((4, 4), np.nan)), "a transform must be"),
+    (lambda s: cmmsim.transform_to_pose(MOVED.T), r"the last row \[0 0 0 1\], got \[0.1, 0.2, 0.3, 1.0\]; is it tran"),
+    (lambda s: cmmsim.transform_to_pose(MOVED @ np.diag([1.1, 1.1, 1.1, 1.0])), r"\|R\^T R - I\| = 0.21.*1.331 \(1\)"),
+    (lambda s: cmmsim.transform_to_pose(np.diag([1.0, 1.0, -1.0, 1.0])), r"must be rigid: .* determinant -1 \(1\)"),
     (lambda s: rod("long", 0.01), r"length and radius of a rod are two finite numbers, m, got \('long', 0.01\)"),
     (lambda s: rod(0.1, -0.01), "length and radius of a rod must be above 0 m, got 0.1 and -0.01"),
     (lambda s: rod_transform(None, np.ones(3)), "the start of a rod is three finite numbers"),
