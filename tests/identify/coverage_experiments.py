@@ -58,7 +58,7 @@ def _row(scenario, trajectory, sensor, number: int) -> dict:
 
 def row_of(number: int, result) -> dict:
     """What one experiment says of every parameter and of every group of several: error in standard deviations, relative
-    standard deviation, and whether it counts as identified."""
+    standard deviation, whether it counts as identified, and whether the interval that is published holds the truth."""
     return {
         "experiment": number,
         "noise_ratio": result.noise_ratio,
@@ -67,14 +67,20 @@ def row_of(number: int, result) -> dict:
     }
 
 
-def _quantities(result) -> Iterator[tuple[str, float, float, bool]]:
+def _quantities(result) -> Iterator[tuple[str, float, float, bool, bool]]:
     true = truth()
     for k, name in enumerate(result.names):
         error, std = result.estimate[k] - true[k], result.std[k]
-        yield name, error / std, std / abs(true[k]), bool(result.identifiable[k])
+        inside = _holds(result.intervals[k], true[k])
+        yield name, error / std, std / abs(true[k]), bool(result.identifiable[k]), inside
     groups = result.groups
     for k, expression in enumerate(groups.expressions):
         if np.count_nonzero(groups.combinations[k]) > 1:
             value = groups.combinations[k] @ true[:64]
             error, std = groups.estimate[k] - value, groups.std[k]
-            yield expression, error / std, std / abs(value), bool(groups.identifiable[k])
+            inside = _holds(result.group_intervals[k], value)
+            yield expression, error / std, std / abs(value), bool(groups.identifiable[k]), inside
+
+
+def _holds(interval, value) -> bool:
+    return bool(interval[0] <= value <= interval[1])
