@@ -5,8 +5,18 @@ in base-frame axes. The crank is what the paper calls the wrench.
 """
 
 from dynamics import closed_loop
+from dynamics.batch import simulate_batch
 from dynamics.errors import DynamicsError
+from dynamics.forward_dynamics import fast_forward_dynamics
 from dynamics.robot import Robot, load_robot
 from dynamics.robot_file import built_in_robots
 
-__all__ = ["DynamicsError", "Robot", "built_in_robots", "closed_loop", "load_robot"]
+__all__ = [
+    "DynamicsError",
+    "Robot",
+    "built_in_robots",
+    "closed_loop",
+    "fast_forward_dynamics",
+    "load_robot",
+    "simulate_batch",
+]

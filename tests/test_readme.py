@@ -13,6 +13,7 @@ from identify import command_line
 from identify.accuracy.saved import read_saved
 from identify.accuracy.table import markdown_table
 from identify.command_line import app
+from identify.estimators.registry import ESTIMATORS
 from identify.files.result_file import load_result
 from identify.reporting.goals import check_goals
 from identify.reporting.tables import excitation_error_table, goals_table
@@ -49,11 +50,15 @@ def test_the_table_of_the_dynamics_is_the_measured_one(dynamics_figures):
         "the paper's figure-7 loop against MuJoCo (`cmmsim verify-model`), steady": (
             f"{found['mujoco_position_steady_um']:.1g} um, {found['mujoco_angle_steady_urad']:.1g} urad"
         ),
-        "forward dynamics against `constraintDynamics`": f"{found['forward_dynamics_over_pinocchio']:.1f} times faster",
+        "forward dynamics (`dynamics.fast_forward_dynamics`) against `constraintDynamics`": (
+            f"{found['forward_dynamics_over_pinocchio']:.1f} times faster"
+        ),
         "forward dynamics against MuJoCo's `mj_step`": f"{found['forward_dynamics_over_mj_step']:.1f} times faster",
         "closed loop with exact stick-slip friction, 60 Hz frames": f"{found['times_real_time']:.0f} times real time",
         "all 67 sensitivities of a run": f"{found['sensitivities_plain_runs']:.1f} plain runs",
-        "a batch of runs on two cores": f"{found['two_cores_gain']:.2f} times faster than on one",
+        "a batch of runs (`dynamics.simulate_batch`) on two cores": (
+            f"{found['two_cores_gain']:.2f} times faster than on one"
+        ),
         "compiling everything, at first use": f"{found['first_compilation_s']:.0f} s",
         "order of the stick-slip integrator": f"{found['integrator_order']:.1f}",
     }
@@ -78,6 +83,13 @@ def test_the_dynamics_reach_their_goals(dynamics_figures):
 def test_the_table_of_accuracy_is_the_saved_one():
     wanted = markdown_table(read_saved(ROOT / ".readme" / "accuracy.json").figures)
     assert wanted.strip() in README, f"the README wants this table:\n{wanted}"
+
+
+def test_it_counts_the_estimators():
+    numbers = ["zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
+    said = re.search(r"`cmmsim estimators [^`]+` runs (\w+) estimators", " ".join(README.split()))
+    assert said
+    assert numbers.index(said[1]) == len(ESTIMATORS)
 
 
 def test_its_export_command_writes_what_mujoco_loads(monkeypatch, capfd, tmp_path):
