@@ -86,10 +86,10 @@ def test_the_table_of_accuracy_is_the_saved_one():
 
 
 def test_it_counts_the_estimators():
-    numbers = ["zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
+    numbers = {"eight": 8, "nine": 9, "ten": 10, "eleven": 11}
     said = re.search(r"`cmmsim estimators [^`]+` runs (\w+) estimators", " ".join(README.split()))
     assert said
-    assert numbers.index(said[1]) == len(ESTIMATORS)
+    assert numbers[said[1]] == len(ESTIMATORS)
 
 
 def test_its_export_command_writes_what_mujoco_loads(monkeypatch, capfd, tmp_path):
