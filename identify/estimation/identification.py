@@ -17,26 +17,19 @@ from identify.arrays import Array
 from identify.cores import one_thread
 from identify.errors import EstimationError
 from identify.estimation import warm_start
-from identify.estimation.base_parameters import (
-    base_parameters,
-    rank_by_threshold,
-    reference_regressor,
-    structural_regressor,
-)
-from identify.estimation.bounded_intervals import bounded_estimate
 from identify.estimation.bounded_least_squares import Solution
-from identify.estimation.conditioning import Conditioning, conditioning
+from identify.estimation.conditioning import Conditioning
 from identify.estimation.estimate_covariance import DRAWS, Uncertainty, estimate_uncertainty
-from identify.estimation.group_estimates import GroupEstimates, group_estimates, group_rows
-from identify.estimation.identifiability import identifiability
+from identify.estimation.explanation import Explanation, explanation
+from identify.estimation.group_estimates import GroupEstimates
+from identify.estimation.judgement import Judgement, judge
 from identify.estimation.loop_parameters import NAMES, starting_guess
-from identify.estimation.misfit import Misfit, misfit_of_white
 from identify.estimation.output_error import OutputErrorProblem
-from identify.estimation.output_error_search import bounds_of, output_error_searches
-from identify.estimation.prior_support import rests_on_prior
+from identify.estimation.output_error_search import output_error_searches
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor
-from identify.estimation.whiteness import LAGS, Whiteness, whiteness
+from identify.estimation.whiteness import Whiteness
 from identify.progress import Progress, SilentProgress
+from identify.record.recorded_origin import recorded_seed
 from identify.record.recorded_run import recorded_run
 from identify.scenario import Scenario
 
@@ -97,29 +90,31 @@ def identify(
     """Estimate the parameters of robot and joint PID from one or several records by closed-loop output error.
 
     Raises:
-        RecordError: the record misses something, or belongs to another robot or frame rate.
-        EstimationError: no robot or scenario, too many lost frames, or no model that runs from the starting guess or
-            the warm start.
+        RecordError: the record misses something, such as its scenario or its scale anchor, or states what is none, such
+            as a seed that is no whole number.
+        EstimationError: no robot or scenario; a record of another robot, timing or servo, or one that cannot carry an
+            identification; no model that runs from the starting guess or the warm start, or that bears the noise.
+        ScenarioError: a parameter set that the robot does not have.
+        dynamics.DynamicsError: poses that the robot cannot reach.
     """
     progress = progress or SilentProgress()
     records = [record] if isinstance(record, xr.Dataset) else list(record)
     problem = output_error_problem(records, robot, scenario)
+    rng = np.random.default_rng([recorded_seed(records[0]), UNCERTAINTY_STREAM])
     began = time.perf_counter()
     warm = warm_start.linear_warm_start(problem.runs, scenario.timing, scenario.filter, problem.guess, problem.anchor)
     warmed = time.perf_counter()
     searches = output_error_searches(problem, scenario, warm, progress)
     searched = time.perf_counter()
     method, driven = scenario.identification.method, problem.driven_by_commands()
-    seed = int(records[0].attrs.get("seed", 0))  # a record of a real robot has none
-    rng = np.random.default_rng([seed, UNCERTAINTY_STREAM])
     with progress.stage("uncertainty", DRAWS) as advance:
         judged = problem if method == "closed_loop" else driven
         uncertainty = estimate_uncertainty(judged, searches[method].parameters, rng, advance)
-    residuals, ok = _driven_residuals(driven, searches["command_driven"].parameters)
-    tested, driven_misfit = whiteness(residuals, ok), misfit_of_white(residuals[ok])
+    explained = explanation(driven, searches["command_driven"].parameters, uncertainty.misfit)
+    judgement = judge(problem, scenario, searches[method], uncertainty, explained)
     ended = time.perf_counter()
     seconds = {"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched}
-    return _result(problem, scenario, warm, searches, uncertainty, tested, driven_misfit, seconds)
+    return _result(problem, warm, searches, uncertainty, explained, judgement, seconds)
 
 
 def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario) -> OutputErrorProblem:
@@ -146,85 +141,42 @@ def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: 
     return OutputErrorProblem(runs, guess, anchor)
 
 
-def _driven_residuals(driven: OutputErrorProblem, parameters: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """All command-driven residuals (N, 6), NaN where lost, and the good frames (N,): one record after the other, with a
-    gap of all lags of the whiteness test between them."""
-    gap, residuals, ok = np.full((LAGS, 6), np.nan), [], []
-    for run in driven.runs:
-        rows = np.full(run.measured.shape, np.nan)
-        rows[run.ok] = run.whiten(run.model_poses(parameters) - run.measured)
-        residuals += [rows, gap]
-        ok += [run.ok, np.zeros(LAGS, dtype=bool)]
-    return np.concatenate(residuals), np.concatenate(ok)
-
-
 def _result(
     problem: OutputErrorProblem,
-    scenario: Scenario,
     warm: Array,
     searches: dict[str, Solution],
     uncertainty: Uncertainty,
-    tested: Whiteness,
-    driven_misfit: Misfit,
+    explained: Explanation,
+    judgement: Judgement,
     seconds: dict[str, float],
 ) -> IdentificationResult:
-    """What the searches and their uncertainty say of parameters and groups."""
-    robot, guess, solution = problem.runs[0].robot, problem.guess, searches[scenario.identification.method]
-    base, known = base_parameters(structural_regressor(robot)), problem.known_information()
-    # An error of the model that the closed loop hides shows where the logged commands drive it.
-    hidden = driven_misfit.decides and not uncertainty.misfit.decides
-    criterion = identifiability(guess, robot, model_holds=not (hidden or uncertainty.misfit.decides))
-    identifiable = criterion.judge(np.eye(len(NAMES)), uncertainty.covariance)
-    groups = group_estimates(base, guess, criterion, solution.parameters, uncertainty.covariance)
-    conditioned = conditioning(uncertainty.information, known, base, guess, solution.parameters)
-    bounded = bounded_estimate(
-        solution.parameters,
-        solution.at_bound,
-        uncertainty.gradient,
-        uncertainty.information + known,
-        uncertainty.covariance,
-        bounds_of(problem, scenario),
-    )
-    of_the_records = (warning for run in problem.runs for warning in run.warnings())
+    """What each step found, as one result; the last search brings the estimate."""
+    solution = list(searches.values())[-1]
     return IdentificationResult(
         names=NAMES,
-        initial=guess.values,
+        initial=problem.guess.values,
         warm_start=warm,
         estimate=solution.parameters,
         std=np.sqrt(np.diag(uncertainty.covariance)),
         covariance=uncertainty.covariance,
-        intervals=bounded.intervals(np.eye(len(NAMES))),
-        identifiable=identifiable,
-        rests_on_prior=identifiable & rests_on_prior(base, problem.anchor, solution.parameters, criterion.sizes),
-        groups=groups,
-        group_intervals=bounded.intervals(group_rows(base)),
-        conditioning=conditioned,
+        intervals=judgement.intervals,
+        identifiable=judgement.identifiable,
+        rests_on_prior=judgement.rests_on_prior,
+        groups=judgement.groups,
+        group_intervals=judgement.group_intervals,
+        conditioning=judgement.conditioning,
         scale_anchor=problem.anchor,
-        base_rank=_excited_rank(problem, scenario),
+        base_rank=judgement.base_rank,
         iterations=sum(one.iterations for one in searches.values()),
         evaluations=sum(one.evaluations for one in searches.values()),
         stop_reason=solution.stop_reason,
         searches=tuple(searches),
         costs=tuple(one.costs for one in searches.values()),
-        active_bounds=bounded.active_bounds,
-        noise_ratio=uncertainty.misfit.found,
-        expected_noise_ratio=uncertainty.misfit.expected,
-        noise_ratio_std=uncertainty.misfit.std,
-        whiteness=tested,
-        warnings=(
-            *of_the_records,
-            *uncertainty.warnings(),
-            *(driven_misfit.warnings("driven by the logged commands, the model") if hidden else ()),
-            *tested.warnings(),
-            *bounded.warnings(),
-            *conditioned.warnings(),
-        ),
+        active_bounds=judgement.active_bounds,
+        noise_ratio=explained.misfit.found,
+        expected_noise_ratio=explained.misfit.expected,
+        noise_ratio_std=explained.misfit.std,
+        whiteness=explained.whiteness,
+        warnings=judgement.warnings,
         seconds=seconds,
     )
-
-
-def _excited_rank(problem: OutputErrorProblem, scenario: Scenario) -> int:
-    """Independent groups that the records' references excite, by the paper's rule."""
-    rate_hz = scenario.timing.frame_rate_hz
-    excited = [reference_regressor(run.robot, run.reference, rate_hz) for run in problem.runs]
-    return rank_by_threshold(np.concatenate(excited), scenario.identification.qr_threshold)
