@@ -9,32 +9,14 @@ The start is smooth when the series begins at the home pose, at rest and without
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dynamics import Robot
 from dynamics.errors import DynamicsError
 from identify.arrays import Array
 from identify.errors import TrajectoryError
-
-
-class TravelLimitedRobot(Protocol):
-    """What a trajectory needs to know of a robot."""
-
-    @property
-    def name(self) -> str:
-        """Name for messages."""
-        ...
-
-    @property
-    def travel_limit(self) -> float:
-        """Largest crank angle [rad]."""
-        ...
-
-    def inverse_kinematics(self, pose: Any) -> Any:
-        """Joint angles [rad], (N, 6), of poses (N, 6)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -119,9 +101,7 @@ def from_home(home: Array, fundamental_hz: float, sine: Array, cosine: Array) ->
     return FourierTrajectory(fundamental_hz, sine, cosine, home + (cosine / w).sum(axis=1))
 
 
-def check_travel(
-    robot: TravelLimitedRobot, trajectory: FourierTrajectory, t: ArrayLike, margin_rad: float = 0.0
-) -> float:
+def check_travel(robot: Robot, trajectory: FourierTrajectory, t: ArrayLike, margin_rad: float = 0.0) -> float:
     """Largest crank angle [rad] of a trajectory sampled at times ``t`` (N,) [s].
 
     Raises:
@@ -140,7 +120,7 @@ def check_travel(
     return worst
 
 
-def _joint_angles(robot: TravelLimitedRobot, trajectory: FourierTrajectory, times: Array) -> Array:
+def _joint_angles(robot: Robot, trajectory: FourierTrajectory, times: Array) -> Array:
     poses = trajectory.pose(times)
     try:
         angles = np.asarray(robot.inverse_kinematics(poses), dtype=float)

@@ -11,11 +11,11 @@ from dynamics.closed_loop import prepare
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import Worst
 from identify.excitation.criterion_information import knowledge, log_information
-from identify.excitation.criterion_observability import log_observability
+from identify.excitation.criterion_observability import log_observability, observability_index
 from identify.excitation.design import motion_check, prepare_search
 from identify.excitation.evolutionary_search import FEWEST_MEMBERS
 from identify.excitation.motion import sample_times
-from identify.excitation.random_search import admissible_trajectories
+from identify.excitation.random_trajectories import admissible_trajectories
 from identify.progress import Progress
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
@@ -78,7 +78,7 @@ def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progr
     with progress.stage("random candidates", 1) as advance:
         candidates = admissible_trajectories(robot, settings, settings.duration_s, count, excitation_seed, check)
         search = prepare_search(robot, scenario, candidates)
-        index = log_observability(robot, search.problem.unknowns, search.candidates[0])
+        index = log_observability(robot, search.problem.unknowns, settings.duration_s, search.candidates[0])
         advance()
     known, prepared = knowledge(robot, scenario), time.perf_counter() - began
     times = sample_times(settings.fundamental_hz, settings.harmonics, COMPARISON_REFINEMENT)
@@ -93,7 +93,7 @@ def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progr
             information = None
         entries.append(
             Entry(
-                method, trajectory, float(np.exp(found.log_value)), float(np.exp(float(index(found.z)))), information,
+                method, trajectory, float(np.exp(found.log_value)), observability_index(index, found.z), information,
                 seconds, found.evaluations, found.gradients, found.iterations, found.reason,
                 tuple(search.problem.constraints.worst(trajectory, times)),
             )

@@ -29,6 +29,7 @@ from dynamics.kinematics import leg_vectors
 from dynamics.workspace import LEAST_LEVERAGE, MOST_CONDITION, characteristic_length
 from identify.arrays import Array
 from identify.errors import TrajectoryError
+from identify.excitation.motion import is_whole_periods
 from identify.excitation.sight import required_stickers, sight_uses, within_sight
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
@@ -158,8 +159,8 @@ class MotionConstraints:
 def check_periods(scenario: Scenario) -> None:
     """Raise TrajectoryError where a run is no whole number of periods, so that it cannot end at home and at rest."""
     settings = scenario.excitation
-    periods = settings.duration_s * settings.fundamental_hz
-    if round(periods) < 1 or abs(periods - round(periods)) > 1e-9 * periods:
+    if not is_whole_periods(settings.duration_s, settings.fundamental_hz):
+        periods = settings.duration_s * settings.fundamental_hz
         raise TrajectoryError(
             f"end at rest: excitation.duration_s = {settings.duration_s:g} s is {periods:.4g} periods of "
             f"excitation.fundamental_hz = {settings.fundamental_hz:g} Hz; excitation.method = {settings.method!r} "

@@ -6,8 +6,13 @@ of the singular values that are not zero is sqrt(det(H_1^T H_1) det(C C^T)), whi
 
     ln O_in = (ln det(H_1^T H_1) + ln det(C C^T)) / (2 rank) - ln(m) / 2.
 
-H_1 is first divided by the triangular factor R of one trajectory, which takes out the units of the parameters and
-keeps H_1^T H_1 well conditioned. One period is sampled: over whole periods the index does not depend on their number.
+The rank, the paper's zeta, is that of the robot and not of a trajectory, so that all trajectories are judged on the
+same subspace. H is not scaled by columns, as in the paper, and like there only the dynamic parameters count, not the
+gains of the joint controller.
+
+H_1 is divided by the triangular factor R of one trajectory, which takes out the units of the parameters and keeps
+H_1^T H_1 well conditioned. One period is sampled where a run plays whole ones: the index does not depend on their
+number. Another run is sampled from its start to its end.
 """
 
 import casadi as ca
@@ -15,9 +20,10 @@ import numpy as np
 from scipy.linalg import qr, solve_triangular
 
 from dynamics import Robot
+from identify.arrays import Array
 from identify.estimation.base_parameters import base_parameters, structural_regressor
 from identify.excitation.log_determinant import log_determinant
-from identify.excitation.motion import motion, sample_times, wrench_regressor
+from identify.excitation.motion import motion, played_times, wrench_regressor
 from identify.excitation.unknowns import Unknowns
 
 SMOOTHING_RAD_S = 0.02
@@ -25,22 +31,40 @@ SMOOTHING_RAD_S = 0.02
 
 
 def log_observability(
-    robot: Robot, unknowns: Unknowns, typical: np.ndarray, smoothing_rad_s: float | None = None
+    robot: Robot, unknowns: Unknowns, duration_s: float, typical: Array, smoothing_rad_s: float | None = None
 ) -> ca.Function:
-    """z -> ln O_in (eq. 39). `typical` is the z of a trajectory that excites everything; it only sets the scale.
+    """z -> ln O_in (eq. 39) of a run of `duration_s`; -inf or NaN where it is too short to show every base parameter.
 
-    `smoothing_rad_s` smooths the sign of Coulomb friction, which makes the function differentiable.
+    `typical` is the z of a trajectory that excites everything; it only sets the scale. `smoothing_rad_s` smooths the
+    sign of Coulomb friction, which makes the function differentiable.
     """
     base = base_parameters(structural_regressor(robot))
-    times = sample_times(unknowns.fundamental_hz, unknowns.harmonics)
+    times = played_times(unknowns.fundamental_hz, unknowns.harmonics, duration_s)
     z = ca.MX.sym("z", unknowns.size)
+    if 6 * len(times) < base.rank:
+        return ca.Function("log_observability", [z], [ca.MX(-np.inf)], ["z"], ["value"])
     sampled = wrench_regressor(robot, smoothing_rad_s).map(len(times))(*motion(unknowns, z, times))
     columns = ca.Function("pivots", [z], [sampled[list(base.pivots), :]])
-    factor = qr(np.array(columns(typical)).T, mode="r")[0][: base.rank]
-    inverse = solve_triangular(factor, np.eye(base.rank))
-    scaled = ca.DM(inverse.T) @ columns(z)
-    constant = 2 * np.log(np.abs(np.diag(factor))).sum()
-    constant += np.linalg.slogdet(base.combinations @ base.combinations.T)[1]
-    determinant = log_determinant(base.rank)(scaled @ scaled.T)
-    index = (determinant + constant) / (2 * base.rank) - np.log(len(times)) / 2
+    index = log_index(columns(z), base.combinations, np.array(columns(typical)), len(times))
     return ca.Function("log_observability", [z], [index], ["z"], ["value"])
+
+
+def log_index(columns: ca.MX, combinations: Array, typical: Array, samples: int) -> ca.MX:
+    """ln O_in (eq. 39) of H = columns^T combinations over `samples` poses.
+
+    `columns` (rank, 6 m) is H_1 transposed, `combinations` (rank, p) is C, and `typical` is as `columns`, of full rank.
+    """
+    rank = len(combinations)
+    factor = qr(typical.T, mode="r")[0][:rank]
+    inverse = solve_triangular(factor, np.eye(rank))
+    scaled = ca.DM(inverse.T) @ columns
+    constant = 2 * np.log(np.abs(np.diag(factor))).sum()
+    constant += np.linalg.slogdet(combinations @ combinations.T)[1]
+    determinant = log_determinant(rank)(scaled @ scaled.T)
+    return (determinant + constant) / (2 * rank) - np.log(samples) / 2
+
+
+def observability_index(logarithm: ca.Function, z: Array) -> float:
+    """O_in (eq. 39) of a trajectory's z by `log_observability`; 0 where a base parameter does not show."""
+    value = float(logarithm(z))
+    return 0.0 if np.isnan(value) else float(np.exp(value))

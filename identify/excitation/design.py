@@ -15,10 +15,10 @@ from identify.errors import TrajectoryError
 from identify.excitation.constraints import MotionConstraints, check_periods
 from identify.excitation.criterion_information import Knowledge, knowledge, log_information
 from identify.excitation.criterion_linear_information import log_linear_information
-from identify.excitation.criterion_observability import SMOOTHING_RAD_S, log_observability
+from identify.excitation.criterion_observability import SMOOTHING_RAD_S, log_observability, observability_index
 from identify.excitation.evolutionary_search import FEWEST_MEMBERS, evolve
 from identify.excitation.gradient_search import climb
-from identify.excitation.random_search import Check, RegressorRobot, admissible_trajectories, observability_indices
+from identify.excitation.random_trajectories import Check, admissible_trajectories
 from identify.excitation.search import SearchProblem, SearchResult
 from identify.excitation.unknowns import unknowns
 from identify.files.trajectory_file import TrajectorySet
@@ -34,12 +34,10 @@ RANDOM_TOLERANCE = 1e-3
 
 
 def design_trajectories(
-    robot: RegressorRobot, scenario: Scenario, seed: int, progress: Progress | None = None
+    robot: Robot, scenario: Scenario, seed: int, progress: Progress | None = None
 ) -> TrajectorySet:
     """Exciting trajectory and validation trajectories of a scenario, each kind from its own stream of the seed.
 
-    A robot that is not a `dynamics.Robot` has no geometry to search with: only the best random trajectory by eq. 39 is
-    chosen, and of the limits only the travel is checked.
     Raises:
         TrajectoryError: no random trajectory of this amplitude keeps the limits; no whole number of periods where a
             search needs it; a search that finds nothing.
@@ -48,10 +46,10 @@ def design_trajectories(
     settings = scenario.excitation
     excitation_seed, validation_seed, search_seed = np.random.SeedSequence(seed).spawn(3)
     check = motion_check(robot, scenario)
-    if isinstance(robot, Robot) and (settings.method, settings.criterion) != ("random", "observability"):
-        excitation, indices = _searched(robot, scenario, excitation_seed, search_seed, check, progress)
-    else:
+    if (settings.method, settings.criterion) == ("random", "observability"):
         excitation, indices = _best_random(robot, scenario, excitation_seed, check, progress)
+    else:
+        excitation, indices = _searched(robot, scenario, excitation_seed, search_seed, check, progress)
     unseen = _unseen(robot, scenario, validation_seed, check)
     return TrajectorySet(
         seed=seed,
@@ -63,21 +61,14 @@ def design_trajectories(
     )
 
 
-def unseen_trajectories(robot: RegressorRobot, scenario: Scenario, seed: int) -> tuple[FourierTrajectory, ...]:
+def unseen_trajectories(robot: Robot, scenario: Scenario, seed: int) -> tuple[FourierTrajectory, ...]:
     """The validation trajectories of a scenario alone, the same as `design_trajectories` gives, without its search."""
     _, validation_seed, _ = np.random.SeedSequence(seed).spawn(3)
     return _unseen(robot, scenario, validation_seed, motion_check(robot, scenario))
 
 
-def motion_check(robot: RegressorRobot, scenario: Scenario) -> Check:
+def motion_check(robot: Robot, scenario: Scenario) -> Check:
     """What refuses a trajectory that breaks a limit beside the travel."""
-    if not isinstance(robot, Robot):
-        if scenario.excitation.method != "random" or scenario.excitation.criterion != "observability":
-            raise TrajectoryError(
-                f"excitation.method = {scenario.excitation.method!r} with criterion "
-                f"{scenario.excitation.criterion!r} needs the geometry of a robot, {robot.name} has none"
-            )
-        return lambda trajectory, times: None
     constraints = MotionConstraints(robot, scenario)
     return lambda trajectory, times: constraints.check(trajectory, times, RANDOM_TOLERANCE)
 
@@ -127,7 +118,8 @@ def prepare_search(robot: Robot, scenario: Scenario, candidates: list[FourierTra
     pool = [free.of(trajectory) for trajectory in candidates]
     if scenario.excitation.criterion == "observability":
         known = None
-        value, smooth = (log_observability(robot, free, pool[0], v) for v in (None, SMOOTHING_RAD_S))
+        duration_s = scenario.excitation.duration_s
+        value, smooth = (log_observability(robot, free, duration_s, pool[0], v) for v in (None, SMOOTHING_RAD_S))
     else:
         known = knowledge(robot, scenario)
         value, smooth = (log_linear_information(robot, free, scenario, known, v) for v in (None, SMOOTHING_RAD_S))
@@ -137,22 +129,28 @@ def prepare_search(robot: Robot, scenario: Scenario, candidates: list[FourierTra
 
 
 def _unseen(
-    robot: RegressorRobot, scenario: Scenario, seed: np.random.SeedSequence, check: Check
+    robot: Robot, scenario: Scenario, seed: np.random.SeedSequence, check: Check
 ) -> tuple[FourierTrajectory, ...]:
     count, duration_s = scenario.validation.count, scenario.validation.duration_s
     return tuple(admissible_trajectories(robot, scenario.excitation, duration_s, count, seed, check))
 
 
 def _best_random(
-    robot: RegressorRobot, scenario: Scenario, seed: np.random.SeedSequence, check: Check, progress: Progress
+    robot: Robot, scenario: Scenario, seed: np.random.SeedSequence, check: Check, progress: Progress
 ) -> tuple[FourierTrajectory, Array]:
     """The best candidate, and the indices (eq. 39) of it and of all."""
     settings = scenario.excitation
     with progress.stage("excitation", settings.candidates) as advance:
         candidates = admissible_trajectories(robot, settings, settings.duration_s, settings.candidates, seed, check)
-        indices = observability_indices(robot, candidates, settings.duration_s, advance)
+        free = unknowns(robot.home_pose, settings)
+        pool = [free.of(trajectory) for trajectory in candidates]
+        index = log_observability(robot, free, settings.duration_s, pool[0])
+        indices = []
+        for z in pool:
+            indices.append(observability_index(index, z))
+            advance()
     best = int(np.argmax(indices))
-    return candidates[best], np.concatenate([indices[[best]], indices])
+    return candidates[best], np.array([indices[best], *indices])
 
 
 def _searched(
@@ -170,6 +168,6 @@ def _searched(
     )
     search = prepare_search(robot, scenario, candidates)
     found = search.run(settings.method, search_seed, progress)
-    index = log_observability(robot, search.problem.unknowns, search.candidates[0])
+    index = log_observability(robot, search.problem.unknowns, settings.duration_s, search.candidates[0])
     pool = [search.problem.unknowns.of(trajectory) for trajectory in candidates]
-    return found.trajectory(search.problem), np.exp([float(index(z)) for z in (found.z, *pool)])
+    return found.trajectory(search.problem), np.array([observability_index(index, z) for z in (found.z, *pool)])

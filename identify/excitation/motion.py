@@ -21,6 +21,21 @@ def sample_times(fundamental_hz: float, harmonics: int, refinement: int = 1) -> 
     return np.asarray((np.arange(count) + 0.5) / (count * fundamental_hz), dtype=float)
 
 
+def is_whole_periods(duration_s: float, fundamental_hz: float) -> bool:
+    """Whether a run is a whole number of periods, at least one, to rounding."""
+    periods = duration_s * fundamental_hz
+    return round(periods) >= 1 and abs(periods - round(periods)) <= 1e-9 * periods
+
+
+def played_times(fundamental_hz: float, harmonics: int, duration_s: float) -> Array:
+    """Instants (N,) [s] as dense as `sample_times`, over what a run plays of a trajectory: one period where it plays
+    whole ones, over which the motion repeats, else all of it."""
+    if is_whole_periods(duration_s, fundamental_hz):
+        return sample_times(fundamental_hz, harmonics)
+    count = max(1, round(SAMPLES_PER_HARMONIC * harmonics * fundamental_hz * duration_s))
+    return np.asarray((np.arange(count) + 0.5) * (duration_s / count), dtype=float)
+
+
 def motion(unknowns: Unknowns, z: ca.MX, times: Array) -> tuple[ca.MX, ca.MX, ca.MX]:
     """Poses, pose rates and pose accelerations, each (6, N), of z at `times` (N,) [s]."""
     matrix = ca.reshape(z, unknowns.columns, 6).T

@@ -13,7 +13,7 @@ from cmmsim.exact_teaching import exactly_taught
 from dynamics import load_robot
 from identify.errors import EstimationError
 from identify.excitation.design import motion_check
-from identify.excitation.random_search import admissible_trajectories
+from identify.excitation.random_trajectories import admissible_trajectories
 from identify.experiment.run import run_plant
 from identify.experiment.sensor_in_loop import make_sensor
 from identify.experiment.truth import true_poses

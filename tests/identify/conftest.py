@@ -1,11 +1,8 @@
-"""A small run with known errors, and a robot simple enough to be worked out by hand."""
-
-from dataclasses import dataclass, field
+"""A small run with known errors."""
 
 import numpy as np
 import pytest
 
-from dynamics.errors import DynamicsError
 from identify.estimation.loop_parameters import NAMES
 from identify.experiment.truth import build_truth
 from identify.files.covariance_file import write_covariance
@@ -16,42 +13,6 @@ from identify.reporting.model_runs import build_model_run, write_model_runs
 from identify.scenario import load_scenario
 
 HOME = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
-
-
-@dataclass
-class DiagonalRobot:
-    """Crank angle i is 50 rad/m or 10 rad/rad times component i from home; the regressor is diagonal.
-
-    Parameters: six masses, a copy of the first (only their sum shows), and one that never shows.
-    """
-
-    name: str = "diagonal"
-    travel_limit: float = 0.9948
-    reach_m: float = 1.0
-    home_pose: np.ndarray = field(default_factory=HOME.copy)
-
-    def inverse_kinematics(self, pose):
-        offset = np.asarray(pose) - self.home_pose
-        if np.abs(offset[:, 0]).max() > self.reach_m:
-            raise DynamicsError(f"leg 1 cannot reach x = {np.abs(offset[:, 0]).max():.3f} m")
-        return offset * [50.0, 50.0, 50.0, 10.0, 10.0, 10.0]
-
-    def twist(self, pose, pose_rate):
-        return pose_rate
-
-    def twist_dot(self, pose, pose_rate, pose_acceleration):
-        return pose_acceleration
-
-    def regressor(self, pose, twist, twist_dot):
-        rows = np.zeros((len(pose), 6, 8))
-        rows[:, range(6), range(6)] = twist_dot
-        rows[:, 0, 6] = twist_dot[:, 0]
-        return rows
-
-
-@pytest.fixture
-def diagonal_robot():
-    return DiagonalRobot()
 
 
 def make_record(samples=120, seed=0, **changes):

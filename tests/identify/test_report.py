@@ -7,13 +7,12 @@ import pytest
 from matplotlib.image import imread
 
 from identify.errors import OutputFolderError, RecordError
-from identify.excitation import design_trajectories
 from identify.files.result_file import load_result, save_result
-from identify.files.trajectory_file import save_trajectories
+from identify.files.trajectory_file import TrajectorySet, save_trajectories
 from identify.reporting import figures
 from identify.reporting.model_runs import build_model_run, write_model_runs
 from identify.reporting.report import SECTIONS, read_report_data, render, write_report
-from identify.scenario import load_scenario
+from identify.trajectory import random_trajectory
 
 FIGURES = {"excitation", "fit_excitation", "fit_validation", "validation_errors", "parameters", "correlation"}
 
@@ -67,11 +66,11 @@ def test_report_shows_goals_parameters_and_the_papers_numbers(run_folder):
         assert shown in text, shown
 
 
-def test_report_states_the_observability_index(run_folder, diagonal_robot):
-    chosen = design_trajectories(diagonal_robot, load_scenario("quick"), seed=0)
-    save_trajectories(run_folder.trajectories, chosen)
+def test_report_states_the_observability_index(run_folder):
+    path = random_trajectory(np.random.default_rng(0), np.zeros(6), 0.1, 5, 0.01, 0.04)
+    save_trajectories(run_folder.trajectories, TrajectorySet(0, path, (path,), 0.5293, 0.4606, 0.4603))
     text = render(read_report_data(run_folder))
-    assert f"{chosen.observability_index:.3g} of the trajectory that is used" in text
+    assert "0.461 of the first random candidate, 0.46 of the middle one, 0.529 of the trajectory that is used" in text
     assert "from 0.38 to 1.345" in text
 
 

@@ -4,6 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import cumulative_simpson
 
+from dynamics import load_robot
 from identify.errors import TrajectoryError
 from identify.trajectory import FourierTrajectory, check_travel, random_trajectory
 
@@ -83,22 +84,30 @@ def test_wrong_shapes_and_too_few_harmonics_are_refused():
         random_one(0, harmonics=1)
 
 
-def test_travel_names_time_leg_angle_and_limit(diagonal_robot):
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot("rss6")
+
+
+def turning_one_crank(robot, crank, angle):
+    """One harmonic of 1 Hz that is at t = 0.25 s where this crank alone is turned by `angle` [rad]."""
+    pose = robot.forward_kinematics(np.where(np.arange(6) == crank, angle, 0.0))
+    return FourierTrajectory(1.0, (2 * np.pi * (pose - HOME))[:, None], np.zeros((6, 1)), HOME)
+
+
+def test_travel_names_time_leg_angle_and_limit(robot):
+    trajectory = turning_one_crank(robot, 1, 0.3)
+    with pytest.raises(TrajectoryError, match=r"crank 2 of rss6 to 0\.3000 rad at t = 0\.250 s.*0\.2948 rad"):
+        check_travel(robot, trajectory, np.arange(5) / 16, margin_rad=0.7)
+
+
+def test_travel_inside_the_limit_returns_the_largest_angle(robot):
+    assert check_travel(robot, turning_one_crank(robot, 1, 0.3), np.arange(5) / 16) == pytest.approx(0.3, abs=1e-9)
+
+
+def test_pose_out_of_reach_keeps_the_robots_evidence(robot):
     sine = np.zeros((6, 1))
-    sine[1, 0] = 0.04 * np.pi  # y = 0.02 m sin(2 pi t), so crank 2 turns to 1 rad at t = 0.25 s
-    trajectory = FourierTrajectory(1.0, sine, np.zeros((6, 1)), HOME)
-    with pytest.raises(TrajectoryError, match=r"crank 2 of diagonal to 1\.0000 rad at t = 0\.250 s.*0\.9448 rad"):
-        check_travel(diagonal_robot, trajectory, np.arange(5) / 16, margin_rad=0.05)
-
-
-def test_travel_inside_the_limit_returns_the_largest_angle(diagonal_robot):
-    sine = np.zeros((6, 1))
-    sine[1, 0] = 0.02 * np.pi
-    trajectory = FourierTrajectory(1.0, sine, np.zeros((6, 1)), HOME)
-    assert check_travel(diagonal_robot, trajectory, np.arange(17) / 16) == pytest.approx(0.5)
-
-
-def test_pose_out_of_reach_keeps_the_robots_evidence(diagonal_robot):
-    diagonal_robot.reach_m = 0.005
-    with pytest.raises(TrajectoryError, match=r"reach of diagonal: leg 1 cannot reach x = 0\.0"):
-        check_travel(diagonal_robot, random_one(0), np.linspace(0, 10, 200))
+    sine[0, 0] = 2 * np.pi  # x = 1 m sin(2 pi t), further than a crank of 0.06 m brings the platform
+    far = FourierTrajectory(1.0, sine, np.zeros((6, 1)), HOME)
+    with pytest.raises(TrajectoryError, match=r"leaves the reach of rss6: .*leg \d"):
+        check_travel(robot, far, np.arange(5) / 16)

@@ -93,10 +93,10 @@ def test_exciting_trajectory_starts_at_home_at_rest_and_stays_inside_the_travel(
     check_travel(robot, trajectory, np.linspace(0, 10, 5000))
 
 
-def test_robot_without_room_for_the_trajectory_is_refused_with_evidence(diagonal_robot):
-    diagonal_robot.travel_limit = 0.2
-    with pytest.raises(TrajectoryError, match=r"none of 200 exciting .*travel limit 0\.2000 rad"):
-        exciting_trajectory(diagonal_robot)
+def test_robot_without_room_for_the_trajectory_is_refused_with_evidence(robot, monkeypatch):
+    monkeypatch.setattr("identify.robot_checks.figure7_loop.TRAVEL_MARGIN_RAD", 0.8)
+    with pytest.raises(TrajectoryError, match=r"none of 200 exciting .*travel limit 0\.9948 rad less margin 0\.8000"):
+        exciting_trajectory(robot)
 
 
 def test_figure_has_units_goals_and_the_closure_error(made_runs):
