@@ -1,6 +1,6 @@
 """What a record must be to carry an identification: of this robot, long enough, moving, and whole.
 
-Each check raises EstimationError with what it found.
+Each check raises EstimationError with what it found, in frames counted from 0.
 """
 
 import numpy as np
@@ -15,9 +15,10 @@ from identify.errors import EstimationError
 from identify.files.dataset import POSE
 from identify.record.filtering import SPLINE_DEGREE, padding_samples
 from identify.record.loop_setup import frame_times
+from identify.record.recorded_origin import recorded_scenario
 from identify.record.recorded_robot import check_robot
 from identify.record.recording import poses
-from identify.scenario import Scenario, scenario_from_toml
+from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
 MINIMUM_GOOD_SHARE = 0.5
@@ -30,10 +31,21 @@ ROUNDING = 1e-9
 """m or rad: difference that means nothing, of a reference from its trajectory or from one that stands still."""
 
 
+ASYMMETRY = 1e-6
+"""Difference of two mirrored entries of a covariance that rounding may make, in units of the standard deviations."""
+
+
+class TooFewFramesError(EstimationError):
+    """A record most of whose frames were lost."""
+
+
 def check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
-    """The record must be of this robot, and made with the timing and the servo that the model is to have."""
+    """The record must be of this robot, and made with the timing and the servo that the model is to have.
+
+    Raises RecordError too, for a record that does not say so.
+    """
     check_robot(record, robot)
-    recorded = scenario_from_toml(str(record.attrs.get("scenario", "")), "scenario in the record")
+    recorded = recorded_scenario(record)
     for section in ("timing", "servo"):
         theirs, ours = getattr(recorded, section).model_dump(), getattr(scenario, section).model_dump()
         for key, value in theirs.items():
@@ -102,33 +114,55 @@ def check_length(frames: int, scenario: Scenario, what: str = "the record has") 
         )
 
 
-def check_channels(measured: Array, logged: Array, ok: NDArray[np.bool_]) -> None:
-    """Enough measured poses (N, 6), and no pose or command (N, 6) that is dead or not finite."""
+def check_good_share(ok: NDArray[np.bool_]) -> None:
+    """Enough frames (N,) that were measured; else TooFewFramesError."""
     if ok.mean() < MINIMUM_GOOD_SHARE:
-        raise EstimationError(
+        raise TooFewFramesError(
             f"only {ok.sum()} of {len(ok)} frames were measured; at least {MINIMUM_GOOD_SHARE:.0%} are needed"
         )
-    channels = [*zip(POSE, measured[ok].T, strict=True)]
-    channels += [(f"command of joint {k + 1}", column) for k, column in enumerate(logged.T)]
-    for name, values in channels:
-        if not np.isfinite(values).all():
+
+
+def check_channels(measured: Array, logged: Array, ok: NDArray[np.bool_]) -> None:
+    """No measured pose (N, 6) in a good frame, and no command (N, 6), that is dead or not finite."""
+    good, every = np.flatnonzero(ok), np.arange(len(ok))
+    channels = [(name, good, column) for name, column in zip(POSE, measured[ok].T, strict=True)]
+    channels += [(f"command of joint {k + 1}", every, column) for k, column in enumerate(logged.T)]
+    for name, frames, values in channels:
+        unknown = frames[~np.isfinite(values)]
+        if len(unknown):
             raise EstimationError(
-                f"{name} is not finite in {np.sum(~np.isfinite(values))} frames that count as measured, the first "
-                f"is good frame {np.flatnonzero(~np.isfinite(values))[0]}"
+                f"{name} is not finite in {len(unknown)} frames that count as measured, the first is frame {unknown[0]}"
             )
         if np.ptp(values) == 0:
             raise EstimationError(f"{name} is {values[0]:g} in every frame: nothing moved, or the channel is dead")
 
 
-def checked_covariance(covariances: Array) -> Array:
-    """Mean (6, 6) of the covariances (n, 6, 6) of the good frames."""
-    unknown = np.flatnonzero(~np.isfinite(covariances).all(axis=(1, 2)))
+def checked_covariance(covariances: Array, ok: NDArray[np.bool_]) -> Array:
+    """Mean (6, 6) of the covariances (N, 6, 6) of the good frames, `ok` (N,)."""
+    frames, good = np.flatnonzero(ok), covariances[ok]
+    unknown = frames[~np.isfinite(good).all(axis=(1, 2))]
     if len(unknown):
         raise EstimationError(
-            f"measured_covariance is not finite in {len(unknown)} frames that count as measured, the first is good "
-            f"frame {unknown[0]}"
+            f"measured_covariance is not finite in {len(unknown)} frames that count as measured, the first is frame "
+            f"{unknown[0]}"
         )
-    mean = covariances.mean(axis=0)
+    _check_symmetry(good, frames)
+    mean = good.mean(axis=0)
     if np.linalg.eigvalsh(mean)[0] <= 0:
         raise EstimationError("the record's mean measured_covariance is not positive definite")
     return np.asarray(mean, dtype=float)
+
+
+def _check_symmetry(covariances: Array, frames: NDArray[np.intp]) -> None:
+    """Covariances (n, 6, 6) of these frames (n,) must be symmetric: what follows reads one triangle only."""
+    gap = np.abs(covariances - covariances.transpose(0, 2, 1))
+    std = np.sqrt(np.abs(np.diagonal(covariances, axis1=1, axis2=2)))
+    excess = gap - ASYMMETRY * std[:, :, None] * std[:, None, :]
+    if excess.max() <= 0:
+        return
+    worst, row, column = np.unravel_index(int(np.argmax(excess > 0)), excess.shape)
+    raise EstimationError(
+        f"measured_covariance is not symmetric in {np.sum((excess > 0).any(axis=(1, 2)))} frames: in frame "
+        f"{frames[worst]} its entry ({POSE[row]}, {POSE[column]}) is {covariances[worst, row, column]:.6g} and "
+        f"({POSE[column]}, {POSE[row]}) is {covariances[worst, column, row]:.6g}"
+    )

@@ -17,6 +17,7 @@ from identify.record.loop_setup import model_settings
 from identify.record.payload import recorded_payload
 from identify.record.record_checks import (
     check_channels,
+    check_good_share,
     check_length,
     check_origin,
     check_reference,
@@ -105,35 +106,56 @@ class RecordedRun:
 
 
 def recorded_run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
-    """A record, checked, with the model side of the scenario.
+    """A record that can carry an identification, with the model side of the scenario.
+
+    Raises:
+        RecordError, EstimationError: as `watched_run` does.
+        EstimationError: too short, a constant channel, numbers that are not finite, a reference that stands still or is
+            faster than the frames can show.
+    """
+    _check_origin(record, robot, scenario)
+    check_length(record.sizes["time"], scenario)
+    run = _run(record, robot, scenario)
+    check_reference(run.reference, scenario)
+    check_channels(run.measured, run.logged, run.ok)
+    return run
+
+
+def watched_run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
+    """A record of this robot and loop, and of a sensor whose noise it tells: long enough for a prediction at least.
 
     Raises:
         RecordError: something is missing or of a wrong shape, a bad payload.
-        EstimationError: another robot, timing or servo; too short, too many lost frames, a constant channel, numbers
-            that are not finite, a reference that stands still or is faster than the frames can show.
+        EstimationError: another robot, timing or servo; too many lost frames (its subclass TooFewFramesError), a
+            covariance that is none: not finite, not symmetric, not positive definite.
     """
-    check_variables(record, VARIABLES, "the record")
-    check_origin(record, robot, scenario)
-    check_length(record.sizes["time"], scenario)
-    reference = recorded_reference(record)
-    check_reference(reference, scenario)
-    ok = record["measured_ok"].values.astype(bool)
-    measured, logged = poses(record, "measured"), np.asarray(record["command"].values, dtype=float)
-    check_channels(measured, logged, ok)
-    covariance = checked_covariance(record["measured_covariance"].values[ok])
-    return RecordedRun(
-        robot=robot,
-        settings=model_settings(scenario),
-        reference=reference,
-        measured=measured,
-        ok=ok,
-        covariance=covariance,
-        logged=logged,
-        payload=recorded_payload(record),
-    )
+    _check_origin(record, robot, scenario)
+    return _run(record, robot, scenario)
 
 
 def recorded_reference(record: xr.Dataset) -> Reference:
     """Reference motion of a record."""
     rates = np.hstack([record["reference_velocity"].values, record["reference_orientation_rate"].values])
     return Reference(poses(record, "reference"), rates)
+
+
+def _check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
+    """The record must be whole, of this robot, and made with the loop of the scenario."""
+    check_variables(record, VARIABLES, "the record")
+    check_origin(record, robot, scenario)
+
+
+def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
+    """What a record holds, and what the scenario says of the model."""
+    ok = record["measured_ok"].values.astype(bool)
+    check_good_share(ok)
+    return RecordedRun(
+        robot=robot,
+        settings=model_settings(scenario),
+        reference=recorded_reference(record),
+        measured=poses(record, "measured"),
+        ok=ok,
+        covariance=checked_covariance(record["measured_covariance"].values, ok),
+        logged=np.asarray(record["command"].values, dtype=float),
+        payload=recorded_payload(record),
+    )

@@ -37,9 +37,29 @@ def standstill(record):
 
 
 def unknown_covariance(record):
-    covariance = record["measured_covariance"].values.copy()
-    covariance[7] = np.nan
-    return with_values(record, measured_covariance=covariance)
+    """In frame 7, after two that were lost."""
+    covariance, ok = record["measured_covariance"].values.copy(), record["measured_ok"].values.copy()
+    covariance[7], ok[2:4] = np.nan, 0
+    return with_values(record, measured_covariance=covariance, measured_ok=ok)
+
+
+def one_triangle(record):
+    """The covariance of z and gamma in one of its two places, in frame 9, after two frames that were lost."""
+    covariance, ok = record["measured_covariance"].values.copy(), record["measured_ok"].values.copy()
+    covariance[9, 2, 5], ok[2:4] = 0.5 * np.sqrt(covariance[9, 2, 2] * covariance[9, 5, 5]), 0
+    return with_values(record, measured_covariance=covariance, measured_ok=ok)
+
+
+def dead_command(record):
+    command, ok = record["command"].values.copy(), record["measured_ok"].values.copy()
+    command[8, 1], ok[2:4] = np.nan, 0
+    return with_values(record, command=command, measured_ok=ok)
+
+
+def without(record, name):
+    bare = record.copy()
+    bare.attrs = {known: value for known, value in record.attrs.items() if known != name}
+    return bare
 
 
 @pytest.mark.parametrize(
@@ -51,7 +71,19 @@ def unknown_covariance(record):
         (lambda r: r.isel(time=slice(0, 1)), EstimationError, "1 frames .0.0167 s., at least 120 are needed"),
         (lambda r: r.assign_coords(time=r["time"].where(r["time"] > 1)), EstimationError, "nan periods of 60"),
         (lambda r: r.assign_coords(time=r["time"] * 1.01), EstimationError, r"1.010 periods of 60 Hz"),
-        (unknown_covariance, EstimationError, "measured_covariance is not finite in 1 frames .*good frame 7"),
+        (unknown_covariance, EstimationError, "measured_covariance is not finite in 1 frames .*first is frame 7"),
+        (one_triangle, EstimationError,
+         r"not symmetric in 1 frames: in frame 9 its entry .z, gamma. is 7.5e-11 and .gamma, z. is 0"),
+        (dead_command, EstimationError, "command of joint 2 is not finite in 1 frames .*first is frame 8"),
+        (lambda r: without(r, "scenario"), RecordError,
+         r"no attribute scenario, .*record.attrs\['scenario'\] = scenario.to_toml\(\), .*identify.build_record"),
+        (lambda r: r.assign_attrs(scenario=7), RecordError, "attribute scenario is 7, must be TOML text"),
+        (lambda r: r.assign_attrs(scenario="paper"), RecordError, "attribute scenario is not valid TOML"),
+        (lambda r: r.assign_attrs(scenario="description = 'mine'"), RecordError, "attribute scenario: name is missing"),
+        (lambda r: r.assign_attrs(seed="abc"), RecordError, "attribute seed is 'abc', must be a whole number >= 0"),
+        (lambda r: r.assign_attrs(seed=-1), RecordError, "attribute seed is -1, must be"),
+        (lambda r: r.assign_attrs(seed=True), RecordError, "attribute seed is True, must be"),
+        (lambda r: r.assign_attrs(seed=np.nan), RecordError, "attribute seed is nan, must be"),
         (lambda r: r.assign(reference_position=r["reference_position"].where(r["time"] > 1)), DynamicsError, "is nan"),
         (standstill, EstimationError, "same pose in every frame: nothing was asked to move"),
         (alias, EstimationError, "the reference's x travels 0.01, .*harmonics above half of 60 Hz"),
@@ -59,12 +91,27 @@ def unknown_covariance(record):
          "or the rate is not its derivative"),
         (lambda r: r.assign(measured_position=1e3 * r["measured_position"]), DynamicsError, "cannot reach"),
     ],
-    ids=["channel", "channels", "empty", "one frame", "time NaN", "rate", "covariance NaN", "reference NaN",
+    ids=["channel", "channels", "empty", "one frame", "time NaN", "rate", "covariance NaN",
+         "covariance in one triangle", "command NaN", "no scenario", "scenario a number", "scenario a name",
+         "scenario without name", "seed a word", "seed negative", "seed a truth value", "seed NaN", "reference NaN",
          "standstill", "alias", "rate not in m/s", "millimetres"],
 )
 def test_what_is_wrong_with_a_record_is_said(record, spoil, error, says):
     with pytest.raises(error, match=says):
         identify(spoil(record), rss6(), quick())
+
+
+def test_what_rounding_leaves_of_symmetry_is_no_fault(record):
+    """A covariance J C J^T of numbers of different size, computed in single precision."""
+    rng = np.random.default_rng(0)
+    units = np.repeat([1e-3, 1.0], 3)
+    jacobian = (units[:, None] * rng.normal(size=(6, 6))).astype(np.float32)
+    drawn = jacobian * np.float32(1e-5)
+    covariance = np.float32(drawn @ drawn.T).astype(float) * (1 + 1e-9 * rng.normal(size=(6, 6)))
+    assert np.abs(covariance - covariance.T).max() > 0
+    stated = np.broadcast_to(covariance, record["measured_covariance"].shape)
+    taken = recorded_run(with_values(record, measured_covariance=stated), rss6(), quick()).covariance
+    np.testing.assert_allclose(taken, covariance)
 
 
 def test_a_load_of_moments_that_no_body_has_is_refused_by_name(record):
@@ -86,8 +133,7 @@ def test_a_frame_rate_below_twice_the_highest_harmonic_is_refused_with_the_scena
 
 
 def test_a_record_of_a_real_robot_has_no_seed(record):
-    real = record.copy()
-    real.attrs = {name: value for name, value in record.attrs.items() if name != "seed"}
+    real = without(record, "seed")
     once = quick(**{"identification.method": "command_driven", "identification.max_iterations": 1})
     assert np.all(np.isfinite(identify(real, rss6(), once).estimate))
 
