@@ -18,6 +18,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from dynamics import DynamicsError, Robot
+from dynamics.errors import ParameterError, SimulationError
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.base_parameters import base_parameters, structural_regressor
@@ -56,10 +57,14 @@ class Examination:
         return np.asarray(parameters[64:] / self.true[64:] - 1, dtype=float)
 
     def pose_distance(self, parameters: Array) -> tuple[float, float]:
-        """RMS of the worst axis and run, um and urad; NaN where the model's loop is unstable."""
+        """RMS of the worst axis and run, um and urad; NaN where the model's loop is unstable, or an estimator gives
+        parameters with which no model runs, such as a gain of zero."""
         rows = []
         for record, truth in self.unseen:
-            poses = model_run(self.robot, self.scenario, parameters, recorded_reference(record))
+            try:
+                poses = model_run(self.robot, self.scenario, parameters, recorded_reference(record))
+            except (ParameterError, SimulationError):
+                return float("nan"), float("nan")
             rows.append(rms_row(rms_figures(poses - true_poses(truth))))
         worst = np.max(np.array(rows), axis=0)
         return float(worst[:3].max()), float(worst[3:].max())

@@ -12,17 +12,17 @@ import numpy as np
 import xarray as xr
 
 import cmmsim
-from dynamics import DynamicsError, Robot, load_robot
-from dynamics.closed_loop import Reference, simulate
+from dynamics import Robot, load_robot
+from dynamics.closed_loop import LoopFailure, Reference, simulate
 from identify.arrays import Array
 from identify.cores import cores
-from identify.errors import EstimationError
 from identify.estimation.pose_prediction import PosePrediction, predict_poses
 from identify.experiment.run import PREDICTION, Experiment, run_plant, stream_seed
 from identify.experiment.sensor_in_loop import make_sensor
 from identify.progress import Advance, Progress
 from identify.record.loop_setup import frame_times, model_settings
-from identify.record.recorded_run import recorded_run
+from identify.record.record_checks import TooFewFramesError
+from identify.record.recorded_run import watched_run
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
@@ -67,10 +67,14 @@ def run_unseen(
 
 
 def model_run(robot: Robot, scenario: Scenario, parameters: Array, reference: Reference) -> Array:
-    """Poses (N, 6) of the model on a reference; NaN throughout when its loop is unstable."""
+    """Poses (N, 6) of the model on a reference; NaN throughout when its loop is unstable.
+
+    Raises dynamics.DynamicsError for what is no model: parameters of another shape or outside their range, poses out of
+    reach.
+    """
     try:
         return simulate(robot, parameters, reference, model_settings(scenario)).pose
-    except DynamicsError:
+    except LoopFailure:
         return np.full_like(reference.poses, np.nan)
 
 
@@ -86,14 +90,18 @@ def predicted_runs(
     """What the identified model (67,) with its covariance (67, 67) predicts for the plant on the references of records.
 
     NaN throughout where its loop is unstable, or too little was measured to know the sensor's noise.
+
+    Raises:
+        RecordError, EstimationError: a record that is damaged, or of another robot, timing or servo.
+        dynamics.DynamicsError: parameters that no model can have.
     """
     predictions = []
     with progress.stage("predict", len(records)) as advance:
         for number, record in enumerate(records, start=1):
             rng = np.random.default_rng(stream_seed(seed, PREDICTION, number))
             try:
-                prediction = predict_poses(recorded_run(record, robot, scenario), parameters, covariance, rng)
-            except (DynamicsError, EstimationError):
+                prediction = predict_poses(watched_run(record, robot, scenario), parameters, covariance, rng)
+            except (LoopFailure, TooFewFramesError):
                 shape = (record.sizes["time"], 6)
                 prediction = PosePrediction(np.full(shape, np.nan), np.full((*shape, 6), np.nan))
             predictions.append(prediction)

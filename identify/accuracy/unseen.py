@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dynamics import Robot
+from dynamics.loop_checks import checked_loop_parameters
 from identify.arrays import Array
 from identify.excitation.design import unseen_trajectories
 from identify.experiment.plant import simulate_plant
@@ -18,9 +19,13 @@ def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed:
 
     On the scenario's unseen trajectories for this seed; plant and model each with their own friction law and steps.
     Both see by an ideal sensor, so that only the parameters and what the model leaves out make the error. NaN where the
-    model's loop is unstable. Raises TrajectoryError, dynamics.DynamicsError.
+    model's loop is unstable, and only there.
+
+    Raises:
+        dynamics.DynamicsError: parameters of another shape, not finite, or outside their range.
+        TrajectoryError: no unseen trajectory keeps the robot's limits.
     """
-    values, true = np.asarray(parameters, dtype=float), true_parameters(robot, scenario)
+    values, true = checked_loop_parameters(parameters), true_parameters(robot, scenario)
     times = frame_times(scenario, scenario.validation.duration_s)
     references = [reference_motion(path, times) for path in unseen_trajectories(robot, scenario, seed)]
     plant = [simulate_plant(scenario, robot, true, reference).pose for reference in references]

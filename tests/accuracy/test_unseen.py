@@ -5,7 +5,8 @@ import pytest
 
 import dynamics
 import identify
-from dynamics.closed_loop import simulate
+from dynamics.closed_loop import LoopFailure, simulate
+from dynamics.errors import DynamicsError
 from identify.excitation.design import design_trajectories
 from identify.record.loop_setup import frame_times, model_settings, reference_motion
 
@@ -45,4 +46,31 @@ def test_wrong_parameters_err_as_two_runs_of_the_loop_differ(scenario, robot):
 def test_an_unstable_model_has_no_error(scenario, robot):
     unstable = robot.parameter_sets["initial"].vector.copy()
     unstable[64:67] = [0.1, 500.0, 0.0]
+    reference = reference_motion(design_trajectories(robot, scenario, 0).validation[0], frame_times(scenario, 1.0))
+    with pytest.raises(LoopFailure):
+        simulate(robot, unstable, reference, model_settings(scenario))
     assert np.isnan(identify.unseen_errors(unstable, robot, scenario)).all()
+
+
+def changed(values, index, value):
+    return np.array([value if k == index else old for k, old in enumerate(values)])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda p: np.zeros(3), r"must have shape \(67,\), got \(3,\)"),
+        (lambda p: p[:, None], r"must have shape \(67,\), got \(67, 1\)"),
+        (lambda p: p[:64], r"must have shape \(67,\), got \(64,\)"),
+        (lambda p: None, "must be numbers of shape"),
+        (lambda p: ["1.0"] * 67, "must be numbers of shape"),
+        (lambda p: p * np.nan, "platform.mass = nan kg is not allowed"),
+        (lambda p: changed(p, 66, np.inf), "joint_pid.ld is inf, must be finite"),
+        (lambda p: changed(p, 0, -1.0), "platform.mass = -1 kg is not allowed"),
+        (lambda p: changed(p, 65, 0.0), "joint_pid.li is 0.0, must be finite and > 0"),
+    ],
+    ids=["three", "column", "no gains", "none", "words", "NaN", "infinite", "negative mass", "no integral gain"],
+)
+def test_what_are_no_parameters_is_refused_before_anything_runs(scenario, robot, spoil, says):
+    with pytest.raises(DynamicsError, match=says):
+        identify.unseen_errors(spoil(robot.parameter_sets["identified"].vector), robot, scenario)

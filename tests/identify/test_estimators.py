@@ -68,6 +68,15 @@ def test_a_model_that_does_not_run_has_no_pose_distance(seen, asked):
     assert np.isnan(score(seen, asked, wild).position_um)
 
 
+def test_parameters_of_no_model_have_no_pose_distance(seen, asked):
+    """A regression may end at a gain of zero, where it is bounded: its row stands without this distance."""
+    stopped = truth().copy()
+    stopped[65] = 0.0
+    found = score(seen, asked, stopped)
+    assert np.isnan(found.position_um)
+    assert found.gain_distance == pytest.approx(1 / np.sqrt(3))
+
+
 def test_names_and_examinations_that_do_not_exist_are_refused(seen):
     with pytest.raises(ScenarioError, match="unknown estimator 'best'; valid: closed_loop, command_driven"):
         choose(["warm_start", "best"])

@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 
+from dynamics.closed_loop import LoopFailure
+from dynamics.errors import ParameterError
+from identify.errors import EstimationError
 from identify.estimation.identification import identify
 from identify.estimation.pose_prediction import PosePrediction, predict_poses
 from identify.progress import SilentProgress
@@ -10,7 +13,7 @@ from identify.record.recorded_run import recorded_run
 from identify.reporting.run_result import prediction_entry
 from identify.validation import predicted_runs
 from tests.identify.estimator_evidence import truth_of
-from tests.identify.synthetic import quick, rss6, run_plant, truth
+from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
 
 
 def test_normalised_squared_error_is_one_for_errors_of_the_stated_covariance():
@@ -24,17 +27,47 @@ def test_normalised_squared_error_is_one_for_errors_of_the_stated_covariance():
 
 
 def test_where_nothing_can_be_predicted_nothing_is_said():
-    """Too many frames lost to know the sensor's noise; and a model whose loop is unstable."""
-    scenario, known = quick(), np.zeros((67, 67))
-    dark, plant = run_plant(scenario, 0, duration_s=2.0, lost=range(80))
-    good, _ = run_plant(scenario, 0, duration_s=2.0)
-    unstable = truth() * np.where(np.arange(67) >= 64, -1.0, 1.0)
-    for record, parameters in ((dark, truth()), (good, unstable)):
+    """Too many frames lost to know the sensor's noise; and a model whose loop is unstable: the starting guess, which
+    has no friction, at 29 Hz with a frame of latency."""
+    slow = quick(sensor="ctrack780_29hz")
+    unstable, known = rss6().parameter_sets["initial"].vector, np.zeros((67, 67))
+    dark, plant = run_plant(quick(), 0, duration_s=2.0, lost=range(80))
+    good, plant_29hz = run_plant(slow, 0, duration_s=8.0)
+    with pytest.raises(LoopFailure, match="the loop is unstable"):
+        recorded_run(good, rss6(), slow).model_poses(unstable)
+    for scenario, record, parameters, true in (
+        (quick(), dark, truth(), plant), (slow, good, unstable, plant_29hz)
+    ):
         (prediction,) = predicted_runs(rss6(), scenario, [record], parameters, known, 0, SilentProgress())
-        assert prediction.std.shape == (120, 6)
+        assert prediction.std.shape == (record.sizes["time"], 6)
         assert np.isnan(prediction.std).all()
-        figures = prediction_entry(prediction, truth_of(plant))["predicted"]
+        figures = prediction_entry(prediction, truth_of(true))["predicted"]
         assert np.isnan(figures["normalised_squared_error"])
+
+
+def test_what_cannot_be_asked_is_no_prediction_of_nothing():
+    """Another robot, another servo and parameters of no model are errors, as everywhere else."""
+    record, _ = run_plant(quick(), 0, duration_s=1.0)
+
+    def predicted(record, parameters, **scenario):
+        return predicted_runs(
+            rss6(), quick(**scenario), [record], parameters, np.zeros((67, 67)), 0, SilentProgress()
+        )
+
+    with pytest.raises(EstimationError, match="is of robot 'rss7', not of 'rss6'"):
+        predicted(record.assign_attrs(robot="rss7"), truth())
+    with pytest.raises(EstimationError, match=r"made with servo.kp = 0.3, the scenario says 0.2"):
+        predicted(record, truth(), **{"servo.kp": 0.2})
+    with pytest.raises(ParameterError, match=r"platform.mass = -23.5 kg is not allowed"):
+        predicted(record, -truth())
+
+
+def test_a_motion_too_short_to_identify_from_can_be_predicted():
+    """With exactly known parameters what remains is what the servo lets through of the sensor's noise."""
+    record, plant = run_plant(quick(), 0, duration_s=0.5)
+    (prediction,) = predicted_runs(rss6(), quick(), [record], truth(), np.zeros((67, 67)), 0, SilentProgress())
+    np.testing.assert_allclose(prediction.poses[0], plant.pose[0])
+    assert np.all((prediction.std > 0) & (prediction.std < SIGMA))
 
 
 @pytest.mark.slow
