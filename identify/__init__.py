@@ -12,12 +12,20 @@ from identify.errors import IdentifyError
 if TYPE_CHECKING:
     from identify.accuracy.unseen import unseen_errors
     from identify.estimation.identification import IdentificationResult, identify
+    from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
     from identify.experiment.run import run_experiment
+    from identify.record.payload import payload_vector, store_payload
+    from identify.record.recording import build_record
     from identify.scenario import Scenario, load_scenario, scenario_names
 
 _HOME = {
     "IdentificationResult": "identify.estimation.identification",
     "identify": "identify.estimation.identification",
+    "ScaleAnchor": "identify.estimation.scale_anchor",
+    "store_anchor": "identify.estimation.scale_anchor",
+    "build_record": "identify.record.recording",
+    "payload_vector": "identify.record.payload",
+    "store_payload": "identify.record.payload",
     "run_experiment": "identify.experiment.run",
     "Scenario": "identify.scenario",
     "load_scenario": "identify.scenario",
@@ -28,11 +36,16 @@ _HOME = {
 __all__ = [
     "IdentificationResult",
     "IdentifyError",
+    "ScaleAnchor",
     "Scenario",
+    "build_record",
     "identify",
     "load_scenario",
+    "payload_vector",
     "run_experiment",
     "scenario_names",
+    "store_anchor",
+    "store_payload",
     "unseen_errors",
 ]
 

@@ -4,11 +4,14 @@ import re
 import shlex
 import shutil
 import sys
+import textwrap
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import dynamics
+import identify
 from identify import command_line
 from identify.accuracy.saved import read_saved
 from identify.accuracy.table import markdown_table
@@ -17,6 +20,7 @@ from identify.estimators.registry import ESTIMATORS
 from identify.files.result_file import load_result
 from identify.reporting.goals import check_goals
 from identify.reporting.tables import excitation_error_table, goals_table
+from tests.identify.synthetic import SIGMA, quick, run_plant, truth
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -113,6 +117,26 @@ def test_its_export_command_writes_what_mujoco_loads(monkeypatch, capfd, tmp_pat
     mujoco.mj_step(model, data)
     assert model.nbody == 14
     assert np.isfinite(data.qacc).all()
+
+
+def test_its_sample_identifies_from_a_record_of_ones_own():
+    """On arrays of a simulated robot, friction and gains come out as they were put in."""
+    seen, run = run_plant(quick(), seed=2, duration_s=3.0)
+    arrays = {
+        "time": run.time,
+        "asked": np.hstack([seen["reference_position"], seen["reference_orientation"]]),
+        "asked_rate": np.hstack([seen["reference_velocity"], seen["reference_orientation_rate"]]),
+        "commands": run.command,
+        "seen": run.measured,
+        "covariances": np.tile(np.diag(SIGMA**2), (len(run.time), 1, 1)),
+        "ok": run.measured_ok,
+    }
+    sample = README.partition("**A record of your own robot.**")[2].partition("```python\n")[2].partition("```")[0]
+    names = arrays | {"dynamics": dynamics, "identify": identify}
+    exec(textwrap.dedent(sample), names)
+    result = names["result"]
+    assert result.identifiable[52:].all()
+    assert np.all(np.abs(result.estimate - truth())[52:] < 4 * result.std[52:])
 
 
 def test_every_linked_file_exists():

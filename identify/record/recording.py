@@ -55,11 +55,15 @@ def build_record(
     command: ArrayLike,
     scenario_toml: str,
     robot: str,
-    seed: int,
     frame_rate_hz: float,
+    seed: int | None = None,
     title: str = "Visual closed-loop experiment",
 ) -> xr.Dataset:
     """Record of one run: ``time`` (N,) [s], poses, rates and ``command`` (N, 6), covariance (N, 6, 6), ok (N,).
+
+    SI units; the poses, and what is a rate, as CONVENTIONS says. ``command``: joint angles [rad], each from its frame
+    on. Where ``measured_ok`` is 0 the pose was lost, and may be NaN. ``scenario_toml``: timing and servo of the run, as
+    `Scenario.to_toml` gives them. ``seed``: of a simulated run; that of a real robot has none.
 
     Raises:
         RecordError: wrong shapes, numbers that are not finite where a measurement was not lost, or a `measured_ok`
@@ -86,7 +90,7 @@ def build_record(
         "title": title,
         "conventions_text": CONVENTIONS,
         "robot": robot,
-        "seed": np.int64(seed),
+        **({} if seed is None else {"seed": np.int64(seed)}),
         "frame_rate_hz": float(frame_rate_hz),
         "scenario": scenario_toml,
         "software": "; ".join(f"{name} {version}" for name, version in versions().items()),
