@@ -39,3 +39,14 @@ def check_moments(moments: Mapping[str, float]) -> None:
     if moments[largest] > (1 + ROUNDING) * sum(others.values()):
         parts = " + ".join(f"{name} {value:g}" for name, value in others.items())
         raise ValueError(f"{largest} = {moments[largest]:g} kg m2 exceeds {parts} kg m2, as in no rigid body")
+
+
+def check_load_std(name: str, std: float, load_name: str, load: float, unit: str) -> None:
+    """Check how well a figure of a known load is known, by the names of both.
+
+    Raises ValueError where the standard deviation exceeds the figure itself.
+    """
+    if std > load:
+        raise ValueError(
+            f"{name} = {std:g} {unit} exceeds {load_name} = {load:g} {unit}: a load that may be none is not known"
+        )

@@ -4,7 +4,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from identify.scenario_checks import check_moments, check_parameter_names
+from identify.scenario_checks import check_load_std, check_moments, check_parameter_names
 
 FrictionName = Literal["coulomb_viscous", "smoothed", "stribeck"]
 """``coulomb_viscous``: the exact law with stick and slip (eq. 24); ``smoothed``: tanh(theta_dot / v_s);
@@ -171,21 +171,43 @@ class Identification(Section):
     @model_validator(mode="after")
     def _anchor_measures_what_is_stated(self) -> "Identification":
         if self.anchor_std is not None and self.scale_anchor in ("payload", "prior"):
-            raise ValueError(f"anchor_std = {self.anchor_std:g}: the anchor {self.scale_anchor} measures no parameter")
+            hint = "; payload.mass_std_kg says how well its load is known" if self.scale_anchor == "payload" else ""
+            raise ValueError(
+                f"anchor_std = {self.anchor_std:g}: the anchor {self.scale_anchor} measures no parameter{hint}"
+            )
         return self
 
 
+LOAD_UNITS = {"mass": "kg", "Ixx": "kg_m2", "Iyy": "kg_m2", "Izz": "kg_m2"}
+"""The figures of a load, with the units that end their keys."""
+
+
 class Payload(Section):
-    """The known load that the platform carries in the second run, where the scale anchor is a payload."""
+    """The known load that the platform carries in the second run, where the scale anchor is a payload.
+
+    A load that is a percent heavier than stated makes all parameters a percent too small, and no residual tells. So
+    state how well it is known: intervals allow for it, and a synthetic experiment draws its true load accordingly.
+    """
 
     mass_kg: float = _quantity(8.0, "kg", "mass, its centre in the origin of the platform frame", gt=0)
     Ixx_kg_m2: float = _quantity(0.02, "kg m2", "moment of inertia about the platform's x axis", ge=0)
     Iyy_kg_m2: float = _quantity(0.02, "kg m2", "moment of inertia about the platform's y axis", ge=0)
     Izz_kg_m2: float = _quantity(0.04, "kg m2", "moment of inertia about the platform's z axis", ge=0)
+    mass_std_kg: float = _quantity(0.0, "kg", "standard deviation of the mass, as weighed; 0: exactly known", ge=0)
+    Ixx_std_kg_m2: float = _quantity(0.0, "kg m2", "standard deviation of Ixx_kg_m2", ge=0)
+    Iyy_std_kg_m2: float = _quantity(0.0, "kg m2", "standard deviation of Iyy_kg_m2", ge=0)
+    Izz_std_kg_m2: float = _quantity(0.0, "kg m2", "standard deviation of Izz_kg_m2", ge=0)
 
     @model_validator(mode="after")
     def _can_exist(self) -> "Payload":
         check_moments({name: getattr(self, name) for name in ("Ixx_kg_m2", "Iyy_kg_m2", "Izz_kg_m2")})
+        return self
+
+    @model_validator(mode="after")
+    def _is_known(self) -> "Payload":
+        for figure, unit in LOAD_UNITS.items():
+            name, std = f"{figure}_{unit}", f"{figure}_std_{unit}"
+            check_load_std(std, getattr(self, std), name, getattr(self, name), unit.replace("_", " "))
         return self
 
 

@@ -5,7 +5,8 @@ closes its own loop cannot follow (its residuals are coloured, and stick-slip ma
 experiment is repeated on the identified model with drawn noise: each draw gives residuals r, and their scores J^T r
 spread as those of the real record do. With W the information of data and prior, the covariance of the estimate is
 W^-1 (cov(J^T r) + prior information) W^-1. A model driven by the logged commands has white residuals, and W^-1 is all.
-Where either misses the record by more than noise explains, what its error does to the scores is added (`misfit`).
+Where either misses the record by more than noise explains, what its error does to the scores is added (`misfit`); and
+what the error of a load does that is not known exactly (`load_error`).
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +18,7 @@ from dynamics.closed_loop import ClosedLoopRun, LoopFailure, simulate
 from identify.arrays import Array
 from identify.cores import cores
 from identify.errors import EstimationError
+from identify.estimation.load_error import load_score_covariance
 from identify.estimation.misfit import Misfit, coloured_score_covariance, misfit_of_white
 from identify.estimation.output_error import OutputErrorProblem
 from identify.progress import Advance
@@ -68,6 +70,8 @@ def estimate_uncertainty(
     if misfit.significant:
         model = sum(coloured_score_covariance(r, j, run.ok) for (r, j), run in zip(found, problem.runs, strict=True))
         scores = scores + misfit.share_of_model * model
+    if any(run.payload_std.any() for run in problem.runs):
+        scores = scores + load_score_covariance(problem.runs, [j for _, j in found])
     inverse = np.linalg.inv(information + prior)
     covariance = inverse @ (scores + prior) @ inverse
     return Uncertainty((covariance + covariance.T) / 2, information, np.asarray(gradient), misfit, unstable)

@@ -5,7 +5,8 @@ Multiplying every dynamic parameter and the three PID gains by the same number c
 
     platform_mass   the platform was weighed
     joint_gain      the proportional gain of the joint PID is known
-    payload         a second run with a known load on the platform (`identify.record.payload`)
+    payload         a second run with a known load on the platform (`identify.record.payload`); the standard deviations
+                    of the load stand with that run, and widen the intervals (`load_error`)
     prior           nothing but the starting guess, with its standard deviations
 """
 
@@ -54,7 +55,8 @@ def measured_anchor(name: str, std: float | None, true: Array, rng: np.random.Ge
         raise ScenarioError(f"unknown identification.scale_anchor {name!r}; valid: {', '.join(ANCHORS)}")
     if name not in MEASURED_PARAMETER:
         if std is not None:
-            raise ScenarioError(f"identification.anchor_std = {std:g}: the anchor {name} measures no parameter")
+            hint = "; payload.mass_std_kg says how well its load is known" if name == "payload" else ""
+            raise ScenarioError(f"identification.anchor_std = {std:g}: the anchor {name} measures no parameter{hint}")
         return ScaleAnchor(name)
     spread = DEFAULT_STD[name] if std is None else std
     return ScaleAnchor(name, float(true[index_of(MEASURED_PARAMETER[name])] + spread * rng.standard_normal()), spread)

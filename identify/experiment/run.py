@@ -2,7 +2,8 @@
 
 Random streams of one seed: (0) exciting trajectories, (1) unseen trajectories, (2) the sensor's teaching, (3) the scale
 anchor, (4, run) the sensor's noise in each run, (5, run) the latency of its frames (the run under a payload has a
-number beyond all others), (6, run) the noise in what is predicted of it.
+number beyond all others), (6, run) the noise in what is predicted of it, (8) the true load. `identify.variation` takes
+(7).
 """
 
 from dataclasses import dataclass
@@ -19,17 +20,18 @@ from identify.estimation.loop_parameters import NAMES, starting_guess
 from identify.estimation.scale_anchor import measured_anchor, store_anchor
 from identify.excitation import design_trajectories
 from identify.experiment.plant import mismatch, plant_robot, simulate_plant
+from identify.experiment.platform_load import PlatformLoad, drawn_load
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, frame_latencies, make_sensor
 from identify.experiment.truth import build_truth
 from identify.progress import Advance, Progress, SilentProgress
 from identify.record import recording
 from identify.record.loop_setup import frame_times, reference_motion
-from identify.record.payload import payload_vector, store_payload
+from identify.record.payload import store_payload
 from identify.record.recorded_robot import store_robot
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory, check_travel
 
-TEACHING, ANCHOR, NOISE, LATENCY, PREDICTION = 2, 3, 4, 5, 6
+TEACHING, ANCHOR, NOISE, LATENCY, PREDICTION, LOAD = 2, 3, 4, 5, 6, 8
 PAYLOAD_RUN = 1_000_000
 
 
@@ -50,7 +52,8 @@ def run_experiment(
 ) -> xr.Dataset:
     """Choose the exciting trajectory, run it with images in the loop, and return the record.
 
-    payload: with the scenario's known load on the platform; such a record beside one without it shows the scale.
+    payload: with the scenario's known load on the platform; such a record beside one without it shows the scale. The
+    record holds the load as stated, the truth as drawn from its standard deviations.
 
     Record and truth are also written as netCDF: to `path`, or to the user's cache folder; attribute `path` says where
     (`identify.experiment.truth.read_truth(path)` opens the truth).
@@ -107,14 +110,8 @@ def excitation_run(
     times = frame_times(scenario, scenario.excitation.duration_s)
     if not payload:
         return run_plant(scenario, robot, sensor, trajectory, times, seed, 0, advance)
-    load = scenario_payload(scenario)
+    load = drawn_load(scenario, np.random.default_rng(stream_seed(seed, LOAD)))
     return run_plant(scenario, robot, sensor, trajectory, times, seed, PAYLOAD_RUN, advance, load)
-
-
-def scenario_payload(scenario: Scenario) -> np.ndarray:
-    """What the scenario's load adds to the parameters (67,)."""
-    load = scenario.payload
-    return payload_vector(load.mass_kg, (load.Ixx_kg_m2, load.Iyy_kg_m2, load.Izz_kg_m2))
 
 
 def run_plant(
@@ -126,10 +123,10 @@ def run_plant(
     seed: int,
     run: int,
     advance: Advance = lambda n=1: None,
-    load: np.ndarray | None = None,
+    load: PlatformLoad | None = None,
 ) -> Experiment:
     """Run the plant of the nominal `robot` along a trajectory at the frames `times` (N,) [s]; `run`: number of the run
-    (0: excitation); `load` (67,): what a known load on the platform adds to its parameters.
+    (0: excitation); `load`: what the platform carries.
 
     Raises TrajectoryError before the run when the trajectory leaves the travel, LoopFailure when the loop is unstable.
     """
@@ -137,15 +134,17 @@ def run_plant(
     reference = reference_motion(trajectory, times)
     parameters = true_parameters(robot, scenario)
     eye = SensorInLoop(sensor, plant_robot(scenario, robot), stream_seed(seed, NOISE, run), advance)
-    loaded = parameters if load is None else parameters + load
+    loaded = parameters if load is None else parameters + load.true
     latencies = frame_latencies(scenario, len(times), np.random.default_rng(stream_seed(seed, LATENCY, run)))
     done = simulate_plant(scenario, robot, loaded, reference, RateSensor(eye.measure), latencies)
     record = _record(scenario, robot, reference, done, eye, seed)
     settings, rng = scenario.identification, np.random.default_rng(stream_seed(seed, ANCHOR))
     store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, parameters, rng))
+    truth = _truth(scenario, robot, done, parameters)
     if load is not None:
-        store_payload(record, load)
-    return Experiment(record, _truth(scenario, robot, done, parameters))
+        store_payload(record, load.stated, load.std)
+        store_payload(truth, load.true)
+    return Experiment(record, truth)
 
 
 def true_parameters(robot: Robot, scenario: Scenario) -> np.ndarray:

@@ -1,7 +1,8 @@
 """A known load on the platform: the same motion with and without it shows the scale of all parameters.
 
 The load is a rigid body whose centre lies in the origin of the platform frame; it adds its mass and its principal
-inertias to the platform's. Its figures stand with the record, as the experimenter's knowledge.
+inertias to the platform's. Its figures stand with the record, as the experimenter's knowledge, and beside each its
+standard deviation: how well it was weighed or computed. Records that state the same figures carry the same load.
 """
 
 import numpy as np
@@ -10,7 +11,7 @@ import xarray as xr
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.estimation.loop_parameters import NAMES, index_of
-from identify.scenario_checks import check_moments
+from identify.scenario_checks import check_load_std, check_moments
 
 ADDED = {
     "payload_mass": ("platform.mass", "kg"),
@@ -18,20 +19,23 @@ ADDED = {
     "payload_Iyy": ("platform.Iyy", "kg m2"),
     "payload_Izz": ("platform.Izz", "kg m2"),
 }
-"""Attributes of a record, and the parameter and unit to which each adds."""
+"""Attributes of a record, and the parameter and unit to which each adds; `payload_mass_std` is the deviation of one."""
 
 
 def payload_vector(mass_kg: float, inertia_kg_m2: tuple[float, float, float]) -> Array:
-    """What a load adds to the parameters (67,)."""
+    """What a load adds to the parameters (67,); or, of standard deviations, the deviations of that."""
     added = np.zeros(len(NAMES))
     for (parameter, _), value in zip(ADDED.values(), (mass_kg, *inertia_kg_m2), strict=True):
         added[index_of(parameter)] = value
     return added
 
 
-def store_payload(record: xr.Dataset, payload: Array) -> None:
-    """Keep a load (67,) with the record made under it."""
-    record.attrs |= {name: float(payload[index_of(parameter)]) for name, (parameter, _) in ADDED.items()}
+def store_payload(record: xr.Dataset, payload: Array, std: Array | None = None) -> None:
+    """Keep a load (67,) with the record made under it, and its standard deviations (67,); None: known exactly."""
+    deviations = np.zeros(len(NAMES)) if std is None else std
+    for name, (parameter, _) in ADDED.items():
+        place = index_of(parameter)
+        record.attrs |= {name: float(payload[place]), f"{name}_std": float(deviations[place])}
 
 
 def recorded_payload(record: xr.Dataset) -> Array:
@@ -40,17 +44,38 @@ def recorded_payload(record: xr.Dataset) -> Array:
     Raises:
         RecordError: some but not all of its figures, one that is no finite number >= 0, or moments of no body.
     """
-    given = [name for name in ADDED if name in record.attrs]
+    given = [name for name in ADDED if name in record.attrs or f"{name}_std" in record.attrs]
     if not given:
         return np.zeros(len(NAMES))
     added = np.zeros(len(NAMES))
     for name, (parameter, unit) in ADDED.items():
-        value = record.attrs.get(name)
-        if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.number) or not 0 <= value < 1e6:
-            raise RecordError(f"the record's attribute {name} is {value!r}, must be a number >= 0 in {unit}")
-        added[index_of(parameter)] = float(value)
+        added[index_of(parameter)] = _not_negative(name, record.attrs.get(name), unit)
     try:
         check_moments({name: float(record.attrs[name]) for name in ADDED if name != "payload_mass"})
     except ValueError as error:
         raise RecordError(f"the record's attribute {error}") from None
     return added
+
+
+def recorded_payload_std(record: xr.Dataset) -> Array:
+    """Standard deviations (67,) of a record's load; zero where it states none.
+
+    Raises:
+        RecordError: as `recorded_payload`; or a deviation that is no finite number >= 0, or exceeds its figure.
+    """
+    load, deviations = recorded_payload(record), np.zeros(len(NAMES))
+    for name, (parameter, unit) in ADDED.items():
+        place = index_of(parameter)
+        deviations[place] = _not_negative(f"{name}_std", record.attrs.get(f"{name}_std", 0.0), unit)
+        try:
+            check_load_std(f"{name}_std", deviations[place], name, load[place], unit)
+        except ValueError as error:
+            raise RecordError(f"the record's attribute {error}") from None
+    return deviations
+
+
+def _not_negative(name: str, value: object, unit: str) -> float:
+    """An attribute's value, a finite number >= 0."""
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.number) or not 0 <= value < 1e6:
+        raise RecordError(f"the record's attribute {name} is {value!r}, must be a number >= 0 in {unit}")
+    return float(value)

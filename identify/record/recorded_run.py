@@ -14,7 +14,7 @@ from dynamics.closed_loop import ClosedLoopRun, LoopSettings, Reference, simulat
 from identify.arrays import Array
 from identify.files.dataset import check_variables
 from identify.record.loop_setup import model_settings
-from identify.record.payload import recorded_payload
+from identify.record.payload import recorded_payload, recorded_payload_std
 from identify.record.record_checks import (
     check_channels,
     check_good_share,
@@ -36,7 +36,7 @@ class RecordedRun:
 
     measured: poses (N, 6), NaN where lost; ok (N,) bool; covariance (6, 6) of one measured pose; logged: the joint
     commands (N, 6) as they were given; driven: whether the model's joints get these, or its own servo acts; payload
-    (67,): what a known load on the platform adds to the parameters.
+    (67,): what a known load on the platform adds to the parameters, with standard deviations payload_std (67,).
     """
 
     robot: Robot
@@ -47,6 +47,7 @@ class RecordedRun:
     covariance: Array
     logged: Array
     payload: Array
+    payload_std: Array
     driven: bool = False
 
     def driven_by_commands(self) -> "RecordedRun":
@@ -158,4 +159,5 @@ def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
         covariance=checked_covariance(record["measured_covariance"].values, ok),
         logged=np.asarray(record["command"].values, dtype=float),
         payload=recorded_payload(record),
+        payload_std=recorded_payload_std(record),
     )

@@ -204,6 +204,21 @@ def test_a_load_that_no_body_has_is_refused_and_a_flat_one_is_not():
     assert load_scenario("paper").with_overrides(flat).payload.Izz_kg_m2 == pytest.approx(0.3)
 
 
+def test_a_load_is_known_to_a_deviation_between_none_and_itself():
+    assert "payload.mass_std_kg = -0.1 [kg]: input should be greater than or equal to 0" in refusal(
+        {"payload.mass_std_kg": -0.1}
+    )
+    assert "payload.mass_std_kg = nan [kg]: input should be a finite number" in refusal(
+        {"payload.mass_std_kg": float("nan")}
+    )
+    assert "payload: mass_std_kg = 9 kg exceeds mass_kg = 8 kg" in refusal({"payload.mass_std_kg": 9.0})
+    message = refusal({"payload.Izz_std_kg_m2": 0.05})
+    assert "payload: Izz_std_kg_m2 = 0.05 kg m2 exceeds Izz_kg_m2 = 0.04 kg m2" in message
+    assert "payload.mass_std_kg" in refusal(
+        {"identification.scale_anchor": "payload", "identification.anchor_std": 0.1}
+    )
+
+
 def test_smoothed_friction_needs_its_velocity_and_the_exact_law_has_none():
     assert "smoothing_velocity_rad_s" in refusal({"plant.friction": "smoothed"})
     assert "smoothing_velocity_rad_s" in refusal({"model.smoothing_velocity_rad_s": 0.001})

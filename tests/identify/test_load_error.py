@@ -1,0 +1,202 @@
+"""How well a known load is known: what its error does to the estimate, and what the intervals say of it.
+
+The oracle is the estimator with its load stated wrong on purpose: how far its optimum moves. The load decides the
+common factor of all masses and gains; so a gain is off by the load's relative error.
+"""
+
+import numpy as np
+import pytest
+
+from identify.errors import EstimationError, RecordError
+from identify.estimation.estimate_covariance import estimate_uncertainty
+from identify.estimation.identification import identify, output_error_problem
+from identify.estimation.loop_parameters import NAMES, index_of
+from identify.estimation.output_error_search import search
+from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
+from identify.experiment.platform_load import drawn_load, scenario_payload, scenario_payload_std
+from identify.experiment.run import excitation_run
+from identify.experiment.truth import true_poses
+from identify.record.payload import recorded_payload_std, store_payload
+from identify.record.recording import poses
+from identify.studies.row_drawn_sensor import DrawnSensor
+from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, trajectory, truth
+
+MASS, GAIN = index_of("platform.mass"), index_of("joint_pid.lp")
+JOINTS = [place for place, name in enumerate(NAMES) if name.startswith("joint")]
+SHARE = 0.005
+"""Relative standard deviation of the load's mass."""
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    tight = {"identification.cost_tolerance": 1e-8, "identification.parameter_tolerance": 1e-5}
+    return quick(**tight, **{"identification.method": "command_driven", "payload.mass_std_kg": SHARE * 8.0})
+
+
+@pytest.fixture(scope="module")
+def records(scenario):
+    """A bare record, and one under the scenario's load, as stated."""
+    load = scenario_payload(scenario)
+    bare, _ = run_plant(scenario, seed=1, duration_s=3.0)
+    heavy, _ = run_plant(scenario, seed=2, parameters=truth() + load, duration_s=3.0)
+    store_anchor(bare, ScaleAnchor("payload"))
+    store_payload(heavy, load, scenario_payload_std(scenario))
+    return [bare, heavy]
+
+
+def stating(records, scenario, load, std=None):
+    """The problem of records whose last was made under a stated load (67,), known to std (67,)."""
+    restated = records[1].copy()
+    store_payload(restated, load, std)
+    return output_error_problem([records[0], restated], rss6(), scenario).driven_by_commands()
+
+
+def covariance(problem, parameters):
+    return estimate_uncertainty(problem, parameters, np.random.default_rng(0)).covariance
+
+
+@pytest.fixture(scope="module")
+def moved(records, scenario):
+    """Where the optimum lies (67,), and how far it moves where the load is stated a standard deviation too heavy."""
+    load, std = scenario_payload(scenario), scenario_payload_std(scenario)
+    heavier, lighter = (
+        search(stating(records, scenario, load + sign * std), truth(), scenario, lambda n=1: None).parameters
+        for sign in (1, -1)
+    )
+    return (heavier + lighter) / 2, (heavier - lighter) / 2
+
+
+def test_the_intervals_allow_for_how_far_a_wrong_load_moves_the_estimate(records, scenario, moved):
+    """Covariance of friction and gains, with all their correlations; all members of the scale move together."""
+    at, shift = moved
+    load, std = scenario_payload(scenario), scenario_payload_std(scenario)
+    known, weighed = (covariance(stating(records, scenario, load, one), at) for one in (None, std))
+    added, expected = (weighed - known)[np.ix_(JOINTS, JOINTS)], np.outer(shift[JOINTS], shift[JOINTS])
+    assert np.abs(added - expected).max() < 0.02 * np.abs(expected).max()
+    assert np.sqrt(np.diag(added)) == pytest.approx(np.abs(shift[JOINTS]), rel=0.02)
+
+
+def test_a_gain_errs_as_the_load_does(records, scenario, moved):
+    """The load alone shows the scale: its relative error is that of the gain, beside what noise leaves."""
+    at, shift = moved
+    assert shift[GAIN] / truth()[GAIN] == pytest.approx(SHARE, rel=0.05)
+    load, std = scenario_payload(scenario), scenario_payload_std(scenario)
+    relative = [
+        np.sqrt(covariance(stating(records, scenario, load, deviation), at)[GAIN, GAIN]) / truth()[GAIN]
+        for deviation in (np.zeros(67), std)
+    ]
+    assert relative[1] == pytest.approx(np.hypot(relative[0], SHARE), rel=0.05)
+    assert relative[1] > 1.4 * relative[0]
+
+
+def test_records_under_the_same_load_share_its_error_and_others_do_not(records, scenario):
+    """A second record under the load repeats its error; under another load, known as well, the errors average."""
+    load, std = scenario_payload(scenario), scenario_payload_std(scenario)
+
+    def added(other, deviation):
+        again, second = (records[1].copy() for _ in range(2))
+        store_payload(again, load, deviation)
+        store_payload(second, other, deviation)
+        problem = output_error_problem([records[0], again, second], rss6(), scenario).driven_by_commands()
+        return covariance(problem, truth())[GAIN, GAIN]
+
+    exact = added(load, np.zeros(67))
+    same, apart = (added(other, std) - exact for other in (load, load * (1 + 1e-9)))
+    assert apart == pytest.approx(same / 2, rel=1e-3)
+
+
+def test_an_exactly_known_load_leaves_every_digit_as_it_was(records, scenario):
+    """Stated with a deviation of zero, or with none, as records of before have it."""
+    silent = records[1].copy()
+    store_payload(silent, scenario_payload(scenario))
+    stated = covariance(output_error_problem([records[0], silent], rss6(), scenario).driven_by_commands(), truth())
+    silent.attrs = {name: value for name, value in silent.attrs.items() if not name.endswith("_std")}
+    unsaid = output_error_problem([records[0], silent], rss6(), scenario).driven_by_commands()
+    assert np.array_equal(covariance(unsaid, truth()), stated)
+    exact = drawn_load(quick(), np.random.default_rng(0))
+    assert np.array_equal(exact.true, scenario_payload(quick()))
+    assert not exact.std.any()
+
+
+@pytest.mark.parametrize(
+    ("attributes", "says"),
+    [
+        ({"payload_mass_std": -0.04}, r"payload_mass_std is -0.04, must be a number >= 0 in kg"),
+        ({"payload_mass_std": np.nan}, r"payload_mass_std is nan, must be a number >= 0 in kg"),
+        ({"payload_mass_std": "0.04"}, r"payload_mass_std is '0.04', must be a number >= 0 in kg"),
+        ({"payload_mass_std": 9.0}, r"payload_mass_std = 9 kg exceeds payload_mass = 8 kg"),
+        ({"payload_Izz_std": 0.05}, r"payload_Izz_std = 0.05 kg m2 exceeds payload_Izz = 0.04 kg m2"),
+    ],
+    ids=["negative", "NaN", "text", "more than the load", "moment"],
+)
+def test_a_deviation_that_cannot_be_is_refused_with_its_value_and_limit(records, scenario, attributes, says):
+    wrong = records[1].assign_attrs(attributes)
+    with pytest.raises(RecordError, match=says):
+        identify([records[0], wrong], rss6(), scenario)
+
+
+def test_a_deviation_without_its_load_is_refused(records):
+    alone = records[0].assign_attrs(payload_mass_std=0.04)
+    with pytest.raises(RecordError, match="payload_mass is None, must be a number >= 0 in kg"):
+        recorded_payload_std(alone)
+
+
+def test_a_deviation_does_not_make_a_load_of_none(records, scenario):
+    """Two records under the same load, known differently well, still do not show the scale."""
+    other = records[1].assign_attrs(payload_mass_std=0.01)
+    store_anchor(other, ScaleAnchor("payload"))
+    with pytest.raises(EstimationError, match="2 records have all the same load"):
+        identify([other, records[1]], rss6(), scenario)
+
+
+def test_drawn_loads_spread_as_stated_and_are_never_negative(scenario):
+    """Mean and spread of many: of a weighed mass, and of one hardly known, which normal deviations would make none."""
+    rng = np.random.default_rng(0)
+    masses = np.array([drawn_load(scenario, rng).true[MASS] for _ in range(2000)])
+    assert masses.std() == pytest.approx(0.04, rel=0.07)
+    assert masses.mean() == pytest.approx(8.0, abs=4 * 0.04 / np.sqrt(2000))
+    vague = quick(**{"payload.mass_std_kg": 8.0, "payload.Izz_std_kg_m2": 0.04})
+    drawn = np.array([drawn_load(vague, rng).true for _ in range(200)])
+    assert (drawn >= 0).all()
+    assert np.flatnonzero(np.ptp(drawn, axis=0)).tolist() == [MASS, index_of("platform.Izz")]
+
+
+def test_an_experiment_states_the_load_and_keeps_the_drawn_one_in_its_truth(scenario):
+    """A stream of its own: the bare run is the same to the last digit, and so is the noise of the loaded one."""
+    sensor, short = DrawnSensor(np.diag(SIGMA**2)), {"excitation.duration_s": 1.0}
+    vague, exact = scenario.with_overrides(short), scenario.with_overrides(short | {"payload.mass_std_kg": 0.0})
+
+    def run(one, seed=0, payload=True):
+        return excitation_run(one, rss6(), sensor, trajectory(0), seed, payload=payload)
+
+    heavy, known = run(vague), run(exact)
+    assert heavy.record.attrs["payload_mass"] == known.record.attrs["payload_mass"] == 8.0
+    assert heavy.record.attrs["payload_mass_std"] == pytest.approx(0.04)
+    assert known.truth.attrs["payload_mass"] == 8.0
+    drawn = heavy.truth.attrs["payload_mass"]
+    assert 0 < abs(drawn - 8.0) < 4 * 0.04
+    assert run(vague).truth.attrs["payload_mass"] == drawn != run(vague, seed=1).truth.attrs["payload_mass"]
+    noise = [poses(one.record, "measured") - true_poses(one.truth) for one in (heavy, known)]
+    assert noise[0] == pytest.approx(noise[1], abs=1e-15)
+    assert not np.array_equal(true_poses(heavy.truth), true_poses(known.truth))
+    np.testing.assert_array_equal(*(true_poses(run(one, payload=False).truth) for one in (vague, exact)))
+    np.testing.assert_array_equal(*(one.truth["parameter_value"].values for one in (heavy, known)))
+
+
+@pytest.mark.slow
+def test_gains_miss_the_truth_as_often_as_they_say_where_the_load_is_drawn(scenario):
+    """Whole experiments, each with noise and a load of its own: errors of the gain in standard deviations have the
+    variance one (99.9 % of chance); with the load called exact, twice the deviation and more."""
+    sensor, count, share = DrawnSensor(np.diag(SIGMA**2)), 16, 0.01
+    weighed = scenario.with_overrides({"payload.mass_std_kg": share * 8.0, "identification.scale_anchor": "payload"})
+    errors, exact = [], []
+    for seed in range(count):
+        bare, heavy = (
+            excitation_run(weighed, rss6(), sensor, trajectory(0), seed, payload=payload) for payload in (False, True)
+        )
+        result = identify([bare.record, heavy.record], rss6(), weighed)
+        error = result.estimate[GAIN] - truth()[GAIN]
+        errors.append(error / result.std[GAIN])
+        exact.append(error / np.sqrt(result.std[GAIN] ** 2 - (share * truth()[GAIN]) ** 2))
+    assert 3.94 / count < np.mean(np.square(errors)) < 39.3 / count, errors  # chi-square of 16, 0.1 % to 99.9 %
+    assert np.sqrt(np.mean(np.square(exact))) > 2, exact
