@@ -8,10 +8,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from dynamics.geometry import Rss6Geometry
-from dynamics.jacobians import crank_leverage, joint_jacobian, joint_row, link_angular_rows, link_row
-from dynamics.kinematics import LegVectors, leg_vectors, platform_arms
-from dynamics.rotation import pose_rate_to_twist
+from dynamics.jacobians import crank_leverage, joint_row, link_angular_rows, link_row
+from dynamics.kinematics import LegVectors
 
 
 @dataclass(frozen=True)
@@ -85,31 +83,6 @@ def link_centre_rows_rate(moving: MovingLeg) -> ca.SX:
 def link_jacobian_rate(moving: MovingLeg) -> ca.SX:
     """J_b_dot (6, 6) (eq. A4)."""
     return ca.vertcat(link_centre_rows_rate(moving), link_angular_rows_rate(moving))
-
-
-def euler_rate_jacobian_rate(angles: ca.SX, rates: ca.SX) -> ca.SX:
-    """J_e_dot (3, 3), 1/s, of Euler angles and their rates; J_e_dot phi_dot is what eq. 38 adds to J_e phi_ddot."""
-    ca_, cb, sa, sb = ca.cos(angles[0]), ca.cos(angles[1]), ca.sin(angles[0]), ca.sin(angles[1])
-    da, db = rates[0], rates[1]
-    return ca.vertcat(
-        ca.horzcat(0, 0, cb * db),
-        ca.horzcat(0, -sa * da, sb * sa * db - cb * ca_ * da),
-        ca.horzcat(0, ca_ * da, -sb * ca_ * db - cb * sa * da),
-    )
-
-
-def joint_jacobian_rate(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX) -> ca.SX:
-    """J_ad_dot (6, 6): theta_ddot = J_ad twist_dot + J_ad_dot twist."""
-    legs, arms = leg_vectors(geometry, pose), platform_arms(geometry, pose)
-    return ca.vertcat(*[joint_row_rate(moving_leg(leg, arm, twist)) for leg, arm in zip(legs, arms, strict=True)])
-
-
-def pose_jacobian_rate(geometry: Rss6Geometry, pose: ca.SX, pose_rate: ca.SX) -> ca.SX:
-    """J_theta_dot (6, 6), 1/s, of pose and pose rate (6,): the derivative of eq. 29."""
-    to_twist = pose_rate_to_twist(pose)
-    to_twist_rate = ca.diagcat(ca.SX.zeros(3, 3), euler_rate_jacobian_rate(pose[3:6], pose_rate[3:6]))
-    rate = joint_jacobian_rate(geometry, pose, to_twist @ pose_rate)
-    return rate @ to_twist + joint_jacobian(geometry, pose) @ to_twist_rate
 
 
 def _tip_row_rate(moving: MovingLeg) -> ca.SX:

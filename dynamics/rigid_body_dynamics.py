@@ -72,16 +72,6 @@ def mass_matrix(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
     return symmetric_from_lower(total)
 
 
-def virtual_work_mass_matrix(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
-    """M (6, 6) as eq. 23 prints it, the sum of J^T M_body J over the bodies; thrice the operations of `mass_matrix`."""
-    total = _body_mass(rotation_matrix(pose[3:6]), rigid[0:4])
-    for index, (leg, arm) in enumerate(zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True)):
-        crank, link = crank_jacobian(leg, arm), link_jacobian(leg, arm)
-        total += crank.T @ _body_mass(_crank_frame(leg), crank_parameters(rigid, index)) @ crank
-        total += link.T @ _body_mass(_link_frame(leg), link_parameters(rigid, index)) @ link
-    return total
-
-
 def coriolis_matrix(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, rigid: ca.SX) -> ca.SX:
     """C (6, 6) of eq. 23: C twist is the Coriolis and centrifugal wrench. Jacobian rates in closed form (eq. A1-A6)."""
     total = _body_coriolis(rotation_matrix(pose[3:6]), rigid[0:4], twist[3:6])

@@ -52,11 +52,6 @@ class WorkspaceMeasures:
         return np.asarray((self.reach_margin > 0).all(axis=1))
 
     @property
-    def travel_distance(self) -> np.ndarray:
-        """Angle left to the travel limit (N, 6), rad; negative beyond it."""
-        return self.travel_limit - np.abs(self.theta)
-
-    @property
     def travel_share(self) -> np.ndarray:
         """Largest |theta| of the six cranks over the travel limit (N,)."""
         return np.asarray(np.abs(self.theta).max(axis=1) / self.travel_limit)
