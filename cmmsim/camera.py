@@ -74,18 +74,6 @@ class PinholeCamera:
         """Whether pixels (..., 2) lie inside the image."""
         return np.all((pixels > -0.5) & (pixels < (self.width - 0.5, self.height - 0.5)), axis=-1)
 
-    def projection_jacobian(self, points: Array) -> Array:
-        """Derivative (..., 2, 3) of the pixel by the point (..., 3) in camera axes, px/m."""
-        x, y, z = np.moveaxis(points, -1, 0)
-        focal_x, focal_y = self.focal_px, self.focal_px * self.aspect
-        jacobian = np.zeros((*points.shape[:-1], 2, 3))
-        jacobian[..., 0, 0], jacobian[..., 1, 1] = focal_x / z, focal_y / z
-        jacobian[..., 0, 2] = -focal_x * x / z**2
-        jacobian[..., 1, 2] = -focal_y * y / z**2
-        if self.distortion.is_zero:
-            return jacobian
-        return self.distortion_jacobian(self.ideal.project(points)[0]) @ jacobian
-
     def distort(self, ideal: Array) -> tuple[Array, NDArrayBool]:
         """Pixels (..., 2) of the image for ideal pixels (..., 2), and whether the distortion model holds there."""
         if self.distortion.is_zero:

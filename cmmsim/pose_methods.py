@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from .marked_body import MarkedBody
@@ -43,4 +41,3 @@ def move_origin(frame: Array, covariance: Array, origin: Array) -> Array:
 
 
 METHODS: tuple[str, ...] = ("registration", "planes")
-PoseMethod = Callable[[StickerObservation, MarkedBody, Array], Solution]

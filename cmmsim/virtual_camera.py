@@ -66,10 +66,6 @@ class VirtualStereoCamera:
         sides = [Side(*side) for side in zip(self._rig.cameras, placed, corners, strict=True)]
         return np.stack(self._formation.windows(sides, size, supersampling))
 
-    def whole_radiance(self, side: int, bodies: Array, supersampling: int) -> NDArray[np.float32]:
-        """Radiance (height, width) of one whole image of bodies (b,4,4) that stand still."""
-        return self.whole_exposure(side, [bodies], supersampling)
-
     def whole_exposure(self, side: int, moments: Sequence[Array], supersampling: int) -> NDArray[np.float32]:
         """Mean radiance (height, width) of one whole image over the moments of an exposure."""
         return whole_image(self._formation, self._rig.cameras[side], moments, supersampling)

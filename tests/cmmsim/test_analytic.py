@@ -95,7 +95,7 @@ def test_both_renderers_show_the_same_image(analytic, taught):
         bodies = [np.concatenate([b, [c @ place]]) for b, c in
                   zip(placed_at(sensor, sensor.home), [m @ sensor._camera_from_base for m in sensor.rig.from_camera],
                       strict=True)]
-        images.append(sensor._camera.whole_radiance(0, bodies[0], 6))
+        images.append(sensor._camera.whole_exposure(0, [bodies[0]], 6))
     gap = np.abs(images[0] - images[1])
     assert (gap > 0.02).sum() < 6000  # edges of bodies, of 3 million pixels
     assert gap.mean() < 1e-4
@@ -107,7 +107,7 @@ def test_windows_are_cut_out_of_the_whole_image(analytic):
     points = apply(placed[0][0], analytic._scene[0].sticker_places)
     corners = np.rint(CAMERA.project(points)[0] - 5.5).astype(int)
     windows = analytic._camera.radiance(placed, np.stack([corners, corners]), 12, 6)[0]
-    image = analytic._camera.whole_radiance(0, placed[0], 6)
+    image = analytic._camera.whole_exposure(0, [placed[0]], 6)
     for (x, y), window in zip(corners, windows, strict=True):
         np.testing.assert_allclose(image[y:y + 12, x:x + 12], window, atol=1e-6)
 

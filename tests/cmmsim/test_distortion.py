@@ -34,11 +34,9 @@ def test_projection_is_that_of_opencv(name):
     rng = np.random.default_rng(1)
     points = rng.uniform([-0.6, -0.45, 1.4], [0.6, 0.45, 2.2], (200, 3))
     pixels, inside = camera.project(points)
-    expected, derivative = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, np.array(LENSES[name]))
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, np.array(LENSES[name]))
     np.testing.assert_allclose(pixels, expected.reshape(-1, 2), rtol=0.0, atol=1e-9)
     assert inside.mean() > 0.5
-    translation = derivative[:, 3:6].reshape(-1, 2, 3)  # a shift of the camera frame is a shift of the point
-    np.testing.assert_allclose(camera.projection_jacobian(points), translation, rtol=1e-9, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", LENSES)

@@ -59,15 +59,6 @@ def test_pose_of_wrong_shape_is_refused(bad):
         p.pose_to_transform(bad)
 
 
-def test_projection_jacobian_matches_finite_differences():
-    points = np.random.default_rng(0).uniform([-0.3, -0.3, 1.2], [0.3, 0.3, 2.0], (20, 3))
-    jacobian = CAMERA.projection_jacobian(points)
-    for k in range(3):
-        step = 1e-6 * np.eye(3)[k]
-        numeric = (CAMERA.project(points + step)[0] - CAMERA.project(points - step)[0]) / 2e-6
-        np.testing.assert_allclose(jacobian[..., k], numeric, rtol=1e-6, atol=1e-4)
-
-
 def test_noise_free_triangulation_returns_the_points(rig):
     stereo, camera_from_base = rig
     points = np.random.default_rng(1).uniform([0.0, -0.2, 0.1], [0.6, 0.2, 0.4], (50, 3))

@@ -124,7 +124,7 @@ def test_vignetting_is_laid_over_windows_and_whole_images(tmp_path):
     placed = placed_at(dark, dark.home)
     corners = np.rint(expected_centres(dark, dark.home) - 7.5).astype(int)
     share = [s._camera.radiance(placed, corners, 16, 6) for s in (dark, bright)]
-    whole = [s._camera.whole_radiance(1, placed[1], 6) for s in (dark, bright)]
+    whole = [s._camera.whole_exposure(1, [placed[1]], 6) for s in (dark, bright)]
     y, x = np.mgrid[:1536, :2048]
     expected = 1.0 - 0.3 * ((x - 1023.5) ** 2 + (y - 767.5) ** 2) / (1024.0**2 + 768.0**2)
     np.testing.assert_allclose(whole[0], whole[1] * expected, atol=1e-6)
@@ -137,7 +137,7 @@ def test_whole_images_show_the_windows(tmp_path):
     placed = placed_at(sensor, sensor.home)
     corners = np.rint(expected_centres(sensor, sensor.home) - 4.5).astype(int)
     windows = sensor._camera.radiance(placed, corners, 10, 6)
-    image = sensor._camera.whole_radiance(0, placed[0], 6)
+    image = sensor._camera.whole_exposure(0, [placed[0]], 6)
     for (x, y), window in zip(corners[0], windows[0], strict=True):
         np.testing.assert_allclose(image[y:y + 10, x:x + 10], window, atol=2e-3)
 

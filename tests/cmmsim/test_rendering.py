@@ -62,7 +62,7 @@ def test_whole_image_shows_the_windows(sensor):
     corners = np.rint(sensor.rig.project(points)[0] - 5.5).astype(int)
     windows = sensor._camera.radiance(placed, corners, 12, SUPERSAMPLING)
     for side in (0, 1):
-        image = sensor._camera.whole_radiance(side, placed[side], SUPERSAMPLING)
+        image = sensor._camera.whole_exposure(side, [placed[side]], SUPERSAMPLING)
         for (x, y), window in zip(corners[side], windows[side], strict=True):
             assert np.abs(image[y:y + 12, x:x + 12] - window).max() < 1.0 / SUPERSAMPLING**2
 
