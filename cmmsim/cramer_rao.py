@@ -70,22 +70,6 @@ def cramer_rao_bound(centres: Array, shapes: Array, size: int, contrast: float, 
     return np.linalg.inv(fisher)[:, :2, :2]
 
 
-def edge_bound(shapes: Array, contrast: float, deviation: float, psf_px: float = 0.0) -> Array:
-    """Closed-form approximation (n,2,2) px² of the bound: a smooth edge in white noise, nothing but the centre unknown.
-
-    An edge of width s = sqrt(psf² + 1/12) carries contrast² / (2 sqrt(pi) s deviation²) of information a px of its
-    length about a shift across it. For a circle: sigma_x = deviation / contrast * sqrt(2 s / (sqrt(pi) r)).
-    """
-    width = np.sqrt(psf_px**2 + 1.0 / 12.0)
-    angles = 2.0 * np.pi * np.arange(256) / 256
-    around = np.stack([np.cos(angles), np.sin(angles)])
-    across = np.linalg.inv(shapes) @ around  # normals of the rim at A (cos, sin), not of length one
-    along = np.linalg.norm(shapes @ np.stack([-np.sin(angles), np.cos(angles)]), axis=1) * (2.0 * np.pi / 256)
-    across = across / np.linalg.norm(across, axis=1, keepdims=True)
-    spread = np.einsum("nik,njk,nk->nij", across, across, along)
-    return np.linalg.inv(spread) * (2.0 * np.sqrt(np.pi) * width * (deviation / contrast) ** 2)
-
-
 def _information_table(lowest: float, highest: float, noise: CameraNoise) -> tuple[Array, Array]:
     """Means that reach from ``lowest`` to ``highest``, and the information at each, averaged over one grey value."""
     least_noise = float(np.sqrt(_analog_variance(np.array([lowest - 1.5, highest + 1.5]), noise)[0].min()))

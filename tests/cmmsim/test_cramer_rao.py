@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.stats import norm
 
 from cmmsim import cramer_rao
-from cmmsim.cramer_rao import cramer_rao_bound, edge_bound, grey_value_information, light_shares
+from cmmsim.cramer_rao import cramer_rao_bound, grey_value_information, light_shares
 from cmmsim.ellipse_coverage import SHAPE_BASIS
 from cmmsim.errors import CmmError
 from cmmsim.noise import CameraNoise
@@ -83,6 +83,22 @@ def test_coarse_noise_makes_rounding_one_more_variance():
     variance = NOISE.variance(means)
     np.testing.assert_allclose(grey_value_information(means, NOISE),
                                1.0 / variance + 0.5 * (NOISE.gain / variance) ** 2, rtol=1e-4)
+
+
+def edge_bound(shapes, contrast, deviation, psf_px):
+    """Closed-form approximation (n,2,2) px² of the bound: a smooth edge in white noise, nothing but the centre unknown.
+
+    An edge of width s = sqrt(psf² + 1/12) carries contrast² / (2 sqrt(pi) s deviation²) of information a px of its
+    length about a shift across it. For a circle: sigma_x = deviation / contrast * sqrt(2 s / (sqrt(pi) r)).
+    """
+    width = np.sqrt(psf_px**2 + 1.0 / 12.0)
+    angles = 2.0 * np.pi * np.arange(256) / 256
+    around = np.stack([np.cos(angles), np.sin(angles)])
+    across = np.linalg.inv(shapes) @ around  # normals of the rim at A (cos, sin), not of length one
+    along = np.linalg.norm(shapes @ np.stack([-np.sin(angles), np.cos(angles)]), axis=1) * (2.0 * np.pi / 256)
+    across = across / np.linalg.norm(across, axis=1, keepdims=True)
+    spread = np.einsum("nik,njk,nk->nij", across, across, along)
+    return np.linalg.inv(spread) * (2.0 * np.sqrt(np.pi) * width * (deviation / contrast) ** 2)
 
 
 @pytest.mark.parametrize("half_axes", [(20.0, 20.0), (24.0, 12.0)])
