@@ -5,28 +5,33 @@ which draws faster than pyrender's four. Each window is drawn into its own cell 
 projection, drawn larger by the supersampling factor, and averaged in linear light. Every drawn pixel has one sample:
 several of pyrender's multisampling cost more than they gain on the stickers' soft rims. A cell draws only the patches
 whose bounding box reaches into it. Projection and camera_from_body are multiplied in double precision, so that the
-shader sees one well-scaled matrix.
+shader sees one well-scaled matrix. Depths are asked for only where they are needed, and a solid that fills a cell is its
+ground, see `laid_views`.
+Pieces of the atlas are handed over as they are ready, so that OpenGL fills them while the next ones are prepared.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
 import weakref
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from .disc_mesh import disc_mesh
 from .errors import CmmError, OpenGLMissingError
+from .laid_views import LaidSolids
 from .scene import DiscStack, Mesh
-from .views import Drawable, View
+from .views import Drawable, View, projections, same_exposure
 
 ATLAS_SIDE_PX = 2048
 KEPT_FRAME_BUFFERS = 12
+PIECES = 3  # of an atlas that are handed over one after another
 
 
 def render_windows(drawable: Drawable, views: Sequence[View], supersampling: int,
@@ -35,21 +40,18 @@ def render_windows(drawable: Drawable, views: Sequence[View], supersampling: int
 
     Each pixel is the mean of ``supersampling``² drawn pixels of one sample each. Raises OpenGLMissingError.
     """
+    from .pooling_kernel import mean_of_cells  # compiles, so it is loaded where it is first needed
+
     width, height = views[0].size
     cell_w, cell_h = width * supersampling, height * supersampling
     columns = max(1, min(ATLAS_SIDE_PX // cell_w, int(np.ceil(np.sqrt(len(views))))))
     per_pass = columns * max(1, ATLAS_SIDE_PX // cell_h)
-    windows = []
+    windows = np.empty((len(views), height, width), dtype=np.float32)
     for first in range(0, len(views), per_pass):
         part = views[first:first + per_pass]
-        rows = -(-len(part) // columns)
-        atlas = _shared_atlas().draw(drawable, part, (cell_w, cell_h), columns, rows, background)
-        pooled = atlas.astype(np.float32)
-        if supersampling > 1:
-            pooled = cv2.resize(pooled, (columns * width, rows * height), interpolation=cv2.INTER_AREA)
-        cells = pooled.reshape(rows, height, columns, width).swapaxes(1, 2).reshape(-1, height, width)
-        windows.append(cells[:len(part)] / np.float32(255.0))
-    return np.concatenate(windows)
+        atlas = _shared_atlas().draw(drawable, part, (cell_w, cell_h), columns, -(-len(part) // columns), background)
+        mean_of_cells(atlas, columns, supersampling, windows[first:first + per_pass])
+    return windows
 
 
 def require_opengl() -> None:
@@ -70,6 +72,24 @@ def _shared_atlas() -> _Atlas:
         raise OpenGLMissingError(error) from error
 
 
+@dataclass(frozen=True)
+class _Patch:
+    """A patch in OpenGL's memory: ``indices`` of its triangles from the front to the back, then, from ``backwards`` on,
+    as many for the other way."""
+
+    vertex_array: int
+    indices: int
+    backwards: ctypes.c_void_p
+
+
+@dataclass(frozen=True)
+class _Uploaded:
+    """What is known of a drawable: its patches by the number of drawn pixels a radian, and what lies over what."""
+
+    patches: dict[float, list[_Patch]]
+    solids: LaidSolids
+
+
 class _Atlas:
     """Draws cells into pyrender's frame buffers."""
 
@@ -83,52 +103,103 @@ class _Atlas:
         self._set_matrix, self._bind_mesh = GL_2_0.glUniformMatrix4fv, GL_3_0.glBindVertexArray
         self._context = pyrender.OffscreenRenderer(64, 64)
         self._shaders = Renderer(64, 64)
+        GL.glDepthFunc(GL.GL_LESS)
+        for switch in (GL.GL_CULL_FACE, GL.GL_BLEND, GL.GL_DEPTH_TEST):
+            GL.glDisable(switch)
+        GL.glPixelStorei(GL.GL_PACK_ALIGNMENT, 1)
         self._flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.OFFSCREEN
         self._frame_buffers: dict[tuple[int, int], _FrameBuffer] = {}
-        self._uploaded: weakref.WeakKeyDictionary[Drawable, dict[float, list[Any]]] = weakref.WeakKeyDictionary()
+        self._known: weakref.WeakKeyDictionary[Drawable, _Uploaded] = weakref.WeakKeyDictionary()
 
     def draw(self, drawable: Drawable, views: Sequence[View], cell: tuple[int, int], columns: int, rows: int,
              background: float) -> NDArray[np.uint8]:
-        """The drawn atlas (rows * cell_h, columns * cell_w) uint8, cells in reading order."""
-        gl, width, height = self._gl, columns * cell[0], rows * cell[1]
+        """The drawn atlas (rows * cell_h, columns * cell_w) uint8, cells in reading order; valid until the next."""
         self._context._platform.make_current()
-        primitives = self._primitives(drawable, views[0].camera.focal_px * cell[0] / views[0].size[0])
-        frame_buffer = self._frame_buffer(width, height)
+        patches, solids = self._uploaded(drawable, views[0].camera.focal_px * cell[0] / views[0].size[0])
+        frame_buffer = self._frame_buffer(columns * cell[0], rows * cell[1])
         frame_buffer.bind()
-        gl.glEnable(gl.GL_DEPTH_TEST)
-        gl.glDepthFunc(gl.GL_LESS)
-        gl.glDisable(gl.GL_CULL_FACE)
-        gl.glDisable(gl.GL_BLEND)
-        gl.glClearColor(background, background, background, 1.0)
-        gl.glClear(gl.GL_COLOR_BUFFER_BIT | gl.GL_DEPTH_BUFFER_BIT)
+        groups = [np.array(group) for group in same_exposure(views)]
+        reaching = drawable.reaching(views, groups)
+        laid = solids.laid(views, groups, reaching)
+        reaching[np.flatnonzero(laid.filled), laid.solid[laid.filled]] = False
+        places = [((k % columns) * cell[0], (k // columns) * cell[1], *cell) for k in range(len(views))]
+        self._clear(np.where(laid.filled, solids.levels[laid.solid], background), places, bool((laid.solid < 0).any()))
         self._program._bind()
-        reaching, meshes = drawable.reaching(views), [(m._vaid, m.indices.size) for m in primitives]
-        for k, view in enumerate(views):
-            self._viewport((k % columns) * cell[0], (k // columns) * cell[1], *cell)
-            clip_from_bodies = (view.projection() @ view.camera_from_bodies).astype(np.float32)
-            body = -1
-            for p in np.flatnonzero(reaching[k]).tolist():
-                if drawable.body_index[p] != body:
-                    body = drawable.body_index[p]
-                    self._set_matrix(self._matrix_location, 1, gl.GL_TRUE, clip_from_bodies[body])
-                mesh, count = meshes[p]
-                self._bind_mesh(mesh)
-                self._draw_elements(gl.GL_TRIANGLES, count, gl.GL_UNSIGNED_INT, None)
-        gl.glBindVertexArray(0)
+        matrices, per_piece = self._matrices(views), -(-rows // PIECES) * columns
+        shown: list[list[int]] = [[] for _ in views]
+        for k, p in np.argwhere(reaching).tolist():
+            shown[k].append(p)
+        for k, place in enumerate(places):
+            if k and k % per_piece == 0:
+                self._gl.glFlush()
+            self._viewport(*place)
+            (self._draw_by_depth if laid.solid[k] < 0 else self._lay)(drawable, shown[k], patches, matrices[k])
+        self._gl.glBindVertexArray(0)
         return frame_buffer.read()
 
-    def _primitives(self, drawable: Drawable, samples: float) -> list[Any]:
+    def _draw_by_depth(self, drawable: Drawable, shown: Sequence[int], patches: Sequence[_Patch],
+                       clip_from_bodies: NDArray[np.float32]) -> None:
+        """The patches ``shown`` in a cell, the nearest of which is seen."""
+        gl, body = self._gl, -1
+        gl.glEnable(gl.GL_DEPTH_TEST)
+        for p in shown:
+            if drawable.body_index[p] != body:
+                body = drawable.body_index[p]
+                self._set_matrix(self._matrix_location, 1, gl.GL_TRUE, clip_from_bodies[body])
+            self._bind_mesh(patches[p].vertex_array)
+            self._draw_elements(gl.GL_TRIANGLES, patches[p].indices, gl.GL_UNSIGNED_INT, None)
+        gl.glDisable(gl.GL_DEPTH_TEST)
+
+    def _lay(self, drawable: Drawable, shown: Sequence[int], patches: Sequence[_Patch],
+             clip_from_bodies: NDArray[np.float32]) -> None:
+        """The patches ``shown`` in a cell, all of one body, over each other: the solid, then what lies on it."""
+        gl = self._gl
+        if shown:
+            self._set_matrix(self._matrix_location, 1, gl.GL_TRUE, clip_from_bodies[drawable.body_index[shown[0]]])
+        for p in sorted(shown, key=lambda p: isinstance(drawable.patches[p], DiscStack)):
+            self._bind_mesh(patches[p].vertex_array)
+            self._draw_elements(gl.GL_TRIANGLES, patches[p].indices, gl.GL_UNSIGNED_INT, patches[p].backwards)
+
+    def _clear(self, grounds: NDArray[np.float64], places: Sequence[tuple[int, ...]], with_depth: bool) -> None:
+        """Give each cell its ground's level, and the farthest depth where depths are asked for."""
+        gl, level = self._gl, float(grounds[0])
+        gl.glClearColor(level, level, level, 1.0)
+        gl.glClear(gl.GL_COLOR_BUFFER_BIT | (gl.GL_DEPTH_BUFFER_BIT if with_depth else 0))
+        others = np.flatnonzero(grounds != level).tolist()
+        if others:
+            gl.glEnable(gl.GL_SCISSOR_TEST)
+            for k in others:
+                gl.glScissor(*places[k])
+                gl.glClearColor(*[float(grounds[k])] * 3, 1.0)
+                gl.glClear(gl.GL_COLOR_BUFFER_BIT)
+            gl.glDisable(gl.GL_SCISSOR_TEST)
+
+    @staticmethod
+    def _matrices(views: Sequence[View]) -> NDArray[np.float32]:
+        """Clip-from-body matrices (n views, bodies, 4, 4)."""
+        moves = np.array([view.camera_from_bodies for view in views])
+        return (projections(views)[:, None] @ moves).astype(np.float32)
+
+    def _uploaded(self, drawable: Drawable, samples: float) -> tuple[list[_Patch], LaidSolids]:
         """The patches in OpenGL's memory, their discs made for ``samples`` drawn pixels a radian."""
-        known = self._uploaded.setdefault(drawable, {})
-        if samples not in known:
-            known[samples] = [self._upload(disc_mesh(p, drawable.distance / samples) if isinstance(p, DiscStack) else p)
-                              for p in drawable.patches]
-        return known[samples]
+        known = self._known.get(drawable)
+        if known is None:
+            known = self._known[drawable] = _Uploaded({}, LaidSolids(drawable))
+        if samples not in known.patches:
+            made = [disc_mesh(p, drawable.distance / samples) if isinstance(p, DiscStack) else p
+                    for p in drawable.patches]
+            known.patches[samples] = [self._patch(mesh) for mesh in made]
+        return known.patches[samples], known.solids
+
+    def _patch(self, mesh: Mesh) -> _Patch:
+        indices = mesh.faces.size
+        return _Patch(self._upload(mesh)._vaid, indices, ctypes.c_void_p(indices * np.dtype(np.uint32).itemsize))
 
     def _upload(self, mesh: Mesh) -> Any:
         grey = np.repeat(mesh.levels[:, None], 3, axis=1)
         primitive = self._pyrender.Primitive(
-            positions=mesh.vertices.astype(np.float32), indices=mesh.faces.astype(np.uint32),
+            positions=mesh.vertices.astype(np.float32),
+            indices=np.concatenate([mesh.faces, mesh.faces[::-1]]).astype(np.uint32),
             color_0=np.column_stack([grey, np.ones(len(grey))]).astype(np.float32),
             material=self._pyrender.MetallicRoughnessMaterial(baseColorFactor=(1.0, 1.0, 1.0, 1.0)), mode=4)
         primitive._add_to_context()
@@ -164,7 +235,11 @@ class _FrameBuffer:
     """Red channel and depth with one sample a pixel."""
 
     def __init__(self, gl: Any, width: int, height: int) -> None:
-        self._gl, self._size = gl, (width, height)
+        from OpenGL.raw.GL.VERSION import GL_1_0  # reads into given memory
+
+        self._gl, self._size, self._read_pixels = gl, (width, height), GL_1_0.glReadPixels
+        self._pixels = np.empty((height, width), dtype=np.uint8)
+        self._target = self._pixels.ctypes.data_as(ctypes.c_void_p)
         self._name = gl.glGenFramebuffers(1)
         self._buffers = [self._attached(gl.GL_COLOR_ATTACHMENT0, gl.GL_R8),
                          self._attached(gl.GL_DEPTH_ATTACHMENT, gl.GL_DEPTH_COMPONENT24)]
@@ -178,12 +253,9 @@ class _FrameBuffer:
         self._gl.glBindFramebuffer(self._gl.GL_FRAMEBUFFER, self._name)
 
     def read(self) -> NDArray[np.uint8]:
-        """The image (height, width)."""
-        gl, (width, height) = self._gl, self._size
-        self.bind()
-        gl.glPixelStorei(gl.GL_PACK_ALIGNMENT, 1)
-        pixels = gl.glReadPixels(0, 0, width, height, gl.GL_RED, gl.GL_UNSIGNED_BYTE)
-        return np.frombuffer(pixels, dtype=np.uint8).reshape(height, width)
+        """The image (height, width), in memory that the next one takes, too."""
+        self._read_pixels(0, 0, *self._size, self._gl.GL_RED, self._gl.GL_UNSIGNED_BYTE, self._target)
+        return self._pixels
 
     def delete(self) -> None:
         """Give the memory back."""

@@ -26,19 +26,26 @@ class View:
     corner: tuple[float, float]
     size: tuple[int, int]
 
-    def projection(self) -> Array:
-        """Clip-from-camera matrix (4,4) for OpenCV camera axes; row 0 of the drawing is the window's top row.
 
-        The half pixel turns OpenCV's pixel-centre convention into OpenGL's pixel-corner convention.
-        """
-        camera, (width, height) = self.camera, self.size
-        x, y = camera.centre_x_px + 0.5 - self.corner[0], camera.centre_y_px + 0.5 - self.corner[1]
-        matrix = np.zeros((4, 4))
-        matrix[0, 0], matrix[0, 2] = 2.0 * camera.focal_px / width, 2.0 * x / width - 1.0
-        matrix[1, 1], matrix[1, 2] = 2.0 * camera.focal_px * camera.aspect / height, 2.0 * y / height - 1.0
-        matrix[2, 2], matrix[2, 3] = (FAR + NEAR) / (FAR - NEAR), -2.0 * FAR * NEAR / (FAR - NEAR)
-        matrix[3, 2] = 1.0
-        return matrix
+def projections(views: Sequence[View]) -> Array:
+    """Clip-from-camera matrices (n,4,4) for OpenCV camera axes; row 0 of a drawing is the window's top row.
+
+    The half pixel turns OpenCV's pixel-centre convention into OpenGL's pixel-corner convention.
+    """
+    principal = np.array([v.camera.centre for v in views]) + 0.5 - np.array([v.corner for v in views])
+    focal, size = np.array([v.camera.focal_lengths for v in views]), np.array([v.size for v in views])
+    matrices = np.zeros((len(views), 4, 4))
+    for i in range(2):
+        matrices[:, i, i], matrices[:, i, 2] = 2.0 * focal[:, i] / size[:, i], 2.0 * principal[:, i] / size[:, i] - 1.0
+    matrices[:, 2, 2], matrices[:, 2, 3] = (FAR + NEAR) / (FAR - NEAR), -2.0 * FAR * NEAR / (FAR - NEAR)
+    matrices[:, 3, 2] = 1.0
+    return matrices
+
+
+def window_bounds(views: Sequence[View]) -> Array:
+    """Lowest x, y and highest x, y (n,4) of windows, px: the outer edges of their first and last pixels."""
+    first = np.array([view.corner for view in views]) - 0.5
+    return np.hstack([first, first + np.array([view.size for view in views])])
 
 
 def same_exposure(views: Sequence[View]) -> list[list[int]]:
@@ -50,34 +57,26 @@ def same_exposure(views: Sequence[View]) -> list[list[int]]:
 
 
 class Drawable:
-    """Patches of several bodies: which body each belongs to, the corners (n,8,3) of its bounding box, m, and the
-    distance m from which they are usually looked at, for which discs are triangulated."""
+    """Patches of several bodies: which body each belongs to, the corners of its bounding box as columns (n,4,8), m and
+    1, and the distance m from which they are usually looked at, for which discs are triangulated."""
 
     def __init__(self, patches: Sequence[Patch], body_index: Sequence[int], distance: float) -> None:
         self.patches = tuple(patches)
         self.body_index = np.array(body_index, dtype=int)
-        self.corners = np.array([list(product(*p.bounds.T)) for p in patches])
+        self.boxes = np.array([[*zip(*product(*p.bounds.T), strict=True), np.ones(8)] for p in patches])
         self.distance = distance
 
-    def reaching(self, views: Sequence[View]) -> NDArray[np.bool_]:
-        """Which patches may show in each window (n views, n patches): bounding boxes against windows."""
-        result = np.empty((len(views), len(self.patches)), dtype=bool)
-        for group in same_exposure(views):
-            lowest, highest = self._extents(views[group[0]])
-            first = np.array([views[k].corner for k in group])[:, None] - 0.5
-            last = first + [[views[k].size] for k in group]
-            result[group] = ((highest >= first) & (lowest <= last)).all(axis=2)
-        return result
+    def reaching(self, views: Sequence[View], groups: Sequence[NDArray[np.int_]]) -> NDArray[np.bool_]:
+        """Which patches may show in each window (n views, n patches): bounding boxes against windows.
 
-    def _extents(self, view: View) -> tuple[Array, Array]:
-        """Smallest and largest pixel (n,2) of each patch's bounding box; a box not wholly ahead may show anywhere."""
-        moves = view.camera_from_bodies[self.body_index]
-        corners = np.einsum("pij,pcj->pci", moves[:, :3, :3], self.corners) + moves[:, None, :3, 3]
-        depth = corners[..., 2]
-        pixels = view.camera.project(np.where(depth[..., None] > NEAR, corners, [0.0, 0.0, 1.0]))[0]
-        lowest, highest = pixels.min(axis=1), pixels.max(axis=1)
-        crossing = depth.min(axis=1) <= NEAR
-        lowest[crossing], highest[crossing] = -np.inf, np.inf
-        behind = depth.max(axis=1) <= 0.0
-        lowest[behind], highest[behind] = np.inf, -np.inf
-        return lowest, highest
+        ``groups``: indices of the views of each camera and exposure.
+        """
+        from .reaching_kernel import boxes_reaching  # compiles, so it is loaded where it is first needed
+
+        windows, result = window_bounds(views), np.zeros((len(views), len(self.patches)), dtype=bool)
+        for group in groups:
+            view, reaching = views[group[0]], np.empty((len(group), len(self.patches)), dtype=bool)
+            boxes_reaching(view.camera.matrix @ view.camera_from_bodies[:, :3], self.body_index, self.boxes,
+                           windows[group], NEAR, reaching)
+            result[group] = reaching
+        return result

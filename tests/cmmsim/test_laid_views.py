@@ -1,0 +1,143 @@
+"""Windows that are drawn without depths: which they are, and that they show what is drawn by depths."""
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from cmmsim import render
+from cmmsim.camera import PinholeCamera
+from cmmsim.laid_views import Laid, LaidSolids
+from cmmsim.pooling_kernel import mean_of_cells
+from cmmsim.pose import pose_to_transform
+from cmmsim.scene import Disc, DiscStack, rod, rod_transform, solid_mesh
+from cmmsim.views import NEAR, Drawable, View, same_exposure
+from cmmsim.virtual_camera import SUPERSAMPLING
+
+CAMERA = PinholeCamera(1000.0, 500.0, 400.0, 1001, 801)
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def stack(x=0.0, normal=UP, height=0.05):
+    """A sticker on its ring, 0.3 mm and 0.2 mm above the box's upper side where it is ``height`` high."""
+    place = np.array([x, 0.0, height])
+    return DiscStack((Disc(place + 2e-4 * normal, normal, 0.009, 0.1), Disc(place + 3e-4 * normal, normal, 0.003, 0.9)))
+
+
+def box(size=(0.2, 0.2, 0.1)):
+    return solid_mesh(trimesh.creation.box(size), 0.3)
+
+
+def looking_down(corners, size=14, turned=0.0, others=()):
+    """Views from 1 m above the box's middle, which shows at (500, 400) px; ``turned``: the box about x, rad."""
+    body = pose_to_transform([0.0, 0.0, 1.0, np.pi + turned, 0.0, 0.0])
+    bodies = np.stack([body, *others])
+    return [View(CAMERA, bodies, (x, y), (size, size)) for x, y in corners]
+
+
+def laid(patches, views, owners=None):
+    drawable = Drawable(patches, owners or [0] * len(patches), 1.0)
+    groups = [np.array(group) for group in same_exposure(views)]
+    return LaidSolids(drawable).laid(views, groups, drawable.reaching(views, groups))
+
+
+def test_sticker_on_a_box_is_laid_and_the_box_fills_the_window():
+    """The upper side, 0.95 m away, reaches 105.3 px from the middle."""
+    found = laid([stack(), box()], looking_down([(493, 393), (595, 393), (599, 393), (600, 500)]))
+    np.testing.assert_array_equal(found.solid, [1, 1, 1, 1])
+    np.testing.assert_array_equal(found.filled, [True, False, False, False])
+    assert laid([stack(), box()], looking_down([(590, 393)])).filled.all()
+
+
+@pytest.mark.parametrize("patches", [
+    pytest.param([stack(height=0.0), box()], id="sunk in the box"),
+    pytest.param([stack(normal=-UP), box()], id="looks away"),
+    pytest.param([DiscStack(stack().discs[::-1]), box()], id="lowest not first"),
+    pytest.param([stack(), stack(0.008), box()], id="two stickers"),
+    pytest.param([stack(), box(), box((0.3, 0.01, 0.01))], id="two solids"),
+    pytest.param([stack(0.05), solid_mesh(trimesh.creation.annulus(0.02, 0.2, 0.1), 0.3)], id="not convex"),
+])
+def test_what_may_hide_something_is_drawn_by_depth(patches):
+    found = laid(patches, looking_down([(500, 393)], 60))
+    assert found.solid.tolist() == [-1]
+    assert not found.filled.any()
+
+
+def test_another_body_before_the_window_needs_depths():
+    views = looking_down([(493, 393), (560, 393)], others=[pose_to_transform([0.0, 0.0, 0.6, 0.0, 0.0, 0.0])])
+    found = laid([stack(), box(), box((0.02, 0.02, 0.02))], views, [0, 0, 1])
+    assert found.solid.tolist() == [-1, 1]
+
+
+def test_sticker_turned_away_from_the_camera_needs_depths():
+    side = stack(normal=UP)
+    assert laid([side, box()], looking_down([(493, 393)], turned=0.0)).solid.tolist() == [1]
+    assert laid([side, box()], looking_down([(493, 393)], turned=np.pi)).solid.tolist() == [-1]
+
+
+@pytest.mark.rendering
+def test_laid_windows_show_what_is_drawn_by_depths(sensor, monkeypatch):
+    """To the last bit, with links before some of the stickers."""
+    rng, kinds = np.random.default_rng(0), set()
+    camera, drawable = crossed_by_links(sensor)
+    for _ in range(6):
+        views = sticker_views(sensor, camera, rng)
+        groups = [np.array(group) for group in same_exposure(views)]
+        found = LaidSolids(drawable).laid(views, groups, drawable.reaching(views, groups))
+        kinds |= {(bool(solid >= 0), bool(filled)) for solid, filled in zip(found.solid, found.filled, strict=True)}
+        without = render.render_windows(drawable, views, SUPERSAMPLING, 0.02)
+        with monkeypatch.context() as patched:
+            nowhere = Laid(np.full(len(views), -1), np.zeros(len(views), dtype=bool))
+            patched.setattr(LaidSolids, "laid", lambda *_, nowhere=nowhere: nowhere)
+            np.testing.assert_array_equal(without, render.render_windows(drawable, views, SUPERSAMPLING, 0.02))
+    assert kinds == {(True, True), (True, False), (False, False)}
+
+
+def crossed_by_links(sensor):
+    """The sensor's left camera, and its bodies with two links beside them."""
+    patches = [p for body in sensor._scene for p in body.stickers] + [body.solid for body in sensor._scene]
+    owners = [k for k, body in enumerate(sensor._scene) for _ in body.stickers] + [0, 1, 2, 3]
+    links = [solid_mesh(rod(0.5, radius), 0.24) for radius in (0.01, 0.02)]
+    return sensor.rig.left, Drawable([*patches, *links], owners, 2.0)
+
+
+def sticker_views(sensor, camera, rng):
+    """Windows about the stickers of platform and base, and some beside them, of a random pose and two random links."""
+    platform = pose_to_transform(sensor.home + rng.uniform(-1, 1, 6) * ([0.02] * 3 + [0.3] * 3))
+    ends = sensor.home[:3] + rng.uniform([0.05, -0.25, -0.15], [0.55, 0.25, 0.35], (4, 3))
+    placed = np.stack([platform, np.eye(4), rod_transform(*ends[:2]), rod_transform(*ends[2:])])
+    bodies = (sensor.rig.from_camera[0] @ sensor._camera_from_base) @ placed
+    points = np.concatenate([body.sticker_places @ move[:3, :3].T + move[:3, 3]
+                             for body, move in zip(sensor._scene, bodies, strict=False)])
+    pixels = camera.project(points)[0] - 7 + rng.integers(-4, 5, (len(points), 2))
+    return [View(camera, bodies, (int(x), int(y)), (14, 14)) for x, y in pixels]
+
+
+@pytest.mark.parametrize("supersampling", [1, 2, 3, 9, 16])
+def test_cells_are_averaged_as_opencv_does(supersampling):
+    """To the last bit; the atlas may have cells left over."""
+    drawn = np.random.default_rng(0).integers(0, 256, (2 * 6 * supersampling, 3 * 5 * supersampling), dtype=np.uint8)
+    windows = np.empty((5, 6, 5), dtype=np.float32)
+    mean_of_cells(drawn, 3, supersampling, windows)
+    pooled = cv2.resize(drawn.astype(np.float32), (15, 12), interpolation=cv2.INTER_AREA) / np.float32(255.0)
+    np.testing.assert_array_equal(windows, pooled.reshape(2, 6, 3, 5).swapaxes(1, 2).reshape(-1, 6, 5)[:5])
+
+
+def test_reaching_patches_are_those_whose_corners_span_the_window():
+    """Against the camera's projection of the corners; near the camera anything may show, behind it nothing."""
+    rng = np.random.default_rng(0)
+    sizes, places = rng.uniform(0.01, 0.3, (40, 3)), rng.uniform([-1, -1, -1], [1, 1, 2], (40, 3))
+    meshes = [solid_mesh(trimesh.creation.box(size), 0.5) for size in sizes]
+    bodies = np.stack([pose_to_transform([*place, *rng.uniform(-1, 1, 3)]) for place in places])
+    drawable = Drawable(meshes, np.arange(40), 1.0)
+    views = [View(CAMERA, bodies, (int(x), int(y)), (30, 20)) for x, y in rng.uniform(0, 800, (50, 2))]
+    found = drawable.reaching(views, [np.arange(50)])
+    for p, (mesh, body) in enumerate(zip(meshes, bodies, strict=True)):
+        points = mesh.vertices @ body[:3, :3].T + body[:3, 3]
+        pixels = CAMERA.project(points)[0]
+        for n, view in enumerate(views):
+            first, last = np.array(view.corner) - 0.5, np.array(view.corner) + view.size - 0.5
+            spans = bool(np.all((pixels.max(axis=0) >= first) & (pixels.min(axis=0) <= last)))
+            expected = points[:, 2].max() > 0.0 if points[:, 2].min() <= NEAR else spans
+            assert found[n, p] == expected
+    assert 0.02 < found.mean() < 0.9
