@@ -1,6 +1,5 @@
 """A robot in MuJoCo, put into any state of the closed chain and stepped. The only module that imports MuJoCo."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,7 @@ def import_mujoco() -> Any:
     try:
         import mujoco
     except ImportError as error:
-        raise MujocoMissingError(f"MuJoCo is not installed ({error}): pip install cmmsim[mujoco]") from None
+        raise MujocoMissingError(f"MuJoCo is not installed ({error}): pip install '.[mujoco]' in a checkout") from None
     except AttributeError as error:
         raise MujocoError(f"MuJoCo does not load ({error}): unset MUJOCO_GL, no picture is needed here") from error
     return mujoco
@@ -140,8 +139,3 @@ class MujocoRobot:
         """One step under a control (6,), N m."""
         self.data.ctrl[:] = floats("control", control, (LEGS,))
         self._mujoco.mj_step(self.model, self.data)
-
-    def stepper(self) -> Callable[[], None]:
-        """`mj_step` on this robot without anything around it, for timing."""
-        model, data, step = self.model, self.data, self._mujoco.mj_step
-        return lambda: step(model, data)

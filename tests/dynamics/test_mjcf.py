@@ -372,5 +372,5 @@ def test_bad_parameters_are_named(robot, change, evidence):
 
 def test_without_mujoco_one_line_names_the_extra(robot, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(MujocoMissingError, match=r"pip install cmmsim\[mujoco\]"):
+    with pytest.raises(MujocoMissingError, match=r"pip install '\.\[mujoco\]' in a checkout"):
         exported(robot)

@@ -138,7 +138,7 @@ def test_command_fails_in_one_line_where_a_goal_is_missed(made_runs, monkeypatch
 @pytest.mark.parametrize(
     ("arguments", "evidence"),
     [
-        (("verify-model", "--out", "new"), "pip install cmmsim[mujoco]"),
+        (("verify-model", "--out", "new"), "pip install '.[mujoco]'"),
         (("verify-model", "nope"), "unknown robot `nope`"),
         (("export", "mjcf", "rss6"), "crank1, crank2, crank3, crank4, crank5, crank6: Izz 0.000605 > Ixx 0.000229 + "),
         (("export", "mjcf", "rss6", "--parameters", ""), "'' is neither a parameter set of robot rss6 (identified, in"),
