@@ -55,7 +55,7 @@ class Scenario(Section):
     sensor_note: str = Field("", description="what the sensor's file says about its own figures")
     sensor_changes: dict[str, Any] = Field({}, description="entries that hold instead of the sensor file's")
     renderer: Literal["pyrender", "analytic", "auto"] = Field(
-        "pyrender", description="what draws the images; analytic needs no OpenGL, auto takes it where OpenGL is missing"
+        "auto", description="what draws the images: pyrender, analytic, or auto: pyrender where OpenGL works"
     )
     pose_method: Literal["registration", "planes"] = "registration"
     timing: Timing = Timing()

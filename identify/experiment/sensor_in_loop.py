@@ -8,6 +8,7 @@ import numpy as np
 
 import cmmsim
 from cmmsim.latency import drawn_latencies
+from cmmsim.renderers import choose_renderer
 from cmmsim.sensor_file import read_sensor_file
 from dynamics import Robot
 from identify.arrays import Array
@@ -27,6 +28,11 @@ def make_sensor(scenario: Scenario, robot: Robot, seed: int, taught: cmmsim.Taug
     sensor = cmmsim.Sensor(file, seed, scenario.pose_method, taught, renderer=scenario.renderer)
     sensor.add_bodies(robot_meshes(robot))
     return sensor
+
+
+def with_renderer(scenario: Scenario) -> Scenario:
+    """The scenario with what draws on this machine in place of "auto"; one line of warning where OpenGL is missing."""
+    return scenario.with_overrides({"renderer": choose_renderer(scenario.renderer).name})
 
 
 def frame_latencies(scenario: Scenario, frames: int, rng: np.random.Generator) -> Array | None:

@@ -11,6 +11,7 @@ import pytest
 from identify.files.result_file import load_result
 from identify.record.recording import read, read_runs
 from identify.reporting.goals import check_goals
+from identify.scenario import load_scenario
 
 pytestmark = [pytest.mark.slow, pytest.mark.rendering]
 
@@ -87,11 +88,26 @@ def test_a_stage_can_be_repeated_and_gives_the_same_numbers(run):
         assert again["identification"]["parameters"][parameter]["estimate"] == entry["estimate"]
 
 
-def test_without_opengl_the_run_stops_with_one_line_and_leaves_nothing(tmp_path):
-    broken = tmp_path / "OpenGL"
-    broken.mkdir()
+@pytest.fixture
+def no_opengl(tmp_path):
+    """A folder for PYTHONPATH where OpenGL cannot be loaded."""
+    broken = tmp_path / "without" / "OpenGL"
+    broken.mkdir(parents=True)
     (broken / "__init__.py").write_text("raise ImportError('no EGL here')\n")
-    done = cmmsim("run", "quick", "--out", tmp_path / "out", PYTHONPATH=str(tmp_path))
+    return str(broken.parent)
+
+
+def test_without_opengl_the_analytic_renderer_draws_and_one_line_says_so(no_opengl, tmp_path):
+    done = cmmsim("excite", "quick", "--out", tmp_path / "out", "--quiet", PYTHONPATH=no_opengl)
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.startswith("warning")]
+    assert lines == ["warning: images are drawn by the analytic renderer, pyrender found no OpenGL: no EGL here"]
+    assert load_scenario(str(tmp_path / "out" / "scenario.toml")).renderer == "analytic"
+
+
+def test_pyrender_without_opengl_stops_with_one_line_and_leaves_nothing(no_opengl, tmp_path):
+    arguments = ("run", "quick", "--set", "renderer=pyrender", "--out", tmp_path / "out")
+    done = cmmsim(*arguments, PYTHONPATH=no_opengl)
     assert done.returncode != 0
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     assert len(lines) == 1, done.stderr
