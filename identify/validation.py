@@ -17,9 +17,10 @@ from dynamics.closed_loop import LoopFailure, Reference, simulate
 from identify.arrays import Array
 from identify.cores import cores
 from identify.estimation.pose_prediction import PosePrediction, predict_poses
-from identify.experiment.run import PREDICTION, Experiment, run_plant, stream_seed
+from identify.experiment.run import Experiment, run_plant
 from identify.experiment.sensor_in_loop import make_sensor
 from identify.progress import Advance, Progress
+from identify.random_streams import PREDICTION, stream_seed
 from identify.record.loop_setup import frame_times, model_settings
 from identify.record.record_checks import TooFewFramesError
 from identify.record.recorded_run import watched_run

@@ -26,17 +26,15 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.identification import IdentificationResult, identify
 from identify.excitation import design_trajectories
-from identify.experiment.run import Experiment, stream_seed, taught_sensor
+from identify.experiment.run import Experiment, taught_sensor
 from identify.progress import Progress, SilentProgress
+from identify.random_streams import DESIGN, stream_seed
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 from identify.validation import run_unseen
 
 FEWEST_RUNS = 3
 """Of fewer runs a standard deviation says nothing."""
-
-DESIGN_STREAM = 7
-"""Random stream of the designed runs, beside those of the experiment."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ def designed_runs(
     As long as the exciting run, by the scenario's method; workers as in `run_unseen`. Raises as the stages `excite` and
     `record` do.
     """
-    own = stream_seed(seed, DESIGN_STREAM)
+    own = stream_seed(seed, DESIGN)
     seeds, trajectories = [stream_seed(own, number) for number in range(count)], []
     with (
         progress.stage("design the runs", count) as advance,

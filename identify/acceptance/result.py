@@ -9,9 +9,9 @@ from cmmsim.acceptance import PUBLISHED, BarTest, LatencyTest, LengthTest, Measu
 from cmmsim.acceptance.bar import LENGTH
 from identify.acceptance.procedure import AcceptanceRun
 from identify.files.versions import versions
+from identify.random_streams import RESAMPLING, mixed_generator
 
 BLOCK = 10  # neighbouring frames of the bar are resampled together
-RESAMPLING_STREAM = 301
 
 
 def acceptance_entry(run: AcceptanceRun, limit_um: float) -> dict[str, Any]:
@@ -28,7 +28,7 @@ def acceptance_entry(run: AcceptanceRun, limit_um: float) -> dict[str, Any]:
     if run.length is not None:
         entry["vdi_2634_1"] = _length(run.length, limit_um)
     if run.bar is not None:
-        entry["astm_e3064"] = _bar(run.bar, np.random.default_rng([run.under_test.seed, RESAMPLING_STREAM]))
+        entry["astm_e3064"] = _bar(run.bar, mixed_generator(RESAMPLING, run.under_test.seed))
     if run.latency is not None:
         entry["astm_e3124"] = _latency(run.latency)
     entry["published"] = [asdict(figure) for figure in PUBLISHED]

@@ -15,9 +15,6 @@ if TYPE_CHECKING:
     from identify.estimator_comparison import Score
     from identify.experiment.joint_instruments import JointInstruments
 
-INSTRUMENTS_STREAM = 20
-"""Random stream of the joint instruments, beside those of the experiment."""
-
 HEADER = ("estimator", "groups\n%", "median\n%", "gains\n%", "pos.\num", "ori.\nurad", "time\ns", "iter.", "evals")
 
 
@@ -68,16 +65,16 @@ def _scores(
     from identify.estimator_comparison import compare, examination
     from identify.estimators.evidence import Evidence, joint_channels
     from identify.experiment.joint_instruments import measure_joints, read_channels, write_channels
-    from identify.experiment.run import LATENCY, stream_seed
     from identify.experiment.sensor_in_loop import frame_latencies
     from identify.experiment.truth import read_truth, read_truth_runs, true_parameters
+    from identify.random_streams import INSTRUMENTS, LATENCY, mixed_generator, stream_seed
     from identify.record import recording
     from identify.scenario import load_scenario
 
     scenario = load_scenario(folder.scenario)
     record, truth = recording.read(folder.experiment), read_truth(folder.experiment)
     problem = output_error_problem([record], load_robot(scenario.robot), scenario)
-    rng = np.random.default_rng([seed, INSTRUMENTS_STREAM])
+    rng = mixed_generator(INSTRUMENTS, seed)
     channels = folder.path / "instruments.nc"
     draws = np.random.default_rng(stream_seed(int(record.attrs["seed"]), LATENCY, 0))
     latencies = frame_latencies(scenario, record.sizes["time"], draws)

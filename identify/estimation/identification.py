@@ -29,12 +29,10 @@ from identify.estimation.output_error_search import output_error_searches
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor
 from identify.estimation.whiteness import Whiteness
 from identify.progress import Progress, SilentProgress
+from identify.random_streams import UNCERTAINTY, mixed_generator
 from identify.record.recorded_origin import recorded_seed
 from identify.record.recorded_run import recorded_run
 from identify.scenario import Scenario
-
-UNCERTAINTY_STREAM = 5
-"""Random stream of the repeated experiments, beside those of the experiment."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,7 @@ def identify(
     progress = progress or SilentProgress()
     records = [record] if isinstance(record, xr.Dataset) else list(record)
     problem = output_error_problem(records, robot, scenario)
-    rng = np.random.default_rng([recorded_seed(records[0]), UNCERTAINTY_STREAM])
+    rng = mixed_generator(UNCERTAINTY, recorded_seed(records[0]))
     began = time.perf_counter()
     warm = warm_start.linear_warm_start(problem.runs, scenario.timing, scenario.filter, problem.guess, problem.anchor)
     warmed = time.perf_counter()

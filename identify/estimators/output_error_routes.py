@@ -14,14 +14,12 @@ from identify.estimation.output_error_search import output_error_searches
 from identify.estimation.warm_start import REWEIGHTINGS, linear_warm_start
 from identify.estimators.evidence import Estimate, Evidence
 from identify.progress import SilentProgress
+from identify.random_streams import ROUTES_UNCERTAINTY, mixed_generator
 
 GAINS = slice(64, 67)
 
 KNOWN = 1e-6
 """Relative standard deviation of a gain that is known."""
-
-DRAWS_STREAM = 21
-"""Random stream of the repeated experiments behind the standard deviations."""
 
 
 def closed_loop(evidence: Evidence) -> Estimate:
@@ -68,5 +66,5 @@ def _warm(evidence: Evidence, problem: OutputErrorProblem) -> Array:
 
 
 def _std(problem: OutputErrorProblem, parameters: Array) -> Array:
-    covariance = estimate_uncertainty(problem, parameters, np.random.default_rng(DRAWS_STREAM)).covariance
+    covariance = estimate_uncertainty(problem, parameters, mixed_generator(ROUTES_UNCERTAINTY)).covariance
     return np.asarray(np.sqrt(np.diag(covariance)).reshape(len(NAMES)), dtype=float)

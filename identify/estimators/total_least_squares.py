@@ -29,11 +29,10 @@ from identify.estimators.torque_equations import (
     prior_of,
     torque_equations,
 )
+from identify.random_streams import DISTURBED_COPIES, mixed_generator
 
 DRAWS = 4
 """Disturbed copies of a record: each has thousands of rows to average the errors over."""
-
-DRAWS_STREAM = 22
 
 SHOWN = 3.0
 """A direction counts as shown by the motion when it is known this many times better than before."""
@@ -114,7 +113,7 @@ def _drawn_errors(
     evidence: Evidence, equations: TorqueEquations, poses: Array, torque: Array, noise: Array
 ) -> Array:
     """Errors (draws, 2 n, 74) of the whitened columns and right side, from drawn noise of poses and torques."""
-    rng = np.random.default_rng(DRAWS_STREAM)
+    rng = mixed_generator(DISTURBED_COPIES)
     factor = np.linalg.cholesky(evidence.run.covariance)
     scenario, drawn = evidence.scenario, []
     for _ in range(DRAWS):

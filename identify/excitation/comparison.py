@@ -17,6 +17,7 @@ from identify.excitation.evolutionary_search import FEWEST_MEMBERS
 from identify.excitation.motion import sample_times
 from identify.excitation.random_trajectories import admissible_trajectories
 from identify.progress import Progress
+from identify.random_streams import EXCITATION, SEARCH, child
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
@@ -66,7 +67,6 @@ def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progr
     """Search with every method. Raises what `design_trajectories` raises."""
     settings = scenario.excitation
     count = max(settings.candidates, FEWEST_MEMBERS)
-    excitation_seed, _, search_seed = np.random.SeedSequence(seed).spawn(3)
     with progress.stage("compile the robot", 2) as advance:
         _ = robot.functions
         advance()
@@ -76,7 +76,8 @@ def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progr
     scenario = scenario.with_overrides({"excitation.method": "gradient", "excitation.candidates": count})
     check = motion_check(robot, scenario)
     with progress.stage("random candidates", 1) as advance:
-        candidates = admissible_trajectories(robot, settings, settings.duration_s, count, excitation_seed, check)
+        drawn = child(seed, EXCITATION)
+        candidates = admissible_trajectories(robot, settings, settings.duration_s, count, drawn, check)
         search = prepare_search(robot, scenario, candidates)
         index = log_observability(robot, search.problem.unknowns, settings.duration_s, search.candidates[0])
         advance()
@@ -85,7 +86,7 @@ def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progr
     entries = []
     for method in METHODS:
         began = time.perf_counter()
-        found = search.run(method, search_seed, progress)
+        found = search.run(method, child(seed, SEARCH), progress)
         seconds, trajectory = time.perf_counter() - began, found.trajectory(search.problem)
         try:
             information = float(np.exp(log_information(robot, scenario, known, trajectory)))

@@ -23,6 +23,7 @@ from identify.excitation.search import SearchProblem, SearchResult
 from identify.excitation.unknowns import unknowns
 from identify.files.trajectory_file import TrajectorySet
 from identify.progress import Progress, SilentProgress
+from identify.random_streams import EXCITATION, SEARCH, UNSEEN, child
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
@@ -44,13 +45,12 @@ def design_trajectories(
     """
     progress = progress or SilentProgress()
     settings = scenario.excitation
-    excitation_seed, validation_seed, search_seed = np.random.SeedSequence(seed).spawn(3)
     check = motion_check(robot, scenario)
     if (settings.method, settings.criterion) == ("random", "observability"):
-        excitation, indices = _best_random(robot, scenario, excitation_seed, check, progress)
+        excitation, indices = _best_random(robot, scenario, seed, check, progress)
     else:
-        excitation, indices = _searched(robot, scenario, excitation_seed, search_seed, check, progress)
-    unseen = _unseen(robot, scenario, validation_seed, check)
+        excitation, indices = _searched(robot, scenario, seed, check, progress)
+    unseen = _unseen(robot, scenario, seed, check)
     return TrajectorySet(
         seed=seed,
         excitation=excitation,
@@ -63,8 +63,7 @@ def design_trajectories(
 
 def unseen_trajectories(robot: Robot, scenario: Scenario, seed: int) -> tuple[FourierTrajectory, ...]:
     """The validation trajectories of a scenario alone, the same as `design_trajectories` gives, without its search."""
-    _, validation_seed, _ = np.random.SeedSequence(seed).spawn(3)
-    return _unseen(robot, scenario, validation_seed, motion_check(robot, scenario))
+    return _unseen(robot, scenario, seed, motion_check(robot, scenario))
 
 
 def motion_check(robot: Robot, scenario: Scenario) -> Check:
@@ -128,20 +127,24 @@ def prepare_search(robot: Robot, scenario: Scenario, candidates: list[FourierTra
     return Search(robot, scenario, problem, [pool[k] for k in order], known)
 
 
-def _unseen(
-    robot: Robot, scenario: Scenario, seed: np.random.SeedSequence, check: Check
-) -> tuple[FourierTrajectory, ...]:
+def _unseen(robot: Robot, scenario: Scenario, seed: int, check: Check) -> tuple[FourierTrajectory, ...]:
     count, duration_s = scenario.validation.count, scenario.validation.duration_s
-    return tuple(admissible_trajectories(robot, scenario.excitation, duration_s, count, seed, check))
+    return tuple(admissible_trajectories(robot, scenario.excitation, duration_s, count, child(seed, UNSEEN), check))
+
+
+def _candidates(robot: Robot, scenario: Scenario, seed: int, check: Check) -> list[FourierTrajectory]:
+    settings = scenario.excitation
+    drawn = child(seed, EXCITATION)
+    return admissible_trajectories(robot, settings, settings.duration_s, settings.candidates, drawn, check)
 
 
 def _best_random(
-    robot: Robot, scenario: Scenario, seed: np.random.SeedSequence, check: Check, progress: Progress
+    robot: Robot, scenario: Scenario, seed: int, check: Check, progress: Progress
 ) -> tuple[FourierTrajectory, Array]:
     """The best candidate, and the indices (eq. 39) of it and of all."""
     settings = scenario.excitation
     with progress.stage("excitation", settings.candidates) as advance:
-        candidates = admissible_trajectories(robot, settings, settings.duration_s, settings.candidates, seed, check)
+        candidates = _candidates(robot, scenario, seed, check)
         free = unknowns(robot.home_pose, settings)
         pool = [free.of(trajectory) for trajectory in candidates]
         index = log_observability(robot, free, settings.duration_s, pool[0])
@@ -154,20 +157,13 @@ def _best_random(
 
 
 def _searched(
-    robot: Robot,
-    scenario: Scenario,
-    excitation_seed: np.random.SeedSequence,
-    search_seed: np.random.SeedSequence,
-    check: Check,
-    progress: Progress,
+    robot: Robot, scenario: Scenario, seed: int, check: Check, progress: Progress
 ) -> tuple[FourierTrajectory, Array]:
     """What the scenario's method finds, and the indices (eq. 39) of it and of all candidates."""
     settings = scenario.excitation
-    candidates = admissible_trajectories(
-        robot, settings, settings.duration_s, settings.candidates, excitation_seed, check
-    )
+    candidates = _candidates(robot, scenario, seed, check)
     search = prepare_search(robot, scenario, candidates)
-    found = search.run(settings.method, search_seed, progress)
+    found = search.run(settings.method, child(seed, SEARCH), progress)
     index = log_observability(robot, search.problem.unknowns, settings.duration_s, search.candidates[0])
     pool = [search.problem.unknowns.of(trajectory) for trajectory in candidates]
     return found.trajectory(search.problem), np.array([observability_index(index, z) for z in (found.z, *pool)])

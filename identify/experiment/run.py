@@ -1,9 +1,6 @@
 """The experiment: the true plant runs a trajectory with the images in the loop, and what is seen is recorded.
 
-Random streams of one seed: (0) exciting trajectories, (1) unseen trajectories, (2) the sensor's teaching, (3) the scale
-anchor, (4, run) the sensor's noise in each run, (5, run) the latency of its frames (the run under a payload has a
-number beyond all others), (6, run) the noise in what is predicted of it, (8) the true load. `identify.variation` takes
-(7).
+What is random is drawn from the streams of `identify.random_streams`.
 """
 
 from dataclasses import dataclass
@@ -24,6 +21,7 @@ from identify.experiment.platform_load import PlatformLoad, drawn_load
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, frame_latencies, make_sensor
 from identify.experiment.truth import build_truth
 from identify.progress import Advance, Progress, SilentProgress
+from identify.random_streams import ANCHOR, LATENCY, LOAD, NOISE, TEACHING, stream_seed
 from identify.record import recording
 from identify.record.loop_setup import frame_times, reference_motion
 from identify.record.payload import store_payload
@@ -31,8 +29,8 @@ from identify.record.recorded_robot import store_robot
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory, check_travel
 
-TEACHING, ANCHOR, NOISE, LATENCY, PREDICTION, LOAD = 2, 3, 4, 5, 6, 8
 PAYLOAD_RUN = 1_000_000
+"""Number of the run under a payload, beyond all others."""
 
 
 @dataclass(frozen=True)
@@ -150,11 +148,6 @@ def run_plant(
 def true_parameters(robot: Robot, scenario: Scenario) -> np.ndarray:
     """The plant's parameters (67,). Raises ScenarioError for an unknown set (with the valid names)."""
     return starting_guess(robot, scenario.plant.parameters, 1.0).values
-
-
-def stream_seed(seed: int, *stream: int) -> int:
-    """Seed of one independent random stream of a run's seed."""
-    return int(np.random.SeedSequence(seed, spawn_key=stream).generate_state(1)[0])
 
 
 def _record(

@@ -13,14 +13,12 @@ from typing import Any
 import numpy as np
 
 from identify.errors import ScenarioError, StudyError
+from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
 from identify.scenario import Scenario, load_scenario
 from identify.studies.keys import check, is_integer, options_in, overrides
 from identify.studies.kinds import check_kind, options_model
 from identify.studies.law_names import check_law_names
 from identify.studies.study_file import Range, Study
-
-SAMPLE_STREAM = 1
-"""Random stream of the sample's points, beside the rows' children of the study's seed."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class Setup:
 
     def row_seed(self, number: int) -> np.random.SeedSequence:
         """The seed of a row."""
-        return np.random.SeedSequence(self.seed, spawn_key=(number,))
+        return child(self.seed, number)
 
 
 class Design:
@@ -82,7 +80,7 @@ class Design:
     @cached_property
     def _shares(self) -> np.ndarray:
         """Where each point (points, factors) lies between the ends of each factor, in [0, 1)."""
-        rng = np.random.default_rng([self._study.seed, SAMPLE_STREAM])
+        rng = mixed_generator(SAMPLED_POINTS, self._study.seed)
         return rng.random((self._study.points, len(self._study.factors)))
 
     def _value(self, path: str, share: float) -> Any:

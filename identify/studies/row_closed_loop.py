@@ -17,11 +17,12 @@ from identify.excitation.random_trajectories import admissible_trajectories
 from identify.experiment.run import run_plant
 from identify.experiment.sensor_in_loop import make_sensor
 from identify.experiment.truth import true_poses
+from identify.random_streams import stream_seed
 from identify.record import recording
 from identify.record.loop_setup import frame_times
 from identify.scenario import Scenario
 from identify.studies.row_columns import POSE_COLUMNS, Column, Kind, Row, RowOptions, pose_figures, rms_um
-from identify.studies.row_sensor import Teaching, sensor_file, stream_seed
+from identify.studies.row_sensor import Teaching, sensor_file
 
 EXPERIMENT, TRAJECTORY = 0, 1
 

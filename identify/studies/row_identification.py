@@ -26,12 +26,12 @@ from identify.experiment.run import Experiment, excitation_run, run_plant, taugh
 from identify.experiment.truth import true_poses
 from identify.files.trajectory_file import TrajectorySet
 from identify.progress import SilentProgress
+from identify.random_streams import stream_seed
 from identify.record.loop_setup import frame_times, model_settings
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, scenario_from_toml
 from identify.studies.row_columns import Column, Kind, Row, RowOptions, rms_um, stated_um
 from identify.studies.row_drawn_sensor import DrawnSensor
-from identify.studies.row_sensor import stream_seed
 from identify.validation import model_run
 
 EXPERIMENT = 0

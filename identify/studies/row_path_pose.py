@@ -15,9 +15,10 @@ import cmmsim
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.experiment.sensor_in_loop import frame_latencies
+from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.studies.row_columns import POSE_COLUMNS, Column, Kind, Row, RowOptions, pose_figures, rms_um
-from identify.studies.row_sensor import RowSensor, Teaching, row_sensor, stream_seed
+from identify.studies.row_sensor import RowSensor, Teaching, row_sensor
 from identify.trajectory import FourierTrajectory, random_trajectory
 
 PATH, SENSOR, LATENCY = 0, 1, 2

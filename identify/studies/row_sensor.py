@@ -56,12 +56,6 @@ def sensor_file(scenario: Scenario) -> SensorFile:
     return file.model_copy(update={"timing": sensor_timing(scenario.timing.model_dump())})
 
 
-def stream_seed(seed: np.random.SeedSequence, stream: int) -> int:
-    """A plain integer seed of one of a row's random streams; the row's own sequence is left as it is."""
-    key = (*seed.spawn_key, stream)
-    return int(np.random.SeedSequence(seed.entropy, spawn_key=key).generate_state(1)[0])
-
-
 @lru_cache(maxsize=SENSORS_KEPT)
 def _exact_sensor(file_json: str, method: str, renderer: str) -> RowSensor:
     file = SensorFile.model_validate_json(file_json)

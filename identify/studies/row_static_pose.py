@@ -2,7 +2,8 @@
 
 The box is the scenario's excitation amplitude around the sensor's home pose. Each row draws one pose (or several) and
 takes several pictures of it. Stickers are looked for where a tracker would expect them, a little beside the true place;
-no picture is searched as a whole. Teaching is exact unless asked for otherwise: the rows show observation noise alone.
+no picture is searched as a whole. The timing's dropout loses pictures, and changes nothing in the others. Teaching is
+exact unless asked for otherwise: the rows show observation noise alone.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ from cmmsim.estimator import PoseEstimator
 from cmmsim.pose import apply, invert
 from identify.arrays import Array
 from identify.errors import EstimationError
+from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.studies.row_columns import POSE_COLUMNS, Column, Kind, Row, RowOptions, pose_figures, rms_um
-from identify.studies.row_sensor import RowSensor, Teaching, row_sensor, stream_seed
+from identify.studies.row_sensor import RowSensor, Teaching, row_sensor
 
-POSES, SENSOR = 0, 1
+POSES, SENSOR, DROPOUT = 0, 1, 2
 PREDICTION_ERROR = np.repeat([1e-4, 5e-4], 3)
 """Standard deviation [m, rad] of the pose near which a picture's stickers are looked for: what a tracker predicts."""
 
@@ -59,7 +61,9 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPos
     amplitude = (scenario.excitation.position_amplitude_m, scenario.excitation.orientation_amplitude_rad)
     box = np.repeat(amplitude, 3)
     captures = options.captures if options.hold_s is None else max(1, scenario.timing.frames(options.hold_s))
-    looks = [_Look(eye, eye.sensor.home + box * rng.uniform(-1.0, 1.0, 6), captures, rng) for _ in range(options.poses)]
+    dropout = np.random.default_rng(stream_seed(seed, DROPOUT))
+    looks = [_Look(eye, eye.sensor.home + box * rng.uniform(-1.0, 1.0, 6), captures, rng, dropout)
+             for _ in range(options.poses)]
     return _row(eye, looks, captures)
 
 
@@ -67,8 +71,10 @@ class _Look:
     """What the pictures of one pose gave: errors and covariances of the pose (n, 6), (n, 6, 6), and what
     `_sticker_errors` says of all stickers in them."""
 
-    def __init__(self, eye: RowSensor, pose: Array, captures: int, rng: np.random.Generator) -> None:
+    def __init__(self, eye: RowSensor, pose: Array, captures: int, rng: np.random.Generator,
+                 dropout: np.random.Generator) -> None:
         estimator = eye.sensor.estimator
+        self._dropout = dropout
         self.reasons: list[str] = []
         seen = [self._measured(eye, estimator, pose, rng) for _ in range(captures)]
         good = [one for one in seen if one is not None]
@@ -84,8 +90,12 @@ class _Look:
     ) -> cmmsim.Measurement | None:
         predicted = pose + PREDICTION_ERROR * rng.standard_normal(6)
         expected = invert(estimator.taught.base_from_camera) @ cmmsim.pose_to_transform(predicted)
+        images = eye.sensor.look(pose)  # also of one that drops out, so that the next have the noise they had
+        if self._dropout.random() < (share := eye.sensor.timing.dropout):
+            self.reasons.append(f"dropped frame (a share of {share:.3g} drops out)")
+            return None
         try:
-            return estimator.measure(eye.sensor.look(pose), expected)[0]
+            return estimator.measure(images, expected)[0]
         except cmmsim.LostError as error:
             self.reasons.append(str(error))
             return None

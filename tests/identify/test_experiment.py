@@ -14,7 +14,7 @@ from cmmsim.measurement import lost_measurement
 from dynamics import load_robot
 from identify.errors import TrajectoryError
 from identify.experiment.robot_bodies import robot_transforms
-from identify.experiment.run import run_experiment, run_plant, stream_seed, taught_sensor
+from identify.experiment.run import run_experiment, run_plant, taught_sensor
 from identify.experiment.sensor_in_loop import SensorInLoop
 from identify.experiment.truth import read_truth, true_poses
 from identify.progress import SilentProgress
@@ -121,11 +121,6 @@ def test_a_trajectory_beyond_the_travel_is_refused_before_the_run(scenario, sens
     wild = random_trajectory(np.random.default_rng(0), rss6().home_pose, 0.1, 5, 0.02, 0.08)
     with pytest.raises(TrajectoryError, match=r"crank \d|leg \d"):
         run_plant(scenario, rss6(), sensor, wild, frame_times(scenario, 10.0), 0, 0)
-
-
-def test_streams_of_one_seed_differ():
-    seeds = {stream_seed(0, *stream) for stream in ((2,), (3,), (4, 0), (4, 1), (4, 2))}
-    assert len(seeds) == 5
 
 
 def test_sensor_in_loop_passes_obstacles_and_keeps_covariances(sensor):
