@@ -54,6 +54,12 @@ The stages alone, each reading what the one before wrote:
   cmmsim report --out mine               report.html, figures/*.png
 
 \b
+Another estimator on the same record, then judged and shown as before:
+  cmmsim identify --out mine --set identification.method=command_driven
+  cmmsim identify --out mine --set 'identification.prior={"platform.mass"={value=23.5,std=0.1}}'
+  cmmsim identify --out mine --set identification.physical_consistency=true
+
+\b
 The model in other engines:
   cmmsim export mjcf rss6 --parameters mine/result.json --allow-unphysical-inertia
   cmmsim verify-model                    MuJoCo against this model, figure8.png
@@ -128,6 +134,15 @@ Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Replace a value of the scenario: timing.frame_rate_hz=30."),
+]
+EstimatorSettings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Replace a setting of the estimator, in the sections identification, model or filter of the scenario: "
+        "identification.method=command_driven. The record was made with the rest.",
+    ),
 ]
 Workers = Annotated[
     int | None, typer.Option("--workers", min=1, help="Processes that render.", show_default="one a core")
@@ -229,11 +244,15 @@ def record(out: RunFolderOption, workers: Workers = None, quiet: Quiet = False) 
 
 
 @app.command()
-def identify(out: RunFolderOption, quiet: Quiet = False) -> None:
-    """Estimate the parameters from the record: writes result.json."""
+def identify(out: RunFolderOption, settings: EstimatorSettings = None, quiet: Quiet = False) -> None:
+    """Estimate the parameters from the record: writes result.json.
+
+    What is set here stays in scenario.toml, so that validate, report and the next identify go on with it; result.json
+    lists all settings of its estimator.
+    """
     folder = RunFolder(out)
     folder.require("scenario.toml", "trajectories.json", "experiment.nc")
-    _pipeline().identify(out, terminal_progress(quiet))
+    _pipeline().identify(out, terminal_progress(quiet), parse_settings(settings))
     result = _warned(folder)
     if not quiet:
         _summary().print_identification(result, folder.result)

@@ -1,7 +1,9 @@
 """The stages of a run, each reading what the one before wrote into the run folder."""
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import xarray as xr
 
@@ -13,10 +15,12 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation import identification
 from identify.estimation.loop_parameters import NAMES, check_parameter_set
+from identify.estimator_settings import estimator_settings, with_estimator_settings
 from identify.excitation import design_trajectories
 from identify.experiment.plant import check_plant, plant_robot
 from identify.experiment.run import excitation_run, taught_sensor, teach, untaught_sensor
 from identify.experiment.run import true_parameters as plant_parameters
+from identify.experiment.sensor_in_loop import with_renderer
 from identify.experiment.truth import read_truth, true_parameters
 from identify.files.atomic import write_text
 from identify.files.covariance_file import read_covariance, write_covariance
@@ -46,7 +50,7 @@ from identify.validation import model_run, predicted_runs, run_unseen
 
 def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:
     """All stages: excite, record, identify, validate, report. What cannot work is refused before any file."""
-    began = time.perf_counter()
+    began, scenario = time.perf_counter(), with_renderer(scenario)
     sensor = untaught_sensor(scenario, load_robot(scenario.robot), seed)
     if scenario.renderer == "pyrender":
         cmmsim.require_opengl()
@@ -65,6 +69,7 @@ def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers
 
 def excite(scenario: Scenario, seed: int, folder: Path, progress: Progress) -> None:
     """Choose the trajectories; writes scenario.toml and trajectories.json."""
+    scenario = with_renderer(scenario)
     _write_plan(folder, scenario, _designed(scenario, seed, progress))
 
 
@@ -88,9 +93,15 @@ def record(
     return sensor.taught
 
 
-def identify(folder: Path, progress: Progress) -> None:
-    """Estimate the parameters from the record; writes result.json (without the truth)."""
-    run_folder, scenario, trajectories, robot = _open(folder)
+def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | None = None) -> None:
+    """Estimate the parameters from the record; writes result.json (without the truth) and covariance.nc.
+
+    settings: of the estimator, by dotted path, instead of the scenario's. Once they have given a result, scenario.toml
+    holds them for the stages that follow.
+    Raises as `identification.identify` does, and ScenarioError for a setting that the record was made with.
+    """
+    run_folder, planned, trajectories, robot = _open(folder)
+    scenario = with_estimator_settings(planned, settings or {})
     began = time.perf_counter()
     payload_files = _payload_files(run_folder, scenario)
     run_folder.require(*(file.name for file in payload_files))
@@ -101,12 +112,15 @@ def identify(folder: Path, progress: Progress) -> None:
     reference = recorded_reference(seen)
     before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))
     seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
+    if scenario != planned:
+        write_text(run_folder.scenario, scenario.to_toml())
     write_covariance(run_folder.covariance, result.names, result.covariance)
     save_result(
         run_folder.result,
         {
             "scenario": scenario.name,
             "seed": trajectories.seed,
+            "settings": estimator_settings(scenario),
             "versions": versions(),
             "seconds": {
                 "record": seen.attrs.get("record_seconds"),
@@ -133,8 +147,8 @@ def validate(
     taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
     runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, workers, progress)
     recording.write_runs(run_folder.validation, [(unseen.record, unseen.truth) for unseen in runs])
-    identification = result["identification"]
-    models = [parameter_vector(identification, column) for column in ("initial", "estimate")]
+    estimated = result["identification"]
+    models = [parameter_vector(estimated, column) for column in ("initial", "estimate")]
     records = [excitation_record, *(run.record for run in runs)]
     model_poses = [_model_poses(robot, scenario, models, seen) for seen in records]
     predictions = predicted_runs(robot, scenario, records[1:], models[1], covariance, trajectories.seed, progress)
@@ -150,7 +164,7 @@ def validate(
         validation_entry(*pair, *poses) | prediction_entry(prediction, pair[1])
         for pair, poses, prediction in zip(pairs[1:], model_poses[1:], predictions, strict=True)
     ]
-    add_truth(identification, true_parameters(excitation_truth))
+    add_truth(estimated, true_parameters(excitation_truth))
     result["seconds"]["validate"] = time.perf_counter() - began
     save_result(run_folder.result, result)
 

@@ -213,13 +213,15 @@ def validation_section(data: ReportData) -> Section:
 def provenance_section(data: ReportData) -> Section:
     """Scenario, versions and times, so that the run can be repeated."""
     versions = tuple((name, str(value)) for name, value in data.result.get("versions", {}).items())
-    scenario = tuple(_split_toml(str(data.experiment.attrs.get("scenario", ""))))
+    text = str(data.experiment.attrs.get("scenario", ""))
+    changed = tables.changed_settings_table(data.result, text)
     return Section(
         "How it was made",
         f"Record made {data.experiment.attrs.get('created', 'at an unknown time')}.",
         (
             tables.seconds_table(data.result),
-            Table("Scenario", ("key", "value", "meaning"), scenario),
+            *([changed] if changed.rows else []),
+            Table("Scenario", ("key", "value", "meaning"), tuple(_split_toml(text))),
             Table("Software", ("package", "version"), versions),
         ),
     )

@@ -1,6 +1,7 @@
 """Tables like the paper's 2, 3 and 4 beside the paper's own figures, as rows of text with units in the header."""
 
 import math
+import tomllib
 from dataclasses import dataclass
 from typing import Any
 
@@ -170,6 +171,19 @@ def seconds_table(result: dict[str, Any]) -> Table:
     """Time of each stage."""
     rows = tuple((name, number(value)) for name, value in result.get("seconds", {}).items())
     return Table("Time of the stages", ("stage", "seconds"), rows)
+
+
+def changed_settings_table(result: dict[str, Any], recorded: str) -> Table:
+    """The estimator's settings that are not those of the scenario (TOML) with which the record was made."""
+    settings = result.get("settings", {})
+    planned = tomllib.loads(recorded) if settings else {}
+    rows = []
+    for key, value in settings.items():
+        section, _, name = key.partition(".")
+        before = planned.get(section, {}).get(name)
+        if value != before:
+            rows.append((key, str(value), "-" if before is None else str(before)))
+    return Table("Set anew for the identification", ("key", "value", "when the record was made"), tuple(rows))
 
 
 def number(value: float | None) -> str:

@@ -90,6 +90,17 @@ def test_stages_read_the_folder(calls, run_folder):
     assert [(c[0], c[1]) for c in calls] == [(s, run_folder.path) for s in ("record", "identify", "validate", "report")]
 
 
+def test_identify_passes_settings_of_the_estimator(calls, run_folder):
+    run_folder.trajectories.write_text("{}")
+    settings = ("identification.method=command_driven", 'identification.prior={"link1.mass"={value=1, std=0.1}}')
+    words = [word for setting in settings for word in ("--set", setting)]
+    assert command("identify", "--out", run_folder.path, "--quiet", *words) == 0
+    assert calls[0][3] == {
+        "identification.method": "command_driven",
+        "identification.prior": {"link1.mass": {"value": 1, "std": 0.1}},
+    }
+
+
 def test_summary_after_a_report_shows_goals_and_where_the_report_is(calls, run_folder, capsys):
     assert command("report", "--out", run_folder.path) == 0
     shown = capsys.readouterr().out
@@ -195,7 +206,12 @@ def test_command_starts_in_a_process_of_its_own():
     assert made.stdout.startswith("cmmsim 0.")
 
 
-@pytest.mark.parametrize(("arguments", "shown"), [(["--help"], "Examples:"), (["run", "--help"], "paper, quick")])
+@pytest.mark.parametrize(("arguments", "shown"), [
+    (["--help"], "Examples:"),
+    (["--help"], "identify --out mine --set identification.method=command_driven"),
+    (["run", "--help"], "paper, quick"),
+    (["identify", "--help"], "stays in scenario.toml"),
+])
 def test_help_teaches(capsys, arguments, shown):
     assert command(*arguments) == 0
     assert shown in capsys.readouterr().out

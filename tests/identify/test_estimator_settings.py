@@ -1,0 +1,105 @@
+"""Another estimator on a record that exists: what may change, what may not, and who hears of it."""
+
+import numpy as np
+import pytest
+
+from identify import pipeline
+from identify.errors import ScenarioError
+from identify.estimation.identification import identify
+from identify.estimator_settings import SECTIONS, estimator_settings, with_estimator_settings
+from identify.files.result_file import load_result
+from identify.files.run_folder import RunFolder
+from identify.files.trajectory_file import TrajectorySet, save_trajectories
+from identify.progress import SilentProgress
+from identify.record.recording import read, write
+from identify.reporting.report import provenance_section, read_report_data
+from identify.reporting.run_result import parameter_vector
+from identify.reporting.tables import changed_settings_table
+from identify.scenario import Scenario, load_scenario
+from tests.identify.commands import command, one_line
+from tests.identify.synthetic import quick, rss6, run_plant, trajectory
+
+SCENARIO = quick(**{"excitation.duration_s": 2.0, "identification.max_iterations": 1})
+DRIVEN = {"identification.method": "command_driven"}
+
+
+@pytest.fixture(scope="module")
+def record():
+    return run_plant(SCENARIO, seed=1, duration_s=2.0)[0]
+
+
+@pytest.fixture
+def run(tmp_path, record):
+    """A folder as `cmmsim record` leaves it."""
+    folder = RunFolder(tmp_path)
+    folder.scenario.write_text(SCENARIO.to_toml(), encoding="utf-8")
+    save_trajectories(folder.trajectories, TrajectorySet(0, trajectory(0), (trajectory(5),), 1.0, 1.0, 1.0))
+    write(folder.experiment, record)
+    return folder
+
+
+def test_a_setting_acts_and_is_kept_for_the_next_stages_and_the_reader(run):
+    pipeline.identify(run.path, SilentProgress(), DRIVEN)
+    kept, result = load_scenario(run.scenario), load_result(run.result)
+    assert kept == SCENARIO.with_overrides(DRIVEN)
+    assert result["settings"]["identification.method"] == "command_driven"
+    expected = identify(read(run.experiment), rss6(), SCENARIO.with_overrides(DRIVEN))
+    np.testing.assert_array_equal(parameter_vector(result["identification"], "estimate"), expected.estimate)
+    assert result["identification"]["searches"] == ["command_driven"]
+    table = changed_settings_table(result, read(run.experiment).attrs["scenario"])
+    assert table.rows == (("identification.method", "command_driven", "closed_loop"),)
+    pipeline.identify(run.path, SilentProgress())
+    assert load_result(run.result)["identification"]["searches"] == ["command_driven"]
+
+
+def test_without_settings_the_scenario_is_left_as_it_is(run):
+    run.scenario.write_text("# mine\n" + SCENARIO.to_toml(), encoding="utf-8")
+    pipeline.identify(run.path, SilentProgress())
+    assert run.scenario.read_text(encoding="utf-8").startswith("# mine\n")
+    result = load_result(run.result)
+    assert result["settings"] == estimator_settings(SCENARIO)
+    assert changed_settings_table(result, SCENARIO.to_toml()).rows == ()
+    assert changed_settings_table({}, "").rows == ()
+
+
+def test_an_identification_that_fails_leaves_scenario_and_result(run):
+    before = run.scenario.read_text(encoding="utf-8")
+    with pytest.raises(ScenarioError, match="robot rss6 has no parameter set 'nobody'; it has identified"):
+        pipeline.identify(run.path, SilentProgress(), {"model.start_parameters": "nobody"})
+    assert run.scenario.read_text(encoding="utf-8") == before
+    assert not run.result.exists()
+
+
+@pytest.mark.parametrize(
+    "setting",
+    ["timing.latency_s=0.01", "servo.kp=0.2", "plant.steps_per_frame=4", "excitation.duration_s=1", "sensor=ctrack780",
+     "identification={}", "identification.scale_anchor=prior", "identification.anchor_std=1", "payload.mass_kg=1"],
+)
+def test_what_the_record_was_made_with_is_refused_in_one_line(run, capfd, setting):
+    assert command("identify", "--out", run.path, "--set", setting) == 1
+    said = one_line(capfd.readouterr().err)
+    assert f"{setting.partition('=')[0]!r} cannot be set for an identification" in said
+    assert "allowed: identification.*, model.*, filter.*, except identification.scale_anchor and" in said
+    assert not run.result.exists()
+
+
+def test_a_wrong_name_or_value_is_refused_as_in_a_scenario():
+    with pytest.raises(ScenarioError, match=r"valid names in \[identification\]: method, scale_anchor"):
+        with_estimator_settings(SCENARIO, {"identification.methode": "closed_loop"})
+    with pytest.raises(ScenarioError, match="model: friction = 'stribeck' with static_ratio = None"):
+        with_estimator_settings(SCENARIO, {"model.friction": "stribeck"})
+
+
+def test_every_setting_of_the_sections_is_listed():
+    listed = {key.partition(".")[0] for key in estimator_settings(SCENARIO)}
+    assert listed == set(SECTIONS) < set(Scenario.model_fields)
+
+
+def test_the_report_says_what_was_set_anew(run_folder):
+    """The scenario that it shows is that of the record."""
+    data = read_report_data(run_folder)
+    assert [table.title for table in provenance_section(data).tables] == ["Time of the stages", "Scenario", "Software"]
+    data.result["settings"] = {"model.steps_per_frame": 9, "filter.order": 8, "identification.anchor_std": 0.1}
+    _, changed, scenario, _ = provenance_section(data).tables
+    assert changed.rows == (("model.steps_per_frame", "9", "4"), ("identification.anchor_std", "0.1", "-"))
+    assert ("model.steps_per_frame", "4") in [row[:2] for row in scenario.rows]
