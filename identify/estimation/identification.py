@@ -12,10 +12,11 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from dynamics import Robot
+from dynamics import DynamicsError, Robot
+from dynamics.loop_checks import checked_loop_parameters
 from identify.arrays import Array
 from identify.cores import one_thread
-from identify.errors import EstimationError
+from identify.errors import EstimationError, ScenarioError
 from identify.estimation import warm_start
 from identify.estimation.bounded_least_squares import Solution
 from identify.estimation.conditioning import Conditioning
@@ -23,7 +24,7 @@ from identify.estimation.estimate_covariance import DRAWS, Uncertainty, estimate
 from identify.estimation.explanation import Explanation, explanation
 from identify.estimation.group_estimates import GroupEstimates
 from identify.estimation.judgement import Judgement, judge
-from identify.estimation.loop_parameters import NAMES, starting_guess
+from identify.estimation.loop_parameters import NAMES, StartingGuess, starting_guess
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor
@@ -92,7 +93,7 @@ def identify(
             as a seed that is no whole number.
         EstimationError: no robot or scenario; a record of another robot, timing or servo, or one that cannot carry an
             identification; no model that runs from the starting guess or the warm start, or that bears the noise.
-        ScenarioError: a parameter set that the robot does not have.
+        ScenarioError: a parameter set that the robot does not have, or a starting guess that no model has.
         dynamics.DynamicsError: poses that the robot cannot reach.
     """
     progress = progress or SilentProgress()
@@ -121,6 +122,7 @@ def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: 
     Raises:
         RecordError: no scale anchor, or no such poses.
         EstimationError: no robot or scenario; a record that does not fit, or cannot carry an identification.
+        ScenarioError: no such starting guess, or one that no model has.
     """
     for given, kind, loader in ((robot, Robot, "dynamics.load_robot"), (scenario, Scenario, "identify.load_scenario")):
         if not isinstance(given, kind):
@@ -134,9 +136,22 @@ def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: 
             f"the scale anchor is a payload, and the {len(runs)} records have all the same load: one with and one "
             "without it are needed"
         )
+    return OutputErrorProblem(runs, _guess(robot, scenario), anchor)
+
+
+def _guess(robot: Robot, scenario: Scenario) -> StartingGuess:
+    """The scenario's starting guess. Raises ScenarioError where the robot has none of the name, or no model has it."""
     settings = scenario.identification
     guess = starting_guess(robot, scenario.model.start_parameters, settings.start_std, settings.prior)
-    return OutputErrorProblem(runs, guess, anchor)
+    try:
+        checked_loop_parameters(guess.values)
+    except DynamicsError as error:
+        known = ", ".join(settings.prior) or "nothing"
+        raise ScenarioError(
+            f"no model has the starting guess (set {scenario.model.start_parameters!r}, known beforehand: {known}): "
+            f"{error}"
+        ) from None
+    return guess
 
 
 def _result(

@@ -41,6 +41,16 @@ def test_of_what_no_motion_shows_the_prior_is_all_that_is_known():
     assert not result.identifiable[k]
 
 
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [("joint_pid.li", "joint_pid.li is 0.0, must be"), ("platform.mass", "platform.mass = 0 kg is not")],
+)
+def test_what_no_model_has_cannot_be_expected_of_one(name, says):
+    record, _ = run_plant(quick(), seed=1, duration_s=2.0)
+    with pytest.raises(ScenarioError, match=rf"set 'initial', known beforehand: {name}\): {says}"):
+        identify(record, rss6(), driven(**{name.replace(".", "_of_"): (0.0, 1.0)}))
+
+
 def test_a_prior_survives_the_scenario_file_and_names_what_does_not_exist():
     scenario = driven(link2_of_Izz=(3e-3, 1e-4))
     assert scenario_from_toml(scenario.to_toml()) == scenario
