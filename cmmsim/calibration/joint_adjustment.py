@@ -3,7 +3,7 @@
 Levenberg and Marquardt's method on the normal equations. A board pose is seen by its own view only, so that the poses
 are eliminated view by view (Schur complement) and what remains is the reduced normal matrix N of the free intrinsics
 and of right_from_left. All pixels count alike; their variance sigma² is estimated from the residuals, and
-sigma² N^-1 is the covariance.
+sigma² N^-1 is the covariance of independent errors, enlarged where the points of a view share theirs.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from ..pose import Array, apply, skew
 from .errors import CalibrationError
 from .intrinsics import project
+from .shared_errors import SharedErrors, shared_errors
 from .sightings import Sightings
 from .state import RigState
 
@@ -30,7 +31,8 @@ POSE = 6
 class Adjustment:
     """state; residuals (m,2) px of each camera, measured minus computed; sigma_px: estimated standard deviation of a
     pixel coordinate; covariance (24,24) of the left and right intrinsics (9 each) and of the small error [dt, dphi] of
-    right_from_left; condition of N scaled to a unit diagonal; steps; freedom: observations minus unknowns."""
+    right_from_left; condition of N scaled to a unit diagonal; steps; freedom: observations minus unknowns; shared:
+    errors that points of one view share, whose factor is in the covariance."""
 
     state: RigState
     residuals: tuple[Array, Array]
@@ -39,12 +41,13 @@ class Adjustment:
     condition: float
     steps: int
     freedom: int
+    shared: SharedErrors
 
 
 @dataclass(frozen=True)
 class _Normal:
-    """Blocks of the normal equations: common (c,c), mixed (v,c,6), boards (v,6,6), right-hand sides (c,) and (v,6);
-    residuals of both cameras; cost: sum of squares, px²."""
+    """Blocks of the normal equations by view: common (v,c,c), mixed (v,c,6), boards (v,6,6), right-hand sides (v,c)
+    and (v,6); residuals of both cameras; cost: sum of squares, px²."""
 
     common: Array
     mixed: Array
@@ -66,11 +69,13 @@ def adjust(points: Array, sightings: tuple[Sightings, Sightings], start: RigStat
 
     state, steps = _minimise(build, start, free)
     normal = build(state)
-    freedom = sum(2 * len(s.view) for s in sightings) - len(normal.common) - POSE * len(state.left_from_boards)
+    size = normal.common.shape[1]
+    freedom = sum(2 * len(s.view) for s in sightings) - size - POSE * len(state.left_from_boards)
     if freedom < 1:
-        raise CalibrationError(f"too few points: {freedom + len(normal.common)} more observations than board poses, "
-                               f"more than {len(normal.common)} needed")
-    reduced = _reduced(normal, 0.0)[0]
+        raise CalibrationError(f"too few points: {freedom + size} more observations than board poses, "
+                               f"more than {size} needed")
+    information, scores = _reduced(normal, 0.0)
+    reduced = information.sum(axis=0)
     scale = 1.0 / np.sqrt(np.diag(reduced))
     eigenvalues, vectors = np.linalg.eigh(reduced * scale[:, None] * scale)
     if not eigenvalues[0] > SINGULAR:
@@ -79,9 +84,11 @@ def adjust(points: Array, sightings: tuple[Sightings, Sightings], start: RigStat
                                "the image")
     sigma2 = normal.cost / freedom
     inverse = (vectors / eigenvalues) @ vectors.T * scale[:, None] * scale
+    shared = shared_errors(scores, information, sigma2)
     spread = _spread(free)
-    return Adjustment(state, normal.residuals, float(np.sqrt(sigma2)), sigma2 * spread @ inverse @ spread.T,
-                      float(eigenvalues[-1] / eigenvalues[0]), steps, freedom)
+    return Adjustment(state, normal.residuals, float(np.sqrt(sigma2)),
+                      shared.factor * sigma2 * spread @ inverse @ spread.T,
+                      float(eigenvalues[-1] / eigenvalues[0]), steps, freedom, shared)
 
 
 def _minimise(build: Callable[[RigState], _Normal], state: RigState, free: Array) -> tuple[RigState, int]:
@@ -108,7 +115,7 @@ def _minimise(build: Callable[[RigState], _Normal], state: RigState, free: Array
 
 def _is_small(change: Array, normal: _Normal) -> bool:
     """Whether a change that does not help is rounding: it would lower the cost by next to nothing."""
-    return bool(abs(change @ normal.common_side) <= 1e-8 * normal.cost)
+    return bool(abs(change @ normal.common_side.sum(axis=0)) <= 1e-8 * normal.cost)
 
 
 def _rms(normal: _Normal) -> float:
@@ -118,8 +125,9 @@ def _rms(normal: _Normal) -> float:
 def _normal_equations(points: Array, sightings: tuple[Sightings, Sightings], state: RigState, free: Array) -> _Normal:
     k, views = free.shape[1], len(state.left_from_boards)
     size = 2 * k + POSE
-    common, mixed, boards = np.zeros((size, size)), np.zeros((views, size, POSE)), np.zeros((views, POSE, POSE))
-    common_side, board_side, residuals = np.zeros(size), np.zeros((views, POSE)), []
+    common, mixed = np.zeros((views, size, size)), np.zeros((views, size, POSE))
+    boards = np.zeros((views, POSE, POSE))
+    common_side, board_side, residuals = np.zeros((views, size)), np.zeros((views, POSE)), []
     for side, seen in enumerate(sightings):
         computed, by_common, by_board = _predict(points, seen, state, side, free)
         error = seen.pixels - computed
@@ -128,10 +136,10 @@ def _normal_equations(points: Array, sightings: tuple[Sightings, Sightings], sta
         for v, (first, last) in enumerate(pairwise(edges)):
             jc = by_common[first:last].reshape(-1, size)
             jb, e = by_board[first:last].reshape(-1, POSE), error[first:last].ravel()
-            common += jc.T @ jc
+            common[v] += jc.T @ jc
             mixed[v] += jc.T @ jb
             boards[v] += jb.T @ jb
-            common_side += jc.T @ e
+            common_side[v] += jc.T @ e
             board_side[v] += jb.T @ e
     cost = float(sum(np.sum(r**2) for r in residuals))
     return _Normal(common, mixed, boards, common_side, board_side, (residuals[0], residuals[1]),
@@ -162,17 +170,17 @@ def _predict(points: Array, seen: Sightings, state: RigState, side: int, free: A
 
 
 def _reduced(normal: _Normal, damping: float) -> tuple[Array, Array]:
-    """Reduced normal matrix (c,c) and its right-hand side (c,)."""
+    """Each view's share of the reduced normal matrix (v,c,c) and of its right-hand side (v,c)."""
     boards = normal.boards + damping * normal.boards * np.eye(POSE)
     eliminated = np.asarray(np.linalg.solve(boards, normal.mixed.swapaxes(1, 2)).swapaxes(1, 2), dtype=np.float64)
-    matrix = normal.common + damping * np.diag(np.diag(normal.common))
-    matrix = matrix - np.einsum("vci,vdi->cd", eliminated, normal.mixed)
-    return matrix, normal.common_side - np.einsum("vci,vi->c", eliminated, normal.board_side)
+    matrix = normal.common + damping * normal.common * np.eye(normal.common.shape[1])
+    matrix = matrix - eliminated @ normal.mixed.swapaxes(1, 2)
+    return matrix, normal.common_side - np.einsum("vci,vi->vc", eliminated, normal.board_side)
 
 
 def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
     """Damped step: changes of the common unknowns (c,) and of the boards (v,6)."""
-    matrix, side = _reduced(normal, damping)
+    matrix, side = (part.sum(axis=0) for part in _reduced(normal, damping))
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     common = scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * side, rcond=1e-15)[0]
     boards = normal.boards + damping * normal.boards * np.eye(POSE)

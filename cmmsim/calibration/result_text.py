@@ -61,6 +61,7 @@ def as_dict(found: Calibration) -> dict[str, Any]:
         "sigma_px": solved.sigma_px,
         "degrees_of_freedom": solved.freedom,
         "condition": solved.condition,
+        "shared_errors": {"ratio": solved.shared.ratio, "limit": solved.shared.limit, "factor": solved.shared.factor},
         "parameters": {name: {"estimate": float(value), "std": float(std), "free": bool(std > 0.0)}
                        for name, value, std in zip(PARAMETER_NAMES, found.values, found.std, strict=True)},
         "covariance": {"names": list(PARAMETER_NAMES), "matrix": found.covariance.tolist()},

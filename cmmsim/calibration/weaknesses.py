@@ -18,8 +18,12 @@ FEW_VIEWS = 8
 
 
 def weaknesses(solved: Adjustment, sightings: tuple[Sightings, Sightings], rig: StereoRig) -> list[str]:
-    """One line for each weakness of a calibration: uncertain cameras, boards alike, images not covered, few views."""
+    """One line for each weakness of a calibration: errors shared within a view, uncertain cameras, boards alike, images
+    not covered, few views."""
     lines = []
+    if (factor := solved.shared.factor) > 1.0:
+        lines.append(f"points of one view err alike: the covariance is taken {factor:.1f} times that of independent "
+                     f"errors (chance allows {solved.shared.limit:.1f}); is the board flat, evenly lit and sharp?")
     spread = np.sqrt(np.diag(solved.covariance))
     tilt = _largest_tilt(solved.state.left_from_boards[:, :3, 2])
     for side, (camera, name) in enumerate(zip(rig.cameras, SIDES, strict=True)):
