@@ -28,6 +28,7 @@ def test_no_two_streams_draw_the_same(seed):
     """Nor do streams of the same number: a seed that a child generates, and one that is mixed, begin others."""
     generators = {name: np.random.default_rng(child(seed, getattr(random_streams, name))) for name in CHILDREN}
     generators["TEACHING"] = np.random.default_rng(stream_seed(seed, random_streams.TEACHING))
+    generators |= {f"NOISE {run}": np.random.default_rng(child(seed, random_streams.NOISE, run)) for run in (0, 1)}
     generators |= {name: mixed_generator(getattr(random_streams, name), seed) for name in MIXED}
     generators |= {name: mixed_generator(getattr(random_streams, name)) for name in ("ROUTES_UNCERTAINTY",
                                                                                      "DISTURBED_COPIES")}
