@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from .arguments import finite_array, require_kind
 from .blob_search import find_ellipses
 from .consistency import consistent
 from .errors import LostError, ShapeError, UnknownOptionError
 from .images import FrameImages, StereoFrame, StereoImages
-from .labelling import find_layout
+from .labelling import ENOUGH, find_layout
 from .marked_body import MarkedBody
 from .matching import candidate_pairs
 from .measurement import Measurement, lost_measurement
 from .noise import CameraNoise
-from .observation import DetectionSettings, StickerObservation, observe
+from .observation import (
+    LONGEST_SMEAR_PX,
+    DetectionSettings,
+    StickerObservation,
+    observe,
+    observe_windows,
+    read_windows,
+)
 from .pose import Array, compose_covariance, pose_covariance, transform_to_pose
 from .pose_methods import METHODS, Solution, by_planes
 from .stereo_rig import StereoRig
+from .streaks import Streaks, find_streaks
 from .taught import Taught
 
 NOMINAL_TOLERANCE = 0.003  # m: nominal places are known to about a millimetre
@@ -43,20 +53,61 @@ class PoseEstimator:
             raise UnknownOptionError("method", self.method, METHODS)
 
     def locate(self, images: StereoImages) -> Array:
-        """Rough camera_from_platform (4,4) from whole images, without prior. Raises LostError."""
-        points = points_in_frame(images.full(), self.rig, self.noise, self.settings)
-        places = self.taught.platform_places
-        return find_layout(places, points, TAUGHT_TOLERANCE, FEWEST_TAUGHT, "platform")[0]
+        """Rough camera_from_platform (4,4) from whole images, without prior. Raises LostError.
+
+        Where the cameras are exposed for some time and many stickers are missing, streaks are looked for as well.
+        """
+        frame, usual = images.full(), self.settings
+        if usual.exposed_share == 0.0:
+            return self._found(frame, usual)[0]
+        streaks = replace(usual, limits=replace(usual.limits, largest_misfit=np.inf))
+        try:
+            found, count = self._found(frame, usual)
+        except LostError:
+            return self._found(frame, streaks)[0]
+        if count < ENOUGH * len(self.taught.platform_places):
+            try:
+                longer, more = self._found(frame, streaks)
+            except LostError:
+                return found
+            return longer if more > count else found
+        return found
 
     def measure(self, images: StereoImages, expected: Array,
                 swept: tuple[Array, Array] | None = None) -> tuple[Measurement, Array]:
         """Measurement near an expected camera_from_platform (4,4), and the measured one. Raises LostError.
 
         ``swept``: expected ones at the beginning and the end of the exposure. Where stickers are smeared over more than
-        half a pixel and it is not told, a pose without point spread is worse than its covariance.
+        half a pixel and it is not told, a pose without point spread is worse than its covariance: ``measure_anew``.
         """
-        seen = observe(images, self.rig, self.noise, self.settings, expected, self.taught.platform_places,
-                       self.platform.sticker_normals, swept)
+        return self._measured(observe(images, self.rig, self.noise, self.settings, expected,
+                                      self.taught.platform_places, self.platform.sticker_normals, swept))
+
+    def measure_anew(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
+        """As ``measure`` where nothing is known of the movement: it is told from the streaks of the stickers.
+
+        Raises LostError, which states the length of the streaks where they show.
+        """
+        if self.settings.exposed_share == 0.0:
+            return self.measure(images, expected)
+        places, normals = self.taught.platform_places, self.platform.sticker_normals
+        read = read_windows(images, self.rig, self.noise, self.settings, expected, places, normals)
+        streaks = find_streaks(read, self.rig, self.noise, self.settings, places, normals)
+        swept = None if streaks is None else streaks.swept
+        try:
+            return self._measured(observe_windows(read, self.rig, self.noise, self.settings, places, swept))
+        except LostError as error:
+            raise error if streaks is None else _lost_in_streaks(error, streaks) from error
+
+    def _found(self, frame: StereoFrame, settings: DetectionSettings) -> tuple[Array, int]:
+        """Rough camera_from_platform (4,4) and the number of stickers that were recognised. Raises LostError."""
+        points = points_in_frame(frame, self.rig, self.noise, settings)
+        place, stickers, _ = find_layout(self.taught.platform_places, points, TAUGHT_TOLERANCE, FEWEST_TAUGHT,
+                                         "platform")
+        return place, len(stickers)
+
+    def _measured(self, seen: StickerObservation) -> tuple[Measurement, Array]:
+        """Measurement, and measured camera_from_platform (4,4), from stickers. Raises LostError."""
         camera_from_platform, covariance, used = self._solve(seen)
         base_from_platform = self.taught.base_from_camera @ camera_from_platform
         spread = compose_covariance(self.taught.base_from_camera, covariance)
@@ -92,9 +143,14 @@ def measure_frame(frame: StereoFrame, estimator: PoseEstimator, expected: Array 
         expected = finite_array(expected, (4, 4), "the expected camera_from_platform must be (4,4) and finite")
     images = FrameImages(frame)
     try:
-        return estimator.measure(images, estimator.locate(images) if expected is None else expected)[0]
+        return estimator.measure_anew(images, estimator.locate(images) if expected is None else expected)[0]
     except LostError as error:
         return lost_measurement(str(error))
+
+
+def _lost_in_streaks(error: LostError, streaks: Streaks) -> LostError:
+    return LostError(f"{error}; the exposure draws stickers out over {streaks.longest_px:.1f} px, at most "
+                     f"{LONGEST_SMEAR_PX:.1f} px can be measured")
 
 
 def points_in_frame(frame: StereoFrame, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings) -> Array:

@@ -79,6 +79,22 @@ class StickerObservation:
                                   None if self.outlines is None else self.outlines.selected(keep))
 
 
+@dataclass(frozen=True)
+class StickerWindows:
+    """Grey values around the k stickers of a body that both cameras should see.
+
+    index (k,) into the body's stickers; camera_from_body (4,4) near which they are expected; corners (2,k,2) px of the
+    first pixels of windows (2,k,h,h), evenly lit; offsets (2,k,2) px of the ellipses' centres from those of the
+    stickers (eccentricity).
+    """
+
+    index: NDArray[np.int_]
+    camera_from_body: Array
+    corners: NDArray[np.int_]
+    windows: Windows
+    offsets: Array
+
+
 def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings,
             camera_from_body: Array, places: Array, normals: Array,
             swept: tuple[Array, Array] | None = None) -> StickerObservation:
@@ -86,34 +102,53 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
 
     ``swept``: camera_from_body at the beginning and at the end of the exposure, where they are thought to be known.
     """
+    read = read_windows(images, rig, noise, settings, camera_from_body, places, normals)
+    return observe_windows(read, rig, noise, settings, places, swept)
+
+
+def read_windows(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings,
+                 camera_from_body: Array, places: Array, normals: Array) -> StickerWindows:
+    """Read the windows of stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose."""
     centres = [apply(move @ camera_from_body, places) for move in rig.from_camera]
     turned = [normals @ (move @ camera_from_body)[:3, :3].T for move in rig.from_camera]
     pixels, valid = rig.project(apply(camera_from_body, places))
     facing = np.stack([faces_camera(c, t) for c, t in zip(centres, turned, strict=True)])
     index = np.flatnonzero(np.all(valid & facing, axis=0))
-    detector = find_detector(settings.detector)
-    window_size, fit_size = settings.window_size + 2 * detector.margin_px, settings.fit_size + 2 * detector.margin_px
+    window_size = settings.window_size + 2 * find_detector(settings.detector).margin_px
     corners = np.rint(pixels[:, index] - 0.5 * (window_size - 1)).astype(int)
     if len(index) == 0:
-        return StickerObservation(index, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        none = np.zeros((2, 0, window_size, window_size))
+        return StickerWindows(index, camera_from_body, corners, none, np.zeros((2, 0, 2)))
     windows = _evenly_lit(images.windows(corners, window_size), corners, rig, noise, settings)
+    offsets = np.stack([centre_offset(camera, c[index], t[index], settings.radius)
+                        for camera, c, t in zip(rig.cameras, centres, turned, strict=True)])
+    return StickerWindows(index, camera_from_body, corners, windows, offsets)
+
+
+def observe_windows(read: StickerWindows, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings,
+                    places: Array, swept: tuple[Array, Array] | None = None) -> StickerObservation:
+    """Observe the stickers in windows that have been read; ``places`` and ``swept`` as of ``observe``."""
+    if len(read.index) == 0:
+        return StickerObservation(read.index, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 3)),
+                                  np.zeros((0, 3, 3)))
+    detector = find_detector(settings.detector)
+    fit_size = settings.fit_size + 2 * detector.margin_px
+    windows, corners = read.windows.reshape(-1, *read.windows.shape[2:]), read.corners.reshape(-1, 2)
 
     def detect(smears: Array | None) -> DetectedCentres:
-        return detector.detect(windows.reshape(-1, *windows.shape[2:]), corners.reshape(-1, 2), noise, fit_size,
-                               settings.limits, psf_px=settings.optics.psf_px, smears=smears)
+        return detector.detect(windows, corners, noise, fit_size, settings.limits, psf_px=settings.optics.psf_px,
+                               smears=smears)
 
-    smears = None if swept is None else _smears(rig, swept, places[index], settings.optics.psf_px)
+    smears = None if swept is None else _smears(rig, swept, places[read.index], settings.optics.psf_px)
     fits = detect(None) if smears is None else _likelier(detect(None), detect(smears))
-    seen_at = fits.centres.reshape(2, -1, 2) - np.stack(
-        [centre_offset(camera, c[index], t[index], settings.radius)
-         for camera, c, t in zip(rig.cameras, centres, turned, strict=True)])
+    seen_at = fits.centres.reshape(2, -1, 2) - read.offsets
     systematic = settings.centre_error_px**2 + detector.bias_px**2
     spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
     ideal, ideal_spread, found = rig.undistort(seen_at, spread)
     good = np.all(fits.good.reshape(2, -1) & found, axis=0)
     seen = triangulate(rig.ideal, *ideal, *ideal_spread)
     outlines = _outlines(fits, settings.centre_error_px**2)
-    return StickerObservation(index, seen_at[0], seen_at[1], seen.points, seen.covariances, outlines).selected(
+    return StickerObservation(read.index, seen_at[0], seen_at[1], seen.points, seen.covariances, outlines).selected(
         good & (seen.ray_gap < settings.largest_ray_gap))
 
 

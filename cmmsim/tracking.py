@@ -20,7 +20,7 @@ class Tracker:
 
     A frame in which the prediction fails is searched as a whole at once; where that finds fewer stickers, what the
     prediction found stands. What moves is fitted as the exposure smears it, as fast as it moved since the last frame;
-    the first frame of a run, and the first after a loss, are taken to be at rest.
+    in the first frame of a run, and in the first after a loss, the smear itself tells how far.
     """
 
     def __init__(self, estimator: PoseEstimator) -> None:
@@ -72,6 +72,8 @@ class Tracker:
     def _found(self, images: StereoImages) -> tuple[Measurement, Array]:
         """The measurement after a search of the whole images, with no prior for where the platform is."""
         found = self._estimator.locate(images)
+        if self._last is None:
+            return self._estimator.measure_anew(images, found)
         return self._estimator.measure(images, found, self._swept(found))
 
     def _swept(self, middle: Array) -> tuple[Array, Array] | None:
