@@ -4,7 +4,7 @@ Under the load L the model has the parameters p + L: an error of the load moves 
 with J their Jacobian by the parameters, and the scores by J^T J dL. With S the covariance of the load, the scores
 spread by H S H beside the noise, where H = J^T J sums over all records made under this load. The estimate follows the
 scores as it follows those of noise (`estimate_covariance`). Where the load shows the scale, a load that is a percent
-heavier than stated makes all parameters some percent too small.
+heavier than stated makes all parameters about a percent too small.
 """
 
 from collections.abc import Sequence
