@@ -18,6 +18,7 @@ from .sensor_schema import Body, Stickers, unit
 
 SUNK = 0.0003  # m the solid surface lies below the sticker planes
 RING_SUNK = 0.0001  # m the dark ring lies below its sticker
+SHORTEST_ROD = 1e-9  # m: of a shorter one rounding is the direction
 
 
 @dataclass(frozen=True)
@@ -109,9 +110,17 @@ def rod(length: float, radius: float) -> trimesh.Trimesh:
 
 
 def rod_transform(start: ArrayLike, end: ArrayLike) -> Array:
-    """base_from_body (4,4) of a rod that begins at ``start`` (3,) and points to ``end`` (3,), m. Raises ShapeError."""
+    """base_from_body (4,4) of a rod that begins at ``start`` (3,) and points to ``end`` (3,), m.
+
+    Raises ShapeError for anything but three finite numbers each, CmmError where the rod is shorter than SHORTEST_ROD.
+    """
     begin = finite_array(start, (3,), "the start of a rod is three finite numbers, m")
-    z = unit(finite_array(end, (3,), "the end of a rod is three finite numbers, m") - begin)
+    along = finite_array(end, (3,), "the end of a rod is three finite numbers, m") - begin
+    length = float(np.linalg.norm(along))
+    if length < SHORTEST_ROD:
+        raise CmmError(f"a rod of {length:g} m from {begin.tolist()} m points nowhere, at least {SHORTEST_ROD:g} m is "
+                       "needed")
+    z = unit(along)
     x = unit(np.cross(z, np.eye(3)[np.argmin(np.abs(z))]))
     transform = np.eye(4)
     transform[:3, :3] = np.column_stack([x, np.cross(z, x), z])

@@ -155,6 +155,7 @@ def test_what_is_no_pose(pose):
     (lambda s: cmmsim.transform_to_pose(np.diag([1.0, 1.0, -1.0, 1.0])), r"must be rigid: .* determinant -1 \(1\)"),
     (lambda s: rod("long", 0.01), r"length and radius of a rod are two finite numbers, m, got \('long', 0.01\)"),
     (lambda s: rod(0.1, -0.01), "length and radius of a rod must be above 0 m, got 0.1 and -0.01"),
+    (lambda s: rod_transform(np.ones(3), np.ones(3)), r"a rod of 0 m from \[1\.0, 1\.0, 1\.0\] m points nowhere"),
     (lambda s: rod_transform(None, np.ones(3)), "the start of a rod is three finite numbers"),
     (lambda s: rod_transform(np.zeros(3), np.ones(2)), r"end of a rod is three finite numbers, m, got shape \(2,\)"),
     (lambda s: cmmsim.PinholeCamera("wide", 9.0, 9.0, 20, 20), "a camera's focal length, .* are finite numbers"),
