@@ -50,6 +50,7 @@ class StickSlipMotion:
         self._has_events = np.logical_and(self._coulomb > 0, friction.sticks)
         self.mode = np.zeros(6, dtype=int)
         self.events = 0
+        self._last_event = MAX_EVENTS_PER_SEGMENT
         self._sensitivity = None
         if tangent is not None:
             self._sensitivity = StepSensitivity(functions, parameters, friction, tangent)
@@ -72,6 +73,16 @@ class StickSlipMotion:
 
     def segment(self, state: State, command: Command, duration: float, steps: int) -> State:
         """The state after `duration` s under one command. Raises MotionStopped."""
+        now = self._begin(state, command)
+        self._last_event = self.events + MAX_EVENTS_PER_SEGMENT
+        for n in range(1, steps + 1):
+            target = duration * n / steps
+            while now.time < target:
+                now = self._step(now, command, target)
+        return now.state
+
+    def _begin(self, state: State, command: Command) -> Evaluation:
+        """The evaluation at the start of a segment, in the modes that its command leaves."""
         start = self._terms(state, 0.0, command)
         self._follow_frictionless(start)
         self._decide_modes(start, np.flatnonzero(self.mode == 0))
@@ -80,33 +91,34 @@ class StickSlipMotion:
             stuck = np.flatnonzero(self.mode == 0)
             self._sensitivity.stop(now, stuck, state.rate, np.zeros(len(stuck)))
         self._unmoved = False
-        events = 0
-        for n in range(1, steps + 1):
-            target = duration * n / steps
-            while now.time < target:
-                h = target - now.time
-                stages, end = self._trial(now, command, h)
-                if self._margin(end)[0] >= 0 and self._hinted(stages):
-                    halfway = self._trial(now, command, h / 2)[1]
-                    h, end = (h / 2, halfway) if self._margin(halfway)[0] < 0 else (h, end)
-                if self._margin(end)[0] >= 0:
-                    if self._sensitivity:
-                        self._sensitivity.step(stages, end, command, self.mode)
-                    stopped = self._stop_joints(end, np.flatnonzero(self.mode == 0))
-                    self._follow_frictionless(end)
-                    now = self._evaluate(stopped, target, command)
-                    continue
-                events += 1
-                if events > MAX_EVENTS_PER_SEGMENT:
-                    raise MotionStopped("more stick-slip events than a frame can hold", now.state.pose)
-                stages, end, held = self._locate_event(now, command, h, end)
-                if self._sensitivity and held:
-                    self._sensitivity.cut_step(stages, end, command, self.mode, self._margin(end)[1])
-                elif self._sensitivity:
-                    self._sensitivity.fixed_step(stages, end, command, self.mode)
-                now = self._after_event(end, command, held)
-                self.events += 1
-        return now.state
+        return now
+
+    def _step(self, now: Evaluation, command: Command, target: float) -> Evaluation:
+        """One step to the time `target`, s, or to where the first mode before it ends."""
+        h = target - now.time
+        stages, end = self._trial(now, command, h)
+        if self._margin(end)[0] >= 0 and self._hinted(stages):
+            halfway = self._trial(now, command, h / 2)[1]
+            h, end = (h / 2, halfway) if self._margin(halfway)[0] < 0 else (h, end)
+        if self._margin(end)[0] < 0:
+            return self._step_to_event(now, command, h, end)
+        if self._sensitivity:
+            self._sensitivity.step(stages, end, command, self.mode)
+        stopped = self._stop_joints(end, np.flatnonzero(self.mode == 0))
+        self._follow_frictionless(end)
+        return self._evaluate(stopped, target, command)
+
+    def _step_to_event(self, now: Evaluation, command: Command, h: float, end: Evaluation) -> Evaluation:
+        """The step to where a mode ends that is broken at `end`, after h s, and what follows in the new modes."""
+        if self.events == self._last_event:
+            raise MotionStopped("more stick-slip events than a frame can hold", now.state.pose)
+        stages, end, held = self._locate_event(now, command, h, end)
+        if self._sensitivity and held:
+            self._sensitivity.cut_step(stages, end, command, self.mode, self._margin(end)[1])
+        elif self._sensitivity:
+            self._sensitivity.fixed_step(stages, end, command, self.mode)
+        self.events += 1
+        return self._after_event(end, command, held)
 
     def _terms(self, state: State, time: float, command: Command) -> Evaluation:
         values = self._functions["equation_of_motion"](state.pose, state.rate, self._rigid)
