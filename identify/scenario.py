@@ -11,6 +11,7 @@ from typing import Any, Literal
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from identify.errors import ScenarioError
+from identify.files.built_in import built_in_names, named_text
 from identify.record.filtering import padding_samples
 from identify.scenario_sections import (
     Excitation,
@@ -162,7 +163,7 @@ class Scenario(Section):
 
 def scenario_names() -> list[str]:
     """Names of the built-in scenarios."""
-    return sorted(path.stem for path in BUILT_IN.glob("*.toml"))
+    return built_in_names(BUILT_IN)
 
 
 def load_scenario(name_or_path: str | Path) -> Scenario:
@@ -171,7 +172,7 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
     Raises:
         ScenarioError: no such scenario (with the built-in names), no TOML, or wrong content.
     """
-    text, source = _read(name_or_path)
+    text, source = named_text(name_or_path, BUILT_IN, "scenario", ScenarioError)
     return scenario_from_toml(text, source)
 
 
@@ -198,20 +199,6 @@ def scenario_from_dict(data: Mapping[str, Any], source: str = "scenario") -> Sce
         return Scenario.model_validate(dict(data))
     except ValidationError as error:
         raise ScenarioError(f"{source}: {one_line(error, Scenario)}") from error
-
-
-def _read(name_or_path: str | Path) -> tuple[str, str]:
-    name = str(name_or_path)
-    if name in scenario_names():
-        return (BUILT_IN / f"{name}.toml").read_text(encoding="utf-8"), f"scenario {name!r}"
-    path = Path(name)
-    try:
-        return path.read_text(encoding="utf-8"), f"scenario file {name}"
-    except (OSError, UnicodeDecodeError) as error:
-        reason = f", and {error}" if path.exists() else " nor a file"
-        raise ScenarioError(
-            f"scenario {name!r} is neither built in ({', '.join(scenario_names())}){reason}"
-        ) from error
 
 
 def _replace(data: dict[str, Any], path: str, value: Any) -> None:

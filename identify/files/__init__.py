@@ -1,1 +1,1 @@
-"""Files of a run: written whole or not at all, read with clear errors."""
+"""Files: those of a run, written whole or not at all and read with clear errors, and those of the package."""

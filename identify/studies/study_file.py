@@ -33,6 +33,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError, field_validator, model_validator
 
 from identify.errors import StudyError
+from identify.files.built_in import built_in_names, named_text
 from identify.scenario_text import one_line
 from identify.studies.law import Law
 
@@ -121,7 +122,7 @@ class Study(_Table):
 
 def study_names() -> list[str]:
     """Names of the built-in studies."""
-    return sorted(path.stem for path in BUILT_IN.glob("*.toml"))
+    return built_in_names(BUILT_IN)
 
 
 def load_study(name_or_path: str | Path) -> Study:
@@ -131,15 +132,7 @@ def load_study(name_or_path: str | Path) -> Study:
         StudyError: no such study (with the built-in names), no TOML, or wrong content; the keys of factors and changes
             are checked by :mod:`identify.studies.design`.
     """
-    name = str(name_or_path)
-    path, source = Path(name), f"study file {name}"
-    if name in study_names():
-        path, source = BUILT_IN / f"{name}.toml", f"study {name!r}"
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = f", and {error}" if path.exists() else " nor a file"
-        raise StudyError(f"study {name!r} is neither built in ({', '.join(study_names())}){reason}") from error
+    text, source = named_text(name_or_path, BUILT_IN, "study", StudyError)
     return study_from_toml(text, source)
 
 
