@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cmmsim.acceptance import BarTest, LatencyTest, LengthTest, MeasuringVolume, bar_paths, seven_lines
@@ -12,6 +11,7 @@ from cmmsim.acceptance.bar_paths import SECONDS
 from cmmsim.acceptance.published import published
 from cmmsim.acceptance.volume import CORNERS
 from cmmsim.pose import apply, invert
+from identify.reporting.blank_figure import blank_figure
 
 EDGES = [(a, b) for a in range(8) for b in range(a) if np.sum(CORNERS[a] != CORNERS[b]) == 1]
 
@@ -32,7 +32,7 @@ def paths_figure(volume: MeasuringVolume) -> Figure:
 
 def length_figure(test: LengthTest, limit_um: float) -> Figure:
     """Length measurement error against length: single exposures as dots, the mean of each length as a line."""
-    figure = _figure(9, 5.5)
+    figure = blank_figure(9, 5.5)
     axes = figure.subplots()
     for number, line in enumerate(test.lines):
         lengths = test.of_line(line.name)
@@ -53,7 +53,7 @@ def length_figure(test: LengthTest, limit_um: float) -> Figure:
 
 def bar_figure(test: BarTest) -> Figure:
     """Relative pose error of the bar over time, and its distribution beside the published limits."""
-    figure = _figure(12, 8)
+    figure = blank_figure(12, 8)
     panels = figure.subplots(2, 2, width_ratios=(3, 2))
     for run in test.runs:
         for row, columns, scale in ((0, slice(0, 3), 1e6), (1, slice(3, 6), 1e6)):
@@ -73,7 +73,7 @@ def bar_figure(test: BarTest) -> Figure:
 
 def latency_figure(test: LatencyTest) -> Figure:
     """Delay of each report, their mean with its interval, and what the sensor file states."""
-    figure = _figure(9, 4.5)
+    figure = blank_figure(9, 4.5)
     series, spread = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
     found = test.latency
     series.plot(test.reported, 1e3 * found.delays, ".", markersize=4, label="one report")
@@ -110,7 +110,7 @@ def _distribution(axes: Axes, test: BarTest, row: int, name: str, unit: str) -> 
 
 def _in_volume(volume: MeasuringVolume, title: str, curves: dict[str, np.ndarray]) -> Figure:
     """Curves (n,3) m in the volume, drawn as a reader sees it: x to the right, depth away, up."""
-    figure = _figure(8, 6.5)
+    figure = blank_figure(8, 6.5)
     axes: Any = figure.add_subplot(projection="3d")
     for a, b in EDGES:
         axes.plot(*_shown(CORNERS[[a, b]] * volume.size), color="grey", linewidth=0.8)
@@ -128,9 +128,3 @@ def _in_volume(volume: MeasuringVolume, title: str, curves: dict[str, np.ndarray
 def _shown(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """x, z and -y (n,) mm of points (n,3) m."""
     return 1e3 * points[:, 0], 1e3 * points[:, 2], -1e3 * points[:, 1]
-
-
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure

@@ -1,11 +1,11 @@
 """The trajectories of all methods: paths of the pose and crank angles with their limits."""
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from dynamics import Robot
 from identify.excitation.comparison import Comparison
+from identify.reporting.blank_figure import blank_figure
 from identify.scenario import Scenario
 
 COMPONENTS = ("x", "y", "z", "α", "β", "γ")
@@ -15,8 +15,7 @@ POINTS = 1000
 def comparison_figure(robot: Robot, scenario: Scenario, comparison: Comparison) -> Figure:
     """One column a method: position, orientation and crank angles over one period, limits dashed."""
     settings = scenario.excitation
-    figure = Figure(figsize=(5 * len(comparison.entries), 9), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(5 * len(comparison.entries), 9)
     panels = figure.subplots(3, len(comparison.entries), sharex=True, sharey="row", squeeze=False)
     time = np.linspace(0.0, 1.0 / settings.fundamental_hz, POINTS)
     travel = robot.travel_limit - settings.travel_margin_rad

@@ -2,10 +2,10 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from cmmsim.calibration import Calibration
+from identify.reporting.blank_figure import blank_figure
 
 SIDES = ("left", "right")
 ARROW_SHARE = 0.06
@@ -56,8 +56,7 @@ def distortion_figure(found: Calibration) -> Figure:
 
 
 def _panels(found: Calibration, title: str) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=(12, 5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(12, 5)
     panels = list(figure.subplots(1, 2).flat)
     for axes in panels:
         axes.set_xlim(-0.5, found.rig.left.width - 0.5)

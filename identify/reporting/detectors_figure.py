@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from cmmsim.detector_leaderboard import Score
 from cmmsim.drawn_discs import Condition
+from identify.reporting.blank_figure import blank_figure
 
 COLUMNS = 3
 
@@ -19,8 +19,7 @@ def detectors_figure(scores: Sequence[Score], at_work: Condition) -> Figure:
     views = list(dict.fromkeys(_view(score.condition) for score in scores))
     columns = min(COLUMNS, len(views))
     rows = -(-len(views) // columns)
-    figure = Figure(figsize=(4.5 * columns, 0.8 + 3.2 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(4.5 * columns, 0.8 + 3.2 * rows)
     panels = figure.subplots(rows, columns, squeeze=False, sharey=True).flat
     for view, axes in zip(views, panels, strict=False):
         _panel(axes, [score for score in scores if _view(score.condition) == view])

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from identify.estimator_comparison import Score
+from identify.reporting.blank_figure import blank_figure
 
 PANELS = (
     ("base parameters", "median error [%]", "group_median", 100.0),
@@ -18,8 +18,7 @@ PANELS = (
 
 def estimators_figure(scores: Sequence[Score]) -> Figure:
     """Points on logarithmic axes, one panel a figure of merit; what does not exist (an unstable model) has none."""
-    figure = Figure(figsize=(14, 1.2 + 0.42 * len(scores)), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(14, 1.2 + 0.42 * len(scores))
     places = np.arange(len(scores))[::-1]
     for axes, (title, label, field, factor) in zip(figure.subplots(1, len(PANELS), sharey=True), PANELS, strict=True):
         values = np.array([factor * getattr(score, field) for score in scores], dtype=float)

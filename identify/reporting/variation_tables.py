@@ -3,10 +3,10 @@
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from dynamics.parameters import unit_of
+from identify.reporting.blank_figure import blank_figure
 from identify.reporting.tables import Table, number
 from identify.variation import Variation
 
@@ -94,8 +94,7 @@ def variation_table(found: Variation) -> Table:
 def variation_figure(found: Variation) -> Figure:
     """Variation of each identified parameter, with what was expected, the paper's, and both limits."""
     shown = np.flatnonzero(found.identified)
-    figure = Figure(figsize=(9, 2.0 + 0.28 * len(shown)), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(9, 2.0 + 0.28 * len(shown))
     axes, places = figure.subplots(), np.arange(len(shown))
     axes.barh(places, 100 * found.variation[shown], color="tab:blue", label="variation")
     axes.plot(100 * found.expected[shown], places, "kd", markersize=5, markerfacecolor="none", label="expected")

@@ -1,8 +1,8 @@
 """The paper's figure 8: position and angle differences of two engines over time, with MuJoCo's own closure error."""
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from identify.reporting.blank_figure import blank_figure
 from identify.robot_checks.figure7_loop import EngineRuns
 from identify.robot_checks.model_verification import GOAL_UM, GOAL_URAD, STEADY_FROM_S, judge
 
@@ -11,8 +11,7 @@ COMPONENTS = ("x", "y", "z", "α", "β", "γ")
 
 def figure_8(runs: EngineRuns) -> Figure:
     """Differences of MuJoCo and this model, and how far MuJoCo's loops are open, over time."""
-    figure = Figure(figsize=(9, 9), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(9, 9)
     position, angle, closure = figure.subplots(3, 1, sharex=True)
     verdict, difference = judge(runs), 1e6 * runs.difference
     for i in range(3):

@@ -2,11 +2,11 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
+from identify.reporting.blank_figure import blank_figure
 from identify.robot_checks.workspace_map import WorkspaceMap, WorkspacePlane
 
 NAMES = ("x", "y", "z", "α", "β", "γ")
@@ -27,8 +27,7 @@ def conditioning_figure(workspace: WorkspaceMap) -> Figure:
 
 
 def _maps(workspace: WorkspaceMap, quantity: str, title: str, label: str, norm: Normalize) -> Figure:
-    figure = Figure(figsize=(12, 8), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(12, 8)
     panels = figure.subplots(-(-len(workspace.planes) // COLUMNS), COLUMNS, squeeze=False)
     for axes, plane in zip(panels.flat, workspace.planes, strict=False):
         shown = _panel(axes, plane, getattr(plane, quantity), norm)

@@ -8,11 +8,11 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 
 from identify.arrays import Array
+from identify.reporting.blank_figure import blank_figure
 from identify.reporting.figures import save_figure
 from identify.studies.law import Law
 from identify.studies.point_statistics import CONFIDENCE as BANDS
@@ -121,8 +121,7 @@ def _levels(study: Study, rows: pd.DataFrame, factor: str) -> pd.Series:
 def _panels(count: int) -> tuple[Figure, list[Axes]]:
     columns = min(count, 3)
     rows = -(-count // columns)
-    figure = Figure(figsize=(5.0 * columns, 3.8 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(5.0 * columns, 3.8 * rows)
     panels = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel().tolist()
     for axes in panels[count:]:
         axes.set_visible(False)
