@@ -30,7 +30,7 @@ def body_frames(robot: Robot, pose: np.ndarray) -> BodyFrames:
     geometry, angle = robot.geometry, robot.inverse_kinematics(pose)
     platform = Rotation.from_euler("XYZ", pose[3:6]).as_matrix()
     crank = crank_rotations(robot, angle)
-    tip = geometry.base_joints + geometry.crank_length * crank[:, :, 0]
+    tip = crank_tips(robot, crank)
     joint = pose[:3] + geometry.platform_joints @ platform.T
     return BodyFrames(angle, tip, joint, platform, crank, _link_rotations(geometry.crank_axes, joint - tip))
 
@@ -40,6 +40,11 @@ def crank_rotations(robot: Robot, angle: np.ndarray) -> np.ndarray:
     axis, zero = robot.geometry.crank_axes, robot.geometry.crank_zero_directions
     x = np.cos(angle)[:, None] * zero + np.sin(angle)[:, None] * np.cross(axis, zero)
     return np.stack([x, np.cross(axis, x), axis], axis=-1)
+
+
+def crank_tips(robot: Robot, crank: np.ndarray) -> np.ndarray:
+    """Crank tips T (6, 3) in m of base-from-crank rotations (6, 3, 3)."""
+    return np.asarray(robot.geometry.base_joints + robot.geometry.crank_length * crank[:, :, 0])
 
 
 def link_angular_velocities(robot: Robot, frames: BodyFrames, pose: np.ndarray, twist: np.ndarray) -> np.ndarray:

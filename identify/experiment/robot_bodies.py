@@ -1,10 +1,10 @@
 """Cranks and links as the cameras see them: rods between the joints, which can hide stickers."""
 
-import numpy as np
 import trimesh
 
 import cmmsim
 from dynamics import Robot
+from dynamics.body_frames import crank_rotations, crank_tips
 from identify.arrays import Array
 
 CRANK_RADIUS_M = 0.010
@@ -24,10 +24,7 @@ def robot_transforms(robot: Robot, pose: Array) -> dict[str, Array]:
     geometry = robot.geometry
     base_from_platform = cmmsim.pose_to_transform(pose)
     ends = geometry.platform_joints @ base_from_platform[:3, :3].T + base_from_platform[:3, 3]
-    angles = robot.inverse_kinematics(pose)[:, None]
-    across = np.cross(geometry.crank_axes, geometry.crank_zero_directions)
-    cranks = geometry.crank_length * (np.cos(angles) * geometry.crank_zero_directions + np.sin(angles) * across)
-    tips = geometry.base_joints + cranks
+    tips = crank_tips(robot, crank_rotations(robot, robot.inverse_kinematics(pose)))
     transforms = {}
     for leg in range(6):
         transforms[f"crank{leg + 1}"] = cmmsim.rod_transform(geometry.base_joints[leg], tips[leg])
