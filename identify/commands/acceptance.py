@@ -57,7 +57,6 @@ def acceptance(
     """
     from identify.acceptance.procedure import chosen_standards, do, prepare, require_limit
     from identify.acceptance.result import acceptance_entry
-    from identify.errors import VerificationError
     from identify.files.run_folder import new_run_folder
 
     require_limit(limit_um)
@@ -69,10 +68,7 @@ def acceptance(
     _write(folder, entry, run, limit_um)
     if not quiet:
         _print_summary(entry, folder)
-    lengths = entry.get("vdi_2634_1")
-    if lengths and not lengths["met"]:
-        raise VerificationError(f"the largest length error is {abs(lengths['largest_error_um']):.1f} um on line "
-                                f"{lengths['largest_error_at']['line']}, more than {limit_um:g} um; see {folder}")
+    _require_met(entry, limit_um, folder)
 
 
 def _write(folder: Path, entry: dict[str, Any], run: Any, limit_um: float) -> None:
@@ -111,3 +107,13 @@ def _print_summary(entry: dict[str, Any], folder: Path) -> None:
         lines.append(f"latency: {test['mean_ms']:.4f} ms ({low:.4f} to {high:.4f}), largest {test['max_ms']:.4f} ms")
     for line in [*lines, f"report: {folder / 'acceptance.md'}"]:
         typer.echo(line)
+
+
+def _require_met(entry: dict[str, Any], limit_um: float, folder: Path) -> None:
+    """Raise VerificationError where a length was off by more than the limit."""
+    from identify.errors import VerificationError
+
+    lengths = entry.get("vdi_2634_1")
+    if lengths and not lengths["met"]:
+        raise VerificationError(f"the largest length error is {abs(lengths['largest_error_um']):.1f} um on line "
+                                f"{lengths['largest_error_at']['line']}, more than {limit_um:g} um; see {folder}")

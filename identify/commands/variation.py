@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from dynamics import Robot
     from identify.reporting.tables import Table
     from identify.scenario import Scenario
+    from identify.variation import Variation
 
 
 def variation(
@@ -45,11 +46,8 @@ def variation(
     --designed 10.
     """
     from dynamics import load_robot
-    from identify.files.atomic import write_text
-    from identify.files.result_file import save_result
     from identify.record import recording
-    from identify.reporting.figures import save_figure
-    from identify.reporting.variation_tables import variation_entry, variation_figure, variation_table
+    from identify.reporting.variation_tables import variation_table
     from identify.scenario import load_scenario
     from identify.variation import identify_each
     from identify.variation import variation as variation_of
@@ -65,12 +63,8 @@ def variation(
         else recording.read_runs(folder.validation)
     )
     found = variation_of(identify_each(records, robot, scenario, progress))
-    method = scenario.excitation.method
-    entry = variation_entry(found, f"designed: {method}" if designed else "unseen")
     table = variation_table(found)
-    save_result(out / "variation.json", entry)
-    write_text(out / "variation.md", f"# {table.title}\n\n{table.markdown()}\n\n{table.note}\n")
-    save_figure(variation_figure(found), folder.figures / "variation.png")
+    _write(folder, found, f"designed: {scenario.excitation.method}" if designed else "unseen", table)
     if not quiet:
         _print(table, *found.worst, out)
 
@@ -86,6 +80,17 @@ def _record_designed(
     runs = designed_runs(scenario, robot, seed, count, workers, progress)
     recording.write_runs(folder.path / "variation.nc", [(run.record, run.truth) for run in runs])
     return [run.record for run in runs]
+
+
+def _write(folder: RunFolder, found: "Variation", runs: str, table: "Table") -> None:
+    from identify.files.atomic import write_text
+    from identify.files.result_file import save_result
+    from identify.reporting.figures import save_figure
+    from identify.reporting.variation_tables import variation_entry, variation_figure
+
+    save_result(folder.path / "variation.json", variation_entry(found, runs))
+    write_text(folder.path / "variation.md", f"# {table.title}\n\n{table.markdown()}\n\n{table.note}\n")
+    save_figure(variation_figure(found), folder.figures / "variation.png")
 
 
 def _print(table: "Table", name: str, worst: float, out: Path) -> None:

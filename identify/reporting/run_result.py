@@ -48,33 +48,42 @@ def identification_entry(result: IdentificationResult) -> dict[str, Any]:
         "strongest_correlations": [asdict(pair) for pair in _strongest(result)],
         "warnings": list(result.warnings),
         "base_rank": result.base_rank,
-        "parameters": {
-            name: {
-                "unit": unit_of(name),
-                "initial": result.initial[index],
-                "true": None,
-                "warm_start": result.warm_start[index],
-                "estimate": result.estimate[index],
-                "std": result.std[index],
-                "interval": result.intervals[index].tolist(),
-                "identifiable": bool(result.identifiable[index]),
-                "rests_on_prior": bool(result.rests_on_prior[index]),
-            }
-            for index, name in enumerate(result.names)
-        },
-        "groups": {
-            name: {
-                "expression": result.groups.expressions[index],
-                "coefficients": _coefficients(result.groups.combinations[index], result.names),
-                "initial": result.groups.initial[index],
-                "true": None,
-                "estimate": result.groups.estimate[index],
-                "std": result.groups.std[index],
-                "interval": result.group_intervals[index].tolist(),
-                "identifiable": bool(result.groups.identifiable[index]),
-            }
-            for index, name in enumerate(result.groups.names)
-        },
+        "parameters": _parameter_entries(result),
+        "groups": _group_entries(result),
+    }
+
+
+def _parameter_entries(result: IdentificationResult) -> dict[str, dict[str, Any]]:
+    return {
+        name: {
+            "unit": unit_of(name),
+            "initial": result.initial[index],
+            "true": None,
+            "warm_start": result.warm_start[index],
+            "estimate": result.estimate[index],
+            "std": result.std[index],
+            "interval": result.intervals[index].tolist(),
+            "identifiable": bool(result.identifiable[index]),
+            "rests_on_prior": bool(result.rests_on_prior[index]),
+        }
+        for index, name in enumerate(result.names)
+    }
+
+
+def _group_entries(result: IdentificationResult) -> dict[str, dict[str, Any]]:
+    groups = result.groups
+    return {
+        name: {
+            "expression": groups.expressions[index],
+            "coefficients": _coefficients(groups.combinations[index], result.names),
+            "initial": groups.initial[index],
+            "true": None,
+            "estimate": groups.estimate[index],
+            "std": groups.std[index],
+            "interval": result.group_intervals[index].tolist(),
+            "identifiable": bool(groups.identifiable[index]),
+        }
+        for index, name in enumerate(groups.names)
     }
 
 
