@@ -57,19 +57,20 @@ def frame_seconds(sensor, poses):
     return fastest
 
 
-def test_frames_a_second(sensor, record_property):
+def test_frames_a_second(sensor, record_property, quote):
     poses = path(sensor, BATCH * (BATCHES + 1))
     for pose in poses[:BATCH]:
         sensor.measure(pose)
     with OtherLoad() as load:
         rate = 1.0 / frame_seconds(sensor, poses[BATCH:])
     record_property("frames_per_second", round(rate, 1))
+    quote(**{f"{sensor.renderer}_frames_a_second": rate})
     goal, slower = GOALS[sensor.renderer], slowness()
     judge(rate * slower >= goal, f"{rate:.1f} stereo frames a second with {sensor.renderer}, goal {goal:g} on one "
           f"{slower:.2f} times as fast", load)
 
 
-def test_against_a_straightforward_pipeline(sensor, record_property):
+def test_against_a_straightforward_pipeline(sensor, record_property, quote):
     """Rounds alternate and the fastest of each counts. The other pipeline measures the same poses, only worse.
 
     20 times is the goal of the sensor and reached by the analytic renderer. Drawing finely with pyrender's meshes is
@@ -93,6 +94,7 @@ def test_against_a_straightforward_pipeline(sensor, record_property):
     assert np.abs(errors)[:, :3].max() < 1e-3
     ratio = theirs / ours
     record_property("times_straightforward", round(ratio, 1))
+    quote(**{f"{sensor.renderer}_times_straightforward": ratio})
     goal = TIMES_STRAIGHTFORWARD[sensor.renderer]
     judge(ratio >= goal, f"{ratio:.1f} times a straightforward pipeline ({1e3 * theirs:.0f} ms a frame) with "
           f"{sensor.renderer}, goal {goal:g}", load)
