@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ from ..pose import Array
 from .board import Board
 from .chessboard_detection import find_chessboard
 from .dot_detection import find_dots
+from .dot_radius import differs
 
 FEWEST_SHARE = 0.7  # of the board's points that must be measured
 LARGEST_GAP = 0.25  # of the distance of neighbours, by which a point may leave the plane's perspective
@@ -19,30 +20,36 @@ LARGEST_GAP = 0.25  # of the distance of neighbours, by which a point may leave 
 
 @dataclass(frozen=True)
 class BoardView:
-    """What one camera sees of a board: index (n,) of the points and their pixels (n, 2)."""
+    """What one camera sees of a board: index (n,) of the points, their pixels (n, 2), the radius of its dots, m."""
 
     index: NDArray[np.int_]
     pixels: Array
+    radius: float | None = None
 
     def read_as(self, order: NDArray[np.int_]) -> BoardView:
         """The same view with its points renamed by one of the board's symmetries."""
         renamed = order[self.index]
         by_index = np.argsort(renamed)
-        return BoardView(renamed[by_index], self.pixels[by_index])
+        return replace(self, index=renamed[by_index], pixels=self.pixels[by_index])
 
 
 def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
     """The board in one grey image, or in words why not."""
-    if board.kind == "chessboard":
-        found = find_chessboard(grey, board.columns, board.rows)
-    else:
-        found = find_dots(grey, board)
+    found, radius = _points(grey, board)
     if found is None:
         return f"no {board.kind} of {board.columns} x {board.rows} found"
     measured = np.isfinite(found).all(axis=1)
     if measured.sum() < FEWEST_SHARE * len(found):
-        return f"only {measured.sum()} of {len(found)} points are sharp and whole"
-    return _as_seen_from_the_front(board, BoardView(np.flatnonzero(measured), found[measured]))
+        size = f", its dots measure {radius:.3g} m in radius, not {board.radius:g}" * differs(radius, board.radius)
+        return f"only {measured.sum()} of {len(found)} points are sharp and whole{size}"
+    return _as_seen_from_the_front(board, BoardView(np.flatnonzero(measured), found[measured], radius))
+
+
+def _points(grey: NDArray[np.uint8], board: Board) -> tuple[Array | None, float | None]:
+    """Points (rows * columns, 2) px, NaN where one is not measured, and the radius of dots, m; None where not found."""
+    if board.kind == "chessboard":
+        return find_chessboard(grey, board.columns, board.rows), None
+    return find_dots(grey, board) or (None, None)
 
 
 def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:

@@ -12,9 +12,11 @@ from ..pose import Array
 from ..stereo_rig import StereoRig
 from .board import Board
 from .calibration import Calibration, UsedView
+from .contradictions import contradictions
 from .errors import CalibrationError
 from .intrinsics import DEFAULT_DISTORTION, DISTORTIONS, camera_from, free_directions
 from .joint_adjustment import Adjustment, adjust
+from .named import some
 from .sightings import SIDES, PairView, Sightings, sightings_of
 from .start_values import start_values
 from .state import RigState
@@ -60,16 +62,17 @@ def calibrate(board: Board, pairs: Sequence[PairView], size: tuple[int, int],
         solved, sightings = _with_true_centres(board, sightings, solved, free, size)
     rejected = {pair.name: pair.reasons for pair in judged if pair.reasons}
     rig = _rig(solved.state, size)
+    warnings = contradictions(board, solved.state, judged) + weaknesses(solved, sightings, rig)
     return Calibration(rig, board, options.distortion, options.fix_aspect, solved, sightings,
-                       _used(kept, solved, sightings), rejected, weaknesses(solved, sightings, rig))
+                       _used(kept, solved, sightings), rejected, warnings)
 
 
 def _require_pairs(pairs: Sequence[PairView], options: CalibrationOptions) -> None:
     good = sum(pair.both for pair in pairs)
     if good < options.min_images:
-        reasons = "; ".join(f"{pair.name} ({pair.reasons})" for pair in pairs if not pair.both)
+        reasons = some([f"{pair.name} ({pair.reasons})" for pair in pairs if not pair.both])
         raise CalibrationError(f"{good} of {len(pairs)} pairs show the board to both cameras, {options.min_images} "
-                               "needed" + (f"; without it: {reasons}" if reasons else ""))
+                               "needed" + (f"; without it: {reasons}" if good < len(pairs) else ""))
 
 
 def _without_misfits(

@@ -16,6 +16,7 @@ from ..images import FrameImages, StereoFrame
 from ..noise import CameraNoise
 from ..pose import Array
 from .board import Board
+from .dot_radius import covered_radius
 
 SMALLEST_AREA_PX = 20.0
 FIND_SIDE_PX = 1600  # dots are first looked for in an image of at most this size: faster, and less noise
@@ -24,6 +25,7 @@ WINDOW_REACH = 2.2  # dot radii around the centre that are looked at
 GROUND_FROM = 1.2  # dot radii from which the ground is taken
 SPREADS_PX = (0.0, 0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.0)  # blurs that are tried, sigma
 PROBED = 12  # dots on which they are tried
+FITTED_SHARE = 0.5  # of the dots whose fits tell their radius; where fewer succeed, the area they cover tells it
 LARGEST_MOVE = 0.3  # a fit that ends farther from OpenCV's centre, in dot radii, has caught something else
 # A photograph's noise is not known and its edges are blurred: all grey values count alike, and the limit only refuses
 # what is no ellipse at all (residuals of 25 grey values rms).
@@ -31,14 +33,22 @@ PLAIN_NOISE = CameraNoise(electrons_at_white=255e4, gain=1e-4, dark_noise=5e4, f
 LIMITS = FitLimits(smallest_contrast=25.0, largest_misfit=25.0)
 
 
-def find_dots(grey: NDArray[np.uint8], board: Board) -> Array | None:
-    """Dot centres (rows * columns, 2) px in the board's order, NaN where a dot is no clean ellipse; None: no board."""
+def find_dots(grey: NDArray[np.uint8], board: Board) -> tuple[Array, float] | None:
+    """Dot centres (rows * columns, 2) px in the board's order, NaN where a dot is no clean ellipse, and the dots'
+    measured radius, m; None: no board."""
     bright = 255 - grey if board.dark else grey
     rough = None
     for side in (FIND_SIDE_PX, max(grey.shape)):
         if rough is None:
             rough = _find_grid(bright, board, min(1.0, side / max(grey.shape)))
-    return None if rough is None else _refine(bright, rough, board)
+    if rough is None:
+        return None
+    shapes = _dot_shapes(rough, board)
+    centres, ratios = _refine(bright, rough, shapes, board)
+    given, reach = float(board.radius or 1.0), 0.5 * float(board.nearest)
+    if np.isfinite(ratios).mean() > FITTED_SHARE:
+        return centres, given * float(np.nanmedian(ratios))
+    return centres, reach * covered_radius(bright, rough, shapes * (reach / given))
 
 
 def _find_grid(bright: NDArray[np.uint8], board: Board, scale: float) -> Array | None:
@@ -69,14 +79,14 @@ def _blob_detector(pixels: int) -> Any:
     return opencv.SimpleBlobDetector_create(options)
 
 
-def _refine(bright: NDArray[np.uint8], rough: Array, board: Board) -> Array:
-    """Fitted centres (n, 2); dots that need windows of one size are fitted together."""
-    shapes = _dot_shapes(rough, board)
+def _refine(bright: NDArray[np.uint8], rough: Array, shapes: Array, board: Board) -> tuple[Array, Array]:
+    """Fitted centres (n, 2), and fitted over expected radii (n,); dots that need windows of one size are fitted
+    together."""
     largest = np.linalg.norm(shapes, axis=2).max(axis=1)
     reach = min(WINDOW_REACH, board.nearest / float(board.radius or 1.0) - 1.15)  # neighbours stay outside
     sizes = 2 * np.ceil(reach * largest + 1.0).astype(int)
     images = FrameImages(StereoFrame(bright, bright))
-    fine, spread = np.full_like(rough, np.nan), None
+    fine, ratios, spread = np.full_like(rough, np.nan), np.full(len(rough), np.nan), None
     for size in np.unique(sizes)[::-1]:
         chosen = np.flatnonzero(sizes == size)
         corners = np.rint(rough[chosen] - 0.5 * (size - 1)).astype(int)
@@ -87,7 +97,9 @@ def _refine(bright: NDArray[np.uint8], rough: Array, board: Board) -> Array:
         moved = np.linalg.norm(fits.centres - rough[chosen], axis=1)
         clean = fits.good & (moved < np.maximum(LARGEST_MOVE * largest[chosen], 0.5))
         fine[chosen[clean]] = fits.centres[clean]
-    return fine
+        areas = np.abs(np.linalg.det(fits.shapes[clean]) / np.linalg.det(shapes[chosen[clean]]))
+        ratios[chosen[clean]] = np.sqrt(areas)
+    return fine, ratios
 
 
 def _point_spread(windows: Array, corners: NDArray[np.int_]) -> float:
@@ -114,5 +126,7 @@ def _without_neighbours(windows: Array, centres: Array, shapes: Array, reach: fl
     inverse = np.linalg.inv(shapes)[..., None, None]
     distance = np.hypot(inverse[:, 0, 0] * x + inverse[:, 0, 1] * y, inverse[:, 1, 0] * x + inverse[:, 1, 1] * y)
     around = np.where((distance > GROUND_FROM) & (distance <= reach), windows, np.nan)
-    ground = np.nan_to_num(np.nanmedian(around.reshape(len(windows), -1), axis=1))
+    around = around.reshape(len(windows), -1)
+    known, ground = np.isfinite(around).any(axis=1), np.zeros(len(windows))
+    ground[known] = np.nanmedian(around[known], axis=1)
     return np.where(distance <= reach, windows, ground[:, None, None])

@@ -109,8 +109,9 @@ def _minimise(build: Callable[[RigState], _Normal], state: RigState, free: Array
             return state, step
         else:
             damping *= 10.0
-    raise CalibrationError(f"the adjustment has not converged in {MOST_STEPS} steps (rms {_rms(normal):.3g} px): show "
-                           "the board tilted to several sides, or free fewer terms of distortion")
+    raise CalibrationError(f"the adjustment has not converged in {MOST_STEPS} steps (rms {_rms(normal):.3g} px, board "
+                           f"normals differ by at most {np.degrees(state.largest_tilt):.1f} degrees): show the board "
+                           "tilted to several sides, by 30 degrees and more, or free fewer terms of distortion")
 
 
 def _is_small(change: Array, normal: _Normal) -> bool:

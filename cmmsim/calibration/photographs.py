@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import CalibrationError
+from .named import some
 
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp")
 WHITE_SHARE = 99.9  # percentile of an image of more than 8 bit that becomes 255: 12-bit cameras fill 1/16 of 16 bit
@@ -44,7 +45,7 @@ def pair_images(left: str | Path, right: str | Path) -> list[ImagePair]:
         alone = [sorted(names[0] - names[1]), sorted(names[1] - names[0])]
         raise CalibrationError(
             f"{left} holds {len(found[0])} images and {right} {len(found[1])}; {HOW_PAIRED}, so each image needs its "
-            f"partner. Only on the left: {_some(alone[0])}; only on the right: {_some(alone[1])}")
+            f"partner. Only on the left: {some(alone[0])}; only on the right: {some(alone[1])}")
     return [ImagePair(a, b) for a, b in zip(*found, strict=True)]
 
 
@@ -85,8 +86,3 @@ def _image_files(folder: Path) -> list[Path]:
     if not files:
         raise CalibrationError(f"folder {folder} holds no images, which end in {', '.join(SUFFIXES)}")
     return files
-
-
-def _some(names: list[str], most: int = 3) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more if names else "none"

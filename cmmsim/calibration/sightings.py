@@ -35,6 +35,8 @@ class PairView:
     @property
     def reasons(self) -> str:
         """Why sides are missing; empty when none is."""
+        if isinstance(self.left, str) and self.left == self.right:
+            return f"both: {self.left}"
         return "; ".join(f"{name}: {side}" for name, side in zip(SIDES, self.sides, strict=True)
                          if isinstance(side, str))
 

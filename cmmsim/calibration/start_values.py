@@ -18,10 +18,11 @@ from .board_detection import BoardView
 from .errors import CalibrationError
 from .sightings import SIDES, PairView
 from .state import RigState
+from .view_variety import require_variety
 
 ALIKE_ANGLE, ALIKE_SHARE = 0.06, 0.12  # rad; of the baseline: places of the right camera that count as the same
 FEWEST_VIEWS = 3
-MISFIT = "both images show the board in places that fit no other pair: wrong partner, or moved between the exposures"
+MISFIT = "the two places of the board fit no other pair: wrong partner, or moved between the exposures"
 
 
 def start_values(board: Board, pairs: Sequence[PairView], size: tuple[int, int], bend: bool,
@@ -45,6 +46,7 @@ def _single(board: Board, pairs: Sequence[PairView], side: int, size: tuple[int,
     views = [(k, v) for k, v in ((k, p.sides[side]) for k, p in enumerate(pairs)) if not isinstance(v, str)]
     if len(views) < FEWEST_VIEWS:
         raise CalibrationError(f"the {SIDES[side]} camera sees the board in {len(views)} images, {FEWEST_VIEWS} needed")
+    require_variety([view for _, view in views], board.symmetries, SIDES[side], FEWEST_VIEWS)
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     flags |= 0 if bend else cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
     flags |= cv2.CALIB_FIX_ASPECT_RATIO if fix_aspect else 0

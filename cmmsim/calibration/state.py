@@ -17,6 +17,12 @@ class RigState:
     right_from_left: Array
     left_from_boards: Array
 
+    @property
+    def largest_tilt(self) -> float:
+        """Largest angle between the normals of any two boards, rad."""
+        normals = self.left_from_boards[:, :3, 2]
+        return float(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0)))
+
     def moved(self, intrinsics: Array, right: Array, boards: Array) -> RigState:
         """The state after changes of the intrinsics (2,9), and small errors [dt, dphi] of right_from_left (6,) and of
         the boards (v,6)."""

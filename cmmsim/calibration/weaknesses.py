@@ -25,7 +25,7 @@ def weaknesses(solved: Adjustment, sightings: tuple[Sightings, Sightings], rig: 
         lines.append(f"points of one view err alike: the covariance is taken {factor:.1f} times that of independent "
                      f"errors (chance allows {solved.shared.limit:.1f}); is the board flat, evenly lit and sharp?")
     spread = np.sqrt(np.diag(solved.covariance))
-    tilt = _largest_tilt(solved.state.left_from_boards[:, :3, 2])
+    tilt = solved.state.largest_tilt
     for side, (camera, name) in enumerate(zip(rig.cameras, SIDES, strict=True)):
         focal, centre = spread[9 * side:9 * side + 2].max(), spread[9 * side + 2:9 * side + 4].max()
         if focal > LARGEST_FOCAL_STD * camera.focal_px or centre > LARGEST_CENTRE_STD * camera.width:
@@ -43,11 +43,6 @@ def weaknesses(solved: Adjustment, sightings: tuple[Sightings, Sightings], rig: 
     if (count := len(solved.state.left_from_boards)) < FEW_VIEWS:
         lines.append(f"{count} views only; {FEW_VIEWS} and more make an estimate of the uncertainty reliable")
     return lines
-
-
-def _largest_tilt(normals: Array) -> float:
-    """Largest angle between any two of the unit normals (v,3), rad."""
-    return float(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0)))
 
 
 def _cover(pixels: Array, width: int, height: int) -> float:
