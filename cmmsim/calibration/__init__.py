@@ -13,12 +13,14 @@ from .errors import CalibrationError
 from .intrinsics import DISTORTIONS
 from .photographs import ImagePair, pair_images, read_grey
 from .rendering import render_pairs
-from .result_text import as_dict, calibrated_sensor, rig_tables
+from .result_text import as_dict, rig_tables
+from .sensor_template import SensorTemplate, require_sensor, sensor_template
 from .sightings import PairView
 from .views_of_images import view_pairs
 
 __all__ = [
     "DISTORTIONS", "PARAMETER_NAMES", "Board", "BoardView", "Calibration", "CalibrationError", "CalibrationOptions",
-    "ImagePair", "PairView", "as_dict", "board_poses", "calibrate", "calibrated_sensor", "default_board", "find_board",
-    "pair_images", "read_board", "read_grey", "render_pairs", "rig_tables", "view_pairs",
+    "ImagePair", "PairView", "SensorTemplate", "as_dict", "board_poses", "calibrate", "default_board", "find_board",
+    "pair_images", "read_board", "read_grey", "render_pairs", "require_sensor", "rig_tables",
+    "sensor_template", "view_pairs",
 ]

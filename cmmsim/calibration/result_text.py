@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import tomllib
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,11 +10,7 @@ import numpy as np
 
 from ..pose import transform_to_pose
 from .calibration import PARAMETER_NAMES, Calibration
-from .errors import CalibrationError
 from .sightings import SIDES
-
-TABLES = ("rig.left", "rig.right", "rig.right_from_left")
-HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(#.*)?$")
 
 
 def rig_tables(found: Calibration) -> str:
@@ -28,25 +22,6 @@ def rig_tables(found: Calibration) -> str:
     lines += ["[rig.right_from_left]", f"translation = {_row(found.rig.right_from_left[:3, 3])}  # m",
               f"rotation_vector = {_row(found.rotation_vector)}  # rad"]
     return "\n".join(lines) + "\n"
-
-
-def calibrated_sensor(template: str, found: Calibration) -> str:
-    """Text of a sensor file with the calibrated cameras in the place of its own; everything else stays as it is.
-
-    Raises CalibrationError when the template's images are of another size, or when its cameras stand in inline tables.
-    """
-    rig = tomllib.loads(template)["rig"]
-    size = found.rig.left.width, found.rig.left.height
-    if (rig["width"], rig["height"]) != size:
-        raise CalibrationError(f"the images are {size[0]} x {size[1]} px, those of the sensor file "
-                               f"{rig['width']} x {rig['height']}: take a sensor file of the same cameras")
-    text = _without_tables(template, TABLES).rstrip() + "\n\n" + rig_tables(found)
-    try:
-        tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise CalibrationError(f"the sensor file must hold {', '.join(TABLES)} as tables of their own: "
-                               f"{error}") from error
-    return text
 
 
 def as_dict(found: Calibration) -> dict[str, Any]:
@@ -75,15 +50,3 @@ def as_dict(found: Calibration) -> dict[str, Any]:
 
 def _row(values: Sequence[float] | np.ndarray) -> str:
     return "[" + ", ".join(repr(float(value)) for value in values) + "]"
-
-
-def _without_tables(text: str, names: Sequence[str]) -> str:
-    """TOML text without some tables; comments before the next header go with the table they follow."""
-    kept, skipping = [], False
-    for line in text.splitlines():
-        header = HEADER.match(line)
-        if header:
-            skipping = header[1].replace(" ", "") in names
-        if not skipping:
-            kept.append(line)
-    return "\n".join(kept) + "\n"

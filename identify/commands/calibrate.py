@@ -1,5 +1,9 @@
 """The command ``cmmsim calibrate``. Heavy imports are late."""
 
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +14,10 @@ from identify.progress import Progress, terminal_progress
 from identify.reporting.terminal import print_table, print_warnings
 
 if TYPE_CHECKING:
-    from cmmsim.calibration import Board, Calibration
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from cmmsim.calibration import Board, Calibration, CalibrationOptions, SensorTemplate
 
 CALIBRATE_HELP = """
 Calibrate a stereo camera from pictures of a board: real photographs, or rendered ones.
@@ -40,6 +47,7 @@ Examples:
 \b
 Writes into the folder:
   calibration.json      estimates with standard deviations, covariance, residuals, images used and rejected
+                        (where the points of a picture err alike, the covariance is enlarged, with a warning)
   rig.toml              tables [rig.left], [rig.right], [rig.right_from_left] for a sensor file
   sensor.toml           with --sensor: that sensor file with the calibrated cameras, for load_sensor
   residuals.png, coverage.png, distortion.png
@@ -63,93 +71,135 @@ def calibrate(
         ),
     ] = None,
     distortion: Annotated[
-        str, typer.Option("--distortion", help="Free terms: none, radial2 (k1, k2) or brown5 (k1, k2, p1, p2, k3).")
-    ] = "brown5",
+        str | None,
+        typer.Option(
+            "--distortion",
+            help="Free terms: none, radial2 (k1, k2) or brown5 (k1, k2, p1, p2, k3), which is the default.",
+            show_default=False,
+        ),
+    ] = None,
     fix_aspect: Annotated[bool, typer.Option("--fix-aspect", help="Square pixels: fx = fy.")] = False,
     min_images: Annotated[
-        int, typer.Option("--min-images", min=3, help="Fewest pairs that must show the board to both cameras.")
-    ] = 3,
+        int | None,
+        typer.Option(
+            "--min-images",
+            min=3,
+            help="Fewest pairs that must show the board to both cameras; 3 where it is left out.",
+            show_default=False,
+        ),
+    ] = None,
     render: Annotated[
         int | None,
         typer.Option("--render", min=1, help="Render this many pairs of pictures instead, and stop."),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the rendered poses and of their noise.")] = 0,
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            "--seed",
+            min=0,
+            help="Seed of the rendered poses and of their noise, 0 where it is left out.",
+            show_default=False,
+        ),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary; warnings stay.")] = False,
 ) -> None:
     """Calibrate a stereo camera from pictures of a board, or render such pictures."""
-    from cmmsim.calibration import read_board
+    from cmmsim.calibration import read_board, sensor_template
     from identify.files.run_folder import new_run_folder
 
     folder = new_run_folder(out).path
     progress = terminal_progress(quiet)
     if render is not None:
-        if left is not None or right is not None:
-            raise ScenarioError("--render makes pictures and reads none: leave out LEFT and RIGHT")
+        _require_none("--render makes pictures and reads none", LEFT=left, RIGHT=right)
+        _require_none("--render makes pictures and calibrates nothing",
+                      **{"--distortion": distortion, "--fix-aspect": fix_aspect or None, "--min-images": min_images})
         chosen = None if board is None else read_board(board)
-        _render(folder, sensor or "ctrack780", chosen, render, seed, progress, quiet)
+        _render(folder, sensor or "ctrack780", chosen, render, seed or 0, progress, quiet)
         return
+    _require_none("a calibration draws no random numbers without --render", **{"--seed": seed})
     if left is None or right is None or board is None:
         missing = ["LEFT"] * (left is None) + ["RIGHT"] * (right is None) + ["--board FILE"] * (board is None)
         raise ScenarioError(f"missing {', '.join(missing)}; cmmsim calibrate --help shows examples")
-    template = None if sensor is None else _template(sensor)
-    found = _calibrate(left, right, read_board(board), (distortion, fix_aspect, min_images), progress)
-    _write(folder, found, template)
-    print_warnings(found.warnings)
+    options = _options(distortion, fix_aspect, min_images)
+    template = None if sensor is None else sensor_template(sensor, folder)
+    found = _calibrate(left, right, read_board(board), options, template, progress)
+    refused = _write(folder, found, template)
+    print_warnings([*found.warnings, *(template.disagreements(found) if template else []), *refused])
     if not quiet:
         _print_summary(found, folder)
 
 
-def _calibrate(left: Path, right: Path, board: "Board", options: tuple[str, bool, int],
-               progress: Progress) -> "Calibration":
-    from cmmsim.calibration import CalibrationOptions, calibrate, pair_images, view_pairs
+def _require_none(reason: str, **given: object) -> None:
+    """Raise ScenarioError naming the arguments that are given although they would change nothing."""
+    if names := [name for name, value in given.items() if value is not None]:
+        raise ScenarioError(f"{reason}: leave out {' and '.join(names)}")
 
-    chosen = CalibrationOptions(*options)
+
+def _options(distortion: str | None, fix_aspect: bool, min_images: int | None) -> "CalibrationOptions":
+    from cmmsim.calibration import CalibrationOptions
+
+    default = CalibrationOptions()
+    return CalibrationOptions(distortion or default.distortion, fix_aspect, min_images or default.min_images)
+
+
+def _calibrate(left: Path, right: Path, board: "Board", options: "CalibrationOptions",
+               template: "SensorTemplate | None", progress: Progress) -> "Calibration":
+    from cmmsim.calibration import calibrate, pair_images, read_grey, view_pairs
+
     files = pair_images(left, right)
+    if template is not None:  # what cannot be written is refused before the search, which takes minutes
+        height, width = read_grey(files[0].left).shape
+        template.require_size((width, height))
     with progress.stage("find the board", len(files)) as advance:
         pairs, size = view_pairs(files, board, advance)
     with progress.stage("adjust", 1) as advance:
-        found = calibrate(board, pairs, size, chosen)
+        found = calibrate(board, pairs, size, options)
         advance()
     return found
 
 
-def _template(sensor: str) -> str:
-    """Text of a sensor file, checked to be one."""
-    from cmmsim.sensor_file import read_sensor_file, sensor_text
-
-    read_sensor_file(sensor)
-    return sensor_text(sensor)
-
-
-def _write(folder: Path, found: "Calibration", template: str | None) -> None:
-    """All files, the texts made before the first is written."""
-    from cmmsim.calibration import as_dict, calibrated_sensor, rig_tables
+def _write(folder: Path, found: "Calibration", template: "SensorTemplate | None") -> list[str]:
+    """All files, the texts made before the first is written; a line where no sensor can have these cameras."""
+    from cmmsim.calibration import as_dict, rig_tables
     from identify.files.atomic import write_text
     from identify.files.result_file import save_result
     from identify.reporting.calibration_figures import coverage_figure, distortion_figure, residual_figure
     from identify.reporting.figures import save_figure
 
     texts = {"rig.toml": rig_tables(found)}
-    if template is not None:
-        texts["sensor.toml"] = calibrated_sensor(template, found)
+    sensor = None if template is None else template.filled(found)
     figures = {"residuals": residual_figure, "coverage": coverage_figure, "distortion": distortion_figure}
     for name, text in texts.items():
         write_text(folder / name, text)
     save_result(folder / "calibration.json", as_dict(found))
     for name, draw in figures.items():
         save_figure(draw(found), folder / f"{name}.png")
+    return [] if sensor is None else _write_sensor(folder / "sensor.toml", sensor)
+
+
+def _write_sensor(path: Path, text: str) -> list[str]:
+    """A sensor file that can be read back, or the line that says why there is none."""
+    from cmmsim.calibration import require_sensor
+    from cmmsim.errors import SensorFileError
+    from identify.files.atomic import atomic_path
+
+    try:
+        with atomic_path(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+            require_sensor(temporary)
+    except SensorFileError as error:
+        return [f"{path.name} is not written, no sensor can have these cameras: {error}"]
+    return []
 
 
 def _render(folder: Path, sensor: str, board: "Board | None", count: int, seed: int, progress: Progress,
             quiet: bool) -> None:
-    """Pictures in left/ and right/, and board.toml beside them."""
-    import cv2
+    """Pictures in left/ and right/, and board.toml beside them: all of them, or nothing."""
     import numpy as np
 
     from cmmsim import load_sensor
     from cmmsim.calibration import board_poses, default_board, render_pairs
     from cmmsim.renderers import choose_renderer
-    from identify.files.atomic import atomic_path, write_text
 
     source = load_sensor(sensor, seed)
     board = board or default_board(source.rig)
@@ -157,17 +207,48 @@ def _render(folder: Path, sensor: str, board: "Board | None", count: int, seed: 
     poses = board_poses(source.rig, board, count, rng)
     renderer = choose_renderer(source.renderer)
     frames = render_pairs(source.rig, board, poses, renderer, source.optics, source.noise, rng)
-    with progress.stage("render", count) as advance:
+    with progress.stage("render", count) as advance, _all_or_nothing(folder) as made:
         for k, frame in enumerate(frames):
             for side, image in (("left", frame.left), ("right", frame.right)):
-                with atomic_path(folder / side / f"{k:03d}.png") as path:
-                    if not cv2.imwrite(str(path), image):
-                        raise OutputFolderError(f"cannot write {folder / side / f'{k:03d}.png'}")
+                _write_picture(made / side / f"{k:03d}.png", image)
             advance()
-    write_text(folder / "board.toml", board.as_toml())
+        (made / "board.toml").write_text(board.as_toml(), encoding="utf-8")
     if not quiet:
         typer.echo(f"pictures: {folder}\ncalibrate with: cmmsim calibrate {folder}/left {folder}/right "
                    f"--board {folder}/board.toml --sensor {sensor}")
+
+
+def _write_picture(path: Path, image: "NDArray[np.unsignedinteger]") -> None:
+    import cv2
+
+    path.parent.mkdir(exist_ok=True)
+    if not cv2.imwrite(str(path), image):
+        raise OutputFolderError(f"cannot write {path}")
+
+
+@contextmanager
+def _all_or_nothing(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder whose contents stand in ``folder``, new or empty, when the block ends without an error.
+
+    It lies within the folder, which so may be one that cannot be replaced, such as the one it is called from.
+    """
+    new = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    moved: list[Path] = []
+    try:
+        with tempfile.TemporaryDirectory(prefix=".making-", dir=folder) as name:
+            yield Path(name)
+            for path in sorted(Path(name).iterdir()):
+                moved.append(folder / path.name)
+                path.rename(moved[-1])
+    except BaseException:  # Ctrl-C as well
+        for path in moved:
+            shutil.rmtree(path, ignore_errors=True)
+            path.unlink(missing_ok=True)
+        with suppress(OSError):
+            if new:
+                folder.rmdir()
+        raise
 
 
 def _print_summary(found: "Calibration", folder: Path) -> None:

@@ -84,8 +84,11 @@ def test_rendering_again_gives_the_same_pictures(pictures, tmp_path):
     (lambda a: [*a, "--distortion", "fisheye"], "unknown distortion 'fisheye': valid are brown5, none, radial2"),
     (lambda a: [*a, "--sensor", "ctrack"], "unknown sensor 'ctrack'"),
     (lambda a: [*a, "--min-images", "9"], "8 of 8 pairs show the board to both cameras, 9 needed"),
-    (lambda a: [*a, "--sensor", "ctrack780"], "images are 640 x 480 px, those of the sensor file 2048 x 1536"),
+    (lambda a: [*a, "--sensor", "ctrack780"], "640 x 480 px, those of the sensor file ctrack780 2048 x 1536"),
     (lambda a: [*a, "--render", "3"], "leave out LEFT and RIGHT"),
+    (lambda _: ["--render", "1", "--distortion", "none", "--min-images", "7", "--fix-aspect"],
+     "calibrates nothing: leave out --distortion and --fix-aspect and --min-images"),
+    (lambda a: [*a, "--seed", "0"], "no random numbers without --render: leave out --seed"),
     (lambda a: ["--render", "3", "--board", "none.toml"], "cannot read board file none.toml"),
 ])
 def test_what_cannot_be_done_is_one_line_and_leaves_nothing(pictures, monkeypatch, capfd, tmp_path, change, evidence):
@@ -96,6 +99,70 @@ def test_what_cannot_be_done_is_one_line_and_leaves_nothing(pictures, monkeypatc
     assert said.count("\n") == 1
     assert evidence in said
     assert list(tmp_path.iterdir()) == []
+
+
+def test_images_of_another_size_are_refused_before_the_board_is_looked_for(pictures, monkeypatch, tmp_path, capfd):
+    monkeypatch.setattr("cmmsim.calibration.views_of_images.find_board", lambda *_: pytest.fail("searched"))
+    assert command("calibrate", *arguments(pictures), "--sensor", "ctrack780_29hz", "--out", tmp_path / "new") == 1
+    assert "those of the sensor file ctrack780_29hz 2048 x 1536" in capfd.readouterr().err
+
+
+def test_sensor_file_based_on_another_is_found_from_where_it_is_written(pictures, tmp_path):
+    slow = 'name = "slow"\nbased_on = "small.toml"\n[timing]\nframe_rate = 29.0\n[rig]\nbaseline = 1.0\n'
+    (pictures / "slow.toml").write_text(slow)
+    out = tmp_path / "deeper" / "new"
+    options = ("--sensor", pictures / "slow.toml", "--out", out, "--quiet")
+    assert command("calibrate", *arguments(pictures), *options) == 0
+    written = cmmsim.load_sensor(out / "sensor.toml")
+    assert tomllib.loads((out / "sensor.toml").read_text())["timing"] == {"frame_rate": 29.0}
+    found = json.loads((out / "calibration.json").read_text())["parameters"]
+    assert written.rig.left.focal_px == found["left.fx_px"]["estimate"]
+    assert written.rig.right_from_left[0, 3] == pytest.approx(found["right_from_left.tx_m"]["estimate"], abs=1e-12)
+
+
+def test_cameras_that_no_sensor_can_have_are_kept_without_a_sensor_file(pictures, tmp_path, capfd):
+    """The folders are given the wrong way round, and the baseline of the sensor file is another."""
+    left, right, *rest = arguments(pictures)
+    text = (pictures / "small.toml").read_text().replace("baseline = 1.0", "baseline = 0.4")
+    (tmp_path / "other.toml").write_text(text)
+    options = ("--sensor", tmp_path / "other.toml", "--out", tmp_path / "new", "--quiet")
+    assert command("calibrate", right, left, *rest, *options) == 0
+    lines = capfd.readouterr().err.splitlines()
+    assert all(line.startswith("warning: ") for line in lines)
+    said = "\n".join(lines)
+    assert "swap the folders LEFT and RIGHT" in said
+    assert "the cameras stand 1 m apart, those of the sensor file" in said
+    assert "sensor.toml is not written, no sensor can have these cameras: rig.right_from_left" in said
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == [
+        "calibration.json", "coverage.png", "distortion.png", "residuals.png", "rig.toml"]
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_stopped_rendering_leaves_nothing(pictures, tmp_path, monkeypatch, capfd, there):
+    written = []
+
+    def stopped(path, image):
+        written.append(path)
+        if len(written) == 3:
+            raise KeyboardInterrupt
+        return True
+
+    out = tmp_path / "new"
+    if there:
+        out.mkdir()
+    monkeypatch.setattr(cv2, "imwrite", stopped)
+    options = ("--sensor", pictures / "small.toml", "--board", pictures / "board.toml", "--out", out)
+    assert command("calibrate", "--render", 3, *options) == 130
+    assert capfd.readouterr().err.endswith("aborted\n")
+    assert list(tmp_path.iterdir()) == ([out] if there else [])
+    assert not there or not list(out.iterdir())
+
+
+def test_rendered_set_is_complete_and_nothing_else(pictures):
+    made = pictures / "pictures"
+    assert sorted(path.name for path in made.iterdir()) == ["board.toml", "left", "right"]
+    for side in ("left", "right"):
+        assert sorted(path.name for path in (made / side).iterdir()) == [f"{k:03d}.png" for k in range(8)]
 
 
 def test_help_teaches_the_board_file(capfd):
