@@ -208,7 +208,7 @@ def _list_kinds() -> None:
     from identify.studies.units import factor_unit
 
     for kind in KINDS.values():
-        typer.echo(f"{kind.name}: {kind.what}\n")
+        typer.echo(f"{kind.name}: {kind.what}\n\nIt reads {kind.reads}, and its options; no other factor is taken.\n")
         options = [
             (f"options.{name}", str(field.default), factor_unit(f"options.{name}"), str(field.description))
             for name, field in kind.options.model_fields.items()

@@ -16,9 +16,10 @@ from identify.errors import ScenarioError, StudyError
 from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
 from identify.scenario import Scenario, load_scenario
 from identify.studies.keys import check, is_integer, options_in, overrides
-from identify.studies.kinds import check_kind, options_model
+from identify.studies.kinds import check_kind, kind_reads, options_model
 from identify.studies.law_names import check_law_names
 from identify.studies.study_file import Range, Study
+from identify.studies.unread_keys import check_ever_read, check_read_here
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,8 @@ def prepare(study: Study) -> Setup:
     The first row is checked as a whole. Values that contradict each other only in other rows are errors of these.
 
     Raises:
-        StudyError: an unknown kind, key, option, or figure or factor of a law, with the valid ones; a wrong value.
+        StudyError: an unknown kind, key, option, or figure or factor of a law, with the valid ones; a wrong value; a
+            key that the kind's rows do not read.
         ScenarioError: no such scenario, or changes that contradict it.
     """
     check_kind(study.kind, study.options)
@@ -109,13 +111,21 @@ def prepare(study: Study) -> Setup:
         if path.startswith("options."):
             raise StudyError(f"changes.{path}: what holds in every row stands in [options]")
         check(path, [value], model)
+    for path in study.factors:
+        if path.startswith("options.") and path.partition(".")[2] in study.options:
+            raise StudyError(f"{path} is both a factor and among the options")
     for path, values in study.factors.items():
         check(path, [values.low, values.high] if isinstance(values, Range) else values, model)
         _check_factor(path, values)
+    reads = kind_reads(study.kind)
+    if reads is not None:
+        check_ever_read(study, reads)
     setup = Setup(study.kind, _scenario(study.scenario, overrides(study.changes)), study.options, study.seed)
     first = Design(study).case(0)
-    setup.row_scenario(first)
-    check_kind(study.kind, setup.row_options(first))
+    scenario, options = setup.row_scenario(first), setup.row_options(first)
+    check_kind(study.kind, options)
+    if reads is not None and model is not None:
+        check_read_here(study, reads, scenario, model.model_validate(options))
     check_law_names(study)
     return setup
 

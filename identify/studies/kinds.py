@@ -16,6 +16,7 @@ from pydantic import BaseModel
 from identify.errors import ScenarioError, StudyError
 from identify.scenario import Scenario
 from identify.studies import rows
+from identify.studies.row_reads import Reads
 
 RowFunction = Callable[[Scenario, np.random.SeedSequence, Mapping[str, Any]], Mapping[str, float]]
 
@@ -43,6 +44,11 @@ def options_model(kind: str) -> type[BaseModel] | None:
         return rows.find_kind(kind).options
     except ScenarioError as error:
         raise StudyError(f"{error}, or module:function") from error
+
+
+def kind_reads(kind: str) -> Reads | None:
+    """What a kind's rows read; None for a function of one's own, which reads what it likes."""
+    return None if ":" in kind else rows.find_kind(kind).reads
 
 
 def figure_names(kind: str) -> list[str] | None:

@@ -22,6 +22,7 @@ from identify.record import recording
 from identify.record.loop_setup import frame_times
 from identify.scenario import Scenario
 from identify.studies.row_columns import POSE_COLUMNS, Column, Kind, Row, RowOptions, pose_figures, rms_um
+from identify.studies.row_reads import NOISE_OFF, PICTURES, PLANT, Reads
 from identify.studies.row_sensor import Teaching, sensor_file
 
 EXPERIMENT, TRAJECTORY = 0, 1
@@ -42,6 +43,16 @@ class ClosedLoopOptions(RowOptions):
     """How the sensor was taught."""
 
     teaching: Teaching = Field("sensor", description="by the sensor itself, seeded by the row, or exact")
+
+
+READS = Reads(
+    ("scenario.robot", *PICTURES, "scenario.timing.", "sensor.timing.", "scenario.servo.", "scenario.plant.",
+     *(f"scenario.excitation.{name}" for name in (
+         "fundamental_hz", "harmonics", "position_amplitude_m", "orientation_amplitude_rad", "travel_margin_rad",
+         "max_joint_velocity_rad_s")),
+     "scenario.validation.duration_s"),
+    idle=(NOISE_OFF, *PLANT),
+)
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoopOptions) -> Row:
@@ -72,4 +83,4 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoo
 
 
 WHAT = "the robot follows an unseen trajectory with the images in the loop"
-CLOSED_LOOP = Kind("closed_loop", WHAT, COLUMNS, MAIN, ClosedLoopOptions, compute)
+CLOSED_LOOP = Kind("closed_loop", WHAT, COLUMNS, MAIN, ClosedLoopOptions, READS, compute)

@@ -13,6 +13,7 @@ from identify.arrays import Array
 from identify.errors import ScenarioError
 from identify.scenario import Scenario
 from identify.scenario_text import one_line
+from identify.studies.row_reads import Reads
 
 Row = dict[str, float]
 
@@ -34,13 +35,14 @@ class RowOptions(BaseModel):
 @dataclass(frozen=True)
 class Kind:
     """One kind of row: `compute(scenario, seed, options)` gives exactly `columns`; `main`: those that are drawn;
-    `options`: their model; `what`: what a row is, in a sentence."""
+    `options`: their model; `reads`: what else acts on it; `what`: what a row is, in a sentence."""
 
     name: str
     what: str
     columns: Mapping[str, Column]
     main: tuple[str, ...]
     options: type[RowOptions]
+    reads: Reads
     compute: Callable[[Scenario, np.random.SeedSequence, Any], Row]
 
     def checked(self, options: Mapping[str, Any]) -> RowOptions:

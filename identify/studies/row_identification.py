@@ -32,6 +32,7 @@ from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, scenario_from_toml
 from identify.studies.row_columns import Column, Kind, Row, RowOptions, rms_um, stated_um
 from identify.studies.row_drawn_sensor import DrawnSensor
+from identify.studies.row_reads import NOISE_OFF, PLANT, SENSOR, Idle, Reads, timing
 from identify.validation import model_run
 
 EXPERIMENT = 0
@@ -67,6 +68,24 @@ class IdentificationOptions(RowOptions):
 
     sensor: Literal["drawn", "images"] = Field("drawn", description="noise of the stated covariance, or images")
     trajectory_seed: int = Field(0, ge=0, description="seed of the exciting and of the unseen trajectories")
+
+
+DRAWN = {"options.sensor": lambda sensor: sensor == "drawn"}
+READS = Reads(
+    ("scenario.", *SENSOR, "sensor.timing."),
+    but=("scenario.name", "scenario.description", "scenario.sensor_note", "scenario.identification.qr_threshold"),
+    idle=(
+        Idle(NOISE_OFF.keys, {**NOISE_OFF.where, "options.sensor": lambda sensor: sensor == "images"}, NOISE_OFF.why),
+        Idle(("sensor.camera.noise",), DRAWN, "options.sensor is drawn: that noise is added all the same"),
+        Idle(("scenario.renderer", "sensor.stickers.obstacle_level", *timing("exposure_s")), DRAWN,
+             "options.sensor is drawn: no picture of a motion is taken"),
+        Idle(("scenario.payload.",), {"scenario.identification.scale_anchor": lambda anchor: anchor != "payload"},
+             "scenario.identification.scale_anchor is not payload"),
+        Idle(("scenario.excitation.generations",), {"scenario.excitation.method": lambda how: how != "evolutionary"},
+             "scenario.excitation.method is not evolutionary"),
+        *PLANT,
+    ),
+)
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: IdentificationOptions) -> Row:
@@ -159,4 +178,4 @@ def _trajectories(scenario_toml: str, seed: int) -> TrajectorySet:
 
 
 WHAT = "a record of the exciting trajectory, the parameters identified from it, and their errors"
-IDENTIFICATION = Kind("identification", WHAT, COLUMNS, MAIN, IdentificationOptions, compute)
+IDENTIFICATION = Kind("identification", WHAT, COLUMNS, MAIN, IdentificationOptions, READS, compute)

@@ -18,6 +18,7 @@ from identify.experiment.sensor_in_loop import frame_latencies
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.studies.row_columns import POSE_COLUMNS, Column, Kind, Row, RowOptions, pose_figures, rms_um
+from identify.studies.row_reads import NOISE_OFF, PICTURES, Reads, timing
 from identify.studies.row_sensor import RowSensor, Teaching, row_sensor
 from identify.trajectory import FourierTrajectory, random_trajectory
 
@@ -41,6 +42,15 @@ class PathPoseOptions(RowOptions):
 
     stretch_s: float = Field(0.5, gt=0, le=3600, description="time along the path, at least two frames")
     teaching: Teaching = Field("exact", description="exact, or by the sensor itself, seeded by the row")
+
+
+READS = Reads(
+    (*PICTURES, *timing("frame_rate_hz", "exposure_s", "latency_s", "latency_jitter_s", "dropout"),
+     "scenario.excitation.fundamental_hz", "scenario.excitation.harmonics", "scenario.excitation.position_amplitude_m",
+     "scenario.excitation.orientation_amplitude_rad"),
+    but=("sensor.stickers.obstacle_level",),
+    idle=(NOISE_OFF,),
+)
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseOptions) -> Row:
@@ -90,4 +100,4 @@ def _used_errors(path: FourierTrajectory, poses: Array, arrivals: Array, period_
 
 
 WHAT = "the sensor alone follows a platform along a random path, with the scenario's timing"
-PATH_POSE = Kind("path_pose", WHAT, COLUMNS, MAIN, PathPoseOptions, compute)
+PATH_POSE = Kind("path_pose", WHAT, COLUMNS, MAIN, PathPoseOptions, READS, compute)

@@ -19,6 +19,7 @@ from identify.errors import EstimationError
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.studies.row_columns import POSE_COLUMNS, Column, Kind, Row, RowOptions, pose_figures, rms_um
+from identify.studies.row_reads import NOISE_OFF, PICTURES, Idle, Reads, timing
 from identify.studies.row_sensor import RowSensor, Teaching, row_sensor
 
 POSES, SENSOR, DROPOUT = 0, 1, 2
@@ -52,6 +53,20 @@ class StaticPoseOptions(RowOptions):
         None, gt=0, le=3600, description="time for which each pose is held: pictures at the frame rate, not `captures`"
     )
     teaching: Teaching = Field("exact", description="exact, or by the sensor itself, seeded by the row")
+
+
+READS = Reads(
+    (*PICTURES, *timing("frame_rate_hz", "exposure_s", "dropout"), "scenario.excitation.position_amplitude_m",
+     "scenario.excitation.orientation_amplitude_rad"),
+    but=("sensor.stickers.obstacle_level",),
+    idle=(
+        NOISE_OFF,
+        Idle(("options.captures",), {"options.hold_s": lambda hold: hold is not None},
+             "options.hold_s is given: it sets the number of pictures"),
+        Idle(timing("frame_rate_hz"), {"options.hold_s": lambda hold: hold is None},
+             "options.hold_s is not given: options.captures sets the number of pictures"),
+    ),
+)
 
 
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPoseOptions) -> Row:
@@ -144,4 +159,4 @@ def _row(eye: RowSensor, looks: list[_Look], captures: int) -> Row:
 
 
 WHAT = "the sensor alone looks at a platform that stands still, at a pose drawn in the box"
-STATIC_POSE = Kind("static_pose", WHAT, COLUMNS, MAIN, StaticPoseOptions, compute)
+STATIC_POSE = Kind("static_pose", WHAT, COLUMNS, MAIN, StaticPoseOptions, READS, compute)
