@@ -7,16 +7,18 @@ are only counted, as `beyond`.
 
 import json
 import os
+import sys
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from identify.errors import StudyError
 from identify.studies.computation import Finished
+
+FINITE = sys.float_info.max
 
 
 class Journal:
@@ -71,8 +73,6 @@ class Journal:
         return (number for number in range(len(self.finished)) if not self.finished[number])
 
     def _note(self, row: Finished) -> None:
-        if row.number < 0:
-            raise StudyError(f"{self.path} is damaged: it has row {row.number}")
         if row.number < len(self.finished):
             self.finished[row.number] = True
         else:
@@ -91,7 +91,20 @@ class Journal:
 
 def _parsed(line: bytes, where: str) -> Finished:
     try:
-        entry: dict[str, Any] = json.loads(line)
-        return Finished(**entry)
+        return _checked(Finished(**json.loads(line)))
     except (ValueError, TypeError) as error:
         raise StudyError(f"{where} is damaged: {error}") from error
+
+
+def _checked(row: Finished) -> Finished:
+    """The row, if a study can have written it. Raises ValueError with the entry and its value if not."""
+    if type(row.number) is not int or row.number < 0:
+        raise ValueError(f"number is {row.number!r}, no number of a row")
+    if not isinstance(row.error, str):
+        raise ValueError(f"error is {row.error!r}, no text")
+    if not isinstance(row.figures, dict):
+        raise ValueError(f"figures is {row.figures!r:.60}, no table")
+    for name, value in [*row.figures.items(), ("seconds", row.seconds)]:
+        if type(value) not in (int, float) or not -FINITE <= value <= FINITE:
+            raise ValueError(f"{name} is {value!r:.60}, no finite number")
+    return row

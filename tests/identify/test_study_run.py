@@ -169,6 +169,37 @@ def test_a_damaged_line_in_the_middle_is_named(tmp_path):
         run(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("entry", "says"),
+    [
+        ({"figures": {"error_um": "four"}}, "error_um is 'four', no finite number"),
+        ({"figures": {"error_um": float("nan")}}, "error_um is nan, no finite number"),
+        ({"figures": {"error_um": -float("inf")}}, "error_um is -inf, no finite number"),
+        ({"figures": {"error_um": 10**400}}, "error_um is 10000"),
+        ({"figures": {"error_um": None}}, "error_um is None, no finite number"),
+        ({"figures": {"error_um": True}}, "error_um is True, no finite number"),
+        ({"figures": [1.0]}, "figures is [1.0], no table"),
+        ({"seconds": "1"}, "seconds is '1', no finite number"),
+        ({"seconds": float("nan")}, "seconds is nan, no finite number"),
+        ({"number": "3"}, "number is '3', no number of a row"),
+        ({"number": -1}, "number is -1, no number of a row"),
+        ({"error": None}, "error is None, no text"),
+        ({"figure": {}}, "unexpected keyword argument 'figure'"),
+    ],
+)
+def test_a_line_with_what_no_study_writes_is_named_and_not_taken_as_done(tmp_path, entry, says):
+    run(tmp_path)
+    lines = (tmp_path / JOURNAL).read_text().splitlines()
+    lines[4] = json.dumps(json.loads(lines[4]) | entry)
+    (tmp_path / JOURNAL).write_text("\n".join(lines) + "\n")
+    with pytest.raises(StudyError) as caught:
+        run(tmp_path)
+    assert str(caught.value).startswith(f"line 5 of {tmp_path / JOURNAL} is damaged: ")
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 250
+
+
 @pytest.mark.parametrize("part", [0, 40])
 def test_full_disk_leaves_whole_lines_and_the_study_goes_on_later(whole, tmp_path, monkeypatch, part):
     """The disk takes `part` bytes of the third batch and no more, as a real one may."""
