@@ -96,12 +96,16 @@ def running_cluster(address: str) -> Iterator[DaskExecutor]:
     """
     _silence_dask()
     try:
-        get_backend(parse_address(address)[0])  # a client of no such kind would go on trying in the background
+        kind, place = parse_address(address)
+        get_backend(kind).get_address_host(place)  # a client of no such kind would go on trying in the background
+    except (ValueError, ImportError) as error:
+        raise _no_scheduler(address, str(error)) from error
+    try:
         client = Client(address, timeout=CONNECT_SECONDS)
-    except Exception as error:  # whatever else listens there may answer anything
-        raise StudyError(
-            f"no Dask scheduler answers at {address} within {CONNECT_SECONDS} s: {' '.join(str(error).split())}"
-        ) from error
+    except OSError as error:
+        raise _no_scheduler(address, str(error)) from error
+    except Exception as error:  # Dask takes the first bytes of whatever it is told for the size of a message
+        raise _no_scheduler(address, "what listens there speaks another protocol") from error
     with client:
         try:
             client.wait_for_workers(1, timeout=CONNECT_SECONDS)
@@ -112,6 +116,10 @@ def running_cluster(address: str) -> Iterator[DaskExecutor]:
         except OSError as error:
             raise gone(error) from error
         yield DaskExecutor(client)
+
+
+def _no_scheduler(address: str, why: str) -> StudyError:
+    return StudyError(f"no Dask scheduler answers at {address} within {CONNECT_SECONDS} s: {' '.join(why.split())}")
 
 
 def _silence_dask() -> None:

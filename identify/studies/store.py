@@ -7,7 +7,7 @@
 import fcntl
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,11 +45,15 @@ def resolved(study: Study, setup: Setup) -> dict[str, Any]:
 def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Journal]:
     """Work on the folder of a resolved study with ``rows`` rows, new or begun before; nobody else may meanwhile.
 
+    A StudyError that comes before the first row leaves nothing behind that was not there.
+
     Raises:
         StudyError: the folder is of another study, in use, holds something else or cannot be made; one of its files
             is damaged; rows would be added to those of another version of cmmsim.
     """
     _check_content(folder)
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    new = not (folder / STUDY).exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = (folder / LOCK).open("a+")
@@ -60,11 +64,16 @@ def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Jour
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise StudyError(f"study folder {folder} is in use by another process; wait, or name another") from None
-        begun = _claim(folder, entry)
-        with Journal(folder / JOURNAL, rows) as journal:
-            if not journal.finished.all():
-                check_folder(folder, begun)
-            yield journal
+        try:
+            begun = _claim(folder, entry)
+            with Journal(folder / JOURNAL, rows) as journal:
+                if not journal.finished.all():
+                    check_folder(folder, begun)
+                yield journal
+        except StudyError:
+            if new and not _has_rows(folder):
+                _take_back(folder, made)
+            raise
 
 
 def _check_content(folder: Path) -> None:
@@ -93,6 +102,15 @@ def _claim(folder: Path, entry: dict[str, Any]) -> dict[str, str]:
     except OSError as error:
         raise StudyError(f"{folder / STUDY} cannot be written: {error.strerror}") from error
     return begun
+
+
+def _take_back(folder: Path, made: list[Path]) -> None:
+    """Remove what was made of a study that did not begin: its files, then the folders made for it, the inmost first."""
+    with suppress(OSError):  # where somebody else has put something there meanwhile, it stays
+        for name in (STUDY, JOURNAL, LOCK):
+            (folder / name).unlink(missing_ok=True)
+        for path in made:
+            path.rmdir()
 
 
 def _has_rows(folder: Path) -> bool:

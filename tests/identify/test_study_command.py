@@ -1,6 +1,10 @@
 """The command ``cmmsim study`` in this process."""
 
+import socket
+import threading
 import time
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
@@ -133,6 +137,8 @@ def test_kinds_are_listed_with_their_options_and_figures(capsys):
     assert command("study", "--kinds") == 0
     shown = capsys.readouterr().out
     assert all(f"{name}: {kind.what}" in shown for name, kind in rows.KINDS.items())
+    assert "\nIt reads scenario.sensor, scenario.renderer, " in shown
+    assert "\nIt reads scenario.*, sensor.rig.*, " in shown
     lines = [line.split() for line in shown.splitlines() if line]
     for kind in rows.KINDS.values():
         assert all([name, column.unit] == [line[0], line[1]] for name, column in kind.columns.items()
@@ -166,6 +172,37 @@ def test_unreachable_scheduler_is_one_line_within_seconds(mine, monkeypatch, cap
     assert command("study", mine, "--scheduler", address) == 1
     assert time.perf_counter() - start < 10.0
     assert f"no Dask scheduler answers at {address}" in one_line(capsys.readouterr().err)
+    assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize("words", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"SSH-2.0-OpenSSH_9.2\r\n", b"\xff" * 30])
+def test_another_program_at_the_address_is_no_scheduler(mine, capsys, words):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=answering, args=(server, words), daemon=True).start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        assert command("study", mine, "--scheduler", address) == 1
+    error = one_line(capsys.readouterr().err)
+    assert f"no Dask scheduler answers at {address}" in error
+    assert "what listens there speaks another protocol" in error
+    assert not Path("runs").exists()
+
+
+def answering(server, words):
+    """Say the words to whoever comes, until the server is closed."""
+    with suppress(OSError):
+        while True:
+            connection, _ = server.accept()
+            connection.sendall(10 * words)
+
+
+def test_a_study_that_cannot_go_on_where_it_was_begun_keeps_its_folder(mine, undrawn, capsys):
+    Path("empty").mkdir()
+    assert command("study", mine, "--scheduler", "nonsense", "--out", "empty") == 1
+    assert [*Path("empty").iterdir()] == []
+    assert command("study", mine, "--workers", 0, "--quiet") == 0
+    before = sorted(Path("runs/study-mine").iterdir())
+    assert command("study", mine, "--repeats", 3, "--scheduler", "nonsense") == 1
+    assert sorted(Path("runs/study-mine").iterdir()) == before
 
 
 @pytest.mark.parametrize(
