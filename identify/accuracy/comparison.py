@@ -36,6 +36,15 @@ class Comparison:
         return "" if now == saved else f"{self.now.test}: the limit of {self.now.name} is {now}, was {saved}"
 
     @property
+    def evidence_change(self) -> str:
+        """One line: name, and what stands behind its value now and before, where that is something else or less; or
+        nothing. An interval of fewer values is wider, and would hold what the saved one did not."""
+        now, saved = self.now, self.saved
+        if (now.interval is None) == (saved.interval is None) and now.count >= saved.count:
+            return ""
+        return f"{now.test}: {now.name} is {_evidence(now)}, was {_evidence(saved)}"
+
+    @property
     def change(self) -> float:
         """Growth of the value as a share of the saved one's size; infinite from zero to anything else."""
         grown = self.now.value - self.saved.value
@@ -57,6 +66,10 @@ class Comparison:
         """One line: name, both values and the change."""
         now, saved = (with_unit(f"{figure.value:.6g}", self.now.unit) for figure in (self.now, self.saved))
         return f"{self.now.test}: {self.now.name} is {now}, was {saved}, {percent(self.change, '+.1')}"
+
+
+def _evidence(figure: Figure) -> str:
+    return "one number" if figure.interval is None else f"a sample of {figure.count} values"
 
 
 def compare(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[Key, Comparison]:

@@ -32,14 +32,19 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options of the group `accuracy`."""
     group = parser.getgroup("accuracy", "accuracy benchmarks (cmmsim)")
     add = group.addoption
-    add("--accuracy-save", metavar="NAME", help="save the figures of a session that passes, unless NAME holds others")
+    add(
+        "--accuracy-save",
+        metavar="NAME",
+        help="save the figures of a session that passes, unless NAME holds others, or one is beyond its limit",
+    )
     add("--accuracy-compare", metavar="NAME", help="show saved figures and the change from them in the table")
     add(
         "--accuracy-fail",
         metavar="RATIO",
         type=ratio,
         help="fail when a figure is worse than the one compared with by more than RATIO of it, such as 0.1 "
-        "(a sample: when both intervals say so), or when its test ran or was skipped and did not record it",
+        "(a sample: when both intervals say so), when it is of fewer values, or one number instead of a sample or the "
+        "other way round, or when its test ran or was skipped and did not record it",
     )
     add("--accuracy-dir", metavar="DIR", help="folder of saved figures (default: .accuracy in the root directory)")
     add("--accuracy-seed", metavar="N", type=seed, default=0, help="seed of the testbed's fixtures (default: 0)")

@@ -77,7 +77,7 @@ class AccuracySession:
                 self._figures[found[0].test] = found
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        """Judge the comparison, then save if everything passed."""
+        """Judge the comparison, then save if everything passed and no figure is beyond its limit."""
         if self._compare is not None:
             self._judge(session)
         if self._save is not None:
@@ -99,6 +99,8 @@ class AccuracySession:
         for pair in self.comparisons.values():
             if pair.limit_change:
                 self._remark(pair.limit_change)
+            if pair.evidence_change:
+                self._tell(session, pair.evidence_change, guarded=True)
             if self._ratio is None:
                 continue
             if pair.mismatch:
@@ -116,10 +118,7 @@ class AccuracySession:
         for test, names in gone.items():
             outcome = self._outcome(test)
             line = f"  {test}: {', '.join(names)} (the test {WHY_MISSING.get(outcome, outcome)})"
-            if outcome is None or self._ratio is None:
-                self._remark(line)
-            else:
-                self._fail(session, line)
+            self._tell(session, line, guarded=outcome is not None)
 
     def _outcome(self, test: str) -> str | None:
         """Outcome of a test or its module, None if it did not run. With --dist loadgroup its reports name a group."""
@@ -136,12 +135,23 @@ class AccuracySession:
             why = "the session did not pass" if self._figures else "no figures were recorded"
             self._remark(f"not saved as {self._save}: {why}")
             return
+        beyond = [f"{figure.test}: {figure.name}" for figure in self.figures if figure.beyond_limit]
+        if beyond:  # of a test that may fail, as one marked xfail
+            self._fail(session, f"not saved as {self._save}: beyond their limits are {'; '.join(beyond)}")
+            return
         try:
             save(path, SavedSession(name=self._save, seed=self._seed, figures=self.figures))
         except AccuracyError as error:
             self._fail(session, str(error))
         else:
             self._remark(f"saved: {_shown(path)}")
+
+    def _tell(self, session: pytest.Session, text: str, guarded: bool) -> None:
+        """Say what the comparison found; fail over it if it is guarded and --accuracy-fail asks for that."""
+        if guarded and self._ratio is not None:
+            self._fail(session, text)
+        else:
+            self._remark(text)
 
     def _remark(self, text: str, bad: bool = False) -> None:
         self._remarks.append((text, bad))

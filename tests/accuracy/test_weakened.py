@@ -90,6 +90,50 @@ def test_another_limit_is_told(project):
     assert "the limit of" not in project(BEFORE, *COMPARE).stdout.str()
 
 
+NUMBER, SIX = 'accuracy.record("r", 10, limit=20)', 'accuracy.sample("s", [1, 2, 3, 4, 5, 6])'
+WIDE, TWO, SEVEN = ('accuracy.sample("r", [1, 50, 2, 60], limit=20)', 'accuracy.sample("s", [1, 300])',
+                    'accuracy.sample("s", [1, 2, 3, 4, 5, 6, 3.5])')
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "says"),
+    [
+        (NUMBER, WIDE, "r is a sample of 4 values, was one number"),
+        (WIDE, NUMBER, "r is one number, was a sample of 4 values"),
+        (SIX, TWO, "s is a sample of 2 values, was a sample of 6 values"),
+        (SIX, SEVEN, ""),
+        (NUMBER, NUMBER, ""),
+    ],
+)
+def test_a_figure_that_rests_on_something_else_or_on_less_is_told_and_fails_where_asked_to(project, before, now, says):
+    """A wide interval overlaps any other, so nothing else would ever say that it got worse."""
+    body = "def test_it(accuracy): {}"
+    project(body.format(before), *SAVE)
+    for guard in ((), ("--accuracy-fail", "0.1")):
+        done = project(body.format(now), *COMPARE, *guard)
+        done.assert_outcomes(passed=1)
+        told = [line for line in done.outlines if ", was " in line]
+        assert told == ([f"test_mine.py::test_it: {says}"] if says else [])
+        assert done.ret == int(bool(says and guard))
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_a_figure_beyond_its_limit_is_not_saved_though_its_test_may_fail(project, pytester, strict):
+    bad = """
+    @pytest.mark.xfail(strict={})
+    def test_bad(accuracy): accuracy.record("r", 10, limit=2)
+
+    def test_good(accuracy): accuracy.record("s", 1, limit=2)
+    """
+    done = project(bad.format(strict), *SAVE)
+    done.assert_outcomes(passed=1, xfailed=1)
+    done.stdout.fnmatch_lines(["not saved as before: beyond their limits are test_mine.py::test_bad: r"])
+    assert done.ret == 1
+    assert not (pytester.path / ".accuracy").exists()
+    assert project(bad.replace("10,", "1,").format(False), *SAVE).ret == 0
+    assert (pytester.path / ".accuracy" / "before.json").exists()
+
+
 def test_a_sample_whose_interval_holds_the_limit_is_undecided(project):
     done = project(
         """
