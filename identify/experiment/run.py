@@ -18,7 +18,7 @@ from identify.estimation.scale_anchor import measured_anchor, store_anchor
 from identify.excitation import design_trajectories
 from identify.experiment.plant import mismatch, plant_robot, simulate_plant
 from identify.experiment.platform_load import PlatformLoad, drawn_load
-from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, frame_latencies, make_sensor
+from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, frame_latencies, make_sensor, with_renderer
 from identify.experiment.truth import build_truth
 from identify.progress import Advance, Progress, SilentProgress
 from identify.random_streams import ANCHOR, LATENCY, LOAD, NOISE, TEACHING, stream_seed
@@ -57,7 +57,7 @@ def run_experiment(
     (`identify.experiment.truth.read_truth(path)` opens the truth).
     Raises ScenarioError, TrajectoryError, cmmsim.CmmError, dynamics.DynamicsError.
     """
-    progress = progress or SilentProgress()
+    progress, scenario = progress or SilentProgress(), with_renderer(scenario)
     robot = load_robot(scenario.robot)
     trajectories = design_trajectories(robot, scenario, seed, progress)
     sensor = taught_sensor(scenario, robot, seed, progress)

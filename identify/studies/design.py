@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from identify.errors import ScenarioError, StudyError
+from identify.experiment.sensor_in_loop import with_renderer
 from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
 from identify.scenario import Scenario, load_scenario
 from identify.studies.keys import check, is_integer, options_in, overrides
@@ -131,8 +132,9 @@ def prepare(study: Study) -> Setup:
 
 
 def _scenario(name: str, changes: Mapping[str, Any]) -> Scenario:
+    """What draws the images is decided here, once for all machines."""
     try:
-        return load_scenario(name).with_overrides(changes)
+        return with_renderer(load_scenario(name).with_overrides(changes))
     except ScenarioError as error:
         raise StudyError(f"scenario of the study: {error}") from error
 
