@@ -31,13 +31,15 @@ POSE = 6
 class Adjustment:
     """state; residuals (m,2) px of each camera, measured minus computed; sigma_px: estimated standard deviation of a
     pixel coordinate; covariance (24,24) of the left and right intrinsics (9 each) and of the small error [dt, dphi] of
-    right_from_left; condition of N scaled to a unit diagonal; steps; freedom: observations minus unknowns; shared:
-    errors that points of one view share, whose factor is in the covariance."""
+    right_from_left, and independent_covariance that it would be if no points of a view erred alike; condition of N
+    scaled to a unit diagonal; steps; freedom: observations minus unknowns; shared: errors that points of a view
+    share."""
 
     state: RigState
     residuals: tuple[Array, Array]
     sigma_px: float
     covariance: Array
+    independent_covariance: Array
     condition: float
     steps: int
     freedom: int
@@ -77,17 +79,16 @@ def adjust(points: Array, sightings: tuple[Sightings, Sightings], start: RigStat
     information, scores = _reduced(normal, 0.0)
     reduced = information.sum(axis=0)
     scale = 1.0 / np.sqrt(np.diag(reduced))
-    eigenvalues, vectors = np.linalg.eigh(reduced * scale[:, None] * scale)
+    eigenvalues = np.linalg.eigvalsh(reduced * scale[:, None] * scale)
     if not eigenvalues[0] > SINGULAR:
         raise CalibrationError("these views do not determine the cameras (smallest eigenvalue of the scaled normal "
                                f"matrix {eigenvalues[0]:.1e}): show the board tilted to several sides, all over "
                                "the image")
     sigma2 = normal.cost / freedom
-    inverse = (vectors / eigenvalues) @ vectors.T * scale[:, None] * scale
     shared = shared_errors(scores, information, sigma2)
     spread = _spread(free)
     return Adjustment(state, normal.residuals, float(np.sqrt(sigma2)),
-                      shared.factor * sigma2 * spread @ inverse @ spread.T,
+                      spread @ shared.covariance @ spread.T, spread @ shared.independent @ spread.T,
                       float(eigenvalues[-1] / eigenvalues[0]), steps, freedom, shared)
 
 

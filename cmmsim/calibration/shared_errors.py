@@ -1,4 +1,4 @@
-"""Errors that the points of one view share: found from the views' scores, and the factor they take on the covariance.
+"""Errors that the points of one view share: found from the views' scores, and the covariance with them.
 
 Independent errors of pixels are an assumption. In photographs a bent board, uneven light or the bias of the corner
 search moves neighbouring points alike, so that a view tells less than its number of points promises. The residuals'
@@ -9,12 +9,14 @@ reduced normal matrices I_v, which add up to N, independent errors of variance s
     cov(s_u, s_v) = sigma² (delta_uv I_v - I_u N^-1 I_v),
 
 so that Q = sum s_v' N^-1 s_v / sigma² has the mean c - sum tr(W_v²), W_v = N^-1/2 I_v N^-1/2. Q over its mean estimates
-the mean eigenvalue of the true covariance relative to sigma² N^-1: the mean generalised design effect, by which Rao and
-Scott (1981, J. Am. Stat. Assoc. 76, 221-230) correct statistics of clustered observations, here of the sandwich
-covariance of Liang and Zeger (1986, Biometrika 73, 13-22) with the correction for leverage in the mean.
+the mean eigenvalue of the true covariance relative to sigma² N^-1: the mean generalised design effect of Rao and Scott
+(1981, J. Am. Stat. Assoc. 76, 221-230), with the correction for leverage in the mean.
 
-The sandwich itself is not taken: of 10 to 25 views and 24 unknowns it is singular, its rank being the number of views
-less one. An error that all views share, such as one bend of the board, stays hidden from any comparison of views.
+Which directions suffer most tells the sandwich of Liang and Zeger (1986, Biometrika 73, 13-22), whitened
+N^-1/2 (sum s_v s_v') N^-1/2. Of 10 to 25 views and 24 unknowns it is singular, its rank being the number of views less
+one. So it is shrunk towards the unit matrix as Ledoit and Wolf (2004, J. Multivar. Anal. 88, 365-411) do, and scaled to
+the mean above.
+An error that all views share, such as one bend of the board, stays hidden from any comparison of views.
 """
 
 from __future__ import annotations
@@ -26,20 +28,23 @@ from scipy.stats import chi2
 
 from ..pose import Array
 
-CHANCE = 1e-3  # of a factor at the limit where the errors of points are independent
+CHANCE = 1e-3  # of a ratio at the limit where the errors of points are independent
 
 
 @dataclass(frozen=True)
 class SharedErrors:
     """ratio: mean eigenvalue of the covariance over that of independent errors, as the views show it; limit: the ratio
-    that independent errors exceed with probability CHANCE."""
+    that independent errors exceed with probability CHANCE; independent and covariance (c,c) of the common unknowns for
+    independent errors, sigma² N^-1, and for those found: the same where the ratio may be chance."""
 
     ratio: float
     limit: float
+    independent: Array
+    covariance: Array
 
     @property
     def factor(self) -> float:
-        """What the covariance of independent errors is multiplied by: 1 where the ratio may be chance."""
+        """By how much the covariance is enlarged in the mean of all directions, beside that of independent errors."""
         return self.ratio if self.ratio > self.limit else 1.0
 
 
@@ -48,18 +53,43 @@ def shared_errors(scores: Array, information: Array, sigma2: float) -> SharedErr
 
     The limit is that of the chi-square distribution with the mean and variance of Q for independent normal errors.
     """
-    total = information.sum(axis=0)
+    whiten = _whitening(information.sum(axis=0))
+    independent = sigma2 * whiten @ whiten.T
+    mean, variance = _moments(whiten.T @ information @ whiten)
+    if not (sigma2 > 0.0 and mean > 0.0 and variance > 0.0):
+        return SharedErrors(1.0, np.inf, independent, independent)
+    pulls = scores @ whiten / np.sqrt(sigma2)
+    freedom = 2.0 * mean**2 / variance
+    ratio, limit = float(np.sum(pulls**2)) / mean, float(chi2.isf(CHANCE, freedom) / freedom)
+    covariance = sigma2 * whiten @ _enlargement(pulls, ratio) @ whiten.T if ratio > limit else independent
+    return SharedErrors(ratio, limit, independent, covariance)
+
+
+def _whitening(total: Array) -> Array:
+    """A matrix R (c,c) with R' N R = 1, of the normal matrix N."""
     scale = 1.0 / np.sqrt(np.diag(total))
     eigenvalues, vectors = np.linalg.eigh(total * scale[:, None] * scale)
-    whiten = scale[:, None] * vectors / np.sqrt(eigenvalues)  # whiten.T @ total @ whiten = 1
-    pulls = scores @ whiten
-    shares = whiten.T @ information @ whiten
+    return np.asarray(scale[:, None] * vectors / np.sqrt(eigenvalues))
+
+
+def _moments(shares: Array) -> tuple[float, float]:
+    """Mean and variance of Q for independent normal errors, from the views' shares W_v (v,c,c) that add up to one."""
     squares = shares @ shares
-    mean = len(total) - float(np.einsum("vii->", squares))
-    cross = squares.sum(axis=0)
-    variance = 2.0 * float(np.einsum("vii->", squares) - 2.0 * np.einsum("vij,vji->", squares, shares)
-                           + np.einsum("ij,ji->", cross, cross))
-    if not (sigma2 > 0.0 and mean > 0.0 and variance > 0.0):
-        return SharedErrors(1.0, np.inf)
-    freedom = 2.0 * mean**2 / variance
-    return SharedErrors(float(np.sum(pulls**2)) / (sigma2 * mean), float(chi2.isf(CHANCE, freedom) / freedom))
+    traced, all_views = float(np.einsum("vii->", squares)), squares.sum(axis=0)
+    variance = traced - 2.0 * float(np.einsum("vij,vji->", squares, shares)) + float(np.sum(all_views * all_views.T))
+    return shares.shape[1] - traced, 2.0 * variance
+
+
+def _enlargement(pulls: Array, ratio: float) -> Array:
+    """Covariance (c,c) relative to that of independent errors: the sandwich of whitened scores (v,c), shrunk, of the
+    mean eigenvalue ``ratio``, and in no direction below one."""
+    views, size = pulls.shape
+    sandwich = pulls.T @ pulls
+    mean = np.trace(sandwich) / size
+    plain = mean * np.eye(size)
+    apart = np.sum((sandwich - plain) ** 2)
+    outer = views * pulls[:, :, None] * pulls[:, None, :]
+    scatter = np.sum((outer - sandwich) ** 2) / views**2
+    weight = min(1.0, scatter / apart) if apart > 0.0 else 1.0
+    eigenvalues, vectors = np.linalg.eigh((weight * plain + (1.0 - weight) * sandwich) * (ratio / mean))
+    return np.asarray((vectors * np.maximum(eigenvalues, 1.0)) @ vectors.T)

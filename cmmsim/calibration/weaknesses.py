@@ -22,8 +22,9 @@ def weaknesses(solved: Adjustment, sightings: tuple[Sightings, Sightings], rig: 
     not covered, few views."""
     lines = []
     if (factor := solved.shared.factor) > 1.0:
-        lines.append(f"points of one view err alike: the covariance is taken {factor:.1f} times that of independent "
-                     f"errors (chance allows {solved.shared.limit:.1f}); is the board flat, evenly lit and sharp?")
+        lines.append(f"points of one view err alike: the covariance is on average {factor:.1f} times that of "
+                     f"independent errors (chance allows {solved.shared.limit:.1f}); is the board flat, evenly lit and "
+                     "sharp?")
     spread = np.sqrt(np.diag(solved.covariance))
     tilt = solved.state.largest_tilt
     for side, (camera, name) in enumerate(zip(rig.cameras, SIDES, strict=True)):

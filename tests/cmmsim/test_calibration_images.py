@@ -1,5 +1,7 @@
 """Boards, image files, and the board in rendered and photograph-like images, against the projected truth."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -85,7 +87,8 @@ def normalised_errors(found, rig):
 
 def errors_beside_independent_ones(found, rig):
     """The same over the std that independent errors of the points would leave."""
-    return normalised_errors(found, rig) * np.sqrt(found.adjustment.shared.factor)
+    plain = replace(found.adjustment, covariance=found.adjustment.independent_covariance)
+    return normalised_errors(replace(found, adjustment=plain), rig)
 
 
 def views_of(frames, board):

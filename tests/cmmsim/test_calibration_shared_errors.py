@@ -63,44 +63,62 @@ KINDS = {
 
 
 def repeated(kind, runs, views):
-    """Errors (n,24), covariances (n,24,24), ratios (n,) and factors (n,) of adjustments."""
+    """Errors (n,24), covariances (n,24,24) as given and for independent errors, and what views share, of adjustments.
+    """
     poses = board_poses(views, np.random.default_rng(4), board=BOARD)
     rng, free = np.random.default_rng(5), free_directions("brown5", False)
     solved = [adjust(BOARD.points, sightings_of(KINDS[kind](poses, rng)), true_state(poses), free) for _ in range(runs)]
     return (np.array([error_of(s) for s in solved]), np.array([s.covariance for s in solved]),
-            np.array([s.shared.ratio for s in solved]), np.array([s.shared.factor for s in solved]))
+            np.array([s.independent_covariance for s in solved]), [s.shared for s in solved])
 
 
 def coverage(errors, covariances):
-    """Share of the 95 % intervals of all 24 parameters that hold the truth."""
-    return np.mean(np.abs(errors) < 1.96 * np.sqrt(np.einsum("nii->ni", covariances)))
+    """Share (24,) of the 95 % intervals of each parameter that hold the truth."""
+    return np.mean(np.abs(errors) < 1.96 * np.sqrt(np.einsum("nii->ni", covariances)), axis=0)
 
 
-@pytest.mark.parametrize(("kind", "least_before", "least_after"), [("field", 0.70, 0.92), ("bent", 0.70, 0.85)])
-def test_intervals_hold_although_points_of_a_view_err_alike(kind, least_before, least_after):
-    errors, covariances, _, factors = repeated(kind, 40, 10)
-    assert np.all(factors > 1.0)
-    assert coverage(errors, covariances / factors[:, None, None]) < least_before
-    assert least_after < coverage(errors, covariances) < 0.98
+@pytest.mark.parametrize("kind", ["field", "bent"])
+def test_intervals_hold_although_points_of_a_view_err_alike(kind):
+    errors, covariances, independent, shared = repeated(kind, 40, 10)
+    assert min(s.factor for s in shared) > 1.0
+    assert coverage(errors, independent).mean() < 0.70
+    assert 0.92 < coverage(errors, covariances).mean() < 0.98
 
 
 def test_independent_errors_leave_the_covariance_as_it_is():
-    _, _, ratios, factors = repeated("independent", 30, 10)
-    assert np.all(factors == 1.0)
+    _, covariances, independent, shared = repeated("independent", 30, 10)
+    np.testing.assert_array_equal(covariances, independent)
+    ratios = np.array([s.ratio for s in shared])
     assert ratios.mean() == pytest.approx(1.0, abs=4.0 * ratios.std() / np.sqrt(30))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("views", [10, 20])
-@pytest.mark.parametrize(("kind", "low", "high"), [("independent", 0.93, 0.97), ("field", 0.93, 0.98),
-                                                   ("bent", 0.87, 0.97)])
-def test_intervals_hold_over_hundreds_of_calibrations(kind, low, high, views):
-    """The bent board is the harder one: single parameters hold 73 %, for one factor serves all directions."""
-    errors, covariances, _, factors = repeated(kind, 200, views)
-    assert low < coverage(errors, covariances) < high
-    assert coverage(errors, covariances / factors[:, None, None]) < (0.97 if kind == "independent" else 0.65)
+@pytest.mark.parametrize(("kind", "before", "worst"), [("independent", 0.97, 0.90), ("field", 0.65, 0.87),
+                                                       ("bent", 0.65, 0.82)])
+def test_intervals_hold_over_hundreds_of_calibrations(kind, before, worst, views):
+    """All 24 together, and each for itself: of few views, what suffers most is known roughly only."""
+    errors, covariances, independent, _ = repeated(kind, 200, views)
+    assert 0.93 < coverage(errors, covariances).mean() < 0.975
+    assert coverage(errors, covariances).min() > worst
+    assert coverage(errors, independent).mean() < before
     squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
-    assert 0.75 < squared.mean() / 24 < 1.3
+    assert 0.6 < squared.mean() / 24 < 1.3
+
+
+def test_enlargement_follows_the_direction_that_views_err_in():
+    """Errors along one direction of six, of many views: the sandwich is then well known, and the rest stays."""
+    rng = np.random.default_rng(2)
+    jacobians = rng.normal(size=(1200, 30, 6))
+    own = rng.normal(0.0, 1.0, (1200, 30)) + (jacobians @ np.eye(6)[2]) * rng.normal(0.0, 1.0, (1200, 1))
+    stacked = jacobians.reshape(-1, 6)
+    left = own.ravel() - stacked @ np.linalg.lstsq(stacked, own.ravel(), rcond=None)[0]
+    found = shared_errors(np.einsum("vnc,vn->vc", jacobians, left.reshape(1200, 30)),
+                          jacobians.swapaxes(1, 2) @ jacobians, 1.0)
+    gain = np.diag(found.covariance) / np.diag(found.independent)
+    assert gain[2] == pytest.approx(33.0, rel=0.1)  # E[(j'j)² + j'j] / E[j'j] of 30 standard normal numbers j
+    np.testing.assert_allclose(np.delete(gain, 2), 2.0, atol=0.6)  # E[(j'k)² + k'k] / E[k'k] of two such columns
+    assert found.ratio == pytest.approx((33.0 + 5.0 * 2.0) / 6.0, rel=0.1)
 
 
 def test_ratio_and_limit_of_scores_drawn_from_their_own_covariance():
@@ -125,6 +143,6 @@ def test_enlarged_covariance_is_warned_of_with_its_factor():
     board_in = board_poses(12, rng, board=BOARD)
     warned = calibrate(BOARD, KINDS["field"](board_in, rng), SIZE)
     factor = warned.adjustment.shared.factor
-    assert any(f"{factor:.1f} times that of independent errors" in line for line in warned.warnings)
+    assert any(f"on average {factor:.1f} times that of independent errors" in line for line in warned.warnings)
     plain = calibrate(BOARD, KINDS["independent"](board_in, rng), SIZE)
     assert not any("independent" in line for line in plain.warnings)
