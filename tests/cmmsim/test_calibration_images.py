@@ -1,4 +1,4 @@
-"""Boards, image files, and the board in rendered and photograph-like images, against the projected truth."""
+"""The board in rendered and photograph-like images, and the cameras found from them, against the projected truth."""
 
 from dataclasses import replace
 
@@ -11,18 +11,13 @@ from cmmsim.calibration import (
     Board,
     CalibrationError,
     CalibrationOptions,
-    ImagePair,
     PairView,
     as_dict,
     board_poses,
     calibrate,
     find_board,
-    pair_images,
-    read_board,
-    read_grey,
     render_pairs,
     sensor_template,
-    view_pairs,
 )
 from cmmsim.camera import PinholeCamera
 from cmmsim.distortion import Distortion
@@ -94,115 +89,6 @@ def errors_beside_independent_ones(found, rig):
 def views_of(frames, board):
     return [PairView(f"{k:02d}.png", find_board(f.left, board), find_board(f.right, board))
             for k, f in enumerate(frames)]
-
-
-# --- board files
-
-
-@pytest.mark.parametrize("board", [DOTS, ASYMMETRIC, CHESSBOARD])
-def test_board_file_is_read_back(tmp_path, board):
-    (tmp_path / "board.toml").write_text(board.as_toml())
-    assert read_board(tmp_path / "board.toml") == board
-
-
-@pytest.mark.parametrize(("text", "evidence"), [
-    ("colums = 9", "unknown key 'colums', valid are columns, dark, kind, radius, rows, spacing"),
-    ("columns = 9.5", r"columns: .*integer.*\(got 9.5\)"),
-    ("columns = true", r"columns: .*\(got True\)"),
-    ("columns = 2", "columns: .*greater than or equal to 3"),
-    ('kind = "aruco"', "kind: .*'chessboard', 'dots' or 'asymmetric_dots'"),
-    ("spacing = nan", "spacing: .*finite"),
-    ("spacing = 0", "spacing: .*greater than 0"),
-    ("radius = 0.03", "nearly touch: the largest radius is 0.02 m"),
-    ("rows", "is not TOML"),
-])
-def test_bad_board_file_is_refused_with_evidence(tmp_path, text, evidence):
-    values = {"kind": '"dots"', "columns": "9", "rows": "7", "spacing": "0.05", "radius": "0.01"}
-    name, _, value = text.partition(" = ")
-    values[name] = value
-    (tmp_path / "board.toml").write_text("\n".join(f"{k} = {v}" for k, v in values.items()))
-    with pytest.raises(CalibrationError, match=evidence):
-        read_board(tmp_path / "board.toml")
-
-
-def test_board_with_parts_that_do_not_belong_is_refused(tmp_path):
-    path = tmp_path / "board.toml"
-    with pytest.raises(CalibrationError, match="cannot read board file"):
-        read_board(path)
-    path.write_text(CHESSBOARD.as_toml() + "radius = 0.01\n")
-    with pytest.raises(CalibrationError, match="a chessboard has no dots"):
-        read_board(path)
-    path.write_text(DOTS.as_toml().replace("radius = 0.0125", ""))
-    with pytest.raises(CalibrationError, match="radius of the dots"):
-        read_board(path)
-
-
-@pytest.mark.parametrize("board", [DOTS, ASYMMETRIC, CHESSBOARD, DOTS.model_copy(update={"columns": 7}),
-                                   ASYMMETRIC.model_copy(update={"rows": 8})])
-def test_symmetries_carry_the_board_onto_itself(board):
-    """All distances stay, which a rigid turn of the same points needs."""
-    def distances(points):
-        return np.linalg.norm(points[:, None] - points[None], axis=2)
-
-    assert len({tuple(order) for order in board.symmetries}) == len(board.symmetries)
-    for order in board.symmetries:
-        np.testing.assert_allclose(distances(board.points[order]), distances(board.points), atol=1e-12)
-    if board.kind == "asymmetric_dots" and board.rows % 2:
-        assert len(board.symmetries) == 1
-
-
-# --- image files
-
-
-def test_grey_values_of_other_kinds_of_images(tmp_path):
-    grey = np.linspace(0, 255, 64 * 48).reshape(48, 64).astype(np.uint8)
-    images = {"colour.png": np.dstack([grey] * 3), "alpha.png": np.dstack([grey] * 3 + [np.full_like(grey, 9)]),
-              "twelve.png": (grey.astype(np.uint16) * 16), "grey.png": grey, "photo.jpg": grey,
-              "deep.tif": grey.astype(np.uint16) * 257}
-    for name, image in images.items():
-        assert cv2.imwrite(str(tmp_path / name), image)
-        read = read_grey(tmp_path / name)
-        assert read.shape == (48, 64)
-        assert read.dtype == np.uint8
-        assert np.abs(read.astype(int) - grey).max() <= (6 if name == "photo.jpg" else 1), name
-
-
-def files(folder, names):
-    folder.mkdir(parents=True)
-    for name in names:
-        cv2.imwrite(str(folder / name), np.zeros((8, 8), np.uint8))
-    return folder
-
-
-def test_pairs_are_made_in_the_order_of_the_names(tmp_path):
-    left, right = files(tmp_path / "a", ["l2.png", "l1.png"]), files(tmp_path / "b", ["r1.png", "r2.png"])
-    (left / "notes.txt").touch()
-    assert [pair.name for pair in pair_images(left, right)] == ["l1.png | r1.png", "l2.png | r2.png"]
-
-
-def test_folders_that_make_no_pairs_are_refused(tmp_path):
-    left = files(tmp_path / "a", ["1.png", "2.png", "4.png"])
-    with pytest.raises(CalibrationError, match=r"no folder .*missing"):
-        pair_images(left, tmp_path / "missing")
-    with pytest.raises(CalibrationError, match=r"holds no images, which end in \.bmp"):
-        pair_images(left, files(tmp_path / "empty", []))
-    with pytest.raises(CalibrationError, match=r"holds 3 images and .* 2; .*left: 4; only on the right: none"):
-        pair_images(left, files(tmp_path / "b", ["1.png", "2.png"]))
-    with pytest.raises(CalibrationError, match="Only on the left: 4; only on the right: 3"):
-        pair_images(left, files(tmp_path / "c", ["1.png", "2.png", "3.png"]))
-    with pytest.raises(CalibrationError, match="named for both cameras"):
-        pair_images(left, left)
-
-
-def test_images_that_cannot_be_read_or_differ_in_size_are_refused(tmp_path):
-    left, right = files(tmp_path / "a", ["1.png"]) / "1.png", files(tmp_path / "b", ["1.png"]) / "1.png"
-    for content in (b"", b"no image"):
-        right.write_bytes(content)
-        with pytest.raises(CalibrationError, match=r"cannot read image .*b.1\.png: it is truncated or not"):
-            view_pairs([ImagePair(left, right)], DOTS)
-    cv2.imwrite(str(right), np.zeros((8, 10), np.uint8))
-    with pytest.raises(CalibrationError, match=r"b.1\.png is 10 x 8 px, .*a.1\.png 8 x 8"):
-        view_pairs([ImagePair(left, right)], DOTS)
 
 
 # --- the board in images
