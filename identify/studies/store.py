@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cmmsim.sensor_file import read_sensor_file
-from identify.errors import StudyError
+from identify.errors import StudyError, StudyInterrupted
 from identify.files.atomic import write_text
 from identify.files.versions import versions
 from identify.studies.design import Setup
@@ -45,7 +45,7 @@ def resolved(study: Study, setup: Setup) -> dict[str, Any]:
 def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Journal]:
     """Work on the folder of a resolved study with ``rows`` rows, new or begun before; nobody else may meanwhile.
 
-    A StudyError that comes before the first row leaves nothing behind that was not there.
+    What refuses the study before its first row leaves nothing behind that was not there; Ctrl-C leaves a study begun.
 
     Raises:
         StudyError: the folder is of another study, in use, holds something else or cannot be made; one of its files
@@ -70,8 +70,8 @@ def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Jour
                 if not journal.finished.all():
                     check_folder(folder, begun)
                 yield journal
-        except StudyError:
-            if new and not _has_rows(folder):
+        except StudyError as error:
+            if new and not _has_rows(folder) and not isinstance(error, StudyInterrupted):
                 _take_back(folder, made)
             raise
 
