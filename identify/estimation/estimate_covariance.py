@@ -6,13 +6,14 @@ experiment is repeated on the identified model with drawn noise: each draw gives
 spread as those of the real record do. With W the information of data and prior, the covariance of the estimate is
 W^-1 (cov(J^T r) + prior information) W^-1. A model driven by the logged commands has white residuals, and W^-1 is all.
 Where either misses the record by more than noise explains, what its error does to the scores is added (`misfit`); and
-what the error of a load does that is not known exactly (`load_error`).
+what the error of a load does that is not known exactly (`load_error`). It is all computed in units where W is one.
 """
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from dynamics.closed_loop import ClosedLoopRun, LoopFailure, simulate
 from identify.arrays import Array
@@ -64,35 +65,52 @@ def estimate_uncertainty(
     found = [run.residuals(parameters) for run in problem.runs]
     known, known_rows = problem.known(parameters)
     gradient = known @ known_rows + sum(np.tensordot(r, j, 2) for r, j in found)
-    prior = known_rows.T @ known_rows
-    information = np.asarray(sum(np.tensordot(j, j, ([0, 1], [0, 1])) for _, j in found))
-    scores, misfit, unstable = _noise(problem, parameters, found, information, rng, advance)
+    information = np.asarray(sum(_information(j) for _, j in found))
+    units = _units([known_rows, *(j.reshape(-1, len(parameters)) for _, j in found)])
+    shown = [(r, j @ units) for r, j in found]
+    scores, misfit, unstable = _noise(problem, parameters, shown, rng, advance)
     if misfit.significant:
-        model = sum(coloured_score_covariance(r, j, run.ok) for (r, j), run in zip(found, problem.runs, strict=True))
+        model = sum(coloured_score_covariance(r, j, run.ok) for (r, j), run in zip(shown, problem.runs, strict=True))
         scores = scores + misfit.share_of_model * model
     if any(run.payload_std.any() for run in problem.runs):
-        scores = scores + load_score_covariance(problem.runs, [j for _, j in found])
-    inverse = np.linalg.inv(information + prior)
-    covariance = inverse @ (scores + prior) @ inverse
+        scores = scores + load_score_covariance(problem.runs, [j for _, j in found], units)
+    prior = _information(known_rows @ units)
+    covariance = units @ (scores + prior) @ units.T
     return Uncertainty((covariance + covariance.T) / 2, information, np.asarray(gradient), misfit, unstable)
+
+
+def _units(rows: list[Array]) -> Array:
+    """Matrix T (p, p) with T^T W T = 1, where W is the information of all rows (n, p) together, and so W^-1 = T T^T.
+
+    From the rows themselves: W has the square of their condition number, beyond what its inverse can bear where a
+    record contradicts the model.
+    """
+    triangle: Array = np.asarray(np.linalg.qr(np.vstack(rows), mode="r"))
+    return np.asarray(solve_triangular(triangle, np.eye(triangle.shape[1])))
+
+
+def _information(jacobian: Array) -> Array:
+    """J^T J (p, p) of rows (..., p)."""
+    rows = jacobian.reshape(-1, jacobian.shape[-1])
+    return np.asarray(rows.T @ rows, dtype=float)
 
 
 def _noise(
     problem: OutputErrorProblem,
     parameters: Array,
     found: list[tuple[Array, Array]],
-    information: Array,
     rng: np.random.Generator,
     advance: Advance,
 ) -> tuple[Array, Misfit, int]:
     """Covariance (67, 67) of the scores that noise makes, the misfit beyond it, and how many repetitions ended early.
 
-    Where the model's error decides, or its residuals are white, no experiment is repeated.
+    found: residuals (n, 6) of each run and their Jacobian (n, 6, 67), in the units of the scores. Where the model's
+    error decides, or its residuals are white, no experiment is repeated.
     """
     white = misfit_of_white(np.concatenate([residual for residual, _ in found]))
     if white.decides or all(run.driven for run in problem.runs):
         advance(DRAWS)
-        return information, white, 0
+        return np.asarray(sum(_information(jacobian) for _, jacobian in found)), white, 0
     scores, squares = _repeated_scores(problem, parameters, found, rng, advance)
     unstable = DRAWS - len(scores)
     if len(scores) < FEWEST:
