@@ -18,6 +18,7 @@ import xarray as xr
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.estimation.loop_parameters import NAMES, index_of, unit_of
+from identify.record.attribute_text import shown
 
 MEASURED_PARAMETER = {"platform_mass": "platform.mass", "joint_gain": "joint_pid.lp"}
 """Anchors that measure a parameter."""
@@ -80,7 +81,7 @@ def read_anchor(record: xr.Dataset) -> ScaleAnchor:
     if name not in ANCHORS:
         raise RecordError(
             f"the record holds no scale anchor (attributes scale_anchor, scale_anchor_value, scale_anchor_std), found "
-            f"{name!r}; valid anchors: {', '.join(ANCHORS)}"
+            f"{shown(name)}; valid anchors: {', '.join(ANCHORS)}"
         )
     if name not in MEASURED_PARAMETER:
         return ScaleAnchor(str(name))
@@ -95,7 +96,7 @@ def _positive(record: xr.Dataset, attribute: str) -> float:
         anchor = record.attrs["scale_anchor"]
         measured = MEASURED_PARAMETER[anchor]
         raise RecordError(
-            f"the record's attribute {attribute} is {value!r}, must be a finite number > 0 in {unit_of(measured)}: the "
-            f"scale anchor {anchor} measures {measured}"
+            f"the record's attribute {attribute} is {shown(value)}, must be a finite number > 0 in "
+            f"{unit_of(measured)}: the scale anchor {anchor} measures {measured}"
         )
     return number

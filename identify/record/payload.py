@@ -11,6 +11,7 @@ import xarray as xr
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.estimation.loop_parameters import NAMES, index_of
+from identify.record.attribute_text import shown
 from identify.scenario_checks import check_load_std, check_moments
 
 ADDED = {
@@ -77,5 +78,5 @@ def recorded_payload_std(record: xr.Dataset) -> Array:
 def _not_negative(name: str, value: object, unit: str) -> float:
     """An attribute's value, a finite number >= 0."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.number) or not 0 <= value < 1e6:
-        raise RecordError(f"the record's attribute {name} is {value!r}, must be a number >= 0 in {unit}")
+        raise RecordError(f"the record's attribute {name} is {shown(value)}, must be a number >= 0 in {unit}")
     return float(value)

@@ -13,6 +13,7 @@ from dynamics.closed_loop import Reference
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.files.dataset import POSE
+from identify.record.attribute_text import shown
 from identify.record.filtering import SPLINE_DEGREE, padding_samples
 from identify.record.loop_setup import frame_times
 from identify.record.recorded_origin import recorded_scenario
@@ -28,7 +29,8 @@ REFERENCE_GAP = 0.05
 """Share of its travel by which a reference may differ from the integral of its rate."""
 
 ROUNDING = 1e-9
-"""m or rad: difference that means nothing, of a reference from its trajectory or from one that stands still."""
+"""m or rad: difference that means nothing, of a reference from its trajectory or from one that stands still; and
+relative, of a frame rate."""
 
 
 ASYMMETRY = 1e-6
@@ -53,12 +55,24 @@ def check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
                 raise EstimationError(
                     f"the record was made with {section}.{key} = {value!r}, the scenario says {ours[key]!r}"
                 )
+    _check_stated_rate(record, scenario.timing.frame_rate_hz)
     steps = np.diff(np.asarray(record["time"].values, dtype=float)) * scenario.timing.frame_rate_hz
     if len(steps) and not np.abs(steps - 1).max() <= 1e-3:
         worst = int(np.abs(steps - 1).argmax())
         raise EstimationError(
             f"frames {worst} and {worst + 1} are {steps[worst]:.3f} periods of {scenario.timing.frame_rate_hz:g} Hz "
             "apart: frames are missing in the record; keep lost ones with measured_ok = 0"
+        )
+
+
+def _check_stated_rate(record: xr.Dataset, rate_hz: float) -> None:
+    """A frame rate that the record states beside its scenario must be that of the scenario [Hz]."""
+    stated = record.attrs.get("frame_rate_hz", rate_hz)
+    number = isinstance(stated, int | float | np.number) and not isinstance(stated, bool)
+    if not number or not abs(stated - rate_hz) <= ROUNDING * rate_hz:
+        raise EstimationError(
+            f"the record contradicts itself: its attribute frame_rate_hz is {shown(stated)}, and timing.frame_rate_hz "
+            f"of its attribute scenario is {rate_hz:g}"
         )
 
 

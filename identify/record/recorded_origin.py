@@ -4,6 +4,7 @@ import numpy as np
 import xarray as xr
 
 from identify.errors import RecordError, ScenarioError
+from identify.record.attribute_text import shown
 from identify.scenario import Scenario, scenario_from_toml
 
 
@@ -20,7 +21,7 @@ def recorded_scenario(record: xr.Dataset) -> Scenario:
             "record.attrs['scenario'] = scenario.to_toml(), or make the record by identify.build_record"
         )
     if not isinstance(text, str):
-        raise RecordError(f"the record's attribute scenario is {text!r}, must be TOML text: scenario.to_toml()")
+        raise RecordError(f"the record's attribute scenario is {shown(text)}, must be TOML text: scenario.to_toml()")
     try:
         return scenario_from_toml(text, "the record's attribute scenario")
     except ScenarioError as error:
@@ -35,5 +36,5 @@ def recorded_seed(record: xr.Dataset) -> int:
     """
     seed = record.attrs.get("seed", 0)
     if isinstance(seed, bool | np.bool_) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise RecordError(f"the record's attribute seed is {seed!r}, must be a whole number >= 0")
+        raise RecordError(f"the record's attribute seed is {shown(seed)}, must be a whole number >= 0")
     return int(seed)

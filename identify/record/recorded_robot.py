@@ -10,6 +10,7 @@ import xarray as xr
 from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
+from identify.record.attribute_text import shown
 
 ATTRIBUTE = "robot_geometry"
 
@@ -30,7 +31,7 @@ def check_robot(record: xr.Dataset, robot: Robot) -> None:
         RecordError: a geometry that cannot be read.
     """
     if record.attrs.get("robot") != robot.name:
-        raise EstimationError(f"the record is of robot {record.attrs.get('robot')!r}, not of {robot.name!r}")
+        raise EstimationError(f"the record is of robot {shown(record.attrs.get('robot'))}, not of {robot.name!r}")
     if ATTRIBUTE not in record.attrs:
         return
     recorded = _read(record.attrs[ATTRIBUTE])

@@ -82,6 +82,10 @@ def without(record, name):
         (lambda r: r.assign_attrs(scenario="description = 'mine'"), RecordError, "attribute scenario: name is missing"),
         (lambda r: r.assign_attrs(seed="abc"), RecordError, "attribute seed is 'abc', must be a whole number >= 0"),
         (lambda r: r.assign_attrs(seed=-1), RecordError, "attribute seed is -1, must be"),
+        (lambda r: r.assign_attrs(seed=np.int64(-2)), RecordError, "attribute seed is -2, must be"),
+        (lambda r: r.assign_attrs(frame_rate_hz=30.0), EstimationError,
+         "contradicts itself: its attribute frame_rate_hz is 30.0, and timing.frame_rate_hz .* is 60"),
+        (lambda r: r.assign_attrs(frame_rate_hz="60 Hz"), EstimationError, "attribute frame_rate_hz is '60 Hz', and"),
         (lambda r: r.assign_attrs(seed=True), RecordError, "attribute seed is True, must be"),
         (lambda r: r.assign_attrs(seed=np.nan), RecordError, "attribute seed is nan, must be"),
         (lambda r: r.assign(reference_position=r["reference_position"].where(r["time"] > 1)), DynamicsError, "is nan"),
@@ -93,7 +97,8 @@ def without(record, name):
     ],
     ids=["channel", "channels", "empty", "one frame", "time NaN", "rate", "covariance NaN",
          "covariance in one triangle", "command NaN", "no scenario", "scenario a number", "scenario a name",
-         "scenario without name", "seed a word", "seed negative", "seed a truth value", "seed NaN", "reference NaN",
+         "scenario without name", "seed a word", "seed negative", "seed of numpy", "other rate", "rate a word",
+         "seed a truth value", "seed NaN", "reference NaN",
          "standstill", "alias", "rate not in m/s", "millimetres"],
 )
 def test_what_is_wrong_with_a_record_is_said(record, spoil, error, says):
@@ -119,6 +124,16 @@ def test_a_load_of_moments_that_no_body_has_is_refused_by_name(record):
     with pytest.raises(RecordError, match=r"attribute payload_Ixx = 100 kg m2 exceeds .*0.02 .*0.04"):
         recorded_payload(record.assign_attrs(load))
     assert recorded_payload(record.assign_attrs(load | {"payload_Ixx": 0.02})).sum() == pytest.approx(8.08)
+
+
+def test_a_number_of_a_netcdf_file_is_shown_as_a_plain_one(record):
+    load = {"payload_mass": np.float64(-8.0), "payload_Ixx": 0.02, "payload_Iyy": 0.02, "payload_Izz": 0.04}
+    with pytest.raises(RecordError, match=r"attribute payload_mass is -8.0, must be"):
+        recorded_payload(record.assign_attrs(load))
+
+
+def test_a_record_need_not_repeat_the_frame_rate_of_its_scenario(record):
+    recorded_run(without(record, "frame_rate_hz"), rss6(), quick())
 
 
 def test_a_reference_that_moves_one_way_only_is_no_fault(record):

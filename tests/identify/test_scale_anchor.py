@@ -35,6 +35,7 @@ def test_a_weighing_is_one_equation_in_standard_deviations():
     ("attributes", "says"),
     [
         ({"scale_anchor_value": -23.0}, r"_value is -23.0, must be a finite number > 0 in kg.*platform.mass"),
+        ({"scale_anchor_value": np.float64(-3.0)}, r"scale_anchor_value is -3.0, must be"),
         ({"scale_anchor_value": 0.0}, r"scale_anchor_value is 0.0, must be a finite number > 0 in kg"),
         ({"scale_anchor_value": np.nan}, r"scale_anchor_value is nan, must be"),
         ({"scale_anchor_value": np.inf}, r"scale_anchor_value is inf, must be"),
@@ -45,7 +46,7 @@ def test_a_weighing_is_one_equation_in_standard_deviations():
          r"scale_anchor_std is nan, must be a finite number > 0 in N m/rad.*joint_gain measures joint_pid.lp"),
         ({"scale_anchor": "guess"}, r"no scale anchor .*found 'guess'; valid anchors: platform_mass"),
     ],
-    ids=["negative", "zero", "NaN", "infinite", "text", "std zero", "std negative", "std NaN", "unknown"],
+    ids=["negative", "of numpy", "zero", "NaN", "infinite", "text", "std zero", "std negative", "std NaN", "unknown"],
 )
 def test_an_impossible_anchor_is_refused_with_its_value_and_limit(record, attributes, says):
     with pytest.raises(RecordError, match=says):
