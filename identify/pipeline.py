@@ -12,7 +12,7 @@ from dynamics import Robot, load_robot
 from dynamics.closed_loop import prepare
 from dynamics.workspace import check_motion
 from identify.arrays import Array
-from identify.errors import EstimationError
+from identify.errors import EstimationError, RecordError
 from identify.estimation import identification
 from identify.estimation.loop_parameters import NAMES, check_parameter_set
 from identify.estimator_settings import estimator_settings, with_estimator_settings
@@ -24,7 +24,7 @@ from identify.experiment.sensor_in_loop import with_renderer
 from identify.experiment.truth import read_truth, true_parameters
 from identify.files.atomic import write_text
 from identify.files.covariance_file import read_covariance, write_covariance
-from identify.files.result_file import load_result, rms_figures, save_result
+from identify.files.result_file import check_entries, load_result, rms_figures, save_result
 from identify.files.run_folder import RunFolder
 from identify.files.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
 from identify.files.versions import versions
@@ -34,6 +34,7 @@ from identify.record.loop_setup import frame_times
 from identify.record.record_checks import check_length, check_trajectory
 from identify.record.recorded_robot import check_robot
 from identify.record.recorded_run import recorded_reference
+from identify.reporting.made_of import ENTRY, RECORDS, check_made_of, file_digests
 from identify.reporting.model_runs import build_model_run, write_model_runs
 from identify.reporting.report import write_report
 from identify.reporting.run_result import (
@@ -106,6 +107,7 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
     payload_files = _payload_files(run_folder, scenario)
     run_folder.require(*(file.name for file in payload_files))
     plan = scenario, trajectories, robot
+    origin = file_digests(run_folder, *(file.name for file in (run_folder.experiment, *payload_files)))
     seen, *loaded = [_read_record(file, *plan) for file in (run_folder.experiment, *payload_files)]
     result = identification.identify([seen, *loaded], robot, scenario, progress)
     measured, ok = recording.poses(seen, "measured"), seen["measured_ok"].values.astype(bool)
@@ -122,6 +124,7 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
             "seed": trajectories.seed,
             "settings": estimator_settings(scenario),
             "versions": versions(),
+            ENTRY: origin | file_digests(run_folder, run_folder.covariance.name),
             "seconds": {
                 "record": seen.attrs.get("record_seconds"),
                 "identify": time.perf_counter() - began,
@@ -137,18 +140,22 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
 def validate(
     folder: Path, progress: Progress, workers: int | None = None, taught: cmmsim.Taught | None = None
 ) -> None:
-    """Run plant and models on the unseen trajectories and open the truth: validation.nc, model.nc, result.json."""
+    """Run plant and models on the unseen trajectories and open the truth: validation.nc, model.nc, result.json.
+
+    Raises RecordError for a result that is not whole, or was made of another record or covariance.
+    """
     run_folder, scenario, trajectories, robot = _open(folder)
     began = time.perf_counter()
     run_folder.require("covariance.nc")
     result, covariance = load_result(run_folder.result), read_covariance(run_folder.covariance, NAMES)
     excitation_record = _read_record(run_folder.experiment, scenario, trajectories, robot)
     excitation_truth = read_truth(run_folder.experiment)
+    check_entries(run_folder.result, result, "identify")
+    check_made_of(run_folder, result, *RECORDS, run_folder.covariance.name)
+    models = _identified_models(run_folder, result)
     taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
     runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, workers, progress)
     recording.write_runs(run_folder.validation, [(unseen.record, unseen.truth) for unseen in runs])
-    estimated = result["identification"]
-    models = [parameter_vector(estimated, column) for column in ("initial", "estimate")]
     records = [excitation_record, *(run.record for run in runs)]
     model_poses = [_model_poses(robot, scenario, models, seen) for seen in records]
     predictions = predicted_runs(robot, scenario, records[1:], models[1], covariance, trajectories.seed, progress)
@@ -164,7 +171,8 @@ def validate(
         validation_entry(*pair, *poses) | prediction_entry(prediction, pair[1])
         for pair, poses, prediction in zip(pairs[1:], model_poses[1:], predictions, strict=True)
     ]
-    add_truth(estimated, true_parameters(excitation_truth))
+    add_truth(result["identification"], true_parameters(excitation_truth))
+    result[ENTRY] = result.get(ENTRY, {}) | file_digests(run_folder, "validation.nc", "model.nc")
     result["seconds"]["validate"] = time.perf_counter() - began
     save_result(run_folder.result, result)
 
@@ -228,6 +236,15 @@ def _check_singularities(robot: Robot, scenario: Scenario, trajectories: Traject
     for trajectory, duration in zip((trajectories.excitation, *trajectories.validation), durations, strict=True):
         times = frame_times(scenario, duration)
         check_motion(robot, trajectory.pose(times), times)
+
+
+def _identified_models(run_folder: RunFolder, result: dict[str, Any]) -> list[Array]:
+    """Parameters (67,) of the starting and of the identified model."""
+    try:
+        return [parameter_vector(result["identification"], column) for column in ("initial", "estimate")]
+    except RecordError as error:
+        again = f"run `cmmsim identify --out {run_folder.path}` again"
+        raise RecordError(f"{run_folder.result}: {error}; {again}") from None
 
 
 def _model_poses(robot: Robot, scenario: Scenario, models: list[Array], record: xr.Dataset) -> list[Array]:

@@ -41,9 +41,11 @@ def estimators(
     from identify.files.result_file import save_result
     from identify.reporting.estimators_figure import estimators_figure
     from identify.reporting.figures import save_figure
+    from identify.reporting.made_of import check_folder
 
     folder = RunFolder(out)
     folder.require("scenario.toml", "experiment.nc", "validation.nc")
+    check_folder(folder, "experiment.nc", "validation.nc")
     instruments = JointInstruments(torque_noise, encoder_noise, 2 * math.pi / 2**encoder_bits)
     chosen = choose(only)
     scores = _scores(folder, instruments, chosen, seed, quiet)

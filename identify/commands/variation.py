@@ -47,6 +47,7 @@ def variation(
     """
     from dynamics import load_robot
     from identify.record import recording
+    from identify.reporting.made_of import check_folder
     from identify.reporting.variation_tables import variation_table
     from identify.scenario import load_scenario
     from identify.variation import identify_each
@@ -54,6 +55,8 @@ def variation(
 
     folder = RunFolder(out)
     folder.require("scenario.toml", *(["trajectories.json"] if designed else ["validation.nc"]))
+    if not designed:
+        check_folder(folder, "validation.nc")
     progress = terminal_progress(quiet)
     scenario = load_scenario(folder.scenario)
     robot = load_robot(scenario.robot)

@@ -13,6 +13,9 @@ from identify.files.atomic import write_text
 AXES = ("x", "y", "z", "alpha", "beta", "gamma")
 """Order of the RMS figures: three positions in um, three orientations in urad."""
 
+ENTRIES = {"identify": ("identification", "before", "after", "seconds"), "validate": ("sensor", "validation")}
+"""What the stages write into a result, and later ones read."""
+
 
 def save_result(path: Path | str, result: dict[str, Any]) -> None:
     """Write a result, whole or not at all; arrays become lists, and numbers that are not finite become null."""
@@ -34,6 +37,19 @@ def load_result(path: Path | str) -> dict[str, Any]:
     if not isinstance(result, dict):
         raise RecordError(f"{path} holds no JSON object")
     return result
+
+
+def check_entries(path: Path | str, result: dict[str, Any], *stages: str) -> None:
+    """Refuse a result without the entries of these stages, ``identify`` and ``validate``.
+
+    Raises:
+        RecordError: naming what is missing and the stage that writes it.
+    """
+    missing = {stage: [name for name in ENTRIES[stage] if name not in result] for stage in stages}
+    first = next((stage for stage in stages if missing[stage]), None)
+    if first is not None:
+        names = ", ".join(name for stage in stages for name in missing[stage])
+        raise RecordError(f"{path} lacks {names}; write it with: cmmsim {first} --out {Path(path).parent}")
 
 
 def rms_figures(errors: Any, counted: Any = None) -> dict[str, list[float]]:

@@ -16,15 +16,17 @@ from identify.estimation.loop_parameters import NAMES
 from identify.experiment.truth import read_truth_runs, true_poses
 from identify.files.atomic import write_text
 from identify.files.covariance_file import read_covariance
-from identify.files.result_file import load_result
+from identify.files.result_file import check_entries, load_result
 from identify.files.run_folder import RunFolder
 from identify.files.trajectory_file import TrajectorySet, load_trajectories
 from identify.progress import Progress, SilentProgress
 from identify.record.recording import poses, read, read_runs, run_name
 from identify.reporting import figures, report_plots, tables
 from identify.reporting.goals import check_goals
+from identify.reporting.made_of import RECORDS, check_made_of
 from identify.reporting.model_runs import EXCITATION, read_model_runs
 from identify.reporting.paper_results import INDEX_BEST, INDEX_FIRST
+from identify.reporting.run_result import check_intervals
 from identify.reporting.tables import Table
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -81,7 +83,7 @@ def read_report_data(run: RunFolder) -> ReportData:
         RecordError: a file is damaged, or the files are not of one run.
     """
     data = ReportData(
-        result=load_result(run.result),
+        result=_checked_result(run),
         experiment=read(run.experiment),
         validation=read_runs(run.validation),
         validation_truth=read_truth_runs(run.validation),
@@ -94,12 +96,19 @@ def read_report_data(run: RunFolder) -> ReportData:
     for name, record in records.items():
         if name not in data.models or data.models[name].sizes["time"] != record.sizes["time"]:
             raise RecordError(f"{run.model} does not belong to the records of {run.path}: run {name} differs")
-    missing = [key for key in ("identification", "before", "after", "sensor", "validation") if key not in data.result]
-    if missing:
-        raise RecordError(
-            f"{run.result} lacks {', '.join(missing)}; complete it with: cmmsim validate --out {run.path}"
-        )
     return data
+
+
+def _checked_result(run: RunFolder) -> dict[str, Any]:
+    """The whole result of a run, made of the files that are there."""
+    result = load_result(run.result)
+    check_entries(run.result, result, "identify", "validate")
+    check_made_of(run, result, *RECORDS, "covariance.nc", "validation.nc", "model.nc")
+    try:
+        check_intervals(result["identification"])
+    except RecordError as error:
+        raise RecordError(f"{run.result}: {error}; run `cmmsim identify --out {run.path}` again") from None
+    return result
 
 
 def png_figures(data: ReportData) -> dict[str, Callable[[], Any]]:

@@ -1,15 +1,19 @@
 """Entries of `result.json` from what the stages computed and recorded."""
 
+import json
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from dynamics import DynamicsError
+from dynamics.loop_checks import checked_loop_parameters
 from identify.arrays import Array
+from identify.errors import RecordError
 from identify.estimation.correlation import Pair, correlation_matrix, strongest_pairs
 from identify.estimation.identification import IdentificationResult
-from identify.estimation.loop_parameters import unit_of
+from identify.estimation.loop_parameters import NAMES, unit_of
 from identify.estimation.pose_prediction import PosePrediction
 from identify.experiment.truth import true_poses
 from identify.files.result_file import AXES, rms_figures
@@ -107,8 +111,40 @@ def _coefficients(row: Array, names: tuple[str, ...]) -> dict[str, float]:
 
 
 def parameter_vector(identification: dict[str, Any], column: str) -> Array:
-    """Parameters (67,) of one column ("initial", "estimate", ...) of an identification entry."""
-    return np.array([entry[column] for entry in identification["parameters"].values()], dtype=float)
+    """Parameters (67,) of one column ("initial", "estimate", ...) of an identification entry.
+
+    Raises:
+        RecordError: one that is missing or no number, or that no model can have.
+    """
+    entries = _entries(identification)
+    values = {name: entries[name].get(column) if isinstance(entries.get(name), dict) else None for name in NAMES}
+    for name, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise RecordError(f"{column} of {name} is {json.dumps(value):.60}, must be a number")
+    try:
+        return checked_loop_parameters(list(values.values()))
+    except DynamicsError as error:
+        raise RecordError(f"{column}: {error}") from None
+
+
+def check_intervals(identification: dict[str, Any]) -> None:
+    """Refuse an estimate outside its own interval, which no identification gives.
+
+    Raises:
+        RecordError: naming the parameter with both.
+    """
+    for name, entry in _entries(identification).items():
+        estimate, (low, high) = entry["estimate"], entry.get("interval") or (-np.inf, np.inf)
+        if estimate is not None and not low <= estimate <= high:
+            raise RecordError(f"the estimate {estimate:g} of {name} is outside its interval {low:g} to {high:g}")
+
+
+def _entries(identification: Any) -> dict[str, Any]:
+    """The entries of the parameters."""
+    entries = identification.get("parameters") if isinstance(identification, dict) else None
+    if not isinstance(entries, dict):
+        raise RecordError("identification has no parameters")
+    return entries
 
 
 def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:

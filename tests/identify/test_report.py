@@ -169,5 +169,5 @@ def test_model_of_another_run_is_refused(run_folder):
 
 def test_incomplete_result_is_named(run_folder):
     save_result(run_folder.result, {"scenario": "quick"})
-    with pytest.raises(RecordError, match="lacks identification, before, after, sensor, validation"):
+    with pytest.raises(RecordError, match=r"lacks .*before, after, seconds, sensor, .*; write .*cmmsim identify"):
         write_report(run_folder.path)
