@@ -1,5 +1,6 @@
 """Clusters that compute a study: a local one of one process a core, or one that is running already."""
 
+import asyncio
 import logging
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -7,7 +8,7 @@ from functools import partial
 from multiprocessing import active_children, resource_tracker
 
 import dask
-from distributed import Client, LocalCluster, WorkerPlugin
+from distributed import Client, LocalCluster, WorkerPlugin, rpc
 from distributed.comm import parse_address
 from distributed.comm.registry import get_backend
 from tornado.ioloop import PeriodicCallback
@@ -101,9 +102,10 @@ def running_cluster(address: str) -> Iterator[DaskExecutor]:
     except (ValueError, ImportError) as error:
         raise _no_scheduler(address, str(error)) from error
     try:
+        asyncio.run(_identity(address))
         client = Client(address, timeout=CONNECT_SECONDS)
     except OSError as error:
-        raise _no_scheduler(address, str(error)) from error
+        raise _no_scheduler(address, str(error) or "what listens there says nothing") from error
     except Exception as error:  # Dask takes the first bytes of whatever it is told for the size of a message
         raise _no_scheduler(address, "what listens there speaks another protocol") from error
     with client:
@@ -116,6 +118,15 @@ def running_cluster(address: str) -> Iterator[DaskExecutor]:
         except OSError as error:
             raise gone(error) from error
         yield DaskExecutor(client)
+
+
+async def _identity(address: str) -> object:
+    """What a scheduler says of itself. A client would wait without end where something listens and never answers.
+
+    Raises OSError where nothing answers in time, and other errors where something else does.
+    """
+    async with rpc(address) as scheduler:
+        return await asyncio.wait_for(scheduler.identity(), CONNECT_SECONDS)
 
 
 def _no_scheduler(address: str, why: str) -> StudyError:

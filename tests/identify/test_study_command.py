@@ -187,6 +187,14 @@ def test_another_program_at_the_address_is_no_scheduler(mine, capsys, words):
     assert not Path("runs").exists()
 
 
+def test_what_listens_and_says_nothing_is_no_scheduler(mine, monkeypatch, capsys):
+    monkeypatch.setattr(dask_runner, "CONNECT_SECONDS", 1)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        assert command("study", mine, "--scheduler", f"tcp://127.0.0.1:{server.getsockname()[1]}") == 1
+    assert "what listens there says nothing" in one_line(capsys.readouterr().err)
+    assert not Path("runs").exists()
+
+
 def answering(server, words):
     """Say the words to whoever comes, until the server is closed."""
     with suppress(OSError):
