@@ -75,6 +75,18 @@ class ImageFormation:
                        for w, s in zip(windows, sides, strict=True)]
         return windows
 
+    def reached(self, camera: PinholeCamera, moments: Sequence[Array], corners: NDArray[np.int_], size: int,
+                sub_pixels: int | None = None) -> NDArray[np.bool_]:
+        """Which patches may show at each of several moments (m, k, patches), with bodies (b,4,4) each, in windows with
+        first pixels ``corners`` (k,2); size and sub_pixels as of ``windows``."""
+        first, drawn_size = corners, size
+        if not self.draws_pixels([camera]):
+            fine_size = (size + 2 * self.optics.margin_px) * (sub_pixels or self.sub_pixels)
+            places = _shown_places(camera, corners, size, self.optics.margin_px, fine_size)
+            (first,), drawn_size = _drawn_parts([places])
+        bounds = np.hstack([first - 0.5, first - 0.5 + drawn_size])
+        return np.stack([self.drawable.reaching_windows(camera.ideal, bodies, bounds) for bodies in moments])
+
     def _drawn(self, sides: Sequence[tuple[PinholeCamera, Array, NDArray]], size: int,
                supersampling: int) -> list[NDArray[np.float32]]:
         """Windows of one size as the renderer draws them."""
@@ -87,10 +99,8 @@ class ImageFormation:
         """Windows drawn finely, bent, spread and averaged."""
         margin = self.optics.margin_px
         fine_size = (size + 2 * margin) * sub_pixels
-        nodes = [_shown_places(side, size, margin, fine_size) for side in sides]
-        first = [np.floor(places.min(axis=(1, 2))).astype(int) - REACH for places in nodes]
-        reach = max(int(np.ceil((places - at[:, None, None]).max())) for places, at in zip(nodes, first, strict=True))
-        drawn_size = -(-(reach + REACH + 1) // SIDE_STEP) * SIDE_STEP
+        nodes = [_shown_places(s.camera, s.corners, size, margin, fine_size) for s in sides]
+        first, drawn_size = _drawn_parts(nodes)
         drawn = self._drawn([(_finer(s.camera.ideal, sub_pixels), s.bodies, at * sub_pixels)
                              for s, at in zip(sides, first, strict=True)], drawn_size * sub_pixels,
                             -(-supersampling // sub_pixels))
@@ -100,12 +110,20 @@ class ImageFormation:
         return [np.asarray(response @ fine @ response.T) for fine in bent]
 
 
-def _shown_places(side: Side, size: int, margin: int, fine_size: int) -> Array:
+def _shown_places(camera: PinholeCamera, corners: NDArray[np.int_], size: int, margin: int,
+                  fine_size: int) -> Array:
     """Ideal pixels (k, 3, 3, 2) that show in the first, middle and last fine row and column of windows with margin."""
     half = 0.5 * (size + 2 * margin) * (1.0 - 1.0 / fine_size)
     ticks = 0.5 * (size - 1) + half * np.array([-1.0, 0.0, 1.0])
     grid = np.stack(np.meshgrid(ticks, ticks), axis=-1)
-    return side.camera.undistort(side.corners[:, None, None] + grid)[0]
+    return camera.undistort(corners[:, None, None] + grid)[0]
+
+
+def _drawn_parts(nodes: Sequence[Array]) -> tuple[list[NDArray[np.int_]], int]:
+    """First ideal pixels (k, 2) on each side, and the common size in px, of what is drawn for places (k, 3, 3, 2)."""
+    first = [np.floor(places.min(axis=(1, 2))).astype(int) - REACH for places in nodes]
+    reach = max(int(np.ceil((places - at[:, None, None]).max())) for places, at in zip(nodes, first, strict=True))
+    return first, -(-(reach + REACH + 1) // SIDE_STEP) * SIDE_STEP
 
 
 def _bent(side: Side, drawn: NDArray[np.float32], nodes: Array, fine_size: int) -> NDArray[np.float32]:

@@ -71,12 +71,19 @@ class Drawable:
 
         ``groups``: indices of the views of each camera and exposure.
         """
-        from .reaching_kernel import boxes_reaching  # compiles, so it is loaded where it is first needed
-
         windows, result = window_bounds(views), np.zeros((len(views), len(self.patches)), dtype=bool)
         for group in groups:
-            view, reaching = views[group[0]], np.empty((len(group), len(self.patches)), dtype=bool)
-            boxes_reaching(view.camera.matrix @ view.camera_from_bodies[:, :3], self.body_index, self.boxes,
-                           windows[group], NEAR, reaching)
-            result[group] = reaching
+            view = views[group[0]]
+            result[group] = self.reaching_windows(view.camera, view.camera_from_bodies, windows[group])
         return result
+
+    def reaching_windows(self, camera: PinholeCamera, camera_from_bodies: Array, bounds: Array) -> NDArray[np.bool_]:
+        """Which patches may show in each window (n windows, n patches) of one camera with a perfect lens.
+
+        Parameters: camera_from_bodies (b,4,4); bounds (n,4): lowest x, y and highest x, y, px.
+        """
+        from .reaching_kernel import boxes_reaching  # compiles, so it is loaded where it is first needed
+
+        reaching = np.empty((len(bounds), len(self.patches)), dtype=bool)
+        boxes_reaching(camera.matrix @ camera_from_bodies[:, :3], self.body_index, self.boxes, bounds, NEAR, reaching)
+        return reaching

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera import PinholeCamera
-from .image_formation import ImageFormation, Side
+from .exposed_windows import exposed_windows
+from .image_formation import ImageFormation
 from .pose import Array
 from .views import View
 
@@ -24,33 +25,30 @@ COARSE = 2  # drawn samples a pixel and axis away from bright spots
 def whole_image(formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array],
                 supersampling: int) -> NDArray[np.float32]:
     """Mean radiance (height, width) of one camera's image over moments with bodies (b,4,4) each."""
-    images = [_coarse(formation, camera, bodies) for bodies in moments]
-    bright = np.any([image > BRIGHT for image in images], axis=0)
-    image = _mean(images)
+    image, bright = _coarse(formation, camera, moments)
     corners, size = _spots(bright, fixed_size=len(moments) == 1 and formation.draws_pixels([camera]))
     if len(corners):
-        fine = _mean([formation.windows([Side(camera, bodies, corners)], size, supersampling, shade=False)[0]
-                      for bodies in moments])
+        fine = exposed_windows(formation, camera, moments, corners, size, supersampling)[0]
         for (x, y), window in zip(corners, fine, strict=True):
             image[y:y + size, x:x + size] = window
     return image if formation.optics.vignetting == 0.0 else image * _illumination(formation, camera)
 
 
-def _mean(images: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    return images[0] if len(images) == 1 else np.mean(images, axis=0, dtype=np.float32)
-
-
-def _coarse(formation: ImageFormation, camera: PinholeCamera, bodies: Array) -> NDArray[np.float32]:
-    """Radiance (height, width) with COARSE² drawn samples a pixel."""
-    if formation.draws_pixels([camera]):
-        view = View(camera.ideal, bodies, (0, 0), (camera.width, camera.height))
-        return formation.renderer.draw(formation.drawable, [view], COARSE, formation.background)[0]
+def _coarse(formation: ImageFormation, camera: PinholeCamera,
+            moments: Sequence[Array]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Mean radiance (height, width) with COARSE² drawn samples a pixel, and where it is bright at any moment."""
+    if len(moments) == 1 and formation.draws_pixels([camera]):
+        view = View(camera.ideal, moments[0], (0, 0), (camera.width, camera.height))
+        image = formation.renderer.draw(formation.drawable, [view], COARSE, formation.background)[0]
+        return image, image > BRIGHT
     rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
     x, y = np.meshgrid(TILE * np.arange(columns), TILE * np.arange(rows))
     corners = np.column_stack([x.ravel(), y.ravel()])
-    tiles = formation.windows([Side(camera, bodies, corners)], TILE, COARSE, sub_pixels=1, shade=False)[0]
-    joined = tiles.reshape(rows, columns, TILE, TILE).swapaxes(1, 2).reshape(rows * TILE, columns * TILE)
-    return joined[:camera.height, :camera.width]
+    mean, brightest = (
+        tiles.reshape(rows, columns, TILE, TILE).swapaxes(1, 2).reshape(rows * TILE, columns * TILE)
+        [:camera.height, :camera.width]
+        for tiles in exposed_windows(formation, camera, moments, corners, TILE, COARSE, sub_pixels=1))
+    return mean, brightest > BRIGHT
 
 
 def _spots(bright: NDArray[np.bool_], fixed_size: bool) -> tuple[NDArray[np.int_], int]:
