@@ -33,6 +33,22 @@ def rigid_start(source: Array, target: Array) -> Array:
     return transform
 
 
+def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
+    """Rigid transforms (c,4,4) from ``source``, (n,3) or one each (c,n,3), to ``targets`` (c,n,3) with weights (c,n),
+    by singular values."""
+    shares = (weights / weights.sum(axis=1, keepdims=True))[..., None]
+    source_means, target_means = (shares * source).sum(axis=1), (shares * targets).sum(axis=1)
+    products = (weights[..., None] * (targets - target_means[:, None])).swapaxes(1, 2) @ (
+        source - source_means[:, None])
+    u, _, vt = np.linalg.svd(products)
+    turns = np.ones((len(targets), 3))
+    turns[:, 2] = np.sign(np.linalg.det(u @ vt))
+    transforms = np.tile(np.eye(4), (len(targets), 1, 1))
+    transforms[:, :3, :3] = (u * turns[:, None]) @ vt
+    transforms[:, :3, 3] = target_means - np.einsum("cij,cj->ci", transforms[:, :3, :3], source_means)
+    return transforms
+
+
 def require_spread(points: Array) -> None:
     """Raise LostError unless ``points`` (n,3) hold three that are clearly not on one line."""
     if len(points) < 3:
