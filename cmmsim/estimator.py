@@ -132,13 +132,7 @@ def measure_frame(frame: StereoFrame, estimator: PoseEstimator, expected: Array 
     """
     require_kind(frame, StereoFrame, "a frame must be a StereoFrame(left, right)")
     require_kind(estimator, PoseEstimator, "an estimator must be a PoseEstimator, such as sensor.estimator")
-    for name, image, camera in zip(("left", "right"), (frame.left, frame.right), estimator.rig.cameras, strict=True):
-        if image.shape != (camera.height, camera.width):
-            raise ShapeError(f"the {name} image is {image.shape[1]} x {image.shape[0]} px, but its camera has "
-                             f"{camera.width} x {camera.height} px")
-        if image.dtype != estimator.noise.image_type:
-            raise ShapeError(f"the {name} image is {image.dtype}, but the camera's bit_depth "
-                             f"{estimator.noise.bit_depth} makes {estimator.noise.image_type}")
+    require_fitting(frame, estimator)
     if expected is not None:
         expected = finite_array(expected, (4, 4), "the expected camera_from_platform must be (4,4) and finite")
     images = FrameImages(frame)
@@ -146,6 +140,17 @@ def measure_frame(frame: StereoFrame, estimator: PoseEstimator, expected: Array 
         return estimator.measure_anew(images, estimator.locate(images) if expected is None else expected)[0]
     except LostError as error:
         return lost_measurement(str(error))
+
+
+def require_fitting(frame: StereoFrame, estimator: PoseEstimator) -> None:
+    """Raise ShapeError for images of another size or bit depth than the estimator's cameras have."""
+    for name, image, camera in zip(("left", "right"), (frame.left, frame.right), estimator.rig.cameras, strict=True):
+        if image.shape != (camera.height, camera.width):
+            raise ShapeError(f"the {name} image is {image.shape[1]} x {image.shape[0]} px, but its camera has "
+                             f"{camera.width} x {camera.height} px")
+        if image.dtype != estimator.noise.image_type:
+            raise ShapeError(f"the {name} image is {image.dtype}, but the camera's bit_depth "
+                             f"{estimator.noise.bit_depth} makes {estimator.noise.image_type}")
 
 
 def _lost_in_streaks(error: LostError, streaks: Streaks) -> LostError:

@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .arguments import require_kind
 from .errors import UnknownOptionError
@@ -24,7 +24,7 @@ from .estimator import PoseEstimator
 from .fault_marks import DiscMark, FillMark, GlintMark, PlateMark
 from .faulty_images import Fault
 from .outlines import sticker_outlines
-from .pose import Array, apply, invert, pose_to_transform
+from .pose import Array, apply, checked_pose, invert, pose_to_transform
 
 BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)  # m, sides of the boxes that hide stickers
 FEW = 4
@@ -60,11 +60,15 @@ class FaultGenerator:
         several: two or three of those at once that leave something to measure."""
         return tuple(self._drawn)
 
-    def draw(self, kind: str, pose: Array, rng: np.random.Generator) -> Fault:
-        """A fault of that kind for the platform at a pose (6,). Raises UnknownOptionError with the valid kinds."""
+    def draw(self, kind: str, pose: ArrayLike, rng: np.random.Generator) -> Fault:
+        """A fault of that kind for the platform at a pose (6,).
+
+        Raises UnknownOptionError with the valid kinds, ShapeError for what is no pose, CmmError for no generator.
+        """
         if kind not in self.kinds:
             raise UnknownOptionError("fault", kind, self.kinds)
-        return self._drawn[kind](np.asarray(pose, dtype=float), rng)
+        require_kind(rng, np.random.Generator, "rng must be a generator, such as numpy.random.default_rng(1)")
+        return self._drawn[kind](checked_pose(pose), rng)
 
     def _outlines(self, pose: Array) -> tuple[Array, Array]:
         """Ellipses of all stickers: centres (2, n, 2) and shapes (2, n, 2, 2), px."""

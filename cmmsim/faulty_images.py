@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from .arguments import require_kind
 from .fault_marks import Mark, paint
-from .images import StereoFrame, StereoImages, Windows
+from .images import StereoFrame, StereoImages, Windows, readable
 from .noise import CameraNoise
 from .pose import Array
 
@@ -26,9 +27,17 @@ class Fault:
 
 
 class FaultyImages:
-    """Images with a fault laid over them; reads like the images it is given."""
+    """Images with a fault laid over them, a StereoFrame's or such as ``sensor.look`` returns; reads like those.
 
-    def __init__(self, images: StereoImages, fault: Fault, noise: CameraNoise, rng: np.random.Generator) -> None:
+    Raises CmmError for arguments of another kind.
+    """
+
+    def __init__(self, images: StereoImages | StereoFrame, fault: Fault, noise: CameraNoise,
+                 rng: np.random.Generator) -> None:
+        images = readable(images)
+        require_kind(fault, Fault, "a fault must be a Fault, such as FaultGenerator.draw returns")
+        require_kind(noise, CameraNoise, "noise must be a CameraNoise, such as sensor.noise")
+        require_kind(rng, np.random.Generator, "rng must be a generator, such as numpy.random.default_rng(1)")
         self._images, self._fault, self._noise, self._rng = images, fault, noise, rng
 
     def full(self) -> StereoFrame:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .arguments import require_kind
 from .errors import ShapeError
 from .noise import GreyImage
 
@@ -31,6 +32,7 @@ class StereoFrame:
                                  f"{image.dtype}")
 
 
+@runtime_checkable
 class StereoImages(Protocol):
     """One exposure of two cameras that can be read whole or in parts."""
 
@@ -60,3 +62,11 @@ class FrameImages:
             columns = np.clip(first[:, 0, None] + ticks, 0, image.shape[1] - 1)
             cut.append(image[rows[:, :, None], columns[:, None, :]])
         return np.stack(cut)
+
+
+def readable(images: StereoImages | StereoFrame) -> StereoImages:
+    """Images that can be read in parts, those of a whole frame too. Raises CmmError for anything else."""
+    if isinstance(images, StereoFrame):
+        return FrameImages(images)
+    require_kind(images, StereoImages, "images must be a StereoFrame(left, right) or what sensor.look returns")
+    return images

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from .arguments import require_kind
 from .errors import LostError
-from .estimator import PoseEstimator
-from .images import StereoImages
+from .estimator import PoseEstimator, require_fitting
+from .images import StereoFrame, StereoImages, readable
 from .measurement import Measurement, lost_measurement
 from .pose import Array, invert, rotation_exp, rotation_log
 
@@ -24,6 +25,7 @@ class Tracker:
     """
 
     def __init__(self, estimator: PoseEstimator) -> None:
+        require_kind(estimator, PoseEstimator, "an estimator must be a PoseEstimator, such as sensor.estimator")
         self._estimator = estimator
         self.forget()
 
@@ -33,8 +35,14 @@ class Tracker:
         self._step_before: Array | None = None
         self._seen = 0
 
-    def measure(self, images: StereoImages) -> Measurement:
-        """Measure one frame; never raises for what is in the images."""
+    def measure(self, images: StereoImages | StereoFrame) -> Measurement:
+        """Measure one frame, such as ``sensor.look`` returns or a StereoFrame; never raises for what is in the images.
+
+        Raises ShapeError for a StereoFrame of another size or bit depth, CmmError for what is no image.
+        """
+        if isinstance(images, StereoFrame):
+            require_fitting(images, self._estimator)
+        images = readable(images)
         best = self._tracked(images)
         if best is None or len(best[0].target_ids) < EXPECTED_SHARE * self._seen:
             try:

@@ -11,6 +11,7 @@ from cmmsim.sensor_file import read_sensor_file, sensor_text
 
 TEXT = sensor_text("ctrack780")
 MOVED = cmmsim.pose_to_transform([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+RNG = np.random.default_rng(0)
 DARK = cmmsim.StereoFrame(*np.zeros((2, 1536, 2048), dtype=np.uint8))
 
 
@@ -147,6 +148,16 @@ def test_what_is_no_pose(pose):
     (lambda s: cmmsim.measure_frame(DARK, s), "an estimator must be a PoseEstimator.* of type Sensor"),
     (lambda s: cmmsim.FaultGenerator(s), "an estimator must be a PoseEstimator.* of type Sensor"),
     (lambda s: cmmsim.FaultGenerator(s.estimator).draw([], s.home, None), r"unknown fault \[\]: valid are black"),
+    (lambda s: cmmsim.FaultGenerator(s.estimator).draw("glint", s.home, 5), "rng must be a generator.* 5 of type int"),
+    (lambda s: cmmsim.FaultGenerator(s.estimator).draw("glint", [1.0], RNG), "a pose is six finite numbers"),
+    (lambda s: cmmsim.Tracker(s), "an estimator must be a PoseEstimator.* of type Sensor"),
+    (lambda s: cmmsim.Tracker(s.estimator).measure(3), "images must be a StereoFrame.* got 3 of type int"),
+    (lambda s: cmmsim.Tracker(s.estimator).measure(cmmsim.StereoFrame(DARK.left[1:], DARK.right)),
+     "the left image is 2048 x 1535 px, but its camera has 2048 x 1536 px"),
+    (lambda s: cmmsim.FaultyImages(None, cmmsim.Fault("some"), s.noise, RNG), "images must be a StereoF.* got None"),
+    (lambda s: cmmsim.FaultyImages(DARK, "glint", s.noise, RNG), "a fault must be a Fault.* glint of type str"),
+    (lambda s: cmmsim.FaultyImages(DARK, cmmsim.Fault("some"), None, RNG), "noise must be a CameraNoise.* got None"),
+    (lambda s: cmmsim.FaultyImages(DARK, cmmsim.Fault("some"), s.noise, 5), "rng must be a generator.* 5 of type int"),
     (lambda s: cmmsim.transform_to_pose(np.eye(3)), r"a transform must be \(4,4\) and finite, got shape \(3, 3\)"),
     (lambda s: cmmsim.transform_to_pose("home"), r"a transform must be \(4,4\) and finite, got home"),
     (lambda s: cmmsim.transform_to_pose(np.full((4, 4), np.nan)), "a transform must be"),
@@ -166,6 +177,15 @@ def test_arguments_of_the_wrong_kind(exact, call, message):
     with pytest.raises(cmmsim.CmmError, match=message) as error:
         call(exact)
     one_line(error)
+
+
+def test_a_whole_frame_is_tracked_and_spoilt_like_one_that_is_drawn_as_far_as_it_is_read(exact):
+    frame = exact.capture(exact.home)
+    tracked = cmmsim.Tracker(exact.estimator).measure(frame)
+    np.testing.assert_array_equal(tracked.pose, cmmsim.measure_frame(frame, exact.estimator).pose)
+    spoilt = cmmsim.FaultyImages(frame, cmmsim.Fault("none"), exact.noise, RNG)
+    np.testing.assert_array_equal(spoilt.full().left, frame.left)
+    np.testing.assert_array_equal(cmmsim.Tracker(exact.estimator).measure(spoilt).pose, tracked.pose)
 
 
 @pytest.mark.parametrize("image", [None, [[1]], np.zeros((8, 8)), np.zeros((8, 8, 3), dtype=np.uint8)])

@@ -8,6 +8,7 @@ from scipy import stats
 
 import cmmsim
 from cmmsim.acceptance import SensorUnderTest, common_volume, latency_test
+from cmmsim.estimator import PoseEstimator
 from cmmsim.latency import drawn_latencies, largest_latency
 from cmmsim.measurement import lost_measurement
 from cmmsim.sensor_file import read_sensor_file, sensor_text
@@ -163,19 +164,32 @@ def test_the_prediction_goes_on_through_missed_frames():
     """A stand-in for the estimator: the platform moves 1 mm a frame, and the tracker says where it expects it."""
     expected = []
 
-    class Estimator:
+    class Estimator(PoseEstimator):
         settings = SimpleNamespace(exposed_share=0.0)
 
+        def __init__(self):
+            pass
+
         def locate(self, images):
-            return _at(images)
+            return _at(images.number)
 
         def measure(self, images, predicted, swept=None):
             assert swept is None
             expected.append(predicted[0, 3])
             good = lost_measurement("stands for a good one")
-            return good, _at(images)
+            return good, _at(images.number)
 
         measure_anew = measure
+
+    class Numbered:
+        def __init__(self, number):
+            self.number = number
+
+        def full(self):
+            raise AssertionError
+
+        def windows(self, corners, size):
+            raise AssertionError
 
     tracker = Tracker(Estimator())
     tracker.miss()
@@ -183,7 +197,7 @@ def test_the_prediction_goes_on_through_missed_frames():
         if frame in (3, 4, 6):
             tracker.miss()
         else:
-            tracker.measure(frame)
+            tracker.measure(Numbered(frame))
     np.testing.assert_allclose(expected, np.array([0, 0, 2, 5, 7, 8]) * 1e-3, atol=1e-15)
 
 
