@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .blurred_coverage import require_psf
 from .camera import PinholeCamera
 from .cramer_rao import light_shares
 from .errors import CmmError
@@ -17,10 +16,11 @@ from .pose import Array, apply, pose_to_transform
 from .projected_disc import project_discs
 from .rig_from_file import rig_from_file
 from .sensor import Sensor
-from .sensor_schema import SensorFile
+from .sensor_schema import NARROWEST_PSF, SensorFile
 
 TOGETHER = 100  # discs drawn at once
-LARGEST_RADIUS_PX = 50.0
+SMALLEST_RADIUS_PX, LARGEST_RADIUS_PX = 1.0, 50.0
+LARGEST_TILT_DEG = 80.0
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,19 @@ class Condition:
     psf_px: float = 0.0
 
     def __post_init__(self) -> None:
-        require_psf(self.psf_px)
-        if not (self.radius_px >= 1.0 and 0.0 <= self.tilt <= 1.4 and 0.0 < self.noise < 1.0):
-            raise CmmError("a condition needs radius >= 1 px, tilt 0 to 1.4 rad (80 degrees) and noise between 0 and 1 "
-                           f"of the contrast, got {self}")
+        if not (SMALLEST_RADIUS_PX <= self.radius_px < np.inf and 0.0 < self.noise < 1.0
+                and 0.0 <= self.tilt <= np.radians(LARGEST_TILT_DEG)):
+            raise CmmError(f"a disc of {self} cannot be drawn: radius must be at least {SMALLEST_RADIUS_PX:g} px, tilt "
+                           f"0 to {LARGEST_TILT_DEG:g} degrees, noise above 0 and below 100 % of the contrast")
+        if not (self.psf_px == 0.0 or NARROWEST_PSF <= self.psf_px < np.inf):
+            raise CmmError(f"a disc of {self} cannot be drawn: psf must be 0 or at least {NARROWEST_PSF:g} px")
         if self.radius_px > LARGEST_RADIUS_PX:
             raise CmmError(f"radius {self.radius_px:g} px is more than {LARGEST_RADIUS_PX:g} px: time and memory grow "
                            "with its square, and errors only fall with its root")
+
+    def __str__(self) -> str:
+        return (f"radius {self.radius_px:g} px, tilt {np.degrees(self.tilt):g} degrees, noise {100.0 * self.noise:g} % "
+                f"of the contrast and psf {self.psf_px:g} px")
 
 
 @dataclass(frozen=True)

@@ -119,10 +119,23 @@ def test_empty_dim_and_cut_spots_are_not_good(detector):
 
 
 def test_conditions_that_cannot_be_drawn_are_refused():
-    with pytest.raises(CmmError, match=r"radius_px=0\.5"):
-        Condition(0.5, 0.0, 0.02)
+    for condition, message in [
+        ((0.5, np.pi / 6, 0.02), r"radius 0\.5 px, tilt 30 degrees, noise 2 % of the contrast and psf 0 px can.* 1 px"),
+        ((3.0, np.pi / 2, 0.02), r"tilt 90 degrees.* 0 to 80 degrees"),
+        ((3.0, 0.0, 1.5), r"noise 150 % .* below 100 % of the contrast"),
+    ]:
+        with pytest.raises(CmmError, match=message):
+            Condition(*condition)
     with pytest.raises(CmmError, match=r"0\.10% of the contrast is less than that of rounding, 0\.16%"):
         SCENE.with_noise(0.001)
+
+
+@pytest.mark.parametrize("psf", [0.05, 0.0999, -1.0, np.nan, np.inf])
+def test_what_a_sensor_file_refuses_as_a_point_spread_is_no_condition(psf):
+    with pytest.raises(CmmError, match=r"psf must be 0 or at least 0\.1 px"):
+        Condition(3.0, 0.0, 0.02, psf)
+    with pytest.raises(CmmError, match="psf_px"):
+        read_sensor_file("ctrack780", {"lens.psf_px": psf})
 
 
 def test_scene_with_other_noise_keeps_contrast_and_ground():
