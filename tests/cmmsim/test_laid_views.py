@@ -11,6 +11,7 @@ from cmmsim.laid_views import Laid, LaidSolids
 from cmmsim.pooling_kernel import mean_of_cells
 from cmmsim.pose import pose_to_transform
 from cmmsim.scene import Disc, DiscStack, rod, rod_transform, solid_mesh
+from cmmsim.sensor import load_sensor
 from cmmsim.views import NEAR, Drawable, View, same_exposure
 from cmmsim.virtual_camera import SUPERSAMPLING
 
@@ -76,9 +77,9 @@ def test_sticker_turned_away_from_the_camera_needs_depths():
 
 
 @pytest.mark.rendering
-def test_laid_windows_show_what_is_drawn_by_depths(sensor, monkeypatch):
+def test_laid_windows_show_what_is_drawn_by_depths(monkeypatch):
     """To the last bit, with links before some of the stickers."""
-    rng, kinds = np.random.default_rng(0), set()
+    rng, kinds, sensor = np.random.default_rng(0), set(), load_sensor("ctrack780")  # only its scene is looked at
     camera, drawable = crossed_by_links(sensor)
     for _ in range(6):
         views = sticker_views(sensor, camera, rng)

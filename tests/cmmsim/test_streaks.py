@@ -108,6 +108,7 @@ def test_a_platform_at_rest_is_measured_as_if_nothing_could_move(tmp_path):
         np.testing.assert_array_equal(found[0].covariance, found[1].covariance)
 
 
+@pytest.mark.slow
 def test_poses_of_streaks_keep_their_covariance(tmp_path):
     sensor, squared = exposed(tmp_path), []
     for k, pose in enumerate(poses_about_home(sensor, 2 * len(RATES), seed=3)):
