@@ -72,6 +72,22 @@ def test_the_table_of_the_dynamics_is_the_measured_one(dynamics_figures):
     assert said in " ".join(README.split()), f"the README wants: {said}"
 
 
+def test_the_sensors_speed_is_the_measured_one():
+    kept = load_result(ROOT / ".readme" / "sensor.json")
+    found, versions = kept["figures"], kept["versions"]
+    rows = [
+        f"| {title} | {found[f'analytic_{name}']:.0f} | {found[f'pyrender_{name}']:.0f} |"
+        for title, name in (
+            ("stereo frames a second, drawn and measured", "frames_a_second"),
+            ("times as fast as the straightforward pipeline", "times_straightforward"),
+        )
+    ]
+    assert "\n".join(rows) in README, f"the README wants these rows:\n{rows}"
+    opencv = versions["opencv-python-headless"]
+    said = f"measured {kept['date']} with OpenCV {opencv} and pyrender {versions['pyrender']}"
+    assert said in " ".join(README.split()), f"the README wants: {said}"
+
+
 def test_the_dynamics_reach_their_goals(dynamics_figures):
     found = dynamics_figures["figures"]
     assert found["pinocchio_relative_difference"] <= 1e-9
