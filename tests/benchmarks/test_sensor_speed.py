@@ -148,7 +148,8 @@ def resident_bytes():
 
 
 def test_kernels_compile_within_fifteen_seconds(tmp_path, taught, record_property):
-    """Of processor time, the less of two into empty caches; another process loads them in a small part of it."""
+    """Of processor time, into an empty cache, tried once more where it is missed; another process loads them in a small
+    part of it."""
     code = ("import time, numpy as np, cmmsim; s = cmmsim.load_sensor('ctrack780', renderer='analytic');"
             "from cmmsim import teaching; c = time.process_time(); s.look(s.home).windows(np.full((2, 3, 2), 700), 16);"
             "from cmmsim.ellipse_fit import fit_ellipses; from cmmsim.triangulation import triangulate;"
@@ -162,8 +163,9 @@ def test_kernels_compile_within_fifteen_seconds(tmp_path, taught, record_propert
                                     env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / cache)}).stdout)
 
     with OtherLoad() as load:
-        cold, warm = min(spent("first"), spent("second")), spent("second")
+        goal, cold, warm = 15.0 * slowness(), spent("first"), spent("first")
+        if cold > goal:
+            cold = min(cold, spent("second"))
     record_property("compile_seconds", round(cold, 1))
     assert warm < 0.3 * cold
-    goal = 15.0 * slowness()
     judge(cold <= goal, f"kernels took {cold:.1f} s to compile, goal {goal:.1f}", load)

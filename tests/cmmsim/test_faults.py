@@ -41,7 +41,7 @@ def require_honest(outcomes):
 
 
 def test_no_wrong_pose_in_some_hundred_faults(sensor):
-    outcomes = run_faults(sensor, SPOILING, 300, 1, untracked=0.0)
+    outcomes = run_faults(sensor, SPOILING, 150, 1, untracked=0.0)
     require_honest(outcomes)
     for kind in ("obstacles", "false_discs", "false_points", "glint"):
         assert len(outcomes[kind].squared) > 0.9 * outcomes[kind].frames, (kind, outcomes[kind].reasons)
