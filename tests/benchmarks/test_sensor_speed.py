@@ -22,7 +22,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.rendering]
 GOALS = {"analytic": 300.0, "pyrender": 60.0}
 TIMES_STRAIGHTFORWARD = {"analytic": 20.0, "pyrender": 8.0}
 BATCH, BATCHES, MOST_ROUNDS = 20, 30, 5
-MEMORY_FRAMES = {"analytic": 5_000, "pyrender": 1_500}
+MEMORY_FRAMES = {"analytic": 3_000, "pyrender": 1_000}
 KEPT = []  # what must live as long as OpenGL is used
 LARGEST_GROWTH = 4e6  # bytes; one renderer made anew takes 2 MB
 

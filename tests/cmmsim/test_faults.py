@@ -64,9 +64,9 @@ def test_no_wrong_pose_in_ten_thousand_faults(sensor, part):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", range(4 if os.environ.get("ALL_FAULTS") else 1))
+@pytest.mark.parametrize("part", range(8 if os.environ.get("ALL_FAULTS") else 1))
 def test_planes_report_no_wrong_pose(part):
-    require_honest(run_faults(exactly_taught("planes"), SPOILING, 500, 200 + part, untracked=0.02))
+    require_honest(run_faults(exactly_taught("planes"), SPOILING, 250, 200 + part, untracked=0.02))
 
 
 def require_found_again(sensor):
