@@ -65,7 +65,8 @@ def estimate_uncertainty(
     found = [run.residuals(parameters) for run in problem.runs]
     known, known_rows = problem.known(parameters)
     gradient = known @ known_rows + sum(np.tensordot(r, j, 2) for r, j in found)
-    information = np.asarray(sum(_information(j) for _, j in found))
+    informations = [_information(j) for _, j in found]
+    information = np.asarray(sum(informations))
     units = _units([known_rows, *(j.reshape(-1, len(parameters)) for _, j in found)])
     shown = [(r, j @ units) for r, j in found]
     scores, misfit, unstable = _noise(problem, parameters, shown, rng, advance)
@@ -73,7 +74,7 @@ def estimate_uncertainty(
         model = sum(coloured_score_covariance(r, j, run.ok) for (r, j), run in zip(shown, problem.runs, strict=True))
         scores = scores + misfit.share_of_model * model
     if any(run.payload_std.any() for run in problem.runs):
-        scores = scores + load_score_covariance(problem.runs, [j for _, j in found], units)
+        scores = scores + load_score_covariance(problem.runs, informations, units)
     prior = _information(known_rows @ units)
     covariance = units @ (scores + prior) @ units.T
     return Uncertainty((covariance + covariance.T) / 2, information, np.asarray(gradient), misfit, unstable)

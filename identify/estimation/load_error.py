@@ -15,16 +15,16 @@ from identify.arrays import Array
 from identify.record.recorded_run import RecordedRun
 
 
-def load_score_covariance(runs: Sequence[RecordedRun], jacobians: Sequence[Array], units: Array) -> Array:
+def load_score_covariance(runs: Sequence[RecordedRun], information: Sequence[Array], units: Array) -> Array:
     """Covariance (p, p) of the scores T^T J^T r that the loads' standard deviations make, to first order.
 
-    jacobians: J of each run's residuals, (n, 6, p); units: T (p, p). Runs that state the same load, equally well known,
-    share its error; different loads err independently.
+    information: J^T J (p, p) of each run's residuals; units: T (p, p). Runs that state the same load, equally well
+    known, share its error; different loads err independently.
     """
-    size = jacobians[0].shape[2]
+    size = len(units)
     shown: dict[tuple[float, ...], Array] = {}
-    for run, jacobian in zip(runs, jacobians, strict=True):
+    for run, one in zip(runs, information, strict=True):
         load = (*run.payload, *run.payload_std)
-        shown[load] = shown.get(load, np.zeros((size, size))) + np.tensordot(jacobian, jacobian, ([0, 1], [0, 1]))
-    spread = [units.T @ information * np.array(load[size:]) for load, information in shown.items()]
+        shown[load] = shown.get(load, np.zeros((size, size))) + one
+    spread = [units.T @ total * np.array(load[size:]) for load, total in shown.items()]
     return np.asarray(sum(one @ one.T for one in spread), dtype=float)
