@@ -17,7 +17,6 @@ from .matching import candidate_pairs
 from .measurement import Measurement, lost_measurement
 from .noise import CameraNoise
 from .observation import (
-    LONGEST_SMEAR_PX,
     DetectionSettings,
     StickerObservation,
     observe,
@@ -27,7 +26,7 @@ from .observation import (
 from .pose import Array, compose_covariance, pose_covariance, transform_to_pose
 from .pose_methods import METHODS, Solution, by_planes
 from .stereo_rig import StereoRig
-from .streaks import Streaks, find_streaks
+from .streaks import drawn_out, find_streaks
 from .taught import Taught
 
 NOMINAL_TOLERANCE = 0.003  # m: nominal places are known to about a millimetre
@@ -97,7 +96,9 @@ class PoseEstimator:
         try:
             return self._measured(observe_windows(read, self.rig, self.noise, self.settings, places, swept))
         except LostError as error:
-            raise error if streaks is None else _lost_in_streaks(error, streaks) from error
+            if streaks is None:
+                raise
+            raise LostError(f"{error}; {drawn_out(streaks.longest_px)}") from error
 
     def _found(self, frame: StereoFrame, settings: DetectionSettings) -> tuple[Array, int]:
         """Rough camera_from_platform (4,4) and the number of stickers that were recognised. Raises LostError."""
@@ -153,10 +154,6 @@ def require_fitting(frame: StereoFrame, estimator: PoseEstimator) -> None:
                              f"{estimator.noise.bit_depth} makes {estimator.noise.image_type}")
 
 
-def _lost_in_streaks(error: LostError, streaks: Streaks) -> LostError:
-    return LostError(f"{error}; the exposure draws stickers out over {streaks.longest_px:.1f} px, at most "
-                     f"{LONGEST_SMEAR_PX:.1f} px can be measured")
-
 
 def points_in_frame(frame: StereoFrame, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings) -> Array:
     """Points (m,3) in the camera frame that may be stickers; true and false pairings together."""
@@ -168,4 +165,3 @@ def points_in_frame(frame: StereoFrame, rig: StereoRig, noise: CameraNoise, sett
     ideal = [pixels[found] for pixels, found in (camera.undistort(side.centres) for camera, side
                                                  in zip(rig.cameras, (left, right), strict=True))]
     return candidate_pairs(rig.ideal, *ideal)[1]
-

@@ -121,14 +121,15 @@ def find_streaks(read: StickerWindows, rig: StereoRig, noise: CameraNoise, setti
         return None
     movement, ellipses = found
     if ellipses.longest_px > LONGEST_SMEAR_PX:
-        raise _too_long(ellipses.longest_px)
+        raise LostError(drawn_out(ellipses.longest_px))
     ends = [read.camera_from_body @ _moved(share * movement, middle) for share in (-0.5, 0.5)]
     return Streaks((ends[0], ends[1]), ellipses.longest_px)
 
 
-def _too_long(length_px: float) -> LostError:
-    return LostError(f"the exposure draws stickers out over {length_px:.1f} px, at most {LONGEST_SMEAR_PX:.1f} px can "
-                     "be measured")
+def drawn_out(length_px: float) -> str:
+    """In words how long the streaks are, and how long they may be."""
+    return (f"the exposure draws stickers out over {length_px:.1f} px, at most {LONGEST_SMEAR_PX:.1f} px can be "
+            "measured")
 
 
 def _require_short(still: _Ellipses) -> None:
@@ -138,7 +139,7 @@ def _require_short(still: _Ellipses) -> None:
     squares = 3.0 * still.excess[still.bright][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     length = float(np.sqrt(max(np.median(np.linalg.eigvalsh(squares)[:, -1]), 0.0)))
     if length > LONGEST_SMEAR_PX:
-        raise _too_long(length)
+        raise LostError(drawn_out(length))
 
 
 def _movement_and_ellipses(still: _Ellipses, fit: Callable[[Array], _Ellipses],
