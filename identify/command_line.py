@@ -102,7 +102,6 @@ Many rows over a grid of settings, on all cores or many machines:
 """
 
 
-
 class _Commands(TyperGroup):
     """Says when Ctrl-C has ended a command; typer alone would end it without a word."""
 

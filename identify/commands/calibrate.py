@@ -1,9 +1,5 @@
 """The command ``cmmsim calibrate``. Heavy imports are late."""
 
-import shutil
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -200,6 +196,7 @@ def _render(folder: Path, sensor: str, board: "Board | None", count: int, seed: 
     from cmmsim import load_sensor
     from cmmsim.calibration import board_poses, default_board, render_pairs
     from cmmsim.renderers import choose_renderer
+    from identify.files.atomic import atomic_contents
 
     source = load_sensor(sensor, seed)
     board = board or default_board(source.rig)
@@ -207,7 +204,7 @@ def _render(folder: Path, sensor: str, board: "Board | None", count: int, seed: 
     poses = board_poses(source.rig, board, count, rng)
     renderer = choose_renderer(source.renderer)
     frames = render_pairs(source.rig, board, poses, renderer, source.optics, source.noise, rng)
-    with progress.stage("render", count) as advance, _all_or_nothing(folder) as made:
+    with progress.stage("render", count) as advance, atomic_contents(folder) as made:
         for k, frame in enumerate(frames):
             for side, image in (("left", frame.left), ("right", frame.right)):
                 _write_picture(made / side / f"{k:03d}.png", image)
@@ -224,31 +221,6 @@ def _write_picture(path: Path, image: "NDArray[np.unsignedinteger]") -> None:
     path.parent.mkdir(exist_ok=True)
     if not cv2.imwrite(str(path), image):
         raise OutputFolderError(f"cannot write {path}")
-
-
-@contextmanager
-def _all_or_nothing(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder whose contents stand in ``folder``, new or empty, when the block ends without an error.
-
-    It lies within the folder, which so may be one that cannot be replaced, such as the one it is called from.
-    """
-    new = not folder.exists()
-    folder.mkdir(parents=True, exist_ok=True)
-    moved: list[Path] = []
-    try:
-        with tempfile.TemporaryDirectory(prefix=".making-", dir=folder) as name:
-            yield Path(name)
-            for path in sorted(Path(name).iterdir()):
-                moved.append(folder / path.name)
-                path.rename(moved[-1])
-    except BaseException:  # Ctrl-C as well
-        for path in moved:
-            shutil.rmtree(path, ignore_errors=True)
-            path.unlink(missing_ok=True)
-        with suppress(OSError):
-            if new:
-                folder.rmdir()
-        raise
 
 
 def _print_summary(found: "Calibration", folder: Path) -> None:

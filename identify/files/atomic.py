@@ -1,9 +1,10 @@
 """Files appear whole or not at all: written under a temporary name in the same folder, then renamed."""
 
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
@@ -24,6 +25,31 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_contents(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder whose contents stand in ``folder``, new or empty, when the block ends without an error.
+
+    It lies within the folder, which so may be one that cannot be replaced, such as the one it is called from.
+    """
+    new = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    moved: list[Path] = []
+    try:
+        with tempfile.TemporaryDirectory(prefix=".making-", dir=folder) as name:
+            yield Path(name)
+            for path in sorted(Path(name).iterdir()):
+                moved.append(folder / path.name)
+                path.rename(moved[-1])
+    except BaseException:  # Ctrl-C as well
+        for path in moved:
+            shutil.rmtree(path, ignore_errors=True)
+            path.unlink(missing_ok=True)
+        with suppress(OSError):
+            if new:
+                folder.rmdir()
+        raise
 
 
 def write_text(path: Path | str, text: str) -> None:
