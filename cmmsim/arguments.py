@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import CmmError, ShapeError
+from cmmsim.errors import CmmError, ShapeError
 
 SHOWN_CHARACTERS = 120  # of what is refused
 
@@ -34,4 +34,4 @@ def require_kind(value: object, kind: type | tuple[type, ...], wanted: str) -> N
 def _shown(values: object) -> str:
     """Values on one line, cut where they are many."""
     text = " ".join(str(values).split())
-    return text if len(text) <= SHOWN_CHARACTERS else f"{text[:SHOWN_CHARACTERS - 3]}..."
+    return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."

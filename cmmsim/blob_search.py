@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from .ellipse_fit import EllipseFits, FitLimits, fit_ellipses
-from .images import FrameImages, StereoFrame
-from .noise import CameraNoise, GreyImage
-from .pose import Array
+from cmmsim.ellipse_fit import EllipseFits, FitLimits, fit_ellipses
+from cmmsim.images import FrameImages, StereoFrame
+from cmmsim.noise import CameraNoise, GreyImage
+from cmmsim.pose import Array
 
 SMALLEST_AREA_PX = 8
 LARGEST_SIDE_PX = 24
@@ -37,8 +37,9 @@ def find_blobs(image: GreyImage, white_level: int = 255, largest_side: int = LAR
     return centres[1:][keep]
 
 
-def find_ellipses(frame: StereoFrame, noise: CameraNoise, window_size: int, fit_size: int,
-                  limits: FitLimits, psf_px: float = 0.0) -> tuple[EllipseFits, EllipseFits]:
+def find_ellipses(
+    frame: StereoFrame, noise: CameraNoise, window_size: int, fit_size: int, limits: FitLimits, psf_px: float = 0.0
+) -> tuple[EllipseFits, EllipseFits]:
     """Ellipses fitted to all bright spots of the left and of the right image that a window holds; only good ones.
 
     Parameters: window_size, fit_size and psf_px, the standard deviation of the point spread, in px.

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from .compiled import compiled
-from .coverage_kernel import inverse_of
+from cmmsim.compiled import compiled
+from cmmsim.coverage_kernel import inverse_of
 
 REACH = 5.5  # standard deviations from the rim beyond which no light is followed: 4e-8 of it
 POINTS_PER_SIGMA = 1.1  # rim points to one standard deviation of the point spread
@@ -39,8 +39,9 @@ def rim_points(shape: np.ndarray, psf_px: float) -> int:
 
 
 @compiled
-def blur_window(centre_x: float, centre_y: float, shape: np.ndarray, psf_px: float, shares: np.ndarray,
-                derivatives: np.ndarray) -> None:
+def blur_window(
+    centre_x: float, centre_y: float, shape: np.ndarray, psf_px: float, shares: np.ndarray, derivatives: np.ndarray
+) -> None:
     """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5)."""
     height, width = shares.shape
     shares[:] = 0.0
@@ -74,8 +75,9 @@ def blur_window(centre_x: float, centre_y: float, shape: np.ndarray, psf_px: flo
 
 
 @compiled
-def blur_windows(centres: np.ndarray, shapes: np.ndarray, psf_px: float, shares: np.ndarray,
-                 derivatives: np.ndarray) -> None:
+def blur_windows(
+    centres: np.ndarray, shapes: np.ndarray, psf_px: float, shares: np.ndarray, derivatives: np.ndarray
+) -> None:
     """``blur_window`` for n ellipses: centres (n,2), shapes (n,2,2), shares (n,h,w), derivatives (n,h,w,5)."""
     for k in range(len(centres)):
         blur_window(centres[k, 0], centres[k, 1], shapes[k], psf_px, shares[k], derivatives[k])

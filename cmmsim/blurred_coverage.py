@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .errors import CmmError
-from .pose import Array
+from cmmsim.errors import CmmError
+from cmmsim.pose import Array
 
 NARROWEST_PX = 0.05
 
@@ -30,12 +30,17 @@ def blurred_coverage(centres: Array, shapes: Array, size: int, psf_px: float) ->
     symmetric and positive definite; size: window side in px; psf_px: sigma of the point spread. Raises CmmError for
     one narrower than NARROWEST_PX.
     """
-    from .blur_kernel import blur_windows  # compiles, so it is loaded where it is first needed
+    from cmmsim.blur_kernel import blur_windows  # compiles, so it is loaded where it is first needed
 
     require_psf(psf_px)
     shares, derivatives = np.empty((len(centres), size, size)), np.empty((len(centres), size, size, 5))
-    blur_windows(np.ascontiguousarray(centres, dtype=float), np.ascontiguousarray(shapes, dtype=float), float(psf_px),
-                 shares, derivatives)
+    blur_windows(
+        np.ascontiguousarray(centres, dtype=float),
+        np.ascontiguousarray(shapes, dtype=float),
+        float(psf_px),
+        shares,
+        derivatives,
+    )
     return shares, derivatives
 
 

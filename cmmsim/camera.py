@@ -11,10 +11,10 @@ from functools import cached_property
 
 import numpy as np
 
-from .arguments import finite_array
-from .distortion import Distortion, NDArrayBool
-from .errors import CmmError
-from .pose import Array
+from cmmsim.arguments import finite_array
+from cmmsim.distortion import Distortion, NDArrayBool
+from cmmsim.errors import CmmError
+from cmmsim.pose import Array
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,13 @@ class PinholeCamera:
     @property
     def matrix(self) -> Array:
         """Camera matrix K (3,3)."""
-        return np.array([[self.focal_px, 0.0, self.centre_x_px],
-                         [0.0, self.focal_px * self.aspect, self.centre_y_px], [0.0, 0.0, 1.0]])
+        return np.array(
+            [
+                [self.focal_px, 0.0, self.centre_x_px],
+                [0.0, self.focal_px * self.aspect, self.centre_y_px],
+                [0.0, 0.0, 1.0],
+            ]
+        )
 
     @cached_property
     def ideal(self) -> PinholeCamera:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from .compiled import compiled
+from cmmsim.compiled import compiled
 
 SMALLEST_PIVOT = 1e-300
 

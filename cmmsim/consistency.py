@@ -23,13 +23,13 @@ from functools import lru_cache
 import numpy as np
 from scipy.stats import chi2
 
-from .errors import LostError
-from .marked_body import MarkedBody
-from .observation import StickerObservation
-from .outlines import sticker_outlines
-from .pose import Array, apply, skew
-from .registration import Registration, register
-from .stereo_rig import StereoRig
+from cmmsim.errors import LostError
+from cmmsim.marked_body import MarkedBody
+from cmmsim.observation import StickerObservation
+from cmmsim.outlines import sticker_outlines
+from cmmsim.pose import Array, apply, skew
+from cmmsim.registration import Registration, register
+from cmmsim.stereo_rig import StereoRig
 
 CHANCE = 1e-4  # of a good sticker to be left out, for its place and for each of its two ellipses
 EXCESS_CHANCE = 1e-4  # of a good frame's residuals to be taken for larger than noise
@@ -62,8 +62,9 @@ class StickerChecks:
         return f"squared misfit {value:.0f} of its {name}, at most {LARGEST_MISFIT:.1f}"
 
 
-def consistent(observation: StickerObservation, rig: StereoRig, body: MarkedBody, places: Array,
-               radius: float) -> tuple[StickerObservation, Registration]:
+def consistent(
+    observation: StickerObservation, rig: StereoRig, body: MarkedBody, places: Array, radius: float
+) -> tuple[StickerObservation, Registration]:
     """The stickers that agree with each other, and their registration.
 
     Parameters: places (n,3) taught ones and radius m of all stickers. Raises LostError when too few agree.
@@ -78,8 +79,10 @@ def consistent(observation: StickerObservation, rig: StereoRig, body: MarkedBody
         excess = residual_excess(float(result.misfit.sum()), 3 * len(result.misfit) - 6)
         worst = checks.worst
         if checks.passed(worst) and excess <= LARGEST_EXCESS:
-            return (replace(observation, covariances=excess * observation.covariances),
-                    replace(result, covariance=excess * result.covariance))
+            return (
+                replace(observation, covariances=excess * observation.covariances),
+                replace(result, covariance=excess * result.covariance),
+            )
         left_out.append(f"{body.sticker_ids[observation.index[worst]]}: {checks.reason(worst)}")
         observation = observation.selected(np.arange(len(observation.index)) != worst)
 
@@ -109,8 +112,14 @@ def outline_misfits(observation: StickerObservation, shapes: Array) -> Array:
     return np.asarray((change * np.linalg.solve(observation.outlines.covariances, change[..., None])[..., 0]).sum(-1))
 
 
-def _checks(observation: StickerObservation, result: Registration, rig: StereoRig, body: MarkedBody, places: Array,
-            radius: float) -> StickerChecks:
+def _checks(
+    observation: StickerObservation,
+    result: Registration,
+    rig: StereoRig,
+    body: MarkedBody,
+    places: Array,
+    radius: float,
+) -> StickerChecks:
     index = observation.index
     place = place_misfits(result, observation.points, places[index], observation.covariances)
     total, freedom = float(result.misfit.sum()), 3 * len(index) - 9  # without a sticker, its place misfit is missing
@@ -133,5 +142,7 @@ def _too_few(left: int, seen: int, left_out: list[str]) -> str:
     """The reason why what is left cannot be trusted."""
     if not left_out:
         return f"{seen} visible stickers, at least {FEWEST} are needed to tell a wrong one"
-    return (f"{seen} visible stickers contradict each other, {left} are left where at least {FEWEST} and more than the "
-            f"{len(left_out)} that were left out are needed; the first was {left_out[0]}")
+    return (
+        f"{seen} visible stickers contradict each other, {left} are left where at least {FEWEST} and more than the "
+        f"{len(left_out)} that were left out are needed; the first was {left_out[0]}"
+    )

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from .camera import PinholeCamera
-from .pose import Array, apply, invert
+from cmmsim.camera import PinholeCamera
+from cmmsim.pose import Array, apply, invert
 
 TOUCHING = 1e-6  # share of the way to a point in which meeting a solid is taken for lying on it
 
@@ -25,7 +25,7 @@ class ConvexSolid:
 
     def hides(self, camera_from_body: Array, points: Array) -> NDArray[np.bool_]:
         """Whether the solid stands between the camera and points (..., 3) in camera axes."""
-        from .layer_kernel import hidden_points  # compiles, so it is loaded where it is first needed
+        from cmmsim.layer_kernel import hidden_points  # compiles, so it is loaded where it is first needed
 
         flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
         hidden = np.empty(len(flat), dtype=bool)
@@ -46,8 +46,8 @@ class Outline:
     ``box`` (4,) its lowest x, y and highest x, y."""
 
     def __init__(self, corners: Array) -> None:
-        from .layer_kernel import half_planes_of  # compiles, so it is loaded where it is first needed
+        from cmmsim.layer_kernel import half_planes_of  # compiles, so it is loaded where it is first needed
 
         self.box = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
         half_planes = np.empty((len(corners), 3))
-        self.half_planes = half_planes[:half_planes_of(corners, half_planes)]
+        self.half_planes = half_planes[: half_planes_of(corners, half_planes)]

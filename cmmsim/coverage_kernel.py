@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from .compiled import compiled
+from cmmsim.compiled import compiled
 
 
 @compiled
@@ -47,8 +47,9 @@ def side_share(start_x: float, start_y: float, step_x: float, step_y: float) -> 
 @compiled
 def reach_of_pixel(m: np.ndarray) -> float:
     """Largest distance, in disc units, of a pixel's points from its middle."""
-    return 0.5 * math.sqrt(max((m[0, 0] + m[0, 1]) ** 2 + (m[1, 0] + m[1, 1]) ** 2,
-                               (m[0, 0] - m[0, 1]) ** 2 + (m[1, 0] - m[1, 1]) ** 2))
+    return 0.5 * math.sqrt(
+        max((m[0, 0] + m[0, 1]) ** 2 + (m[1, 0] + m[1, 1]) ** 2, (m[0, 0] - m[0, 1]) ** 2 + (m[1, 0] - m[1, 1]) ** 2)
+    )
 
 
 @compiled
@@ -90,8 +91,9 @@ def inverse_of(shape: np.ndarray) -> np.ndarray:
 
 
 @compiled
-def cover_window(centre_x: float, centre_y: float, shape: np.ndarray, shares: np.ndarray,
-                 derivatives: np.ndarray) -> None:
+def cover_window(
+    centre_x: float, centre_y: float, shape: np.ndarray, shares: np.ndarray, derivatives: np.ndarray
+) -> None:
     """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5); only pixels on the rim need more than a distance."""
     m = inverse_of(shape)
     reach = reach_of_pixel(m)

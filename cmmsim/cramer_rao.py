@@ -13,11 +13,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtr
 
-from .blurred_coverage import blurred_coverage
-from .ellipse_coverage import coverage, covered_area
-from .errors import CmmError
-from .noise import CameraNoise
-from .pose import Array
+from cmmsim.blurred_coverage import blurred_coverage
+from cmmsim.ellipse_coverage import coverage, covered_area
+from cmmsim.errors import CmmError
+from cmmsim.noise import CameraNoise
+from cmmsim.pose import Array
 
 REACH = 6.0  # standard deviations within which noise is followed
 TABLE_STEPS = 64  # tabulated informations in one grey value; fewer where the noise hides the rounding
@@ -57,8 +57,9 @@ def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
     return np.sum(np.where(usable, change**2 / np.where(usable, probability, 1.0), 0.0), axis=-1)
 
 
-def cramer_rao_bound(centres: Array, shapes: Array, size: int, contrast: float, ground: float, noise: CameraNoise,
-                     psf_px: float = 0.0) -> Array:
+def cramer_rao_bound(
+    centres: Array, shapes: Array, size: int, contrast: float, ground: float, noise: CameraNoise, psf_px: float = 0.0
+) -> Array:
     """Smallest covariance (n,2,2) px² of an unbiased centre, from windows of ``size`` px; contrast, ground grey values.
 
     Other parameters as of ``light_shares``. Raises CmmError.
@@ -79,7 +80,7 @@ def _information_table(lowest: float, highest: float, noise: CameraNoise) -> tup
     window = np.full(steps + 1, 1.0 / steps)
     window[[0, -1]] *= 0.5
     averaged = np.convolve(grey_value_information(means, noise), window, mode="valid")
-    return means[steps // 2:][:count], averaged
+    return means[steps // 2 :][:count], averaged
 
 
 def _analog_variance(mean_grey: Array, noise: CameraNoise) -> tuple[Array, Array]:

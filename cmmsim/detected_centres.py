@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .pose import Array
+from cmmsim.pose import Array
 
 
 @dataclass(frozen=True)

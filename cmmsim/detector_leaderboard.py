@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .cramer_rao import cramer_rao_bound
-from .detected_centres import DetectedCentres
-from .detectors import DETECTORS, Detector
-from .drawn_discs import Condition, Scene, draw_discs, random_ellipses
-from .ellipse_fit import FitLimits
-from .errors import CmmError
-from .noise import CameraNoise
-from .pose import Array
+from cmmsim.cramer_rao import cramer_rao_bound
+from cmmsim.detected_centres import DetectedCentres
+from cmmsim.detectors import DETECTORS, Detector
+from cmmsim.drawn_discs import Condition, Scene, draw_discs, random_ellipses
+from cmmsim.ellipse_fit import FitLimits
+from cmmsim.errors import CmmError
+from cmmsim.noise import CameraNoise
+from cmmsim.pose import Array
 
 FREE_PX = 3  # px between a disc's rim and the side of the part that is looked at
 RESAMPLES, CONFIDENCE = 1000, 0.95
@@ -46,9 +46,14 @@ class Score:
     lost: float
 
 
-def compete(scene: Scene, conditions: Sequence[Condition], draws: int, rng: np.random.Generator,
-            detectors: Sequence[Detector] | None = None,
-            report: Callable[[int, int], None] = lambda done, total: None) -> list[Score]:
+def compete(
+    scene: Scene,
+    conditions: Sequence[Condition],
+    draws: int,
+    rng: np.random.Generator,
+    detectors: Sequence[Detector] | None = None,
+    report: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Score]:
     """Scores of all detectors (built-in ones and OpenCV's by default) under all conditions, with ``draws`` discs each.
 
     ``report(done, total)`` is called after each condition. Raises CmmError.
@@ -64,8 +69,9 @@ def compete(scene: Scene, conditions: Sequence[Condition], draws: int, rng: np.r
     return scores
 
 
-def _round(scene: Scene, condition: Condition, draws: int, rng: np.random.Generator,
-           detectors: Sequence[Detector]) -> list[Score]:
+def _round(
+    scene: Scene, condition: Condition, draws: int, rng: np.random.Generator, detectors: Sequence[Detector]
+) -> list[Score]:
     fit_size = 2 * int(np.ceil(condition.radius_px + FREE_PX))
     centres, shapes = random_ellipses(condition, scene.focal_px, fit_size + 2, draws, rng)
     radiance = draw_discs(scene, centres, shapes, fit_size + 2, condition.psf_px)
@@ -73,21 +79,35 @@ def _round(scene: Scene, condition: Condition, draws: int, rng: np.random.Genera
     bounds = _bounds(scene, condition.psf_px, centres, shapes, fit_size + 2)
     scores = []
     for detector in detectors:
-        found, without_noise = (detector.detect(w, np.zeros((draws, 2), dtype=int), scene.noise, fit_size, LIMITS,
-                                                condition.psf_px) for w in (noisy, clean))
+        found, without_noise = (
+            detector.detect(w, np.zeros((draws, 2), dtype=int), scene.noise, fit_size, LIMITS, condition.psf_px)
+            for w in (noisy, clean)
+        )
         good = found.good
         squared = 0.5 * ((found.centres - centres)[good] ** 2).sum(axis=1)
         systematic = (without_noise.centres - centres)[without_noise.good] ** 2
-        scores.append(Score(detector.name, condition, _root_mean(bounds), _root_mean(squared),
-                            *_ratio_interval(squared, bounds[good], rng), _root_mean(systematic),
-                            1.0 - float(good.mean())))
+        scores.append(
+            Score(
+                detector.name,
+                condition,
+                _root_mean(bounds),
+                _root_mean(squared),
+                *_ratio_interval(squared, bounds[good], rng),
+                _root_mean(systematic),
+                1.0 - float(good.mean()),
+            )
+        )
     return scores
 
 
 def _bounds(scene: Scene, psf_px: float, centres: Array, shapes: Array, size: int) -> Array:
     """Smallest mean squared error (n,) of each centre per axis, px²."""
-    parts = [cramer_rao_bound(centres[k:k + TOGETHER], shapes[k:k + TOGETHER], size, scene.contrast, scene.ground,
-                              scene.noise, psf_px) for k in range(0, len(centres), TOGETHER)]
+    parts = [
+        cramer_rao_bound(
+            centres[k : k + TOGETHER], shapes[k : k + TOGETHER], size, scene.contrast, scene.ground, scene.noise, psf_px
+        )
+        for k in range(0, len(centres), TOGETHER)
+    ]
     return 0.5 * np.trace(np.concatenate(parts), axis1=1, axis2=2)
 
 
@@ -106,8 +126,12 @@ def _root_mean(squared: Array) -> float:
     return float(np.sqrt(squared.mean())) if squared.size else np.inf
 
 
-def _by_window(find: Callable[[NDArray[np.uint8]], tuple[float, float] | None], windows: NDArray,
-               corners: NDArray[np.integer], white_level: int) -> DetectedCentres:
+def _by_window(
+    find: Callable[[NDArray[np.uint8]], tuple[float, float] | None],
+    windows: NDArray,
+    corners: NDArray[np.integer],
+    white_level: int,
+) -> DetectedCentres:
     """Centres that a function finds in each window alone, in 8 bit; OpenCV states no covariance, so it is zero."""
     found = [find(window) for window in np.rint(windows * (255.0 / white_level)).astype(np.uint8)]
     good = np.array([centre is not None for centre in found], dtype=bool)
@@ -115,9 +139,15 @@ def _by_window(find: Callable[[NDArray[np.uint8]], tuple[float, float] | None], 
     return DetectedCentres(centres + corners, np.zeros((len(found), 2, 2)), good)
 
 
-def detect_by_blobs(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                    limits: FitLimits | None = None, psf_px: float = 0.0,
-                    smears: Array | None = None) -> DetectedCentres:
+def detect_by_blobs(
+    windows: NDArray,
+    corners: NDArray[np.integer],
+    noise: CameraNoise,
+    fit_size: int,
+    limits: FitLimits | None = None,
+    psf_px: float = 0.0,
+    smears: Array | None = None,
+) -> DetectedCentres:
     """``cv2.SimpleBlobDetector`` with its filters of shape switched off: the largest bright blob."""
     settings = cv2.SimpleBlobDetector.Params()
     settings.filterByCircularity = settings.filterByConvexity = settings.filterByInertia = False
@@ -131,9 +161,15 @@ def detect_by_blobs(windows: NDArray, corners: NDArray[np.integer], noise: Camer
     return _by_window(find, windows, corners, noise.white_level)
 
 
-def detect_by_contour(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                      limits: FitLimits | None = None, psf_px: float = 0.0,
-                      smears: Array | None = None) -> DetectedCentres:
+def detect_by_contour(
+    windows: NDArray,
+    corners: NDArray[np.integer],
+    noise: CameraNoise,
+    fit_size: int,
+    limits: FitLimits | None = None,
+    psf_px: float = 0.0,
+    smears: Array | None = None,
+) -> DetectedCentres:
     """``cv2.fitEllipse`` on the longest contour of the window thresholded after Otsu."""
 
     def find(window: NDArray[np.uint8]) -> tuple[float, float] | None:

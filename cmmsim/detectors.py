@@ -8,20 +8,28 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .detected_centres import DetectedCentres
-from .dual_conic import EDGE_PX, detect_by_dual_conic
-from .ellipse_fit import FitLimits, fit_ellipses
-from .errors import UnknownOptionError
-from .grey_centroid import detect_by_centroid
-from .noise import CameraNoise
-from .pose import Array
+from cmmsim.detected_centres import DetectedCentres
+from cmmsim.dual_conic import EDGE_PX, detect_by_dual_conic
+from cmmsim.ellipse_fit import FitLimits, fit_ellipses
+from cmmsim.errors import UnknownOptionError
+from cmmsim.grey_centroid import detect_by_centroid
+from cmmsim.noise import CameraNoise
+from cmmsim.pose import Array
 
 
 class DetectWindows(Protocol):
     """Ellipse centres in n windows with one bright spot each."""
 
-    def __call__(self, windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                 limits: FitLimits | None = None, psf_px: float = 0.0, smears: Array | None = None) -> DetectedCentres:
+    def __call__(
+        self,
+        windows: NDArray,
+        corners: NDArray[np.integer],
+        noise: CameraNoise,
+        fit_size: int,
+        limits: FitLimits | None = None,
+        psf_px: float = 0.0,
+        smears: Array | None = None,
+    ) -> DetectedCentres:
         """Detect.
 
         Parameters: windows (n, h, h) grey values; corners (n, 2) the full-image pixel (x, y) of each window's first
@@ -43,19 +51,28 @@ class Detector:
     margin_px: int = 0
 
 
-def detect_by_maximum_likelihood(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                                 limits: FitLimits | None = None, psf_px: float = 0.0,
-                                 smears: Array | None = None) -> DetectedCentres:
+def detect_by_maximum_likelihood(
+    windows: NDArray,
+    corners: NDArray[np.integer],
+    noise: CameraNoise,
+    fit_size: int,
+    limits: FitLimits | None = None,
+    psf_px: float = 0.0,
+    smears: Array | None = None,
+) -> DetectedCentres:
     """Centres of the maximum-likelihood fit of a blurred ellipse. Parameters as of ``DetectWindows``."""
     fits = fit_ellipses(windows, corners, noise, fit_size, limits, psf_px=psf_px, smears=smears)
     return DetectedCentres(fits.centres, fits.covariances, fits.good, fits.shapes, fits.shape_covariances, fits.misfit)
 
 
-DETECTORS = {d.name: d for d in (
-    Detector("maximum_likelihood", detect_by_maximum_likelihood, 0.0),
-    Detector("dual_conic", detect_by_dual_conic, 0.004, EDGE_PX),
-    Detector("grey_centroid", detect_by_centroid, 0.009),
-)}
+DETECTORS = {
+    d.name: d
+    for d in (
+        Detector("maximum_likelihood", detect_by_maximum_likelihood, 0.0),
+        Detector("dual_conic", detect_by_dual_conic, 0.004, EDGE_PX),
+        Detector("grey_centroid", detect_by_centroid, 0.009),
+    )
+}
 DEFAULT_DETECTOR = "maximum_likelihood"
 
 

@@ -6,12 +6,19 @@ import math
 
 import numpy as np
 
-from .compiled import compiled
+from cmmsim.compiled import compiled
 
 
 @compiled
-def project_disc(centre: np.ndarray, normal: np.ndarray, radius: float, focal: np.ndarray, principal: np.ndarray,
-                 middle: np.ndarray, shape: np.ndarray) -> None:
+def project_disc(
+    centre: np.ndarray,
+    normal: np.ndarray,
+    radius: float,
+    focal: np.ndarray,
+    principal: np.ndarray,
+    middle: np.ndarray,
+    shape: np.ndarray,
+) -> None:
     """Ellipse of a disc, see ``projected_disc``: ``middle`` (2,) px and ``shape`` (2,2) px, the root of a matrix M:
     (M + d I) / sqrt(trace M + 2 d), d² = det M."""
     depth = centre[2] ** 2 - radius**2 * (1.0 - normal[2] ** 2)
@@ -34,16 +41,29 @@ def project_disc(centre: np.ndarray, normal: np.ndarray, radius: float, focal: n
 
 
 @compiled
-def project_all(centres: np.ndarray, normals: np.ndarray, radii: np.ndarray, focal: np.ndarray, principal: np.ndarray,
-                middles: np.ndarray, shapes: np.ndarray) -> None:
+def project_all(
+    centres: np.ndarray,
+    normals: np.ndarray,
+    radii: np.ndarray,
+    focal: np.ndarray,
+    principal: np.ndarray,
+    middles: np.ndarray,
+    shapes: np.ndarray,
+) -> None:
     """``project_disc`` for n discs: centres (n,3), normals (n,3), radii (n,), middles (n,2), shapes (n,2,2)."""
     for n in range(len(centres)):
         project_disc(centres[n], normals[n], radii[n], focal, principal, middles[n], shapes[n])
 
 
 @compiled
-def place_discs(moves: np.ndarray, owners: np.ndarray, places: np.ndarray, directions: np.ndarray, centres: np.ndarray,
-                normals: np.ndarray) -> None:
+def place_discs(
+    moves: np.ndarray,
+    owners: np.ndarray,
+    places: np.ndarray,
+    directions: np.ndarray,
+    centres: np.ndarray,
+    normals: np.ndarray,
+) -> None:
     """Centres and normals (n,3) in camera axes of discs at ``places`` with normals ``directions`` (n,3) in the axes of
     their ``owners`` (n,); moves (b,4,4) camera from bodies."""
     for n in range(len(places)):

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .pose import Array
-from .projected_disc import project_discs
-from .scene import DiscStack
-from .views import NEAR, Drawable, View
+from cmmsim.pose import Array
+from cmmsim.projected_disc import project_discs
+from cmmsim.scene import DiscStack
+from cmmsim.views import NEAR, Drawable, View
 
 PROBES = 8  # points on a disc's rim, asked with its middle whether a solid hides them
 
@@ -35,8 +35,12 @@ class DiscTable:
     """All discs of a drawable in the axes of their bodies."""
 
     def __init__(self, drawable: Drawable) -> None:
-        rows = [(disc, body) for patch, body in zip(drawable.patches, drawable.body_index, strict=True)
-                if isinstance(patch, DiscStack) for disc in patch.discs]
+        rows = [
+            (disc, body)
+            for patch, body in zip(drawable.patches, drawable.body_index, strict=True)
+            if isinstance(patch, DiscStack)
+            for disc in patch.discs
+        ]
         self._places = np.array([d.centre for d, _ in rows]).reshape(-1, 3)
         self._normals = np.array([d.normal for d, _ in rows]).reshape(-1, 3)
         self._radii = np.array([d.radius for d, _ in rows])
@@ -45,7 +49,7 @@ class DiscTable:
 
     def seen(self, view: View) -> DiscsInView:
         """The discs that face a view's camera."""
-        from .disc_kernel import place_discs, probe_discs  # compiles, so it is loaded where it is first needed
+        from cmmsim.disc_kernel import place_discs, probe_discs  # compiles, so it is loaded where it is first needed
 
         centres, normals = np.empty_like(self._places), np.empty_like(self._places)
         place_discs(view.camera_from_bodies, self._owners, self._places, self._normals, centres, normals)
@@ -56,5 +60,6 @@ class DiscTable:
         pixels, shapes = project_discs(view.camera, centres, normals, radii)
         probes = np.empty((len(kept), PROBES + 1, 3))
         probe_discs(centres, normals, radii, probes)
-        return DiscsInView(pixels, shapes, np.linalg.norm(shapes, axis=2), self._levels[kept], self._owners[kept],
-                           probes)
+        return DiscsInView(
+            pixels, shapes, np.linalg.norm(shapes, axis=2), self._levels[kept], self._owners[kept], probes
+        )

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .pose import Array
-from .scene import Disc, DiscStack, Mesh
+from cmmsim.pose import Array
+from cmmsim.scene import Disc, DiscStack, Mesh
 
 RIM_SAMPLES = 1.8
 LARGEST_SAG = 0.08  # samples by which a side of the polygon may fall short of the rim
@@ -24,12 +24,16 @@ def disc_mesh(stack: DiscStack, sample: float) -> Mesh:
     The uppermost disc has a soft rim where another one lies below it; the others are coarse and sharp.
     """
     *grounds, top = stack.discs
-    pieces = [_soft_disc(top, grounds[-1].level, sample) if grounds else _sharp_disc(top, _sides(top.radius, sample)),
-              *(_sharp_disc(disc, GROUND_SIDES) for disc in reversed(grounds))]
+    pieces = [
+        _soft_disc(top, grounds[-1].level, sample) if grounds else _sharp_disc(top, _sides(top.radius, sample)),
+        *(_sharp_disc(disc, GROUND_SIDES) for disc in reversed(grounds)),
+    ]
     first = np.cumsum([0, *(len(p.vertices) for p in pieces)])
-    return Mesh(np.concatenate([p.vertices for p in pieces]),
-                np.concatenate([p.faces + start for p, start in zip(pieces, first, strict=False)]),
-                np.concatenate([p.levels for p in pieces]))
+    return Mesh(
+        np.concatenate([p.vertices for p in pieces]),
+        np.concatenate([p.faces + start for p, start in zip(pieces, first, strict=False)]),
+        np.concatenate([p.levels for p in pieces]),
+    )
 
 
 def _soft_disc(disc: Disc, around: float, sample: float) -> Mesh:
@@ -62,8 +66,9 @@ def _corners(disc: Disc, radius: float, sides: int) -> Array:
 def _band_triangles(sides: int) -> NDArray[np.int_]:
     """Triangles (2 sides, 3) between ``sides`` corners and as many around them."""
     here, there = np.arange(sides), np.roll(np.arange(sides), -1)
-    return np.concatenate([np.column_stack([here, there, sides + here]),
-                           np.column_stack([there, sides + there, sides + here])])
+    return np.concatenate(
+        [np.column_stack([here, there, sides + here]), np.column_stack([there, sides + there, sides + here])]
+    )
 
 
 def _balanced_triangles(sides: int) -> NDArray[np.int_]:

@@ -16,8 +16,8 @@ from functools import cached_property
 
 import numpy as np
 
-from .errors import CmmError
-from .pose import Array
+from cmmsim.errors import CmmError
+from cmmsim.pose import Array
 
 NDArrayBool = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 CONVERGED = 1e-12  # largest distance, in normalised coordinates, between a point and the image of its inverse
@@ -56,8 +56,13 @@ class Distortion:
         x, y = points[..., 0], points[..., 1]
         s = x * x + y * y
         radial = 1.0 + s * (self.k1 + s * (self.k2 + s * self.k3))
-        return np.stack([x * radial + 2.0 * self.p1 * x * y + self.p2 * (s + 2.0 * x * x),
-                         y * radial + self.p1 * (s + 2.0 * y * y) + 2.0 * self.p2 * x * y], axis=-1)
+        return np.stack(
+            [
+                x * radial + 2.0 * self.p1 * x * y + self.p2 * (s + 2.0 * x * x),
+                y * radial + self.p1 * (s + 2.0 * y * y) + 2.0 * self.p2 * x * y,
+            ],
+            axis=-1,
+        )
 
     def jacobian(self, points: Array) -> Array:
         """Derivative (..., 2, 2) of the distorted by the undistorted points (..., 2)."""
@@ -91,8 +96,13 @@ class Distortion:
             jacobian = self.jacobian(found)
             determinant = np.linalg.det(jacobian)
             steady = np.where(np.abs(determinant) > 1e-6, determinant, 1e-6)
-            step = np.stack([jacobian[..., 1, 1] * gap[..., 0] - jacobian[..., 0, 1] * gap[..., 1],
-                             jacobian[..., 0, 0] * gap[..., 1] - jacobian[..., 1, 0] * gap[..., 0]], axis=-1)
+            step = np.stack(
+                [
+                    jacobian[..., 1, 1] * gap[..., 0] - jacobian[..., 0, 1] * gap[..., 1],
+                    jacobian[..., 0, 0] * gap[..., 1] - jacobian[..., 1, 0] * gap[..., 0],
+                ],
+                axis=-1,
+            )
             found = found + np.clip(step / steady[..., None], -1.0, 1.0)
         found = _drawn_in(found, reach)
         return found, (np.abs(points - self.distort(found)).max(axis=-1) <= CONVERGED) & self.holds(found)

@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from .detected_centres import DetectedCentres, no_centres
-from .ellipse_fit import FitLimits
-from .grey_centroid import BrightSpots, bright_spots, whole_inside
-from .noise import CameraNoise
-from .pose import Array
+from cmmsim.detected_centres import DetectedCentres, no_centres
+from cmmsim.ellipse_fit import FitLimits
+from cmmsim.grey_centroid import BrightSpots, bright_spots, whole_inside
+from cmmsim.noise import CameraNoise
+from cmmsim.pose import Array
 
 SLOPE = (-0.5, 0.0, 0.5)
 SMOOTHING = (0.1875, 0.625, 0.1875)  # across the slope (Scharr): the most nearly isotropic of this size
@@ -35,9 +35,15 @@ EDGE_PX = 2  # from the rim to the window's side: a gradient reaches 1.5 px from
 SMALLEST_CONDITION = 1e-9  # reciprocal condition below which the lines do not determine an ellipse
 
 
-def detect_by_dual_conic(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                         limits: FitLimits | None = None, psf_px: float = 0.0,
-                         smears: Array | None = None) -> DetectedCentres:
+def detect_by_dual_conic(
+    windows: NDArray,
+    corners: NDArray[np.integer],
+    noise: CameraNoise,
+    fit_size: int,
+    limits: FitLimits | None = None,
+    psf_px: float = 0.0,
+    smears: Array | None = None,
+) -> DetectedCentres:
     """Centres by the dual conic. Parameters as of ``DetectWindows``; the point spread only widens the rim, and smears
     play no part."""
     limits = limits or FitLimits()

@@ -18,9 +18,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from .camera import PinholeCamera
-from .pose import Array
-from .projected_disc import project_discs
+from cmmsim.camera import PinholeCamera
+from cmmsim.pose import Array
+from cmmsim.projected_disc import project_discs
 
 RIM_POINTS = 24
 

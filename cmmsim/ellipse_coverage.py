@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .pose import Array
+from cmmsim.pose import Array
 
 SHAPE_BASIS = np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
 SHAPE_BASIS.setflags(write=False)
@@ -26,11 +26,12 @@ def coverage(centres: Array, shapes: Array, size: int) -> tuple[Array, Array]:
     Parameters: centres (n, 2) px, where (0, 0) is the middle of the window's first pixel; shapes (n, 2, 2) px,
     symmetric and positive definite; size: window side in px.
     """
-    from .coverage_kernel import cover_windows  # compiles, so it is loaded where it is first needed
+    from cmmsim.coverage_kernel import cover_windows  # compiles, so it is loaded where it is first needed
 
     shares, derivatives = np.empty((len(centres), size, size)), np.empty((len(centres), size, size, 5))
-    cover_windows(np.ascontiguousarray(centres, dtype=float), np.ascontiguousarray(shapes, dtype=float), shares,
-                  derivatives)
+    cover_windows(
+        np.ascontiguousarray(centres, dtype=float), np.ascontiguousarray(shapes, dtype=float), shares, derivatives
+    )
     return shares, derivatives
 
 

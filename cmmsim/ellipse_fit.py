@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .blurred_coverage import require_psf
-from .noise import CameraNoise
-from .pose import Array
+from cmmsim.blurred_coverage import require_psf
+from cmmsim.noise import CameraNoise
+from cmmsim.pose import Array
 
 RING_REACH = 2.4  # pixels beyond this many sticker radii may lie outside the dark ring and are left out
 SMALLEST_RADIUS_PX = 0.8
@@ -59,9 +59,16 @@ class FitLimits:
     largest_misfit: float = 1.8
 
 
-def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                 limits: FitLimits | None = None, iterations: int = 8, psf_px: float = 0.0,
-                 smears: Array | None = None) -> EllipseFits:
+def fit_ellipses(
+    windows: NDArray,
+    corners: NDArray[np.integer],
+    noise: CameraNoise,
+    fit_size: int,
+    limits: FitLimits | None = None,
+    iterations: int = 8,
+    psf_px: float = 0.0,
+    smears: Array | None = None,
+) -> EllipseFits:
     """Fit one ellipse in each window.
 
     Parameters: windows (n, h, h) grey values; corners (n, 2) the full-image pixel (x, y) of each window's first pixel;
@@ -71,7 +78,11 @@ def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNo
     """
     require_psf(psf_px)
     limits = limits or FitLimits()
-    from .fit_kernel import UNKNOWNS, FitSettings, fit_windows  # compiles, so it is loaded where it is first needed
+    from cmmsim.fit_kernel import (  # compiles, so it is loaded where it is first needed
+        UNKNOWNS,
+        FitSettings,
+        fit_windows,
+    )
 
     n = len(windows)
     inner, parameters, misfit = np.empty((n, 2)), np.empty((n, UNKNOWNS)), np.empty(n)
@@ -80,22 +91,49 @@ def fit_ellipses(windows: NDArray, corners: NDArray[np.integer], noise: CameraNo
     greys = scale * _GREYS
     variances = noise.variance(greys)
     largest_step = _LARGEST_STEP * [1.0, 1.0, 1.0, 1.0, 1.0, scale, scale]
-    settings = FitSettings(CORE_SHARE, RING_REACH, SMALLEST_START_PX, SMALLEST_RADIUS_PX, largest_step, iterations,
-                           CONVERGED_PX, float(psf_px), max(SMEAR_STEP_PX, 0.5 * psf_px), variances, greys[0],
-                           1.0 / (greys[1] - greys[0]))
+    settings = FitSettings(
+        CORE_SHARE,
+        RING_REACH,
+        SMALLEST_START_PX,
+        SMALLEST_RADIUS_PX,
+        largest_step,
+        iterations,
+        CONVERGED_PX,
+        float(psf_px),
+        max(SMEAR_STEP_PX, 0.5 * psf_px),
+        variances,
+        greys[0],
+        1.0 / (greys[1] - greys[0]),
+    )
     moved = np.zeros((n, 2)) if smears is None else np.ascontiguousarray(smears, dtype=float)
     pixels = np.ascontiguousarray(windows, dtype=float)
 
     def fit(part: slice) -> None:
-        fit_windows(pixels[part], moved[part], fit_size, settings, inner[part], parameters[part], shapes[part],
-                    covariances[part], misfit[part])
+        fit_windows(
+            pixels[part],
+            moved[part],
+            fit_size,
+            settings,
+            inner[part],
+            parameters[part],
+            shapes[part],
+            covariances[part],
+            misfit[part],
+        )
 
     _in_two_threads(fit, n)
     good = parameters[:, 5] >= limits.smallest_contrast
     good &= misfit <= largest_misfits(limits, noise, parameters[:, 5], parameters[:, 6])
     good &= _inside(parameters[:, :2], shapes, fit_size)
-    return EllipseFits(parameters[:, :2] + inner + corners, covariances[:, :2, :2], shapes, covariances[:, 2:, 2:],
-                       parameters[:, 5], misfit, good)
+    return EllipseFits(
+        parameters[:, :2] + inner + corners,
+        covariances[:, :2, :2],
+        shapes,
+        covariances[:, 2:, 2:],
+        parameters[:, 5],
+        misfit,
+        good,
+    )
 
 
 def _in_two_threads(fit: Callable[[slice], None], count: int) -> None:

@@ -6,28 +6,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .arguments import finite_array, require_kind
-from .blob_search import find_ellipses
-from .consistency import consistent
-from .errors import LostError, ShapeError, UnknownOptionError
-from .images import FrameImages, StereoFrame, StereoImages
-from .labelling import ENOUGH, find_layout
-from .marked_body import MarkedBody
-from .matching import candidate_pairs
-from .measurement import Measurement, lost_measurement
-from .noise import CameraNoise
-from .observation import (
-    DetectionSettings,
-    StickerObservation,
-    observe,
-    observe_windows,
-    read_windows,
-)
-from .pose import Array, compose_covariance, pose_covariance, transform_to_pose
-from .pose_methods import METHODS, Solution, by_planes
-from .stereo_rig import StereoRig
-from .streaks import drawn_out, find_streaks
-from .taught import Taught
+from cmmsim.arguments import finite_array, require_kind
+from cmmsim.blob_search import find_ellipses
+from cmmsim.consistency import consistent
+from cmmsim.errors import LostError, ShapeError, UnknownOptionError
+from cmmsim.images import FrameImages, StereoFrame, StereoImages
+from cmmsim.labelling import ENOUGH, find_layout
+from cmmsim.marked_body import MarkedBody
+from cmmsim.matching import candidate_pairs
+from cmmsim.measurement import Measurement, lost_measurement
+from cmmsim.noise import CameraNoise
+from cmmsim.observation import DetectionSettings, StickerObservation, observe, observe_windows, read_windows
+from cmmsim.pose import Array, compose_covariance, pose_covariance, transform_to_pose
+from cmmsim.pose_methods import METHODS, Solution, by_planes
+from cmmsim.stereo_rig import StereoRig
+from cmmsim.streaks import drawn_out, find_streaks
+from cmmsim.taught import Taught
 
 NOMINAL_TOLERANCE = 0.003  # m: nominal places are known to about a millimetre
 TAUGHT_TOLERANCE = 0.0005  # m: taught places are known to microns, points in a whole image to tenths of a millimetre
@@ -72,15 +66,26 @@ class PoseEstimator:
             return longer if more > count else found
         return found
 
-    def measure(self, images: StereoImages, expected: Array,
-                swept: tuple[Array, Array] | None = None) -> tuple[Measurement, Array]:
+    def measure(
+        self, images: StereoImages, expected: Array, swept: tuple[Array, Array] | None = None
+    ) -> tuple[Measurement, Array]:
         """Measurement near an expected camera_from_platform (4,4), and the measured one. Raises LostError.
 
         ``swept``: expected ones at the beginning and the end of the exposure. Where stickers are smeared over more than
         half a pixel and it is not told, a pose without point spread is worse than its covariance: ``measure_anew``.
         """
-        return self._measured(observe(images, self.rig, self.noise, self.settings, expected,
-                                      self.taught.platform_places, self.platform.sticker_normals, swept))
+        return self._measured(
+            observe(
+                images,
+                self.rig,
+                self.noise,
+                self.settings,
+                expected,
+                self.taught.platform_places,
+                self.platform.sticker_normals,
+                swept,
+            )
+        )
 
     def measure_anew(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
         """As ``measure`` where nothing is known of the movement: it is told from the streaks of the stickers.
@@ -103,8 +108,9 @@ class PoseEstimator:
     def _found(self, frame: StereoFrame, settings: DetectionSettings) -> tuple[Array, int]:
         """Rough camera_from_platform (4,4) and the number of stickers that were recognised. Raises LostError."""
         points = points_in_frame(frame, self.rig, self.noise, settings)
-        place, stickers, _ = find_layout(self.taught.platform_places, points, TAUGHT_TOLERANCE, FEWEST_TAUGHT,
-                                         "platform")
+        place, stickers, _ = find_layout(
+            self.taught.platform_places, points, TAUGHT_TOLERANCE, FEWEST_TAUGHT, "platform"
+        )
         return place, len(stickers)
 
     def _measured(self, seen: StickerObservation) -> tuple[Measurement, Array]:
@@ -113,8 +119,15 @@ class PoseEstimator:
         base_from_platform = self.taught.base_from_camera @ camera_from_platform
         spread = compose_covariance(self.taught.base_from_camera, covariance)
         measurement = Measurement(
-            transform_to_pose(base_from_platform), pose_covariance(base_from_platform, spread), used.points,
-            used.covariances, used.left_pixels, used.right_pixels, self.platform.sticker_ids[used.index], True)
+            transform_to_pose(base_from_platform),
+            pose_covariance(base_from_platform, spread),
+            used.points,
+            used.covariances,
+            used.left_pixels,
+            used.right_pixels,
+            self.platform.sticker_ids[used.index],
+            True,
+        )
         return measurement, camera_from_platform
 
     def _solve(self, seen: StickerObservation) -> Solution:
@@ -147,12 +160,15 @@ def require_fitting(frame: StereoFrame, estimator: PoseEstimator) -> None:
     """Raise ShapeError for images of another size or bit depth than the estimator's cameras have."""
     for name, image, camera in zip(("left", "right"), (frame.left, frame.right), estimator.rig.cameras, strict=True):
         if image.shape != (camera.height, camera.width):
-            raise ShapeError(f"the {name} image is {image.shape[1]} x {image.shape[0]} px, but its camera has "
-                             f"{camera.width} x {camera.height} px")
+            raise ShapeError(
+                f"the {name} image is {image.shape[1]} x {image.shape[0]} px, but its camera has "
+                f"{camera.width} x {camera.height} px"
+            )
         if image.dtype != estimator.noise.image_type:
-            raise ShapeError(f"the {name} image is {image.dtype}, but the camera's bit_depth "
-                             f"{estimator.noise.bit_depth} makes {estimator.noise.image_type}")
-
+            raise ShapeError(
+                f"the {name} image is {image.dtype}, but the camera's bit_depth "
+                f"{estimator.noise.bit_depth} makes {estimator.noise.image_type}"
+            )
 
 
 def points_in_frame(frame: StereoFrame, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings) -> Array:
@@ -160,8 +176,14 @@ def points_in_frame(frame: StereoFrame, rig: StereoRig, noise: CameraNoise, sett
     window_size = max(SEARCH_WINDOW_PX, settings.window_size + SEARCH_ROOM_PX)
     left, right = find_ellipses(frame, noise, window_size, settings.fit_size, settings.limits, settings.optics.psf_px)
     if not len(left.centres) or not len(right.centres):
-        raise LostError(f"{len(left.centres)} bright spots in the left image and {len(right.centres)} in the right, "
-                        f"at least {FEWEST_TAUGHT} in each needed")
-    ideal = [pixels[found] for pixels, found in (camera.undistort(side.centres) for camera, side
-                                                 in zip(rig.cameras, (left, right), strict=True))]
+        raise LostError(
+            f"{len(left.centres)} bright spots in the left image and {len(right.centres)} in the right, "
+            f"at least {FEWEST_TAUGHT} in each needed"
+        )
+    ideal = [
+        pixels[found]
+        for pixels, found in (
+            camera.undistort(side.centres) for camera, side in zip(rig.cameras, (left, right), strict=True)
+        )
+    ]
     return candidate_pairs(rig.ideal, *ideal)[1]

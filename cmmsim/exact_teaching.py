@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import numpy as np
 
-from .marked_body import marked_body
-from .pose import invert
-from .rig_from_file import rig_from_file
-from .scene import placed_stickers
-from .sensor_schema import SensorFile
-from .taught import Taught
-from .taught_setup import setup_of
+from cmmsim.marked_body import marked_body
+from cmmsim.pose import invert
+from cmmsim.rig_from_file import rig_from_file
+from cmmsim.scene import placed_stickers
+from cmmsim.sensor_schema import SensorFile
+from cmmsim.taught import Taught
+from cmmsim.taught_setup import setup_of
 
 
 def exactly_taught(file: SensorFile) -> Taught:
     """The true frames and sticker places of a sensor file's scene, with zero covariances. Raises SensorFileError."""
     _, camera_from_base = rig_from_file(file.rig)
-    platform, base = (placed_stickers(marked_body(name, section), file.stickers, stream)
-                      for stream, (name, section) in enumerate((("platform", file.platform), ("base", file.base))))
-    return Taught(file.name, invert(camera_from_base), np.zeros((6, 6)), platform, np.zeros((len(platform), 3, 3)),
-                  np.zeros((6, 6)), base, setup_of(file))
+    platform, base = (
+        placed_stickers(marked_body(name, section), file.stickers, stream)
+        for stream, (name, section) in enumerate((("platform", file.platform), ("base", file.base)))
+    )
+    return Taught(
+        file.name,
+        invert(camera_from_base),
+        np.zeros((6, 6)),
+        platform,
+        np.zeros((len(platform), 3, 3)),
+        np.zeros((6, 6)),
+        base,
+        setup_of(file),
+    )

@@ -10,14 +10,20 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import PinholeCamera
-from .image_formation import ImageFormation, Side
-from .pose import Array
+from cmmsim.camera import PinholeCamera
+from cmmsim.image_formation import ImageFormation, Side
+from cmmsim.pose import Array
 
 
-def exposed_windows(formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array],
-                    corners: NDArray[np.int_], size: int, supersampling: int, sub_pixels: int | None = None
-                    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def exposed_windows(
+    formation: ImageFormation,
+    camera: PinholeCamera,
+    moments: Sequence[Array],
+    corners: NDArray[np.int_],
+    size: int,
+    supersampling: int,
+    sub_pixels: int | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean and largest radiance (k, size, size) over moments with bodies (b,4,4) each, without vignetting.
 
     Parameters: corners (k,2) px; supersampling and sub_pixels as of ``ImageFormation.windows``.
@@ -30,8 +36,9 @@ def exposed_windows(formation: ImageFormation, camera: PinholeCamera, moments: S
     def draw(bodies: Array, which: NDArray[np.bool_]) -> NDArray[np.float32]:
         if not which.any():
             return np.empty((0, size, size), dtype=np.float32)
-        return formation.windows([Side(camera, bodies, corners[which])], size, supersampling, sub_pixels,
-                                 shade=False)[0]
+        return formation.windows([Side(camera, bodies, corners[which])], size, supersampling, sub_pixels, shade=False)[
+            0
+        ]
 
     mean = np.full((len(corners), size, size), formation.background, dtype=np.float32)
     mean[drawn_once] = draw(moments[0], drawn_once)

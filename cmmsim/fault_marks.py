@@ -12,9 +12,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .ellipse_coverage import covered_area
-from .noise import CameraNoise
-from .pose import Array
+from cmmsim.ellipse_coverage import covered_area
+from cmmsim.noise import CameraNoise
+from cmmsim.pose import Array
 
 FAINTEST = 1e-4  # radiance below which added light is not drawn
 
@@ -50,7 +50,7 @@ class DiscMark:
 
     def light(self, corner: NDArray[np.int_], shape: tuple[int, int]) -> tuple[Array, Array]:
         """See ``Mark``."""
-        share = covered_area((self.centre - corner)[None], self.shape[None], max(shape))[0, :shape[0], :shape[1]]
+        share = covered_area((self.centre - corner)[None], self.shape[None], max(shape))[0, : shape[0], : shape[1]]
         return share, share * self.radiance
 
 
@@ -72,10 +72,14 @@ class PlateMark:
     def light(self, corner: NDArray[np.int_], shape: tuple[int, int]) -> tuple[Array, Array]:
         """See ``Mark``."""
         x, y = _offsets(self.centre, corner, shape)
-        along, across = np.array([np.cos(self.angle), np.sin(self.angle)]), np.array([-np.sin(self.angle),
-                                                                                       np.cos(self.angle)])
-        inside = [np.clip(0.5 + half - np.abs(x * axis[0] + y * axis[1]), 0.0, 1.0)
-                  for axis, half in zip((along, across), self.half, strict=True)]
+        along, across = (
+            np.array([np.cos(self.angle), np.sin(self.angle)]),
+            np.array([-np.sin(self.angle), np.cos(self.angle)]),
+        )
+        inside = [
+            np.clip(0.5 + half - np.abs(x * axis[0] + y * axis[1]), 0.0, 1.0)
+            for axis, half in zip((along, across), self.half, strict=True)
+        ]
         share = inside[0] * inside[1]
         return share, share * self.radiance
 
@@ -95,8 +99,11 @@ class GlintMark:
 
     def box(self) -> tuple[float, float, float, float]:
         """See ``Mark``."""
-        reach = (self.core * np.sqrt(2.0 * np.log(max(self.peak, self.tail_peak) / FAINTEST)) + 1.0
-                 + self.tail * np.log(max(self.tail_peak / FAINTEST, 1.0)))
+        reach = (
+            self.core * np.sqrt(2.0 * np.log(max(self.peak, self.tail_peak) / FAINTEST))
+            + 1.0
+            + self.tail * np.log(max(self.tail_peak / FAINTEST, 1.0))
+        )
         return self.centre[0] - reach, self.centre[1] - reach, self.centre[0] + reach, self.centre[1] + reach
 
     def light(self, corner: NDArray[np.int_], shape: tuple[int, int]) -> tuple[Array, Array]:

@@ -18,13 +18,13 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from .arguments import require_kind
-from .errors import UnknownOptionError
-from .estimator import PoseEstimator
-from .fault_marks import DiscMark, FillMark, GlintMark, PlateMark
-from .faulty_images import Fault
-from .outlines import sticker_outlines
-from .pose import Array, apply, checked_pose, invert, pose_to_transform
+from cmmsim.arguments import require_kind
+from cmmsim.errors import UnknownOptionError
+from cmmsim.estimator import PoseEstimator
+from cmmsim.fault_marks import DiscMark, FillMark, GlintMark, PlateMark
+from cmmsim.faulty_images import Fault
+from cmmsim.outlines import sticker_outlines
+from cmmsim.pose import Array, apply, checked_pose, invert, pose_to_transform
 
 BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)  # m, sides of the boxes that hide stickers
 FEW = 4
@@ -33,8 +33,9 @@ STICKER_RADIANCE, DARK_RADIANCE, SATURATING = 228.0 / 255.0, 60.0 / 255.0, 1.5
 
 def fault_bodies() -> dict[str, trimesh.Trimesh]:
     """Boxes that hide stickers, by the names that ``Fault.obstacles`` uses, m."""
-    return {f"fault box {k}": trimesh.creation.box(extents=(0.5 * size, size, size))
-            for k, size in enumerate(BODY_SIZES)}
+    return {
+        f"fault box {k}": trimesh.creation.box(extents=(0.5 * size, size, size)) for k, size in enumerate(BODY_SIZES)
+    }
 
 
 class FaultGenerator:
@@ -45,11 +46,20 @@ class FaultGenerator:
         self._rig, self._platform, self._taught = estimator.rig, estimator.platform, estimator.taught
         self._radius = estimator.settings.radius
         self._drawn: dict[str, Callable[[Array, np.random.Generator], Fault]] = {
-            "hidden": self._hidden, "half_hidden": self._half_hidden, "obstacles": self._obstacles,
-            "one_camera_dark": self._one_camera_dark, "one_camera_covered": self._one_camera_covered,
-            "false_discs": self._false_discs, "false_points": self._false_points, "glint": self._glint,
-            "merging": self._merging, "swapped": self._swapped, "black": self._black, "saturated": self._saturated,
-            "several": self._several}
+            "hidden": self._hidden,
+            "half_hidden": self._half_hidden,
+            "obstacles": self._obstacles,
+            "one_camera_dark": self._one_camera_dark,
+            "one_camera_covered": self._one_camera_covered,
+            "false_discs": self._false_discs,
+            "false_points": self._false_points,
+            "glint": self._glint,
+            "merging": self._merging,
+            "swapped": self._swapped,
+            "black": self._black,
+            "saturated": self._saturated,
+            "several": self._several,
+        }
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -73,8 +83,9 @@ class FaultGenerator:
     def _outlines(self, pose: Array) -> tuple[Array, Array]:
         """Ellipses of all stickers: centres (2, n, 2) and shapes (2, n, 2, 2), px."""
         camera_from_platform = invert(self._taught.base_from_camera) @ pose_to_transform(pose)
-        return sticker_outlines(self._rig, camera_from_platform, self._taught.platform_places,
-                                self._platform.sticker_normals, self._radius)
+        return sticker_outlines(
+            self._rig, camera_from_platform, self._taught.platform_places, self._platform.sticker_normals, self._radius
+        )
 
     def _some(self, rng: np.random.Generator, most: int | None = None) -> NDArray[np.int_]:
         """Random stickers: as often as not up to FEW of them, else up to all; never more than ``most``."""
@@ -85,9 +96,20 @@ class FaultGenerator:
     def _hidden(self, pose: Array, rng: np.random.Generator) -> Fault:
         centres, shapes = self._outlines(pose)
         sides = _one_or_both(rng)
-        return Fault("hidden", tuple(
-            PlateMark(side, centres[side, k], _reach(shapes[side, k]) + rng.uniform(1.0, 12.0, 2),
-                      rng.uniform(0.0, np.pi), DARK_RADIANCE) for k in self._some(rng) for side in sides))
+        return Fault(
+            "hidden",
+            tuple(
+                PlateMark(
+                    side,
+                    centres[side, k],
+                    _reach(shapes[side, k]) + rng.uniform(1.0, 12.0, 2),
+                    rng.uniform(0.0, np.pi),
+                    DARK_RADIANCE,
+                )
+                for k in self._some(rng)
+                for side in sides
+            ),
+        )
 
     def _half_hidden(self, pose: Array, rng: np.random.Generator) -> Fault:
         """The edge stands anywhere between a sticker's nearest and farthest rim, often close to the nearest one."""
@@ -134,8 +156,14 @@ class FaultGenerator:
         for _ in range(rng.integers(1, 31)):
             side = int(rng.integers(2))
             near, shape = centres[side, rng.integers(centres.shape[1])], shapes[side, rng.integers(centres.shape[1])]
-            marks.append(DiscMark(side, near + rng.choice([2.0, 6.0, 80.0]) * rng.standard_normal(2),
-                                  rng.uniform(0.7, 1.4) * shape, _radiance(rng)))
+            marks.append(
+                DiscMark(
+                    side,
+                    near + rng.choice([2.0, 6.0, 80.0]) * rng.standard_normal(2),
+                    rng.uniform(0.7, 1.4) * shape,
+                    _radiance(rng),
+                )
+            )
         return Fault("false_discs", tuple(marks))
 
     def _false_points(self, pose: Array, rng: np.random.Generator) -> Fault:
@@ -145,8 +173,13 @@ class FaultGenerator:
         for _ in range(rng.integers(1, 21)):
             k = rng.integers(len(stickers))
             off = rng.choice([0.0005, 0.003, 0.01, 0.1]) * rng.standard_normal(3)
-            centres, shapes = sticker_outlines(self._rig, camera_from_platform, stickers[k:k + 1] + off,
-                                               self._platform.sticker_normals[k:k + 1], self._radius)
+            centres, shapes = sticker_outlines(
+                self._rig,
+                camera_from_platform,
+                stickers[k : k + 1] + off,
+                self._platform.sticker_normals[k : k + 1],
+                self._radius,
+            )
             radiance = _radiance(rng)
             marks += [DiscMark(side, centres[side, 0], shapes[side, 0], radiance) for side in range(2)]
         return Fault("false_points", tuple(marks))
@@ -154,11 +187,22 @@ class FaultGenerator:
     def _glint(self, pose: Array, rng: np.random.Generator) -> Fault:
         """Of one surface, so both cameras see it near the same sticker, in unlike directions and strengths."""
         centres, shapes = self._outlines(pose)
-        return Fault("glint", tuple(
-            GlintMark(side, centres[side, k] + rng.uniform(0.0, 4.0) * shapes[side, k] @ _direction(rng),
-                      10.0 ** rng.uniform(-1.5, 1.0), rng.uniform(0.5, 3.0), 10.0 ** rng.uniform(-2.5, 0.5),
-                      rng.uniform(2.0, 20.0), rng.uniform(0.0, np.pi))
-            for k in self._some(rng, 6) for side in _one_or_both(rng)))
+        return Fault(
+            "glint",
+            tuple(
+                GlintMark(
+                    side,
+                    centres[side, k] + rng.uniform(0.0, 4.0) * shapes[side, k] @ _direction(rng),
+                    10.0 ** rng.uniform(-1.5, 1.0),
+                    rng.uniform(0.5, 3.0),
+                    10.0 ** rng.uniform(-2.5, 0.5),
+                    rng.uniform(2.0, 20.0),
+                    rng.uniform(0.0, np.pi),
+                )
+                for k in self._some(rng, 6)
+                for side in _one_or_both(rng)
+            ),
+        )
 
     def _merging(self, pose: Array, rng: np.random.Generator) -> Fault:
         """The discs' rims overlap, touch, or leave a small gap."""
@@ -166,8 +210,10 @@ class FaultGenerator:
         sides, marks = _one_or_both(rng), []
         for k in self._some(rng):
             towards, gap, radiance = _direction(rng), rng.uniform(0.2, 2.4), _radiance(rng)
-            marks += [DiscMark(side, centres[side, k] + gap * shapes[side, k] @ towards, shapes[side, k], radiance)
-                      for side in sides]
+            marks += [
+                DiscMark(side, centres[side, k] + gap * shapes[side, k] @ towards, shapes[side, k], radiance)
+                for side in sides
+            ]
         return Fault("merging", tuple(marks))
 
     def _swapped(self, pose: Array, rng: np.random.Generator) -> Fault:

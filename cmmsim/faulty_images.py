@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from .arguments import require_kind
-from .fault_marks import Mark, paint
-from .images import StereoFrame, StereoImages, Windows, readable
-from .noise import CameraNoise
-from .pose import Array
+from cmmsim.arguments import require_kind
+from cmmsim.fault_marks import Mark, paint
+from cmmsim.images import StereoFrame, StereoImages, Windows, readable
+from cmmsim.noise import CameraNoise
+from cmmsim.pose import Array
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,9 @@ class FaultyImages:
     Raises CmmError for arguments of another kind.
     """
 
-    def __init__(self, images: StereoImages | StereoFrame, fault: Fault, noise: CameraNoise,
-                 rng: np.random.Generator) -> None:
+    def __init__(
+        self, images: StereoImages | StereoFrame, fault: Fault, noise: CameraNoise, rng: np.random.Generator
+    ) -> None:
         images = readable(images)
         require_kind(fault, Fault, "a fault must be a Fault, such as FaultGenerator.draw returns")
         require_kind(noise, CameraNoise, "noise must be a CameraNoise, such as sensor.noise")

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .blur_kernel import blur_window
-from .cholesky_kernel import factor, invert_factored, solve_factored
-from .compiled import compiled
-from .coverage_kernel import cover_window, inverse_of
+from cmmsim.blur_kernel import blur_window
+from cmmsim.cholesky_kernel import factor, invert_factored, solve_factored
+from cmmsim.compiled import compiled
+from cmmsim.coverage_kernel import cover_window, inverse_of
 
 UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
 
@@ -102,8 +102,17 @@ def variance_at(mean: float, settings: FitSettings) -> float:
 
 
 @compiled
-def accumulate(window: np.ndarray, mask: np.ndarray, shares: np.ndarray, derivatives: np.ndarray, contrast: float,
-               ground: float, settings: FitSettings, normal: np.ndarray, right: np.ndarray) -> float:
+def accumulate(
+    window: np.ndarray,
+    mask: np.ndarray,
+    shares: np.ndarray,
+    derivatives: np.ndarray,
+    contrast: float,
+    ground: float,
+    settings: FitSettings,
+    normal: np.ndarray,
+    right: np.ndarray,
+) -> float:
     """Add up the normal matrix (7,7), lower triangle, and right-hand side (7,); returns the weighted squared misfit."""
     normal[:], right[:], misfit = 0.0, 0.0, 0.0
     row_of = np.empty(UNKNOWNS)
@@ -168,8 +177,9 @@ def step_within_bounds(parameters: np.ndarray, step: np.ndarray, settings: FitSe
             moved = max(moved, abs(change))
     for k in range(2):
         parameters[k] = min(max(parameters[k], 0.0), size - 1.0)
-    parameters[2], parameters[3], parameters[4] = bound_radii(parameters[2], parameters[3], parameters[4],
-                                                              settings.smallest, float(size))
+    parameters[2], parameters[3], parameters[4] = bound_radii(
+        parameters[2], parameters[3], parameters[4], settings.smallest, float(size)
+    )
     return moved
 
 
@@ -180,8 +190,9 @@ def set_shape(parameters: np.ndarray, shape: np.ndarray) -> None:
 
 
 @compiled
-def light_of_still(centre_x: float, centre_y: float, shape: np.ndarray, psf_px: float, shares: np.ndarray,
-                   derivatives: np.ndarray) -> None:
+def light_of_still(
+    centre_x: float, centre_y: float, shape: np.ndarray, psf_px: float, shares: np.ndarray, derivatives: np.ndarray
+) -> None:
     """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that stands still."""
     if psf_px > 0.0:
         blur_window(centre_x, centre_y, shape, psf_px, shares, derivatives)
@@ -190,8 +201,9 @@ def light_of_still(centre_x: float, centre_y: float, shape: np.ndarray, psf_px: 
 
 
 @compiled
-def add_light(shares: np.ndarray, derivatives: np.ndarray, weight: float, to_shares: np.ndarray,
-              to_derivatives: np.ndarray) -> None:
+def add_light(
+    shares: np.ndarray, derivatives: np.ndarray, weight: float, to_shares: np.ndarray, to_derivatives: np.ndarray
+) -> None:
     """Add shares (h, w) and derivatives (h, w, 5), weighted, to others; whole-array sums would compile for seconds."""
     for row in range(shares.shape[0]):
         for column in range(shares.shape[1]):
@@ -201,8 +213,14 @@ def add_light(shares: np.ndarray, derivatives: np.ndarray, weight: float, to_sha
 
 
 @compiled
-def light_of_moving(parameters: np.ndarray, shape: np.ndarray, smear: np.ndarray, settings: FitSettings,
-                    shares: np.ndarray, derivatives: np.ndarray) -> None:
+def light_of_moving(
+    parameters: np.ndarray,
+    shape: np.ndarray,
+    smear: np.ndarray,
+    settings: FitSettings,
+    shares: np.ndarray,
+    derivatives: np.ndarray,
+) -> None:
     """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that moves evenly by ``smear`` (2,) px during
     the exposure, by the midpoint rule; its parameters are those in the middle."""
     count = math.ceil(math.hypot(smear[0], smear[1]) / settings.smear_step)
@@ -212,8 +230,14 @@ def light_of_moving(parameters: np.ndarray, shape: np.ndarray, smear: np.ndarray
     total, changes = np.zeros(shares.shape), np.zeros(derivatives.shape)
     for k in range(count):
         part = (k + 0.5) / count - 0.5
-        light_of_still(parameters[0] + part * smear[0], parameters[1] + part * smear[1], shape, settings.psf_px, shares,
-                       derivatives)
+        light_of_still(
+            parameters[0] + part * smear[0],
+            parameters[1] + part * smear[1],
+            shape,
+            settings.psf_px,
+            shares,
+            derivatives,
+        )
         add_light(shares, derivatives, 1.0, total, changes)
     shares[:] = 0.0
     derivatives[:] = 0.0
@@ -221,8 +245,14 @@ def light_of_moving(parameters: np.ndarray, shape: np.ndarray, smear: np.ndarray
 
 
 @compiled
-def fit_window(window: np.ndarray, smear: np.ndarray, settings: FitSettings, parameters: np.ndarray,
-               shape: np.ndarray, covariance: np.ndarray) -> float:
+def fit_window(
+    window: np.ndarray,
+    smear: np.ndarray,
+    settings: FitSettings,
+    parameters: np.ndarray,
+    shape: np.ndarray,
+    covariance: np.ndarray,
+) -> float:
     """Gauss-Newton from ``parameters`` (7,), which it moves; returns the reduced chi-square.
 
     It ends when the ellipse moves by less than ``converged`` px: the normal matrix and the misfit of that last step
@@ -253,8 +283,17 @@ def fit_window(window: np.ndarray, smear: np.ndarray, settings: FitSettings, par
 
 
 @compiled
-def fit_windows(windows: np.ndarray, smears: np.ndarray, size: int, settings: FitSettings, corners: np.ndarray,
-                parameters: np.ndarray, shapes: np.ndarray, covariances: np.ndarray, misfits: np.ndarray) -> None:
+def fit_windows(
+    windows: np.ndarray,
+    smears: np.ndarray,
+    size: int,
+    settings: FitSettings,
+    corners: np.ndarray,
+    parameters: np.ndarray,
+    shapes: np.ndarray,
+    covariances: np.ndarray,
+    misfits: np.ndarray,
+) -> None:
     """Fit the part of ``size`` px around the bright spot of each window (n,h,h) of floats, which moved by ``smears``
     (n,2) px during the exposure.
 
@@ -266,7 +305,7 @@ def fit_windows(windows: np.ndarray, smears: np.ndarray, size: int, settings: Fi
         room = windows.shape[1] - size
         left = min(max(int(np.rint(spot[2] - 0.5 * (size - 1))), 0), room)
         top = min(max(int(np.rint(spot[3] - 0.5 * (size - 1))), 0), room)
-        part = windows[k, top:top + size, left:left + size]
+        part = windows[k, top : top + size, left : left + size]
         start_ellipse(part, settings, parameters[k])
         misfits[k] = fit_window(part, smears[k], settings, parameters[k], shapes[k], covariances[k])
         corners[k, 0], corners[k, 1] = left, top

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .detected_centres import DetectedCentres, no_centres
-from .ellipse_fit import RING_REACH, FitLimits
-from .noise import CameraNoise
-from .pose import Array
+from cmmsim.detected_centres import DetectedCentres, no_centres
+from cmmsim.ellipse_fit import RING_REACH, FitLimits
+from cmmsim.noise import CameraNoise
+from cmmsim.pose import Array
 
 THRESHOLD = 0.1  # share of the contrast
 CORE_THRESHOLD = 0.4  # the same where only the spot itself is wanted, whatever surrounds it
@@ -43,9 +43,15 @@ class BrightSpots:
     spreads: Array
 
 
-def detect_by_centroid(windows: NDArray, corners: NDArray[np.integer], noise: CameraNoise, fit_size: int,
-                       limits: FitLimits | None = None, psf_px: float = 0.0,
-                       smears: Array | None = None) -> DetectedCentres:
+def detect_by_centroid(
+    windows: NDArray,
+    corners: NDArray[np.integer],
+    noise: CameraNoise,
+    fit_size: int,
+    limits: FitLimits | None = None,
+    psf_px: float = 0.0,
+    smears: Array | None = None,
+) -> DetectedCentres:
     """Grey centroids. Parameters as of ``DetectWindows``; neither the point spread nor smears play a part."""
     limits = limits or FitLimits()
     if len(windows) == 0:

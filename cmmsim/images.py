@@ -8,9 +8,9 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from .arguments import require_kind
-from .errors import ShapeError
-from .noise import GreyImage
+from cmmsim.arguments import require_kind
+from cmmsim.errors import ShapeError
+from cmmsim.noise import GreyImage
 
 Windows = GreyImage | NDArray[np.float64]
 
@@ -28,8 +28,9 @@ class StereoFrame:
             if not isinstance(image, np.ndarray):
                 raise ShapeError(f"the {name} image must be an array (height, width), got {type(image).__name__}")
             if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
-                raise ShapeError(f"the {name} image must be (height, width) uint8 or uint16, got {image.shape} "
-                                 f"{image.dtype}")
+                raise ShapeError(
+                    f"the {name} image must be (height, width) uint8 or uint16, got {image.shape} {image.dtype}"
+                )
 
 
 @runtime_checkable

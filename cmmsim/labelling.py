@@ -13,17 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from .errors import LostError
-from .pose import Array, apply
-from .registration import rigid_starts
+from cmmsim.errors import LostError
+from cmmsim.pose import Array, apply
+from cmmsim.registration import rigid_starts
 
 SMALLEST_TRIANGLE = 0.002  # m² area
 MOST_TOGETHER = 64  # triangles judged together
 ENOUGH = 0.8  # share of the layout that ends the search
 
 
-def find_layout(layout: Array, points: Array, tolerance: float, fewest: int,
-                name: str) -> tuple[Array, NDArray[np.int_], NDArray[np.int_]]:
+def find_layout(
+    layout: Array, points: Array, tolerance: float, fewest: int, name: str
+) -> tuple[Array, NDArray[np.int_], NDArray[np.int_]]:
     """Pose of a layout in a cloud of points.
 
     Parameters: layout (n,3) m in body axes; points (m,3) m in the camera frame; tolerance in m of the layout's places;
@@ -49,8 +50,9 @@ def find_layout(layout: Array, points: Array, tolerance: float, fewest: int,
         if count >= ENOUGH * len(layout):
             break
     if best is None or count < fewest:
-        raise LostError(f"{name}: {count} of {len(layout)} stickers recognised among {len(points)} points, "
-                        f"at least {fewest} needed")
+        raise LostError(
+            f"{name}: {count} of {len(layout)} stickers recognised among {len(points)} points, at least {fewest} needed"
+        )
     if rival > count - 2:
         raise LostError(f"{name}: two poses explain the points, with {count} and {rival} stickers")
     nearest = _nearest(best[None], layout, tree, tolerance)[0]
@@ -71,7 +73,7 @@ def _blocks(triples: NDArray[np.int_]) -> Iterator[NDArray[np.int_]]:
     first = 0
     while first < len(triples):
         size = min(1 + first, MOST_TOGETHER)
-        yield triples[first:first + size]
+        yield triples[first : first + size]
         first += size
 
 
@@ -84,8 +86,9 @@ def _congruent(gaps: Array, corners: Array, tolerance: float) -> NDArray[np.int_
     return np.column_stack([first[pair], second[pair], third])
 
 
-def _proposed(layout: Array, triples: NDArray[np.int_], points: Array, gaps: Array, tree: cKDTree,
-              tolerance: float) -> tuple[NDArray[np.int_], Array, NDArray[np.int_]]:
+def _proposed(
+    layout: Array, triples: NDArray[np.int_], points: Array, gaps: Array, tree: cKDTree, tolerance: float
+) -> tuple[NDArray[np.int_], Array, NDArray[np.int_]]:
     """Which of the triples (t,3) of stickers propose poses (c,) where three points are as far from each other; the
     poses (c,4,4), laid onto all stickers that then have a point close by; and how many (c,) have one in the end.
 

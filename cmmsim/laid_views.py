@@ -14,10 +14,10 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from .convex_solid import ConvexSolid
-from .pose import Array
-from .scene import DiscStack, Mesh
-from .views import FAR, NEAR, Drawable, View, window_bounds
+from cmmsim.convex_solid import ConvexSolid
+from cmmsim.pose import Array
+from cmmsim.scene import DiscStack, Mesh
+from cmmsim.views import FAR, NEAR, Drawable, View, window_bounds
 
 RIM_PX = 0.5  # around a window that the solid must fill, too: far more than rounding
 CLEARANCE = 1e-6  # m by which a disc must lie over its solid
@@ -43,17 +43,25 @@ class LaidSolids:
 
     def __init__(self, drawable: Drawable) -> None:
         patches, self._body_index = drawable.patches, drawable.body_index
-        self._solids = {k: ConvexSolid(p.vertices) for k, p in enumerate(patches)
-                        if isinstance(p, Mesh) and _is_plain_convex(p)}
-        self.levels = np.array([p.levels[0] if k in self._solids and isinstance(p, Mesh) else np.nan
-                                for k, p in enumerate(patches)])
+        self._solids = {
+            k: ConvexSolid(p.vertices) for k, p in enumerate(patches) if isinstance(p, Mesh) and _is_plain_convex(p)
+        }
+        self.levels = np.array(
+            [p.levels[0] if k in self._solids and isinstance(p, Mesh) else np.nan for k, p in enumerate(patches)]
+        )
         self._normals = np.array([p.discs[-1].normal if isinstance(p, DiscStack) else np.zeros(3) for p in patches])
-        self._heights = np.array([p.discs[-1].centre @ p.discs[-1].normal if isinstance(p, DiscStack) else 0.0
-                                  for p in patches])
-        self._lying = {k: np.array([isinstance(p, DiscStack) and body == self._body_index[k]
-                                    and _lies_over(p, solid.vertices)
-                                    for p, body in zip(patches, self._body_index, strict=True)])
-                       for k, solid in self._solids.items()}
+        self._heights = np.array(
+            [p.discs[-1].centre @ p.discs[-1].normal if isinstance(p, DiscStack) else 0.0 for p in patches]
+        )
+        self._lying = {
+            k: np.array(
+                [
+                    isinstance(p, DiscStack) and body == self._body_index[k] and _lies_over(p, solid.vertices)
+                    for p, body in zip(patches, self._body_index, strict=True)
+                ]
+            )
+            for k, solid in self._solids.items()
+        }
 
     def laid(self, views: Sequence[View], groups: Sequence[NDArray[np.int_]], reaching: NDArray[np.bool_]) -> Laid:
         """Which windows need no depths.
@@ -97,7 +105,7 @@ def _is_plain_convex(mesh: Mesh) -> bool:
     if not solid.is_watertight or np.ptp(mesh.levels) > 0.0:
         return False
     volume = abs(float(solid.volume))
-    return volume > FLATTEST * float(np.max(solid.extents))**3 and volume > (1.0 - 1e-9) * solid.convex_hull.volume
+    return volume > FLATTEST * float(np.max(solid.extents)) ** 3 and volume > (1.0 - 1e-9) * solid.convex_hull.volume
 
 
 def _lies_over(stack: DiscStack, vertices: Array) -> bool:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .pose import Array
-from .sensor_schema import Timing
+from cmmsim.pose import Array
+from cmmsim.sensor_schema import Timing
 
 WIDEST = 3.0  # standard deviations: no frame's latency is farther from the mean
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .compiled import compiled
-from .coverage_kernel import cover_pixel, inverse_of, reach_of_pixel
+from cmmsim.compiled import compiled
+from cmmsim.coverage_kernel import cover_pixel, inverse_of, reach_of_pixel
 
 
 class Solids(NamedTuple):
@@ -94,7 +94,7 @@ def lay_solids(image: np.ndarray, x: float, y: float, solids: Solids, lines: int
         low_x, low_y, high_x, high_y = solids.boxes[k]
         if high_x <= x or low_x >= x + width or high_y <= y or low_y >= y + height:
             continue
-        half_planes = solids.half_planes[solids.starts[k]:solids.starts[k + 1]]
+        half_planes = solids.half_planes[solids.starts[k] : solids.starts[k + 1]]
         if polygon_holds(half_planes, x, y, width, height):
             share[:] = 1.0
         else:
@@ -124,8 +124,9 @@ def lay_disc(image: np.ndarray, centre_x: float, centre_y: float, k: int, discs:
     reach = reach_of_pixel(m)
     extent_x, extent_y = discs.extents[k]
     for row in range(max(0, math.ceil(centre_y - extent_y - 0.5)), min(height, math.floor(centre_y + extent_y + 1.5))):
-        for column in range(max(0, math.ceil(centre_x - extent_x - 0.5)),
-                            min(width, math.floor(centre_x + extent_x + 1.5))):
+        for column in range(
+            max(0, math.ceil(centre_x - extent_x - 0.5)), min(width, math.floor(centre_x + extent_x + 1.5))
+        ):
             x, y = column - centre_x, row - centre_y
             distance = math.sqrt((m[0, 0] * x + m[0, 1] * y) ** 2 + (m[1, 0] * x + m[1, 1] * y) ** 2)
             if distance >= 1.0 + reach:
@@ -136,8 +137,9 @@ def lay_disc(image: np.ndarray, centre_x: float, centre_y: float, k: int, discs:
 
 
 @compiled
-def lay_layers(images: np.ndarray, group: np.ndarray, corners: np.ndarray, solids: Solids, lines: int,
-               discs: Discs) -> None:
+def lay_layers(
+    images: np.ndarray, group: np.ndarray, corners: np.ndarray, solids: Solids, lines: int, discs: Discs
+) -> None:
     """Lay solids, then discs, over the windows ``images[group]`` (h, w) with first pixels ``corners`` (n, 2)."""
     _, height, width = images.shape
     covers = np.empty((discs.behind.shape[1], height, width))
@@ -147,8 +149,12 @@ def lay_layers(images: np.ndarray, group: np.ndarray, corners: np.ndarray, solid
         lay_solids(image, x - 0.5, y - 0.5, solids, lines, covers)
         for k in range(len(discs.levels)):
             gap_x, gap_y = discs.centres[k, 0] - x, discs.centres[k, 1] - y
-            if (gap_x + discs.extents[k, 0] > -0.5 and gap_x - discs.extents[k, 0] < width - 0.5
-                    and gap_y + discs.extents[k, 1] > -0.5 and gap_y - discs.extents[k, 1] < height - 0.5):
+            if (
+                gap_x + discs.extents[k, 0] > -0.5
+                and gap_x - discs.extents[k, 0] < width - 0.5
+                and gap_y + discs.extents[k, 1] > -0.5
+                and gap_y - discs.extents[k, 1] < height - 0.5
+            ):
                 lay_disc(image, gap_x, gap_y, k, discs, covers)
 
 
@@ -171,8 +177,14 @@ def hides(eye: np.ndarray, point: np.ndarray, normals: np.ndarray, offsets: np.n
 
 
 @compiled
-def hidden_points(body_from_camera: np.ndarray, points: np.ndarray, normals: np.ndarray, offsets: np.ndarray,
-                  touching: float, hidden: np.ndarray) -> None:
+def hidden_points(
+    body_from_camera: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    offsets: np.ndarray,
+    touching: float,
+    hidden: np.ndarray,
+) -> None:
     """``hides`` for points (n,3) in camera axes, into ``hidden`` (n,)."""
     eye, point = np.empty(3), np.empty(3)
     for n in range(len(points)):

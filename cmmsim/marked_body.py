@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import ShapeError, TeachingError
-from .plane_frame import PLANE_NAMES, frame_from_planes
-from .pose import Array
-from .sensor_schema import Body, StickerPlane, unit
+from cmmsim.errors import ShapeError, TeachingError
+from cmmsim.plane_frame import PLANE_NAMES, frame_from_planes
+from cmmsim.pose import Array
+from cmmsim.sensor_schema import Body, StickerPlane, unit
 
 SMALLEST_CORNER = 0.001  # volume that the unit normals of three planes span: of a cube's corner it is 1
 
@@ -60,16 +60,25 @@ def marked_body(name: str, body: Body) -> MarkedBody:
     axes = [_plane_axes(p) for p in planes]
     nominal = [np.array(p.point) + np.array(p.stickers) @ a.T for p, a in zip(planes, axes, strict=True)]
     ids = [f"{plane}{k + 1}" for plane, count in zip(PLANE_NAMES, counts, strict=True) for k in range(count)]
-    return MarkedBody(name, normals, offsets, np.array(ids), np.repeat(np.arange(3), counts),
-                      np.concatenate(nominal), np.repeat(np.stack(axes), counts, axis=0))
+    return MarkedBody(
+        name,
+        normals,
+        offsets,
+        np.array(ids),
+        np.repeat(np.arange(3), counts),
+        np.concatenate(nominal),
+        np.repeat(np.stack(axes), counts, axis=0),
+    )
 
 
 def require_corner(body: MarkedBody) -> None:
     """Raise TeachingError unless the three planes of a body meet in one point, which its frame hangs on."""
     volume = abs(float(np.linalg.det(body.normals)))
     if volume < SMALLEST_CORNER:
-        raise TeachingError(f"{body.name}: planes A, B and C meet in no point, so no frame can be taught: their unit "
-                            f"normals span a volume of {volume:.1g}, at least {SMALLEST_CORNER:g} is needed")
+        raise TeachingError(
+            f"{body.name}: planes A, B and C meet in no point, so no frame can be taught: their unit "
+            f"normals span a volume of {volume:.1g}, at least {SMALLEST_CORNER:g} is needed"
+        )
 
 
 def _plane_axes(plane: StickerPlane) -> Array:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .pose import Array
-from .stereo_rig import StereoRig
-from .triangulation import linear_triangulation
+from cmmsim.pose import Array
+from cmmsim.stereo_rig import StereoRig
+from cmmsim.triangulation import linear_triangulation
 
 LINE_TOLERANCE_PX = 0.5
 NEAREST, FURTHEST = 0.3, 6.0  # m

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import ShapeError
-from .pose import Array
+from cmmsim.errors import ShapeError
+from cmmsim.pose import Array
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,22 @@ class Measurement:
             raise ShapeError(f"pose (6,) and covariance (6,6) expected, got {self.pose.shape}, {self.covariance.shape}")
         finite = bool(np.isfinite(self.pose).all() and np.isfinite(self.covariance).all())
         if self.ok != finite or self.ok == bool(self.reason):
-            raise ShapeError(f"a measurement is either ok and finite or lost for a reason, got ok={self.ok}, "
-                             f"finite={finite}, reason={self.reason!r}")
+            raise ShapeError(
+                f"a measurement is either ok and finite or lost for a reason, got ok={self.ok}, "
+                f"finite={finite}, reason={self.reason!r}"
+            )
 
 
 def lost_measurement(reason: str) -> Measurement:
     """A measurement that holds no pose, and says why."""
-    return Measurement(np.full(6, np.nan), np.full((6, 6), np.nan), np.zeros((0, 3)), np.zeros((0, 3, 3)),
-                       np.zeros((0, 2)), np.zeros((0, 2)), np.array([], dtype=str), False, reason)
+    return Measurement(
+        np.full(6, np.nan),
+        np.full((6, 6), np.nan),
+        np.zeros((0, 3)),
+        np.zeros((0, 3, 3)),
+        np.zeros((0, 2)),
+        np.zeros((0, 2)),
+        np.array([], dtype=str),
+        False,
+        reason,
+    )

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .errors import CmmError
-from .pose import Array
+from cmmsim.errors import CmmError
+from cmmsim.pose import Array
 
 LARGEST_STEP_PX = 0.3  # between two sub-frames no sticker moves farther
 MOST_SUB_FRAMES = 500
@@ -24,7 +24,9 @@ def sub_frame_poses(pose: Array, pose_rate: Array, exposure: float, sticker_pixe
     moved = float(np.linalg.norm(sticker_pixels(pose + half) - sticker_pixels(pose - half), axis=-1).max())
     count = max(1, int(np.ceil(moved / LARGEST_STEP_PX)))
     if count > MOST_SUB_FRAMES:
-        raise CmmError(f"a sticker moves {moved:.0f} px during the exposure of {exposure:g} s at pose rate "
-                       f"{pose_rate.tolist()}, at most {MOST_SUB_FRAMES * LARGEST_STEP_PX:.0f} px can be drawn")
+        raise CmmError(
+            f"a sticker moves {moved:.0f} px during the exposure of {exposure:g} s at pose rate "
+            f"{pose_rate.tolist()}, at most {MOST_SUB_FRAMES * LARGEST_STEP_PX:.0f} px can be drawn"
+        )
     share = (2.0 * np.arange(count) + 1.0) / count - 1.0
     return pose + share[:, None] * half

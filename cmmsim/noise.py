@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import CmmError
-from .fixed_pattern import FixedPattern
-from .pose import Array
+from cmmsim.errors import CmmError
+from cmmsim.fixed_pattern import FixedPattern
+from cmmsim.pose import Array
 
 BIT_DEPTHS = (8, 10, 12)
 ROUNDING_TERMS = 50  # of a series, which leave 0.002 of 0.25 without noise
@@ -53,8 +53,9 @@ class CameraNoise:
         if min(self.electrons_at_white, self.gain, self.full_well) <= 0.0 or self.dark_noise < 0.0:
             raise CmmError(f"camera noise needs positive electrons, gain and full well, got {self}")
         if min(self.prnu, self.dsnu) < 0.0 or self.bit_depth not in BIT_DEPTHS or self.frames < 1:
-            raise CmmError(f"camera noise needs prnu and dsnu >= 0, bit_depth of {BIT_DEPTHS} and frames >= 1, got "
-                           f"{self}")
+            raise CmmError(
+                f"camera noise needs prnu and dsnu >= 0, bit_depth of {BIT_DEPTHS} and frames >= 1, got {self}"
+            )
 
     @property
     def white_level(self) -> int:
@@ -102,17 +103,22 @@ class CameraNoise:
     def variance_coefficients(self) -> tuple[float, float, float]:
         """Variance of a grey value as a polynomial in its electrons: constant, linear, quadratic."""
         temporal, pattern = self.gain**2 / self.frames, self.gain**2
-        return (temporal * self.dark_noise**2 + pattern * self.dsnu**2 + 1.0 / (12.0 * self.frames), temporal,
-                pattern * self.prnu**2)
+        return (
+            temporal * self.dark_noise**2 + pattern * self.dsnu**2 + 1.0 / (12.0 * self.frames),
+            temporal,
+            pattern * self.prnu**2,
+        )
 
-    def expose(self, radiance: NDArray[np.float32], rng: np.random.Generator,
-               pattern: FixedPattern | None = None) -> GreyImage:
+    def expose(
+        self, radiance: NDArray[np.float32], rng: np.random.Generator, pattern: FixedPattern | None = None
+    ) -> GreyImage:
         """One exposure of a radiance image (float32, 0 to 1); ``pattern`` of the same shape, where pixels differ."""
         grey = np.rint(np.clip(self._analog(radiance, rng, pattern), 0.0, float(self.white_level)))
         return np.asarray(grey.astype(self.image_type))
 
-    def mean_of_exposures(self, radiance: NDArray[np.float32], rng: np.random.Generator, frames: int,
-                          pattern: FixedPattern | None = None) -> Array:
+    def mean_of_exposures(
+        self, radiance: NDArray[np.float32], rng: np.random.Generator, frames: int, pattern: FixedPattern | None = None
+    ) -> Array:
         """Mean grey values of ``frames`` independent exposures of a scene that stands still (float64).
 
         Without noise it is not rounded: the mean that noisy exposures approach, as their noise dithers the rounding.
@@ -124,8 +130,9 @@ class CameraNoise:
             total += self.expose(radiance, rng, pattern)
         return total / frames
 
-    def _analog(self, radiance: NDArray[np.float32], rng: np.random.Generator,
-                pattern: FixedPattern | None) -> NDArray[np.floating]:
+    def _analog(
+        self, radiance: NDArray[np.float32], rng: np.random.Generator, pattern: FixedPattern | None
+    ) -> NDArray[np.floating]:
         if not self.enabled:
             return self.mean_grey(radiance)
         light = radiance * np.float32(self.electrons_at_white)

@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from .detected_centres import DetectedCentres
-from .detectors import DEFAULT_DETECTOR, find_detector
-from .eccentricity import centre_offset
-from .ellipse_fit import SMEAR_STEP_PX, FitLimits
-from .images import StereoImages, Windows
-from .noise import CameraNoise
-from .optics import Optics
-from .pose import Array, apply
-from .stereo_rig import StereoRig
-from .triangulation import triangulate
+from cmmsim.detected_centres import DetectedCentres
+from cmmsim.detectors import DEFAULT_DETECTOR, find_detector
+from cmmsim.eccentricity import centre_offset
+from cmmsim.ellipse_fit import SMEAR_STEP_PX, FitLimits
+from cmmsim.images import StereoImages, Windows
+from cmmsim.noise import CameraNoise
+from cmmsim.optics import Optics
+from cmmsim.pose import Array, apply
+from cmmsim.stereo_rig import StereoRig
+from cmmsim.triangulation import triangulate
 
 LONGEST_SMEAR_PX = 8.0  # about the size of a sticker
 SHORTEST_SMEAR = 1.5  # standard deviations of the point spread: shorter ones do not change what the fit finds
@@ -74,9 +74,14 @@ class StickerObservation:
 
     def selected(self, keep: NDArray[np.bool_]) -> StickerObservation:
         """The observation with only some of its stickers."""
-        return StickerObservation(self.index[keep], self.left_pixels[keep], self.right_pixels[keep],
-                                  self.points[keep], self.covariances[keep],
-                                  None if self.outlines is None else self.outlines.selected(keep))
+        return StickerObservation(
+            self.index[keep],
+            self.left_pixels[keep],
+            self.right_pixels[keep],
+            self.points[keep],
+            self.covariances[keep],
+            None if self.outlines is None else self.outlines.selected(keep),
+        )
 
 
 @dataclass(frozen=True)
@@ -95,9 +100,16 @@ class StickerWindows:
     offsets: Array
 
 
-def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings,
-            camera_from_body: Array, places: Array, normals: Array,
-            swept: tuple[Array, Array] | None = None) -> StickerObservation:
+def observe(
+    images: StereoImages,
+    rig: StereoRig,
+    noise: CameraNoise,
+    settings: DetectionSettings,
+    camera_from_body: Array,
+    places: Array,
+    normals: Array,
+    swept: tuple[Array, Array] | None = None,
+) -> StickerObservation:
     """Observe stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose of the body.
 
     ``swept``: camera_from_body at the beginning and at the end of the exposure, where they are thought to be known.
@@ -106,8 +118,15 @@ def observe(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: 
     return observe_windows(read, rig, noise, settings, places, swept)
 
 
-def read_windows(images: StereoImages, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings,
-                 camera_from_body: Array, places: Array, normals: Array) -> StickerWindows:
+def read_windows(
+    images: StereoImages,
+    rig: StereoRig,
+    noise: CameraNoise,
+    settings: DetectionSettings,
+    camera_from_body: Array,
+    places: Array,
+    normals: Array,
+) -> StickerWindows:
     """Read the windows of stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose."""
     centres = [apply(move @ camera_from_body, places) for move in rig.from_camera]
     turned = [normals @ (move @ camera_from_body)[:3, :3].T for move in rig.from_camera]
@@ -120,24 +139,34 @@ def read_windows(images: StereoImages, rig: StereoRig, noise: CameraNoise, setti
         none = np.zeros((2, 0, window_size, window_size))
         return StickerWindows(index, camera_from_body, corners, none, np.zeros((2, 0, 2)))
     windows = _evenly_lit(images.windows(corners, window_size), corners, rig, noise, settings)
-    offsets = np.stack([centre_offset(camera, c[index], t[index], settings.radius)
-                        for camera, c, t in zip(rig.cameras, centres, turned, strict=True)])
+    offsets = np.stack(
+        [
+            centre_offset(camera, c[index], t[index], settings.radius)
+            for camera, c, t in zip(rig.cameras, centres, turned, strict=True)
+        ]
+    )
     return StickerWindows(index, camera_from_body, corners, windows, offsets)
 
 
-def observe_windows(read: StickerWindows, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings,
-                    places: Array, swept: tuple[Array, Array] | None = None) -> StickerObservation:
+def observe_windows(
+    read: StickerWindows,
+    rig: StereoRig,
+    noise: CameraNoise,
+    settings: DetectionSettings,
+    places: Array,
+    swept: tuple[Array, Array] | None = None,
+) -> StickerObservation:
     """Observe the stickers in windows that have been read; ``places`` and ``swept`` as of ``observe``."""
     if len(read.index) == 0:
-        return StickerObservation(read.index, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 3)),
-                                  np.zeros((0, 3, 3)))
+        return StickerObservation(read.index, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     detector = find_detector(settings.detector)
     fit_size = settings.fit_size + 2 * detector.margin_px
     windows, corners = read.windows.reshape(-1, *read.windows.shape[2:]), read.corners.reshape(-1, 2)
 
     def detect(smears: Array | None) -> DetectedCentres:
-        return detector.detect(windows, corners, noise, fit_size, settings.limits, psf_px=settings.optics.psf_px,
-                               smears=smears)
+        return detector.detect(
+            windows, corners, noise, fit_size, settings.limits, psf_px=settings.optics.psf_px, smears=smears
+        )
 
     smears = None if swept is None else _smears(rig, swept, places[read.index], settings.optics.psf_px)
     fits = detect(None) if smears is None else _likelier(detect(None), detect(smears))
@@ -149,7 +178,8 @@ def observe_windows(read: StickerWindows, rig: StereoRig, noise: CameraNoise, se
     seen = triangulate(rig.ideal, *ideal, *ideal_spread)
     outlines = _outlines(fits, settings.centre_error_px**2)
     return StickerObservation(read.index, seen_at[0], seen_at[1], seen.points, seen.covariances, outlines).selected(
-        good & (seen.ray_gap < settings.largest_ray_gap))
+        good & (seen.ray_gap < settings.largest_ray_gap)
+    )
 
 
 def faces_camera(centres: Array, normals: Array) -> NDArray[np.bool_]:
@@ -183,8 +213,9 @@ def _outlines(fits: DetectedCentres, systematic: float) -> Outlines | None:
     return Outlines(fits.shapes.reshape(2, -1, 2, 2), spread)
 
 
-def _evenly_lit(windows: Windows, corners: NDArray[np.int_], rig: StereoRig, noise: CameraNoise,
-                settings: DetectionSettings) -> Windows:
+def _evenly_lit(
+    windows: Windows, corners: NDArray[np.int_], rig: StereoRig, noise: CameraNoise, settings: DetectionSettings
+) -> Windows:
     """Windows (2, n, size, size) with the light within each made even: that of its middle.
 
     Only the slope of the light across a sticker would move its centre; the noise stays what it is to a few per mille.
@@ -192,7 +223,11 @@ def _evenly_lit(windows: Windows, corners: NDArray[np.int_], rig: StereoRig, noi
     if settings.optics.vignetting == 0.0:
         return windows
     size, middle = windows.shape[-1], corners + 0.5 * (windows.shape[-1] - 1)
-    share = np.stack([settings.optics.window_illumination(camera, at, size)
-                      / settings.optics.illumination(camera, centre)[:, None, None]
-                      for camera, at, centre in zip(rig.cameras, corners, middle, strict=True)])
+    share = np.stack(
+        [
+            settings.optics.window_illumination(camera, at, size)
+            / settings.optics.illumination(camera, centre)[:, None, None]
+            for camera, at, centre in zip(rig.cameras, corners, middle, strict=True)
+        ]
+    )
     return noise.black_level + (windows - noise.black_level) / share

@@ -9,9 +9,9 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import PinholeCamera
-from .errors import CmmError
-from .pose import Array
+from cmmsim.camera import PinholeCamera
+from cmmsim.errors import CmmError
+from cmmsim.pose import Array
 
 PSF_REACH = 5.0  # standard deviations after which the point spread is cut off
 

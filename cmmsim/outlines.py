@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from .pose import Array, apply
-from .projected_disc import project_discs
-from .stereo_rig import StereoRig
+from cmmsim.pose import Array, apply
+from cmmsim.projected_disc import project_discs
+from cmmsim.stereo_rig import StereoRig
 
 
-def sticker_outlines(rig: StereoRig, camera_from_body: Array, places: Array, normals: Array,
-                     radius: float) -> tuple[Array, Array]:
+def sticker_outlines(
+    rig: StereoRig, camera_from_body: Array, places: Array, normals: Array, radius: float
+) -> tuple[Array, Array]:
     """Centres (2, n, 2) px and shapes A (2, n, 2, 2) px of the ellipses of n stickers before both cameras.
 
     Parameters: camera_from_body (4,4); places (n,3) m and normals (n,3) in body axes; radius m. Distortion is taken as
@@ -19,8 +20,9 @@ def sticker_outlines(rig: StereoRig, camera_from_body: Array, places: Array, nor
     centres, shapes = [], []
     for camera, from_camera in zip(rig.cameras, rig.from_camera, strict=True):
         move = from_camera @ camera_from_body
-        middles, shape = project_discs(camera.ideal, apply(move, places), normals @ move[:3, :3].T,
-                                       np.full(len(places), radius))
+        middles, shape = project_discs(
+            camera.ideal, apply(move, places), normals @ move[:3, :3].T, np.full(len(places), radius)
+        )
         if not camera.distortion.is_zero:
             local = camera.distortion_jacobian(middles) @ shape
             middles, shape = camera.distort(middles)[0], symmetric_root(local @ local.swapaxes(-1, -2))

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import LostError
-from .pose import Array, rotation_log
-from .registration import SMALLEST_SPREAD
+from cmmsim.errors import LostError
+from cmmsim.pose import Array, rotation_log
+from cmmsim.registration import SMALLEST_SPREAD
 
 PLANE_NAMES = ("A", "B", "C")
 FEWEST_STICKERS = 3
@@ -40,8 +40,10 @@ def fit_plane(points: Array, covariances: Array, towards: Array, name: str = "")
     middle = points.mean(axis=0)
     _, spread, axes = np.linalg.svd(points - middle)
     if spread[1] < SMALLEST_SPREAD:
-        raise LostError(f"plane {name}: its {len(points)} visible stickers lie on one line "
-                        f"to {spread[1] * 1e3:.1f} mm, at least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed")
+        raise LostError(
+            f"plane {name}: its {len(points)} visible stickers lie on one line "
+            f"to {spread[1] * 1e3:.1f} mm, at least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed"
+        )
     normal = axes[2] * (1.0 if axes[2] @ towards > 0.0 else -1.0)
     offset = float(normal @ middle)
     for _ in range(2):
@@ -73,15 +75,17 @@ def frame_from_planes(normals: Array, offsets: Array) -> Array:
     return frame
 
 
-def frame_of_points(points: Array, covariances: Array, plane_index: NDArray[np.int_],
-                    towards: Array) -> tuple[Array, Array]:
+def frame_of_points(
+    points: Array, covariances: Array, plane_index: NDArray[np.int_], towards: Array
+) -> tuple[Array, Array]:
     """Frame (4,4) of the planes through measured stickers, and the covariance (6,6) of its small error [dt, dphi].
 
     Parameters: points (n,3) and covariances (n,3,3); plane_index (n,) 0, 1, 2 for A, B, C; towards (3,3) rough normals
     by row. Raises LostError that names the plane, the count and the limit.
     """
-    planes = [fit_plane(points[plane_index == k], covariances[plane_index == k], towards[k], PLANE_NAMES[k])
-              for k in range(3)]
+    planes = [
+        fit_plane(points[plane_index == k], covariances[plane_index == k], towards[k], PLANE_NAMES[k]) for k in range(3)
+    ]
     normals = np.stack([p.normal for p in planes])
     offsets = np.array([p.offset for p in planes])
     frame = frame_from_planes(normals, offsets)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .cholesky_kernel import factor, invert_factored, solve_factored
-from .compiled import compiled
+from cmmsim.cholesky_kernel import factor, invert_factored, solve_factored
+from cmmsim.compiled import compiled
 
 
 @compiled
@@ -24,8 +24,9 @@ def project_point(projection: np.ndarray, point: np.ndarray, pixel: np.ndarray, 
 
 
 @compiled
-def add_weighted(jacobian: np.ndarray, weight: np.ndarray, residual: np.ndarray, normal: np.ndarray,
-                 right: np.ndarray) -> float:
+def add_weighted(
+    jacobian: np.ndarray, weight: np.ndarray, residual: np.ndarray, normal: np.ndarray, right: np.ndarray
+) -> float:
     """Add J' W J to ``normal`` and J' W r to ``right``; returns r' W r."""
     rows, columns = jacobian.shape
     squared = 0.0
@@ -41,8 +42,15 @@ def add_weighted(jacobian: np.ndarray, weight: np.ndarray, residual: np.ndarray,
 
 
 @compiled
-def refine_points(projections: np.ndarray, observed: np.ndarray, weights: np.ndarray, steps: int, points: np.ndarray,
-                  covariances: np.ndarray, gaps: np.ndarray) -> None:
+def refine_points(
+    projections: np.ndarray,
+    observed: np.ndarray,
+    weights: np.ndarray,
+    steps: int,
+    points: np.ndarray,
+    covariances: np.ndarray,
+    gaps: np.ndarray,
+) -> None:
     """Move n points to where they explain their pixels best.
 
     projections (c,3,4); observed (n,c,2) px; weights (n,c,2,2), inverse covariances; points (n,3) from start to result;
@@ -67,8 +75,14 @@ def refine_points(projections: np.ndarray, observed: np.ndarray, weights: np.nda
 
 
 @compiled
-def rigid_step(source: np.ndarray, target: np.ndarray, weights: np.ndarray, transform: np.ndarray,
-               covariance: np.ndarray, change: np.ndarray) -> None:
+def rigid_step(
+    source: np.ndarray,
+    target: np.ndarray,
+    weights: np.ndarray,
+    transform: np.ndarray,
+    covariance: np.ndarray,
+    change: np.ndarray,
+) -> None:
     """One step of the rigid fit target = transform(source): ``change`` (6,) is [dt, dphi], ``covariance`` (6,6) its
     covariance.
 

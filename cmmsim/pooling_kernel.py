@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .compiled import compiled
+from cmmsim.compiled import compiled
 
 
 @compiled
@@ -21,7 +21,7 @@ def mean_of_cells(drawn: np.ndarray, columns: int, supersampling: int, windows: 
         for y in range(height):
             sums[:] = 0
             for i in range(supersampling):
-                row = drawn[top + y * supersampling + i, left:left + width * supersampling]
+                row = drawn[top + y * supersampling + i, left : left + width * supersampling]
                 for x in range(len(row)):
                     sums[x] += row[x]
             for x in range(width):

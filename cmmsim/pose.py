@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arguments import finite_array
-from .errors import ShapeError
+from cmmsim.arguments import finite_array
+from cmmsim.errors import ShapeError
 
 Array = NDArray[np.float64]
 
@@ -48,8 +48,10 @@ def checked_transform(transform: ArrayLike, name: str = "a transform") -> Array:
         raise ShapeError(f"{name} must have the last row [0 0 0 1], got {last.tolist()}; is it transposed?")
     error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     if error > RIGID or np.linalg.det(rotation) < 0.0:
-        raise ShapeError(f"{name} must be rigid: its rotation R has |R^T R - I| = {error:.3g} (at most {RIGID:g}) and "
-                         f"determinant {np.linalg.det(rotation):.6g} (1)")
+        raise ShapeError(
+            f"{name} must be rigid: its rotation R has |R^T R - I| = {error:.3g} (at most {RIGID:g}) and "
+            f"determinant {np.linalg.det(rotation):.6g} (1)"
+        )
     return values
 
 
@@ -94,8 +96,9 @@ def rotation_exp(vector: Array) -> Array:
 
 def rotation_log(rotation: Array) -> Array:
     """Rotation vector (3,) of a rotation (3,3) whose angle is well below pi."""
-    axis = 0.5 * np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0],
-                           rotation[1, 0] - rotation[0, 1]])
+    axis = 0.5 * np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
     sine = float(np.linalg.norm(axis))
     cosine = 0.5 * (np.trace(rotation) - 1.0)
     return axis if sine < 1e-12 else axis * (np.arctan2(sine, cosine) / sine)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from .marked_body import MarkedBody
-from .observation import StickerObservation
-from .plane_frame import frame_of_points
-from .pose import Array, invert, skew
-from .registration import register
+from cmmsim.marked_body import MarkedBody
+from cmmsim.observation import StickerObservation
+from cmmsim.plane_frame import frame_of_points
+from cmmsim.pose import Array, invert, skew
+from cmmsim.registration import register
 
 Solution = tuple[Array, Array, StickerObservation]
 
@@ -27,8 +27,9 @@ def by_planes(observation: StickerObservation, body: MarkedBody, towards: Array)
 
     ``towards`` (3,3): rough normals of planes A, B, C in the camera frame. Raises LostError that names the plane.
     """
-    frame, covariance = frame_of_points(observation.points, observation.covariances,
-                                        body.plane_index[observation.index], towards)
+    frame, covariance = frame_of_points(
+        observation.points, observation.covariances, body.plane_index[observation.index], towards
+    )
     planes_from_body = invert(body.body_from_planes)
     return frame @ planes_from_body, move_origin(frame, covariance, planes_from_body[:3, 3]), observation
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .camera import PinholeCamera
-from .pose import Array
+from cmmsim.camera import PinholeCamera
+from cmmsim.pose import Array
 
 
 def project_discs(camera: PinholeCamera, centres: Array, normals: Array, radii: Array) -> tuple[Array, Array]:
@@ -18,9 +18,16 @@ def project_discs(camera: PinholeCamera, centres: Array, normals: Array, radii: 
     Parameters: centres (n,3) m and normals (n,3) unit, in camera axes; radii (n,) m. The ellipse is the image of the
     unit disc under x -> centre + A x.
     """
-    from .disc_kernel import project_all  # compiles, so it is loaded where it is first needed
+    from cmmsim.disc_kernel import project_all  # compiles, so it is loaded where it is first needed
 
     pixels, shapes = np.empty((len(centres), 2)), np.empty((len(centres), 2, 2))
-    project_all(np.ascontiguousarray(centres, dtype=float), np.ascontiguousarray(normals, dtype=float),
-                np.ascontiguousarray(radii, dtype=float), camera.focal_lengths, camera.centre, pixels, shapes)
+    project_all(
+        np.ascontiguousarray(centres, dtype=float),
+        np.ascontiguousarray(normals, dtype=float),
+        np.ascontiguousarray(radii, dtype=float),
+        camera.focal_lengths,
+        camera.centre,
+        pixels,
+        shapes,
+    )
     return pixels, shapes

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .errors import LostError
-from .pose import Array, apply, rotation_exp
+from cmmsim.errors import LostError
+from cmmsim.pose import Array, apply, rotation_exp
 
 SMALLEST_SPREAD = 0.005  # m; points closer than this to one line do not determine a rotation
 
@@ -39,7 +39,8 @@ def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
     shares = (weights / weights.sum(axis=1, keepdims=True))[..., None]
     source_means, target_means = (shares * source).sum(axis=1), (shares * targets).sum(axis=1)
     products = (weights[..., None] * (targets - target_means[:, None])).swapaxes(1, 2) @ (
-        source - source_means[:, None])
+        source - source_means[:, None]
+    )
     u, _, vt = np.linalg.svd(products)
     turns = np.ones((len(targets), 3))
     turns[:, 2] = np.sign(np.linalg.det(u @ vt))
@@ -55,8 +56,10 @@ def require_spread(points: Array) -> None:
         raise LostError(f"{len(points)} visible stickers, at least 3 that are not on one line are needed")
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]
     if spread < SMALLEST_SPREAD:
-        raise LostError(f"the {len(points)} visible stickers lie on one line to {spread * 1e3:.1f} mm, "
-                        f"at least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed")
+        raise LostError(
+            f"the {len(points)} visible stickers lie on one line to {spread * 1e3:.1f} mm, "
+            f"at least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed"
+        )
 
 
 def register(source: Array, target: Array, covariances: Array, iterations: int = 2) -> Registration:
@@ -65,7 +68,7 @@ def register(source: Array, target: Array, covariances: Array, iterations: int =
     Parameters: source (n,3) known points; target (n,3) measured points, m; covariances (n,3,3) of the measured ones.
     Raises LostError when fewer than three points off one line are given.
     """
-    from .point_kernel import rigid_step  # compiles, so it is loaded where it is first needed
+    from cmmsim.point_kernel import rigid_step  # compiles, so it is loaded where it is first needed
 
     require_spread(source)
     transform = rigid_start(source, target)

@@ -23,24 +23,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .disc_mesh import disc_mesh
-from .errors import CmmError, OpenGLMissingError
-from .laid_views import LaidSolids
-from .scene import DiscStack, Mesh
-from .views import Drawable, View, projections, same_exposure
+from cmmsim.disc_mesh import disc_mesh
+from cmmsim.errors import CmmError, OpenGLMissingError
+from cmmsim.laid_views import LaidSolids
+from cmmsim.scene import DiscStack, Mesh
+from cmmsim.views import Drawable, View, projections, same_exposure
 
 ATLAS_SIDE_PX = 2048
 KEPT_FRAME_BUFFERS = 12
 PIECES = 3  # of an atlas that are handed over one after another
 
 
-def render_windows(drawable: Drawable, views: Sequence[View], supersampling: int,
-                   background: float = 0.0) -> NDArray[np.float32]:
+def render_windows(
+    drawable: Drawable, views: Sequence[View], supersampling: int, background: float = 0.0
+) -> NDArray[np.float32]:
     """Radiance (n, h, w) float32, 0 to 1, of n windows of one size.
 
     Each pixel is the mean of ``supersampling``² drawn pixels of one sample each. Raises OpenGLMissingError.
     """
-    from .pooling_kernel import mean_of_cells  # compiles, so it is loaded where it is first needed
+    from cmmsim.pooling_kernel import mean_of_cells  # compiles, so it is loaded where it is first needed
 
     width, height = views[0].size
     cell_w, cell_h = width * supersampling, height * supersampling
@@ -48,9 +49,9 @@ def render_windows(drawable: Drawable, views: Sequence[View], supersampling: int
     per_pass = columns * max(1, ATLAS_SIDE_PX // cell_h)
     windows = np.empty((len(views), height, width), dtype=np.float32)
     for first in range(0, len(views), per_pass):
-        part = views[first:first + per_pass]
+        part = views[first : first + per_pass]
         atlas = _shared_atlas().draw(drawable, part, (cell_w, cell_h), columns, -(-len(part) // columns), background)
-        mean_of_cells(atlas, columns, supersampling, windows[first:first + per_pass])
+        mean_of_cells(atlas, columns, supersampling, windows[first : first + per_pass])
     return windows
 
 
@@ -111,8 +112,15 @@ class _Atlas:
         self._frame_buffers: dict[tuple[int, int], _FrameBuffer] = {}
         self._known: weakref.WeakKeyDictionary[Drawable, _Uploaded] = weakref.WeakKeyDictionary()
 
-    def draw(self, drawable: Drawable, views: Sequence[View], cell: tuple[int, int], columns: int, rows: int,
-             background: float) -> NDArray[np.uint8]:
+    def draw(
+        self,
+        drawable: Drawable,
+        views: Sequence[View],
+        cell: tuple[int, int],
+        columns: int,
+        rows: int,
+        background: float,
+    ) -> NDArray[np.uint8]:
         """The drawn atlas (rows * cell_h, columns * cell_w) uint8, cells in reading order; valid until the next."""
         self._context._platform.make_current()
         patches, solids = self._uploaded(drawable, views[0].camera.focal_px * cell[0] / views[0].size[0])
@@ -137,8 +145,9 @@ class _Atlas:
         self._gl.glBindVertexArray(0)
         return frame_buffer.read()
 
-    def _draw_by_depth(self, drawable: Drawable, shown: Sequence[int], patches: Sequence[_Patch],
-                       clip_from_bodies: NDArray[np.float32]) -> None:
+    def _draw_by_depth(
+        self, drawable: Drawable, shown: Sequence[int], patches: Sequence[_Patch], clip_from_bodies: NDArray[np.float32]
+    ) -> None:
         """The patches ``shown`` in a cell, the nearest of which is seen."""
         gl, body = self._gl, -1
         gl.glEnable(gl.GL_DEPTH_TEST)
@@ -150,8 +159,9 @@ class _Atlas:
             self._draw_elements(gl.GL_TRIANGLES, patches[p].indices, gl.GL_UNSIGNED_INT, None)
         gl.glDisable(gl.GL_DEPTH_TEST)
 
-    def _lay(self, drawable: Drawable, shown: Sequence[int], patches: Sequence[_Patch],
-             clip_from_bodies: NDArray[np.float32]) -> None:
+    def _lay(
+        self, drawable: Drawable, shown: Sequence[int], patches: Sequence[_Patch], clip_from_bodies: NDArray[np.float32]
+    ) -> None:
         """The patches ``shown`` in a cell, all of one body, over each other: the solid, then what lies on it."""
         gl = self._gl
         if shown:
@@ -186,8 +196,9 @@ class _Atlas:
         if known is None:
             known = self._known[drawable] = _Uploaded({}, LaidSolids(drawable))
         if samples not in known.patches:
-            made = [disc_mesh(p, drawable.distance / samples) if isinstance(p, DiscStack) else p
-                    for p in drawable.patches]
+            made = [
+                disc_mesh(p, drawable.distance / samples) if isinstance(p, DiscStack) else p for p in drawable.patches
+            ]
             known.patches[samples] = [self._patch(mesh) for mesh in made]
         return known.patches[samples], known.solids
 
@@ -201,7 +212,9 @@ class _Atlas:
             positions=mesh.vertices.astype(np.float32),
             indices=np.concatenate([mesh.faces, mesh.faces[::-1]]).astype(np.uint32),
             color_0=np.column_stack([grey, np.ones(len(grey))]).astype(np.float32),
-            material=self._pyrender.MetallicRoughnessMaterial(baseColorFactor=(1.0, 1.0, 1.0, 1.0)), mode=4)
+            material=self._pyrender.MetallicRoughnessMaterial(baseColorFactor=(1.0, 1.0, 1.0, 1.0)),
+            mode=4,
+        )
         primitive._add_to_context()
         return primitive
 
@@ -241,8 +254,10 @@ class _FrameBuffer:
         self._pixels = np.empty((height, width), dtype=np.uint8)
         self._target = self._pixels.ctypes.data_as(ctypes.c_void_p)
         self._name = gl.glGenFramebuffers(1)
-        self._buffers = [self._attached(gl.GL_COLOR_ATTACHMENT0, gl.GL_R8),
-                         self._attached(gl.GL_DEPTH_ATTACHMENT, gl.GL_DEPTH_COMPONENT24)]
+        self._buffers = [
+            self._attached(gl.GL_COLOR_ATTACHMENT0, gl.GL_R8),
+            self._attached(gl.GL_DEPTH_ATTACHMENT, gl.GL_DEPTH_COMPONENT24),
+        ]
         self.bind()
         state = gl.glCheckFramebufferStatus(gl.GL_FRAMEBUFFER)
         if state != gl.GL_FRAMEBUFFER_COMPLETE:

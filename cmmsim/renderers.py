@@ -10,9 +10,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from . import analytic, render
-from .errors import OpenGLMissingError, UnknownOptionError
-from .views import Drawable, View
+from cmmsim import analytic, render
+from cmmsim.errors import OpenGLMissingError, UnknownOptionError
+from cmmsim.views import Drawable, View
 
 RENDERER_NAMES = ("analytic", "auto", "pyrender")
 _WARNED: dict[str | tuple[str, type[Warning], int], int] = {}  # what this process has said once is not said again
@@ -21,8 +21,9 @@ _WARNED: dict[str | tuple[str, type[Warning], int], int] = {}  # what this proce
 class DrawWindows(Protocol):
     """Radiance (n, h, w) float32, 0 to 1, of n views of one size; row 0 is a window's top row."""
 
-    def __call__(self, drawable: Drawable, views: Sequence[View], supersampling: int,
-                 background: float = 0.0) -> NDArray[np.float32]:
+    def __call__(
+        self, drawable: Drawable, views: Sequence[View], supersampling: int, background: float = 0.0
+    ) -> NDArray[np.float32]:
         """Draw; supersampling: how finely edges are sampled within a pixel."""
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .pose import Array
+from cmmsim.pose import Array
 
 _QUADRATIC = np.array([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])  # from values at -1, 0, 1
 _QUADRATIC.setflags(write=False)
@@ -23,7 +23,7 @@ def resample(drawn: NDArray[np.float32], nodes: Array, size: int) -> NDArray[np.
 
     Parameters: nodes (n, 3, 3, 2): places (x, y) in the drawn window for the first, middle and last row and column.
     """
-    from .resampling_kernel import resample_windows  # compiles, so it is loaded where it is first needed
+    from cmmsim.resampling_kernel import resample_windows  # compiles, so it is loaded where it is first needed
 
     coefficients = np.einsum("ar,bc,nrcx->nabx", _QUADRATIC, _QUADRATIC, nodes)
     result = np.empty((len(drawn), size, size), dtype=np.float32)

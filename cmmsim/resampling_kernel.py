@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from .compiled import compiled
+from cmmsim.compiled import compiled
 
 
 @compiled
 def keys_weights(share: float) -> tuple:
     """Weights of the four pixels around a place that lies ``share`` (0 to 1) after the second one."""
     s = min(max(share, 0.0), 1.0)
-    return (s * (-0.5 + s * (1.0 - 0.5 * s)), 1.0 + s * s * (-2.5 + 1.5 * s),
-            s * (0.5 + s * (2.0 - 1.5 * s)), s * s * (-0.5 + 0.5 * s))
+    return (
+        s * (-0.5 + s * (1.0 - 0.5 * s)),
+        1.0 + s * s * (-2.5 + 1.5 * s),
+        s * (0.5 + s * (2.0 - 1.5 * s)),
+        s * s * (-0.5 + 0.5 * s),
+    )
 
 
 @compiled
@@ -26,8 +30,11 @@ def resample_windows(drawn: np.ndarray, coefficients: np.ndarray, result: np.nda
             t = 2.0 * row / (size - 1) - 1.0
             for b in range(3):
                 for axis in range(2):
-                    at[b, axis] = (coefficients[k, 0, b, axis] + t * coefficients[k, 1, b, axis]
-                                   + t * t * coefficients[k, 2, b, axis])
+                    at[b, axis] = (
+                        coefficients[k, 0, b, axis]
+                        + t * coefficients[k, 1, b, axis]
+                        + t * t * coefficients[k, 2, b, axis]
+                    )
             for column in range(size):
                 s = 2.0 * column / (size - 1) - 1.0
                 x = at[0, 0] + s * (at[1, 0] + s * at[2, 0])

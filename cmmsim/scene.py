@@ -9,12 +9,12 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import HalfspaceIntersection, QhullError
 
-from .arguments import finite_array
-from .errors import CmmError, SensorFileError
-from .marked_body import MarkedBody
-from .plane_frame import PLANE_NAMES
-from .pose import Array
-from .sensor_schema import Body, Stickers, unit
+from cmmsim.arguments import finite_array
+from cmmsim.errors import CmmError, SensorFileError
+from cmmsim.marked_body import MarkedBody
+from cmmsim.plane_frame import PLANE_NAMES
+from cmmsim.pose import Array
+from cmmsim.sensor_schema import Body, Stickers, unit
 
 SUNK = 0.0003  # m the solid surface lies below the sticker planes
 RING_SUNK = 0.0001  # m the dark ring lies below its sticker
@@ -41,8 +41,12 @@ class DiscStack:
     def bounds(self) -> Array:
         """Smallest and largest coordinates (2,3), m."""
         reach = [d.radius * np.sqrt(np.maximum(1.0 - d.normal**2, 0.0)) for d in self.discs]
-        return np.stack([np.min([d.centre - r for d, r in zip(self.discs, reach, strict=True)], axis=0),
-                         np.max([d.centre + r for d, r in zip(self.discs, reach, strict=True)], axis=0)])
+        return np.stack(
+            [
+                np.min([d.centre - r for d, r in zip(self.discs, reach, strict=True)], axis=0),
+                np.max([d.centre + r for d, r in zip(self.discs, reach, strict=True)], axis=0),
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -118,8 +122,9 @@ def rod_transform(start: ArrayLike, end: ArrayLike) -> Array:
     along = finite_array(end, (3,), "the end of a rod is three finite numbers, m") - begin
     length = float(np.linalg.norm(along))
     if length < SHORTEST_ROD:
-        raise CmmError(f"a rod of {length:g} m from {begin.tolist()} m points nowhere, at least {SHORTEST_ROD:g} m is "
-                       "needed")
+        raise CmmError(
+            f"a rod of {length:g} m from {begin.tolist()} m points nowhere, at least {SHORTEST_ROD:g} m is needed"
+        )
     z = unit(along)
     x = unit(np.cross(z, np.eye(3)[np.argmin(np.abs(z))]))
     transform = np.eye(4)
@@ -131,16 +136,20 @@ def rod_transform(start: ArrayLike, end: ArrayLike) -> Array:
 def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
     """Convex solid of the sunk sticker planes and the cuts. Raises SensorFileError where they enclose none."""
     normals = [*body.normals, *(unit(c.normal) for c in section.cuts)]
-    points = [*(d * n - SUNK * n for n, d in zip(body.normals, body.offsets, strict=True)),
-              *(np.array(c.point) for c in section.cuts)]
+    points = [
+        *(d * n - SUNK * n for n, d in zip(body.normals, body.offsets, strict=True)),
+        *(np.array(c.point) for c in section.cuts),
+    ]
     half_spaces = np.array([[*n, -(n @ p)] for n, p in zip(normals, points, strict=True)])
     inside = body.nominal.mean(axis=0) - 0.01 * body.normals.sum(axis=0)
     outside = half_spaces @ [*inside, 1.0]
     if outside.max() >= 0.0:
         side = [*(f"plane {name}" for name in PLANE_NAMES), *(f"cut {k + 1}" for k in range(len(section.cuts)))]
-        raise SensorFileError(f"{body.name}: the middle of its stickers, {np.round(inside, 4).tolist()} m, lies "
-                              f"{outside.max():.4f} m outside of {side[outside.argmax()]}: the stickers do not sit on "
-                              "the solid that its planes and cuts enclose")
+        raise SensorFileError(
+            f"{body.name}: the middle of its stickers, {np.round(inside, 4).tolist()} m, lies "
+            f"{outside.max():.4f} m outside of {side[outside.argmax()]}: the stickers do not sit on "
+            "the solid that its planes and cuts enclose"
+        )
     try:
         corners = HalfspaceIntersection(half_spaces, inside).intersections
         if not np.isfinite(corners).all():
@@ -154,5 +163,9 @@ def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
 def _sticker(place: Array, axes: Array, stickers: Stickers) -> DiscStack:
     """A bright disc, and RING_SUNK below it a dark one that shows as a ring."""
     normal = np.cross(axes[:, 0], axes[:, 1])
-    return DiscStack((Disc(place - RING_SUNK * normal, normal, stickers.ring_radius, stickers.ring_level / 255.0),
-                      Disc(place, normal, stickers.radius, stickers.sticker_level / 255.0)))
+    return DiscStack(
+        (
+            Disc(place - RING_SUNK * normal, normal, stickers.ring_radius, stickers.ring_level / 255.0),
+            Disc(place, normal, stickers.radius, stickers.sticker_level / 255.0),
+        )
+    )

@@ -13,32 +13,32 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from .arguments import finite_array, require_kind
-from .blob_search import SMALLEST_STEP
-from .ellipse_fit import FitLimits
-from .errors import CmmError, UnknownBodyError, UnknownOptionError
-from .estimator import PoseEstimator
-from .image_formation import ImageFormation
-from .images import StereoFrame, StereoImages
-from .marked_body import marked_body, require_corner
-from .measurement import Measurement, lost_measurement
-from .noise import CameraNoise
-from .observation import DetectionSettings
-from .optics import Optics
-from .pose import Array, checked_pose, checked_transform, pose_to_transform
-from .pose_methods import METHODS
-from .renderers import RENDERER_NAMES, Renderer, choose_renderer
-from .rig_from_file import rig_from_file
-from .scene import Mesh, scene_body, solid_mesh
-from .sensor_file import read_sensor_file
-from .sensor_schema import SensorFile, Timing
-from .taught import Taught
-from .taught_setup import require_taught_for, setup_of
-from .teaching import Progress, Teacher
-from .tracking import Tracker
-from .views import Drawable
-from .virtual_camera import Quality, VirtualStereoCamera
-from .window_sizes import WindowSizes, largest_radius, radius_at, window_sizes
+from cmmsim.arguments import finite_array, require_kind
+from cmmsim.blob_search import SMALLEST_STEP
+from cmmsim.ellipse_fit import FitLimits
+from cmmsim.errors import CmmError, UnknownBodyError, UnknownOptionError
+from cmmsim.estimator import PoseEstimator
+from cmmsim.image_formation import ImageFormation
+from cmmsim.images import StereoFrame, StereoImages
+from cmmsim.marked_body import marked_body, require_corner
+from cmmsim.measurement import Measurement, lost_measurement
+from cmmsim.noise import CameraNoise
+from cmmsim.observation import DetectionSettings
+from cmmsim.optics import Optics
+from cmmsim.pose import Array, checked_pose, checked_transform, pose_to_transform
+from cmmsim.pose_methods import METHODS
+from cmmsim.renderers import RENDERER_NAMES, Renderer, choose_renderer
+from cmmsim.rig_from_file import rig_from_file
+from cmmsim.scene import Mesh, scene_body, solid_mesh
+from cmmsim.sensor_file import read_sensor_file
+from cmmsim.sensor_schema import SensorFile, Timing
+from cmmsim.taught import Taught
+from cmmsim.taught_setup import require_taught_for, setup_of
+from cmmsim.teaching import Progress, Teacher
+from cmmsim.tracking import Tracker
+from cmmsim.views import Drawable
+from cmmsim.virtual_camera import Quality, VirtualStereoCamera
+from cmmsim.window_sizes import WindowSizes, largest_radius, radius_at, window_sizes
 
 TEACHING_STREAM, RUN_STREAM, DROPOUT_STREAM = 0, 1, 2
 
@@ -50,8 +50,15 @@ class Sensor:
     TeachingError, naming what differs, for what another one was taught.
     """
 
-    def __init__(self, file: SensorFile, seed: int = 0, method: str = "registration", taught: Taught | None = None,
-                 progress: Progress | None = None, renderer: str | None = None) -> None:
+    def __init__(
+        self,
+        file: SensorFile,
+        seed: int = 0,
+        method: str = "registration",
+        taught: Taught | None = None,
+        progress: Progress | None = None,
+        renderer: str | None = None,
+    ) -> None:
         require_kind(file, SensorFile, "a sensor is made of a SensorFile; load_sensor takes a name or a path")
         if method not in METHODS:
             raise UnknownOptionError("method", method, METHODS)
@@ -70,8 +77,10 @@ class Sensor:
         if taught is not None:
             require_kind(taught, Taught, "taught must be what another sensor's teach() returned")
             require_taught_for(taught, file, len(self.platform.nominal))
-        self._scene = [scene_body(body, section, file.stickers, stream) for stream, (body, section)
-                       in enumerate(((self.platform, file.platform), (self.base, file.base)))]
+        self._scene = [
+            scene_body(body, section, file.stickers, stream)
+            for stream, (body, section) in enumerate(((self.platform, file.platform), (self.base, file.base)))
+        ]
         self._obstacles: dict[str, Mesh] = {}
         self._asked_renderer = renderer or file.renderer
         self._taught = taught
@@ -93,18 +102,26 @@ class Sensor:
         """How stickers are looked for in windows."""
         limits = FitLimits(smallest_contrast=SMALLEST_STEP * self.noise.white_level)
         sizes = self._window_sizes
-        return DetectionSettings(sizes.window, sizes.fit, radius=self._file.stickers.radius,
-                                 detector=self._file.detection.detector, limits=limits, optics=self.optics,
-                                 centre_error_px=self._camera.centre_error_px(Quality()),
-                                 exposed_share=self.timing.exposure * self.timing.frame_rate)
+        return DetectionSettings(
+            sizes.window,
+            sizes.fit,
+            radius=self._file.stickers.radius,
+            detector=self._file.detection.detector,
+            limits=limits,
+            optics=self.optics,
+            centre_error_px=self._camera.centre_error_px(Quality()),
+            exposed_share=self.timing.exposure * self.timing.frame_rate,
+        )
 
     @cached_property
     def _window_sizes(self) -> WindowSizes:
         """Large and blurred stickers need a wider view."""
         radius, place = self._file.stickers.radius, self._camera_from_base
         at_target = radius_at(self.rig, place, np.array(self._file.rig.target), radius)
-        at_teaching = max(largest_radius(self.rig, place, self.base, radius),
-                          largest_radius(self.rig, place @ pose_to_transform(self.home), self.platform, radius))
+        at_teaching = max(
+            largest_radius(self.rig, place, self.base, radius),
+            largest_radius(self.rig, place @ pose_to_transform(self.home), self.platform, radius),
+        )
         blurred = self.optics.psf_px > 0.0 or self.timing.exposure > 0.0
         return window_sizes(at_target, at_teaching, self.optics.psf_px, blurred)
 
@@ -138,8 +155,9 @@ class Sensor:
         if self._taught is None:
             for body in (self.platform, self.base):
                 require_corner(body)
-            teacher = Teacher(self._camera, self.rig, self.noise, self.settings, self.platform, self.base,
-                              self._window_sizes.plan())
+            teacher = Teacher(
+                self._camera, self.rig, self.noise, self.settings, self.platform, self.base, self._window_sizes.plan()
+            )
             rng = np.random.default_rng([self._seed, TEACHING_STREAM])
             found = teacher.teach(self.name, self.home, rng, progress or self._progress)
             self._taught = replace(found, setup=setup_of(self._file))
@@ -180,8 +198,9 @@ class Sensor:
         self._true_rig = self._true_rig.shifted(side, (x, y))
         self._build_again()
 
-    def look(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None,
-             pose_rate: ArrayLike | None = None) -> StereoImages:
+    def look(
+        self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
+    ) -> StereoImages:
         """One exposure, drawn as far as it is read.
 
         Parameters: pose (6,) of the platform in the middle of the exposure; obstacles: name -> base_from_body (4,4),
@@ -191,13 +210,15 @@ class Sensor:
         """
         return self._camera.look(*self._checked(pose, obstacles), pose_rate=_checked_rate(pose_rate))
 
-    def capture(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None,
-                pose_rate: ArrayLike | None = None) -> StereoFrame:
+    def capture(
+        self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
+    ) -> StereoFrame:
         """Both whole images; parameters as in ``look``."""
         return self.look(pose, obstacles, pose_rate).full()
 
-    def measure(self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None,
-                pose_rate: ArrayLike | None = None) -> Measurement:
+    def measure(
+        self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
+    ) -> Measurement:
         """Measure the platform; parameters as in ``look``, they go to the renderer only.
 
         The measured pose is that in the middle of the exposure. A frame that drops out is lost without being looked at.
@@ -230,11 +251,19 @@ class Sensor:
         distance = float(np.linalg.norm(np.subtract(self._file.rig.position, self._file.rig.target)))
         drawable = Drawable([*patches, *self._obstacles.values()], owners, distance)
         formation = ImageFormation(self._renderer, drawable, self._file.stickers.background_level / 255.0, self.optics)
-        return VirtualStereoCamera(self._true_rig, self._camera_from_base, formation, self.noise, list(self._obstacles),
-                                   self._file.timing.exposure, self._file.camera.pattern_seed)
+        return VirtualStereoCamera(
+            self._true_rig,
+            self._camera_from_base,
+            formation,
+            self.noise,
+            list(self._obstacles),
+            self._file.timing.exposure,
+            self._file.camera.pattern_seed,
+        )
 
-    def _checked(self, pose: ArrayLike,
-                 obstacles: Mapping[str, Array] | None) -> tuple[Array, np.random.Generator, Mapping[str, Array]]:
+    def _checked(
+        self, pose: ArrayLike, obstacles: Mapping[str, Array] | None
+    ) -> tuple[Array, np.random.Generator, Mapping[str, Array]]:
         checked = checked_pose(pose)
         placed: dict[str, Array] = {}
         obstacles = {} if obstacles is None else obstacles
@@ -265,9 +294,15 @@ def _checked_rate(pose_rate: ArrayLike | None) -> Array | None:
     return finite_array(pose_rate, (6,), "a pose rate is six finite numbers, m/s and rad/s")
 
 
-def load_sensor(name: str | Path, seed: int = 0, method: str = "registration", taught: Taught | None = None,
-                progress: Progress | None = None, renderer: str | None = None,
-                changes: Mapping[str, Any] | None = None) -> Sensor:
+def load_sensor(
+    name: str | Path,
+    seed: int = 0,
+    method: str = "registration",
+    taught: Taught | None = None,
+    progress: Progress | None = None,
+    renderer: str | None = None,
+    changes: Mapping[str, Any] | None = None,
+) -> Sensor:
     """Sensor of a built-in name or of a TOML file.
 
     Parameters: seed of teaching and of the first run's noise; method "registration" or "planes"; taught: the result of

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from .errors import SensorFileError
+from cmmsim.errors import SensorFileError
 
 
 def dotted(changes: Mapping[str, Any], section: str = "") -> dict[str, Any]:
@@ -23,12 +23,14 @@ def require_keys(name: str | Path, changes: object) -> None:
     if changes is None:
         return
     if not isinstance(changes, Mapping):
-        raise SensorFileError(f"sensor file {name}: changes = {changes!r} must be given by key, as "
-                              "{'camera.dark_noise': 40.0}")
+        raise SensorFileError(
+            f"sensor file {name}: changes = {changes!r} must be given by key, as {{'camera.dark_noise': 40.0}}"
+        )
     for key, value in changes.items():
         if not isinstance(key, str):
-            raise SensorFileError(f"sensor file {name}: key {key!r} of the changes is no name such as "
-                                  "'camera.dark_noise'")
+            raise SensorFileError(
+                f"sensor file {name}: key {key!r} of the changes is no name such as 'camera.dark_noise'"
+            )
         if isinstance(value, Mapping):
             require_keys(name, value)
 

@@ -13,17 +13,18 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from .arguments import require_kind
-from .errors import SensorFileError, UnknownSensorError
-from .sensor_changes import change, require_keys
-from .sensor_schema import SensorFile
-from .sticker_ring import closest, ring_of_stickers
+from cmmsim.arguments import require_kind
+from cmmsim.errors import SensorFileError, UnknownSensorError
+from cmmsim.sensor_changes import change, require_keys
+from cmmsim.sensor_schema import SensorFile
+from cmmsim.sticker_ring import closest, ring_of_stickers
 
 
 def built_in_names() -> list[str]:
     """Names of the sensors that come with the package."""
-    return sorted(f.name[:-5] for f in resources.files(__package__).joinpath("sensors").iterdir()
-                  if f.name.endswith(".toml"))
+    return sorted(
+        f.name[:-5] for f in resources.files(__package__).joinpath("sensors").iterdir() if f.name.endswith(".toml")
+    )
 
 
 def sensor_text(name: str | Path) -> str:
@@ -72,8 +73,10 @@ def _with_stickers(file: SensorFile, source: str) -> SensorFile:
     for name, plane in file.platform.planes:
         places = ring_of_stickers(plane.stickers, count)
         if closest(places) < room:
-            raise SensorFileError(f"{source}: stickers.per_plane = {count} puts stickers {closest(places):.4f} m apart "
-                                  f"on plane {name}, two rings need {room:g} m")
+            raise SensorFileError(
+                f"{source}: stickers.per_plane = {count} puts stickers {closest(places):.4f} m apart "
+                f"on plane {name}, two rings need {room:g} m"
+            )
         planes[name] = plane.model_copy(update={"stickers": [(u, v) for u, v in places.tolist()]})
     platform = file.platform.model_copy(update={"planes": file.platform.planes.model_copy(update=planes)})
     return file.model_copy(update={"platform": platform})
@@ -91,10 +94,14 @@ def _content(name: str | Path) -> dict[str, Any]:
     except UnknownSensorError as error:
         raise SensorFileError(f"sensor file {name}: based_on: {error}") from error
     if "based_on" in base:
-        raise SensorFileError(f"sensor file {name}: based_on = {basis!r}, which is itself based on "
-                              f"{base['based_on']!r}: name a sensor whose file is complete")
-    merged = {key: {**base[key], **value} if isinstance(value, dict) and isinstance(base.get(key), dict) else value
-              for key, value in own.items()}
+        raise SensorFileError(
+            f"sensor file {name}: based_on = {basis!r}, which is itself based on "
+            f"{base['based_on']!r}: name a sensor whose file is complete"
+        )
+    merged = {
+        key: {**base[key], **value} if isinstance(value, dict) and isinstance(base.get(key), dict) else value
+        for key, value in own.items()
+    }
     return base | merged
 
 

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from .errors import SensorFileError
-from .pose import Array
+from cmmsim.errors import SensorFileError
+from cmmsim.pose import Array
 
 Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -38,8 +38,10 @@ class Timing(_Section):
     @model_validator(mode="after")
     def _possible(self) -> Timing:
         if self.exposure * self.frame_rate > 1.0 + 1e-9:
-            raise ValueError(f"exposure {self.exposure:g} s is longer than a frame of {self.frame_rate:g} Hz, "
-                             f"{1.0 / self.frame_rate:.4g} s")
+            raise ValueError(
+                f"exposure {self.exposure:g} s is longer than a frame of {self.frame_rate:g} Hz, "
+                f"{1.0 / self.frame_rate:.4g} s"
+            )
         if self.latency_jitter > self.latency:
             raise ValueError(f"latency_jitter {self.latency_jitter:g} s is larger than latency {self.latency:g} s")
         return self
@@ -108,8 +110,10 @@ class Camera(_Section):
     @model_validator(mode="after")
     def _black_below_white(self) -> Camera:
         if self.black_level >= 2**self.bit_depth - 1:
-            raise ValueError(f"black_level {self.black_level:g} must lie below the largest grey value of bit_depth "
-                             f"{self.bit_depth}, {2**self.bit_depth - 1}")
+            raise ValueError(
+                f"black_level {self.black_level:g} must lie below the largest grey value of bit_depth "
+                f"{self.bit_depth}, {2**self.bit_depth - 1}"
+            )
         return self
 
 
@@ -159,14 +163,19 @@ class Stickers(_Section):
     @model_validator(mode="after")
     def _bright_on_dark(self) -> Stickers:
         if self.ring_radius < self.radius:
-            raise ValueError(f"ring_radius {self.ring_radius:g} m must be at least radius {self.radius:g} m: "
-                             "stickers are found as bright discs within dark rings")
+            raise ValueError(
+                f"ring_radius {self.ring_radius:g} m must be at least radius {self.radius:g} m: "
+                "stickers are found as bright discs within dark rings"
+            )
         if self.sticker_level <= self.ring_level:
-            raise ValueError(f"sticker_level {self.sticker_level} must be above ring_level {self.ring_level}: "
-                             "stickers are found as bright discs within dark rings")
+            raise ValueError(
+                f"sticker_level {self.sticker_level} must be above ring_level {self.ring_level}: "
+                "stickers are found as bright discs within dark rings"
+            )
         if self.placement[0] > self.placement[1]:
-            raise ValueError(f"placement {list(self.placement)} m is the smallest and the largest distance, in this "
-                             "order")
+            raise ValueError(
+                f"placement {list(self.placement)} m is the smallest and the largest distance, in this order"
+            )
         return self
 
 

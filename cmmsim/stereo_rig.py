@@ -7,10 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from .camera import PinholeCamera
-from .distortion import NDArrayBool
-from .errors import ShapeError
-from .pose import Array, apply, invert
+from cmmsim.camera import PinholeCamera
+from cmmsim.distortion import NDArrayBool
+from cmmsim.errors import ShapeError
+from cmmsim.pose import Array, apply, invert
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,9 @@ class StereoRig:
 
     def project(self, points: Array) -> tuple[Array, NDArrayBool]:
         """Pixels (2, n, 2) of points (n, 3) in C for the left and right camera, and their validity (2, n)."""
-        seen = [camera.project(apply(move, points))
-                for camera, move in zip(self.cameras, self.from_camera, strict=True)]
+        seen = [
+            camera.project(apply(move, points)) for camera, move in zip(self.cameras, self.from_camera, strict=True)
+        ]
         return np.stack([s[0] for s in seen]), np.stack([s[1] for s in seen])
 
     def undistort(self, pixels: Array, covariances: Array) -> tuple[Array, Array, NDArrayBool]:
@@ -67,8 +68,12 @@ class StereoRig:
         """
         if self.ideal is self:
             return pixels, covariances, np.ones(pixels.shape[:2], dtype=bool)
-        ideal, found = (np.stack(values) for values in zip(
-            *(camera.undistort(side) for camera, side in zip(self.cameras, pixels, strict=True)), strict=True))
+        ideal, found = (
+            np.stack(values)
+            for values in zip(
+                *(camera.undistort(side) for camera, side in zip(self.cameras, pixels, strict=True)), strict=True
+            )
+        )
         jacobian = np.stack([c.distortion_jacobian(side) for c, side in zip(self.cameras, ideal, strict=True)])
         inverse = np.linalg.inv(np.where(found[..., None, None], jacobian, np.eye(2)))
         return ideal, inverse @ covariances @ inverse.swapaxes(-1, -2), found
@@ -76,8 +81,9 @@ class StereoRig:
     def shifted(self, side: int, shift_px: tuple[float, float]) -> StereoRig:
         """The rig with the principal point of camera ``side`` (0 left, 1 right) moved by (x, y) px."""
         camera = self.cameras[side]
-        moved = replace(camera, centre_x_px=camera.centre_x_px + shift_px[0],
-                        centre_y_px=camera.centre_y_px + shift_px[1])
+        moved = replace(
+            camera, centre_x_px=camera.centre_x_px + shift_px[0], centre_y_px=camera.centre_y_px + shift_px[1]
+        )
         return replace(self, left=moved) if side == 0 else replace(self, right=moved)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .pose import Array
+from cmmsim.pose import Array
 
 
 def ring_of_stickers(listed: Sequence[tuple[float, float]], count: int) -> Array:

@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from .ellipse_fit import EllipseFits, fit_ellipses
-from .errors import LostError
-from .noise import CameraNoise
-from .observation import LONGEST_SMEAR_PX, DetectionSettings, StickerWindows
-from .outlines import sticker_outlines
-from .pose import Array, apply, rotation_exp
-from .stereo_rig import StereoRig
+from cmmsim.ellipse_fit import EllipseFits, fit_ellipses
+from cmmsim.errors import LostError
+from cmmsim.noise import CameraNoise
+from cmmsim.observation import LONGEST_SMEAR_PX, DetectionSettings, StickerWindows
+from cmmsim.outlines import sticker_outlines
+from cmmsim.pose import Array, apply, rotation_exp
+from cmmsim.stereo_rig import StereoRig
 
 CHANCE = 1e-4  # of stickers at rest to be taken for streaks
 FEWEST = 8  # ellipses in both images together: four stickers
@@ -88,8 +88,9 @@ class _Ellipses:
         return float(np.linalg.norm(self.smears, axis=1).max())
 
 
-def find_streaks(read: StickerWindows, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings, places: Array,
-                 normals: Array) -> Streaks | None:
+def find_streaks(
+    read: StickerWindows, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings, places: Array, normals: Array
+) -> Streaks | None:
     """The movement during the exposure of the body whose stickers were read; None where none shows.
 
     Parameters: places (n,3) m and normals (n,3) of all stickers, body axes. Raises LostError where the streaks are
@@ -100,8 +101,9 @@ def find_streaks(read: StickerWindows, rig: StereoRig, noise: CameraNoise, setti
     limits = replace(settings.limits, largest_misfit=np.inf)  # a streak is no ellipse
 
     def fit(smears: Array) -> _Ellipses:
-        fits = fit_ellipses(windows, corners, noise, settings.fit_size, limits, psf_px=settings.optics.psf_px,
-                            smears=smears)
+        fits = fit_ellipses(
+            windows, corners, noise, settings.fit_size, limits, psf_px=settings.optics.psf_px, smears=smears
+        )
         squares, whiten = _squares(fits, settings.centre_error_px**2)
         added = _entries(_outer(smears)) / 3.0
         excess = squares - _entries(_square(at_rest.reshape(-1, 2, 2))) + added
@@ -128,8 +130,7 @@ def find_streaks(read: StickerWindows, rig: StereoRig, noise: CameraNoise, setti
 
 def drawn_out(length_px: float) -> str:
     """In words how long the streaks are, and how long they may be."""
-    return (f"the exposure draws stickers out over {length_px:.1f} px, at most {LONGEST_SMEAR_PX:.1f} px can be "
-            "measured")
+    return f"the exposure draws stickers out over {length_px:.1f} px, at most {LONGEST_SMEAR_PX:.1f} px can be measured"
 
 
 def _require_short(still: _Ellipses) -> None:
@@ -142,8 +143,9 @@ def _require_short(still: _Ellipses) -> None:
         raise LostError(drawn_out(length))
 
 
-def _movement_and_ellipses(still: _Ellipses, fit: Callable[[Array], _Ellipses],
-                           by_movement: Array) -> tuple[Array, _Ellipses] | None:
+def _movement_and_ellipses(
+    still: _Ellipses, fit: Callable[[Array], _Ellipses], by_movement: Array
+) -> tuple[Array, _Ellipses] | None:
     """The movement (6,) about the stickers' middle that explains all ellipses, or else most, and the ellipses fitted
     with it; None where too few are left."""
     best: tuple[Array, _Ellipses] | None = None
@@ -156,8 +158,7 @@ def _movement_and_ellipses(still: _Ellipses, fit: Callable[[Array], _Ellipses],
     return best
 
 
-def _settled(movement: Array, fit: Callable[[Array], _Ellipses],
-             by_movement: Array) -> tuple[Array, _Ellipses] | None:
+def _settled(movement: Array, fit: Callable[[Array], _Ellipses], by_movement: Array) -> tuple[Array, _Ellipses] | None:
     """A movement (6,) once fits of ellipses that move with it change it no more, and these ellipses.
 
     None where too few are left. One that is longer than can be measured is given back as it is, one far beyond cut.
@@ -178,8 +179,7 @@ def _settled(movement: Array, fit: Callable[[Array], _Ellipses],
 
 
 def _moved(movement: Array, middle: Array) -> Array:
-    """Transform (4,4) of a small movement (6,), shift and rotation vector, of a body about its point ``middle`` (3,).
-    """
+    """Transform (4,4) of a movement (6,), shift and rotation vector, of a body about the point ``middle`` (3,)."""
     transform = np.eye(4)
     transform[:3, :3] = rotation_exp(movement[3:])
     transform[:3, 3] = movement[:3] + middle - transform[:3, :3] @ middle
@@ -188,8 +188,13 @@ def _moved(movement: Array, middle: Array) -> Array:
 
 def _pixels_by_movement(rig: StereoRig, camera_from_body: Array, places: Array, middle: Array) -> Array:
     """Derivatives (2k, 2, 6) of the pixels of k stickers in both images by a movement about ``middle`` (3,)."""
-    columns = [np.subtract(*(rig.project(apply(camera_from_body @ _moved(sign * unit, middle), places))[0]
-                             for sign in (0.5, -0.5))) / UNIT for unit in UNIT * np.eye(6)]
+    columns = [
+        np.subtract(
+            *(rig.project(apply(camera_from_body @ _moved(sign * unit, middle), places))[0] for sign in (0.5, -0.5))
+        )
+        / UNIT
+        for unit in UNIT * np.eye(6)
+    ]
     return np.stack(columns, axis=-1).reshape(-1, 2, 6)
 
 
@@ -210,8 +215,10 @@ def _squares(fits: EllipseFits, systematic: float) -> tuple[Array, Array]:
     """Entries (k,3) px² of A A and the matrices (k,3,3) that whiten them; ``systematic`` px² of A that is not noise."""
     xx, xy, yy = _entries(fits.shapes).T
     zero = np.zeros_like(xx)
-    by_shape = np.stack([np.stack(row, axis=-1) for row in (
-        (2.0 * xx, 2.0 * xy, zero), (xy, xx + yy, xy), (zero, 2.0 * xy, 2.0 * yy))], axis=1)
+    by_shape = np.stack(
+        [np.stack(row, axis=-1) for row in ((2.0 * xx, 2.0 * xy, zero), (xy, xx + yy, xy), (zero, 2.0 * xy, 2.0 * yy))],
+        axis=1,
+    )
     spread = by_shape @ (fits.shape_covariances + systematic * np.eye(3)) @ by_shape.swapaxes(1, 2)
     return _entries(_square(fits.shapes)), np.linalg.inv(np.linalg.cholesky(spread))
 
@@ -243,8 +250,9 @@ def _linear_movement(by_movement: Array, excess: Array) -> Array:
     design = np.stack([products[:, 0, 0], products[:, 0, 1], products[:, 1, 1]], axis=1)
     weights, entries = np.ones((len(excess), 1)), np.zeros(len(rows))
     for _ in range(REWEIGHTED):
-        entries = np.linalg.lstsq((weights[..., None] * design).reshape(-1, len(rows)), (weights * excess).ravel(),
-                                  rcond=SMALLEST_SHARE)[0]
+        entries = np.linalg.lstsq(
+            (weights[..., None] * design).reshape(-1, len(rows)), (weights * excess).ravel(), rcond=SMALLEST_SHARE
+        )[0]
         left = ((excess - design @ entries) ** 2).sum(axis=1, keepdims=True)
         weights = 1.0 / (1.0 + left / max(float(np.median(left)), TINY_PX2))
     found = np.zeros((len(scale), len(scale)))

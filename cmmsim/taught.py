@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .errors import ShapeError
-from .pose import Array, compose_covariance, pose_covariance, pose_to_transform, skew
+from cmmsim.errors import ShapeError
+from cmmsim.pose import Array, compose_covariance, pose_covariance, pose_to_transform, skew
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,14 @@ class Taught:
 
     def __post_init__(self) -> None:
         stickers, base_stickers = len(self.platform_places), len(self.base_places)
-        shapes = {"base_from_camera": (4, 4), "base_covariance": (6, 6), "platform_places": (stickers, 3),
-                  "place_covariances": (stickers, 3, 3), "platform_covariance": (6, 6),
-                  "base_places": (base_stickers, 3)}
+        shapes = {
+            "base_from_camera": (4, 4),
+            "base_covariance": (6, 6),
+            "platform_places": (stickers, 3),
+            "place_covariances": (stickers, 3, 3),
+            "platform_covariance": (6, 6),
+            "base_places": (base_stickers, 3),
+        }
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise ShapeError(f"taught {name} must have the shape {shape}, got {getattr(self, name).shape}")

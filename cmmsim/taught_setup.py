@@ -8,10 +8,10 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from .errors import TeachingError
-from .sensor_changes import dotted
-from .sensor_schema import SensorFile
-from .taught import Taught
+from cmmsim.errors import TeachingError
+from cmmsim.sensor_changes import dotted
+from cmmsim.sensor_schema import SensorFile
+from cmmsim.taught import Taught
 
 SHOWN_CHANGES, SHOWN_CHARACTERS = 3, 40
 
@@ -32,11 +32,14 @@ def require_taught_for(taught: Taught, file: SensorFile, stickers: int) -> None:
     if not taught.setup and taught.sensor_name != file.name:
         raise TeachingError(f"taught belongs to sensor {taught.sensor_name!r}, not to {file.name!r}")
     if taught.setup and taught.setup != setup_of(file):
-        raise TeachingError(f"taught belongs to sensor {taught.sensor_name!r} set up differently: "
-                            f"{_changes(taught.setup, setup_of(file))}; teach this sensor anew")
+        raise TeachingError(
+            f"taught belongs to sensor {taught.sensor_name!r} set up differently: "
+            f"{_changes(taught.setup, setup_of(file))}; teach this sensor anew"
+        )
     if len(taught.platform_places) != stickers:
-        raise TeachingError(f"taught holds {len(taught.platform_places)} stickers of the platform, sensor "
-                            f"{file.name!r} has {stickers}")
+        raise TeachingError(
+            f"taught holds {len(taught.platform_places)} stickers of the platform, sensor {file.name!r} has {stickers}"
+        )
 
 
 def _changes(there: str, here: str) -> str:
@@ -51,4 +54,4 @@ def _changes(there: str, here: str) -> str:
 def _short(value: Any) -> str:
     """A value on one line, cut where it is long."""
     text = "nothing" if value is None else json.dumps(value)
-    return text if len(text) <= SHOWN_CHARACTERS else f"{text[:SHOWN_CHARACTERS - 3]}..."
+    return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."

@@ -17,19 +17,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .detectors import DEFAULT_DETECTOR
-from .errors import LostError, TeachingError
-from .estimator import FEWEST_NOMINAL, NOMINAL_TOLERANCE, points_in_frame
-from .labelling import find_layout
-from .marked_body import MarkedBody
-from .noise import CameraNoise
-from .observation import DetectionSettings, StickerObservation, observe
-from .pose import Array, apply, compose_covariance, invert
-from .pose_methods import by_planes
-from .registration import register
-from .stereo_rig import StereoRig
-from .taught import Taught
-from .virtual_camera import Quality, VirtualStereoCamera
+from cmmsim.detectors import DEFAULT_DETECTOR
+from cmmsim.errors import LostError, TeachingError
+from cmmsim.estimator import FEWEST_NOMINAL, NOMINAL_TOLERANCE, points_in_frame
+from cmmsim.labelling import find_layout
+from cmmsim.marked_body import MarkedBody
+from cmmsim.noise import CameraNoise
+from cmmsim.observation import DetectionSettings, StickerObservation, observe
+from cmmsim.pose import Array, apply, compose_covariance, invert
+from cmmsim.pose_methods import by_planes
+from cmmsim.registration import register
+from cmmsim.stereo_rig import StereoRig
+from cmmsim.taught import Taught
+from cmmsim.virtual_camera import Quality, VirtualStereoCamera
 
 Progress = Callable[[int, int], None]
 SHIFT, TURN = 0.008, 0.03  # m, rad: reach of the teaching path about home
@@ -62,8 +62,9 @@ class Teacher:
     base: MarkedBody
     plan: TeachingPlan = field(default_factory=TeachingPlan)
 
-    def teach(self, sensor_name: str, home: Array, rng: np.random.Generator,
-              progress: Progress | None = None) -> Taught:
+    def teach(
+        self, sensor_name: str, home: Array, rng: np.random.Generator, progress: Progress | None = None
+    ) -> Taught:
         """Teach base and platform around the pose ``home`` (6,). Raises TeachingError."""
         steps = self.plan.poses + 2
         report = progress or (lambda done, total: None)
@@ -71,11 +72,14 @@ class Teacher:
         try:
             path = teaching_path(home, self.plan.poses)
             points = points_in_frame(self.camera.look(path[0], rng).full(), self.rig, self.noise, self.settings)
-            start = [find_layout(body.nominal, points, NOMINAL_TOLERANCE, FEWEST_NOMINAL, body.name)[0]
-                     for body in (self.base, self.platform)]
+            start = [
+                find_layout(body.nominal, points, NOMINAL_TOLERANCE, FEWEST_NOMINAL, body.name)[0]
+                for body in (self.base, self.platform)
+            ]
             report(1, steps)
-            base = self._look_at(self.base, start[0], self.base.nominal, path[0], rng, self.plan.base,
-                                 self.plan.base_window)
+            base = self._look_at(
+                self.base, start[0], self.base.nominal, path[0], rng, self.plan.base, self.plan.base_window
+            )
             camera_from_base, base_covariance, base = by_planes(base, self.base, _towards(self.base, start[0]))
             report(2, steps)
             seen = self._platform_views(start[1], path, rng, lambda k: report(k + 2, steps))
@@ -83,22 +87,52 @@ class Teacher:
             raise TeachingError(f"teaching failed: {error}") from error
         base_from_camera = invert(camera_from_base)
         places, place_covariances, platform_covariance = self._platform_places(seen)
-        return Taught(sensor_name, base_from_camera, compose_covariance(base_from_camera, base_covariance), places,
-                      place_covariances, platform_covariance, apply(base_from_camera, base.points))
+        return Taught(
+            sensor_name,
+            base_from_camera,
+            compose_covariance(base_from_camera, base_covariance),
+            places,
+            place_covariances,
+            platform_covariance,
+            apply(base_from_camera, base.points),
+        )
 
-    def _look_at(self, body: MarkedBody, expected: Array, places: Array, pose: Array, rng: np.random.Generator,
-                 quality: Quality, window_size: int) -> StickerObservation:
+    def _look_at(
+        self,
+        body: MarkedBody,
+        expected: Array,
+        places: Array,
+        pose: Array,
+        rng: np.random.Generator,
+        quality: Quality,
+        window_size: int,
+    ) -> StickerObservation:
         """All stickers of a body from averaged exposures. Raises LostError when one is missing."""
         limits = replace(self.settings.limits, largest_misfit=np.inf)
         noise = replace(self.noise, frames=quality.exposures)
-        settings = replace(self.settings, window_size=window_size, limits=limits, largest_ray_gap=np.inf,
-                           detector=DEFAULT_DETECTOR, centre_error_px=self.camera.centre_error_px(quality))
-        seen = observe(self.camera.look(pose, rng, quality=quality), self.rig, noise, settings, expected, places,
-                       body.sticker_normals)
+        settings = replace(
+            self.settings,
+            window_size=window_size,
+            limits=limits,
+            largest_ray_gap=np.inf,
+            detector=DEFAULT_DETECTOR,
+            centre_error_px=self.camera.centre_error_px(quality),
+        )
+        seen = observe(
+            self.camera.look(pose, rng, quality=quality),
+            self.rig,
+            noise,
+            settings,
+            expected,
+            places,
+            body.sticker_normals,
+        )
         if len(seen.index) < len(places):
             missing = np.setdiff1d(np.arange(len(places)), seen.index)
-            raise LostError(f"{body.name}: stickers {', '.join(body.sticker_ids[missing])} not seen by both cameras"
-                            + self._outside(body, missing, apply(expected, places)))
+            raise LostError(
+                f"{body.name}: stickers {', '.join(body.sticker_ids[missing])} not seen by both cameras"
+                + self._outside(body, missing, apply(expected, places))
+            )
         return seen
 
     def _outside(self, body: MarkedBody, missing: NDArray[np.int_], points: Array) -> str:
@@ -106,8 +140,9 @@ class Teacher:
         outside = missing[~np.all(self.rig.project(points[missing])[1], axis=0)]
         return f"; {', '.join(body.sticker_ids[outside])} lie outside of an image" if len(outside) else ""
 
-    def _platform_views(self, rough: Array, path: Array, rng: np.random.Generator,
-                        report: Callable[[int], None]) -> list[StickerObservation]:
+    def _platform_views(
+        self, rough: Array, path: Array, rng: np.random.Generator, report: Callable[[int], None]
+    ) -> list[StickerObservation]:
         """Observations along the teaching path, each expected where the ones before lead to."""
         places, last, step, seen = self.platform.nominal, rough, np.eye(4), []
         for k, pose in enumerate(path):
@@ -128,8 +163,10 @@ class Teacher:
         gaps = np.linalg.norm(apply(camera_from_body, places) - seen.points, axis=1)
         if gaps.max() > LARGEST_GAP:
             worst = self.platform.sticker_ids[gaps.argmax()]
-            raise LostError(f"{self.platform.name}: sticker {worst} is {gaps.max() * 1e6:.0f} um off its place, "
-                            f"at most {LARGEST_GAP * 1e6:.0f} um; it may be partly hidden")
+            raise LostError(
+                f"{self.platform.name}: sticker {worst} is {gaps.max() * 1e6:.0f} um off its place, "
+                f"at most {LARGEST_GAP * 1e6:.0f} um; it may be partly hidden"
+            )
 
     def _platform_places(self, seen: list[StickerObservation]) -> tuple[Array, Array, Array]:
         """Sticker places (n,3), their covariances (n,3,3) and the covariance (6,6) of the platform frame."""
@@ -141,8 +178,11 @@ class Teacher:
         mean_from_body, frame_covariance, _ = by_planes(whole, self.platform, towards)
         body_from_mean = invert(mean_from_body)
         turn = body_from_mean[:3, :3]
-        return (apply(body_from_mean, mean), turn @ covariances @ turn.T,
-                compose_covariance(body_from_mean, frame_covariance))
+        return (
+            apply(body_from_mean, mean),
+            turn @ covariances @ turn.T,
+            compose_covariance(body_from_mean, frame_covariance),
+        )
 
 
 def teaching_path(home: Array, count: int) -> Array:

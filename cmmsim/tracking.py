@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from .arguments import require_kind
-from .errors import LostError
-from .estimator import PoseEstimator, require_fitting
-from .images import StereoFrame, StereoImages, readable
-from .measurement import Measurement, lost_measurement
-from .pose import Array, invert, rotation_exp, rotation_log
+from cmmsim.arguments import require_kind
+from cmmsim.errors import LostError
+from cmmsim.estimator import PoseEstimator, require_fitting
+from cmmsim.images import StereoFrame, StereoImages, readable
+from cmmsim.measurement import Measurement, lost_measurement
+from cmmsim.pose import Array, invert, rotation_exp, rotation_log
 
 # A tracked frame that shows less than this share of the stickers seen before is searched as a whole too: most windows
 # may have been laid beside their stickers.

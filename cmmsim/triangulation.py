@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from .errors import ShapeError
-from .pose import Array
-from .stereo_rig import StereoRig
+from cmmsim.errors import ShapeError
+from cmmsim.pose import Array
+from cmmsim.stereo_rig import StereoRig
 
 STEPS = 2  # of Gauss-Newton after the linear start
 
@@ -24,18 +24,20 @@ class StereoPoints:
     ray_gap: Array
 
 
-def triangulate(rig: StereoRig, left: Array, right: Array, left_covariances: Array,
-                right_covariances: Array) -> StereoPoints:
+def triangulate(
+    rig: StereoRig, left: Array, right: Array, left_covariances: Array, right_covariances: Array
+) -> StereoPoints:
     """Points seen at ideal pixels ``left`` and ``right`` (n, 2) with covariances (n, 2, 2), px²."""
     if left.shape != right.shape or left.ndim != 2 or left.shape[1] != 2:
         raise ShapeError(f"left and right pixels must both be (n,2), got {left.shape} and {right.shape}")
-    from .point_kernel import refine_points  # compiles, so it is loaded where it is first needed
+    from cmmsim.point_kernel import refine_points  # compiles, so it is loaded where it is first needed
 
     points = np.ascontiguousarray(linear_triangulation(rig, left, right))
     weights = np.linalg.inv(np.stack([left_covariances, right_covariances], axis=1))
     covariances, gaps = np.empty((len(points), 3, 3)), np.empty(len(points))
-    refine_points(np.stack(rig.projection_matrices), np.stack([left, right], axis=1), weights, STEPS, points,
-                  covariances, gaps)
+    refine_points(
+        np.stack(rig.projection_matrices), np.stack([left, right], axis=1), weights, STEPS, points, covariances, gaps
+    )
     return StereoPoints(points, covariances, gaps)
 
 
@@ -44,6 +46,7 @@ def linear_triangulation(rig: StereoRig, left: Array, right: Array) -> Array:
     if len(left) == 0:
         return np.zeros((0, 3))
     first, second = rig.projection_matrices
-    homogeneous = cv2.triangulatePoints(first, second, np.ascontiguousarray(left.T, dtype=np.float64),
-                                        np.ascontiguousarray(right.T, dtype=np.float64))
+    homogeneous = cv2.triangulatePoints(
+        first, second, np.ascontiguousarray(left.T, dtype=np.float64), np.ascontiguousarray(right.T, dtype=np.float64)
+    )
     return (homogeneous[:3] / homogeneous[3]).T

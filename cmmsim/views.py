@@ -9,9 +9,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import PinholeCamera
-from .pose import Array
-from .scene import Patch
+from cmmsim.camera import PinholeCamera
+from cmmsim.pose import Array
+from cmmsim.scene import Patch
 
 NEAR, FAR = 0.2, 10.0  # m
 
@@ -82,7 +82,7 @@ class Drawable:
 
         Parameters: camera_from_bodies (b,4,4); bounds (n,4): lowest x, y and highest x, y, px.
         """
-        from .reaching_kernel import boxes_reaching  # compiles, so it is loaded where it is first needed
+        from cmmsim.reaching_kernel import boxes_reaching  # compiles, so it is loaded where it is first needed
 
         reaching = np.empty((len(bounds), len(self.patches)), dtype=bool)
         boxes_reaching(camera.matrix @ camera_from_bodies[:, :3], self.body_index, self.boxes, bounds, NEAR, reaching)

@@ -9,15 +9,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from .fixed_pattern import FixedPattern, draw_pattern
-from .image_formation import ImageFormation, Side
-from .images import StereoFrame, Windows
-from .motion_blur import sub_frame_poses
-from .noise import CameraNoise
-from .pose import Array, apply, pose_to_transform
-from .scene import DiscStack
-from .stereo_rig import StereoRig
-from .whole_image import whole_image
+from cmmsim.fixed_pattern import FixedPattern, draw_pattern
+from cmmsim.image_formation import ImageFormation, Side
+from cmmsim.images import StereoFrame, Windows
+from cmmsim.motion_blur import sub_frame_poses
+from cmmsim.noise import CameraNoise
+from cmmsim.pose import Array, apply, pose_to_transform
+from cmmsim.scene import DiscStack
+from cmmsim.stereo_rig import StereoRig
+from cmmsim.whole_image import whole_image
 
 SUPERSAMPLING = 9
 
@@ -38,14 +38,28 @@ class VirtualStereoCamera:
     what differs from pixel to pixel.
     """
 
-    def __init__(self, rig: StereoRig, camera_from_base: Array, formation: ImageFormation, noise: CameraNoise,
-                 obstacle_names: Sequence[str] = (), exposure: float = 0.0, pattern_seed: int = 0) -> None:
+    def __init__(
+        self,
+        rig: StereoRig,
+        camera_from_base: Array,
+        formation: ImageFormation,
+        noise: CameraNoise,
+        obstacle_names: Sequence[str] = (),
+        exposure: float = 0.0,
+        pattern_seed: int = 0,
+    ) -> None:
         self._rig, self._noise, self._formation = rig, noise, formation
         self._obstacle_names, self._exposure, self._pattern_seed = tuple(obstacle_names), exposure, pattern_seed
         self._from_base = [move @ camera_from_base for move in rig.from_camera]
 
-    def look(self, pose: Array, rng: np.random.Generator, obstacles: Mapping[str, Array] | None = None,
-             quality: Quality | None = None, pose_rate: Array | None = None) -> LiveImages:
+    def look(
+        self,
+        pose: Array,
+        rng: np.random.Generator,
+        obstacles: Mapping[str, Array] | None = None,
+        quality: Quality | None = None,
+        pose_rate: Array | None = None,
+    ) -> LiveImages:
         """One exposure of the platform and of the obstacles at base_from_body (4,4) each.
 
         ``pose`` (6,) of the platform in the middle of the exposure, ``pose_rate`` (6,) its time derivative; obstacles
@@ -57,8 +71,9 @@ class VirtualStereoCamera:
         moments = [self._placed(pose_to_transform(p), obstacles or {}) for p in poses]
         return LiveImages(self, moments, rng, quality or Quality())
 
-    def radiance(self, placed: Sequence[Array], corners: NDArray[np.int_], size: int,
-                 supersampling: int) -> NDArray[np.float32]:
+    def radiance(
+        self, placed: Sequence[Array], corners: NDArray[np.int_], size: int, supersampling: int
+    ) -> NDArray[np.float32]:
         """Radiance (2, n, size, size) of windows at ``corners`` (2, n, 2) in the left and right image.
 
         ``placed``: camera_from_body (b,4,4) of all bodies for the left and the right camera.
@@ -85,40 +100,72 @@ class VirtualStereoCamera:
 
     @cached_property
     def _patterns(self) -> Sequence[FixedPattern]:
-        return [draw_pattern((camera.height, camera.width), self._noise.prnu, self._noise.dsnu,
-                             np.random.default_rng([self._pattern_seed, side]))
-                for side, camera in enumerate(self._rig.cameras)]
+        return [
+            draw_pattern(
+                (camera.height, camera.width),
+                self._noise.prnu,
+                self._noise.dsnu,
+                np.random.default_rng([self._pattern_seed, side]),
+            )
+            for side, camera in enumerate(self._rig.cameras)
+        ]
 
     def _placed(self, base_from_platform: Array, obstacles: Mapping[str, Array]) -> list[Array]:
         """camera_from_body (b,4,4) of all bodies for the left and the right camera."""
         absent = np.diag([1.0, 1.0, 1.0, 1.0])
         absent[2, 3] = -1e3  # an obstacle without a place stands far behind both cameras
-        return [np.stack([c @ p for p in (base_from_platform, np.eye(4))]
-                         + [c @ obstacles[n] if n in obstacles else absent for n in self._obstacle_names])
-                for c in self._from_base]
+        return [
+            np.stack(
+                [c @ p for p in (base_from_platform, np.eye(4))]
+                + [c @ obstacles[n] if n in obstacles else absent for n in self._obstacle_names]
+            )
+            for c in self._from_base
+        ]
 
     def _sticker_pixels(self, pose: Array) -> Array:
         """Pixels (2, n, 2) of the platform's stickers."""
         drawable = self._formation.drawable
-        places = np.array([patch.discs[-1].centre for patch, body in
-                           zip(drawable.patches, drawable.body_index, strict=True)
-                           if body == 0 and isinstance(patch, DiscStack)])
-        return np.stack([camera.project(apply(c @ pose_to_transform(pose), places))[0]
-                         for camera, c in zip(self._rig.cameras, self._from_base, strict=True)])
+        places = np.array(
+            [
+                patch.discs[-1].centre
+                for patch, body in zip(drawable.patches, drawable.body_index, strict=True)
+                if body == 0 and isinstance(patch, DiscStack)
+            ]
+        )
+        return np.stack(
+            [
+                camera.project(apply(c @ pose_to_transform(pose), places))[0]
+                for camera, c in zip(self._rig.cameras, self._from_base, strict=True)
+            ]
+        )
 
 
 class LiveImages:
     """One exposure, drawn as far as it is read; moments: the placed bodies at each of its sub-frames."""
 
-    def __init__(self, camera: VirtualStereoCamera, moments: Sequence[Sequence[Array]], rng: np.random.Generator,
-                 quality: Quality) -> None:
+    def __init__(
+        self,
+        camera: VirtualStereoCamera,
+        moments: Sequence[Sequence[Array]],
+        rng: np.random.Generator,
+        quality: Quality,
+    ) -> None:
         self._camera, self._moments, self._rng, self._quality = camera, moments, rng, quality
 
     def full(self) -> StereoFrame:
         """Both whole images."""
-        return StereoFrame(*(self._camera.noise.expose(
-            self._camera.whole_exposure(side, [placed[side] for placed in self._moments], self._quality.supersampling),
-            self._rng, pattern) for side, pattern in enumerate(self._camera.patterns())))
+        return StereoFrame(
+            *(
+                self._camera.noise.expose(
+                    self._camera.whole_exposure(
+                        side, [placed[side] for placed in self._moments], self._quality.supersampling
+                    ),
+                    self._rng,
+                    pattern,
+                )
+                for side, pattern in enumerate(self._camera.patterns())
+            )
+        )
 
     def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
         """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x, y)."""

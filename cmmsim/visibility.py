@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import LostError
-from .marked_body import MarkedBody, marked_body
-from .observation import DetectionSettings, faces_camera, observe
-from .pose import Array, apply, compose_covariance, invert, pose_covariance, pose_to_transform
-from .pose_methods import by_planes, by_registration
-from .rig_from_file import rig_from_file
-from .sensor import load_sensor
-from .sensor_file import read_sensor_file
-from .stereo_rig import StereoRig
+from cmmsim.errors import LostError
+from cmmsim.marked_body import MarkedBody, marked_body
+from cmmsim.observation import DetectionSettings, faces_camera, observe
+from cmmsim.pose import Array, apply, compose_covariance, invert, pose_covariance, pose_to_transform
+from cmmsim.pose_methods import by_planes, by_registration
+from cmmsim.rig_from_file import rig_from_file
+from cmmsim.sensor import load_sensor
+from cmmsim.sensor_file import read_sensor_file
+from cmmsim.stereo_rig import StereoRig
 
 EDGE_PX = DetectionSettings().window_size
 
@@ -48,8 +48,9 @@ class SightLines:
             move = from_base @ base_from_platform
             places, normals = apply(move, self.platform.nominal), self.platform.sticker_normals @ move[:3, :3].T
             pixels, ahead = camera.project(places)
-            inside = np.all((pixels >= EDGE_PX) & (pixels <= (camera.width - 1 - EDGE_PX,
-                                                              camera.height - 1 - EDGE_PX)), axis=1)
+            inside = np.all(
+                (pixels >= EDGE_PX) & (pixels <= (camera.width - 1 - EDGE_PX, camera.height - 1 - EDGE_PX)), axis=1
+            )
             seen &= ahead & inside & faces_camera(places, normals)
         return seen
 
@@ -64,8 +65,13 @@ def sight_lines(name: str | Path, changes: Mapping[str, Any] | None = None) -> S
     return SightLines(marked_body("platform", file.platform), rig, camera_from_base)
 
 
-def expected_covariance(name: str | Path, pose: ArrayLike, method: str = "registration", seed: int = 0,
-                        changes: Mapping[str, Any] | None = None) -> Array:
+def expected_covariance(
+    name: str | Path,
+    pose: ArrayLike,
+    method: str = "registration",
+    seed: int = 0,
+    changes: Mapping[str, Any] | None = None,
+) -> Array:
     """Covariance (6,6) that a sensor would state for a pose (6,), m and rad, from one exposure drawn without OpenGL.
 
     Taken as taught without error. Raises LostError where the stickers do not suffice, and what `load_sensor` raises.
@@ -73,8 +79,15 @@ def expected_covariance(name: str | Path, pose: ArrayLike, method: str = "regist
     sensor, sight = load_sensor(name, seed, method, renderer="analytic", changes=changes), sight_lines(name, changes)
     base_from_platform = pose_to_transform(pose)
     expected = sight.camera_from_base @ base_from_platform
-    seen = observe(sensor.look(pose), sight.rig, sensor.noise, sensor.settings, expected, sight.platform.nominal,
-                   sight.platform.sticker_normals)
+    seen = observe(
+        sensor.look(pose),
+        sight.rig,
+        sensor.noise,
+        sensor.settings,
+        expected,
+        sight.platform.nominal,
+        sight.platform.sticker_normals,
+    )
     if method == "planes":
         covariance = by_planes(seen, sight.platform, sight.platform.normals @ expected[:3, :3].T)[1]
     else:

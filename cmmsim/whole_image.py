@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import PinholeCamera
-from .exposed_windows import exposed_windows
-from .image_formation import ImageFormation
-from .pose import Array
-from .views import View
+from cmmsim.camera import PinholeCamera
+from cmmsim.exposed_windows import exposed_windows
+from cmmsim.image_formation import ImageFormation
+from cmmsim.pose import Array
+from cmmsim.views import View
 
 PASTED_SIZE = 24  # px side of the finely drawn window around a bright spot
 LARGEST_PASTED_SIZE = 96  # px: a larger spot is left coarse
@@ -22,20 +22,22 @@ TILE = 64  # px side of the pieces that are bent and blurred at a time
 COARSE = 2  # drawn samples a pixel and axis away from bright spots
 
 
-def whole_image(formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array],
-                supersampling: int) -> NDArray[np.float32]:
+def whole_image(
+    formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array], supersampling: int
+) -> NDArray[np.float32]:
     """Mean radiance (height, width) of one camera's image over moments with bodies (b,4,4) each."""
     image, bright = _coarse(formation, camera, moments)
     corners, size = _spots(bright, fixed_size=len(moments) == 1 and formation.draws_pixels([camera]))
     if len(corners):
         fine = exposed_windows(formation, camera, moments, corners, size, supersampling)[0]
         for (x, y), window in zip(corners, fine, strict=True):
-            image[y:y + size, x:x + size] = window
+            image[y : y + size, x : x + size] = window
     return image if formation.optics.vignetting == 0.0 else image * _illumination(formation, camera)
 
 
-def _coarse(formation: ImageFormation, camera: PinholeCamera,
-            moments: Sequence[Array]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _coarse(
+    formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Mean radiance (height, width) with COARSE² drawn samples a pixel, and where it is bright at any moment."""
     if len(moments) == 1 and formation.draws_pixels([camera]):
         view = View(camera.ideal, moments[0], (0, 0), (camera.width, camera.height))
@@ -45,9 +47,11 @@ def _coarse(formation: ImageFormation, camera: PinholeCamera,
     x, y = np.meshgrid(TILE * np.arange(columns), TILE * np.arange(rows))
     corners = np.column_stack([x.ravel(), y.ravel()])
     mean, brightest = (
-        tiles.reshape(rows, columns, TILE, TILE).swapaxes(1, 2).reshape(rows * TILE, columns * TILE)
-        [:camera.height, :camera.width]
-        for tiles in exposed_windows(formation, camera, moments, corners, TILE, COARSE, sub_pixels=1))
+        tiles.reshape(rows, columns, TILE, TILE)
+        .swapaxes(1, 2)
+        .reshape(rows * TILE, columns * TILE)[: camera.height, : camera.width]
+        for tiles in exposed_windows(formation, camera, moments, corners, TILE, COARSE, sub_pixels=1)
+    )
     return mean, brightest > BRIGHT
 
 

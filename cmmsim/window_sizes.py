@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .marked_body import MarkedBody
-from .observation import faces_camera
-from .outlines import sticker_outlines
-from .pose import Array, apply
-from .stereo_rig import StereoRig
-from .teaching import TeachingPlan
+from cmmsim.marked_body import MarkedBody
+from cmmsim.observation import faces_camera
+from cmmsim.outlines import sticker_outlines
+from cmmsim.pose import Array, apply
+from cmmsim.stereo_rig import StereoRig
+from cmmsim.teaching import TeachingPlan
 
 ROOM = 1.35  # half the side of what is fitted over a sticker's radius at the rig's target
 SMALLEST_ROOM_PX = 0.7  # on each side of the largest sticker at teaching: half a pixel goes into rounding
@@ -36,8 +36,10 @@ class WindowSizes:
     def plan(self) -> TeachingPlan:
         """Teaching with windows that have grown alike."""
         plan = TeachingPlan()
-        sizes = {name: 2 * round(0.5 * self.growth * getattr(plan, name))
-                 for name in ("base_window", "first_window", "platform_window")}
+        sizes = {
+            name: 2 * round(0.5 * self.growth * getattr(plan, name))
+            for name in ("base_window", "first_window", "platform_window")
+        }
         return replace(plan, **sizes)
 
 
@@ -55,8 +57,10 @@ def window_sizes(target_px: float, largest_px: float, psf_px: float, blurred: bo
 def radius_at(rig: StereoRig, camera_from_base: Array, target: Array, radius: float) -> float:
     """Radius in px of a sticker of ``radius`` m that faces the nearer camera at ``target`` (3,) m, base axes."""
     distances = [float(np.linalg.norm(apply(move @ camera_from_base, target))) for move in rig.from_camera]
-    return max(radius * float(camera.focal_lengths.max()) / distance
-               for camera, distance in zip(rig.cameras, distances, strict=True))
+    return max(
+        radius * float(camera.focal_lengths.max()) / distance
+        for camera, distance in zip(rig.cameras, distances, strict=True)
+    )
 
 
 def largest_radius(rig: StereoRig, camera_from_body: Array, body: MarkedBody, radius: float) -> float:

@@ -14,9 +14,7 @@ Shape = tuple[int | Literal["N"], ...]
 ErrorClass = type[DynamicsError]
 
 
-def floats(
-    name: str, value: object, *shapes: Shape, error: ErrorClass = ShapeError, finite: bool = True
-) -> np.ndarray:
+def floats(name: str, value: object, *shapes: Shape, error: ErrorClass = ShapeError, finite: bool = True) -> np.ndarray:
     """The value as float64 of one of the shapes, in which "N" stands for any length; a float64 array is not copied.
 
     Raises `error`, which names the array with what was got, or with the place of an entry that is not finite.

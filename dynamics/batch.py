@@ -41,9 +41,7 @@ def simulate_batch(
     count = max(lengths)
     if not set(lengths) <= {1, count}:
         of_starts = "" if starts is None else f" and {len(begins)} start states"
-        raise SimulationError(
-            f"{len(vectors)} parameter vectors and {len(given)} references{of_starts} do not pair up"
-        )
+        raise SimulationError(f"{len(vectors)} parameter vectors and {len(given)} references{of_starts} do not pair up")
 
     def one(index: int) -> ClosedLoopRun:
         return simulate(

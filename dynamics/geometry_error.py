@@ -24,9 +24,7 @@ def with_geometry_error(robot: Robot, std: float, rng: np.random.Generator) -> R
         return robot
     base, platform = std * rng.standard_normal((2, LEGS, 3))
     nominal = robot.geometry
-    moved = replace(
-        nominal, base_joints=nominal.base_joints + base, platform_joints=nominal.platform_joints + platform
-    )
+    moved = replace(nominal, base_joints=nominal.base_joints + base, platform_joints=nominal.platform_joints + platform)
     try:
         geometry = _zeroed_at_home(moved)
     except RobotFileError as error:

@@ -49,9 +49,7 @@ def leg_to(geometry: Rss6Geometry, leg: int, joint_position: ca.SX) -> LegVector
     sine = (across * chord + along * root) * inverse
     crank = geometry.crank_length * (cosine * zero + sine * np.cross(axis, zero))
     link = joint_position - geometry.base_joints[leg] - crank
-    return LegVectors(
-        ca.atan2(sine, cosine), ca.SX(axis), crank, link, geometry.crank_length, geometry.link_length
-    )
+    return LegVectors(ca.atan2(sine, cosine), ca.SX(axis), crank, link, geometry.crank_length, geometry.link_length)
 
 
 def loop_closure(geometry: Rss6Geometry, pose: ca.SX, angles: ca.SX) -> tuple[ca.SX, ca.SX]:

@@ -95,9 +95,7 @@ def check_elasticity(problem: LoopProblem) -> None:
         return
     if start.motor_angle is None or start.motor_rate is None:
         raise SimulationError("a start with elastic joints needs motor_angle and motor_rate")
-    steps = elasticity.steps_needed(
-        problem.robot, problem.parameters, start.pose, problem.period, settings.friction
-    )
+    steps = elasticity.steps_needed(problem.robot, problem.parameters, start.pose, problem.period, settings.friction)
     if settings.steps_per_frame < steps:
         raise SimulationError(
             f"steps_per_frame is {settings.steps_per_frame}, must be >= {steps} to follow joints with "

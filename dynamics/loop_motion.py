@@ -37,9 +37,7 @@ class State:
 
     def moved(self, slope: "State", h: float) -> "State":
         """The state after a time h at a constant slope."""
-        return State(
-            self.pose + h * slope.pose, self.rate + h * slope.rate, self.integral + h * slope.integral
-        )
+        return State(self.pose + h * slope.pose, self.rate + h * slope.rate, self.integral + h * slope.integral)
 
 
 @dataclass

@@ -203,9 +203,7 @@ def measurement(
 def own_command(controller: Controller, problem: LoopProblem, frame: int, measured: np.ndarray) -> np.ndarray:
     """What a controller answers to a good measurement (6,), as (6,) floats. Raises SimulationError otherwise."""
     reference = problem.reference
-    command = controller(
-        frame, frame * problem.period, measured.copy(), reference.poses[frame], reference.rates[frame]
-    )
+    command = controller(frame, frame * problem.period, measured.copy(), reference.poses[frame], reference.rates[frame])
     return np.array(floats(f"what the controller returned at frame {frame}", command, (6,), error=SimulationError))
 
 

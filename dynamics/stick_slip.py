@@ -132,9 +132,7 @@ class StickSlipMotion:
         angle, velocity = angle[:, 0], jacobian @ state.rate
         error = command.value + command.slope * time - angle
         torque = self._lp * error + self._ld * (command.rate - velocity) + self._li * state.integral
-        return Evaluation(
-            state, time, mass, bias[:, 0], jacobian, bias_acceleration[:, 0], error, velocity, torque
-        )
+        return Evaluation(state, time, mass, bias[:, 0], jacobian, bias_acceleration[:, 0], error, velocity, torque)
 
     def _evaluate(self, state: State, time: float, command: Command) -> Evaluation:
         """Acceleration for the present modes; stuck joints carry what keeps their acceleration zero."""

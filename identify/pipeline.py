@@ -137,9 +137,7 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
     )
 
 
-def validate(
-    folder: Path, progress: Progress, workers: int | None = None, taught: cmmsim.Taught | None = None
-) -> None:
+def validate(folder: Path, progress: Progress, workers: int | None = None, taught: cmmsim.Taught | None = None) -> None:
     """Run plant and models on the unseen trajectories and open the truth: validation.nc, model.nc, result.json.
 
     Raises RecordError for a result that is not whole, or was made of another record or covariance.

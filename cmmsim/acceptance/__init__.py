@@ -4,20 +4,41 @@ The artefacts are imaged by the sensor's own virtual cameras and measured by its
 is true of them is used only to judge the result.
 """
 
-from .artefact_sensor import SensorUnderTest
-from .bar_paths import BarPath, bar_paths
-from .errors import AcceptanceError
-from .latency import Latency, LatencyTest, estimate_latency, latency_test
-from .length_test import LengthTest, MeasuredLength, length_test
-from .measuring_lines import MeasuringLine, require_rules, seven_lines
-from .moving_bar import BarRun, BarTest, bar_test
-from .published import PUBLISHED, PublishedFigure
-from .statistics import Statistics, interval_of_mean, summarise
-from .volume import MeasuringVolume, common_volume, volume_of_size
+from cmmsim.acceptance.artefact_sensor import SensorUnderTest
+from cmmsim.acceptance.bar_paths import BarPath, bar_paths
+from cmmsim.acceptance.errors import AcceptanceError
+from cmmsim.acceptance.latency import Latency, LatencyTest, estimate_latency, latency_test
+from cmmsim.acceptance.length_test import LengthTest, MeasuredLength, length_test
+from cmmsim.acceptance.measuring_lines import MeasuringLine, require_rules, seven_lines
+from cmmsim.acceptance.moving_bar import BarRun, BarTest, bar_test
+from cmmsim.acceptance.published import PUBLISHED, PublishedFigure
+from cmmsim.acceptance.statistics import Statistics, interval_of_mean, summarise
+from cmmsim.acceptance.volume import MeasuringVolume, common_volume, volume_of_size
 
 __all__ = [
-    "PUBLISHED", "AcceptanceError", "BarPath", "BarRun", "BarTest", "Latency", "LatencyTest", "LengthTest",
-    "MeasuredLength", "MeasuringLine", "MeasuringVolume", "PublishedFigure", "SensorUnderTest", "Statistics",
-    "bar_paths", "bar_test", "common_volume", "estimate_latency", "interval_of_mean", "latency_test", "length_test",
-    "require_rules", "seven_lines", "summarise", "volume_of_size",
+    "PUBLISHED",
+    "AcceptanceError",
+    "BarPath",
+    "BarRun",
+    "BarTest",
+    "Latency",
+    "LatencyTest",
+    "LengthTest",
+    "MeasuredLength",
+    "MeasuringLine",
+    "MeasuringVolume",
+    "PublishedFigure",
+    "SensorUnderTest",
+    "Statistics",
+    "bar_paths",
+    "bar_test",
+    "common_volume",
+    "estimate_latency",
+    "interval_of_mean",
+    "latency_test",
+    "length_test",
+    "require_rules",
+    "seven_lines",
+    "summarise",
+    "volume_of_size",
 ]

@@ -12,8 +12,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..pose import Array
-from ..sensor_schema import Body, HalfSpace, Planes, Platform, Rig, SensorFile, StickerPlane
+from cmmsim.pose import Array
+from cmmsim.sensor_schema import Body, HalfSpace, Planes, Platform, Rig, SensorFile, StickerPlane
 
 H = TypeVar("H", bound=HalfSpace)
 SLOPE = np.deg2rad(15.0)
@@ -39,14 +39,22 @@ def board(a: StickerRow, b: StickerRow, c: StickerRow) -> Platform:
     """
     reach = max(float(np.abs(row.along).max()) for row in (a, b, c)) + END
     sine, cosine = float(np.sin(SLOPE)), float(np.cos(SLOPE))
-    sides = {"A": _side((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), a, 1.0),
-             "B": _side((0.0, sine, cosine), (0.0, HALF_RIDGE, 0.0), b, 1.0),
-             "C": _side((0.0, -sine, cosine), (0.0, -HALF_RIDGE, 0.0), c, -1.0)}
+    sides = {
+        "A": _side((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), a, 1.0),
+        "B": _side((0.0, sine, cosine), (0.0, HALF_RIDGE, 0.0), b, 1.0),
+        "C": _side((0.0, -sine, cosine), (0.0, -HALF_RIDGE, 0.0), c, -1.0),
+    }
     width = HALF_RIDGE + SIDE * cosine
-    cuts = [_half_space(normal, point) for normal, point in (
-        ((1.0, 0.0, 0.0), (reach, 0.0, 0.0)), ((-1.0, 0.0, 0.0), (-reach, 0.0, 0.0)),
-        ((0.0, 1.0, 0.0), (0.0, width, 0.0)), ((0.0, -1.0, 0.0), (0.0, -width, 0.0)),
-        ((0.0, 0.0, -1.0), (0.0, 0.0, -SIDE * sine - 0.05)))]
+    cuts = [
+        _half_space(normal, point)
+        for normal, point in (
+            ((1.0, 0.0, 0.0), (reach, 0.0, 0.0)),
+            ((-1.0, 0.0, 0.0), (-reach, 0.0, 0.0)),
+            ((0.0, 1.0, 0.0), (0.0, width, 0.0)),
+            ((0.0, -1.0, 0.0), (0.0, -width, 0.0)),
+            ((0.0, 0.0, -1.0), (0.0, 0.0, -SIDE * sine - 0.05)),
+        )
+    ]
     return Platform(planes=Planes(**sides), cuts=cuts, home=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
 
 
@@ -68,11 +76,16 @@ def facing_rotation(along: Array, towards: Array) -> Array:
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def _side(normal: tuple[float, float, float], point: tuple[float, float, float], row: StickerRow,
-          sign: float) -> StickerPlane:
+def _side(
+    normal: tuple[float, float, float], point: tuple[float, float, float], row: StickerRow, sign: float
+) -> StickerPlane:
     """u runs along the artefact; v = n x u points to +y on all sides, so that C counts backwards."""
-    return StickerPlane(normal=normal, point=point, across=(1.0, 0.0, 0.0),
-                        stickers=[(float(u), sign * float(v)) for u, v in np.column_stack([row.along, row.across])])
+    return StickerPlane(
+        normal=normal,
+        point=point,
+        across=(1.0, 0.0, 0.0),
+        stickers=[(float(u), sign * float(v)) for u, v in np.column_stack([row.along, row.across])],
+    )
 
 
 def _half_space(normal: tuple[float, float, float], point: tuple[float, float, float]) -> HalfSpace:

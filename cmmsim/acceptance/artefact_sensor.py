@@ -7,20 +7,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import LostError
-from ..estimator import PoseEstimator
-from ..images import StereoImages
-from ..marked_body import MarkedBody
-from ..observation import StickerObservation, observe
-from ..pose import Array, invert, pose_to_transform, transform_to_pose
-from ..render import require_opengl
-from ..renderers import PYRENDER, choose_renderer
-from ..rig_from_file import rig_from_file
-from ..sensor import Sensor
-from ..sensor_schema import Platform, SensorFile
-from ..taught import Taught
-from .artefact import artefact_file
-from .errors import AcceptanceError
+from cmmsim.acceptance.artefact import artefact_file
+from cmmsim.acceptance.errors import AcceptanceError
+from cmmsim.errors import LostError
+from cmmsim.estimator import PoseEstimator
+from cmmsim.images import StereoImages
+from cmmsim.marked_body import MarkedBody
+from cmmsim.observation import StickerObservation, observe
+from cmmsim.pose import Array, invert, pose_to_transform, transform_to_pose
+from cmmsim.render import require_opengl
+from cmmsim.renderers import PYRENDER, choose_renderer
+from cmmsim.rig_from_file import rig_from_file
+from cmmsim.sensor import Sensor
+from cmmsim.sensor_schema import Platform, SensorFile
+from cmmsim.taught import Taught
 
 
 @dataclass(frozen=True)
@@ -56,16 +56,29 @@ def estimator_of(sensor: Sensor, body: MarkedBody, base_from_camera: Array | Non
     Poses are in the camera frame unless the place of the base is given.
     """
     count = len(body.nominal)
-    taught = Taught(sensor.name, np.eye(4) if base_from_camera is None else base_from_camera, np.zeros((6, 6)),
-                    body.nominal.copy(), np.zeros((count, 3, 3)), np.zeros((6, 6)), np.zeros((0, 3)))
+    taught = Taught(
+        sensor.name,
+        np.eye(4) if base_from_camera is None else base_from_camera,
+        np.zeros((6, 6)),
+        body.nominal.copy(),
+        np.zeros((count, 3, 3)),
+        np.zeros((6, 6)),
+        np.zeros((0, 3)),
+    )
     return PoseEstimator(sensor.rig, sensor.noise, sensor.settings, body, taught)
 
 
 def part_of_body(body: MarkedBody, name: str, keep: NDArray[np.int_], origin: Array) -> MarkedBody:
     """A rigid body of its own made of the stickers ``keep`` (k,), its axes moved to ``origin`` (3,) of the whole."""
-    return replace(body, name=name, offsets=body.offsets - body.normals @ origin, sticker_ids=body.sticker_ids[keep],
-                   plane_index=body.plane_index[keep], nominal=body.nominal[keep] - origin,
-                   in_plane=body.in_plane[keep])
+    return replace(
+        body,
+        name=name,
+        offsets=body.offsets - body.normals @ origin,
+        sticker_ids=body.sticker_ids[keep],
+        plane_index=body.plane_index[keep],
+        nominal=body.nominal[keep] - origin,
+        in_plane=body.in_plane[keep],
+    )
 
 
 def locate(estimator: PoseEstimator, images: StereoImages) -> Array:
@@ -79,8 +92,9 @@ def locate(estimator: PoseEstimator, images: StereoImages) -> Array:
 def observe_stickers(estimator: PoseEstimator, images: StereoImages, expected: Array) -> StickerObservation:
     """Points of the stickers near an expected camera_from_body (4,4): nothing of the layout enters the points."""
     body = estimator.platform
-    return observe(images, estimator.rig, estimator.noise, estimator.settings, expected, body.nominal,
-                   body.sticker_normals)
+    return observe(
+        images, estimator.rig, estimator.noise, estimator.settings, expected, body.nominal, body.sticker_normals
+    )
 
 
 def pose_in_base(base_from_volume: Array, rotation: Array, position: Array) -> Array:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..marked_body import MarkedBody
-from ..sensor_schema import Platform
-from .artefact import HALF_RIDGE, SIDE, StickerRow, board
-from .artefact_sensor import part_of_body
+from cmmsim.acceptance.artefact import HALF_RIDGE, SIDE, StickerRow, board
+from cmmsim.acceptance.artefact_sensor import part_of_body
+from cmmsim.marked_body import MarkedBody
+from cmmsim.sensor_schema import Platform
 
 LENGTH = 0.300  # m between the origins of the clusters, which lie on the bar's x axis
 HALF_LENGTH, HALF_WIDTH = 0.5 * LENGTH + 0.065, HALF_RIDGE + SIDE
@@ -18,9 +18,11 @@ END_FROM_END.setflags(write=False)
 
 def rigid_bar() -> Platform:
     """The sensor-file section of the bar. The clusters differ, so that one cannot be taken for the other."""
-    return board(StickerRow((-0.190, -0.115, 0.110, 0.186), (0.006, -0.010, 0.010, -0.004)),
-                 StickerRow((-0.172, -0.120, 0.126, 0.194), (0.018, 0.045, 0.044, 0.030)),
-                 StickerRow((-0.194, -0.138, 0.108, 0.160), (0.044, 0.022, 0.028, 0.046)))
+    return board(
+        StickerRow((-0.190, -0.115, 0.110, 0.186), (0.006, -0.010, 0.010, -0.004)),
+        StickerRow((-0.172, -0.120, 0.126, 0.194), (0.018, 0.045, 0.044, 0.030)),
+        StickerRow((-0.194, -0.138, 0.108, 0.160), (0.044, 0.022, 0.028, 0.046)),
+    )
 
 
 def bar_ends(bar: MarkedBody) -> tuple[MarkedBody, MarkedBody]:
@@ -28,5 +30,7 @@ def bar_ends(bar: MarkedBody) -> tuple[MarkedBody, MarkedBody]:
     first = np.flatnonzero(bar.nominal[:, 0] < 0.0)
     second = np.flatnonzero(bar.nominal[:, 0] > 0.0)
     middle = np.array([0.5 * LENGTH, 0.0, 0.0])
-    return (part_of_body(bar, "first end of the bar", first, -middle),
-            part_of_body(bar, "second end of the bar", second, middle))
+    return (
+        part_of_body(bar, "first end of the bar", first, -middle),
+        part_of_body(bar, "second end of the bar", second, middle),
+    )

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..pose import Array, rotation_exp
-from .artefact import facing_rotation
-from .artefact_sensor import pose_in_base
-from .bar import HALF_LENGTH, HALF_WIDTH
-from .errors import AcceptanceError
-from .volume import MeasuringVolume
+from cmmsim.acceptance.artefact import facing_rotation
+from cmmsim.acceptance.artefact_sensor import pose_in_base
+from cmmsim.acceptance.bar import HALF_LENGTH, HALF_WIDTH
+from cmmsim.acceptance.errors import AcceptanceError
+from cmmsim.acceptance.volume import MeasuringVolume
+from cmmsim.pose import Array, rotation_exp
 
 SECONDS = 3.0  # of motion a run
 CYCLES = 1.5  # to and fro in this time
@@ -26,8 +26,11 @@ TOWARDS_DEPTH = np.deg2rad(35.0)
 STEP = 1e-4  # s, of the difference quotient of a path
 SPEED_SAMPLES = 100
 RASTERS = {"x": 0, "y": 1}
-ORIENTATIONS = {"along x": np.array([1.0, 0.0, 0.0]), "along y": np.array([0.0, 1.0, 0.0]),
-                "towards depth": np.array([np.cos(TOWARDS_DEPTH), 0.0, np.sin(TOWARDS_DEPTH)])}
+ORIENTATIONS = {
+    "along x": np.array([1.0, 0.0, 0.0]),
+    "along y": np.array([0.0, 1.0, 0.0]),
+    "towards depth": np.array([np.cos(TOWARDS_DEPTH), 0.0, np.sin(TOWARDS_DEPTH)]),
+}
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,11 @@ def room_of_bar(along: Array) -> Array:
 
 def bar_paths(volume: MeasuringVolume) -> tuple[BarPath, ...]:
     """The six paths of a volume. Raises AcceptanceError when the bar does not find room in it."""
-    paths = tuple(BarPath(f"raster {raster}, bar {name}", axis, along, volume)
-                  for raster, axis in RASTERS.items() for name, along in ORIENTATIONS.items())
+    paths = tuple(
+        BarPath(f"raster {raster}, bar {name}", axis, along, volume)
+        for raster, axis in RASTERS.items()
+        for name, along in ORIENTATIONS.items()
+    )
     for path in paths:
         if path.reach.min() <= 0.0:
             needed = " x ".join(f"{2e3 * v:.0f}" for v in room_of_bar(path.along))

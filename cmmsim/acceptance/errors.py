@@ -1,6 +1,6 @@
 """What an acceptance test refuses."""
 
-from ..errors import CmmError
+from cmmsim.errors import CmmError
 
 
 class AcceptanceError(CmmError):

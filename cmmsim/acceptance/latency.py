@@ -11,16 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import ShapeError
-from ..latency import drawn_latencies
-from ..pose import Array
-from ..tracking import Tracker
-from .artefact import facing_rotation
-from .artefact_sensor import SensorUnderTest, estimator_of, locate, pose_in_base
-from .bar import HALF_LENGTH, HALF_WIDTH, rigid_bar
-from .errors import AcceptanceError
-from .statistics import Interval, interval_of_mean
-from .volume import MeasuringVolume
+from cmmsim.acceptance.artefact import facing_rotation
+from cmmsim.acceptance.artefact_sensor import SensorUnderTest, estimator_of, locate, pose_in_base
+from cmmsim.acceptance.bar import HALF_LENGTH, HALF_WIDTH, rigid_bar
+from cmmsim.acceptance.errors import AcceptanceError
+from cmmsim.acceptance.statistics import Interval, interval_of_mean
+from cmmsim.acceptance.volume import MeasuringVolume
+from cmmsim.errors import ShapeError
+from cmmsim.latency import drawn_latencies
+from cmmsim.pose import Array
+from cmmsim.tracking import Tracker
 
 STREAM = 201
 RADIUS, PERIOD = 0.05, 1.0  # m and s of the circle: 0.31 m/s
@@ -55,8 +55,9 @@ class LatencyTest:
     lost: int
 
 
-def estimate_latency(reported: Array, positions: Array, motion: Motion, largest: float,
-                     covariances: Array | None = None) -> Latency:
+def estimate_latency(
+    reported: Array, positions: Array, motion: Motion, largest: float, covariances: Array | None = None
+) -> Latency:
     """Delay of each report by least squares: positions(k) = motion(reported(k) - delay(k)) + offset.
 
     Parameters: reported (n,) s; positions (n,3) m; motion; largest: latencies from 0 to this are searched, s, at most
@@ -64,8 +65,9 @@ def estimate_latency(reported: Array, positions: Array, motion: Motion, largest:
     Raises ShapeError for less than four reports or a motion that stands still.
     """
     if len(reported) < 4 or positions.shape != (len(reported), 3):
-        raise ShapeError(f"latency needs four reports or more with positions (n,3), got {len(reported)} and "
-                         f"{positions.shape}")
+        raise ShapeError(
+            f"latency needs four reports or more with positions (n,3), got {len(reported)} and {positions.shape}"
+        )
     delays = np.full(len(reported), _coarse_delay(reported, positions, motion, largest))
     offset = np.zeros(3)
     for iteration in range(ITERATIONS):
@@ -73,28 +75,42 @@ def estimate_latency(reported: Array, positions: Array, motion: Motion, largest:
         velocity = (motion(times + STEP) - motion(times - STEP)) / (2.0 * STEP)
         squared = np.sum(velocity**2, axis=1)
         if squared.min() < 1e-8:
-            raise ShapeError("latency needs a motion that never stands still: its lowest speed is "
-                             f"{1e3 * np.sqrt(squared.min()):.3g} mm/s, at least 0.1 mm/s is needed")
+            raise ShapeError(
+                "latency needs a motion that never stands still: its lowest speed is "
+                f"{1e3 * np.sqrt(squared.min()):.3g} mm/s, at least 0.1 mm/s is needed"
+            )
         residuals = positions - motion(times) - offset
         if iteration < ITERATIONS // 2:  # one common delay and the offset first, then each delay for itself
             common, shift = _common_step(residuals, velocity)
             delays, offset = delays + common, offset + shift
         else:
             delays = delays - np.sum(residuals * velocity, axis=1) / squared
-    return Latency(delays, float(delays.mean()), float(delays.std(ddof=1)), float(delays.max()),
-                   interval_of_mean(delays), _resolution(velocity, covariances))
+    return Latency(
+        delays,
+        float(delays.mean()),
+        float(delays.std(ddof=1)),
+        float(delays.max()),
+        interval_of_mean(delays),
+        _resolution(velocity, covariances),
+    )
 
 
 def require_room(volume: MeasuringVolume) -> None:
     """Raise AcceptanceError unless the bar finds room for its circle."""
     needed = 2.0 * np.array([HALF_LENGTH + RADIUS, HALF_WIDTH + RADIUS, 0.0])
     if np.any(needed > volume.size):
-        raise AcceptanceError(f"latency: the body on its circle needs {1e3 * needed[0]:.0f} x {1e3 * needed[1]:.0f} mm "
-                              f"across the line of sight, the volume has {volume}")
+        raise AcceptanceError(
+            f"latency: the body on its circle needs {1e3 * needed[0]:.0f} x {1e3 * needed[1]:.0f} mm "
+            f"across the line of sight, the volume has {volume}"
+        )
 
 
-def latency_test(under_test: SensorUnderTest, volume: MeasuringVolume, frames: int = FRAMES,
-                 advance: Callable[[], None] = lambda: None) -> LatencyTest:
+def latency_test(
+    under_test: SensorUnderTest,
+    volume: MeasuringVolume,
+    frames: int = FRAMES,
+    advance: Callable[[], None] = lambda: None,
+) -> LatencyTest:
     """Move a body on a circle in the middle of the volume and report its measured positions; ``advance`` is called
     after each frame. Raises AcceptanceError when it is not measured."""
     require_room(volume)
@@ -123,8 +139,13 @@ def latency_test(under_test: SensorUnderTest, volume: MeasuringVolume, frames: i
         raise AcceptanceError(f"latency: {good.sum()} of {frames} frames are measured: {measured[-1].reason}")
     reported = (taken + drawn_latencies(sensor.timing, frames, np.random.default_rng([under_test.seed, STREAM])))[good]
     kept = [m for m in measured if m.ok]
-    latency = estimate_latency(reported, np.array([m.pose[:3] for m in kept]), motion, 0.5 * PERIOD,
-                               np.array([m.covariance[:3, :3] for m in kept]))
+    latency = estimate_latency(
+        reported,
+        np.array([m.pose[:3] for m in kept]),
+        motion,
+        0.5 * PERIOD,
+        np.array([m.covariance[:3, :3] for m in kept]),
+    )
     return LatencyTest(latency, reported, sensor.timing.latency, 1.0 / sensor.timing.frame_rate, int((~good).sum()))
 
 

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..pose import Array
-from ..sensor import Sensor
-from ..sensor_schema import Platform
-from .artefact import StickerRow, board, facing_rotation
-from .artefact_sensor import SensorUnderTest, estimator_of, locate, observe_stickers, pose_in_base
-from .errors import AcceptanceError
-from .measuring_lines import MeasuringLine, seven_lines
-from .volume import MeasuringVolume
+from cmmsim.acceptance.artefact import StickerRow, board, facing_rotation
+from cmmsim.acceptance.artefact_sensor import SensorUnderTest, estimator_of, locate, observe_stickers, pose_in_base
+from cmmsim.acceptance.errors import AcceptanceError
+from cmmsim.acceptance.measuring_lines import MeasuringLine, seven_lines
+from cmmsim.acceptance.volume import MeasuringVolume
+from cmmsim.pose import Array
+from cmmsim.sensor import Sensor
+from cmmsim.sensor_schema import Platform
 
 STREAM = 1
 EXPOSURES = 5  # of the standing artefact, whose lengths are averaged
@@ -83,13 +83,19 @@ def length_artefact(line: MeasuringLine) -> Platform:
     """The artefact of a line: six stickers in a row on side A, the first at the line's start."""
     longest = float(line.lengths.max())
     along = np.concatenate([[0.0], line.lengths]) - 0.5 * longest
-    return board(StickerRow(along, np.zeros(len(along))),
-                 StickerRow(longest * np.array(RECOGNITION_B), RECOGNITION_ACROSS),
-                 StickerRow(longest * np.array(RECOGNITION_C), RECOGNITION_ACROSS))
+    return board(
+        StickerRow(along, np.zeros(len(along))),
+        StickerRow(longest * np.array(RECOGNITION_B), RECOGNITION_ACROSS),
+        StickerRow(longest * np.array(RECOGNITION_C), RECOGNITION_ACROSS),
+    )
 
 
-def length_test(under_test: SensorUnderTest, volume: MeasuringVolume, exposures: int = EXPOSURES,
-                advance: Callable[[], None] = lambda: None) -> LengthTest:
+def length_test(
+    under_test: SensorUnderTest,
+    volume: MeasuringVolume,
+    exposures: int = EXPOSURES,
+    advance: Callable[[], None] = lambda: None,
+) -> LengthTest:
     """Measure five lengths on each of the seven lines of a volume; ``advance`` is called after each line.
 
     Raises AcceptanceError when a line breaks a rule or a sticker is not measured.
@@ -118,8 +124,10 @@ def measure_line(sensor: Sensor, volume: MeasuringVolume, line: MeasuringLine, e
             names = ", ".join(sensor.platform.sticker_ids[missing])
             raise AcceptanceError(f"line {line.name}: stickers {names} are not measured by both cameras")
         values[k], stds[k] = lengths_from_first(seen.points[:count], seen.covariances[:count])
-    return [MeasuredLength(line.name, float(true), value, float(np.sqrt(np.mean(std**2))))
-            for true, value, std in zip(line.lengths, values.T, stds.T, strict=True)]
+    return [
+        MeasuredLength(line.name, float(true), value, float(np.sqrt(np.mean(std**2))))
+        for true, value, std in zip(line.lengths, values.T, stds.T, strict=True)
+    ]
 
 
 def lengths_from_first(points: Array, covariances: Array) -> tuple[Array, Array]:

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..pose import Array
-from .errors import AcceptanceError
-from .volume import MeasuringVolume
+from cmmsim.acceptance.errors import AcceptanceError
+from cmmsim.acceptance.volume import MeasuringVolume
+from cmmsim.pose import Array
 
 FEWEST_LINES, FEWEST_LENGTHS = 7, 5
 LONGEST_SHARE = 2.0 / 3.0  # of the volume's space diagonal
@@ -49,8 +49,9 @@ def seven_lines(volume: MeasuringVolume) -> tuple[MeasuringLine, ...]:
     """The seven lines of a volume, five test lengths each. Raises AcceptanceError when a rule is broken."""
     ends = [(np.array(a, dtype=float), -np.array(a, dtype=float)) for a in SPACE_DIAGONALS]
     ends += [(np.array(a, dtype=float), np.array(b, dtype=float)) for a, b in FACE_DIAGONALS]
-    lines = tuple(_line(name, 0.5 * a * volume.size, 0.5 * b * volume.size)
-                  for name, (a, b) in zip(LINE_NAMES, ends, strict=True))
+    lines = tuple(
+        _line(name, 0.5 * a * volume.size, 0.5 * b * volume.size) for name, (a, b) in zip(LINE_NAMES, ends, strict=True)
+    )
     require_rules(lines, volume)
     return lines
 
@@ -62,13 +63,15 @@ def require_rules(lines: Sequence[MeasuringLine], volume: MeasuringVolume) -> No
     for line in lines:
         different = len(np.unique(np.round(line.lengths, 6)))
         if different < FEWEST_LENGTHS:
-            raise AcceptanceError(f"line {line.name}: {different} different test lengths, at least {FEWEST_LENGTHS} "
-                                  "are needed")
+            raise AcceptanceError(
+                f"line {line.name}: {different} different test lengths, at least {FEWEST_LENGTHS} are needed"
+            )
         longest, limit = line.lengths.max(), LONGEST_SHARE * volume.diagonal
         if longest < limit:
             raise AcceptanceError(
                 f"line {line.name}: its longest test length of {1e3 * longest:.0f} mm is less than two thirds of the "
-                f"volume's space diagonal, {1e3 * limit:.0f} mm; choose a volume nearer to a cube")
+                f"volume's space diagonal, {1e3 * limit:.0f} mm; choose a volume nearer to a cube"
+            )
         for point in (line.start, line.end):
             if np.any(np.abs(point) > 0.5 * volume.size + 1e-9):
                 raise AcceptanceError(f"line {line.name} leaves the volume at {np.round(1e3 * point)} mm")

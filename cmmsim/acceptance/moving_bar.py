@@ -12,15 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..measurement import Measurement
-from ..pose import Array, euler_rates_matrix, pose_to_transform, rotation_log, skew
-from ..sensor import Sensor
-from ..tracking import Tracker
-from .artefact_sensor import SensorUnderTest, estimator_of, locate, relative_pose
-from .bar import END_FROM_END, bar_ends, rigid_bar
-from .bar_paths import SECONDS, BarPath, bar_paths
-from .errors import AcceptanceError
-from .volume import MeasuringVolume
+from cmmsim.acceptance.artefact_sensor import SensorUnderTest, estimator_of, locate, relative_pose
+from cmmsim.acceptance.bar import END_FROM_END, bar_ends, rigid_bar
+from cmmsim.acceptance.bar_paths import SECONDS, BarPath, bar_paths
+from cmmsim.acceptance.errors import AcceptanceError
+from cmmsim.acceptance.volume import MeasuringVolume
+from cmmsim.measurement import Measurement
+from cmmsim.pose import Array, euler_rates_matrix, pose_to_transform, rotation_log, skew
+from cmmsim.sensor import Sensor
+from cmmsim.tracking import Tracker
 
 STREAM = 101
 STANDING = 15  # exposures of the standing bar before each run
@@ -84,8 +84,13 @@ class BarTest:
         return float(np.concatenate([run.variance_ratios for run in self.runs]).mean())
 
 
-def bar_test(under_test: SensorUnderTest, volume: MeasuringVolume, seconds: float = SECONDS, standing: int = STANDING,
-             advance: Callable[[], None] = lambda: None) -> BarTest:
+def bar_test(
+    under_test: SensorUnderTest,
+    volume: MeasuringVolume,
+    seconds: float = SECONDS,
+    standing: int = STANDING,
+    advance: Callable[[], None] = lambda: None,
+) -> BarTest:
     """Move the bar along the six paths of a volume; ``advance`` is called after each.
 
     seconds: of motion that are measured, from the start of each path. Raises AcceptanceError when the bar does not
@@ -125,8 +130,15 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
     if not (np.any(np.array(seen) < 0.0) and np.any(np.array(seen) >= 0.0)):
         raise AcceptanceError(f"{path.name}: no frame of the standing or none of the moving bar is measured: {reason}")
     errors, distances, ratios = (np.array(column) for column in zip(*rows, strict=True))
-    return BarRun(path.name, np.array(seen), errors, distances, ratios, len(times) - len(seen),
-                  reason if in_a_row == GIVEN_UP else "")
+    return BarRun(
+        path.name,
+        np.array(seen),
+        errors,
+        distances,
+        ratios,
+        len(times) - len(seen),
+        reason if in_a_row == GIVEN_UP else "",
+    )
 
 
 def relative_error(first: Measurement, second: Measurement) -> tuple[Array, float, float]:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
-from ..errors import ShapeError
-from ..pose import Array
+from cmmsim.errors import ShapeError
+from cmmsim.pose import Array
 
 LEVEL = 0.95
 RESAMPLES = 1000
@@ -38,7 +38,7 @@ def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statis
     """
     _require_finite(values)
     starts = rng.integers(0, len(values), (RESAMPLES, -(-len(values) // block)))
-    drawn = ((starts[:, :, None] + np.arange(block)) % len(values)).reshape(RESAMPLES, -1)[:, :len(values)]
+    drawn = ((starts[:, :, None] + np.arange(block)) % len(values)).reshape(RESAMPLES, -1)[:, : len(values)]
     sampled = values[drawn]
     interval = {name: _percentile_interval(figure(sampled)) for name, figure in _FIGURES.items()}
     mean, rms, p95 = (float(figure(values)) for figure in _FIGURES.values())

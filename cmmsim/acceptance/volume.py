@@ -11,11 +11,11 @@ from itertools import product
 
 import numpy as np
 
-from ..pose import Array, apply, invert
-from ..rig_from_file import rig_from_file
-from ..sensor_schema import Rig
-from ..stereo_rig import StereoRig
-from .errors import AcceptanceError
+from cmmsim.acceptance.errors import AcceptanceError
+from cmmsim.pose import Array, apply, invert
+from cmmsim.rig_from_file import rig_from_file
+from cmmsim.sensor_schema import Rig
+from cmmsim.stereo_rig import StereoRig
 
 MARGIN_PX = 40.0  # the corners stay this far inside the images: room for the width of the artefacts
 LARGEST_SHARE = 0.8  # the front face stays beyond a fifth of the way from the baseline to the target
@@ -35,8 +35,9 @@ class MeasuringVolume:
 
     def __post_init__(self) -> None:
         if self.size.shape != (3,) or not np.all(np.isfinite(self.size)) or self.size.min() < SMALLEST_SIZE:
-            raise AcceptanceError(f"measuring volume {self}: three sides of at least {1e3 * SMALLEST_SIZE:.0f} mm "
-                                  "are needed")
+            raise AcceptanceError(
+                f"measuring volume {self}: three sides of at least {1e3 * SMALLEST_SIZE:.0f} mm are needed"
+            )
         self.base_from_volume.setflags(write=False)
         self.size.setflags(write=False)
 
@@ -67,8 +68,10 @@ def common_volume(place: Rig) -> MeasuringVolume:
         else:
             high = middle
     if low < SMALLEST_SIZE:
-        raise AcceptanceError(f"nothing is visible to both cameras around their target: the largest common cube has "
-                              f"sides of {1e3 * low:.1f} mm, at least {1e3 * SMALLEST_SIZE:.0f} mm are needed")
+        raise AcceptanceError(
+            f"nothing is visible to both cameras around their target: the largest common cube has "
+            f"sides of {1e3 * low:.1f} mm, at least {1e3 * SMALLEST_SIZE:.0f} mm are needed"
+        )
     return MeasuringVolume(frame, np.full(3, np.floor(1e3 * low) / 1e3), distance)
 
 
@@ -83,8 +86,10 @@ def volume_of_size(place: Rig, size: Array) -> MeasuringVolume:
     hidden = _unseen(rig, camera_from_base @ frame, volume.size, distance)
     if hidden is not None:
         largest = 1e3 * common_volume(place).size[0]
-        raise AcceptanceError(f"measuring volume {volume} is not wholly visible to both cameras: {hidden}; the largest "
-                              f"cube that is has sides of {largest:.0f} mm")
+        raise AcceptanceError(
+            f"measuring volume {volume} is not wholly visible to both cameras: {hidden}; the largest "
+            f"cube that is has sides of {largest:.0f} mm"
+        )
     return volume
 
 
@@ -110,12 +115,15 @@ def _unseen(rig: StereoRig, camera_from_volume: Array, size: Array, distance: fl
     points = apply(camera_from_volume, corners)
     pixels, valid = rig.project(points)
     for camera, name, spots, ahead in zip(rig.cameras, ("left", "right"), pixels, valid, strict=True):
-        inside = ahead & np.all((spots >= MARGIN_PX) & (spots <= (camera.width - 1 - MARGIN_PX,
-                                                                  camera.height - 1 - MARGIN_PX)), axis=1)
+        inside = ahead & np.all(
+            (spots >= MARGIN_PX) & (spots <= (camera.width - 1 - MARGIN_PX, camera.height - 1 - MARGIN_PX)), axis=1
+        )
         if not inside.all():
             k = int(np.flatnonzero(~inside)[0])
             corner = ", ".join(f"{1e3 * v:+.0f}" for v in corners[k])
             x, y = spots[k]
-            return (f"the corner ({corner}) mm is at pixel ({x:.0f}, {y:.0f}) of the {name} camera, whose image has "
-                    f"{camera.width} x {camera.height} px and {MARGIN_PX:.0f} px of margin")
+            return (
+                f"the corner ({corner}) mm is at pixel ({x:.0f}, {y:.0f}) of the {name} camera, whose image has "
+                f"{camera.width} x {camera.height} px and {MARGIN_PX:.0f} px of margin"
+            )
     return None

@@ -4,23 +4,42 @@ The way: a board description, pairs of image files, the board in each image, Ope
 adjustment of both cameras with its covariance.
 """
 
-from .board import Board, read_board
-from .board_detection import BoardView, find_board
-from .board_poses import board_poses, default_board
-from .calibrate import CalibrationOptions, calibrate
-from .calibration import PARAMETER_NAMES, Calibration
-from .errors import CalibrationError
-from .intrinsics import DISTORTIONS
-from .photographs import ImagePair, pair_images, read_grey
-from .rendering import render_pairs
-from .result_text import as_dict, rig_tables
-from .sensor_template import SensorTemplate, require_sensor, sensor_template
-from .sightings import PairView
-from .views_of_images import view_pairs
+from cmmsim.calibration.board import Board, read_board
+from cmmsim.calibration.board_detection import BoardView, find_board
+from cmmsim.calibration.board_poses import board_poses, default_board
+from cmmsim.calibration.calibrate import CalibrationOptions, calibrate
+from cmmsim.calibration.calibration import PARAMETER_NAMES, Calibration
+from cmmsim.calibration.errors import CalibrationError
+from cmmsim.calibration.intrinsics import DISTORTIONS
+from cmmsim.calibration.photographs import ImagePair, pair_images, read_grey
+from cmmsim.calibration.rendering import render_pairs
+from cmmsim.calibration.result_text import as_dict, rig_tables
+from cmmsim.calibration.sensor_template import SensorTemplate, require_sensor, sensor_template
+from cmmsim.calibration.sightings import PairView
+from cmmsim.calibration.views_of_images import view_pairs
 
 __all__ = [
-    "DISTORTIONS", "PARAMETER_NAMES", "Board", "BoardView", "Calibration", "CalibrationError", "CalibrationOptions",
-    "ImagePair", "PairView", "SensorTemplate", "as_dict", "board_poses", "calibrate", "default_board", "find_board",
-    "pair_images", "read_board", "read_grey", "render_pairs", "require_sensor", "rig_tables",
-    "sensor_template", "view_pairs",
+    "DISTORTIONS",
+    "PARAMETER_NAMES",
+    "Board",
+    "BoardView",
+    "Calibration",
+    "CalibrationError",
+    "CalibrationOptions",
+    "ImagePair",
+    "PairView",
+    "SensorTemplate",
+    "as_dict",
+    "board_poses",
+    "calibrate",
+    "default_board",
+    "find_board",
+    "pair_images",
+    "read_board",
+    "read_grey",
+    "render_pairs",
+    "require_sensor",
+    "rig_tables",
+    "sensor_template",
+    "view_pairs",
 ]

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from ..pose import Array
-from .errors import CalibrationError
+from cmmsim.calibration.errors import CalibrationError
+from cmmsim.pose import Array
 
 Length = Annotated[float, Field(gt=0.0, le=100.0)]
 Count = Annotated[int, Field(ge=3, le=200)]
@@ -49,8 +49,10 @@ class Board(BaseModel):
         elif self.radius is None:
             raise ValueError(f"radius of the dots (m) is missing, {self.kind} need it")
         elif self.radius > 0.4 * self.nearest:
-            raise ValueError(f"dots of radius {self.radius:g} m, {self.nearest:g} m from centre to centre, nearly "
-                             f"touch: the largest radius is {0.4 * self.nearest:.4g} m")
+            raise ValueError(
+                f"dots of radius {self.radius:g} m, {self.nearest:g} m from centre to centre, nearly "
+                f"touch: the largest radius is {0.4 * self.nearest:.4g} m"
+            )
         return self
 
     @property
@@ -81,8 +83,12 @@ class Board(BaseModel):
 
     def as_toml(self) -> str:
         """The board as the text of a board file."""
-        lines = [f'kind = "{self.kind}"', f"columns = {self.columns}", f"rows = {self.rows}",
-                 f"spacing = {self.spacing!r}  # m"]
+        lines = [
+            f'kind = "{self.kind}"',
+            f"columns = {self.columns}",
+            f"rows = {self.rows}",
+            f"spacing = {self.spacing!r}  # m",
+        ]
         if self.radius is not None:
             lines += [f"radius = {self.radius!r}  # m", f"dark = {str(self.dark).lower()}"]
         return "\n".join(lines) + "\n"

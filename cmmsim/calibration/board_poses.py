@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..camera import PinholeCamera
-from ..pose import Array, apply, invert, rotation_exp
-from ..stereo_rig import StereoRig
-from .board import Board
-from .board_scene import plate_corners
-from .errors import CalibrationError
+from cmmsim.calibration.board import Board
+from cmmsim.calibration.board_scene import plate_corners
+from cmmsim.calibration.errors import CalibrationError
+from cmmsim.camera import PinholeCamera
+from cmmsim.pose import Array, apply, invert, rotation_exp
+from cmmsim.stereo_rig import StereoRig
 
 LARGEST_TILT = 0.75  # rad between the board's normal and the view from the middle of the baseline
 DEPTH_RANGE = (0.8, 1.2)  # of the depth at which the optical axes come nearest
@@ -55,8 +55,10 @@ def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generat
         if rig.project(apply(pose, corners))[1].all() and _front_to_both(rig, pose, middle):
             return pose
     width, height = np.ptp(corners[:, :2], axis=0)
-    raise CalibrationError(f"none of {TRIES} poses shows the whole board of {width:.3g} x {height:.3g} m to both "
-                           f"cameras at about {meeting_depth(rig):.3g} m: take a smaller one")
+    raise CalibrationError(
+        f"none of {TRIES} poses shows the whole board of {width:.3g} x {height:.3g} m to both "
+        f"cameras at about {meeting_depth(rig):.3g} m: take a smaller one"
+    )
 
 
 def _point_in_cell(camera: PinholeCamera, cell: int, depth: float, rng: np.random.Generator) -> Array:
@@ -88,5 +90,6 @@ def _tilt(rng: np.random.Generator) -> Array:
 def _front_to_both(rig: StereoRig, pose: Array, middle: Array) -> bool:
     """Whether both cameras see the front, at more than a grazing angle."""
     place = apply(pose, middle)
-    return all(float(pose[:3, 2] @ view) > GRAZING * float(np.linalg.norm(view))
-               for view in (place, place - _right_eye(rig)))
+    return all(
+        float(pose[:3, 2] @ view) > GRAZING * float(np.linalg.norm(view)) for view in (place, place - _right_eye(rig))
+    )

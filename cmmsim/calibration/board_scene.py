@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from ..pose import Array
-from ..scene import SUNK, Disc, DiscStack, Mesh, Patch, solid_mesh
-from ..views import Drawable
-from .board import Board
+from cmmsim.calibration.board import Board
+from cmmsim.pose import Array
+from cmmsim.scene import SUNK, Disc, DiscStack, Mesh, Patch, solid_mesh
+from cmmsim.views import Drawable
 
 MARGIN = 1.0  # of the spacing: rim of the plate beyond its outermost points; a chessboard's outer squares reach there
 RIM = 0.35  # of the spacing: bright rim beyond the outer squares of a chessboard
@@ -49,6 +49,10 @@ def _dots(board: Board, level: float) -> list[DiscStack]:
 def _squares(board: Board, level: float) -> list[Mesh]:
     """The dark squares of a chessboard, its outermost ones included."""
     corners = board.spacing * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
-    places = [np.array([column, row, 0.0]) * board.spacing for row in range(-1, board.rows)
-              for column in range(-1, board.columns) if (row + column) % 2 == 0]
+    places = [
+        np.array([column, row, 0.0]) * board.spacing
+        for row in range(-1, board.rows)
+        for column in range(-1, board.columns)
+        if (row + column) % 2 == 0
+    ]
     return [Mesh(corners + place, np.array([[0, 1, 2], [0, 2, 3]]), np.full(4, level)) for place in places]

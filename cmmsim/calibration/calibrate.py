@@ -7,20 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..eccentricity import centre_offset
-from ..pose import Array
-from ..stereo_rig import StereoRig
-from .board import Board
-from .calibration import Calibration, UsedView
-from .contradictions import contradictions
-from .errors import CalibrationError
-from .intrinsics import DEFAULT_DISTORTION, DISTORTIONS, camera_from, free_directions
-from .joint_adjustment import Adjustment, adjust
-from .named import some
-from .sightings import SIDES, PairView, Sightings, sightings_of
-from .start_values import start_values
-from .state import RigState
-from .weaknesses import weaknesses
+from cmmsim.calibration.board import Board
+from cmmsim.calibration.calibration import Calibration, UsedView
+from cmmsim.calibration.contradictions import contradictions
+from cmmsim.calibration.errors import CalibrationError
+from cmmsim.calibration.intrinsics import DEFAULT_DISTORTION, DISTORTIONS, camera_from, free_directions
+from cmmsim.calibration.joint_adjustment import Adjustment, adjust
+from cmmsim.calibration.named import some
+from cmmsim.calibration.sightings import SIDES, PairView, Sightings, sightings_of
+from cmmsim.calibration.start_values import start_values
+from cmmsim.calibration.state import RigState
+from cmmsim.calibration.weaknesses import weaknesses
+from cmmsim.eccentricity import centre_offset
+from cmmsim.pose import Array
+from cmmsim.stereo_rig import StereoRig
 
 FEWEST_PAIRS = 3
 LARGEST_RMS_RATIO = 4.0  # an image with residuals above this many medians of all images is given up
@@ -45,8 +45,9 @@ class CalibrationOptions:
             raise CalibrationError(f"at least {FEWEST_PAIRS} pairs are needed, min_images is {self.min_images}")
 
 
-def calibrate(board: Board, pairs: Sequence[PairView], size: tuple[int, int],
-              options: CalibrationOptions | None = None) -> Calibration:
+def calibrate(
+    board: Board, pairs: Sequence[PairView], size: tuple[int, int], options: CalibrationOptions | None = None
+) -> Calibration:
     """Calibrate both cameras from what pairs of images of size (width, height) px show.
 
     Images with the board in one camera only help that camera. Raises CalibrationError with the reasons of all pairs
@@ -63,16 +64,27 @@ def calibrate(board: Board, pairs: Sequence[PairView], size: tuple[int, int],
     rejected = {pair.name: pair.reasons for pair in judged if pair.reasons}
     rig = _rig(solved.state, size)
     warnings = contradictions(board, solved.state, judged) + weaknesses(solved, sightings, rig)
-    return Calibration(rig, board, options.distortion, options.fix_aspect, solved, sightings,
-                       _used(kept, solved, sightings), rejected, warnings)
+    return Calibration(
+        rig,
+        board,
+        options.distortion,
+        options.fix_aspect,
+        solved,
+        sightings,
+        _used(kept, solved, sightings),
+        rejected,
+        warnings,
+    )
 
 
 def _require_pairs(pairs: Sequence[PairView], options: CalibrationOptions) -> None:
     good = sum(pair.both for pair in pairs)
     if good < options.min_images:
         reasons = some([f"{pair.name} ({pair.reasons})" for pair in pairs if not pair.both])
-        raise CalibrationError(f"{good} of {len(pairs)} pairs show the board to both cameras, {options.min_images} "
-                               "needed" + (f"; without it: {reasons}" if good < len(pairs) else ""))
+        raise CalibrationError(
+            f"{good} of {len(pairs)} pairs show the board to both cameras, {options.min_images} "
+            "needed" + (f"; without it: {reasons}" if good < len(pairs) else "")
+        )
 
 
 def _without_misfits(
@@ -108,8 +120,9 @@ def _image_rms(solved: Adjustment, sightings: tuple[Sightings, Sightings]) -> Ar
     return rms
 
 
-def _with_true_centres(board: Board, measured: tuple[Sightings, Sightings], solved: Adjustment, free: Array,
-                       size: tuple[int, int]) -> tuple[Adjustment, tuple[Sightings, Sightings]]:
+def _with_true_centres(
+    board: Board, measured: tuple[Sightings, Sightings], solved: Adjustment, free: Array, size: tuple[int, int]
+) -> tuple[Adjustment, tuple[Sightings, Sightings]]:
     """Adjusted rig with the eccentricity of the dots' images taken off, which needs the rig: by iteration."""
     last = [np.zeros_like(seen.pixels) for seen in measured]
     for _ in range(ROUNDS):
@@ -138,6 +151,7 @@ def _rig(state: RigState, size: tuple[int, int]) -> StereoRig:
 
 def _used(kept: Sequence[PairView], solved: Adjustment, sightings: tuple[Sightings, Sightings]) -> list[UsedView]:
     rms = _image_rms(solved, sightings)
-    return [UsedView(pair.name, k, {side: float(rms[j, k]) for j, side in enumerate(SIDES) if np.isfinite(rms[j, k])})
-            for k, pair in enumerate(kept)]
-
+    return [
+        UsedView(pair.name, k, {side: float(rms[j, k]) for j, side in enumerate(SIDES) if np.isfinite(rms[j, k])})
+        for k, pair in enumerate(kept)
+    ]

@@ -7,16 +7,18 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ..pose import Array, skew
-from ..stereo_rig import StereoRig
-from .board import Board
-from .intrinsics import INTRINSIC_NAMES
-from .joint_adjustment import Adjustment
-from .sightings import Sightings
+from cmmsim.calibration.board import Board
+from cmmsim.calibration.intrinsics import INTRINSIC_NAMES
+from cmmsim.calibration.joint_adjustment import Adjustment
+from cmmsim.calibration.sightings import Sightings
+from cmmsim.pose import Array, skew
+from cmmsim.stereo_rig import StereoRig
 
 PLACE_NAMES = ("tx_m", "ty_m", "tz_m", "rx_rad", "ry_rad", "rz_rad")
-PARAMETER_NAMES = (*(f"{side}.{name}" for side in ("left", "right") for name in INTRINSIC_NAMES),
-                   *(f"right_from_left.{name}" for name in PLACE_NAMES))
+PARAMETER_NAMES = (
+    *(f"{side}.{name}" for side in ("left", "right") for name in INTRINSIC_NAMES),
+    *(f"right_from_left.{name}" for name in PLACE_NAMES),
+)
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..ellipse_fit import FitLimits, fit_ellipses
-from ..images import FrameImages, StereoFrame
-from ..noise import CameraNoise
-from ..pose import Array
-from .board import Board
-from .dot_radius import covered_radius
+from cmmsim.calibration.board import Board
+from cmmsim.calibration.dot_radius import covered_radius
+from cmmsim.ellipse_fit import FitLimits, fit_ellipses
+from cmmsim.images import FrameImages, StereoFrame
+from cmmsim.noise import CameraNoise
+from cmmsim.pose import Array
 
 SMALLEST_AREA_PX = 20.0
 FIND_SIDE_PX = 1600  # dots are first looked for in an image of at most this size: faster, and less noise
@@ -57,8 +57,9 @@ def _find_grid(bright: NDArray[np.uint8], board: Board, scale: float) -> Array |
     small = cv2.GaussianBlur(small, (3, 3), 0.0)
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.kind == "asymmetric_dots" else cv2.CALIB_CB_SYMMETRIC_GRID
     for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
-        found, centres = cv2.findCirclesGrid(small, (board.columns, board.rows), flags=flags,
-                                             blobDetector=_blob_detector(small.size))
+        found, centres = cv2.findCirclesGrid(
+            small, (board.columns, board.rows), flags=flags, blobDetector=_blob_detector(small.size)
+        )
         if found:
             rough = np.asarray(centres, dtype=float).reshape(-1, 2)
             return (rough + 0.5) / scale - 0.5  # the first pixel's corner, not its middle, stays in place
@@ -104,8 +105,10 @@ def _refine(bright: NDArray[np.uint8], rough: Array, shapes: Array, board: Board
 
 def _point_spread(windows: Array, corners: NDArray[np.int_]) -> float:
     """Sigma in px of the Gaussian blur with which ellipses fit these windows best: that of lens and focus together."""
-    misfits = [np.median(fit_ellipses(windows, corners, PLAIN_NOISE, windows.shape[1], LIMITS, FIT_ITERATIONS,
-                                      spread).misfit) for spread in SPREADS_PX]
+    misfits = [
+        np.median(fit_ellipses(windows, corners, PLAIN_NOISE, windows.shape[1], LIMITS, FIT_ITERATIONS, spread).misfit)
+        for spread in SPREADS_PX
+    ]
     return SPREADS_PX[int(np.argmin(misfits))]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..errors import CmmError
+from cmmsim.errors import CmmError
 
 
 class CalibrationError(CmmError):

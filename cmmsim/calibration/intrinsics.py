@@ -9,10 +9,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ..camera import PinholeCamera
-from ..distortion import Distortion
-from ..errors import UnknownOptionError
-from ..pose import Array
+from cmmsim.camera import PinholeCamera
+from cmmsim.distortion import Distortion
+from cmmsim.errors import UnknownOptionError
+from cmmsim.pose import Array
 
 INTRINSIC_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 DISTORTIONS = {"none": (), "radial2": ("k1", "k2"), "brown5": ("k1", "k2", "p1", "p2", "k3")}
@@ -26,8 +26,9 @@ def free_directions(distortion: str, fix_aspect: bool) -> Array:
     """
     if distortion not in DISTORTIONS:
         raise UnknownOptionError("distortion", distortion, DISTORTIONS)
-    free = np.eye(len(INTRINSIC_NAMES))[:, [k for k, name in enumerate(INTRINSIC_NAMES)
-                                            if name.endswith("_px") or name in DISTORTIONS[distortion]]]
+    free = np.eye(len(INTRINSIC_NAMES))[
+        :, [k for k, name in enumerate(INTRINSIC_NAMES) if name.endswith("_px") or name in DISTORTIONS[distortion]]
+    ]
     if fix_aspect:
         free[:, 0] += free[:, 1]
         free = np.delete(free, 1, axis=1)

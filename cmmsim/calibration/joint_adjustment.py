@@ -14,12 +14,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..pose import Array, apply, skew
-from .errors import CalibrationError
-from .intrinsics import project
-from .shared_errors import SharedErrors, shared_errors
-from .sightings import Sightings
-from .state import RigState
+from cmmsim.calibration.errors import CalibrationError
+from cmmsim.calibration.intrinsics import project
+from cmmsim.calibration.shared_errors import SharedErrors, shared_errors
+from cmmsim.calibration.sightings import Sightings
+from cmmsim.calibration.state import RigState
+from cmmsim.pose import Array, apply, skew
 
 MOST_STEPS = 60
 SMALLEST_GAIN = 1e-11  # relative decrease of the sum of squares that ends the iteration
@@ -66,6 +66,7 @@ def adjust(points: Array, sightings: tuple[Sightings, Sightings], start: RigStat
     Parameters: points (n,3) m of the board; sightings of the left and right camera, each view seen by at least one;
     start; free (9,k) from ``free_directions``. Raises CalibrationError where the views do not determine the cameras.
     """
+
     def build(state: RigState) -> _Normal:
         return _normal_equations(points, sightings, state, free)
 
@@ -74,22 +75,33 @@ def adjust(points: Array, sightings: tuple[Sightings, Sightings], start: RigStat
     size = normal.common.shape[1]
     freedom = sum(2 * len(s.view) for s in sightings) - size - POSE * len(state.left_from_boards)
     if freedom < 1:
-        raise CalibrationError(f"too few points: {freedom + size} more observations than board poses, "
-                               f"more than {size} needed")
+        raise CalibrationError(
+            f"too few points: {freedom + size} more observations than board poses, more than {size} needed"
+        )
     information, scores = _reduced(normal, 0.0)
     reduced = information.sum(axis=0)
     scale = 1.0 / np.sqrt(np.diag(reduced))
     eigenvalues = np.linalg.eigvalsh(reduced * scale[:, None] * scale)
     if not eigenvalues[0] > SINGULAR:
-        raise CalibrationError("these views do not determine the cameras (smallest eigenvalue of the scaled normal "
-                               f"matrix {eigenvalues[0]:.1e}): show the board tilted to several sides, all over "
-                               "the image")
+        raise CalibrationError(
+            "these views do not determine the cameras (smallest eigenvalue of the scaled normal "
+            f"matrix {eigenvalues[0]:.1e}): show the board tilted to several sides, all over "
+            "the image"
+        )
     sigma2 = normal.cost / freedom
     shared = shared_errors(scores, information, sigma2)
     spread = _spread(free)
-    return Adjustment(state, normal.residuals, float(np.sqrt(sigma2)),
-                      spread @ shared.covariance @ spread.T, spread @ shared.independent @ spread.T,
-                      float(eigenvalues[-1] / eigenvalues[0]), steps, freedom, shared)
+    return Adjustment(
+        state,
+        normal.residuals,
+        float(np.sqrt(sigma2)),
+        spread @ shared.covariance @ spread.T,
+        spread @ shared.independent @ spread.T,
+        float(eigenvalues[-1] / eigenvalues[0]),
+        steps,
+        freedom,
+        shared,
+    )
 
 
 def _minimise(build: Callable[[RigState], _Normal], state: RigState, free: Array) -> tuple[RigState, int]:
@@ -99,7 +111,7 @@ def _minimise(build: Callable[[RigState], _Normal], state: RigState, free: Array
     k = free.shape[1]
     for step in range(1, MOST_STEPS + 1):
         common, boards = _solve(normal, damping)
-        trial = state.moved((free @ common[:2 * k].reshape(2, k).T).T, common[2 * k:], boards)
+        trial = state.moved((free @ common[: 2 * k].reshape(2, k).T).T, common[2 * k :], boards)
         attempt = build(trial)
         if attempt.cost < normal.cost:
             gain = (normal.cost - attempt.cost) / normal.cost
@@ -110,9 +122,11 @@ def _minimise(build: Callable[[RigState], _Normal], state: RigState, free: Array
             return state, step
         else:
             damping *= 10.0
-    raise CalibrationError(f"the adjustment has not converged in {MOST_STEPS} steps (rms {_rms(normal):.3g} px, board "
-                           f"normals differ by at most {np.degrees(state.largest_tilt):.1f} degrees): show the board "
-                           "tilted to several sides, by 30 degrees and more, or free fewer terms of distortion")
+    raise CalibrationError(
+        f"the adjustment has not converged in {MOST_STEPS} steps (rms {_rms(normal):.3g} px, board "
+        f"normals differ by at most {np.degrees(state.largest_tilt):.1f} degrees): show the board "
+        "tilted to several sides, by 30 degrees and more, or free fewer terms of distortion"
+    )
 
 
 def _is_small(change: Array, normal: _Normal) -> bool:
@@ -144,8 +158,15 @@ def _normal_equations(points: Array, sightings: tuple[Sightings, Sightings], sta
             common_side[v] += jc.T @ e
             board_side[v] += jb.T @ e
     cost = float(sum(np.sum(r**2) for r in residuals))
-    return _Normal(common, mixed, boards, common_side, board_side, (residuals[0], residuals[1]),
-                   cost if np.isfinite(cost) else np.inf)
+    return _Normal(
+        common,
+        mixed,
+        boards,
+        common_side,
+        board_side,
+        (residuals[0], residuals[1]),
+        cost if np.isfinite(cost) else np.inf,
+    )
 
 
 def _predict(points: Array, seen: Sightings, state: RigState, side: int, free: Array) -> tuple[Array, Array, Array]:
@@ -164,10 +185,10 @@ def _predict(points: Array, seen: Sightings, state: RigState, side: int, free: A
     ahead = places[:, 2] > 1e-6
     pixels, by_intrinsics, by_place = project(state.intrinsics[side], np.where(ahead[:, None], places, [0.0, 0.0, 1.0]))
     pixels[~ahead] = np.inf  # a step that puts a board behind a camera is no improvement
-    by_common[:, :, side * k:(side + 1) * k] = by_intrinsics @ free
+    by_common[:, :, side * k : (side + 1) * k] = by_intrinsics @ free
     if side == 1:
-        by_common[:, :, 2 * k:2 * k + 3] = by_place
-        by_common[:, :, 2 * k + 3:] = by_place @ -skew(turned)
+        by_common[:, :, 2 * k : 2 * k + 3] = by_place
+        by_common[:, :, 2 * k + 3 :] = by_place @ -skew(turned)
     return pixels, by_common, by_place @ place_by_board
 
 
@@ -194,6 +215,6 @@ def _spread(free: Array) -> Array:
     """Matrix (24,c) from the free unknowns to all intrinsics and the small error of right_from_left."""
     rows, k = free.shape
     spread = np.zeros((2 * rows + POSE, 2 * k + POSE))
-    spread[:rows, :k] = spread[rows:2 * rows, k:2 * k] = free
-    spread[2 * rows:, 2 * k:] = np.eye(POSE)
+    spread[:rows, :k] = spread[rows : 2 * rows, k : 2 * k] = free
+    spread[2 * rows :, 2 * k :] = np.eye(POSE)
     return spread

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import CalibrationError
-from .named import some
+from cmmsim.calibration.errors import CalibrationError
+from cmmsim.calibration.named import some
 
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp")
 WHITE_SHARE = 99.9  # percentile of an image of more than 8 bit that becomes 255: 12-bit cameras fill 1/16 of 16 bit
@@ -45,7 +45,8 @@ def pair_images(left: str | Path, right: str | Path) -> list[ImagePair]:
         alone = [sorted(names[0] - names[1]), sorted(names[1] - names[0])]
         raise CalibrationError(
             f"{left} holds {len(found[0])} images and {right} {len(found[1])}; {HOW_PAIRED}, so each image needs its "
-            f"partner. Only on the left: {some(alone[0])}; only on the right: {some(alone[1])}")
+            f"partner. Only on the left: {some(alone[0])}; only on the right: {some(alone[1])}"
+        )
     return [ImagePair(a, b) for a, b in zip(*found, strict=True)]
 
 
@@ -81,8 +82,11 @@ def _eight_bit(image: NDArray) -> NDArray[np.uint8]:
 def _image_files(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise CalibrationError(f"no folder {folder}; name a folder of left and a folder of right images")
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file()
-                   and not path.name.startswith("."))
+    files = sorted(
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
+    )
     if not files:
         raise CalibrationError(f"folder {folder} holds no images, which end in {', '.join(SUFFIXES)}")
     return files

@@ -7,25 +7,32 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera import PinholeCamera
-from ..image_formation import ImageFormation, Side
-from ..images import StereoFrame
-from ..noise import CameraNoise
-from ..optics import Optics
-from ..pose import Array, apply
-from ..renderers import Renderer
-from ..stereo_rig import StereoRig
-from .board import Board
-from .board_scene import board_drawable, plate_corners
-from .errors import CalibrationError
+from cmmsim.calibration.board import Board
+from cmmsim.calibration.board_scene import board_drawable, plate_corners
+from cmmsim.calibration.errors import CalibrationError
+from cmmsim.camera import PinholeCamera
+from cmmsim.image_formation import ImageFormation, Side
+from cmmsim.images import StereoFrame
+from cmmsim.noise import CameraNoise
+from cmmsim.optics import Optics
+from cmmsim.pose import Array, apply
+from cmmsim.renderers import Renderer
+from cmmsim.stereo_rig import StereoRig
 
 TILE_PX = 64
 SUPERSAMPLING = 12
 OUTLINE_POINTS = 15  # along each side of the plate, to know where a bent one reaches
 
 
-def render_pairs(rig: StereoRig, board: Board, poses: Sequence[Array], renderer: Renderer, optics: Optics,
-                 noise: CameraNoise, rng: np.random.Generator) -> Iterator[StereoFrame]:
+def render_pairs(
+    rig: StereoRig,
+    board: Board,
+    poses: Sequence[Array],
+    renderer: Renderer,
+    optics: Optics,
+    noise: CameraNoise,
+    rng: np.random.Generator,
+) -> Iterator[StereoFrame]:
     """Noisy images of both cameras for each pose left_from_board (4,4).
 
     Raises CalibrationError for a chessboard with the analytic renderer, which draws discs and convex solids only.
@@ -35,20 +42,23 @@ def render_pairs(rig: StereoRig, board: Board, poses: Sequence[Array], renderer:
     distance = float(np.mean([np.linalg.norm(pose[:3, 3]) for pose in poses]))
     formation = ImageFormation(renderer, board_drawable(board, distance), 0.0, optics)
     for pose in poses:
-        sides = [noise.expose(_radiance(formation, camera, move @ pose, board), rng)
-                 for camera, move in zip(rig.cameras, rig.from_camera, strict=True)]
+        sides = [
+            noise.expose(_radiance(formation, camera, move @ pose, board), rng)
+            for camera, move in zip(rig.cameras, rig.from_camera, strict=True)
+        ]
         yield StereoFrame(*sides)
 
 
-def _radiance(formation: ImageFormation, camera: PinholeCamera, camera_from_board: Array,
-              board: Board) -> NDArray[np.float32]:
+def _radiance(
+    formation: ImageFormation, camera: PinholeCamera, camera_from_board: Array, board: Board
+) -> NDArray[np.float32]:
     """Radiance (height, width) of one image; only tiles that the board reaches are drawn."""
     image = np.zeros((-(-camera.height // TILE_PX) * TILE_PX, -(-camera.width // TILE_PX) * TILE_PX), dtype=np.float32)
     corners = _reached_tiles(camera, camera_from_board, board, formation.optics.margin_px)
     tiles = formation.windows([Side(camera, camera_from_board[None], corners)], TILE_PX, SUPERSAMPLING)[0]
     for (x, y), tile in zip(corners, tiles, strict=True):
-        image[y:y + TILE_PX, x:x + TILE_PX] = tile
-    return image[:camera.height, :camera.width]
+        image[y : y + TILE_PX, x : x + TILE_PX] = tile
+    return image[: camera.height, : camera.width]
 
 
 def _reached_tiles(camera: PinholeCamera, camera_from_board: Array, board: Board, margin: int) -> NDArray[np.int_]:

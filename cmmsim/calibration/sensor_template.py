@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..rig_from_file import rig_from_file
-from ..sensor_file import built_in_names, read_sensor_file, sensor_text
-from .calibration import Calibration
-from .errors import CalibrationError
-from .result_text import rig_tables
+from cmmsim.calibration.calibration import Calibration
+from cmmsim.calibration.errors import CalibrationError
+from cmmsim.calibration.result_text import rig_tables
+from cmmsim.rig_from_file import rig_from_file
+from cmmsim.sensor_file import built_in_names, read_sensor_file, sensor_text
 
 TABLES = ("rig.left", "rig.right", "rig.right_from_left")
 HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(#.*)?$")
@@ -37,8 +37,10 @@ class SensorTemplate:
     def require_size(self, size: tuple[int, int]) -> None:
         """Raise CalibrationError for images of another size (width, height) px."""
         if size != self.size:
-            raise CalibrationError(f"the images are {size[0]} x {size[1]} px, those of the sensor file {self.name} "
-                                   f"{self.size[0]} x {self.size[1]}: take a sensor file of the same cameras")
+            raise CalibrationError(
+                f"the images are {size[0]} x {size[1]} px, those of the sensor file {self.name} "
+                f"{self.size[0]} x {self.size[1]}: take a sensor file of the same cameras"
+            )
 
     def filled(self, found: Calibration) -> str:
         """Text of the sensor file with the calibrated cameras. Raises CalibrationError for images of another size."""
@@ -50,8 +52,10 @@ class SensorTemplate:
         baseline = float(np.linalg.norm(found.rig.right_from_left[:3, 3]))
         if max(baseline / self.baseline, self.baseline / baseline) <= LARGEST_RATIO:
             return []
-        return [f"the cameras stand {baseline:.4g} m apart, those of the sensor file {self.name} {self.baseline:.4g} "
-                "m: are the lengths of the board file in m, and is it the file of these cameras?"]
+        return [
+            f"the cameras stand {baseline:.4g} m apart, those of the sensor file {self.name} {self.baseline:.4g} "
+            "m: are the lengths of the board file in m, and is it the file of these cameras?"
+        ]
 
 
 def sensor_template(name: str | Path, folder: str | Path) -> SensorTemplate:
@@ -65,8 +69,9 @@ def sensor_template(name: str | Path, folder: str | Path) -> SensorTemplate:
     try:
         tomllib.loads(text + "".join(f"[{table}]\n" for table in TABLES))
     except tomllib.TOMLDecodeError as error:
-        raise CalibrationError(f"sensor file {name} must hold {', '.join(TABLES)} as tables of their own: "
-                               f"{error}") from error
+        raise CalibrationError(
+            f"sensor file {name} must hold {', '.join(TABLES)} as tables of their own: {error}"
+        ) from error
     baseline = float(np.linalg.norm(rig_from_file(section)[0].right_from_left[:3, 3]))
     return SensorTemplate(text, (section.width, section.height), baseline, str(name))
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pose import Array
-from .board_detection import BoardView
+from cmmsim.calibration.board_detection import BoardView
+from cmmsim.pose import Array
 
 SIDES = ("left", "right")
 
@@ -37,8 +37,9 @@ class PairView:
         """Why sides are missing; empty when none is."""
         if isinstance(self.left, str) and self.left == self.right:
             return f"both: {self.left}"
-        return "; ".join(f"{name}: {side}" for name, side in zip(SIDES, self.sides, strict=True)
-                         if isinstance(side, str))
+        return "; ".join(
+            f"{name}: {side}" for name, side in zip(SIDES, self.sides, strict=True) if isinstance(side, str)
+        )
 
     def without(self, side: int, reason: str) -> PairView:
         """The pair with one side (0 left, 1 right) given up."""
@@ -64,7 +65,11 @@ def sightings_of(pairs: Sequence[PairView]) -> tuple[Sightings, Sightings]:
     for side in range(2):
         seen = [(k, pair.sides[side]) for k, pair in enumerate(pairs)]
         views = [(k, view) for k, view in seen if not isinstance(view, str)]
-        both.append(Sightings(np.concatenate([np.full(len(v.index), k) for k, v in views]),
-                              np.concatenate([v.index for _, v in views]),
-                              np.concatenate([v.pixels for _, v in views])))
+        both.append(
+            Sightings(
+                np.concatenate([np.full(len(v.index), k) for k, v in views]),
+                np.concatenate([v.index for _, v in views]),
+                np.concatenate([v.pixels for _, v in views]),
+            )
+        )
     return both[0], both[1]

@@ -12,21 +12,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pose import Array, invert
-from .board import Board
-from .board_detection import BoardView
-from .errors import CalibrationError
-from .sightings import SIDES, PairView
-from .state import RigState
-from .view_variety import require_variety
+from cmmsim.calibration.board import Board
+from cmmsim.calibration.board_detection import BoardView
+from cmmsim.calibration.errors import CalibrationError
+from cmmsim.calibration.sightings import SIDES, PairView
+from cmmsim.calibration.state import RigState
+from cmmsim.calibration.view_variety import require_variety
+from cmmsim.pose import Array, invert
 
 ALIKE_ANGLE, ALIKE_SHARE = 0.06, 0.12  # rad; of the baseline: places of the right camera that count as the same
 FEWEST_VIEWS = 3
 MISFIT = "the two places of the board fit no other pair: wrong partner, or moved between the exposures"
 
 
-def start_values(board: Board, pairs: Sequence[PairView], size: tuple[int, int], bend: bool,
-                 fix_aspect: bool) -> tuple[RigState, list[PairView]]:
+def start_values(
+    board: Board, pairs: Sequence[PairView], size: tuple[int, int], bend: bool, fix_aspect: bool
+) -> tuple[RigState, list[PairView]]:
     """First state, and the pairs with right images read like the left ones; pairs that do not fit lose both sides.
 
     bend: whether two radial terms of distortion are estimated; size: (width, height) px. Raises CalibrationError.
@@ -35,13 +36,18 @@ def start_values(board: Board, pairs: Sequence[PairView], size: tuple[int, int],
     poses = [dict(camera[1]) for camera in cameras]
     pairs, right_from_left = _read_alike(board, pairs, poses)
     right_from_left = _stereo(board, pairs, [camera[0] for camera in cameras], size, right_from_left)
-    boards = np.stack([poses[0][k] if k in poses[0] else invert(right_from_left) @ poses[1].get(k, np.eye(4))
-                       for k in range(len(pairs))])
+    boards = np.stack(
+        [
+            poses[0][k] if k in poses[0] else invert(right_from_left) @ poses[1].get(k, np.eye(4))
+            for k in range(len(pairs))
+        ]
+    )
     return RigState(np.stack([camera[0] for camera in cameras]), right_from_left, boards), pairs
 
 
-def _single(board: Board, pairs: Sequence[PairView], side: int, size: tuple[int, int], bend: bool,
-            fix_aspect: bool) -> tuple[Array, list[tuple[int, Array]]]:
+def _single(
+    board: Board, pairs: Sequence[PairView], side: int, size: tuple[int, int], bend: bool, fix_aspect: bool
+) -> tuple[Array, list[tuple[int, Array]]]:
     """Intrinsics (9,) of one camera, and camera_from_board (4,4) of each view by the pair's place."""
     views = [(k, v) for k, v in ((k, p.sides[side]) for k, p in enumerate(pairs)) if not isinstance(v, str)]
     if len(views) < FEWEST_VIEWS:
@@ -55,19 +61,21 @@ def _single(board: Board, pairs: Sequence[PairView], side: int, size: tuple[int,
     try:
         _, matrix, terms, turns, shifts = cv2.calibrateCamera(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
     except cv2.error as error:
-        raise CalibrationError(f"OpenCV finds no {SIDES[side]} camera for these views: {error.err}; show the board "
-                               "tilted to several sides") from error
+        raise CalibrationError(
+            f"OpenCV finds no {SIDES[side]} camera for these views: {error.err}; show the board tilted to several sides"
+        ) from error
     terms = np.asarray(terms, dtype=float).ravel()
     values = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *terms[:5]])
     places = [_transform(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
     if not (np.isfinite(values).all() and values[:2].min() > 0.0 and all(np.isfinite(p).all() for p in places)):
-        raise CalibrationError(f"OpenCV's {SIDES[side]} camera is not finite (focal lengths {values[:2]}): show the "
-                               "board tilted to several sides")
+        raise CalibrationError(
+            f"OpenCV's {SIDES[side]} camera is not finite (focal lengths {values[:2]}): show the "
+            "board tilted to several sides"
+        )
     return values, [(k, place) for (k, _), place in zip(views, places, strict=True)]
 
 
-def _read_alike(board: Board, pairs: Sequence[PairView],
-                poses: list[dict[int, Array]]) -> tuple[list[PairView], Array]:
+def _read_alike(board: Board, pairs: Sequence[PairView], poses: list[dict[int, Array]]) -> tuple[list[PairView], Array]:
     """Pairs whose right images are read in the order that most pairs agree on, and right_from_left (4,4) of it."""
     orders = board.symmetries
     turned = [_renaming_move(board, order) for order in orders]
@@ -80,8 +88,10 @@ def _read_alike(board: Board, pairs: Sequence[PairView],
     best = int(np.lexsort((angle, -support))[0])
     count = sum(pair.both for pair in pairs)
     if support[best] < max(FEWEST_VIEWS, 0.5 * count):
-        raise CalibrationError(f"only {support[best]} of {count} pairs agree on where the right camera stands: the "
-                               "images of a pair were not taken together, or the folders are paired wrongly")
+        raise CalibrationError(
+            f"only {support[best]} of {count} pairs agree on where the right camera stands: the "
+            "images of a pair were not taken together, or the folders are paired wrongly"
+        )
     chosen = {names[i][0]: orders[names[i][1]] for i in np.flatnonzero(alike[best])}
     read = list(pairs)
     for k, pair in enumerate(pairs):
@@ -119,8 +129,9 @@ def _angles(places: Array, rotations: Array) -> Array:
     return np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))
 
 
-def _stereo(board: Board, pairs: Sequence[PairView], cameras: list[Array], size: tuple[int, int],
-            guess: Array) -> Array:
+def _stereo(
+    board: Board, pairs: Sequence[PairView], cameras: list[Array], size: tuple[int, int], guess: Array
+) -> Array:
     """right_from_left (4,4) by OpenCV with the cameras as they are, from the points that both see."""
     points, left, right = [], [], []
     for pair in pairs:

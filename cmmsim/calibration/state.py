@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..pose import Array, rotation_exp
+from cmmsim.pose import Array, rotation_exp
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,11 @@ class RigState:
     def moved(self, intrinsics: Array, right: Array, boards: Array) -> RigState:
         """The state after changes of the intrinsics (2,9), and small errors [dt, dphi] of right_from_left (6,) and of
         the boards (v,6)."""
-        return RigState(self.intrinsics + intrinsics, _moved(self.right_from_left, right),
-                        np.stack([_moved(b, change) for b, change in zip(self.left_from_boards, boards, strict=True)]))
+        return RigState(
+            self.intrinsics + intrinsics,
+            _moved(self.right_from_left, right),
+            np.stack([_moved(b, change) for b, change in zip(self.left_from_boards, boards, strict=True)]),
+        )
 
 
 def _moved(transform: Array, change: Array) -> Array:

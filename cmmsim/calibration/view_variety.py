@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..pose import Array
-from .board_detection import BoardView
-from .errors import CalibrationError
+from cmmsim.calibration.board_detection import BoardView
+from cmmsim.calibration.errors import CalibrationError
+from cmmsim.pose import Array
 
 ALIKE_PX = 2.0  # rms distance of the points of two pictures that show the board in one place
 
@@ -22,9 +22,11 @@ def require_variety(views: Sequence[BoardView], orders: Sequence[NDArray[np.int_
     count = len(different_views(views, orders))
     if count < fewest:
         places = "one place" if count == 1 else f"{count} places"
-        raise CalibrationError(f"the {len(views)} pictures of the {camera} camera are alike, they show the board in "
-                               f"{places} only (within {ALIKE_PX:g} px), {fewest} at the least are needed: move and "
-                               "tilt the board from picture to picture")
+        raise CalibrationError(
+            f"the {len(views)} pictures of the {camera} camera are alike, they show the board in "
+            f"{places} only (within {ALIKE_PX:g} px), {fewest} at the least are needed: move and "
+            "tilt the board from picture to picture"
+        )
 
 
 def different_views(views: Sequence[BoardView], orders: Sequence[NDArray[np.int_]]) -> list[BoardView]:

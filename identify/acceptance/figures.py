@@ -25,8 +25,10 @@ def lines_figure(volume: MeasuringVolume) -> Figure:
 def paths_figure(volume: MeasuringVolume) -> Figure:
     """The volume with the paths of the bar's middle; axes in mm."""
     to_volume = invert(volume.base_from_volume)
-    curves = {path.name: apply(to_volume, np.array([path.pose(time)[:3] for time in np.linspace(0.0, SECONDS, 200)]))
-              for path in bar_paths(volume)}
+    curves = {
+        path.name: apply(to_volume, np.array([path.pose(time)[:3] for time in np.linspace(0.0, SECONDS, 200)]))
+        for path in bar_paths(volume)
+    }
     return _in_volume(volume, "Paths of the bar's middle (ASTM E3064)", curves)
 
 
@@ -44,8 +46,10 @@ def length_figure(test: LengthTest, limit_um: float) -> Figure:
         axes.axhline(sign * limit_um, color="black", linestyle="--", linewidth=1)
     axes.set_xlabel("certified length [mm]")
     axes.set_ylabel("length measurement error [um]")
-    axes.set_title(f"VDI/VDE 2634-1: largest error {1e6 * test.largest.error:+.1f} um, limit ± {limit_um:g} um (dashes)"
-                   "\ndots: single exposures, lines: their mean")
+    axes.set_title(
+        f"VDI/VDE 2634-1: largest error {1e6 * test.largest.error:+.1f} um, limit ± {limit_um:g} um (dashes)"
+        "\ndots: single exposures, lines: their mean"
+    )
     axes.legend(fontsize="small", ncols=2)
     axes.grid(alpha=0.3)
     return figure
@@ -57,8 +61,9 @@ def bar_figure(test: BarTest) -> Figure:
     panels = figure.subplots(2, 2, width_ratios=(3, 2))
     for run in test.runs:
         for row, columns, scale in ((0, slice(0, 3), 1e6), (1, slice(3, 6), 1e6)):
-            panels[row, 0].plot(run.time, scale * np.linalg.norm(run.errors[:, columns], axis=1), linewidth=0.7,
-                                label=run.name)
+            panels[row, 0].plot(
+                run.time, scale * np.linalg.norm(run.errors[:, columns], axis=1), linewidth=0.7, label=run.name
+            )
     for row, (name, unit) in enumerate((("position", "um"), ("orientation", "urad"))):
         panels[row, 0].set_ylabel(f"{name} error [{unit}]")
         panels[row, 0].axvline(0.0, color="black", linestyle="--", linewidth=1)
@@ -93,14 +98,18 @@ def latency_figure(test: LatencyTest) -> Figure:
 def _distribution(axes: Axes, test: BarTest, row: int, name: str, unit: str) -> None:
     """Share of frames below an error, standing and moving, with published figures as vertical lines."""
     for moving, word in ((False, "standing"), (True, "moving")):
-        magnitudes = np.sort(1e6 * np.linalg.norm(test.errors(moving)[:, 3 * row:3 * row + 3], axis=1))
+        magnitudes = np.sort(1e6 * np.linalg.norm(test.errors(moving)[:, 3 * row : 3 * row + 3], axis=1))
         axes.plot(magnitudes, np.arange(1, len(magnitudes) + 1) / len(magnitudes), label=f"this sensor, {word}")
     figures = [*published(f"{name}, static"), *published(f"{name}, moving")]
     for number, figure in enumerate(figures):
         value = 1e3 * figure.value if figure.unit == "mm" else 1e6 * np.deg2rad(figure.value)
         style = ":" if figure.quantity.endswith("static") else "-."
-        axes.axvline(value, color=f"C{number + 2}", linestyle=style,
-                     label=f"{figure.instrument}, {figure.quantity.split(', ')[1]}")
+        axes.axvline(
+            value,
+            color=f"C{number + 2}",
+            linestyle=style,
+            label=f"{figure.instrument}, {figure.quantity.split(', ')[1]}",
+        )
     axes.set_xscale("log")
     axes.set_xlabel(f"{name} error [{unit}]")
     axes.set_ylabel("share of frames")
@@ -117,8 +126,12 @@ def _in_volume(volume: MeasuringVolume, title: str, curves: dict[str, np.ndarray
     for name, curve in curves.items():
         axes.plot(*_shown(curve), label=name)
     near, far = volume.depth_range
-    axes.set(xlabel="x [mm]", ylabel="z, away from the rig [mm]", zlabel="−y, up [mm]",
-             title=f"{title}\nvolume {volume}, {1e3 * near:.0f} to {1e3 * far:.0f} mm from the baseline")
+    axes.set(
+        xlabel="x [mm]",
+        ylabel="z, away from the rig [mm]",
+        zlabel="−y, up [mm]",
+        title=f"{title}\nvolume {volume}, {1e3 * near:.0f} to {1e3 * far:.0f} mm from the baseline",
+    )
     axes.set_box_aspect(volume.size[[0, 2, 1]], zoom=0.85)
     axes.view_init(elev=16, azim=-72)
     axes.legend(loc="upper left", fontsize="x-small")

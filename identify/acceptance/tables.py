@@ -9,8 +9,11 @@ from identify.reporting.tables import Table, number
 
 URAD_IN_DEG = float(np.rad2deg(1e-6))
 STATISTICS = (("mean", "mean"), ("rms", "RMS"), ("p95", "95th percentile"), ("maximum", "maximum"))
-MAGNITUDES = (("position_um", "position [um]"), ("orientation_urad", "orientation [urad]"),
-              ("distance_um", "distance of the ends [um]"))
+MAGNITUDES = (
+    ("position_um", "position [um]"),
+    ("orientation_urad", "orientation [urad]"),
+    ("distance_um", "distance of the ends [um]"),
+)
 COMPARABLE = """\
 What is comparable: the NIST figures are of the same kind as our bar test, the relative error of markers at both ends of
 a rigid bar. The length test follows the rules of the guideline, so its errors mean what such a test's errors mean.
@@ -31,19 +34,31 @@ def length_table(entry: dict[str, Any]) -> Table:
     for line in test["lines"]:
         lengths = line["lengths"]
         errors = [length["error_um"] for length in lengths]
-        rows.append((line["name"], ", ".join(f"{length['certified_mm']:.0f}" for length in lengths),
-                     number(line["longest_share_of_diagonal"]), ", ".join(f"{error:+.1f}" for error in errors),
-                     number(max(abs(error) for error in errors))))
+        rows.append(
+            (
+                line["name"],
+                ", ".join(f"{length['certified_mm']:.0f}" for length in lengths),
+                number(line["longest_share_of_diagonal"]),
+                ", ".join(f"{error:+.1f}" for error in errors),
+                number(max(abs(error) for error in errors)),
+            )
+        )
     verdict = "met" if test["met"] else "MISSED"
     where = test["largest_error_at"]
     low, high = test["mean_error_interval_um"]
-    note = (f"Largest error {test['largest_error_um']:+.1f} um ({where['line']}, {where['length_mm']:.0f} mm), limit "
-            f"± {test['limit_um']:g} um: {verdict}. Mean error {test['mean_error_um']:+.2f} um, 95 % interval "
-            f"{low:+.2f} to {high:+.2f} um. A length is the mean of {test['exposures_a_length']} exposures; the RMS "
-            f"error of a single one is {number(test['single_exposure_rms_um'])} um, its mean square "
-            f"{number(test['variance_ratio'])} times the stated variance.")
-    return Table("Lengths in the style of VDI/VDE 2634-1",
-                 ("line", "lengths [mm]", "longest / diagonal", "errors E [um]", "largest [um]"), tuple(rows), note)
+    note = (
+        f"Largest error {test['largest_error_um']:+.1f} um ({where['line']}, {where['length_mm']:.0f} mm), limit "
+        f"± {test['limit_um']:g} um: {verdict}. Mean error {test['mean_error_um']:+.2f} um, 95 % interval "
+        f"{low:+.2f} to {high:+.2f} um. A length is the mean of {test['exposures_a_length']} exposures; the RMS "
+        f"error of a single one is {number(test['single_exposure_rms_um'])} um, its mean square "
+        f"{number(test['variance_ratio'])} times the stated variance."
+    )
+    return Table(
+        "Lengths in the style of VDI/VDE 2634-1",
+        ("line", "lengths [mm]", "longest / diagonal", "errors E [um]", "largest [um]"),
+        tuple(rows),
+        note,
+    )
 
 
 def bar_table(entry: dict[str, Any]) -> Table:
@@ -55,15 +70,21 @@ def bar_table(entry: dict[str, Any]) -> Table:
             figures = test[state][key]
             values = [number(figures[k]) + _interval(figures["interval"].get(k)) for k, _ in STATISTICS]
             rows.append((f"{state}, {name}", *values, str(figures["count"])))
-    note = (f"A bar with {test['bar_length_mm']:.0f} mm between the clusters at its ends, moved at up to "
-            f"{test['largest_speed_mm_s']:.0f} mm/s with {test['exposure_ms']:g} ms of exposure; in brackets 95 % "
-            f"intervals. {test['lost_frames']} of {test['frames']} frames lost. The squared "
-            f"errors are {number(test['variance_ratio'])} times the stated variance.")
+    note = (
+        f"A bar with {test['bar_length_mm']:.0f} mm between the clusters at its ends, moved at up to "
+        f"{test['largest_speed_mm_s']:.0f} mm/s with {test['exposure_ms']:g} ms of exposure; in brackets 95 % "
+        f"intervals. {test['lost_frames']} of {test['frames']} frames lost. The squared "
+        f"errors are {number(test['variance_ratio'])} times the stated variance."
+    )
     given_up = [f"{run['name']} ({run['given_up']})" for run in test["runs"] if run["given_up"]]
     if given_up:
         note += f" Given up after {GIVEN_UP} lost frames in a row, the rest counted as lost: {'; '.join(given_up)}."
-    return Table("Rigid bar in the style of ASTM E3064-16",
-                 ("relative pose error", *(name for _, name in STATISTICS), "frames"), tuple(rows), note)
+    return Table(
+        "Rigid bar in the style of ASTM E3064-16",
+        ("relative pose error", *(name for _, name in STATISTICS), "frames"),
+        tuple(rows),
+        note,
+    )
 
 
 def latency_table(entry: dict[str, Any]) -> Table:
@@ -78,9 +99,13 @@ def latency_table(entry: dict[str, Any]) -> Table:
         ("stated in the sensor file", f"{test['sensor_file_ms']:.4f}"),
         ("oldest pose at hand: maximum and one frame", f"{test['oldest_pose_ms']:.4f}"),
     )
-    return Table("Latency in the style of ASTM E3124", ("from the middle of the exposure to the report", "[ms]"), rows,
-                 f"{test['reports']} reports of a body on a circle, {test['lost_frames']} frames lost; in brackets the "
-                 "95 % interval.")
+    return Table(
+        "Latency in the style of ASTM E3124",
+        ("from the middle of the exposure to the report", "[ms]"),
+        rows,
+        f"{test['reports']} reports of a body on a circle, {test['lost_frames']} frames lost; in brackets the "
+        "95 % interval.",
+    )
 
 
 def published_table(entry: dict[str, Any]) -> Table:
@@ -90,8 +115,11 @@ def published_table(entry: dict[str, Any]) -> Table:
     quantities = dict.fromkeys([*(figure["quantity"] for figure in entry["published"])])
     for quantity in quantities:
         rows += [(quantity, entry["sensor"], value, note) for value, note in ours.get(quantity, ())]
-        rows += [(quantity, f["instrument"], f"{f['value']:g} {f['unit']}", f["note"]) for f in entry["published"]
-                 if f["quantity"] == quantity]
+        rows += [
+            (quantity, f["instrument"], f"{f['value']:g} {f['unit']}", f["note"])
+            for f in entry["published"]
+            if f["quantity"] == quantity
+        ]
     return Table("Beside published figures", ("quantity", "instrument", "value", "what it is"), tuple(rows))
 
 
@@ -100,13 +128,18 @@ def acceptance_markdown(entry: dict[str, Any]) -> str:
     volume = entry["volume"]
     near, far = volume["depth_from_baseline_mm"]
     sides = " x ".join(f"{side:.0f}" for side in volume["size_mm"])
-    parts = [f"# Acceptance of {entry['sensor']}",
-             f"Renderer {entry['renderer']}, seed {entry['seed']}. Measuring volume {sides} mm "
-             f"({volume['cubic_metres']:.3g} m³, space diagonal {volume['diagonal_mm']:.0f} mm), {near:.0f} to "
-             f"{far:.0f} mm from the middle of the baseline: wholly seen by both cameras.",
-             *([f"Of the sensor's figures: {entry['note']}."] if entry.get("note") else [])]
-    tables = [make(entry) for key, make in (("vdi_2634_1", length_table), ("astm_e3064", bar_table),
-                                            ("astm_e3124", latency_table)) if key in entry]
+    parts = [
+        f"# Acceptance of {entry['sensor']}",
+        f"Renderer {entry['renderer']}, seed {entry['seed']}. Measuring volume {sides} mm "
+        f"({volume['cubic_metres']:.3g} m³, space diagonal {volume['diagonal_mm']:.0f} mm), {near:.0f} to "
+        f"{far:.0f} mm from the middle of the baseline: wholly seen by both cameras.",
+        *([f"Of the sensor's figures: {entry['note']}."] if entry.get("note") else []),
+    ]
+    tables = [
+        make(entry)
+        for key, make in (("vdi_2634_1", length_table), ("astm_e3064", bar_table), ("astm_e3124", latency_table))
+        if key in entry
+    ]
     for table in [*tables, published_table(entry)]:
         parts += [f"## {table.title}", table.markdown(), *([table.note] if table.note else [])]
     return "\n\n".join([*parts, COMPARABLE.strip()]) + "\n"
@@ -117,18 +150,25 @@ def _our_figures(entry: dict[str, Any]) -> dict[str, list[tuple[str, str]]]:
     found: dict[str, list[tuple[str, str]]] = {}
     if "vdi_2634_1" in entry:
         test = entry["vdi_2634_1"]
-        found["position, static"] = [(f"{1e-3 * abs(test['largest_error_um']):.4f} mm",
-                                      f"largest length error, mean of {test['exposures_a_length']} exposures")]
+        found["position, static"] = [
+            (
+                f"{1e-3 * abs(test['largest_error_um']):.4f} mm",
+                f"largest length error, mean of {test['exposures_a_length']} exposures",
+            )
+        ]
     if "astm_e3064" in entry:
         for state, word in (("standing", "static"), ("moving", "moving")):
             figures = entry["astm_e3064"][state]
-            for key, name, scale, unit in (("position_um", "position", 1e-3, "mm"),
-                                           ("distance_um", "position", 1e-3, "mm"),
-                                           ("orientation_urad", "orientation", URAD_IN_DEG, "deg")):
+            for key, name, scale, unit in (
+                ("position_um", "position", 1e-3, "mm"),
+                ("distance_um", "position", 1e-3, "mm"),
+                ("orientation_urad", "orientation", URAD_IN_DEG, "deg"),
+            ):
                 values = figures[key]
                 what = "distance of the bar's ends" if key == "distance_um" else "relative pose of the bar's ends"
                 found.setdefault(f"{name}, {word}", []).append(
-                    (f"{scale * values['rms']:.4f} {unit} RMS, {scale * values['maximum']:.4f} {unit} largest", what))
+                    (f"{scale * values['rms']:.4f} {unit} RMS, {scale * values['maximum']:.4f} {unit} largest", what)
+                )
     if "astm_e3124" in entry:
         found["latency"] = [(f"{entry['astm_e3124']['mean_ms']:.3f} ms", "mean; set by the sensor file")]
     return found

@@ -21,9 +21,7 @@ def acceptance(
         str | None,
         typer.Option(help="pyrender, analytic or auto.", show_default="what the sensor file says"),
     ] = None,
-    standard: Annotated[
-        str, typer.Option(help="vdi (lengths), e3064 (moving bar), e3124 (latency) or all.")
-    ] = "all",
+    standard: Annotated[str, typer.Option(help="vdi (lengths), e3064 (moving bar), e3124 (latency) or all.")] = "all",
     volume: Annotated[
         str | None,
         typer.Option(
@@ -95,13 +93,17 @@ def _print_summary(entry: dict[str, Any], folder: Path) -> None:
     """One line a test, and where the report is."""
     lines = []
     if (test := entry.get("vdi_2634_1")) is not None:
-        lines.append(f"length error: largest {test['largest_error_um']:+.1f} um, limit ± {test['limit_um']:g} um: "
-                     f"{'met' if test['met'] else 'MISSED'}")
+        lines.append(
+            f"length error: largest {test['largest_error_um']:+.1f} um, limit ± {test['limit_um']:g} um: "
+            f"{'met' if test['met'] else 'MISSED'}"
+        )
     if (test := entry.get("astm_e3064")) is not None:
         for state in ("standing", "moving"):
             position, orientation = test[state]["position_um"], test[state]["orientation_urad"]
-            lines.append(f"{state} bar: position {position['rms']:.1f} um RMS, {position['maximum']:.0f} largest; "
-                         f"orientation {orientation['rms']:.0f} urad RMS, {orientation['maximum']:.0f} largest")
+            lines.append(
+                f"{state} bar: position {position['rms']:.1f} um RMS, {position['maximum']:.0f} largest; "
+                f"orientation {orientation['rms']:.0f} urad RMS, {orientation['maximum']:.0f} largest"
+            )
     if (test := entry.get("astm_e3124")) is not None:
         low, high = test["mean_interval_ms"]
         lines.append(f"latency: {test['mean_ms']:.4f} ms ({low:.4f} to {high:.4f}), largest {test['max_ms']:.4f} ms")
@@ -115,5 +117,7 @@ def _require_met(entry: dict[str, Any], limit_um: float, folder: Path) -> None:
 
     lengths = entry.get("vdi_2634_1")
     if lengths and not lengths["met"]:
-        raise VerificationError(f"the largest length error is {abs(lengths['largest_error_um']):.1f} um on line "
-                                f"{lengths['largest_error_at']['line']}, more than {limit_um:g} um; see {folder}")
+        raise VerificationError(
+            f"the largest length error is {abs(lengths['largest_error_um']):.1f} um on line "
+            f"{lengths['largest_error_at']['line']}, more than {limit_um:g} um; see {folder}"
+        )

@@ -107,8 +107,10 @@ def calibrate(
     progress = terminal_progress(quiet)
     if render is not None:
         _require_none("--render makes pictures and reads none", LEFT=left, RIGHT=right)
-        _require_none("--render makes pictures and calibrates nothing",
-                      **{"--distortion": distortion, "--fix-aspect": fix_aspect or None, "--min-images": min_images})
+        _require_none(
+            "--render makes pictures and calibrates nothing",
+            **{"--distortion": distortion, "--fix-aspect": fix_aspect or None, "--min-images": min_images},
+        )
         chosen = None if board is None else read_board(board)
         _render(folder, sensor or "ctrack780", chosen, render, seed or 0, progress, quiet)
         return
@@ -138,8 +140,14 @@ def _options(distortion: str | None, fix_aspect: bool, min_images: int | None) -
     return CalibrationOptions(distortion or default.distortion, fix_aspect, min_images or default.min_images)
 
 
-def _calibrate(left: Path, right: Path, board: "Board", options: "CalibrationOptions",
-               template: "SensorTemplate | None", progress: Progress) -> "Calibration":
+def _calibrate(
+    left: Path,
+    right: Path,
+    board: "Board",
+    options: "CalibrationOptions",
+    template: "SensorTemplate | None",
+    progress: Progress,
+) -> "Calibration":
     from cmmsim.calibration import calibrate, pair_images, read_grey, view_pairs
 
     files = pair_images(left, right)
@@ -188,8 +196,9 @@ def _write_sensor(path: Path, text: str) -> list[str]:
     return []
 
 
-def _render(folder: Path, sensor: str, board: "Board | None", count: int, seed: int, progress: Progress,
-            quiet: bool) -> None:
+def _render(
+    folder: Path, sensor: str, board: "Board | None", count: int, seed: int, progress: Progress, quiet: bool
+) -> None:
     """Pictures in left/ and right/, and board.toml beside them: all of them, or nothing."""
     import numpy as np
 
@@ -211,8 +220,10 @@ def _render(folder: Path, sensor: str, board: "Board | None", count: int, seed: 
             advance()
         (made / "board.toml").write_text(board.as_toml(), encoding="utf-8")
     if not quiet:
-        typer.echo(f"pictures: {folder}\ncalibrate with: cmmsim calibrate {folder}/left {folder}/right "
-                   f"--board {folder}/board.toml --sensor {sensor}")
+        typer.echo(
+            f"pictures: {folder}\ncalibrate with: cmmsim calibrate {folder}/left {folder}/right "
+            f"--board {folder}/board.toml --sensor {sensor}"
+        )
 
 
 def _write_picture(path: Path, image: "NDArray[np.unsignedinteger]") -> None:
@@ -227,8 +238,10 @@ def _print_summary(found: "Calibration", folder: Path) -> None:
     from cmmsim.calibration import PARAMETER_NAMES
 
     count = sum(len(view.rms_px) == 2 for view in found.used)
-    rows = [(name, f"{value:.6g}", f"{std:.2g}" if std > 0.0 else "fixed")
-            for name, value, std in zip(PARAMETER_NAMES, found.values, found.std, strict=True)]
+    rows = [
+        (name, f"{value:.6g}", f"{std:.2g}" if std > 0.0 else "fixed")
+        for name, value, std in zip(PARAMETER_NAMES, found.values, found.std, strict=True)
+    ]
     title = f"{count} pairs, sigma {found.adjustment.sigma_px:.3g} px"
     print_table(("parameter", "estimate", "std"), rows, ("parameter",), title)
     for name, reason in found.rejected.items():

@@ -171,8 +171,13 @@ def _pivots(columns: Array, preference: Array) -> tuple[Array, tuple[float, floa
 
 def _preference(name: str) -> int:
     """Place of a parameter among columns that are long enough."""
-    kinds = (name in COULOMB_NAMES + VISCOUS_NAMES, name.startswith("platform"), not name.endswith(".mass"),
-             name.startswith("link"), True)
+    kinds = (
+        name in COULOMB_NAMES + VISCOUS_NAMES,
+        name.startswith("platform"),
+        not name.endswith(".mass"),
+        name.startswith("link"),
+        True,
+    )
     place = PARAMETER_NAMES.index(name) if name in PARAMETER_NAMES else 0
     return kinds.index(True) * len(PARAMETER_NAMES) + place
 

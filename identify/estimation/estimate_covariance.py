@@ -158,6 +158,4 @@ def repeated_experiment(run: RecordedRun, parameters: Array, rng: np.random.Gene
     Raises LoopFailure where the loop is unstable.
     """
     noise = rng.standard_normal(run.measured.shape) @ np.linalg.cholesky(run.covariance).T
-    return simulate(
-        run.robot, parameters + run.payload, run.reference, run.settings, lost=~run.ok, noise=noise
-    )
+    return simulate(run.robot, parameters + run.payload, run.reference, run.settings, lost=~run.ok, noise=noise)

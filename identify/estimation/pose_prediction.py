@@ -41,9 +41,7 @@ class PosePrediction:
         return float(np.mean(np.sum(errors * weighted, axis=1))) / 6
 
 
-def predict_poses(
-    run: RecordedRun, parameters: Array, covariance: Array, rng: np.random.Generator
-) -> PosePrediction:
+def predict_poses(run: RecordedRun, parameters: Array, covariance: Array, rng: np.random.Generator) -> PosePrediction:
     """Predict a run with estimated parameters (67,) of covariance (67, 67).
 
     Of the run only the reference, the sensor's covariance and the lost frames count, not what was measured.

@@ -109,9 +109,7 @@ def _fit_block(matrix: Array, right: Array, errors: Array, columns: slice, value
     return truncated_tls(matrix * scale, right - matrix @ values[columns], block * np.append(scale, 1.0))
 
 
-def _drawn_errors(
-    evidence: Evidence, equations: TorqueEquations, poses: Array, torque: Array, noise: Array
-) -> Array:
+def _drawn_errors(evidence: Evidence, equations: TorqueEquations, poses: Array, torque: Array, noise: Array) -> Array:
     """Errors (draws, 2 n, 74) of the whitened columns and right side, from drawn noise of poses and torques."""
     rng = mixed_generator(DISTURBED_COPIES)
     factor = np.linalg.cholesky(evidence.run.covariance)

@@ -94,8 +94,16 @@ def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progr
             information = None
         entries.append(
             Entry(
-                method, trajectory, float(np.exp(found.log_value)), observability_index(index, found.z), information,
-                seconds, found.evaluations, found.gradients, found.iterations, found.reason,
+                method,
+                trajectory,
+                float(np.exp(found.log_value)),
+                observability_index(index, found.z),
+                information,
+                seconds,
+                found.evaluations,
+                found.gradients,
+                found.iterations,
+                found.reason,
                 tuple(search.problem.constraints.worst(trajectory, times)),
             )
         )

@@ -24,8 +24,11 @@ def comparison_figure(robot: Robot, scenario: Scenario, comparison: Comparison) 
         poses = entry.trajectory.pose(time)
         away = 1e3 * (poses - robot.home_pose)
         angles = robot.inverse_kinematics(poses)
-        rows = [(away[:, :3], COMPONENTS[:3], boxes[0]), (away[:, 3:], COMPONENTS[3:], boxes[1]),
-                (angles, [f"crank {k}" for k in range(1, 7)], travel)]
+        rows = [
+            (away[:, :3], COMPONENTS[:3], boxes[0]),
+            (away[:, 3:], COMPONENTS[3:], boxes[1]),
+            (angles, [f"crank {k}" for k in range(1, 7)], travel),
+        ]
         for axes, (values, names, limit) in zip(panels[:, column], rows, strict=True):
             for name, line in zip(names, values.T, strict=True):
                 axes.plot(time, line, label=name, linewidth=1.0)
@@ -34,8 +37,9 @@ def comparison_figure(robot: Robot, scenario: Scenario, comparison: Comparison) 
             axes.grid(alpha=0.3)
         panels[0, column].set_title(f"{entry.method}: index {entry.observability:.3f}, {entry.seconds:.1f} s")
         panels[2, column].set_xlabel("time [s]")
-    for axes, label in zip(panels[:, 0], ("position from home [mm]", "orientation from home [mrad]",
-                                          "crank angle [rad]"), strict=True):
+    for axes, label in zip(
+        panels[:, 0], ("position from home [mm]", "orientation from home [mrad]", "crank angle [rad]"), strict=True
+    ):
         axes.set_ylabel(label)
         axes.legend(loc="upper right", fontsize="small", ncols=2)
     figure.suptitle(f"Exciting trajectories, criterion {comparison.criterion}, seed {comparison.seed}; dashed: limits")

@@ -94,8 +94,12 @@ class MotionConstraints:
             Limit("conditioning", (MOST_CONDITION,), "", ("",)),
         ]
         if self._stickers:
-            names = [f"sticker {sight.platform.sticker_ids[k]}, {side} camera, {what}" for k in self._stickers
-                     for side in ("left", "right") for what in ("incidence", "across", "up")]
+            names = [
+                f"sticker {sight.platform.sticker_ids[k]}, {side} camera, {what}"
+                for k in self._stickers
+                for side in ("left", "right")
+                for what in ("incidence", "across", "up")
+            ]
             self.limits.append(Limit("visibility", (1.0,) * len(names), " of the limit", tuple(names)))
 
     @cached_property

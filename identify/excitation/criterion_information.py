@@ -59,7 +59,10 @@ def log_information(robot: Robot, scenario: Scenario, known: Knowledge, trajecto
     times = frame_times(scenario, scenario.excitation.duration_s)
     try:
         run = simulate(
-            robot, known.guess.values, reference_motion(trajectory, times), model_settings(scenario),
+            robot,
+            known.guess.values,
+            reference_motion(trajectory, times),
+            model_settings(scenario),
             sensitivities=True,
         )
     except LoopFailure as error:

@@ -34,9 +34,7 @@ RANDOM_TOLERANCE = 1e-3
 """Share by which random trajectories may go over a limit: they fill the box as closely as they were sampled for it."""
 
 
-def design_trajectories(
-    robot: Robot, scenario: Scenario, seed: int, progress: Progress | None = None
-) -> TrajectorySet:
+def design_trajectories(robot: Robot, scenario: Scenario, seed: int, progress: Progress | None = None) -> TrajectorySet:
     """Exciting trajectory and validation trajectories of a scenario, each kind from its own stream of the seed.
 
     Raises:

@@ -10,9 +10,7 @@ def built_in_names(folder: Path) -> list[str]:
     return sorted(path.stem for path in folder.glob("*.toml"))
 
 
-def named_text(
-    name_or_path: str | Path, folder: Path, kind: str, error_class: type[IdentifyError]
-) -> tuple[str, str]:
+def named_text(name_or_path: str | Path, folder: Path, kind: str, error_class: type[IdentifyError]) -> tuple[str, str]:
     """Text of a built-in file by name, or of a user's by path, and how messages call it; `kind`: as ``scenario``.
 
     Raises:

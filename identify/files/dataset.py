@@ -46,9 +46,7 @@ def pose_array(values: ArrayLike, name: str) -> Array:
     return array
 
 
-def described_dataset(
-    values: dict[str, Any], time: ArrayLike, variables: Variables, **labels: list[str]
-) -> xr.Dataset:
+def described_dataset(values: dict[str, Any], time: ArrayLike, variables: Variables, **labels: list[str]) -> xr.Dataset:
     """Dataset of described variables on a time axis; ``labels`` are the coordinates of further dimensions.
 
     Raises:

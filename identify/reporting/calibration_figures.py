@@ -20,8 +20,14 @@ def residual_figure(found: Calibration) -> Figure:
     for k, axes in enumerate(panels):
         pixels, residuals = found.sightings[k].pixels, found.adjustment.residuals[k]
         three_sigma = 3.0 * max(found.adjustment.sigma_px, 1e-9)
-        arrows = axes.quiver(*pixels.T, *residuals.T, angles="xy", scale_units="xy", width=0.0015,
-                             scale=three_sigma / (ARROW_SHARE * found.rig.left.width))
+        arrows = axes.quiver(
+            *pixels.T,
+            *residuals.T,
+            angles="xy",
+            scale_units="xy",
+            width=0.0015,
+            scale=three_sigma / (ARROW_SHARE * found.rig.left.width),
+        )
         axes.quiverkey(arrows, 0.85, 1.03, three_sigma, f"{three_sigma:.2g} px")
         rms = np.sqrt(np.mean(residuals**2))
         axes.set_title(f"{SIDES[k]}: {len(residuals)} points, rms {rms:.3g} px", loc="left", fontsize="medium")

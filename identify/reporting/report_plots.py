@@ -53,8 +53,10 @@ def fit_plot(
         models = [("identified model", identified, BLUE)]
         if initial is not None:
             models.insert(0, ("starting model", initial, GREEN))
-        traces = [_dots(time, 1e3 * measured[:, i], "measured"),
-                  *(_line(time, 1e3 * poses[:, i], name, colour) for name, poses, colour in models)]
+        traces = [
+            _dots(time, 1e3 * measured[:, i], "measured"),
+            *(_line(time, 1e3 * poses[:, i], name, colour) for name, poses, colour in models),
+        ]
         for trace in traces:
             figure.add_trace(trace.update(showlegend=first), row=row, col=column)
         rest = [_dots(time, 1e6 * (measured - identified)[:, i], "measured − identified")]
@@ -92,8 +94,14 @@ def parameter_plot(parameters: dict[str, dict[str, Any]]) -> str:
     error = [100 * (p["estimate"] - p["true"]) / abs(p["true"]) for p in shown.values()]
     bars = [[100 * one / abs(p["true"]) for one in interval_bars(p)] for p in shown.values()]
     below, above = [one[0] for one in bars], [one[1] for one in bars]
-    trace = go.Scatter(x=list(shown), y=error, error_y={"type": "data", "array": above, "arrayminus": below},
-                       mode="markers", marker_color=BLUE, showlegend=False)
+    trace = go.Scatter(
+        x=list(shown),
+        y=error,
+        error_y={"type": "data", "array": above, "arrayminus": below},
+        mode="markers",
+        marker_color=BLUE,
+        showlegend=False,
+    )
     figure = go.Figure(trace)
     figure.add_hrect(y0=-5, y1=5, fillcolor=GREEN, opacity=0.1, line_width=0)
     figure.update_yaxes(title_text="estimate − truth, bars: 95 % interval [%]")
@@ -118,8 +126,16 @@ def _band(time: Array, half: Array) -> list[Any]:
 def correlation_plot(correlations: Array, names: Sequence[str]) -> str:
     """Correlations (n, n) of estimates as a coloured matrix."""
     labels = list(names)
-    shown = go.Heatmap(x=labels, y=labels, z=correlations, zmin=-1, zmax=1, colorscale="RdBu", reversescale=True,
-                       colorbar={"title": "correlation"})
+    shown = go.Heatmap(
+        x=labels,
+        y=labels,
+        z=correlations,
+        zmin=-1,
+        zmax=1,
+        colorscale="RdBu",
+        reversescale=True,
+        colorbar={"title": "correlation"},
+    )
     figure = go.Figure(shown)
     figure.update_yaxes(autorange="reversed")
     return _html(figure, 200 + 20 * len(labels))

@@ -84,7 +84,14 @@ def compare_engines(
             rows[frame] = row
             advance()
     return EngineRuns(
-        time, reference.poses, model.pose, rows[:, :6], model.torque, rows[:, 6:12], rows[:, 12], rows[:, 13],
+        time,
+        reference.poses,
+        model.pose,
+        rows[:, :6],
+        model.torque,
+        rows[:, 6:12],
+        rows[:, 12],
+        rows[:, 13],
         engine.version,
     )
 

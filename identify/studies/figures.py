@@ -39,8 +39,11 @@ def draw(folder: Path, study: Study, done: pd.DataFrame, shown: list[str], verdi
     grid = [path for path, values in study.factors.items() if isinstance(values, list)]
     if study.sample is None and len(grid) >= 2:
         save_figure(map_figure(study, done, (grid[0], grid[1]), shown[:2]), folder / "map.png")
-    laws = [(law, verdict) for law, verdict in zip(study.theory, verdicts, strict=True)
-            if law.exponent is not None and verdict.measured is not None]
+    laws = [
+        (law, verdict)
+        for law, verdict in zip(study.theory, verdicts, strict=True)
+        if law.exponent is not None and verdict.measured is not None
+    ]
     if laws:
         save_figure(laws_figure(study, done, laws), folder / "laws.png")
 
@@ -101,8 +104,9 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
             _curve(axes, _levels(study, rows, factor), law_data(law, rows), label)
         _theory_line(axes, have[factor], law_data(law, have), law.exponent or 0.0)
         _scale(axes, have[factor], pd.Series(law_data(law, have)))
-        axes.set_title(f"{verdict.verdict}: {verdict.measured:.4g} ({verdict.low:.4g} to {verdict.high:.4g})",
-                       fontsize="small")
+        axes.set_title(
+            f"{verdict.verdict}: {verdict.measured:.4g} ({verdict.low:.4g} to {verdict.high:.4g})", fontsize="small"
+        )
         unit = factor_unit(factor) if factor in study.factors else figure_unit(study.kind, factor)
         axes.set_xlabel(labelled(factor, unit))
         axes.set_ylabel(labelled(law.quantity, figure_unit(study.kind, law.figure) if law.per is None else ""))
@@ -140,8 +144,10 @@ def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFra
         return [(f"rows of all {len(groups)} other settings", done)]
     if len(groups) < 2:
         return [("", done)]
-    return [(", ".join(f"{path.rpartition('.')[2]} {value}" for path, value in zip(others, values, strict=True)), rows)
-            for values, rows in groups]
+    return [
+        (", ".join(f"{path.rpartition('.')[2]} {value}" for path, value in zip(others, values, strict=True)), rows)
+        for values, rows in groups
+    ]
 
 
 def _curve(axes: Axes, levels: pd.Series, values: Array, label: str) -> None:

@@ -35,8 +35,14 @@ COLUMNS = {
     **POSE_COLUMNS,
     "torque_rms_N_m": Column("N m", "torque of the joint controllers, rms over frames and joints"),
 }
-MAIN = ("tracking_position_rms_um", "tracking_orientation_rms_urad", "position_rms_um", "orientation_rms_urad",
-        "lost_frames", "torque_rms_N_m")
+MAIN = (
+    "tracking_position_rms_um",
+    "tracking_orientation_rms_urad",
+    "position_rms_um",
+    "orientation_rms_urad",
+    "lost_frames",
+    "torque_rms_N_m",
+)
 
 
 class ClosedLoopOptions(RowOptions):
@@ -46,11 +52,26 @@ class ClosedLoopOptions(RowOptions):
 
 
 READS = Reads(
-    ("scenario.robot", *PICTURES, "scenario.timing.", "sensor.timing.", "scenario.servo.", "scenario.plant.",
-     *(f"scenario.excitation.{name}" for name in (
-         "fundamental_hz", "harmonics", "position_amplitude_m", "orientation_amplitude_rad", "travel_margin_rad",
-         "max_joint_velocity_rad_s")),
-     "scenario.validation.duration_s"),
+    (
+        "scenario.robot",
+        *PICTURES,
+        "scenario.timing.",
+        "sensor.timing.",
+        "scenario.servo.",
+        "scenario.plant.",
+        *(
+            f"scenario.excitation.{name}"
+            for name in (
+                "fundamental_hz",
+                "harmonics",
+                "position_amplitude_m",
+                "orientation_amplitude_rad",
+                "travel_margin_rad",
+                "max_joint_velocity_rad_s",
+            )
+        ),
+        "scenario.validation.duration_s",
+    ),
     idle=(NOISE_OFF, *PLANT),
 )
 

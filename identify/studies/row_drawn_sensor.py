@@ -35,6 +35,12 @@ class DrawnSensor:
             return lost_measurement("dropped frame")
         none = np.zeros((0, 2))
         return cmmsim.Measurement(
-            np.asarray(pose, dtype=float) + noise, self._covariance, np.zeros((0, 3)), np.zeros((0, 3, 3)), none, none,
-            np.array([], dtype=str), True,
+            np.asarray(pose, dtype=float) + noise,
+            self._covariance,
+            np.zeros((0, 3)),
+            np.zeros((0, 3, 3)),
+            none,
+            none,
+            np.array([], dtype=str),
+            True,
         )

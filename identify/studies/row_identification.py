@@ -44,23 +44,35 @@ COLUMNS = {
     "lost_frames": Column("1", "frames of the record without a pose"),
     "pose_noise_um": Column("um", "stated standard deviation of a measured position, rms over frames and axes"),
     "pose_noise_urad": Column("urad", "stated standard deviation of a measured orientation, rms over frames and axes"),
-    **{f"{name}_std_percent": Column("%", f"stated standard deviation of {what}, rms relative to the truth")
-       for name, what in (("coulomb", "Coulomb friction"), ("viscous", "viscous friction"), ("gains", "joint gains"))},
-    **{f"{name}_error_percent": Column("%", f"error of {what}, rms relative to the truth")
-       for name, what in (("coulomb", "Coulomb friction"), ("viscous", "viscous friction"), ("gains", "joint gains"))},
+    **{
+        f"{name}_std_percent": Column("%", f"stated standard deviation of {what}, rms relative to the truth")
+        for name, what in (("coulomb", "Coulomb friction"), ("viscous", "viscous friction"), ("gains", "joint gains"))
+    },
+    **{
+        f"{name}_error_percent": Column("%", f"error of {what}, rms relative to the truth")
+        for name, what in (("coulomb", "Coulomb friction"), ("viscous", "viscous friction"), ("gains", "joint gains"))
+    },
     "identified_groups": Column("1", "base parameters that the record identifies"),
     "group_std_percent": Column("%", "stated standard deviation of those, relative to the truth, median"),
     "normalised_error": Column("1", "error of those over its stated standard deviation, rms; 1 where stated well"),
     "noise_ratio": Column("1", "mean squared whitened residual; 1 where noise is all that is left"),
     "iterations": Column("1", "iterations of all searches"),
-    "prediction_rms_um": Column("um", "identified model against the true one on unseen trajectories, neither with "
-                                      "noise: position, rms over axes"),
+    "prediction_rms_um": Column(
+        "um",
+        "identified model against the true one on unseen trajectories, neither with noise: position, rms over axes",
+    ),
     "stated_prediction_rms_um": Column("um", "the same, as the covariance of the parameters states it"),
     "unseen_position_rms_um": Column("um", "model against true plant on unseen trajectories, rms over axes"),
     "unseen_orientation_rms_urad": Column("urad", "model against true plant on unseen trajectories, rms over axes"),
 }
-MAIN = ("coulomb_std_percent", "viscous_std_percent", "gains_std_percent", "group_std_percent",
-        "unseen_position_rms_um", "unseen_orientation_rms_urad")
+MAIN = (
+    "coulomb_std_percent",
+    "viscous_std_percent",
+    "gains_std_percent",
+    "group_std_percent",
+    "unseen_position_rms_um",
+    "unseen_orientation_rms_urad",
+)
 
 
 class IdentificationOptions(RowOptions):
@@ -77,12 +89,21 @@ READS = Reads(
     idle=(
         Idle(NOISE_OFF.keys, {**NOISE_OFF.where, "options.sensor": lambda sensor: sensor == "images"}, NOISE_OFF.why),
         Idle(("sensor.camera.noise",), DRAWN, "options.sensor is drawn: that noise is added all the same"),
-        Idle(("scenario.renderer", "sensor.stickers.obstacle_level", *timing("exposure_s")), DRAWN,
-             "options.sensor is drawn: no picture of a motion is taken"),
-        Idle(("scenario.payload.",), {"scenario.identification.scale_anchor": lambda anchor: anchor != "payload"},
-             "scenario.identification.scale_anchor is not payload"),
-        Idle(("scenario.excitation.generations",), {"scenario.excitation.method": lambda how: how != "evolutionary"},
-             "scenario.excitation.method is not evolutionary"),
+        Idle(
+            ("scenario.renderer", "sensor.stickers.obstacle_level", *timing("exposure_s")),
+            DRAWN,
+            "options.sensor is drawn: no picture of a motion is taken",
+        ),
+        Idle(
+            ("scenario.payload.",),
+            {"scenario.identification.scale_anchor": lambda anchor: anchor != "payload"},
+            "scenario.identification.scale_anchor is not payload",
+        ),
+        Idle(
+            ("scenario.excitation.generations",),
+            {"scenario.excitation.method": lambda how: how != "evolutionary"},
+            "scenario.excitation.method is not evolutionary",
+        ),
         *PLANT,
     ),
 )
@@ -100,21 +121,35 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Identific
         records.append(excitation_run(scenario, robot, sensor, trajectories.excitation, number, payload=True).record)
     result = identify_record(records, robot, scenario)
     times = frame_times(scenario, scenario.validation.duration_s)
-    unseen = [run_plant(scenario, robot, sensor, trajectory, times, number, run)
-              for run, trajectory in enumerate(trajectories.validation, start=1)]
+    unseen = [
+        run_plant(scenario, robot, sensor, trajectory, times, number, run)
+        for run, trajectory in enumerate(trajectories.validation, start=1)
+    ]
     errors = np.concatenate([_model_errors(robot, scenario, result.estimate, one) for one in unseen])
     truth = true_parameters(robot, scenario)
-    return (_record_figures(experiment) | _parameter_figures(result, truth)
-            | prediction_figures(robot, scenario, (result.estimate, result.covariance), truth,
-                                 [recorded_reference(one.record) for one in unseen])
-            | {"unseen_position_rms_um": rms_um(errors[:, :3]), "unseen_orientation_rms_urad": rms_um(errors[:, 3:])})
+    return (
+        _record_figures(experiment)
+        | _parameter_figures(result, truth)
+        | prediction_figures(
+            robot,
+            scenario,
+            (result.estimate, result.covariance),
+            truth,
+            [recorded_reference(one.record) for one in unseen],
+        )
+        | {"unseen_position_rms_um": rms_um(errors[:, :3]), "unseen_orientation_rms_urad": rms_um(errors[:, 3:])}
+    )
 
 
 def _record_figures(experiment: Experiment) -> Row:
     ok = experiment.record["measured_ok"].values.astype(bool)
     position, orientation = stated_um(experiment.record["measured_covariance"].values[ok])
-    return {"frames": len(ok), "lost_frames": int(np.sum(~ok)), "pose_noise_um": position,
-            "pose_noise_urad": orientation}
+    return {
+        "frames": len(ok),
+        "lost_frames": int(np.sum(~ok)),
+        "pose_noise_um": position,
+        "pose_noise_urad": orientation,
+    }
 
 
 def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
@@ -151,8 +186,10 @@ def prediction_figures(
         slopes = model.pose_sensitivity[:, :3]
         squares.append(np.mean((model.pose - model_run(robot, scenario, truth, reference))[:, :3] ** 2))
         stated.append(np.mean(np.einsum("nip,pq,niq->ni", slopes, covariance, slopes, optimize=True)))
-    return {"prediction_rms_um": 1e6 * float(np.sqrt(np.mean(squares))),
-            "stated_prediction_rms_um": 1e6 * float(np.sqrt(np.mean(stated)))}
+    return {
+        "prediction_rms_um": 1e6 * float(np.sqrt(np.mean(squares))),
+        "stated_prediction_rms_um": 1e6 * float(np.sqrt(np.mean(stated))),
+    }
 
 
 def _model_errors(robot: Robot, scenario: Scenario, parameters: Array, unseen: Experiment) -> Array:

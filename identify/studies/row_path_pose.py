@@ -45,9 +45,14 @@ class PathPoseOptions(RowOptions):
 
 
 READS = Reads(
-    (*PICTURES, *timing("frame_rate_hz", "exposure_s", "latency_s", "latency_jitter_s", "dropout"),
-     "scenario.excitation.fundamental_hz", "scenario.excitation.harmonics", "scenario.excitation.position_amplitude_m",
-     "scenario.excitation.orientation_amplitude_rad"),
+    (
+        *PICTURES,
+        *timing("frame_rate_hz", "exposure_s", "latency_s", "latency_jitter_s", "dropout"),
+        "scenario.excitation.fundamental_hz",
+        "scenario.excitation.harmonics",
+        "scenario.excitation.position_amplitude_m",
+        "scenario.excitation.orientation_amplitude_rad",
+    ),
     but=("sensor.stickers.obstacle_level",),
     idle=(NOISE_OFF,),
 )
@@ -58,8 +63,14 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
     eye = row_sensor(scenario, options.teaching, stream_seed(seed, SENSOR))
     rng = np.random.default_rng(stream_seed(seed, PATH))
     excitation = scenario.excitation
-    path = random_trajectory(rng, eye.sensor.home, excitation.fundamental_hz, excitation.harmonics,
-                             excitation.position_amplitude_m, excitation.orientation_amplitude_rad)
+    path = random_trajectory(
+        rng,
+        eye.sensor.home,
+        excitation.fundamental_hz,
+        excitation.harmonics,
+        excitation.position_amplitude_m,
+        excitation.orientation_amplitude_rad,
+    )
     start = rng.uniform(0.0, 1.0 / excitation.fundamental_hz)
     frames = max(2, scenario.timing.frames(options.stretch_s))
     times: Array = start + scenario.timing.frame_period_s * np.arange(frames, dtype=float)

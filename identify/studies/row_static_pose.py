@@ -40,8 +40,14 @@ COLUMNS = {
     "centre_rms_px": Column("px", "error of sticker centres in the images, rms over stickers, cameras and axes"),
     "disparity_rms_px": Column("px", "error of the difference of a sticker's x in both images, rms over stickers"),
 }
-MAIN = ("position_rms_um", "orientation_rms_urad", "mean_position_rms_um", "mean_orientation_rms_urad",
-        "point_depth_rms_um", "centre_rms_px")
+MAIN = (
+    "position_rms_um",
+    "orientation_rms_urad",
+    "mean_position_rms_um",
+    "mean_orientation_rms_urad",
+    "point_depth_rms_um",
+    "centre_rms_px",
+)
 
 
 class StaticPoseOptions(RowOptions):
@@ -56,15 +62,25 @@ class StaticPoseOptions(RowOptions):
 
 
 READS = Reads(
-    (*PICTURES, *timing("frame_rate_hz", "exposure_s", "dropout"), "scenario.excitation.position_amplitude_m",
-     "scenario.excitation.orientation_amplitude_rad"),
+    (
+        *PICTURES,
+        *timing("frame_rate_hz", "exposure_s", "dropout"),
+        "scenario.excitation.position_amplitude_m",
+        "scenario.excitation.orientation_amplitude_rad",
+    ),
     but=("sensor.stickers.obstacle_level",),
     idle=(
         NOISE_OFF,
-        Idle(("options.captures",), {"options.hold_s": lambda hold: hold is not None},
-             "options.hold_s is given: it sets the number of pictures"),
-        Idle(timing("frame_rate_hz"), {"options.hold_s": lambda hold: hold is None},
-             "options.hold_s is not given: options.captures sets the number of pictures"),
+        Idle(
+            ("options.captures",),
+            {"options.hold_s": lambda hold: hold is not None},
+            "options.hold_s is given: it sets the number of pictures",
+        ),
+        Idle(
+            timing("frame_rate_hz"),
+            {"options.hold_s": lambda hold: hold is None},
+            "options.hold_s is not given: options.captures sets the number of pictures",
+        ),
     ),
 )
 
@@ -77,8 +93,10 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPos
     box = np.repeat(amplitude, 3)
     captures = options.captures if options.hold_s is None else max(1, scenario.timing.frames(options.hold_s))
     dropout = np.random.default_rng(stream_seed(seed, DROPOUT))
-    looks = [_Look(eye, eye.sensor.home + box * rng.uniform(-1.0, 1.0, 6), captures, rng, dropout)
-             for _ in range(options.poses)]
+    looks = [
+        _Look(eye, eye.sensor.home + box * rng.uniform(-1.0, 1.0, 6), captures, rng, dropout)
+        for _ in range(options.poses)
+    ]
     return _row(eye, looks, captures)
 
 
@@ -86,8 +104,9 @@ class _Look:
     """What the pictures of one pose gave: errors and covariances of the pose (n, 6), (n, 6, 6), and what
     `_sticker_errors` says of all stickers in them."""
 
-    def __init__(self, eye: RowSensor, pose: Array, captures: int, rng: np.random.Generator,
-                 dropout: np.random.Generator) -> None:
+    def __init__(
+        self, eye: RowSensor, pose: Array, captures: int, rng: np.random.Generator, dropout: np.random.Generator
+    ) -> None:
         estimator = eye.sensor.estimator
         self._dropout = dropout
         self.reasons: list[str] = []

@@ -40,16 +40,26 @@ def write(folder: Path, study: Study, frame: pd.DataFrame) -> dict[str, Any]:
     points = _points(study, done, names)
     verdicts = check_laws(study, frame)
     entry = {
-        "name": study.name, "title": study.title, "kind": study.kind, "scenario": study.scenario, "seed": study.seed,
+        "name": study.name,
+        "title": study.title,
+        "kind": study.kind,
+        "scenario": study.scenario,
+        "seed": study.seed,
         "versions": versions(),
-        "rows": {"planned": study.rows, "done": len(done), "failed": len(frame) - len(done),
-                 "missing": study.rows - len(frame)},
+        "rows": {
+            "planned": study.rows,
+            "done": len(done),
+            "failed": len(frame) - len(done),
+            "missing": study.rows - len(frame),
+        },
         "failures": _failures(study, frame),
         "confidence": {"bands": point_statistics.CONFIDENCE, "laws": theory.CONFIDENCE},
         "units": {name: unit for name in [*study.factors, *names] if (unit := unit_of(name, study))},
         "theory": [theory.as_entry(verdict) for verdict in verdicts],
-        "points": [{"factors": factors, "figures": {name: asdict(one) for name, one in figures.items()}}
-                   for factors, figures in points],
+        "points": [
+            {"factors": factors, "figures": {name: asdict(one) for name, one in figures.items()}}
+            for factors, figures in points
+        ],
     }
     folder.mkdir(parents=True, exist_ok=True)
     save_result(folder / JSON, entry)
@@ -78,8 +88,10 @@ def _points(study: Study, done: pd.DataFrame, names: list[str]) -> list[tuple[di
         return []
     if not paths or (study.sample is not None and study.repeats == 1):
         return [({}, _statistics(done, names))]
-    return [(dict(zip(paths, values, strict=True)), _statistics(rows, names))
-            for values, rows in done.groupby(paths, sort=study.sample is not None)]
+    return [
+        (dict(zip(paths, values, strict=True)), _statistics(rows, names))
+        for values, rows in done.groupby(paths, sort=study.sample is not None)
+    ]
 
 
 def _statistics(rows: pd.DataFrame, names: list[str]) -> dict[str, Statistics]:
@@ -102,12 +114,22 @@ def _markdown(
     shown: list[str],
 ) -> str:
     rows = entry["rows"]
-    lines = [f"# {study.title or study.name}", "",
-             f"Study `{study.name}`, rows of kind `{study.kind}`, scenario `{study.scenario}`, seed {study.seed}: "
-             f"{rows['done']} rows done, {rows['failed']} failed, {rows['missing']} missing."]
+    lines = [
+        f"# {study.title or study.name}",
+        "",
+        f"Study `{study.name}`, rows of kind `{study.kind}`, scenario `{study.scenario}`, seed {study.seed}: "
+        f"{rows['done']} rows done, {rows['failed']} failed, {rows['missing']} missing.",
+    ]
     if verdicts:
-        lines += ["", "## Theory", "", f"Intervals at {theory.CONFIDENCE:.0%}.", "",
-                  "| law | says | measured | interval | verdict |", "|---|---|---|---|---|"]
+        lines += [
+            "",
+            "## Theory",
+            "",
+            f"Intervals at {theory.CONFIDENCE:.0%}.",
+            "",
+            "| law | says | measured | interval | verdict |",
+            "|---|---|---|---|---|",
+        ]
         lines += [_law_row(verdict) for verdict in verdicts]
     if rows["failed"]:
         lines += ["", "## Failed rows", "", "They are in no figure below."]
@@ -120,8 +142,10 @@ def _markdown(
 def _law_row(verdict: Verdict) -> str:
     if verdict.measured is None:
         return f"| {verdict.statement} | {verdict.expected} | {verdict.reason} | | {verdict.verdict} |"
-    return (f"| {verdict.statement} | {verdict.expected} | {verdict.measured:.4g} | "
-            f"{verdict.low:.4g} to {verdict.high:.4g} | {verdict.verdict} |")
+    return (
+        f"| {verdict.statement} | {verdict.expected} | {verdict.measured:.4g} | "
+        f"{verdict.low:.4g} to {verdict.high:.4g} | {verdict.verdict} |"
+    )
 
 
 def _bands_text(points: list[tuple[dict[str, Any], dict[str, Statistics]]]) -> str:

@@ -56,9 +56,7 @@ def check_read_here(study: Study, reads: Reads, first: Scenario, options: BaseMo
                 raise StudyError(f"{setting} does nothing in rows of kind {study.kind!r} where {idle.why}")
 
 
-def _always(
-    holds: Callable[[Any], bool], path: str, study: Study, first: Scenario, options: BaseModel
-) -> bool:
+def _always(holds: Callable[[Any], bool], path: str, study: Study, first: Scenario, options: BaseModel) -> bool:
     """Whether something holds of a path's value in all rows; no where another sensor may say otherwise."""
     twins = next((pair for pair in _TWINS if path in pair), (path,))
     for twin in twins:

@@ -15,7 +15,7 @@ def test_sensor(accuracy):
 def test_pose(accuracy, method):
     accuracy.record("pose", 10.0, unit="um")
 """
-FEWER = BEFORE.replace("    accuracy.record(\"seen\", 0.98", "    dict(name=\"seen\", value=0.98")
+FEWER = BEFORE.replace('    accuracy.record("seen", 0.98', '    dict(name="seen", value=0.98')
 SKIPPED = BEFORE.replace("accuracy, method):", "accuracy, method):\n    if method == 'planes': pytest.skip('none')")
 MODULE = "pytest.skip('no library', allow_module_level=True)\n" + BEFORE
 RENAMED = BEFORE.replace("test_sensor", "test_other")
@@ -91,8 +91,11 @@ def test_another_limit_is_told(project):
 
 
 NUMBER, SIX = 'accuracy.record("r", 10, limit=20)', 'accuracy.sample("s", [1, 2, 3, 4, 5, 6])'
-WIDE, TWO, SEVEN = ('accuracy.sample("r", [1, 50, 2, 60], limit=20)', 'accuracy.sample("s", [1, 300])',
-                    'accuracy.sample("s", [1, 2, 3, 4, 5, 6, 3.5])')
+WIDE, TWO, SEVEN = (
+    'accuracy.sample("r", [1, 50, 2, 60], limit=20)',
+    'accuracy.sample("s", [1, 300])',
+    'accuracy.sample("s", [1, 2, 3, 4, 5, 6, 3.5])',
+)
 
 
 @pytest.mark.parametrize(

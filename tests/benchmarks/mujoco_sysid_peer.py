@@ -54,7 +54,12 @@ def estimate(commands, measured, guess, integrator="implicitfast"):
     seen = np.hstack([measured.position, measured.quaternion])
     signal = TimeSeries.from_custom_map(TIMES, seen, [("platform_qpos", 7, SignalType.MjStateQPos)])
     sequences = sysid.ModelSequences(
-        "rss6", spec, "run", at_home(spec.compile()), TimeSeries(TIMES, felt_commands(commands)), signal,
+        "rss6",
+        spec,
+        "run",
+        at_home(spec.compile()),
+        TimeSeries(TIMES, felt_commands(commands)),
+        signal,
         allow_missing_sensors=True,
     )
     residual = sysid.build_residual_fn(models_sequences=[sequences])

@@ -25,8 +25,9 @@ class StraightforwardSensor:
         self._scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 1.0))
         self._bodies = [self._scene.add(pyrender.Mesh([self._primitive(body)])) for body in sensor._scene]
         c = self._rig.left
-        camera = pyrender.IntrinsicsCamera(c.focal_px, c.focal_px * c.aspect, c.centre_x_px + 0.5, c.centre_y_px + 0.5,
-                                           0.2, 10.0)
+        camera = pyrender.IntrinsicsCamera(
+            c.focal_px, c.focal_px * c.aspect, c.centre_x_px + 0.5, c.centre_y_px + 0.5, 0.2, 10.0
+        )
         self._camera = self._scene.add(camera)
         settings = cv2.SimpleBlobDetector_Params()
         settings.blobColor, settings.filterByArea, settings.minArea, settings.maxArea = 255, True, 10.0, 400.0
@@ -38,8 +39,10 @@ class StraightforwardSensor:
         places = self._sensor.taught.platform_places
         camera_from_base = np.linalg.inv(self._sensor.taught.base_from_camera)
         expected_pixels, _ = self._rig.project(apply(camera_from_base @ pose_to_transform(expected), places))
-        found = [self._nearest(self._blobs(move), at)
-                 for move, at in zip(self._rig.from_camera, expected_pixels, strict=True)]
+        found = [
+            self._nearest(self._blobs(move), at)
+            for move, at in zip(self._rig.from_camera, expected_pixels, strict=True)
+        ]
         seen = np.flatnonzero(np.isfinite(found[0][:, 0]) & np.isfinite(found[1][:, 0]))
         first, second = self._rig.projection_matrices
         points = cv2.triangulatePoints(first, second, found[0][seen].T, found[1][seen].T)
@@ -71,5 +74,7 @@ class StraightforwardSensor:
         return pyrender.Primitive(
             positions=np.concatenate([p.vertices for p in patches]).astype(np.float32),
             indices=np.concatenate([p.faces + s for p, s in zip(patches, starts, strict=False)]).astype(np.uint32),
-            color_0=np.column_stack([grey, np.ones(len(grey))]).astype(np.float32), mode=4,
-            material=pyrender.MetallicRoughnessMaterial(baseColorFactor=(1.0, 1.0, 1.0, 1.0), doubleSided=True))
+            color_0=np.column_stack([grey, np.ones(len(grey))]).astype(np.float32),
+            mode=4,
+            material=pyrender.MetallicRoughnessMaterial(baseColorFactor=(1.0, 1.0, 1.0, 1.0), doubleSided=True),
+        )

@@ -80,15 +80,22 @@ def test_one_draw_is_refused():
 @pytest.mark.slow
 def test_default_detector_stays_at_the_bound_over_all_conditions(capsys):
     """Radius 2.5 to 10 px, noise 0.2 to 5 %, tilt 0 to 60 degrees; some blurred."""
-    conditions = [Condition(radius, np.radians(tilt), noise) for radius in (2.5, 5.0, 10.0)
-                  for tilt in (0.0, 30.0, 60.0) for noise in (0.002, 0.01, 0.05)]
+    conditions = [
+        Condition(radius, np.radians(tilt), noise)
+        for radius in (2.5, 5.0, 10.0)
+        for tilt in (0.0, 30.0, 60.0)
+        for noise in (0.002, 0.01, 0.05)
+    ]
     conditions += [Condition(radius, np.radians(45.0), noise, 0.6) for radius in (2.5, 10.0) for noise in (0.002, 0.05)]
     scores = compete(SCENE, conditions, 400, np.random.default_rng(5))
-    lines = [f"  {s.condition.radius_px:5.1f} px {np.degrees(s.condition.tilt):3.0f} deg "
-             f"{100 * s.condition.noise:4.1f} % psf {s.condition.psf_px:.1f} {s.detector:<19} "
-             f"bound {s.bound_px:.5f} rms {s.rms_px:.5f} px, "
-             f"ratio {s.ratio:7.3f} [{s.ratio_low:.3f}, {s.ratio_high:.3f}], bias {s.bias_px:.5f}, "
-             f"lost {s.lost:.1%}" for s in scores]
+    lines = [
+        f"  {s.condition.radius_px:5.1f} px {np.degrees(s.condition.tilt):3.0f} deg "
+        f"{100 * s.condition.noise:4.1f} % psf {s.condition.psf_px:.1f} {s.detector:<19} "
+        f"bound {s.bound_px:.5f} rms {s.rms_px:.5f} px, "
+        f"ratio {s.ratio:7.3f} [{s.ratio_low:.3f}, {s.ratio_high:.3f}], bias {s.bias_px:.5f}, "
+        f"lost {s.lost:.1%}"
+        for s in scores
+    ]
     with capsys.disabled():
         sys.stdout.write("\n".join(["\ndetectors:", *lines, ""]))
     for score in (s for s in scores if s.detector == DEFAULT_DETECTOR):

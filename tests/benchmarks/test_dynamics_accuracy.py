@@ -15,9 +15,7 @@ def test_papers_loop_on_both_engines(quote):
     from identify.robot_checks.model_verification import judge, verify
 
     verdict = judge(verify(dynamics.load_robot("rss6")))
-    quote(
-        mujoco_position_steady_um=verdict.position_steady_um, mujoco_angle_steady_urad=verdict.angle_steady_urad
-    )
+    quote(mujoco_position_steady_um=verdict.position_steady_um, mujoco_angle_steady_urad=verdict.angle_steady_urad)
     assert verdict.position_steady_um < 0.010
     assert verdict.angle_steady_urad < 0.020
 

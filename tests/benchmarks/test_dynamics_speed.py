@@ -104,8 +104,11 @@ def test_everything_compiles_within_twenty_seconds_and_only_once(benchmark, tmp_
     if compilation.find_compiler() is None:
         pytest.skip("needs a C compiler")
     monkeypatch.setenv("CMMSIM_CACHE", str(tmp_path))
-    command = [sys.executable, "-c", "import dynamics as d; r = d.load_robot('rss6'); r.functions;"
-               " d.closed_loop.prepare(r)"]
+    command = [
+        sys.executable,
+        "-c",
+        "import dynamics as d; r = d.load_robot('rss6'); r.functions; d.closed_loop.prepare(r)",
+    ]
     with OtherLoad() as load:
         first = seconds(lambda: subprocess.run(command, check=True))
     stamps = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}

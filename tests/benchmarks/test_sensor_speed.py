@@ -48,7 +48,7 @@ def frame_seconds(sensor, poses):
     """Seconds a frame of the fastest batch; all frames are measured well."""
     fastest = np.inf
     for start in range(0, len(poses), BATCH):
-        batch = poses[start:start + BATCH]
+        batch = poses[start : start + BATCH]
         began = time.perf_counter()
         found = [sensor.measure(pose) for pose in batch]
         fastest = min(fastest, (time.perf_counter() - began) / len(batch))
@@ -75,8 +75,12 @@ def test_frames_a_second(sensor, record_property, quote):
     second = float(np.median(gains or [2.0]))
     part = f"the second core brings a loop {second:.2f} x" if second < WHOLE_SECOND_CORE else ""
     record_property("frames_per_second", round(rate, 1))
-    judge(rate * slower >= goal, f"{rate:.1f} stereo frames a second with {sensor.renderer}, goal {goal:g} on one "
-          f"{slower:.2f} times as fast", load, part)
+    judge(
+        rate * slower >= goal,
+        f"{rate:.1f} stereo frames a second with {sensor.renderer}, goal {goal:g} on one {slower:.2f} times as fast",
+        load,
+        part,
+    )
     quote(**{f"{sensor.renderer}_frames_a_second": rate})
 
 
@@ -94,8 +98,8 @@ def test_against_a_straightforward_pipeline(sensor, record_property, quote):
     ours, theirs, errors = np.inf, np.inf, []
     with OtherLoad() as load:
         for start in range(0, len(poses), BATCH):
-            ours = min(ours, frame_seconds(sensor, poses[start:start + BATCH]))
-            for pose in poses[start:start + 3]:
+            ours = min(ours, frame_seconds(sensor, poses[start : start + BATCH]))
+            for pose in poses[start : start + 3]:
                 began = time.perf_counter()
                 found, count = other.measure(pose, pose)
                 theirs = min(theirs, time.perf_counter() - began)
@@ -105,8 +109,12 @@ def test_against_a_straightforward_pipeline(sensor, record_property, quote):
     ratio = theirs / ours
     record_property("times_straightforward", round(ratio, 1))
     goal = TIMES_STRAIGHTFORWARD[sensor.renderer]
-    judge(ratio >= goal, f"{ratio:.1f} times a straightforward pipeline ({1e3 * theirs:.0f} ms a frame) with "
-          f"{sensor.renderer}, goal {goal:g}", load)
+    judge(
+        ratio >= goal,
+        f"{ratio:.1f} times a straightforward pipeline ({1e3 * theirs:.0f} ms a frame) with "
+        f"{sensor.renderer}, goal {goal:g}",
+        load,
+    )
     quote(**{f"{sensor.renderer}_times_straightforward": ratio})
 
 
@@ -134,6 +142,7 @@ def count_renderers(monkeypatch):
 
     made = []
     for kind in (pyrender.OffscreenRenderer, Renderer, render._FrameBuffer):
+
         def counted(self, *args, _kind=kind, _plain=kind.__init__, **kwargs):
             made.append(_kind.__name__)
             _plain(self, *args, **kwargs)
@@ -150,17 +159,26 @@ def resident_bytes():
 def test_kernels_compile_within_fifteen_seconds(tmp_path, taught, record_property):
     """Of processor time, into an empty cache, tried once more where it is missed; another process loads them in a small
     part of it."""
-    code = ("import time, numpy as np, cmmsim; s = cmmsim.load_sensor('ctrack780', renderer='analytic');"
-            "from cmmsim import teaching; c = time.process_time(); s.look(s.home).windows(np.full((2, 3, 2), 700), 16);"
-            "from cmmsim.ellipse_fit import fit_ellipses; from cmmsim.triangulation import triangulate;"
-            "from cmmsim.registration import register;"
-            "fit_ellipses(np.zeros((1, 16, 16)), np.zeros((1, 2), int), s.noise, 14);"
-            "p = np.full((4, 2), 1000.0); e = np.tile(np.eye(2), (4, 1, 1)); triangulate(s.rig, p, p, e, e);"
-            "x = np.eye(3); register(x, x, np.tile(np.eye(3), (3, 1, 1))); print(time.process_time() - c)")
+    code = (
+        "import time, numpy as np, cmmsim; s = cmmsim.load_sensor('ctrack780', renderer='analytic');"
+        "from cmmsim import teaching; c = time.process_time(); s.look(s.home).windows(np.full((2, 3, 2), 700), 16);"
+        "from cmmsim.ellipse_fit import fit_ellipses; from cmmsim.triangulation import triangulate;"
+        "from cmmsim.registration import register;"
+        "fit_ellipses(np.zeros((1, 16, 16)), np.zeros((1, 2), int), s.noise, 14);"
+        "p = np.full((4, 2), 1000.0); e = np.tile(np.eye(2), (4, 1, 1)); triangulate(s.rig, p, p, e, e);"
+        "x = np.eye(3); register(x, x, np.tile(np.eye(3), (3, 1, 1))); print(time.process_time() - c)"
+    )
 
     def spent(cache):
-        return float(subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True,
-                                    env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / cache)}).stdout)
+        return float(
+            subprocess.run(
+                [sys.executable, "-c", code],
+                check=True,
+                capture_output=True,
+                text=True,
+                env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / cache)},
+            ).stdout
+        )
 
     with OtherLoad() as load:
         goal, cold, warm = 15.0 * slowness(), spent("first"), spent("first")

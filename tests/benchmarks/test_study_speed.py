@@ -153,8 +153,10 @@ def test_rate_of_sensor_rows(two_cores, tmp_path, record_property):
         wall = seconds(lambda: runs(study))
     slow = slowness()
     whole = wall * SENSOR_ROWS / study.rows
-    figure = (f"{study.rows / wall:.1f} sensor rows/s on two cores, {SENSOR_ROWS} in {whole:.0f} s (goal "
-              f"{SENSOR_SECONDS:g} s), {study.rows} measured, machine {slow:.2f} x slower than the goals'")
+    figure = (
+        f"{study.rows / wall:.1f} sensor rows/s on two cores, {SENSOR_ROWS} in {whole:.0f} s (goal "
+        f"{SENSOR_SECONDS:g} s), {study.rows} measured, machine {slow:.2f} x slower than the goals'"
+    )
     record_property("figure", figure)
     judge(whole / slow <= SENSOR_SECONDS, figure, load)
 

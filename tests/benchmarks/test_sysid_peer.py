@@ -152,9 +152,12 @@ def test_its_error_on_our_design_is_a_fifth_of_the_peers_on_the_same_plant(rows,
     """
     found, _ = rows
     ours, exact, best = found[DESIGN, EXACT, OURS], found[DESIGN, EXACT, PEER], best_of_peer(found, DESIGN)
-    show(capsys, f"{DESIGN}: {ours.error / exact.error:.3f} times the peer's error on the same plant, "
-         f"{ours.error / best.error:.2f} times that on its own simulation, "
-         f"{ours.error / best_of_peer(found, SINES).error:.2f} times that with its sines there")
+    show(
+        capsys,
+        f"{DESIGN}: {ours.error / exact.error:.3f} times the peer's error on the same plant, "
+        f"{ours.error / best.error:.2f} times that on its own simulation, "
+        f"{ours.error / best_of_peer(found, SINES).error:.2f} times that with its sines there",
+    )
     assert ours.error <= exact.error / 5
 
 

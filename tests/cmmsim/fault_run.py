@@ -38,8 +38,15 @@ def exactly_taught(method="registration", renderer="analytic", seed=0):
     rig = file.rig.model_copy(update={"width": 800, "height": 640, "target": (0.02, 0.0, 0.29)})
     sensor = cmmsim.Sensor(file.model_copy(update={"rig": rig}), seed, method, renderer=renderer)
     platform, base = (body.sticker_places for body in sensor._scene)
-    sensor._taught = Taught(sensor.name, invert(sensor._camera_from_base), np.zeros((6, 6)), platform.copy(),
-                            np.zeros((len(platform), 3, 3)), np.zeros((6, 6)), base.copy())
+    sensor._taught = Taught(
+        sensor.name,
+        invert(sensor._camera_from_base),
+        np.zeros((6, 6)),
+        platform.copy(),
+        np.zeros((len(platform), 3, 3)),
+        np.zeros((6, 6)),
+        base.copy(),
+    )
     sensor.add_bodies(fault_bodies())
     return sensor
 

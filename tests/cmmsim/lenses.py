@@ -42,8 +42,15 @@ def perfectly_taught(sensor):
     """What a teaching without error would find."""
     places = sensor._scene[0].sticker_places
     zero = np.zeros((6, 6))
-    return cmmsim.Taught(sensor.name, np.linalg.inv(sensor._camera_from_base), zero, places.copy(),
-                         np.zeros((len(places), 3, 3)), zero, sensor._scene[1].sticker_places.copy())
+    return cmmsim.Taught(
+        sensor.name,
+        np.linalg.inv(sensor._camera_from_base),
+        zero,
+        places.copy(),
+        np.zeros((len(places), 3, 3)),
+        zero,
+        sensor._scene[1].sticker_places.copy(),
+    )
 
 
 def poses_about_home(sensor, count, seed=0):
@@ -67,6 +74,8 @@ def expected_centres(sensor, pose):
 
 def pose_errors(sensor, poses, **look):
     """Errors (n, 6) of the poses measured near the true ones, um and urad, and the measurements."""
-    found = [sensor.estimator.measure(sensor.look(pose, **look), sensor._camera_from_base @ pose_to_transform(pose))[0]
-             for pose in poses]
+    found = [
+        sensor.estimator.measure(sensor.look(pose, **look), sensor._camera_from_base @ pose_to_transform(pose))[0]
+        for pose in poses
+    ]
     return 1e6 * (np.array([m.pose for m in found]) - poses), found

@@ -26,8 +26,13 @@ def blurred_coverage(centres: Array, shapes: Array, size: int, psf_px: float) ->
     density = np.exp(-0.5 * below[0] ** 2) / np.sqrt(2.0 * np.pi)
     passed = 1.0 - psf_px * np.diff(below[0] * ndtr(below[0]) + density, axis=1)  # P
     share = across[1] @ (passed * normal[:, :1]).transpose(0, 2, 1)
-    rates = (normal[:, 0], normal[:, 1], u[0] * normal[:, 0], u[1] * normal[:, 0] + u[0] * normal[:, 1],
-             u[1] * normal[:, 1])
+    rates = (
+        normal[:, 0],
+        normal[:, 1],
+        u[0] * normal[:, 0],
+        u[1] * normal[:, 0] + u[0] * normal[:, 1],
+        u[1] * normal[:, 1],
+    )
     derivatives = [across[1] @ (across[0] * rate[:, None]).transpose(0, 2, 1) for rate in rates]
     return share, np.stack(derivatives, axis=-1)
 

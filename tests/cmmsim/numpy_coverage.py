@@ -25,8 +25,9 @@ def coverage(centres: Array, shapes: Array, size: int) -> tuple[Array, Array]:
         flux_y = across_x.length * across_x.velocity(gradient[:, 1])
         flux_x = across_y.length * across_y.velocity(gradient[:, 0])
         divergence = np.trace(gradient, axis1=1, axis2=2)[:, None, None]
-        derivatives[..., 2 + k] = (divergence * area - flux_y[:, 1:] + flux_y[:, :-1]
-                                   - flux_x[:, :, 1:] + flux_x[:, :, :-1])
+        derivatives[..., 2 + k] = (
+            divergence * area - flux_y[:, 1:] + flux_y[:, :-1] - flux_x[:, :, 1:] + flux_x[:, :, :-1]
+        )
     return area, derivatives
 
 
@@ -39,8 +40,10 @@ def _all_sides(centres: Array, inverse: NDArray[np.floating], size: int) -> tupl
     """Sides along x, indexed (n, line y, pixel x), and along y (n, pixel y, line x)."""
     ticks = np.arange(size + 1) - 0.5
     along = np.arange(size) - 0.5
-    return (_Sides(inverse, along[None, :] - centres[:, :1], ticks[None, :] - centres[:, 1:], axis=0),
-            _Sides(inverse, ticks[None, :] - centres[:, :1], along[None, :] - centres[:, 1:], axis=1))
+    return (
+        _Sides(inverse, along[None, :] - centres[:, :1], ticks[None, :] - centres[:, 1:], axis=0),
+        _Sides(inverse, ticks[None, :] - centres[:, :1], along[None, :] - centres[:, 1:], axis=1),
+    )
 
 
 def _area(shapes: Array, across_x: _Sides, across_y: _Sides) -> Array:

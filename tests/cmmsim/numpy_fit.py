@@ -18,8 +18,10 @@ def fit_ellipses(windows, corners, noise, fit_size, limits=None, iterations=3):
         mean = ground + contrast * radiance_share
         weights = mask / noise.variance(mean)
         residuals = inner - mean
-        jacobian = np.concatenate([contrast[..., None] * derivatives, radiance_share[..., None],
-                                   np.ones_like(radiance_share)[..., None]], axis=-1).reshape(len(inner), -1, 7)
+        jacobian = np.concatenate(
+            [contrast[..., None] * derivatives, radiance_share[..., None], np.ones_like(radiance_share)[..., None]],
+            axis=-1,
+        ).reshape(len(inner), -1, 7)
         weighted = jacobian.transpose(0, 2, 1) * weights.reshape(len(inner), 1, -1)
         normal = weighted @ jacobian + 1e-9 * np.eye(7)
         if step < iterations:
@@ -30,8 +32,15 @@ def fit_ellipses(windows, corners, noise, fit_size, limits=None, iterations=3):
     good = parameters[:, 5] >= limits.smallest_contrast
     good &= misfit <= largest_misfits(limits, noise, parameters[:, 5], parameters[:, 6])
     good &= _inside(parameters, fit_size)
-    return EllipseFits(parameters[:, :2] + inner_corners + corners, covariances[:, :2, :2], _shape(parameters),
-                       covariances[:, 2:5, 2:5], parameters[:, 5], misfit, good)
+    return EllipseFits(
+        parameters[:, :2] + inner_corners + corners,
+        covariances[:, :2, :2],
+        _shape(parameters),
+        covariances[:, 2:5, 2:5],
+        parameters[:, 5],
+        misfit,
+        good,
+    )
 
 
 _LARGEST_STEP = np.array([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0])
@@ -108,4 +117,5 @@ def _inside(parameters, size):
     reach = np.linalg.norm(shape, axis=2)  # half extent along x and y
     centre = parameters[:, :2]
     return np.all((centre - reach > -0.5) & (centre + reach < size - 0.5), axis=1) & (
-        np.linalg.eigvalsh(shape)[:, 0] > 1.01 * SMALLEST_RADIUS_PX)
+        np.linalg.eigvalsh(shape)[:, 0] > 1.01 * SMALLEST_RADIUS_PX
+    )

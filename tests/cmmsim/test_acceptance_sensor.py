@@ -65,8 +65,9 @@ def test_shifted_camera_gives_the_lengths_that_linearised_triangulation_predicts
     points = apply(camera_from_base @ volume.base_from_volume, row)
     steps = []
     for point in points:
-        jacobian = np.vstack([(rig.project(point + step)[0] - rig.project(point - step)[0]).ravel() / 2e-6
-                              for step in 1e-6 * np.eye(3)]).T
+        jacobian = np.vstack(
+            [(rig.project(point + step)[0] - rig.project(point - step)[0]).ravel() / 2e-6 for step in 1e-6 * np.eye(3)]
+        ).T
         steps.append(np.linalg.pinv(jacobian) @ [0.0, 0.0, shift, 0.0])
     towards = (points[-1] - points[0]) / np.linalg.norm(points[-1] - points[0])
     predicted = (np.array(steps[1:]) - steps[0]) @ towards
@@ -83,8 +84,16 @@ def test_lengths_and_their_deviations_by_hand():
 
 
 def pose_measurement(transform, covariance=None):
-    return Measurement(transform_to_pose(transform), np.eye(6) if covariance is None else covariance, np.zeros((0, 3)),
-                       np.zeros((0, 3, 3)), np.zeros((0, 2)), np.zeros((0, 2)), np.array([], dtype=str), True)
+    return Measurement(
+        transform_to_pose(transform),
+        np.eye(6) if covariance is None else covariance,
+        np.zeros((0, 3)),
+        np.zeros((0, 3, 3)),
+        np.zeros((0, 2)),
+        np.zeros((0, 2)),
+        np.array([], dtype=str),
+        True,
+    )
 
 
 def test_relative_error_of_known_poses():
@@ -124,7 +133,7 @@ def test_standing_and_moving_bar_have_the_stated_errors(volume):
     assert found.moving.sum() == 40
     assert 0.75 < found.variance_ratios.mean() < 1.3
     assert np.sqrt(np.mean(found.distance_errors**2)) < 8e-6
-    assert np.sqrt(np.mean(found.errors[:, :3]**2)) < 60e-6
+    assert np.sqrt(np.mean(found.errors[:, :3] ** 2)) < 60e-6
 
 
 @pytest.mark.slow
@@ -147,8 +156,9 @@ def test_a_run_that_loses_the_bar_is_given_up(volume):
     """The bar is taken out of sight after four frames."""
     path = bar_paths(volume)[0]
     gone = path.pose(0.0) + np.array([0.0, 0.0, -5.0, 0.0, 0.0, 0.0])
-    hidden = SimpleNamespace(name="hidden", pose=lambda time: gone if time > 0.02 else path.pose(0.0),
-                             pose_rate=lambda time: np.zeros(6))
+    hidden = SimpleNamespace(
+        name="hidden", pose=lambda time: gone if time > 0.02 else path.pose(0.0), pose_rate=lambda time: np.zeros(6)
+    )
     sensor = SensorUnderTest(FILE, 0, "analytic").facing(rigid_bar(), 1)
     found = bar_run(sensor, hidden, np.arange(-2, 30) / 60.0)
     assert (len(found.time), found.lost) == (4, 28)
@@ -159,8 +169,15 @@ def test_a_run_that_loses_the_bar_is_given_up(volume):
 
 def test_same_seed_same_numbers(volume):
     line = seven_lines(volume)[4]
-    runs = [[length.error for length in measure_line(SensorUnderTest(FILE, seed, "analytic").facing(
-        length_artefact(line), 1), volume, line, 1)] for seed in (0, 0, 1)]
+    runs = [
+        [
+            length.error
+            for length in measure_line(
+                SensorUnderTest(FILE, seed, "analytic").facing(length_artefact(line), 1), volume, line, 1
+            )
+        ]
+        for seed in (0, 0, 1)
+    ]
     assert runs[0] == runs[1]
     assert runs[0] != runs[2]
 

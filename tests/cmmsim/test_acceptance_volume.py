@@ -36,16 +36,18 @@ def test_volume_is_the_largest_that_both_cameras_see(volume):
     assert room.min() >= MARGIN_PX
     assert room.min() < MARGIN_PX + 3.0  # a millimetre more would be too much
     np.testing.assert_allclose(volume.base_from_volume[:3, 3], RIG.target)
-    np.testing.assert_allclose(volume.base_from_volume[:3, :3] @ volume.base_from_volume[:3, :3].T, np.eye(3),
-                               atol=1e-12)
+    np.testing.assert_allclose(
+        volume.base_from_volume[:3, :3] @ volume.base_from_volume[:3, :3].T, np.eye(3), atol=1e-12
+    )
     distance = np.linalg.norm(np.subtract(RIG.target, RIG.position))
     assert volume.depth_range == pytest.approx((distance - volume.size[2] / 2, distance + volume.size[2] / 2))
 
 
 def test_volume_axes_are_those_of_the_images(volume):
     """x goes right and y down in both images, and what is further away is smaller."""
-    pixels = {tuple(corner): spots for corner, spots in zip(CORNERS, corner_pixels(volume).transpose(1, 0, 2),
-                                                            strict=True)}
+    pixels = {
+        tuple(corner): spots for corner, spots in zip(CORNERS, corner_pixels(volume).transpose(1, 0, 2), strict=True)
+    }
     for side in range(2):
         assert pixels[0.5, 0.5, -0.5][side, 0] > pixels[-0.5, 0.5, -0.5][side, 0]
         assert pixels[0.5, 0.5, -0.5][side, 1] > pixels[0.5, -0.5, -0.5][side, 1]
@@ -53,12 +55,15 @@ def test_volume_axes_are_those_of_the_images(volume):
         assert heights[1] < heights[0]
 
 
-@pytest.mark.parametrize(("size", "message"), [
-    ((2.0, 0.5, 0.5), r"2000 x 500 x 500 mm is not wholly visible.*corner \(-1000, .*px.*largest cube.*682 mm"),
-    ((0.5, 0.5, 3.0), r"front face comes within \d+ mm"),
-    ((0.5, 0.05, 0.5), "at least 100 mm"),
-    ((0.5, np.nan, 0.5), "three sides"),
-])
+@pytest.mark.parametrize(
+    ("size", "message"),
+    [
+        ((2.0, 0.5, 0.5), r"2000 x 500 x 500 mm is not wholly visible.*corner \(-1000, .*px.*largest cube.*682 mm"),
+        ((0.5, 0.5, 3.0), r"front face comes within \d+ mm"),
+        ((0.5, 0.05, 0.5), "at least 100 mm"),
+        ((0.5, np.nan, 0.5), "three sides"),
+    ],
+)
 def test_impossible_volumes_are_refused(size, message):
     with pytest.raises(AcceptanceError, match=message):
         volume_of_size(RIG, np.array(size))

@@ -41,8 +41,10 @@ def centres_of(sensor, pose, supersampling=SUPERSAMPLING):
     placed = placed_at(sensor, pose)
     points = [apply(bodies[0], sensor._scene[0].sticker_places) for bodies in placed]
     normals = [sensor.platform.sticker_normals @ bodies[0, :3, :3].T for bodies in placed]
-    expected = [camera.project(p)[0] + eccentricity(p, n, 0.003, camera.focal_px)
-                for camera, p, n in zip(sensor.rig.cameras, points, normals, strict=True)]
+    expected = [
+        camera.project(p)[0] + eccentricity(p, n, 0.003, camera.focal_px)
+        for camera, p, n in zip(sensor.rig.cameras, points, normals, strict=True)
+    ]
     corners = np.rint(np.stack(expected) - 7.5).astype(int)
     windows = sensor._camera.radiance(placed, corners, 16, supersampling).reshape(-1, 16, 16)
     fits = fit_ellipses(NOISE.mean_grey(windows), corners.reshape(-1, 2), NOISE, 14)
@@ -96,8 +98,14 @@ def test_both_renderers_agree_in_every_sticker_centre_behind_a_real_lens(tmp_pat
         centres = []
         for sensor in (first, other):
             windows = sensor._camera.radiance(placed_at(sensor, pose), corners, 18, SUPERSAMPLING).reshape(-1, 18, 18)
-            fits = fit_ellipses(NOISE.mean_grey(windows), corners.reshape(-1, 2), NOISE, 16,
-                                FitLimits(largest_misfit=np.inf), psf_px=sensor.optics.psf_px)
+            fits = fit_ellipses(
+                NOISE.mean_grey(windows),
+                corners.reshape(-1, 2),
+                NOISE,
+                16,
+                FitLimits(largest_misfit=np.inf),
+                psf_px=sensor.optics.psf_px,
+            )
             assert fits.good.all()
             centres.append(fits.centres)
         assert np.abs(centres[0] - centres[1]).max() < 0.005
@@ -111,9 +119,14 @@ def test_both_renderers_show_the_same_image(analytic, taught):
     images = []
     for sensor in (analytic, other):
         sensor.add_bodies({"rod": cmmsim.rod(0.33, 0.01)})
-        bodies = [np.concatenate([b, [c @ place]]) for b, c in
-                  zip(placed_at(sensor, sensor.home), [m @ sensor._camera_from_base for m in sensor.rig.from_camera],
-                      strict=True)]
+        bodies = [
+            np.concatenate([b, [c @ place]])
+            for b, c in zip(
+                placed_at(sensor, sensor.home),
+                [m @ sensor._camera_from_base for m in sensor.rig.from_camera],
+                strict=True,
+            )
+        ]
         images.append(sensor._camera.whole_exposure(0, [bodies[0]], 6))
     gap = np.abs(images[0] - images[1])
     assert (gap > 0.02).sum() < 6000  # edges of bodies, of 3 million pixels
@@ -128,7 +141,7 @@ def test_windows_are_cut_out_of_the_whole_image(analytic):
     windows = analytic._camera.radiance(placed, np.stack([corners, corners]), 12, 6)[0]
     image = analytic._camera.whole_exposure(0, [placed[0]], 6)
     for (x, y), window in zip(corners, windows, strict=True):
-        np.testing.assert_allclose(image[y:y + 12, x:x + 12], window, atol=1e-6)
+        np.testing.assert_allclose(image[y : y + 12, x : x + 12], window, atol=1e-6)
 
 
 def test_tracking_needs_no_opengl(analytic, moving_path, monkeypatch):
@@ -175,8 +188,10 @@ def test_outline_covers_what_sampling_says():
     cover_by_polygon(outline.half_planes, *corner, 6, coarse)
     assert np.abs(coarse - fine).max() < 0.1
     x, y = np.meshgrid(np.arange(40), np.arange(40))
-    inside = [polygon_holds(outline.half_planes, corner[0] + i, corner[1] + j, 1, 1)
-              for i, j in zip(x.ravel(), y.ravel(), strict=True)]
+    inside = [
+        polygon_holds(outline.half_planes, corner[0] + i, corner[1] + j, 1, 1)
+        for i, j in zip(x.ravel(), y.ravel(), strict=True)
+    ]
     np.testing.assert_allclose(fine.ravel()[inside], 1.0, atol=1e-6)
     area = fine.sum()
     assert 0.9 * area < np.sum(inside) + 0.5 * np.sum((fine > 0) & (fine < 1)) < 1.1 * area
@@ -210,8 +225,9 @@ def test_layers_are_laid_as_plain_numpy_lays_them():
     centres, shapes = rng.uniform(6.0, 9.0, (2, 2)), np.stack([np.diag([5.0, 3.0]), [[2.5, 0.4], [0.4, 1.8]]])
     levels, corner = np.array([0.1, 0.9]), np.array([100.0, 50.0])
     half = np.array([[1.0, 0.0, corner[0] + 7.25]])
-    solids = Solids(half, np.array([0, 1]), np.array([[-1e3, -1e3, corner[0] + 7.25, 1e3]]), np.array([0.4]),
-                    np.array([0]))
+    solids = Solids(
+        half, np.array([0, 1]), np.array([[-1e3, -1e3, corner[0] + 7.25, 1e3]]), np.array([0.4]), np.array([0])
+    )
     discs = Discs(centres + corner, shapes, np.linalg.norm(shapes, axis=2), levels, np.array([[False], [True]]))
     shares = numpy_coverage.covered_area(centres, shapes, 16)
     cover = np.tile(np.clip(7.75 - np.arange(16), 0.0, 1.0), (16, 1))

@@ -26,13 +26,16 @@ def test_unknown_sensor_names_the_valid_ones():
         cmmsim.load_sensor("ctrak")
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ("dark_noise = 26.0", "darknoise = 26.0", "unknown key 'camera.darknoise', valid are .*dark_noise"),
-    ("baseline = 1.0", 'baseline = "wide"', "rig.baseline: .*number.*'wide'"),
-    ("baseline = 1.0", "baseline = -1.0", "rig.baseline: .*greater than 0"),
-    ("width = 2048", "width = inf", "rig.width"),
-    ("[camera]", "[camera", "sensor file"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("dark_noise = 26.0", "darknoise = 26.0", "unknown key 'camera.darknoise', valid are .*dark_noise"),
+        ("baseline = 1.0", 'baseline = "wide"', "rig.baseline: .*number.*'wide'"),
+        ("baseline = 1.0", "baseline = -1.0", "rig.baseline: .*greater than 0"),
+        ("width = 2048", "width = inf", "rig.width"),
+        ("[camera]", "[camera", "sensor file"),
+    ],
+)
 def test_bad_sensor_file(tmp_path, old, new, message):
     assert old in TEXT
     with pytest.raises(cmmsim.SensorFileError, match=message):
@@ -83,19 +86,22 @@ def one_line(error):
     return text
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"stickers.placement": [0.002, 0.001]}, r"placement \[0.002, 0.001\] m is the smallest and the largest"),
-    ({"stickers.placement_seed": -4}, r"placement_seed: .*\(got -4\)"),
-    ({"stickers.ring_radius": 0.002}, "ring_radius 0.002 m must be at least radius 0.003 m"),
-    ({"stickers.sticker_level": 8}, "sticker_level 8 must be above ring_level 8"),
-    ({"platform.planes.A.stickers": [[1, 0], [2, 0], [3, 0]]}, "platform: the middle of its stickers.*outside of"),
-    ({"platform.cuts": []}, "platform: its planes and cuts enclose no solid"),
-    ({"platform.planes.B.normal": [0, 0, 0]}, r"must not be zero, got \[0.0, 0.0, 0.0\]"),
-    ({3: 4}, "key 3 of the changes is no name"),
-    ({"rig": {3: 4}}, "key 3 of the changes is no name"),
-    ([1], r"changes = \[1\] must be given by key"),
-    ({"based_on": "nothing"}, "based_on = 'nothing' cannot be changed"),
-])
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"stickers.placement": [0.002, 0.001]}, r"placement \[0.002, 0.001\] m is the smallest and the largest"),
+        ({"stickers.placement_seed": -4}, r"placement_seed: .*\(got -4\)"),
+        ({"stickers.ring_radius": 0.002}, "ring_radius 0.002 m must be at least radius 0.003 m"),
+        ({"stickers.sticker_level": 8}, "sticker_level 8 must be above ring_level 8"),
+        ({"platform.planes.A.stickers": [[1, 0], [2, 0], [3, 0]]}, "platform: the middle of its stickers.*outside of"),
+        ({"platform.cuts": []}, "platform: its planes and cuts enclose no solid"),
+        ({"platform.planes.B.normal": [0, 0, 0]}, r"must not be zero, got \[0.0, 0.0, 0.0\]"),
+        ({3: 4}, "key 3 of the changes is no name"),
+        ({"rig": {3: 4}}, "key 3 of the changes is no name"),
+        ([1], r"changes = \[1\] must be given by key"),
+        ({"based_on": "nothing"}, "based_on = 'nothing' cannot be changed"),
+    ],
+)
 def test_bad_changes(changes, message):
     with pytest.raises(cmmsim.SensorFileError, match=message) as error:
         cmmsim.load_sensor("ctrack780", changes=changes)
@@ -123,55 +129,94 @@ def test_bad_seed(seed):
     one_line(error)
 
 
-@pytest.mark.parametrize("pose", ["home", ["0"] * 6, np.zeros(6) * 1j, [[0.0], [1.0, 2.0]], None, [None] * 6, {},
-                                  np.zeros((6, 1)), [10**400] * 6, np.full((200, 200), np.nan)])
+@pytest.mark.parametrize(
+    "pose",
+    [
+        "home",
+        ["0"] * 6,
+        np.zeros(6) * 1j,
+        [[0.0], [1.0, 2.0]],
+        None,
+        [None] * 6,
+        {},
+        np.zeros((6, 1)),
+        [10**400] * 6,
+        np.full((200, 200), np.nan),
+    ],
+)
 def test_what_is_no_pose(pose):
     with pytest.raises(cmmsim.ShapeError, match="six finite numbers") as error:
         cmmsim.pose_to_transform(pose)
     one_line(error)
 
 
-@pytest.mark.parametrize(("call", "message"), [
-    (lambda s: cmmsim.load_sensor(None), "a sensor must be .* name or the path .*, got None of type NoneType"),
-    (lambda s: cmmsim.load_sensor(b"ctrack780"), "got b'ctrack780' of type bytes"),
-    (lambda s: cmmsim.load_sensor("ctrack780", taught=3), "taught must be what .*, got 3 of type int"),
-    (lambda s: cmmsim.load_sensor("ctrack780", progress=3), "progress must be a function .*, got 3"),
-    (lambda s: cmmsim.load_sensor("ctrack780", method=[]), r"unknown method \[\]: valid are planes, registration"),
-    (lambda s: cmmsim.Sensor("ctrack780"), "made of a SensorFile; .*, got ctrack780 of type str"),
-    (lambda s: s.look(s.home, 3), "obstacles must be transforms by name.*, got 3 of type int"),
-    (lambda s: s.measure(s.home, [np.eye(4)]), r"obstacles must be .*, got \[array.* of type list"),
-    (lambda s: s.capture(s.home, 0), "obstacles must be .*, got 0 of type int"),
-    (lambda s: s.add_bodies(None), "bodies must be meshes by name.*, got None of type NoneType"),
-    (lambda s: s.add_bodies({"rod": 3}), "body 'rod' must be a trimesh.Trimesh, got 3 of type int"),
-    (lambda s: s.add_bodies({3: rod(0.1, 0.01)}), "the name of a body must be text, got 3 of type int"),
-    (lambda s: cmmsim.measure_frame(None, s.estimator), "a frame must be a StereoFrame.*, got None"),
-    (lambda s: cmmsim.measure_frame(DARK, s), "an estimator must be a PoseEstimator.* of type Sensor"),
-    (lambda s: cmmsim.FaultGenerator(s), "an estimator must be a PoseEstimator.* of type Sensor"),
-    (lambda s: cmmsim.FaultGenerator(s.estimator).draw([], s.home, None), r"unknown fault \[\]: valid are black"),
-    (lambda s: cmmsim.FaultGenerator(s.estimator).draw("glint", s.home, 5), "rng must be a generator.* 5 of type int"),
-    (lambda s: cmmsim.FaultGenerator(s.estimator).draw("glint", [1.0], RNG), "a pose is six finite numbers"),
-    (lambda s: cmmsim.Tracker(s), "an estimator must be a PoseEstimator.* of type Sensor"),
-    (lambda s: cmmsim.Tracker(s.estimator).measure(3), "images must be a StereoFrame.* got 3 of type int"),
-    (lambda s: cmmsim.Tracker(s.estimator).measure(cmmsim.StereoFrame(DARK.left[1:], DARK.right)),
-     "the left image is 2048 x 1535 px, but its camera has 2048 x 1536 px"),
-    (lambda s: cmmsim.FaultyImages(None, cmmsim.Fault("some"), s.noise, RNG), "images must be a StereoF.* got None"),
-    (lambda s: cmmsim.FaultyImages(DARK, "glint", s.noise, RNG), "a fault must be a Fault.* glint of type str"),
-    (lambda s: cmmsim.FaultyImages(DARK, cmmsim.Fault("some"), None, RNG), "noise must be a CameraNoise.* got None"),
-    (lambda s: cmmsim.FaultyImages(DARK, cmmsim.Fault("some"), s.noise, 5), "rng must be a generator.* 5 of type int"),
-    (lambda s: cmmsim.transform_to_pose(np.eye(3)), r"a transform must be \(4,4\) and finite, got shape \(3, 3\)"),
-    (lambda s: cmmsim.transform_to_pose("home"), r"a transform must be \(4,4\) and finite, got home"),
-    (lambda s: cmmsim.transform_to_pose(np.full((4, 4), np.nan)), "a transform must be"),
-    (lambda s: cmmsim.transform_to_pose(MOVED.T), r"the last row \[0 0 0 1\], got \[0.1, 0.2, 0.3, 1.0\]; is it tran"),
-    (lambda s: cmmsim.transform_to_pose(MOVED @ np.diag([1.1, 1.1, 1.1, 1.0])), r"\|R\^T R - I\| = 0.21.*1.331 \(1\)"),
-    (lambda s: cmmsim.transform_to_pose(np.diag([1.0, 1.0, -1.0, 1.0])), r"must be rigid: .* determinant -1 \(1\)"),
-    (lambda s: rod("long", 0.01), r"length and radius of a rod are two finite numbers, m, got \('long', 0.01\)"),
-    (lambda s: rod(0.1, -0.01), "length and radius of a rod must be above 0 m, got 0.1 and -0.01"),
-    (lambda s: rod_transform(np.ones(3), np.ones(3)), r"a rod of 0 m from \[1\.0, 1\.0, 1\.0\] m points nowhere"),
-    (lambda s: rod_transform(None, np.ones(3)), "the start of a rod is three finite numbers"),
-    (lambda s: rod_transform(np.zeros(3), np.ones(2)), r"end of a rod is three finite numbers, m, got shape \(2,\)"),
-    (lambda s: cmmsim.PinholeCamera("wide", 9.0, 9.0, 20, 20), "a camera's focal length, .* are finite numbers"),
-    (lambda s: cmmsim.PinholeCamera(np.nan, 9.0, 9.0, 20, 20), "a camera's focal length, .* are finite numbers"),
-])
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda s: cmmsim.load_sensor(None), "a sensor must be .* name or the path .*, got None of type NoneType"),
+        (lambda s: cmmsim.load_sensor(b"ctrack780"), "got b'ctrack780' of type bytes"),
+        (lambda s: cmmsim.load_sensor("ctrack780", taught=3), "taught must be what .*, got 3 of type int"),
+        (lambda s: cmmsim.load_sensor("ctrack780", progress=3), "progress must be a function .*, got 3"),
+        (lambda s: cmmsim.load_sensor("ctrack780", method=[]), r"unknown method \[\]: valid are planes, registration"),
+        (lambda s: cmmsim.Sensor("ctrack780"), "made of a SensorFile; .*, got ctrack780 of type str"),
+        (lambda s: s.look(s.home, 3), "obstacles must be transforms by name.*, got 3 of type int"),
+        (lambda s: s.measure(s.home, [np.eye(4)]), r"obstacles must be .*, got \[array.* of type list"),
+        (lambda s: s.capture(s.home, 0), "obstacles must be .*, got 0 of type int"),
+        (lambda s: s.add_bodies(None), "bodies must be meshes by name.*, got None of type NoneType"),
+        (lambda s: s.add_bodies({"rod": 3}), "body 'rod' must be a trimesh.Trimesh, got 3 of type int"),
+        (lambda s: s.add_bodies({3: rod(0.1, 0.01)}), "the name of a body must be text, got 3 of type int"),
+        (lambda s: cmmsim.measure_frame(None, s.estimator), "a frame must be a StereoFrame.*, got None"),
+        (lambda s: cmmsim.measure_frame(DARK, s), "an estimator must be a PoseEstimator.* of type Sensor"),
+        (lambda s: cmmsim.FaultGenerator(s), "an estimator must be a PoseEstimator.* of type Sensor"),
+        (lambda s: cmmsim.FaultGenerator(s.estimator).draw([], s.home, None), r"unknown fault \[\]: valid are black"),
+        (
+            lambda s: cmmsim.FaultGenerator(s.estimator).draw("glint", s.home, 5),
+            "rng must be a generator.* 5 of type int",
+        ),
+        (lambda s: cmmsim.FaultGenerator(s.estimator).draw("glint", [1.0], RNG), "a pose is six finite numbers"),
+        (lambda s: cmmsim.Tracker(s), "an estimator must be a PoseEstimator.* of type Sensor"),
+        (lambda s: cmmsim.Tracker(s.estimator).measure(3), "images must be a StereoFrame.* got 3 of type int"),
+        (
+            lambda s: cmmsim.Tracker(s.estimator).measure(cmmsim.StereoFrame(DARK.left[1:], DARK.right)),
+            "the left image is 2048 x 1535 px, but its camera has 2048 x 1536 px",
+        ),
+        (
+            lambda s: cmmsim.FaultyImages(None, cmmsim.Fault("some"), s.noise, RNG),
+            "images must be a StereoF.* got None",
+        ),
+        (lambda s: cmmsim.FaultyImages(DARK, "glint", s.noise, RNG), "a fault must be a Fault.* glint of type str"),
+        (
+            lambda s: cmmsim.FaultyImages(DARK, cmmsim.Fault("some"), None, RNG),
+            "noise must be a CameraNoise.* got None",
+        ),
+        (
+            lambda s: cmmsim.FaultyImages(DARK, cmmsim.Fault("some"), s.noise, 5),
+            "rng must be a generator.* 5 of type int",
+        ),
+        (lambda s: cmmsim.transform_to_pose(np.eye(3)), r"a transform must be \(4,4\) and finite, got shape \(3, 3\)"),
+        (lambda s: cmmsim.transform_to_pose("home"), r"a transform must be \(4,4\) and finite, got home"),
+        (lambda s: cmmsim.transform_to_pose(np.full((4, 4), np.nan)), "a transform must be"),
+        (
+            lambda s: cmmsim.transform_to_pose(MOVED.T),
+            r"the last row \[0 0 0 1\], got \[0.1, 0.2, 0.3, 1.0\]; is it tran",
+        ),
+        (
+            lambda s: cmmsim.transform_to_pose(MOVED @ np.diag([1.1, 1.1, 1.1, 1.0])),
+            r"\|R\^T R - I\| = 0.21.*1.331 \(1\)",
+        ),
+        (lambda s: cmmsim.transform_to_pose(np.diag([1.0, 1.0, -1.0, 1.0])), r"must be rigid: .* determinant -1 \(1\)"),
+        (lambda s: rod("long", 0.01), r"length and radius of a rod are two finite numbers, m, got \('long', 0.01\)"),
+        (lambda s: rod(0.1, -0.01), "length and radius of a rod must be above 0 m, got 0.1 and -0.01"),
+        (lambda s: rod_transform(np.ones(3), np.ones(3)), r"a rod of 0 m from \[1\.0, 1\.0, 1\.0\] m points nowhere"),
+        (lambda s: rod_transform(None, np.ones(3)), "the start of a rod is three finite numbers"),
+        (
+            lambda s: rod_transform(np.zeros(3), np.ones(2)),
+            r"end of a rod is three finite numbers, m, got shape \(2,\)",
+        ),
+        (lambda s: cmmsim.PinholeCamera("wide", 9.0, 9.0, 20, 20), "a camera's focal length, .* are finite numbers"),
+        (lambda s: cmmsim.PinholeCamera(np.nan, 9.0, 9.0, 20, 20), "a camera's focal length, .* are finite numbers"),
+    ],
+)
 def test_arguments_of_the_wrong_kind(exact, call, message):
     """One line with what was got, where Python would complain of an attribute or an index somewhere inside."""
     with pytest.raises(cmmsim.CmmError, match=message) as error:
@@ -228,11 +273,14 @@ def test_discs_too_large_to_compare_detectors_on_are_refused():
     one_line(error)
 
 
-@pytest.mark.parametrize(("side", "shift", "message"), [
-    (2, (1.0, 0.0), r"unknown side 2: valid are 0 \(left\), 1 \(right\)"),
-    (0, (np.nan, 0.0), "a shift of a camera is two finite numbers"),
-    (0, 3.0, "a shift of a camera is two finite numbers"),
-])
+@pytest.mark.parametrize(
+    ("side", "shift", "message"),
+    [
+        (2, (1.0, 0.0), r"unknown side 2: valid are 0 \(left\), 1 \(right\)"),
+        (0, (np.nan, 0.0), "a shift of a camera is two finite numbers"),
+        (0, 3.0, "a shift of a camera is two finite numbers"),
+    ],
+)
 def test_bad_camera_shift(exact, side, shift, message):
     with pytest.raises(cmmsim.CmmError, match=message) as error:
         exact.shift_camera(side, shift)

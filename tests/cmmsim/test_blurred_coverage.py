@@ -61,8 +61,9 @@ def test_fit_of_blurred_windows_reaches_its_own_covariance_and_has_no_bias():
     rng = np.random.default_rng(3)
     centres, shapes = random_ellipses(rng, 2000, SIZE)
     radiance = (8.0 + 220.0 * blurred_coverage(centres, shapes, SIZE, 0.6)[0]) / 255.0
-    fits = fit_ellipses(NOISE.expose(radiance.astype(np.float32), rng), np.zeros((2000, 2), dtype=int), NOISE, 18,
-                        psf_px=0.6)
+    fits = fit_ellipses(
+        NOISE.expose(radiance.astype(np.float32), rng), np.zeros((2000, 2), dtype=int), NOISE, 18, psf_px=0.6
+    )
     error = fits.centres - centres
     assert fits.good.all()
     assert np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.covariances), error).mean() == pytest.approx(2, rel=0.07)

@@ -74,8 +74,9 @@ def error_of(solved):
     """Estimate minus truth (24,): intrinsics, and the small error [dt, dphi] of right_from_left."""
     place = solved.state.right_from_left
     turn = Rotation.from_matrix(place[:3, :3] @ RIGHT_FROM_LEFT[:3, :3].T).as_rotvec()
-    return np.concatenate([solved.state.intrinsics[0] - LEFT, solved.state.intrinsics[1] - RIGHT,
-                           place[:3, 3] - SHIFT, turn])
+    return np.concatenate(
+        [solved.state.intrinsics[0] - LEFT, solved.state.intrinsics[1] - RIGHT, place[:3, 3] - SHIFT, turn]
+    )
 
 
 def test_projection_and_its_derivatives():
@@ -99,8 +100,9 @@ def test_noise_free_points_give_the_truth_from_opencvs_start():
     assert not found.rejected
 
 
-@pytest.mark.parametrize(("distortion", "fix_aspect", "free"),
-                         [("none", False, 4), ("radial2", True, 5), ("brown5", False, 9)])
+@pytest.mark.parametrize(
+    ("distortion", "fix_aspect", "free"), [("none", False, 4), ("radial2", True, 5), ("brown5", False, 9)]
+)
 def test_what_is_not_free_stays(distortion, fix_aspect, free):
     values = []
     for own in (LEFT.copy(), RIGHT.copy()):
@@ -158,8 +160,12 @@ def test_covariance_of_the_rotation_vector():
     """Against the scatter of the rotation vector's finite differences."""
     found = calibrate(BOARD, seen_pairs(board_poses(8, np.random.default_rng(6)), 0.1, np.random.default_rng(7)), SIZE)
     rotation = Rotation.from_matrix(found.rig.right_from_left[:3, :3])
-    slope = np.column_stack([((Rotation.from_rotvec(1e-6 * axis) * rotation).as_rotvec() - rotation.as_rotvec()) / 1e-6
-                             for axis in np.eye(3)])
+    slope = np.column_stack(
+        [
+            ((Rotation.from_rotvec(1e-6 * axis) * rotation).as_rotvec() - rotation.as_rotvec()) / 1e-6
+            for axis in np.eye(3)
+        ]
+    )
     expected = slope @ found.adjustment.covariance[-3:, -3:] @ slope.T
     np.testing.assert_allclose(found.covariance[-3:, -3:], expected, rtol=1e-4)
     assert len(found.values) == len(PARAMETER_NAMES)

@@ -32,13 +32,13 @@ def test_right_names_and_units_are_not_warned_of(pairs):
 
 def test_swapped_folders_are_named_with_the_place_of_the_right_camera(pairs):
     swapped = [PairView(p.name, p.right, p.left) for p in pairs]
-    line, = lines_with("swap the folders", BOARD, swapped)
+    (line,) = lines_with("swap the folders", BOARD, swapped)
     assert f"({SHIFT[0]:.2g}" in line  # of the left camera in the axes of the right one
 
 
 @pytest.mark.parametrize(("unit", "size"), [(1e3, "400 x 300 m"), (1e2, "40 x 30 m"), (1e-3, "0.0004 x 0.0003 m")])
 def test_lengths_that_are_no_metres_are_named(pairs, unit, size):
-    line, = lines_with("other units", BOARD.model_copy(update={"spacing": unit * BOARD.spacing}), pairs)
+    (line,) = lines_with("other units", BOARD.model_copy(update={"spacing": unit * BOARD.spacing}), pairs)
     assert size in line
     baseline = unit * np.linalg.norm(SHIFT)
     assert float(line.split("cameras ")[1].split()[0]) == pytest.approx(baseline, rel=0.01)
@@ -49,7 +49,7 @@ def test_many_pairs_not_used_are_warned_of_with_the_board_of_the_file(pairs):
         return [p.without(1, "no chessboard of 9 x 7 found") if k < count else p for k, p in enumerate(pairs)]
 
     assert not lines_with("not used", BOARD, without(4))
-    line, = lines_with("not used", BOARD, without(5))
+    (line,) = lines_with("not used", BOARD, without(5))
     assert line.startswith("5 of 12 pairs are not used, the first is 00.png (right: no chessboard of 9 x 7 found)")
     assert "9 columns and 7 rows" in line
 
@@ -114,6 +114,6 @@ def test_wrong_radius_is_warned_of_with_both(pairs):
 def test_wrong_radius_of_rendered_dots_is_warned_of():
     _, frames = rendered(PERFECT, DOTS, 6, seed=3)
     board = DOTS.model_copy(update={"radius": 0.0175})
-    line, = [line for line in calibrate(board, views_of(frames, board), (800, 600)).warnings if "radius" in line]
+    (line,) = [line for line in calibrate(board, views_of(frames, board), (800, 600)).warnings if "radius" in line]
     assert "radius 0.0175 m" in line
     assert float(line.split("they measure ")[1].split()[0]) == pytest.approx(DOTS.radius, rel=0.01)

@@ -16,17 +16,20 @@ def test_board_file_is_read_back(tmp_path, board):
     assert read_board(tmp_path / "board.toml") == board
 
 
-@pytest.mark.parametrize(("text", "evidence"), [
-    ("colums = 9", "unknown key 'colums', valid are columns, dark, kind, radius, rows, spacing"),
-    ("columns = 9.5", r"columns: .*integer.*\(got 9.5\)"),
-    ("columns = true", r"columns: .*\(got True\)"),
-    ("columns = 2", "columns: .*greater than or equal to 3"),
-    ('kind = "aruco"', "kind: .*'chessboard', 'dots' or 'asymmetric_dots'"),
-    ("spacing = nan", "spacing: .*finite"),
-    ("spacing = 0", "spacing: .*greater than 0"),
-    ("radius = 0.03", "nearly touch: the largest radius is 0.02 m"),
-    ("rows", "is not TOML"),
-])
+@pytest.mark.parametrize(
+    ("text", "evidence"),
+    [
+        ("colums = 9", "unknown key 'colums', valid are columns, dark, kind, radius, rows, spacing"),
+        ("columns = 9.5", r"columns: .*integer.*\(got 9.5\)"),
+        ("columns = true", r"columns: .*\(got True\)"),
+        ("columns = 2", "columns: .*greater than or equal to 3"),
+        ('kind = "aruco"', "kind: .*'chessboard', 'dots' or 'asymmetric_dots'"),
+        ("spacing = nan", "spacing: .*finite"),
+        ("spacing = 0", "spacing: .*greater than 0"),
+        ("radius = 0.03", "nearly touch: the largest radius is 0.02 m"),
+        ("rows", "is not TOML"),
+    ],
+)
 def test_bad_board_file_is_refused_with_evidence(tmp_path, text, evidence):
     values = {"kind": '"dots"', "columns": "9", "rows": "7", "spacing": "0.05", "radius": "0.01"}
     name, _, value = text.partition(" = ")
@@ -48,10 +51,13 @@ def test_board_with_parts_that_do_not_belong_is_refused(tmp_path):
         read_board(path)
 
 
-@pytest.mark.parametrize("board", [DOTS, ASYMMETRIC, CHESSBOARD, DOTS.model_copy(update={"columns": 7}),
-                                   ASYMMETRIC.model_copy(update={"rows": 8})])
+@pytest.mark.parametrize(
+    "board",
+    [DOTS, ASYMMETRIC, CHESSBOARD, DOTS.model_copy(update={"columns": 7}), ASYMMETRIC.model_copy(update={"rows": 8})],
+)
 def test_symmetries_carry_the_board_onto_itself(board):
     """All distances stay, which a rigid turn of the same points needs."""
+
     def distances(points):
         return np.linalg.norm(points[:, None] - points[None], axis=2)
 
@@ -67,9 +73,14 @@ def test_symmetries_carry_the_board_onto_itself(board):
 
 def test_grey_values_of_other_kinds_of_images(tmp_path):
     grey = np.linspace(0, 255, 64 * 48).reshape(48, 64).astype(np.uint8)
-    images = {"colour.png": np.dstack([grey] * 3), "alpha.png": np.dstack([grey] * 3 + [np.full_like(grey, 9)]),
-              "twelve.png": (grey.astype(np.uint16) * 16), "grey.png": grey, "photo.jpg": grey,
-              "deep.tif": grey.astype(np.uint16) * 257}
+    images = {
+        "colour.png": np.dstack([grey] * 3),
+        "alpha.png": np.dstack([grey] * 3 + [np.full_like(grey, 9)]),
+        "twelve.png": (grey.astype(np.uint16) * 16),
+        "grey.png": grey,
+        "photo.jpg": grey,
+        "deep.tif": grey.astype(np.uint16) * 257,
+    }
     for name, image in images.items():
         assert cv2.imwrite(str(tmp_path / name), image)
         read = read_grey(tmp_path / name)

@@ -34,9 +34,11 @@ DOTS = Board(kind="dots", columns=9, rows=7, spacing=0.05, radius=0.0125)
 ASYMMETRIC = Board(kind="asymmetric_dots", columns=4, rows=9, spacing=0.04, radius=0.014)
 CHESSBOARD = Board(kind="chessboard", columns=8, rows=6, spacing=0.05)
 PERFECT = toed_in_rig(PinholeCamera(1000.0, 399.5, 299.5, 800, 600), 0.5, np.array([0.0, -1.6, 0.0]), np.zeros(3))[0]
-BENT = StereoRig(PinholeCamera(1000.0, 404.0, 296.0, 800, 600, 1.002, Distortion(-0.15, 0.08, 6e-4, -4e-4)),
-                 PinholeCamera(1010.0, 395.0, 303.0, 800, 600, 0.999, Distortion(-0.12, 0.05, -3e-4, 5e-4)),
-                 PERFECT.right_from_left.copy())
+BENT = StereoRig(
+    PinholeCamera(1000.0, 404.0, 296.0, 800, 600, 1.002, Distortion(-0.15, 0.08, 6e-4, -4e-4)),
+    PinholeCamera(1010.0, 395.0, 303.0, 800, 600, 0.999, Distortion(-0.12, 0.05, -3e-4, 5e-4)),
+    PERFECT.right_from_left.copy(),
+)
 
 
 def rendered(rig, board, count, seed=0, renderer=ANALYTIC, optics=None):
@@ -87,8 +89,9 @@ def errors_beside_independent_ones(found, rig):
 
 
 def views_of(frames, board):
-    return [PairView(f"{k:02d}.png", find_board(f.left, board), find_board(f.right, board))
-            for k, f in enumerate(frames)]
+    return [
+        PairView(f"{k:02d}.png", find_board(f.left, board), find_board(f.right, board)) for k, f in enumerate(frames)
+    ]
 
 
 # --- the board in images
@@ -148,7 +151,7 @@ def test_no_board_is_a_reason_and_not_an_error():
     _, frames = rendered(PERFECT, DOTS, 1)
     half = frames[0].left.copy()
     rows = np.flatnonzero((half > 120).any(axis=1))
-    half[rows[0]:rows[len(rows) // 2]] = 20
+    half[rows[0] : rows[len(rows) // 2]] = 20
     assert find_board(half, DOTS) == "no dots of 9 x 7 found"
 
 
@@ -208,9 +211,12 @@ def test_eccentricity_correction_removes_the_bias_of_large_dots():
     rng = np.random.default_rng(5)
     pairs = []
     for k, pose in enumerate(board_poses(BENT, board, 12, rng)):
-        sides = [cmmsim.calibration.BoardView(np.arange(42), expected_pixels(c, m @ pose, board)
-                                              + rng.normal(0, 0.005, (42, 2)))
-                 for c, m in zip(BENT.cameras, BENT.from_camera, strict=True)]
+        sides = [
+            cmmsim.calibration.BoardView(
+                np.arange(42), expected_pixels(c, m @ pose, board) + rng.normal(0, 0.005, (42, 2))
+            )
+            for c, m in zip(BENT.cameras, BENT.from_camera, strict=True)
+        ]
         pairs.append(PairView(f"{k}", *sides))
     on = calibrate(board, pairs, (800, 600))
     off = calibrate(board, pairs, (800, 600), CalibrationOptions(correct_dots=False))
@@ -236,7 +242,7 @@ def test_large_rendered_dots_are_unbiased_with_the_correction_only():
 
 def as_photograph(image, rng):
     """Uneven light, a blurred lens, noise and JPEG."""
-    y, x = np.mgrid[:image.shape[0], :image.shape[1]]
+    y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     light = 1.0 - 0.45 * np.hypot(x - 150, y - 100) / 1000.0
     soft = cv2.GaussianBlur(image.astype(np.float32) * light, (0, 0), 1.0) + rng.normal(0, 1.5, image.shape)
     coded = cv2.imencode(".jpg", np.clip(soft, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 88])[1]
@@ -252,7 +258,7 @@ def test_photograph_like_images_give_the_true_cameras(board, renderer):
     images = [(as_photograph(f.left, rng), as_photograph(f.right, rng)) for f in frames]
     columns = np.flatnonzero((frames[0].left > 100).any(axis=0))
     cut = np.roll(images[0][0], -int(np.mean(columns[[0, -1]])), axis=1)
-    cut[:, -int(np.mean(columns[[0, -1]])):] = 10
+    cut[:, -int(np.mean(columns[[0, -1]])) :] = 10
     images[0] = cut, images[0][1]
     views = [PairView(f"{k:02d}.jpg", find_board(a, board), find_board(b, board)) for k, (a, b) in enumerate(images)]
     found = calibrate(board, views, (800, 600))

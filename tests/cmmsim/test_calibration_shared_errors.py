@@ -40,8 +40,12 @@ def with_field(pairs, rng):
     places = BOARD.points[:, :2]
     gap = np.linalg.norm(places[:, None] - places[None], axis=2)
     root = FIELD * np.linalg.cholesky(np.exp(-0.5 * (gap / REACH) ** 2) + 1e-9 * np.eye(len(places)))
-    return [PairView(p.name, *(BoardView(v.index, v.pixels + root @ rng.standard_normal((len(places), 2)))
-                               for v in p.sides)) for p in pairs]
+    return [
+        PairView(
+            p.name, *(BoardView(v.index, v.pixels + root @ rng.standard_normal((len(places), 2))) for v in p.sides)
+        )
+        for p in pairs
+    ]
 
 
 def bent_pairs(poses, rng):
@@ -51,8 +55,10 @@ def bent_pairs(poses, rng):
     for k, pose in enumerate(poses):
         a, b, c = rng.normal(0.0, BEND, 3)
         points = BOARD.points + np.outer(a * x**2 + b * x * y + c * y**2, [0.0, 0.0, 1.0])
-        seen = [brown(own, points @ move[:3, :3].T + move[:3, 3])
-                for own, move in ((LEFT, pose), (RIGHT, RIGHT_FROM_LEFT @ pose))]
+        seen = [
+            brown(own, points @ move[:3, :3].T + move[:3, 3])
+            for own, move in ((LEFT, pose), (RIGHT, RIGHT_FROM_LEFT @ pose))
+        ]
         pairs.append(PairView(f"{k}", *(BoardView(np.arange(len(p)), p + rng.normal(0, NOISE, p.shape)) for p in seen)))
     return pairs
 
@@ -65,13 +71,16 @@ KINDS = {
 
 
 def repeated(kind, runs, views):
-    """Errors (n,24), covariances (n,24,24) as given and for independent errors, and what views share, of adjustments.
-    """
+    """Errors (n,24), covariances (n,24,24), stated and for independent errors, and what views share, of adjustments."""
     poses = board_poses(views, np.random.default_rng(4), board=BOARD)
     rng, free = np.random.default_rng(5), free_directions("brown5", False)
     solved = [adjust(BOARD.points, sightings_of(KINDS[kind](poses, rng)), true_state(poses), free) for _ in range(runs)]
-    return (np.array([error_of(s) for s in solved]), np.array([s.covariance for s in solved]),
-            np.array([s.independent_covariance for s in solved]), [s.shared for s in solved])
+    return (
+        np.array([error_of(s) for s in solved]),
+        np.array([s.covariance for s in solved]),
+        np.array([s.independent_covariance for s in solved]),
+        [s.shared for s in solved],
+    )
 
 
 def coverage(errors, covariances):
@@ -96,8 +105,9 @@ def test_independent_errors_leave_the_covariance_as_it_is():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("views", [10, 20] if os.environ.get("ALL_COVERAGE") else [10])
-@pytest.mark.parametrize(("kind", "before", "worst"), [("independent", 0.97, 0.90), ("field", 0.65, 0.87),
-                                                       ("bent", 0.65, 0.82)])
+@pytest.mark.parametrize(
+    ("kind", "before", "worst"), [("independent", 0.97, 0.90), ("field", 0.65, 0.87), ("bent", 0.65, 0.82)]
+)
 def test_intervals_hold_over_hundreds_of_calibrations(kind, before, worst, views):
     """All 24 together, and each for itself: of few views, what suffers most is known roughly only.
 
@@ -118,8 +128,9 @@ def test_enlargement_follows_the_direction_that_views_err_in():
     own = rng.normal(0.0, 1.0, (1200, 30)) + (jacobians @ np.eye(6)[2]) * rng.normal(0.0, 1.0, (1200, 1))
     stacked = jacobians.reshape(-1, 6)
     left = own.ravel() - stacked @ np.linalg.lstsq(stacked, own.ravel(), rcond=None)[0]
-    found = shared_errors(np.einsum("vnc,vn->vc", jacobians, left.reshape(1200, 30)),
-                          jacobians.swapaxes(1, 2) @ jacobians, 1.0)
+    found = shared_errors(
+        np.einsum("vnc,vn->vc", jacobians, left.reshape(1200, 30)), jacobians.swapaxes(1, 2) @ jacobians, 1.0
+    )
     gain = np.diag(found.covariance) / np.diag(found.independent)
     assert gain[2] == pytest.approx(33.0, rel=0.1)  # E[(j'j)² + j'j] / E[j'j] of 30 standard normal numbers j
     np.testing.assert_allclose(np.delete(gain, 2), 2.0, atol=0.6)  # E[(j'k)² + k'k] / E[k'k] of two such columns

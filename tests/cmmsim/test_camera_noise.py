@@ -15,8 +15,11 @@ from tests.cmmsim.lenses import lens_sensor
 GAIN, DARK_NOISE, WHITE, BLACK = 0.13, 26.0, 1600.0, 16.0
 CORNERS = np.array([[[200 + 400 * i, 150 + 300 * j] for i in range(4) for j in range(4)]] * 2)
 SIZE = 60
-TWELVE_BIT = [("noise = true", "noise = true\nbit_depth = 12"), ("gain = 0.13", "gain = 2.08"),
-              ("black_level = 16.0", "black_level = 256.0")]
+TWELVE_BIT = [
+    ("noise = true", "noise = true\nbit_depth = 12"),
+    ("gain = 0.13", "gain = 2.08"),
+    ("black_level = 16.0", "black_level = 256.0"),
+]
 
 
 def lit_evenly(folder, level, seed=0, changes=()):
@@ -70,6 +73,7 @@ def test_pattern_is_recovered_from_averaged_images(tmp_path):
 
 def test_pattern_stays_and_belongs_to_the_camera(tmp_path):
     """The same in windows and whole images and for other noise; another one for the other camera and pattern seed."""
+
     def pattern(seed, pattern_seed):
         camera = f"noise = true\ndsnu = 60\npattern_seed = {pattern_seed}"
         expose = lit_evenly(tmp_path, 0, seed, [("noise = true", camera)])
@@ -85,7 +89,7 @@ def test_pattern_stays_and_belongs_to_the_camera(tmp_path):
     sensor = lens_sensor(tmp_path, changes=[("noise = true", "noise = true\ndsnu = 60"), ("_level = 30", "_level = 0")])
     frame = sensor.capture(sensor.home)
     x, y = CORNERS[0, -1]
-    assert alike(given[0, -1], frame.left[y:y + SIZE, x:x + SIZE].astype(float)) > 0.8
+    assert alike(given[0, -1], frame.left[y : y + SIZE, x : x + SIZE].astype(float)) > 0.8
 
 
 def test_windows_of_a_pattern_are_cut_out_of_it():
@@ -128,13 +132,16 @@ def test_twelve_bits_measure_as_well_as_eight(tmp_path):
     assert 3.0 < np.mean(squared) < 10.0  # 6 expected of 8 draws
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ("noise = true", "noise = true\nbit_depth = 9", "camera.bit_depth: .*8, 10 or 12.*9"),
-    ("noise = true", "noise = true\nprnu = -0.01", "camera.prnu: .*greater than or equal to 0"),
-    ("noise = true", "noise = true\ndsnu = nan", "camera.dsnu: .*finite"),
-    ("noise = true", "noise = true\npattern_seed = -1", "camera.pattern_seed: .*greater than or equal to 0"),
-    ("black_level = 16.0", "black_level = 256.0", "camera: .*black_level 256 must lie below .* 255"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("noise = true", "noise = true\nbit_depth = 9", "camera.bit_depth: .*8, 10 or 12.*9"),
+        ("noise = true", "noise = true\nprnu = -0.01", "camera.prnu: .*greater than or equal to 0"),
+        ("noise = true", "noise = true\ndsnu = nan", "camera.dsnu: .*finite"),
+        ("noise = true", "noise = true\npattern_seed = -1", "camera.pattern_seed: .*greater than or equal to 0"),
+        ("black_level = 16.0", "black_level = 256.0", "camera: .*black_level 256 must lie below .* 255"),
+    ],
+)
 def test_bad_noise_in_a_sensor_file(tmp_path, old, new, message):
     with pytest.raises(cmmsim.SensorFileError, match=message):
         lens_sensor(tmp_path, changes=[(old, new)])

@@ -23,8 +23,10 @@ def observed(rng, stickers, shift_px=0.0, shrink_px=0.0):
     """Stickers with pixel noise; the first one's left centre is shifted along the epipolar line, its shape shrunk."""
     stickers = np.asarray(stickers)
     spread = [pixel_covariances(rng, len(stickers)) for _ in range(2)]
-    pixels = [q[stickers] + np.einsum("nij,nj->ni", np.linalg.cholesky(s), rng.standard_normal((len(stickers), 2)))
-              for q, s in zip(PIXELS, spread, strict=True)]
+    pixels = [
+        q[stickers] + np.einsum("nij,nj->ni", np.linalg.cholesky(s), rng.standard_normal((len(stickers), 2)))
+        for q, s in zip(PIXELS, spread, strict=True)
+    ]
     pixels[0][0, 0] += shift_px
     seen = triangulate(RIG, *pixels, *spread)
     shapes = SHAPES[:, stickers].copy()
@@ -94,8 +96,9 @@ def test_drifted_camera_enlarges_the_covariance():
     """Residuals of twice the stated noise: all stickers are kept, and all covariances are four times as large."""
     rng = np.random.default_rng(9)
     seen = observed(rng, range(18))
-    doubled = StickerObservation(seen.index, seen.left_pixels, seen.right_pixels, seen.points, seen.covariances / 4.0,
-                                 seen.outlines)
+    doubled = StickerObservation(
+        seen.index, seen.left_pixels, seen.right_pixels, seen.points, seen.covariances / 4.0, seen.outlines
+    )
     plain, scaled = (consistent(s, RIG, BODY, BODY.nominal, RADIUS) for s in (seen, doubled))
     assert len(scaled[0].index) == 18
     freedom = 3 * 18 - 6

@@ -16,8 +16,9 @@ from cmmsim.triangulation import triangulate
 DRAWS = 2000
 FILE = read_sensor_file("ctrack780")
 BODY = marked_body("platform", FILE.platform)
-RIG, CAMERA_FROM_BASE = toed_in_rig(PinholeCamera(2300.0, 1023.5, 767.5, 2048, 1536), 1.0,
-                                    np.array(FILE.rig.position), np.array(FILE.rig.target))
+RIG, CAMERA_FROM_BASE = toed_in_rig(
+    PinholeCamera(2300.0, 1023.5, 767.5, 2048, 1536), 1.0, np.array(FILE.rig.position), np.array(FILE.rig.target)
+)
 BASE_FROM_CAMERA = np.linalg.inv(CAMERA_FROM_BASE)
 POSES = [
     FILE.platform.home,
@@ -43,8 +44,9 @@ def draws(request):
     roots = [np.linalg.cholesky(s) for s in spread]
     observed = []
     for _ in range(DRAWS):
-        left, right = (q + np.einsum("nij,nj->ni", r, rng.standard_normal(q.shape))
-                       for q, r in zip(pixels, roots, strict=True))
+        left, right = (
+            q + np.einsum("nij,nj->ni", r, rng.standard_normal(q.shape)) for q, r in zip(pixels, roots, strict=True)
+        )
         seen = triangulate(RIG, left, right, *spread)
         observed.append(StickerObservation(np.arange(len(points)), left, right, seen.points, seen.covariances))
     return np.array(request.param), camera_from_body, points, observed

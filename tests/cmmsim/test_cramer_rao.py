@@ -81,8 +81,9 @@ def test_information_of_a_rounded_number_is_that_of_its_probabilities():
 def test_coarse_noise_makes_rounding_one_more_variance():
     means = np.linspace(60.0, 180.0, 25)
     variance = NOISE.variance(means)
-    np.testing.assert_allclose(grey_value_information(means, NOISE),
-                               1.0 / variance + 0.5 * (NOISE.gain / variance) ** 2, rtol=1e-4)
+    np.testing.assert_allclose(
+        grey_value_information(means, NOISE), 1.0 / variance + 0.5 * (NOISE.gain / variance) ** 2, rtol=1e-4
+    )
 
 
 def edge_bound(shapes, contrast, deviation, psf_px):
@@ -114,8 +115,10 @@ def test_large_blurred_disc_reaches_the_closed_form_of_an_edge(half_axes):
 def test_twelve_bits_with_the_same_noise_keep_the_bound():
     """Sixteen times the gain: all grey values are sixteen times larger, and rounding matters less."""
     fine = replace(NOISE, bit_depth=12, gain=16.0 * NOISE.gain, black_level=256.0)
-    coarse, deep = (cramer_rao_bound(CENTRES, SHAPES, SIZE, k * CONTRAST, k * GROUND, noise, 0.0)
-                    for k, noise in ((1.0, NOISE), (16.0, fine)))
+    coarse, deep = (
+        cramer_rao_bound(CENTRES, SHAPES, SIZE, k * CONTRAST, k * GROUND, noise, 0.0)
+        for k, noise in ((1.0, NOISE), (16.0, fine))
+    )
     np.testing.assert_allclose(deep, coarse, rtol=0.02, atol=1e-8)
     assert np.all(np.trace(deep, axis1=1, axis2=2) < np.trace(coarse, axis1=1, axis2=2))
 

@@ -46,9 +46,11 @@ def test_no_windows_no_centres(detector):
 
 
 @EVERY
-@pytest.mark.parametrize("condition", [Condition(3.8, 0.8, 0.027), Condition(5.0, 0.0, 0.01),
-                                       Condition(3.0, 0.5, 0.05), Condition(4.0, 0.8, 0.02, 0.6)],
-                         ids=["working", "round", "noisy", "blurred"])
+@pytest.mark.parametrize(
+    "condition",
+    [Condition(3.8, 0.8, 0.027), Condition(5.0, 0.0, 0.01), Condition(3.0, 0.5, 0.05), Condition(4.0, 0.8, 0.02, 0.6)],
+    ids=["working", "round", "noisy", "blurred"],
+)
 def test_covariance_is_that_of_sampled_noise(detector, condition):
     """Normalised squared error of what the noise does to a centre: 2 within 12 %, where 800 draws allow some 7 %."""
     _, clean, noisy, noise = drawn(condition, 800, 1)

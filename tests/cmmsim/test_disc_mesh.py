@@ -61,6 +61,7 @@ def test_bounds_hold_the_discs():
     bounds = DiscStack((RING, STICKER)).bounds
     across = np.linalg.svd(NORMAL[None])[2][1:]
     angles = np.linspace(0.0, 2.0 * np.pi, 2001)[:, None]
-    rims = np.concatenate([d.centre + d.radius * (np.cos(angles) * across[0] + np.sin(angles) * across[1])
-                           for d in (RING, STICKER)])
+    rims = np.concatenate(
+        [d.centre + d.radius * (np.cos(angles) * across[0] + np.sin(angles) * across[1]) for d in (RING, STICKER)]
+    )
     np.testing.assert_allclose(bounds, [rims.min(axis=0), rims.max(axis=0)], atol=1e-8)

@@ -23,8 +23,13 @@ def drawn(camera, normal, corner):
     rim = np.roll(rim - corner, -np.argmin(rim[:, 1]), axis=0)  # from the top round and back
     lowest = np.argmax(rim[:, 1])
     lines = (np.arange(SIZE * LINES) + 0.5) / LINES - 0.5
-    ends = np.sort([np.interp(lines, side[:, 1], side[:, 0], np.inf, np.inf)
-                    for side in (rim[:lowest + 1], np.roll(rim, -1, axis=0)[lowest - 1:][::-1])], axis=0)[..., None]
+    ends = np.sort(
+        [
+            np.interp(lines, side[:, 1], side[:, 0], np.inf, np.inf)
+            for side in (rim[: lowest + 1], np.roll(rim, -1, axis=0)[lowest - 1 :][::-1])
+        ],
+        axis=0,
+    )[..., None]
     ticks = np.arange(SIZE)
     share = np.clip(np.minimum(ends[1], ticks + 0.5) - np.maximum(ends[0], ticks - 0.5), 0.0, 1.0)
     return np.where(np.isfinite(ends[0]), share, 0.0).reshape(SIZE, LINES, SIZE).mean(axis=1)
@@ -52,8 +57,13 @@ def test_round_image_follows_the_second_derivative():
     middle, step = np.array([1700.0, 300.0]), 2.0
     jacobian = camera.distortion_jacobian(middle)
     shape = 3.0 * np.linalg.inv(jacobian)  # its distorted image is round, of 3 px
-    curvature = np.stack([(camera.distortion_jacobian(middle + d) - camera.distortion_jacobian(middle - d))
-                          / (2.0 * step) for d in step * np.eye(2)], axis=-1)
+    curvature = np.stack(
+        [
+            (camera.distortion_jacobian(middle + d) - camera.distortion_jacobian(middle - d)) / (2.0 * step)
+            for d in step * np.eye(2)
+        ],
+        axis=-1,
+    )
     bent = np.einsum("ijk,jm,kn->imn", curvature, shape, shape) / 3.0
     expected = 3.0 * (np.einsum("ijj->i", bent) + 2.0 * np.einsum("jij->i", bent)) / 8.0
     np.testing.assert_allclose(bending(camera, middle[None], shape[None])[0], expected, rtol=2e-3)

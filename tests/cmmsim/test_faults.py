@@ -125,17 +125,24 @@ def test_marks_reach_windows_and_whole_images_alike():
     """Without noise a window shows what the whole image shows there."""
     noise = CameraNoise(1600.0, 0.13, 0.0, 1800.0, 16.0, enabled=False)
     dark = np.full((120, 160), 16, dtype=np.uint8)
-    marks = (DiscMark(0, np.array([40.3, 50.6]), 4.0 * np.eye(2), 0.9),
-             PlateMark(0, np.array([45.0, 52.0]), np.array([6.0, 3.0]), 0.4, 0.2),
-             GlintMark(1, np.array([44.0, 50.0]), 3.0, 1.5, 0.5, 6.0, 0.3), FillMark(1, 0.05))
+    marks = (
+        DiscMark(0, np.array([40.3, 50.6]), 4.0 * np.eye(2), 0.9),
+        PlateMark(0, np.array([45.0, 52.0]), np.array([6.0, 3.0]), 0.4, 0.2),
+        GlintMark(1, np.array([44.0, 50.0]), 3.0, 1.5, 0.5, 6.0, 0.3),
+        FillMark(1, 0.05),
+    )
     images = FaultyImages(FrameImages(StereoFrame(dark, dark)), Fault("some", marks), noise, np.random.default_rng(0))
     frame, corners = images.full(), np.array([[[32, 42]], [[36, 41]]])
     windows = images.windows(corners, 16)
     np.testing.assert_array_equal(windows[0, 0], frame.left[42:58, 32:48])
     np.testing.assert_array_equal(windows[1, 0], frame.right[41:57, 36:52])
     assert frame.left.max() == 16 + round(0.13 * 1600 * 0.9)
-    swapped = FaultyImages(FrameImages(StereoFrame(dark, dark + np.uint8(9))), Fault("swapped", swapped=True), noise,
-                           np.random.default_rng(0))
+    swapped = FaultyImages(
+        FrameImages(StereoFrame(dark, dark + np.uint8(9))),
+        Fault("swapped", swapped=True),
+        noise,
+        np.random.default_rng(0),
+    )
     assert swapped.full().left.max() == swapped.windows(corners, 16)[0].max() == 25
 
 

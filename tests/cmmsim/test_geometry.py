@@ -35,8 +35,9 @@ def test_rotation_is_the_paper_order_and_round_trips(alpha, beta, gamma):
 
 @given(st.floats(0.0, 2.5), ANGLE, ANGLE)
 def test_rotation_vector_round_trips(size, azimuth, elevation):
-    vector = size * np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
-                              np.sin(elevation)])
+    vector = size * np.array(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
     rotation = p.rotation_exp(vector)
     np.testing.assert_allclose(rotation, Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
     np.testing.assert_allclose(p.rotation_log(rotation), vector, atol=1e-8)
@@ -48,8 +49,9 @@ def test_euler_rates_match_finite_differences():
     for k in range(3):
         step = np.zeros(6)
         step[3 + k] = 1e-6
-        turn = Rotation.from_matrix(p.pose_to_transform(pose + step)[:3, :3]
-                                    @ p.pose_to_transform(pose - step)[:3, :3].T)
+        turn = Rotation.from_matrix(
+            p.pose_to_transform(pose + step)[:3, :3] @ p.pose_to_transform(pose - step)[:3, :3].T
+        )
         np.testing.assert_allclose(turn.as_rotvec() / 2e-6, matrix[:, k], atol=1e-7)
 
 
@@ -90,15 +92,19 @@ def test_plane_frame_of_exact_points():
     camera_from_body[:3, :3] = Rotation.from_rotvec([1.8, -0.9, 0.4]).as_matrix()
     camera_from_body[:3, 3] = [0.1, -0.2, 1.7]
     covariances = np.broadcast_to(1e-10 * np.eye(3), (15, 3, 3))
-    frame, _ = frame_of_points(p.apply(camera_from_body, np.concatenate(points)), covariances, index,
-                               normals @ camera_from_body[:3, :3].T)
+    frame, _ = frame_of_points(
+        p.apply(camera_from_body, np.concatenate(points)), covariances, index, normals @ camera_from_body[:3, :3].T
+    )
     np.testing.assert_allclose(frame, camera_from_body @ own, atol=1e-12)
 
 
-@pytest.mark.parametrize(("points", "message"), [
-    (np.eye(3)[:2], "plane B: 2 visible stickers, at least 3 needed"),
-    (np.outer(np.arange(4.0), [1.0, 2.0, 3.0]), "plane B: its 4 visible stickers lie on one line"),
-])
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.eye(3)[:2], "plane B: 2 visible stickers, at least 3 needed"),
+        (np.outer(np.arange(4.0), [1.0, 2.0, 3.0]), "plane B: its 4 visible stickers lie on one line"),
+    ],
+)
 def test_plane_of_too_few_stickers_is_lost(points, message):
     with pytest.raises(LostError, match=message):
         fit_plane(points, np.broadcast_to(np.eye(3), (len(points), 3, 3)), np.array([0.0, 0.0, 1.0]), "B")

@@ -25,15 +25,24 @@ GREY = 208.0  # values of white light above black
 def little_noise(deviation):
     """Changes of a sensor file: noise of ``deviation`` grey values at white, half of its variance in the dark too."""
     gain = 0.5 * deviation**2 / GREY
-    figures = {"electrons_at_white = 1600.0": GREY / gain, "gain = 0.13": gain,
-               "full_well = 1800.0": 1.125 * GREY / gain, "dark_noise = 26.0": np.sqrt(0.5) * deviation / gain}
+    figures = {
+        "electrons_at_white = 1600.0": GREY / gain,
+        "gain = 0.13": gain,
+        "full_well = 1800.0": 1.125 * GREY / gain,
+        "dark_noise = 26.0": np.sqrt(0.5) * deviation / gain,
+    }
     return [(old, f"{old.split(' = ')[0]} = {float(value)}") for old, value in figures.items()]
 
 
 @pytest.mark.parametrize("deviation", [0.1, 0.2, 0.3, 0.5])
-@pytest.mark.parametrize(("lens", "renderer", "count"), [
-    ("perfect", "analytic", 60), ("all", "analytic", 6),
-    pytest.param("perfect", "pyrender", 25, marks=pytest.mark.rendering)])
+@pytest.mark.parametrize(
+    ("lens", "renderer", "count"),
+    [
+        ("perfect", "analytic", 60),
+        ("all", "analytic", 6),
+        pytest.param("perfect", "pyrender", 25, marks=pytest.mark.rendering),
+    ],
+)
 def test_little_noise_loses_no_frame(tmp_path, lens, renderer, count, deviation):
     """Rounding to whole grey values then decides; the covariance stays true, nearly all stickers are taken."""
     sensor = lens_sensor(tmp_path, lens, renderer, changes=little_noise(deviation))

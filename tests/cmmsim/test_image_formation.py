@@ -35,8 +35,12 @@ def centre_errors(sensor, pose, supersampling=SUPERSAMPLING):
 def finely_drawn(sensor, side, pose, corner, size):
     """Radiance (size * FINE, size * FINE) through a perfect lens."""
     camera = sensor.rig.cameras[side].ideal
-    fine = replace(camera, focal_px=FINE * camera.focal_px, centre_x_px=FINE * (camera.centre_x_px + 0.5) - 0.5,
-                   centre_y_px=FINE * (camera.centre_y_px + 0.5) - 0.5)
+    fine = replace(
+        camera,
+        focal_px=FINE * camera.focal_px,
+        centre_x_px=FINE * (camera.centre_x_px + 0.5) - 0.5,
+        centre_y_px=FINE * (camera.centre_y_px + 0.5) - 0.5,
+    )
     view = View(fine, placed_at(sensor, pose)[side], (FINE * corner[0], FINE * corner[1]), (FINE * size, FINE * size))
     formation = sensor._camera._formation
     return formation.renderer.draw(formation.drawable, [view], 1, formation.background)[0]
@@ -87,8 +91,9 @@ def test_bent_images_show_what_opencv_says(tmp_path):
         for corner, window in zip(corners[side], windows[side], strict=True):
             ticks = (np.arange(size * FINE) + 0.5) / FINE - 0.5
             shown = np.stack(np.meshgrid(corner[0] + ticks, corner[1] + ticks), axis=-1).reshape(-1, 1, 2)
-            ideal = cv2.undistortPoints(shown, camera.matrix, np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3]),
-                                        None, None, camera.matrix).reshape(size * FINE, size * FINE, 2)
+            ideal = cv2.undistortPoints(
+                shown, camera.matrix, np.array([lens.k1, lens.k2, lens.p1, lens.p2, lens.k3]), None, None, camera.matrix
+            ).reshape(size * FINE, size * FINE, 2)
             first = np.floor(ideal.min(axis=(0, 1))).astype(int) - margin
             fine = finely_drawn(sensor, side, pose, first, size + 2 * margin + 4)
             column, row = (np.moveaxis(ideal, -1, 0) - first[:, None, None] + 0.5) * FINE - 0.5
@@ -102,8 +107,11 @@ def test_a_perfect_lens_is_drawn_on_the_pixels(tmp_path):
     sensor = lens_sensor(tmp_path)
     formation, placed = sensor._camera._formation, placed_at(sensor, sensor.home)
     corners = np.rint(expected_centres(sensor, sensor.home) - 7.5).astype(int)
-    views = [View(camera, bodies, (int(x), int(y)), (16, 16)) for camera, bodies, side
-             in zip(sensor.rig.cameras, placed, corners, strict=True) for x, y in side]
+    views = [
+        View(camera, bodies, (int(x), int(y)), (16, 16))
+        for camera, bodies, side in zip(sensor.rig.cameras, placed, corners, strict=True)
+        for x, y in side
+    ]
     drawn = formation.renderer.draw(formation.drawable, views, 6, 0.0).reshape(2, -1, 16, 16)
     np.testing.assert_array_equal(sensor._camera.radiance(placed, corners, 16, 6), drawn)
 
@@ -129,7 +137,7 @@ def test_vignetting_is_laid_over_windows_and_whole_images(tmp_path):
     expected = 1.0 - 0.3 * ((x - 1023.5) ** 2 + (y - 767.5) ** 2) / (1024.0**2 + 768.0**2)
     np.testing.assert_allclose(whole[0], whole[1] * expected, atol=1e-6)
     for k, (x0, y0) in enumerate(corners[1]):
-        np.testing.assert_allclose(share[0][1, k], share[1][1, k] * expected[y0:y0 + 16, x0:x0 + 16], atol=1e-6)
+        np.testing.assert_allclose(share[0][1, k], share[1][1, k] * expected[y0 : y0 + 16, x0 : x0 + 16], atol=1e-6)
 
 
 def test_whole_images_show_the_windows(tmp_path):
@@ -139,7 +147,7 @@ def test_whole_images_show_the_windows(tmp_path):
     windows = sensor._camera.radiance(placed, corners, 10, 6)
     image = sensor._camera.whole_exposure(0, [placed[0]], 6)
     for (x, y), window in zip(corners[0], windows[0], strict=True):
-        np.testing.assert_allclose(image[y:y + 10, x:x + 10], window, atol=2e-3)
+        np.testing.assert_allclose(image[y : y + 10, x : x + 10], window, atol=2e-3)
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -200,9 +208,15 @@ def test_pixels_and_points_of_a_measurement(tmp_path, lens):
 
 def test_search_of_whole_images_through_all_effects(tmp_path):
     """A first frame of 12 bit without prior; the same frame handed over as arrays."""
-    sensor = lens_sensor(tmp_path, "all", changes=[
-        ("noise = true", "noise = true\nbit_depth = 12"), ("gain = 0.13", "gain = 2.08"),
-        ("black_level = 16.0", "black_level = 256.0")])
+    sensor = lens_sensor(
+        tmp_path,
+        "all",
+        changes=[
+            ("noise = true", "noise = true\nbit_depth = 12"),
+            ("gain = 0.13", "gain = 2.08"),
+            ("black_level = 16.0", "black_level = 256.0"),
+        ],
+    )
     pose = poses_about_home(sensor, 1, seed=3)[0]
     frame = sensor.capture(pose)
     assert frame.left.dtype == np.uint16
@@ -211,12 +225,15 @@ def test_search_of_whole_images_through_all_effects(tmp_path):
     assert np.all(np.abs(m.pose - pose) * 1e6 < [20, 20, 20, 100, 100, 100])
 
 
-@pytest.mark.parametrize(("addition", "message"), [
-    ("[lens]\npsf_px = -0.5", "lens.psf_px: .*greater than or equal to 0"),
-    ("[lens]\npsf_px = 0.01", "lens: .*psf_px 0.01 must be 0 or at least 0.1 px"),
-    ("[lens]\nvignetting = 1.0", "lens.vignetting: .*less than or equal to 0.9"),
-    ("[lens]\nvignette = 0.3", "unknown key 'lens.vignette', valid are psf_px, vignetting"),
-])
+@pytest.mark.parametrize(
+    ("addition", "message"),
+    [
+        ("[lens]\npsf_px = -0.5", "lens.psf_px: .*greater than or equal to 0"),
+        ("[lens]\npsf_px = 0.01", "lens: .*psf_px 0.01 must be 0 or at least 0.1 px"),
+        ("[lens]\nvignetting = 1.0", "lens.vignetting: .*less than or equal to 0.9"),
+        ("[lens]\nvignette = 0.3", "unknown key 'lens.vignette', valid are psf_px, vignetting"),
+    ],
+)
 def test_bad_lens_in_a_sensor_file(tmp_path, addition, message):
     with pytest.raises(cmmsim.SensorFileError, match=message):
         lens_sensor(tmp_path, changes=[("[stickers]", f"{addition}\n[stickers]")])

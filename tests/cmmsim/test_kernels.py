@@ -24,16 +24,20 @@ def test_coverage_is_that_of_plain_numpy(radii):
     """In all cases of a side: within, outside, crossed once or twice; centres on pixel corners are among them."""
     centres, shapes = random_ellipses(np.random.default_rng(0), 50, SIZE, radii)
     centres[:10] = np.round(2.0 * centres[:10]) / 2.0
-    for found, expected in zip(coverage(centres, shapes, SIZE), numpy_coverage.coverage(centres, shapes, SIZE),
-                               strict=True):
+    for found, expected in zip(
+        coverage(centres, shapes, SIZE), numpy_coverage.coverage(centres, shapes, SIZE), strict=True
+    ):
         np.testing.assert_allclose(found, expected, atol=2e-12)
 
 
 @pytest.mark.parametrize("psf_px", [0.2, 0.5, 1.5])
 def test_blurred_coverage_is_that_of_plain_numpy(psf_px):
     centres, shapes = random_ellipses(np.random.default_rng(1), 20, SIZE)
-    for found, expected in zip(blurred_coverage(centres, shapes, SIZE, psf_px),
-                               numpy_blurred_coverage.blurred_coverage(centres, shapes, SIZE, psf_px), strict=True):
+    for found, expected in zip(
+        blurred_coverage(centres, shapes, SIZE, psf_px),
+        numpy_blurred_coverage.blurred_coverage(centres, shapes, SIZE, psf_px),
+        strict=True,
+    ):
         np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
@@ -61,7 +65,7 @@ def test_windows_fitted_together_are_those_fitted_alone():
     windows, corners = exposed(5, 37)
     together = ellipse_fit.fit_ellipses(windows, corners, NOISE, 14)
     for k in range(37):
-        alone = ellipse_fit.fit_ellipses(windows[k:k + 1], corners[k:k + 1], NOISE, 14)
+        alone = ellipse_fit.fit_ellipses(windows[k : k + 1], corners[k : k + 1], NOISE, 14)
         np.testing.assert_array_equal(together.centres[k], alone.centres[0])
         np.testing.assert_array_equal(together.covariances[k], alone.covariances[0])
         assert together.misfit[k] == alone.misfit[0]
@@ -99,20 +103,24 @@ def test_kernels_compute_the_same_uncompiled():
         np.testing.assert_allclose(*results, atol=1e-13)
     m = np.linalg.inv(shapes[0])
     for x, y in ((0.2, 0.1), (3.0, 1.0), (2.2, -2.0), (9.0, 9.0)):
-        np.testing.assert_allclose(coverage_kernel.cover_pixel(x, y, m), coverage_kernel.cover_pixel.py_func(x, y, m),
-                                   atol=1e-14)
+        np.testing.assert_allclose(
+            coverage_kernel.cover_pixel(x, y, m), coverage_kernel.cover_pixel.py_func(x, y, m), atol=1e-14
+        )
     sides = np.random.default_rng(5).normal(size=(200, 4))
     for side in sides:
-        np.testing.assert_allclose(coverage_kernel.side_share(*side), coverage_kernel.side_share.py_func(*side),
-                                   atol=1e-14)
+        np.testing.assert_allclose(
+            coverage_kernel.side_share(*side), coverage_kernel.side_share.py_func(*side), atol=1e-14
+        )
 
 
 def test_small_linear_algebra_is_that_of_lapack():
     rng = np.random.default_rng(6)
     half, right = rng.normal(size=(9, 7)), rng.normal(size=7)
     k = cholesky_kernel
-    for factor, solve, invert in ((k.factor, k.solve_factored, k.invert_factored),
-                                  (k.factor.py_func, k.solve_factored.py_func, k.invert_factored.py_func)):
+    for factor, solve, invert in (
+        (k.factor, k.solve_factored, k.invert_factored),
+        (k.factor.py_func, k.solve_factored.py_func, k.invert_factored.py_func),
+    ):
         lower, found, inverse = half.T @ half, right.copy(), np.empty((2, 2))
         factor(lower)
         solve(lower, found)
@@ -134,20 +142,29 @@ def test_selection_and_bounded_radii():
     np.testing.assert_allclose([[xx, xy], [xy, yy]], vectors @ np.diag(np.clip(values, 0.5, 3.0)) @ vectors.T)
 
 
-PROBE = ("import numpy as np; from cmmsim.ellipse_coverage import covered_area as c;"
-         "print(c(np.full((1, 2), 5.2), np.eye(2)[None] * 3.0, 12).sum())")
+PROBE = (
+    "import numpy as np; from cmmsim.ellipse_coverage import covered_area as c;"
+    "print(c(np.full((1, 2), 5.2), np.eye(2)[None] * 3.0, 12).sum())"
+)
 
 
 def run_copy(folder, environment):
-    return subprocess.run([sys.executable, "-c", PROBE], cwd=folder, env={**os.environ, **environment}, check=True,
-                          capture_output=True, text=True).stdout
+    return subprocess.run(
+        [sys.executable, "-c", PROBE],
+        cwd=folder,
+        env={**os.environ, **environment},
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
 
 
 @pytest.fixture
 def copied(tmp_path):
     """A folder with a copy of the package, without any compiled kernel."""
-    shutil.copytree(Path(cmmsim.__file__).parent, tmp_path / "install" / "cmmsim",
-                    ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        Path(cmmsim.__file__).parent, tmp_path / "install" / "cmmsim", ignore=shutil.ignore_patterns("__pycache__")
+    )
     return tmp_path / "install"
 
 

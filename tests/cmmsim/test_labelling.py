@@ -18,7 +18,7 @@ def cloud(kept, false, seed):
     true = apply(PLACE, LAYOUT[kept]) + 5e-5 * rng.standard_normal((len(kept), 3))
     points = np.concatenate([true, PLACE[:3, 3] + rng.uniform(-0.15, 0.15, (false, 3))])
     order = rng.permutation(len(points))
-    return points[order], np.argsort(order)[:len(kept)]
+    return points[order], np.argsort(order)[: len(kept)]
 
 
 @pytest.mark.parametrize(("count", "false"), [(18, 0), (18, 100), (15, 300), (12, 100), (6, 30)])
@@ -33,11 +33,14 @@ def test_what_was_planted_is_found(count, false):
     assert np.linalg.norm(apply(found, LAYOUT) - apply(PLACE, LAYOUT), axis=1).max() < TOLERANCE
 
 
-@pytest.mark.parametrize(("kept", "false", "reason"), [
-    (3, 0, "platform: 3 of 18 stickers recognised among 3 points, at least 4 needed"),
-    (0, 2, "platform: 0 of 18 stickers recognised among 2 points"),
-    (0, 0, "platform: 0 of 18 stickers recognised among 0 points"),
-])
+@pytest.mark.parametrize(
+    ("kept", "false", "reason"),
+    [
+        (3, 0, "platform: 3 of 18 stickers recognised among 3 points, at least 4 needed"),
+        (0, 2, "platform: 0 of 18 stickers recognised among 2 points"),
+        (0, 0, "platform: 0 of 18 stickers recognised among 0 points"),
+    ],
+)
 def test_too_few_are_lost_with_their_number(kept, false, reason):
     points, _ = cloud(np.arange(kept), false, seed=1)
     with pytest.raises(LostError, match=reason):
@@ -47,7 +50,7 @@ def test_too_few_are_lost_with_their_number(kept, false, reason):
 @pytest.mark.parametrize("counts", [(10, 10), (9, 10), (10, 9)])
 def test_two_layouts_that_are_about_as_whole_cannot_be_told_apart(counts):
     beside = apply(pose_to_transform([0.0, 0.3, 0.0, 0.3, 0.0, 0.0]), LAYOUT)
-    points = apply(PLACE, np.concatenate([LAYOUT[:counts[0]], beside[:counts[1]]]))
+    points = apply(PLACE, np.concatenate([LAYOUT[: counts[0]], beside[: counts[1]]]))
     with pytest.raises(LostError, match=f"two poses explain the points, with 10 and {min(counts)} stickers"):
         find_layout(LAYOUT, points, TOLERANCE, 4, "platform")
 

@@ -50,14 +50,17 @@ def test_sticker_on_a_box_is_laid_and_the_box_fills_the_window():
     assert laid([stack(), box()], looking_down([(590, 393)])).filled.all()
 
 
-@pytest.mark.parametrize("patches", [
-    pytest.param([stack(height=0.0), box()], id="sunk in the box"),
-    pytest.param([stack(normal=-UP), box()], id="looks away"),
-    pytest.param([DiscStack(stack().discs[::-1]), box()], id="lowest not first"),
-    pytest.param([stack(), stack(0.008), box()], id="two stickers"),
-    pytest.param([stack(), box(), box((0.3, 0.01, 0.01))], id="two solids"),
-    pytest.param([stack(0.05), solid_mesh(trimesh.creation.annulus(0.02, 0.2, 0.1), 0.3)], id="not convex"),
-])
+@pytest.mark.parametrize(
+    "patches",
+    [
+        pytest.param([stack(height=0.0), box()], id="sunk in the box"),
+        pytest.param([stack(normal=-UP), box()], id="looks away"),
+        pytest.param([DiscStack(stack().discs[::-1]), box()], id="lowest not first"),
+        pytest.param([stack(), stack(0.008), box()], id="two stickers"),
+        pytest.param([stack(), box(), box((0.3, 0.01, 0.01))], id="two solids"),
+        pytest.param([stack(0.05), solid_mesh(trimesh.creation.annulus(0.02, 0.2, 0.1), 0.3)], id="not convex"),
+    ],
+)
 def test_what_may_hide_something_is_drawn_by_depth(patches):
     found = laid(patches, looking_down([(500, 393)], 60))
     assert found.solid.tolist() == [-1]
@@ -108,8 +111,9 @@ def sticker_views(sensor, camera, rng):
     ends = sensor.home[:3] + rng.uniform([0.05, -0.25, -0.15], [0.55, 0.25, 0.35], (4, 3))
     placed = np.stack([platform, np.eye(4), rod_transform(*ends[:2]), rod_transform(*ends[2:])])
     bodies = (sensor.rig.from_camera[0] @ sensor._camera_from_base) @ placed
-    points = np.concatenate([body.sticker_places @ move[:3, :3].T + move[:3, 3]
-                             for body, move in zip(sensor._scene, bodies, strict=False)])
+    points = np.concatenate(
+        [body.sticker_places @ move[:3, :3].T + move[:3, 3] for body, move in zip(sensor._scene, bodies, strict=False)]
+    )
     pixels = camera.project(points)[0] - 7 + rng.integers(-4, 5, (len(points), 2))
     return [View(camera, bodies, (int(x), int(y)), (14, 14)) for x, y in pixels]
 

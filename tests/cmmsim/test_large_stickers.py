@@ -12,8 +12,11 @@ from cmmsim.sensor import Sensor
 from cmmsim.sensor_file import read_sensor_file
 from cmmsim.sensor_schema import SensorFile
 
-PLACES = {"A": [[0.12, 0.0], [-0.05, 0.12], [-0.08, -0.12]], "B": [[0.05, -0.06], [0.12, -0.06], [0.2, -0.06]],
-          "C": [[-0.05, -0.06], [-0.12, -0.06], [-0.2, -0.06]]}
+PLACES = {
+    "A": [[0.12, 0.0], [-0.05, 0.12], [-0.08, -0.12]],
+    "B": [[0.05, -0.06], [0.12, -0.06], [0.2, -0.06]],
+    "C": [[-0.05, -0.06], [-0.12, -0.06], [-0.2, -0.06]],
+}
 
 
 def large_sticker_sensor(radius):
@@ -46,8 +49,15 @@ def test_correction_takes_the_predicted_bias_away(radius):
     settings = DetectionSettings(window_size=size + 2, fit_size=size, radius=radius)
     errors = {}
     for name, taken in (("on", radius), ("off", 0.0)):
-        seen = observe(sensor.look(sensor.home), sensor.rig, sensor.noise, replace(settings, radius=taken),
-                       camera_from_body, places, normals)
+        seen = observe(
+            sensor.look(sensor.home),
+            sensor.rig,
+            sensor.noise,
+            replace(settings, radius=taken),
+            camera_from_body,
+            places,
+            normals,
+        )
         assert seen.index.tolist() == [0, 1, 2]
         errors[name] = np.stack([seen.left_pixels, seen.right_pixels]) - expected
     predicted, tilts = np.empty((2, 3, 2)), np.empty((2, 3))

@@ -102,8 +102,9 @@ def test_images_decide_the_result(taught):
         poses[shift] = np.mean([sensor.measure(sensor.home).pose for _ in range(30)], axis=0)
     moved = poses[0.1] - poses[0.0]
 
-    pixels = sensor.rig.project(apply(sensor._camera_from_base @ pose_to_transform(sensor.home),
-                                      taught.platform_places))[0]
+    pixels = sensor.rig.project(
+        apply(sensor._camera_from_base @ pose_to_transform(sensor.home), taught.platform_places)
+    )[0]
     shifted = pixels + np.array([[[0.0, 0.0]], [[0.1, 0.0]]])
 
     def residuals(pose):

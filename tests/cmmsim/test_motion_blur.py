@@ -24,16 +24,23 @@ def rate_of(sensor, pose, longest_px):
 def spot_spread(window):
     """Second moments (2, 2) px² of the bright spot above its surroundings."""
     light = window - np.percentile(window, 10)
-    y, x = np.mgrid[:len(window), :len(window)]
+    y, x = np.mgrid[: len(window), : len(window)]
     places = np.stack([x, y], axis=-1) - (light[..., None] * np.stack([x, y], axis=-1)).sum(axis=(0, 1)) / light.sum()
     return np.einsum("hw,hwi,hwj->ij", light, places, places) / light.sum()
 
 
 def test_blur_has_the_length_of_the_movement(tmp_path):
     """A movement by d in the image adds d d' / 12 to the second moments of a sticker."""
-    sensor = lens_sensor(tmp_path, changes=[*EXPOSURE, ("noise = true", "noise = false\nbit_depth = 12"),
-                                            ("gain = 0.13", "gain = 2.0"), ("body_level = 30", "body_level = 8"),
-                                            ("background_level = 0", "background_level = 8")])
+    sensor = lens_sensor(
+        tmp_path,
+        changes=[
+            *EXPOSURE,
+            ("noise = true", "noise = false\nbit_depth = 12"),
+            ("gain = 0.13", "gain = 2.0"),
+            ("body_level = 30", "body_level = 8"),
+            ("background_level = 0", "background_level = 8"),
+        ],
+    )
     pose = sensor.home
     rate = rate_of(sensor, pose, 4.0)
     moved = expected_centres(sensor, pose + 0.002 * rate) - expected_centres(sensor, pose - 0.002 * rate)
@@ -134,7 +141,7 @@ def test_whole_image_is_blurred_as_its_windows_are(tmp_path):
     frame = sensor.capture(pose, pose_rate=rate)
     for image, side, cut in zip((frame.left, frame.right), corners, windows, strict=True):
         for (x, y), window in zip(side, cut, strict=True):
-            np.testing.assert_allclose(image[y:y + 12, x:x + 12], window.astype(float), atol=1)
+            np.testing.assert_allclose(image[y : y + 12, x : x + 12], window.astype(float), atol=1)
 
 
 def test_bad_pose_rates(tmp_path):

@@ -26,6 +26,7 @@ def test_points_explain_their_pixels_best(seen):
     found = triangulate(rig, *pixels, *covariances)
     roots = np.linalg.inv(np.linalg.cholesky(covariances))
     for n in range(pixels.shape[1]):
+
         def whitened(point, n=n):
             return np.einsum("kij,kj->ki", roots[:, n], rig.project(point[None])[0][:, 0] - pixels[:, n]).ravel()
 

@@ -43,8 +43,12 @@ def centre_errors(sensor, pose, supersampling):
 def test_sticker_centres_agree_with_their_projection(sensor, supersampling, limit):
     """The pixel convention: half a pixel off would be 0.5; the rest falls with supersampling as the renderer states."""
     rng = np.random.default_rng(0)
-    errors = np.concatenate([centre_errors(sensor, sensor.home + rng.uniform(-1, 1, 6) * ([0.009] * 3 + [0.03] * 3),
-                                           supersampling) for _ in range(8)])
+    errors = np.concatenate(
+        [
+            centre_errors(sensor, sensor.home + rng.uniform(-1, 1, 6) * ([0.009] * 3 + [0.03] * 3), supersampling)
+            for _ in range(8)
+        ]
+    )
     rms, mean = np.sqrt((errors**2).mean(axis=0)), errors.mean(axis=0)
     assert np.all(rms < limit), rms
     assert np.all(np.abs(mean) < 0.0002), mean
@@ -56,15 +60,17 @@ def test_whole_image_shows_the_windows(sensor):
 
     Single samples on an edge may fall to the other side by rounding: one of the 81 in a pixel is granted.
     """
-    placed = [np.stack([m @ sensor._camera_from_base @ pose_to_transform(sensor.home), m @ sensor._camera_from_base])
-              for m in sensor.rig.from_camera]
+    placed = [
+        np.stack([m @ sensor._camera_from_base @ pose_to_transform(sensor.home), m @ sensor._camera_from_base])
+        for m in sensor.rig.from_camera
+    ]
     points = apply(sensor._camera_from_base @ pose_to_transform(sensor.home), sensor._scene[0].sticker_places)
     corners = np.rint(sensor.rig.project(points)[0] - 5.5).astype(int)
     windows = sensor._camera.radiance(placed, corners, 12, SUPERSAMPLING)
     for side in (0, 1):
         image = sensor._camera.whole_exposure(side, [placed[side]], SUPERSAMPLING)
         for (x, y), window in zip(corners[side], windows[side], strict=True):
-            assert np.abs(image[y:y + 12, x:x + 12] - window).max() < 1.0 / SUPERSAMPLING**2
+            assert np.abs(image[y : y + 12, x : x + 12] - window).max() < 1.0 / SUPERSAMPLING**2
 
 
 def test_captured_images_have_the_stated_size_and_type(sensor):

@@ -16,8 +16,16 @@ from tests.cmmsim.lenses import lens_sensor, poses_about_home
 EXPOSED = [(0.002, "perfect"), (0.004, "perfect")]
 if os.environ.get("ALL_FAULTS"):
     EXPOSED += [(0.001, "perfect"), (0.002, "all")]
-RATES = [[1.0, 0, 0, 0, 0, 0], [0, 1.0, 0, 0, 0, 0], [0, 0, 1.0, 0, 0, 0], [0.5, 0.6, -0.6, 0, 0, 0],  # m/s, rad/s
-         [0, 0, 0, 3.0, 0, 0], [0, 0, 0, 0, 3.0, 0], [0, 0, 0, 0, 0, 3.0], [-0.4, 0.5, 0.5, 1.0, -1.2, 0.8]]
+RATES = [
+    [1.0, 0, 0, 0, 0, 0],
+    [0, 1.0, 0, 0, 0, 0],
+    [0, 0, 1.0, 0, 0, 0],
+    [0.5, 0.6, -0.6, 0, 0, 0],  # m/s, rad/s
+    [0, 0, 0, 3.0, 0, 0],
+    [0, 0, 0, 0, 3.0, 0],
+    [0, 0, 0, 0, 0, 3.0],
+    [-0.4, 0.5, 0.5, 1.0, -1.2, 0.8],
+]
 
 
 def exposed(folder, exposure=0.002, lens="perfect", seed=0):
@@ -75,7 +83,7 @@ class PartlyHidden:
 
     def windows(self, corners, size):
         grey = self._images.windows(corners, size).copy()
-        grey[0, :self._count, :size // 2] = grey[0, :self._count].min(axis=(1, 2), keepdims=True)
+        grey[0, : self._count, : size // 2] = grey[0, : self._count].min(axis=(1, 2), keepdims=True)
         return grey
 
 

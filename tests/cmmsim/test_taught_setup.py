@@ -16,29 +16,41 @@ def load(changes=None, taught=TAUGHT, name="ctrack780"):
     return cmmsim.load_sensor(name, taught=taught, changes=changes)
 
 
-@pytest.mark.parametrize(("changes", "message"), [
-    ({"rig.target": [0.30, 0.0, 0.185]}, r"rig.target \[0.3, 0.0, 0.18\] there, \[0.3, 0.0, 0.185\] here"),
-    ({"rig.distance": 1.5}, r"rig.position \[1.44, 0.0, 1.28\] there, \[1.37"),
-    ({"rig.baseline": 0.8}, "rig.baseline 1.0 there, 0.8 here"),
-    ({"rig.left": {"focal_px": [2301.0, 2301.0], "centre_px": [1023.5, 767.5]}}, "rig.left.centre_px nothing there"),
-    ({"rig.right_from_left": {"translation": [-0.9, 0.0, 0.3], "rotation_vector": [0.0, 0.6, 0.0]}}, "right_from_left"),
-    ({"stickers.placement_seed": 781}, "stickers.placement_seed 780 there, 781 here"),
-    ({"base.planes.A.point": [0.0, 0.0, 0.181]}, "base.planes.A.point"),
-    ({"stickers.per_plane": 4}, "platform.planes.A.stickers .* platform.planes.C.stickers"),
-])
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rig.target": [0.30, 0.0, 0.185]}, r"rig.target \[0.3, 0.0, 0.18\] there, \[0.3, 0.0, 0.185\] here"),
+        ({"rig.distance": 1.5}, r"rig.position \[1.44, 0.0, 1.28\] there, \[1.37"),
+        ({"rig.baseline": 0.8}, "rig.baseline 1.0 there, 0.8 here"),
+        (
+            {"rig.left": {"focal_px": [2301.0, 2301.0], "centre_px": [1023.5, 767.5]}},
+            "rig.left.centre_px nothing there",
+        ),
+        (
+            {"rig.right_from_left": {"translation": [-0.9, 0.0, 0.3], "rotation_vector": [0.0, 0.6, 0.0]}},
+            "right_from_left",
+        ),
+        ({"stickers.placement_seed": 781}, "stickers.placement_seed 780 there, 781 here"),
+        ({"base.planes.A.point": [0.0, 0.0, 0.181]}, "base.planes.A.point"),
+        ({"stickers.per_plane": 4}, "platform.planes.A.stickers .* platform.planes.C.stickers"),
+    ],
+)
 def test_what_another_sensor_was_taught_is_refused_with_what_differs(changes, message):
     with pytest.raises(cmmsim.TeachingError, match=message) as refusal:
         load(changes)
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize("changes", [
-    {"camera.dark_noise": 3.0, "camera.bit_depth": 12, "camera.prnu": 0.01},
-    {"timing.exposure": 0.001, "timing.frame_rate": 29.0},
-    {"lens.psf_px": 0.5, "lens.vignetting": 0.2},
-    {"detection": {"detector": "dual_conic"}, "renderer": "analytic"},
-    {"rig.distance": 1.5841717078650281},  # where it stands anyway
-])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"camera.dark_noise": 3.0, "camera.bit_depth": 12, "camera.prnu": 0.01},
+        {"timing.exposure": 0.001, "timing.frame_rate": 29.0},
+        {"lens.psf_px": 0.5, "lens.vignetting": 0.2},
+        {"detection": {"detector": "dual_conic"}, "renderer": "analytic"},
+        {"rig.distance": 1.5841717078650281},  # where it stands anyway
+    ],
+)
 def test_what_does_not_change_teaching_may_differ(changes):
     assert load(changes).taught is TAUGHT
 

@@ -56,12 +56,15 @@ def test_a_file_based_on_another_changes_single_entries_of_a_section(tmp_path):
     assert found.rig == read_sensor_file("ctrack780").rig
 
 
-@pytest.mark.parametrize(("basis", "message"), [
-    ('"ctrack78"', r"mine.toml: based_on: unknown sensor .*ctrack78.*ctrack780"),
-    ('"mine.toml"', "which is itself based on 'mine.toml': name a sensor whose file is complete"),
-    ('"ctrack780_29hz"', "which is itself based on 'ctrack780'"),
-    ("3", "based_on: Input should be a valid string"),
-])
+@pytest.mark.parametrize(
+    ("basis", "message"),
+    [
+        ('"ctrack78"', r"mine.toml: based_on: unknown sensor .*ctrack78.*ctrack780"),
+        ('"mine.toml"', "which is itself based on 'mine.toml': name a sensor whose file is complete"),
+        ('"ctrack780_29hz"', "which is itself based on 'ctrack780'"),
+        ("3", "based_on: Input should be a valid string"),
+    ],
+)
 def test_a_bad_basis_is_refused(tmp_path, basis, message):
     """One level only: neither a chain nor a circle."""
     mine = tmp_path / "mine.toml"
@@ -70,12 +73,15 @@ def test_a_bad_basis_is_refused(tmp_path, basis, message):
         read_sensor_file(mine)
 
 
-@pytest.mark.parametrize(("entry", "message"), [
-    ("dropout = 1.1", "timing.dropout: .*less than or equal to 1"),
-    ("dropout = -0.1", "timing.dropout: .*greater than or equal to 0"),
-    ("latency = 0.01\nlatency_jitter = 0.02", r"timing: latency_jitter 0.02 s is larger than latency 0.01 s$"),
-    ("exposure = 0.02", r"timing: exposure 0.02 s is longer than a frame of 60 Hz, 0.01667 s$"),
-])
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ("dropout = 1.1", "timing.dropout: .*less than or equal to 1"),
+        ("dropout = -0.1", "timing.dropout: .*greater than or equal to 0"),
+        ("latency = 0.01\nlatency_jitter = 0.02", r"timing: latency_jitter 0.02 s is larger than latency 0.01 s$"),
+        ("exposure = 0.02", r"timing: exposure 0.02 s is longer than a frame of 60 Hz, 0.01667 s$"),
+    ],
+)
 def test_contradictions_in_the_timing_are_refused(tmp_path, entry, message):
     mine = tmp_path / "mine.toml"
     mine.write_text(f'name = "mine"\nbased_on = "ctrack780"\n[timing]\n{entry}\n')

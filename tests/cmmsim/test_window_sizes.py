@@ -18,13 +18,16 @@ def load(changes):
     return cmmsim.load_sensor("ctrack780", seed=2, renderer="analytic", changes=changes)
 
 
-@pytest.mark.parametrize(("changes", "sizes"), [
-    ({}, (14, 12)),
-    ({"stickers.radius": 0.002}, (14, 12)),
-    ({"rig.distance": 3.0}, (14, 12)),
-    ({"lens.psf_px": 0.6}, (16, 14)),
-    ({"timing.exposure": 0.004}, (16, 14)),
-])
+@pytest.mark.parametrize(
+    ("changes", "sizes"),
+    [
+        ({}, (14, 12)),
+        ({"stickers.radius": 0.002}, (14, 12)),
+        ({"rig.distance": 3.0}, (14, 12)),
+        ({"lens.psf_px": 0.6}, (16, 14)),
+        ({"timing.exposure": 0.004}, (16, 14)),
+    ],
+)
 def test_the_built_in_stickers_and_smaller_ones_get_the_smallest_windows(changes, sizes):
     sensor = load(changes)
     assert (sensor.settings.window_size, sensor.settings.fit_size) == sizes
@@ -59,7 +62,11 @@ def test_larger_stickers_are_taught_and_measured_with_a_true_covariance(changes,
 def test_teaching_names_the_stickers_that_no_image_shows():
     """One metre from the middle of platform and base, the lower stickers of the base lie below both images."""
     sensor = load({"rig.distance": 1.0})
-    below = [str(sensor.base.sticker_ids[k]) for k in np.flatnonzero(
-        ~sensor.rig.project(apply(sensor._camera_from_base, sensor.base.nominal))[1].all(axis=0))]
+    below = [
+        str(sensor.base.sticker_ids[k])
+        for k in np.flatnonzero(
+            ~sensor.rig.project(apply(sensor._camera_from_base, sensor.base.nominal))[1].all(axis=0)
+        )
+    ]
     with pytest.raises(cmmsim.TeachingError, match=f"; {', '.join(below)} lie outside of an image"):
         sensor.teach()

@@ -90,8 +90,7 @@ def legs_at(robot: dynamics.Robot) -> Callable[[np.ndarray], Legs]:
         g = robot.geometry
         theta = robot.inverse_kinematics(pose)[:, None]
         crank = g.crank_length * (
-            np.cos(theta) * g.crank_zero_directions
-            + np.sin(theta) * np.cross(g.crank_axes, g.crank_zero_directions)
+            np.cos(theta) * g.crank_zero_directions + np.sin(theta) * np.cross(g.crank_axes, g.crank_zero_directions)
         )
         joint = pose[:3] + g.platform_joints @ base_from_platform(pose).T
         return Legs(g.base_joints + crank, joint, crank)

@@ -288,9 +288,7 @@ def test_only_a_robot_is_compiled():
     ],
 )
 def test_arguments_of_a_batch(robot, identified, make_reference, make_settings, change, message):
-    arguments = {
-        "robot": robot, "parameters": identified, "references": make_reference(5), "settings": make_settings()
-    }
+    arguments = {"robot": robot, "parameters": identified, "references": make_reference(5), "settings": make_settings()}
     with pytest.raises(SimulationError, match=message):
         simulate_batch(**{**arguments, **change})
 

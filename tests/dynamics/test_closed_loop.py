@@ -95,9 +95,7 @@ def test_noise_of_the_ideal_sensor_is_a_sensor_with_that_noise(
     """Rows of noise, with frames lost, do what a sensor that adds them and answers None does."""
     settings, reference = make_settings(latency_s=0.4 * PERIOD), make_reference(12)
     noise, lost = 2e-5 * np.sin(np.arange(12)[:, None] + np.arange(6)), np.isin(np.arange(12), (0, 5))
-    asked = closed_loop.simulate(
-        robot, identified, reference, settings, _sensor({0, 5}), compiled=compiled
-    )
+    asked = closed_loop.simulate(robot, identified, reference, settings, _sensor({0, 5}), compiled=compiled)
     drawn = closed_loop.simulate(robot, identified, reference, settings, noise=noise, lost=lost, compiled=compiled)
     for name in ("pose", "measured", "measured_ok", "command"):
         np.testing.assert_array_equal(getattr(drawn, name), getattr(asked, name), err_msg=name)
@@ -179,9 +177,7 @@ def test_unstable_loop_ends_with_frame_and_reason(robot, make_reference, make_se
     """Table 1 parameters at 29 Hz with one frame of delay: the loop is unstable and says where it ended."""
     settings, reference = make_settings(29.0, latency_s=1 / 29), make_reference(580, 29.0)
     with pytest.raises(closed_loop.LoopFailure, match=r"stopped at frame \d+ \(t = .* s\): .*unstable") as caught:
-        closed_loop.simulate(
-            robot, robot.parameter_sets["initial"].vector, reference, settings, compiled=compiled
-        )
+        closed_loop.simulate(robot, robot.parameter_sets["initial"].vector, reference, settings, compiled=compiled)
     assert 5 < caught.value.frame < 580
     assert f"frame {caught.value.frame} " in str(caught.value)
 

@@ -125,9 +125,7 @@ def test_reloaded_bodies_accelerate_as_the_robot_with_the_changed_parameters(muj
     changed[RIGID_BODY] = physical_inertias(values, allow_changes=True).values.ravel()
     torques = 5 * np.random.default_rng(8).standard_normal((300, 6))
     ours = robot.forward_dynamics(many_states.pose, many_states.twist, torques, changed)
-    for pose, twist, torque, acceleration in zip(
-        many_states.pose, many_states.twist, torques, ours, strict=True
-    ):
+    for pose, twist, torque, acceleration in zip(many_states.pose, many_states.twist, torques, ours, strict=True):
         theirs = acceleration_in_rigid_loops(mujoco, engine, pose, twist, torque)
         assert np.abs(theirs - acceleration).max() <= 1e-9 * np.abs(acceleration).max()
 
@@ -225,9 +223,15 @@ def test_robot_with_tilted_cranks_agrees_too(mujoco, robot, states):
     g, turn = robot.geometry, Rotation.from_rotvec([0.5, 0.4, 0.3]).as_matrix()
     turned_home = Rotation.from_matrix(turn) * Rotation.from_euler("XYZ", g.home_pose[3:])
     geometry = Rss6Geometry(
-        g.base_joints @ turn.T, g.platform_joints, g.crank_axes @ turn.T, g.crank_zero_directions @ turn.T,
-        g.crank_length, g.link_length, np.concatenate([turn @ g.home_pose[:3], turned_home.as_euler("XYZ")]),
-        g.travel_limit, g.gravity,
+        g.base_joints @ turn.T,
+        g.platform_joints,
+        g.crank_axes @ turn.T,
+        g.crank_zero_directions @ turn.T,
+        g.crank_length,
+        g.link_length,
+        np.concatenate([turn @ g.home_pose[:3], turned_home.as_euler("XYZ")]),
+        g.travel_limit,
+        g.gravity,
     )
     tilted = Robot(RobotDescription("tilted", geometry, robot.parameter_sets))
     engine = exported(tilted)

@@ -16,9 +16,10 @@ def samples(robot, states):
     """(pose, rate, acceleration, torque) of a few random states."""
     rng = np.random.default_rng(2)
     scale = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
-    return [(pose, scale * a, 10 * scale * b, 5 * c) for pose, (a, b, c) in zip(
-        states.pose[:6], rng.standard_normal((6, 3, 6)), strict=True
-    )]
+    return [
+        (pose, scale * a, 10 * scale * b, 5 * c)
+        for pose, (a, b, c) in zip(states.pose[:6], rng.standard_normal((6, 3, 6)), strict=True)
+    ]
 
 
 def _evaluate(function, *arguments):

@@ -58,9 +58,7 @@ def test_sensitivities_are_finite_differences_of_the_run(
     commands = closed_loop.simulate(robot, identified, reference, settings).command if driven else None
 
     def run(values, sensitivities=False):
-        return closed_loop.simulate(
-            robot, values, reference, settings, commands=commands, sensitivities=sensitivities
-        )
+        return closed_loop.simulate(robot, values, reference, settings, commands=commands, sensitivities=sensitivities)
 
     base = run(identified, sensitivities=True)
     assert (base.events > 10) == (case != "smoothed friction")

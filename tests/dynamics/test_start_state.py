@@ -199,9 +199,7 @@ def test_a_batch_carries_starts_and_their_sensitivities(robot, identified, half_
     starts = [_moved(start, scale * np.ones(24)) for scale in (0, 1e-5, 2e-5)]
     runs = simulate_batch(robot, identified, reference, settings, starts=starts, start_sensitivities=True)
     for begin, run in zip(starts, runs, strict=True):
-        alone = closed_loop.simulate(
-            robot, identified, reference, settings, start=begin, start_sensitivities=True
-        )
+        alone = closed_loop.simulate(robot, identified, reference, settings, start=begin, start_sensitivities=True)
         np.testing.assert_array_equal(run.pose, alone.pose)
         np.testing.assert_array_equal(run.pose_sensitivity, alone.pose_sensitivity)
         np.testing.assert_array_equal(run.start_sensitivity, alone.start_sensitivity)

@@ -157,9 +157,7 @@ def test_sticking_joints_are_those_of_the_friction_problem(robot, identified):
         motion = StickSlipMotion(functions, identified, FrictionLaw())
         integral = (torque) / identified[65]
         rows = np.zeros((6, COLUMNS))
-        end = motion.segment(
-            State(pose, rest, integral), Command(angle[:, 0], rest, rest, rows, rows, rows), 1e-6, 1
-        )
+        end = motion.segment(State(pose, rest, integral), Command(angle[:, 0], rest, rest, rows, rows, rows), 1e-6, 1)
         np.testing.assert_array_equal(motion.mode, modes)
         np.testing.assert_allclose(end.rate / 1e-6, acceleration, atol=1e-4 * np.abs(acceleration).max() + 1e-9)
 

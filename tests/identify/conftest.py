@@ -56,8 +56,11 @@ def make_result():
     """A result with round numbers; every goal is met."""
     six = [1e-6, 1.4e-6, 1.8e-6, 4e-6, 6e-6, 8e-6]
     model_error = rms_figures(np.array([six, six]))
-    predicted = {"position_std_um": [1.5, 2.5, 3.5], "orientation_std_urad": [11.0, 16.0, 21.0],
-                 "normalised_squared_error": 0.9}
+    predicted = {
+        "position_std_um": [1.5, 2.5, 3.5],
+        "orientation_std_urad": [11.0, 16.0, 21.0],
+        "normalised_squared_error": 0.9,
+    }
     parameters = {
         "platform.mass": parameter(24.0, 23.5, 23.5, 0.0),
         "link1.Ixx": parameter(5.23e-4, 6.3e-4, None, None, identifiable=False),
@@ -70,14 +73,26 @@ def make_result():
         "seed": 0,
         "versions": {"cmmsim": "0.1.0"},
         "seconds": {"excite": 1.0, "record": 30.0},
-        "sensor": {"frames": 120, "lost_frames": 0, "stereo_frames_per_second": 70.0,
-                   "position_rms_um": [5.0, 6.0, 7.0], "orientation_rms_urad": [30.0, 40.0, 50.0]},
-        "identification": {"scale_anchor": "platform_mass", "iterations": 5, "stop_reason": "tolerance",
-                           "base_rank": 4, "parameters": parameters, "noise_ratio": 1.2,
-                           "expected_noise_ratio": 1.1, "noise_ratio_std": 0.04, "whiteness": {"p_value": 0.3},
-                           "conditioning": {"with_guess": 1e9, "poses_alone": 2e11, "directions": 39, "unshown": 3},
-                           "strongest_correlations": [{"first": "joint1.coulomb", "second": "joint_pid.lp",
-                                                       "correlation": 0.98765}]},
+        "sensor": {
+            "frames": 120,
+            "lost_frames": 0,
+            "stereo_frames_per_second": 70.0,
+            "position_rms_um": [5.0, 6.0, 7.0],
+            "orientation_rms_urad": [30.0, 40.0, 50.0],
+        },
+        "identification": {
+            "scale_anchor": "platform_mass",
+            "iterations": 5,
+            "stop_reason": "tolerance",
+            "base_rank": 4,
+            "parameters": parameters,
+            "noise_ratio": 1.2,
+            "expected_noise_ratio": 1.1,
+            "noise_ratio_std": 0.04,
+            "whiteness": {"p_value": 0.3},
+            "conditioning": {"with_guess": 1e9, "poses_alone": 2e11, "directions": 39, "unshown": 3},
+            "strongest_correlations": [{"first": "joint1.coulomb", "second": "joint_pid.lp", "correlation": 0.98765}],
+        },
         "before": {"position_rms_um": [None] * 3, "orientation_rms_urad": [None] * 3},
         "after": {"position_rms_um": [20.0, 21.0, 22.0], "orientation_rms_urad": [80.0, 81.0, 82.0]},
         "validation": [
@@ -89,8 +104,14 @@ def make_result():
 
 def parameter(initial, true, estimate, std, identifiable=True):
     interval = [max(estimate - 1.96 * std, 0.0), estimate + 1.96 * std] if identifiable else None
-    return {"initial": initial, "true": true, "estimate": estimate, "std": std, "interval": interval,
-            "identifiable": identifiable}
+    return {
+        "initial": initial,
+        "true": true,
+        "estimate": estimate,
+        "std": std,
+        "interval": interval,
+        "identifiable": identifiable,
+    }
 
 
 @pytest.fixture

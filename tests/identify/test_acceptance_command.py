@@ -17,20 +17,23 @@ def nothing_is_drawn(monkeypatch):
     monkeypatch.setattr(acceptance, "do", drawn)
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["ctrak"], "unknown sensor 'ctrak'"),
-    (["--renderer", "oil"], "unknown renderer 'oil': valid are analytic"),
-    (["--standard", "iso"], "unknown standard 'iso': valid are all, e3064, e3124, vdi"),
-    (["--limit-um", "0"], "positive number of um, got 0"),
-    (["--limit-um", "nan"], "positive number of um, got nan"),
-    (["--volume", "big"], "volume 'big' is neither"),
-    (["--volume", "1x2"], "volume '1x2' is neither"),
-    (["--volume", "nan"], "volume 'nan' is neither"),
-    (["--volume", "3"], "measuring volume 3000 x 3000 x 3000 mm is not wholly visible to both cameras"),
-    (["--volume", "0.6x0.3x0.3"], "two thirds"),
-    (["--volume", "0.3", "--standard", "e3064"], "the bar needs"),
-    (["--volume", "0.3", "--standard", "e3124"], "the body on its circle needs"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["ctrak"], "unknown sensor 'ctrak'"),
+        (["--renderer", "oil"], "unknown renderer 'oil': valid are analytic"),
+        (["--standard", "iso"], "unknown standard 'iso': valid are all, e3064, e3124, vdi"),
+        (["--limit-um", "0"], "positive number of um, got 0"),
+        (["--limit-um", "nan"], "positive number of um, got nan"),
+        (["--volume", "big"], "volume 'big' is neither"),
+        (["--volume", "1x2"], "volume '1x2' is neither"),
+        (["--volume", "nan"], "volume 'nan' is neither"),
+        (["--volume", "3"], "measuring volume 3000 x 3000 x 3000 mm is not wholly visible to both cameras"),
+        (["--volume", "0.6x0.3x0.3"], "two thirds"),
+        (["--volume", "0.3", "--standard", "e3064"], "the bar needs"),
+        (["--volume", "0.3", "--standard", "e3124"], "the body on its circle needs"),
+    ],
+)
 def test_bad_input_is_one_line_before_anything_is_drawn(nothing_is_drawn, tmp_path, capsys, arguments, message):
     out = tmp_path / "out"
     assert command("acceptance", *arguments, "--out", out) == 1
@@ -61,8 +64,9 @@ def test_help_teaches(capsys):
 def lengths(tmp_path_factory):
     """The length test alone, with a limit that no sensor keeps."""
     out = tmp_path_factory.mktemp("acceptance") / "out"
-    status = command("acceptance", "--standard", "vdi", "--renderer", "analytic", "--limit-um", "0.01", "--out", out,
-                     "--quiet")
+    status = command(
+        "acceptance", "--standard", "vdi", "--renderer", "analytic", "--limit-um", "0.01", "--out", out, "--quiet"
+    )
     return status, out
 
 
@@ -88,8 +92,12 @@ def test_tables_stand_beside_the_published_figures(lengths):
     entry = json.loads((out / "acceptance.json").read_text(encoding="utf-8"))
     text = acceptance_markdown(entry)
     assert text == (out / "acceptance.md").read_text(encoding="utf-8")
-    for row in ("| position, static | Creaform C-Track 780 | 0.05 mm |", "| latency | NDI Polaris Vega | 14.2 ms |",
-                "| position, moving | NIST, 12 cameras | 0.2 mm |", "| position, static | Vicon | 0.15 mm |"):
+    for row in (
+        "| position, static | Creaform C-Track 780 | 0.05 mm |",
+        "| latency | NDI Polaris Vega | 14.2 ms |",
+        "| position, moving | NIST, 12 cameras | 0.2 mm |",
+        "| position, static | Vicon | 0.15 mm |",
+    ):
         assert row in text
     assert "What is not:" in text
 
@@ -115,4 +123,9 @@ def test_whole_acceptance_of_the_built_in_sensor(tmp_path, capsys):
     latency = entry["astm_e3124"]
     assert latency["mean_interval_ms"][0] <= latency["sensor_file_ms"] <= latency["mean_interval_ms"][1]
     assert {path.name for path in (out / "figures").iterdir()} == {
-        "measuring_lines.png", "length_errors.png", "bar_paths.png", "bar_errors.png", "latency.png"}
+        "measuring_lines.png",
+        "length_errors.png",
+        "bar_paths.png",
+        "bar_errors.png",
+        "latency.png",
+    }

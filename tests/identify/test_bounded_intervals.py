@@ -72,9 +72,7 @@ def test_a_sum_of_many_at_their_bounds_is_covered_where_the_cut_interval_of_the_
     size, bounds, rows = 30, not_negative(30), np.ones((1, 30))
     data = rng.standard_normal((DRAWS, size))
     one = np.eye(size)
-    estimates = [
-        bounded_estimate(np.maximum(y, 0), y < 0, np.maximum(-y, 0), one, one, bounds) for y in data
-    ]
+    estimates = [bounded_estimate(np.maximum(y, 0), y < 0, np.maximum(-y, 0), one, one, bounds) for y in data]
 
     def cut(found, rows):
         half, value = 1.96 * np.sqrt(size), rows @ found.estimate

@@ -10,8 +10,17 @@ from identify.studies.table import tidy_table
 from identify.studies.theory import check_laws
 
 IDENTIFYING = {"parameter_noise", "parameter_periods"}
-EXPECTED = {"pixel_noise", "sticker_size", "sticker_count", "baseline", "distance", "frame_rate", "hold_time",
-            "pose_method", *IDENTIFYING}
+EXPECTED = {
+    "pixel_noise",
+    "sticker_size",
+    "sticker_count",
+    "baseline",
+    "distance",
+    "frame_rate",
+    "hold_time",
+    "pose_method",
+    *IDENTIFYING,
+}
 QUICK = sorted(EXPECTED - IDENTIFYING)
 
 

@@ -11,17 +11,23 @@ import pytest
 import cmmsim
 from tests.identify.commands import command
 
-SENSOR = (resources.files("cmmsim").joinpath("sensors", "ctrack780.toml").read_text(encoding="utf-8")
-          .replace("width = 2048", "width = 640").replace("height = 1536", "height = 480")
-          .replace("focal_px = 2300.0", "focal_px = 720.0").replace('name = "ctrack780"', 'name = "small"')
-          .replace('renderer = "auto"', ""))
+SENSOR = (
+    resources.files("cmmsim")
+    .joinpath("sensors", "ctrack780.toml")
+    .read_text(encoding="utf-8")
+    .replace("width = 2048", "width = 640")
+    .replace("height = 1536", "height = 480")
+    .replace("focal_px = 2300.0", "focal_px = 720.0")
+    .replace('name = "ctrack780"', 'name = "small"')
+    .replace('renderer = "auto"', "")
+)
 BOARD = 'kind = "dots"\ncolumns = 7\nrows = 6\nspacing = 0.07\nradius = 0.0175\n'
 
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrate")
-    (folder / "small.toml").write_text("renderer = \"analytic\"\n" + SENSOR)
+    (folder / "small.toml").write_text('renderer = "analytic"\n' + SENSOR)
     (folder / "board.toml").write_text(BOARD)
     options = ("--sensor", folder / "small.toml", "--board", folder / "board.toml", "--out", folder / "pictures")
     assert command("calibrate", "--render", 8, *options, "--quiet") == 0
@@ -45,8 +51,13 @@ def test_command_calibrates_what_it_rendered(pictures, tmp_path, capfd):
     assert [view["name"] for view in result["used"]] == [f"{k:03d}.png" for k in range(8)]
     truth = cmmsim.load_sensor(pictures / "small.toml").rig
     found = result["parameters"]
-    for name, value in (("left.fx_px", 720.0), ("right.fy_px", 720.0), ("left.cx_px", 319.5), ("right.k1", 0.0),
-                        ("right_from_left.tx_m", truth.right_from_left[0, 3])):
+    for name, value in (
+        ("left.fx_px", 720.0),
+        ("right.fy_px", 720.0),
+        ("left.cx_px", 319.5),
+        ("right.k1", 0.0),
+        ("right_from_left.tx_m", truth.right_from_left[0, 3]),
+    ):
         assert abs(found[name]["estimate"] - value) < 4.0 * found[name]["std"], name
     covariance = np.array(result["covariance"]["matrix"])
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [p["std"] for p in found.values()])
@@ -64,7 +75,12 @@ def test_options_reach_the_calibration(pictures, tmp_path):
     result = json.loads((tmp_path / "new" / "calibration.json").read_text())
     assert result["options"] == {"distortion": "none", "fix_aspect": True}
     assert [n for n, p in result["parameters"].items() if not p["free"] and n.startswith("left")] == [
-        "left.k1", "left.k2", "left.p1", "left.p2", "left.k3"]
+        "left.k1",
+        "left.k2",
+        "left.p1",
+        "left.p2",
+        "left.k3",
+    ]
     assert not (tmp_path / "new" / "sensor.toml").exists()
 
 
@@ -77,20 +93,25 @@ def test_rendering_again_gives_the_same_pictures(pictures, tmp_path):
         assert first == second
 
 
-@pytest.mark.parametrize(("change", "evidence"), [
-    (lambda a: [a[0]], "missing RIGHT, --board FILE; cmmsim calibrate --help shows examples"),
-    (lambda a: ["nowhere", *a[1:]], "no folder nowhere"),
-    (lambda a: [*a[:3], "none.toml"], "cannot read board file none.toml"),
-    (lambda a: [*a, "--distortion", "fisheye"], "unknown distortion 'fisheye': valid are brown5, none, radial2"),
-    (lambda a: [*a, "--sensor", "ctrack"], "unknown sensor 'ctrack'"),
-    (lambda a: [*a, "--min-images", "9"], "8 of 8 pairs show the board to both cameras, 9 needed"),
-    (lambda a: [*a, "--sensor", "ctrack780"], "640 x 480 px, those of the sensor file ctrack780 2048 x 1536"),
-    (lambda a: [*a, "--render", "3"], "leave out LEFT and RIGHT"),
-    (lambda _: ["--render", "1", "--distortion", "none", "--min-images", "7", "--fix-aspect"],
-     "calibrates nothing: leave out --distortion and --fix-aspect and --min-images"),
-    (lambda a: [*a, "--seed", "0"], "no random numbers without --render: leave out --seed"),
-    (lambda a: ["--render", "3", "--board", "none.toml"], "cannot read board file none.toml"),
-])
+@pytest.mark.parametrize(
+    ("change", "evidence"),
+    [
+        (lambda a: [a[0]], "missing RIGHT, --board FILE; cmmsim calibrate --help shows examples"),
+        (lambda a: ["nowhere", *a[1:]], "no folder nowhere"),
+        (lambda a: [*a[:3], "none.toml"], "cannot read board file none.toml"),
+        (lambda a: [*a, "--distortion", "fisheye"], "unknown distortion 'fisheye': valid are brown5, none, radial2"),
+        (lambda a: [*a, "--sensor", "ctrack"], "unknown sensor 'ctrack'"),
+        (lambda a: [*a, "--min-images", "9"], "8 of 8 pairs show the board to both cameras, 9 needed"),
+        (lambda a: [*a, "--sensor", "ctrack780"], "640 x 480 px, those of the sensor file ctrack780 2048 x 1536"),
+        (lambda a: [*a, "--render", "3"], "leave out LEFT and RIGHT"),
+        (
+            lambda _: ["--render", "1", "--distortion", "none", "--min-images", "7", "--fix-aspect"],
+            "calibrates nothing: leave out --distortion and --fix-aspect and --min-images",
+        ),
+        (lambda a: [*a, "--seed", "0"], "no random numbers without --render: leave out --seed"),
+        (lambda a: ["--render", "3", "--board", "none.toml"], "cannot read board file none.toml"),
+    ],
+)
 def test_what_cannot_be_done_is_one_line_and_leaves_nothing(pictures, monkeypatch, capfd, tmp_path, change, evidence):
     monkeypatch.chdir(tmp_path)
     assert command("calibrate", *change(list(arguments(pictures))), "--out", "new", "--quiet") == 1
@@ -134,7 +155,12 @@ def test_cameras_that_no_sensor_can_have_are_kept_without_a_sensor_file(pictures
     assert "the cameras stand 1 m apart, those of the sensor file" in said
     assert "sensor.toml is not written, no sensor can have these cameras: rig.right_from_left" in said
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == [
-        "calibration.json", "coverage.png", "distortion.png", "residuals.png", "rig.toml"]
+        "calibration.json",
+        "coverage.png",
+        "distortion.png",
+        "residuals.png",
+        "rig.toml",
+    ]
 
 
 @pytest.mark.parametrize("there", [True, False])

@@ -31,8 +31,12 @@ def calls(monkeypatch):
 
 def warned(result):
     """The result of a plant that the model cannot be."""
-    result["identification"] |= {"noise_ratio": 1.356, "whiteness": {"p_value": 0.0}, "warnings": ["not white", "a\nb"],
-                                 "groups": {"platform.mass": {"identifiable": True}}}
+    result["identification"] |= {
+        "noise_ratio": 1.356,
+        "whiteness": {"p_value": 0.0},
+        "warnings": ["not white", "a\nb"],
+        "groups": {"platform.mass": {"identifiable": True}},
+    }
     return result
 
 
@@ -70,9 +74,25 @@ def test_a_run_of_a_wrong_plant_warns_and_misses_its_goals(calls, tmp_path, capf
 
 def test_run_passes_scenario_seed_folder_and_workers(calls, tmp_path):
     out = tmp_path / "mine"
-    assert command("run", "quick", "--out", out, "--seed", 7, "--workers", 2, "--quiet",
-                   "--set", "timing.latency_s=0.01", "--set", "pose_method=planes") == 0
-    (name, scenario, seed, folder, _, workers), = calls
+    assert (
+        command(
+            "run",
+            "quick",
+            "--out",
+            out,
+            "--seed",
+            7,
+            "--workers",
+            2,
+            "--quiet",
+            "--set",
+            "timing.latency_s=0.01",
+            "--set",
+            "pose_method=planes",
+        )
+        == 0
+    )
+    ((name, scenario, seed, folder, _, workers),) = calls
     assert (name, seed, folder, workers) == ("run", 7, out, 2)
     assert (scenario.name, scenario.timing.latency_s, scenario.pose_method) == ("quick", 0.01, "planes")
 
@@ -158,8 +178,11 @@ def test_known_errors_of_every_package_are_one_line(calls, capfd, monkeypatch, t
     from dynamics.errors import RobotFileError
     from identify.errors import RecordError
 
-    error = {"identify": RecordError("a\nb"), "dynamics": RobotFileError("a\nb"),
-             "cmmsim": OpenGLMissingError(ImportError("a\nb"))}[module]
+    error = {
+        "identify": RecordError("a\nb"),
+        "dynamics": RobotFileError("a\nb"),
+        "cmmsim": OpenGLMissingError(ImportError("a\nb")),
+    }[module]
 
     def fail(*_):
         raise error
@@ -200,18 +223,19 @@ def test_new_folder_may_be_absent_or_empty_but_no_file(tmp_path):
 
 
 def test_command_starts_in_a_process_of_its_own():
-    made = subprocess.run(
-        [sys.executable, "-m", "identify", "--version"], capture_output=True, text=True, check=True
-    )
+    made = subprocess.run([sys.executable, "-m", "identify", "--version"], capture_output=True, text=True, check=True)
     assert made.stdout.startswith("cmmsim 0.")
 
 
-@pytest.mark.parametrize(("arguments", "shown"), [
-    (["--help"], "Examples:"),
-    (["--help"], "identify --out mine --set identification.method=command_driven"),
-    (["run", "--help"], "paper, quick"),
-    (["identify", "--help"], "stays in scenario.toml"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "shown"),
+    [
+        (["--help"], "Examples:"),
+        (["--help"], "identify --out mine --set identification.method=command_driven"),
+        (["run", "--help"], "paper, quick"),
+        (["identify", "--help"], "stays in scenario.toml"),
+    ],
+)
 def test_help_teaches(capsys, arguments, shown):
     assert command(*arguments) == 0
     assert shown in capsys.readouterr().out

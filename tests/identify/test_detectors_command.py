@@ -55,13 +55,16 @@ def test_table_shows_bound_and_errors_and_a_figure_is_drawn(done):
     assert sorted(f.name for f in folder.iterdir()) == ["detectors.csv", "detectors.json", "detectors.png"]
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    (["--radius", "0.2"], r"radius 0\.2 px, tilt 0 degrees, noise 0\.2 % of the contrast"),
-    (["--radius", "500"], "radius 500 px is more than 50 px"),
-    (["--tilt", "85"], "80 degrees"),
-    (["--noise", "0.1"], "less than that of rounding"),
-    (["--psf", "0.05"], r"psf 0\.05 px .* at least 0\.1 px"),
-])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--radius", "0.2"], r"radius 0\.2 px, tilt 0 degrees, noise 0\.2 % of the contrast"),
+        (["--radius", "500"], "radius 500 px is more than 50 px"),
+        (["--tilt", "85"], "80 degrees"),
+        (["--noise", "0.1"], "less than that of rounding"),
+        (["--psf", "0.05"], r"psf 0\.05 px .* at least 0\.1 px"),
+    ],
+)
 def test_bad_conditions_are_refused_before_anything_is_written(options, message, tmp_path):
     result = CliRunner().invoke(app, ["detectors", *options, "--draws", "2", "--quiet", "--out", str(tmp_path / "out")])
     with pytest.raises(CmmError, match=message):

@@ -26,8 +26,12 @@ def problem():
     noise = rng.standard_normal((FRAMES, 6))
 
     def of(size):
-        run = SimpleNamespace(residuals=lambda parameters: (size * noise, jacobian), driven=True,
-                              ok=np.ones(FRAMES, dtype=bool), payload_std=np.zeros(SIZE))
+        run = SimpleNamespace(
+            residuals=lambda parameters: (size * noise, jacobian),
+            driven=True,
+            ok=np.ones(FRAMES, dtype=bool),
+            payload_std=np.zeros(SIZE),
+        )
         return SimpleNamespace(runs=(run,), known=lambda parameters: (np.zeros(SIZE), np.eye(SIZE)))
 
     return of, right

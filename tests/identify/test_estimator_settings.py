@@ -72,8 +72,17 @@ def test_an_identification_that_fails_leaves_scenario_and_result(run):
 
 @pytest.mark.parametrize(
     "setting",
-    ["timing.latency_s=0.01", "servo.kp=0.2", "plant.steps_per_frame=4", "excitation.duration_s=1", "sensor=ctrack780",
-     "identification={}", "identification.scale_anchor=prior", "identification.anchor_std=1", "payload.mass_kg=1"],
+    [
+        "timing.latency_s=0.01",
+        "servo.kp=0.2",
+        "plant.steps_per_frame=4",
+        "excitation.duration_s=1",
+        "sensor=ctrack780",
+        "identification={}",
+        "identification.scale_anchor=prior",
+        "identification.anchor_std=1",
+        "payload.mass_kg=1",
+    ],
 )
 def test_what_the_record_was_made_with_is_refused_in_one_line(run, capfd, setting):
     assert command("identify", "--out", run.path, "--set", setting) == 1

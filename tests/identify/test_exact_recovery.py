@@ -67,8 +67,6 @@ def test_integration_limits_what_a_finer_plant_lets_recover():
 
     With both four times finer, the fourth-order integrator's difference is some hundred times smaller.
     """
-    coarse, fine = (
-        relative_errors(solution, base)[0] for _, solution, base in (found(16, 4), found(64, 16))
-    )
+    coarse, fine = (relative_errors(solution, base)[0] for _, solution, base in (found(16, 4), found(64, 16)))
     assert np.median(coarse) > 1e-6
     assert np.median(fine) < np.median(coarse) / 30

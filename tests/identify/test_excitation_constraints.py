@@ -39,7 +39,7 @@ def test_worst_is_what_the_robot_says(robot, seed):
     worst = {w.name: w for w in MotionConstraints(robot, SCENARIO).worst(trajectory, t)}
     seen = measure(robot, trajectory.pose(t))
     fine = 1e-4
-    rates = (robot.inverse_kinematics(trajectory.pose(t + fine)) - robot.inverse_kinematics(trajectory.pose(t - fine)))
+    rates = robot.inverse_kinematics(trajectory.pose(t + fine)) - robot.inverse_kinematics(trajectory.pose(t - fine))
     assert worst["travel"].value == pytest.approx(np.abs(seen.theta).max(), rel=1e-9)
     assert worst["travel"].limit == pytest.approx(robot.travel_limit - 0.1)
     assert worst["leverage"].value == pytest.approx(seen.leverage.min(), rel=1e-9)

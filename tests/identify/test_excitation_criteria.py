@@ -41,8 +41,12 @@ def drawn(robot, seed, scenario=SCENARIO):
     settings = scenario.excitation
     free = unknowns(robot.home_pose, settings)
     trajectory = random_trajectory(
-        np.random.default_rng(seed), robot.home_pose, settings.fundamental_hz, settings.harmonics,
-        settings.position_amplitude_m, settings.orientation_amplitude_rad,
+        np.random.default_rng(seed),
+        robot.home_pose,
+        settings.fundamental_hz,
+        settings.harmonics,
+        settings.position_amplitude_m,
+        settings.orientation_amplitude_rad,
     )
     return free, free.of(trajectory), trajectory
 
@@ -136,7 +140,10 @@ def test_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
     parameters = robot.parameter_sets["initial"].vector.copy()
     parameters[VISCOUS] = 0.5  # without friction the loop rings longer than a period
     run = simulate(
-        robot, parameters, reference_motion(trajectory, frame_times(scenario, 20.0)), model_settings(scenario),
+        robot,
+        parameters,
+        reference_motion(trajectory, frame_times(scenario, 20.0)),
+        model_settings(scenario),
         sensitivities=True,
     )
     s, t = harmonics(free), run.time[6000:]
@@ -145,8 +152,16 @@ def test_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
     parts = np.array(ca.Function("spectrum", [unknown], [spectrum])(z)).reshape(67, len(s), 2, 6)
     waves = np.exp(np.outer(s, t))
     expected = np.einsum("pkj,kt->tjp", parts[:, :, 0] + 1j * parts[:, :, 1], waves).real
-    for name in ("platform.mass", "platform.Ixx", "crank1.Izz", "link2.mass", "joint3.viscous", "joint_pid.lp",
-                 "joint_pid.li", "joint_pid.ld"):
+    for name in (
+        "platform.mass",
+        "platform.Ixx",
+        "crank1.Izz",
+        "link2.mass",
+        "joint3.viscous",
+        "joint_pid.lp",
+        "joint_pid.li",
+        "joint_pid.ld",
+    ):
         column = index_of(name)
         seen = run.pose_sensitivity[6000:, :, column]
         seen, linear = seen - seen.mean(axis=0), expected[:, :, column]
@@ -161,7 +176,10 @@ def test_information_is_the_determinant_of_rows_and_prior(robot, known, prior):
     for name, (value, deviation) in prior.items():
         values[NAMES.index(name)], std[NAMES.index(name)] = value, deviation
     run = simulate(
-        robot, values, reference_motion(trajectory, frame_times(SCENARIO, 10.0)), model_settings(SCENARIO),
+        robot,
+        values,
+        reference_motion(trajectory, frame_times(SCENARIO, 10.0)),
+        model_settings(SCENARIO),
         sensitivities=True,
     )
     eigenvalues, vectors = np.linalg.eigh(known.covariance)

@@ -41,16 +41,25 @@ def test_arrays_are_told_apart_by_name_shape_and_number_alone():
     values = np.array([[1.0, np.nan], [3.0, 4.0]])
     known = array_digest({"a": values, "b": np.zeros(2)})
     assert array_digest({"b": np.zeros(2, dtype=np.int8), "a": np.asfortranarray(values)}) == known
-    for other in ({"a": values}, {"a": values, "c": np.zeros(2)}, {"a": values.ravel(), "b": np.zeros(2)},
-                  {"a": np.nextafter(values, 9), "b": np.zeros(2)}, {"a": values.T, "b": np.zeros(2)}):
+    for other in (
+        {"a": values},
+        {"a": values, "c": np.zeros(2)},
+        {"a": values.ravel(), "b": np.zeros(2)},
+        {"a": np.nextafter(values, 9), "b": np.zeros(2)},
+        {"a": values.T, "b": np.zeros(2)},
+    ):
         assert array_digest(other) != known
 
 
 def test_a_record_is_the_same_wherever_and_whenever_it_was_written(record, tmp_path):
     """Nor does it matter which estimator its scenario named: the record was made without."""
     write(tmp_path / "one.nc", record)
-    later = record.assign_attrs(created="later", record_seconds=3.0, title="mine", scenario=SCENARIO.with_overrides(
-        {"identification.method": "command_driven"}).to_toml())
+    later = record.assign_attrs(
+        created="later",
+        record_seconds=3.0,
+        title="mine",
+        scenario=SCENARIO.with_overrides({"identification.method": "command_driven"}).to_toml(),
+    )
     write(tmp_path / "two.nc", later)
     known = {record_digest(one) for one in (record, later, read(tmp_path / "one.nc"), read(tmp_path / "two.nc"))}
     assert len(known) == 1
@@ -134,8 +143,9 @@ def truth_as_long_as(record):
     """Of the record's length; nothing here reads its numbers."""
     count = record.sizes["time"]
     joints = {name: np.zeros((count, 6)) for name in ("joint_angle", "joint_velocity", "joint_torque")}
-    return build_truth(time=record["time"].values, pose=np.zeros((count, 6)), parameter_names=list(NAMES),
-                       parameters=truth(), **joints)
+    return build_truth(
+        time=record["time"].values, pose=np.zeros((count, 6)), parameter_names=list(NAMES), parameters=truth(), **joints
+    )
 
 
 @pytest.fixture
@@ -150,12 +160,16 @@ def run(tmp_path, record):
 
 def identified(run, **estimates):
     """The result as `identify` leaves it, with these estimates instead of the true parameters."""
-    parameters = {name: {"initial": value, "estimate": estimates.get(name, value)}
-                  for name, value in zip(NAMES, truth(), strict=True)}
+    parameters = {
+        name: {"initial": value, "estimate": estimates.get(name, value)}
+        for name, value in zip(NAMES, truth(), strict=True)
+    }
     write_covariance(run.covariance, NAMES, np.eye(len(NAMES)))
     made_of = file_digests(run, "experiment.nc", "covariance.nc")
-    save_result(run.result, {"seconds": {}, "before": {}, "after": {}, "identification": {"parameters": parameters},
-                             ENTRY: made_of})
+    save_result(
+        run.result,
+        {"seconds": {}, "before": {}, "after": {}, "identification": {"parameters": parameters}, ENTRY: made_of},
+    )
 
 
 def test_identification_states_what_it_read_and_wrote(run, record):
@@ -198,12 +212,18 @@ def test_unseen_runs_that_were_replaced_show_no_variation(run, record, capsys):
         (lambda r: r.clear(), "lacks identification, before, after, seconds; write it with: cmmsim identify"),
         (lambda r: r.update(identification=[]), "identification has no parameters"),
         (lambda r: r["identification"]["parameters"].pop("link3.mass"), "initial of link3.mass is null, must be"),
-        (lambda r: r["identification"]["parameters"]["link3.mass"].update(estimate=None),
-         "estimate of link3.mass is null, must be a number"),
-        (lambda r: r["identification"]["parameters"]["link3.mass"].update(estimate="1 kg"),
-         'estimate of link3.mass is "1 kg", must be a number'),
-        (lambda r: r["identification"]["parameters"]["platform.mass"].update(estimate=-5),
-         "estimate: platform.mass = -5 kg is not allowed"),
+        (
+            lambda r: r["identification"]["parameters"]["link3.mass"].update(estimate=None),
+            "estimate of link3.mass is null, must be a number",
+        ),
+        (
+            lambda r: r["identification"]["parameters"]["link3.mass"].update(estimate="1 kg"),
+            'estimate of link3.mass is "1 kg", must be a number',
+        ),
+        (
+            lambda r: r["identification"]["parameters"]["platform.mass"].update(estimate=-5),
+            "estimate: platform.mass = -5 kg is not allowed",
+        ),
         (lambda r: r["identification"]["parameters"]["joint_pid.li"].update(initial=0), "initial: joint_pid.li"),
         (lambda r: r.update(made_of=7), "made_of must be digests"),
     ],

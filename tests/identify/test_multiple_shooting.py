@@ -17,8 +17,11 @@ from identify.estimation.record_segments import STATES, end_state, measured_stat
 from identify.progress import SilentProgress
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
 
-SMOOTHED = {f"{side}.{key}": value for side in ("plant", "model") for key, value in
-            (("friction", "smoothed"), ("smoothing_velocity_rad_s", 0.05))}
+SMOOTHED = {
+    f"{side}.{key}": value
+    for side in ("plant", "model")
+    for key, value in (("friction", "smoothed"), ("smoothing_velocity_rad_s", 0.05))
+}
 
 
 def silent(n=1):
@@ -164,7 +167,7 @@ def test_the_bar_moves_with_every_iteration_and_ends_full():
     unstable, problem = with_unstable_guess(problem)
     progress = Stages()
     found = shoot(problem, scenario, unstable, progress)
-    (name, total, steps), = progress.seen
+    ((name, total, steps),) = progress.seen
     assert (name, total, sum(steps)) == ("multiple shooting", 3, 3)
     assert found.iterations >= 2
     assert steps[: found.iterations] == [1] * found.iterations

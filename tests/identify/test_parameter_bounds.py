@@ -100,8 +100,11 @@ def test_the_nearest_parameters_are_within_the_bounds_and_physical_ones_stay():
     physical_inertias(near[:64])
     changed = {NAMES[k] for k in np.flatnonzero(np.abs(near - initial) > 1e-9)}
     assert changed
-    assert changed <= {f"{body}{leg}.{moment}" for leg in range(1, 7) for body, moment in
-                       (("crank", "Ixx"), ("crank", "Iyy"), ("link", "Izz"))}
+    assert changed <= {
+        f"{body}{leg}.{moment}"
+        for leg in range(1, 7)
+        for body, moment in (("crank", "Ixx"), ("crank", "Iyy"), ("link", "Izz"))
+    }
     assert np.allclose(bounds.nearest(near), near, rtol=1e-12)
     plain = parameter_bounds(StartingGuess(initial, initial), physical=False)
     assert np.array_equal(plain.nearest(initial), initial)

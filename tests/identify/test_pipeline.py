@@ -15,8 +15,17 @@ from identify.scenario import load_scenario
 
 pytestmark = [pytest.mark.slow, pytest.mark.rendering]
 
-FILES = {"scenario.toml", "trajectories.json", "experiment.nc", "covariance.nc", "result.json", "validation.nc",
-         "model.nc", "report.html", "figures"}
+FILES = {
+    "scenario.toml",
+    "trajectories.json",
+    "experiment.nc",
+    "covariance.nc",
+    "result.json",
+    "validation.nc",
+    "model.nc",
+    "report.html",
+    "figures",
+}
 
 
 def cmmsim(*arguments, **environment):
@@ -59,8 +68,13 @@ def test_the_result_has_every_entry_of_the_contract(run):
     assert result["scenario"] == name
     assert result["seed"] == 0
     assert {"excite", "record", "identify", "validate", "report", "total"} <= set(result["seconds"])
-    assert set(result["sensor"]) >= {"frames", "lost_frames", "stereo_frames_per_second", "position_rms_um",
-                                     "orientation_rms_urad"}
+    assert set(result["sensor"]) >= {
+        "frames",
+        "lost_frames",
+        "stereo_frames_per_second",
+        "position_rms_um",
+        "orientation_rms_urad",
+    }
     identification = result["identification"]
     assert identification["scale_anchor"] == "platform_mass"
     assert len(identification["parameters"]) == 67

@@ -35,9 +35,7 @@ def test_where_nothing_can_be_predicted_nothing_is_said():
     good, plant_29hz = run_plant(slow, 0, duration_s=8.0)
     with pytest.raises(LoopFailure, match="the loop is unstable"):
         recorded_run(good, rss6(), slow).model_poses(unstable)
-    for scenario, record, parameters, true in (
-        (quick(), dark, truth(), plant), (slow, good, unstable, plant_29hz)
-    ):
+    for scenario, record, parameters, true in ((quick(), dark, truth(), plant), (slow, good, unstable, plant_29hz)):
         (prediction,) = predicted_runs(rss6(), scenario, [record], parameters, known, 0, SilentProgress())
         assert prediction.std.shape == (record.sizes["time"], 6)
         assert np.isnan(prediction.std).all()
@@ -50,9 +48,7 @@ def test_what_cannot_be_asked_is_no_prediction_of_nothing():
     record, _ = run_plant(quick(), 0, duration_s=1.0)
 
     def predicted(record, parameters, **scenario):
-        return predicted_runs(
-            rss6(), quick(**scenario), [record], parameters, np.zeros((67, 67)), 0, SilentProgress()
-        )
+        return predicted_runs(rss6(), quick(**scenario), [record], parameters, np.zeros((67, 67)), 0, SilentProgress())
 
     with pytest.raises(EstimationError, match="is of robot 'rss7', not of 'rss6'"):
         predicted(record.assign_attrs(robot="rss7"), truth())
@@ -95,8 +91,6 @@ def test_the_error_on_unseen_motions_is_the_one_predicted():
         for unseen in (2 * seed, 2 * seed + 1):
             record, plant = run_plant(scenario, seed=100 + unseen, trajectory_seed=50 + unseen, duration_s=5.0)
             rng = np.random.default_rng(unseen)
-            prediction = predict_poses(
-                recorded_run(record, rss6(), scenario), result.estimate, result.covariance, rng
-            )
+            prediction = predict_poses(recorded_run(record, rss6(), scenario), result.estimate, result.covariance, rng)
             ratios.append(prediction.normalised_squared_error(plant.pose))
     assert 0.8 < np.mean(ratios) < 1.2, ratios

@@ -30,8 +30,9 @@ def test_no_two_streams_draw_the_same(seed):
     generators["TEACHING"] = np.random.default_rng(stream_seed(seed, random_streams.TEACHING))
     generators |= {f"NOISE {run}": np.random.default_rng(child(seed, random_streams.NOISE, run)) for run in (0, 1)}
     generators |= {name: mixed_generator(getattr(random_streams, name), seed) for name in MIXED}
-    generators |= {name: mixed_generator(getattr(random_streams, name)) for name in ("ROUTES_UNCERTAINTY",
-                                                                                     "DISTURBED_COPIES")}
+    generators |= {
+        name: mixed_generator(getattr(random_streams, name)) for name in ("ROUTES_UNCERTAINTY", "DISTURBED_COPIES")
+    }
     drawn = {name: generator.integers(2**63) for name, generator in generators.items()}
     assert len(set(drawn.values())) == len(drawn), drawn
 

@@ -72,34 +72,68 @@ def without(record, name):
         (lambda r: r.assign_coords(time=r["time"].where(r["time"] > 1)), EstimationError, "nan periods of 60"),
         (lambda r: r.assign_coords(time=r["time"] * 1.01), EstimationError, r"1.010 periods of 60 Hz"),
         (unknown_covariance, EstimationError, "measured_covariance is not finite in 1 frames .*first is frame 7"),
-        (one_triangle, EstimationError,
-         r"not symmetric in 1 frames: in frame 9 its entry .z, gamma. is 7.5e-11 and .gamma, z. is 0"),
+        (
+            one_triangle,
+            EstimationError,
+            r"not symmetric in 1 frames: in frame 9 its entry .z, gamma. is 7.5e-11 and .gamma, z. is 0",
+        ),
         (dead_command, EstimationError, "command of joint 2 is not finite in 1 frames .*first is frame 8"),
-        (lambda r: without(r, "scenario"), RecordError,
-         r"no attribute scenario, .*record.attrs\['scenario'\] = scenario.to_toml\(\), .*identify.build_record"),
+        (
+            lambda r: without(r, "scenario"),
+            RecordError,
+            r"no attribute scenario, .*record.attrs\['scenario'\] = scenario.to_toml\(\), .*identify.build_record",
+        ),
         (lambda r: r.assign_attrs(scenario=7), RecordError, "attribute scenario is 7, must be TOML text"),
         (lambda r: r.assign_attrs(scenario="paper"), RecordError, "attribute scenario is not valid TOML"),
         (lambda r: r.assign_attrs(scenario="description = 'mine'"), RecordError, "attribute scenario: name is missing"),
         (lambda r: r.assign_attrs(seed="abc"), RecordError, "attribute seed is 'abc', must be a whole number >= 0"),
         (lambda r: r.assign_attrs(seed=-1), RecordError, "attribute seed is -1, must be"),
         (lambda r: r.assign_attrs(seed=np.int64(-2)), RecordError, "attribute seed is -2, must be"),
-        (lambda r: r.assign_attrs(frame_rate_hz=30.0), EstimationError,
-         "contradicts itself: its attribute frame_rate_hz is 30.0, and timing.frame_rate_hz .* is 60"),
+        (
+            lambda r: r.assign_attrs(frame_rate_hz=30.0),
+            EstimationError,
+            "contradicts itself: its attribute frame_rate_hz is 30.0, and timing.frame_rate_hz .* is 60",
+        ),
         (lambda r: r.assign_attrs(frame_rate_hz="60 Hz"), EstimationError, "attribute frame_rate_hz is '60 Hz', and"),
         (lambda r: r.assign_attrs(seed=True), RecordError, "attribute seed is True, must be"),
         (lambda r: r.assign_attrs(seed=np.nan), RecordError, "attribute seed is nan, must be"),
         (lambda r: r.assign(reference_position=r["reference_position"].where(r["time"] > 1)), DynamicsError, "is nan"),
         (standstill, EstimationError, "same pose in every frame: nothing was asked to move"),
         (alias, EstimationError, "the reference's x travels 0.01, .*harmonics above half of 60 Hz"),
-        (lambda r: with_values(r, reference_velocity=1e3 * r["reference_velocity"].values), EstimationError,
-         "or the rate is not its derivative"),
+        (
+            lambda r: with_values(r, reference_velocity=1e3 * r["reference_velocity"].values),
+            EstimationError,
+            "or the rate is not its derivative",
+        ),
         (lambda r: r.assign(measured_position=1e3 * r["measured_position"]), DynamicsError, "cannot reach"),
     ],
-    ids=["channel", "channels", "empty", "one frame", "time NaN", "rate", "covariance NaN",
-         "covariance in one triangle", "command NaN", "no scenario", "scenario a number", "scenario a name",
-         "scenario without name", "seed a word", "seed negative", "seed of numpy", "other rate", "rate a word",
-         "seed a truth value", "seed NaN", "reference NaN",
-         "standstill", "alias", "rate not in m/s", "millimetres"],
+    ids=[
+        "channel",
+        "channels",
+        "empty",
+        "one frame",
+        "time NaN",
+        "rate",
+        "covariance NaN",
+        "covariance in one triangle",
+        "command NaN",
+        "no scenario",
+        "scenario a number",
+        "scenario a name",
+        "scenario without name",
+        "seed a word",
+        "seed negative",
+        "seed of numpy",
+        "other rate",
+        "rate a word",
+        "seed a truth value",
+        "seed NaN",
+        "reference NaN",
+        "standstill",
+        "alias",
+        "rate not in m/s",
+        "millimetres",
+    ],
 )
 def test_what_is_wrong_with_a_record_is_said(record, spoil, error, says):
     with pytest.raises(error, match=says):
@@ -137,8 +171,10 @@ def test_a_record_need_not_repeat_the_frame_rate_of_its_scenario(record):
 
 
 def test_a_reference_that_moves_one_way_only_is_no_fault(record):
-    one_way = {"reference_position": record["reference_position"].values * [1, 0, 0] + [0, 0, 0.2],
-               "reference_velocity": record["reference_velocity"].values * [1, 0, 0]}
+    one_way = {
+        "reference_position": record["reference_position"].values * [1, 0, 0] + [0, 0, 0.2],
+        "reference_velocity": record["reference_velocity"].values * [1, 0, 0],
+    }
     recorded_run(with_values(record, **one_way), rss6(), quick())
 
 

@@ -76,8 +76,14 @@ def test_lost_frames_may_be_nan_and_only_they(make_record):
 
 
 @pytest.mark.parametrize(
-    ("name", "shape"), [("command", (120, 5)), ("measured_covariance", (120, 6)), ("measured_ok", (119,)),
-                        ("reference_pose", (6, 120)), ("measured_pose", (119, 6))],
+    ("name", "shape"),
+    [
+        ("command", (120, 5)),
+        ("measured_covariance", (120, 6)),
+        ("measured_ok", (119,)),
+        ("reference_pose", (6, 120)),
+        ("measured_pose", (119, 6)),
+    ],
 )
 def test_wrong_shape_is_named(make_record, name, shape):
     with pytest.raises(RecordError) as caught:
@@ -87,8 +93,11 @@ def test_wrong_shape_is_named(make_record, name, shape):
 
 @pytest.mark.parametrize(
     ("frames", "value", "says"),
-    [([5], 7, "it is 7 in frame 5$"), ([3, 9, 11], -1, "it is -1 in frame 3 and wrong in 2 more"),
-     ([0], np.nan, "it is nan in frame 0")],
+    [
+        ([5], 7, "it is 7 in frame 5$"),
+        ([3, 9, 11], -1, "it is -1 in frame 3 and wrong in 2 more"),
+        ([0], np.nan, "it is nan in frame 0"),
+    ],
 )
 def test_a_frame_was_measured_or_lost_and_nothing_else(make_record, frames, value, says):
     record = make_record()

@@ -60,9 +60,21 @@ def check_figures(folder):
 
 def test_report_shows_goals_parameters_and_the_papers_numbers(run_folder):
     text = render(read_report_data(run_folder))
-    for shown in ("All 10 goals are met.", "joint1.coulomb", "not identifiable", "1260", "1411", "platform_mass",
-                  "timing.frame_rate_hz", "diverged", "stopped by: tolerance", "joint1.coulomb, joint_pid.lp",
-                  "+0.9877", "2.0e+11 of the poses alone", "1 predicted std"):
+    for shown in (
+        "All 10 goals are met.",
+        "joint1.coulomb",
+        "not identifiable",
+        "1260",
+        "1411",
+        "platform_mass",
+        "timing.frame_rate_hz",
+        "diverged",
+        "stopped by: tolerance",
+        "joint1.coulomb, joint_pid.lp",
+        "+0.9877",
+        "2.0e+11 of the poses alone",
+        "1 predicted std",
+    ):
         assert shown in text, shown
 
 
@@ -86,8 +98,11 @@ def test_report_names_what_is_missed_and_escapes_text(run_folder):
 
 def test_every_axis_has_a_unit_and_every_panel_its_letter(run_folder, result):
     time, pose = np.arange(120) / 60, np.random.default_rng(0).normal(size=(120, 6))
-    for figure in (figures.excitation_figure(time, pose), figures.fit_figure(time, pose, pose, pose, "t"),
-                   figures.validation_figure(result["validation"])):
+    for figure in (
+        figures.excitation_figure(time, pose),
+        figures.fit_figure(time, pose, pose, pose, "t"),
+        figures.validation_figure(result["validation"]),
+    ):
         for axes in figure.axes:
             assert re.search(r"\[(mm|mrad|um|urad)\]", axes.get_ylabel()), axes.get_ylabel()
         assert "trajectory" in figure.axes[-1].get_xlabel() or figure.axes[-1].get_xlabel() == "time [s]"

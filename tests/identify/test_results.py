@@ -43,7 +43,10 @@ def test_result_file_is_standard_json_with_null_for_what_is_not_finite(tmp_path)
         raise AssertionError(f"{name} is no standard JSON")
 
     assert json.loads(path.read_text(), parse_constant=refuse) == {
-        "a": 1.5, "b": [None, None], "c": [0, 1], "d": {"e": True}
+        "a": 1.5,
+        "b": [None, None],
+        "c": [0, 1],
+        "d": {"e": True},
     }
     assert load_result(path)["a"] == 1.5
 
@@ -101,8 +104,14 @@ def test_missed_parameter_is_named(result):
 
 @pytest.mark.parametrize(
     ("estimate", "std", "inside"),
-    [(1.049, 0.0, True), (1.06, 0.0, False), (1.06, 0.021, True), (0.94, 0.019, False), (1.0, None, True),
-     (None, 0.1, False)],
+    [
+        (1.049, 0.0, True),
+        (1.06, 0.0, False),
+        (1.06, 0.021, True),
+        (0.94, 0.019, False),
+        (1.0, None, True),
+        (None, 0.1, False),
+    ],
 )
 def test_parameter_is_inside_by_five_percent_or_three_deviations(estimate, std, inside):
     assert within_tolerance({"true": 1.0, "estimate": estimate, "std": std}) is inside

@@ -42,8 +42,10 @@ def test_a_weighing_is_one_equation_in_standard_deviations():
         ({"scale_anchor_value": "23.5"}, r"scale_anchor_value is '23.5', must be"),
         ({"scale_anchor_std": 0.0}, r"scale_anchor_std is 0.0, must be a finite number > 0 in kg"),
         ({"scale_anchor_std": -0.005}, r"scale_anchor_std is -0.005, must be"),
-        ({"scale_anchor": "joint_gain", "scale_anchor_std": np.nan},
-         r"scale_anchor_std is nan, must be a finite number > 0 in N m/rad.*joint_gain measures joint_pid.lp"),
+        (
+            {"scale_anchor": "joint_gain", "scale_anchor_std": np.nan},
+            r"scale_anchor_std is nan, must be a finite number > 0 in N m/rad.*joint_gain measures joint_pid.lp",
+        ),
         ({"scale_anchor": "guess"}, r"no scale anchor .*found 'guess'; valid anchors: platform_mass"),
     ],
     ids=["negative", "of numpy", "zero", "NaN", "infinite", "text", "std zero", "std negative", "std NaN", "unknown"],

@@ -30,7 +30,10 @@ def test_quick_scenario_differs_only_in_what_takes_time():
     sections = [section for section in paper if isinstance(paper[section], dict)]
     differing = {f"{s}.{k}" for s in sections for k in paper[s] if paper[s][k] != quick[s][k]}
     assert differing == {
-        "excitation.duration_s", "excitation.candidates", "excitation.method", "validation.count",
+        "excitation.duration_s",
+        "excitation.candidates",
+        "excitation.method",
+        "validation.count",
         "validation.duration_s",
     }
 

@@ -43,13 +43,30 @@ def study(**options):
 def process(*arguments, before=ROOT):
     """A process of this Python, in a group of its own; what is in the folder `before` it finds first."""
     environment = os.environ | {"PYTHONPATH": f"{before}:{ROOT}"}
-    return subprocess.Popen([sys.executable, *map(str, arguments)], cwd=before, env=environment, start_new_session=True,
-                            stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        [sys.executable, *map(str, arguments)],
+        cwd=before,
+        env=environment,
+        start_new_session=True,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
 
 
 def worker(address, folder, before=ROOT):
-    return process("-m", "distributed.cli.dask_worker", address, "--no-nanny", "--nthreads", 1, "--no-dashboard",
-                   "--local-directory", folder, before=before)
+    return process(
+        "-m",
+        "distributed.cli.dask_worker",
+        address,
+        "--no-nanny",
+        "--nthreads",
+        1,
+        "--no-dashboard",
+        "--local-directory",
+        folder,
+        before=before,
+    )
 
 
 def other_versions(folder, **packages):
@@ -72,8 +89,17 @@ def wait_for(condition, what):
 def cluster(folder, workers, before=ROOT):
     """A scheduler and workers, each a process of its own: address, scheduler, workers; `before`: see `process`."""
     file = folder / "scheduler.json"
-    scheduler = process("-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard",
-                        "--scheduler-file", file)
+    scheduler = process(
+        "-m",
+        "distributed.cli.dask_scheduler",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        0,
+        "--no-dashboard",
+        "--scheduler-file",
+        file,
+    )
     there = []
     try:
         wait_for(lambda: file.exists() and file.read_text().endswith("}"), "scheduler")

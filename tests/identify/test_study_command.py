@@ -88,10 +88,13 @@ def test_failed_rows_make_an_exit_status_of_their_own(tmp_path, undrawn, capsys)
     assert frame["error"].ne("").tolist() == [False, True, False, False]
 
 
-@pytest.mark.parametrize(("law", "status"), [
-    ("exponent = 3.0", study_command.A_LAW_FAILED),
-    ("exponent = 0.0", 0),
-])
+@pytest.mark.parametrize(
+    ("law", "status"),
+    [
+        ("exponent = 3.0", study_command.A_LAW_FAILED),
+        ("exponent = 0.0", 0),
+    ],
+)
 def test_a_law_that_fails_makes_an_exit_status_of_its_own(tmp_path, capsys, law, status):
     """The figure is the standard deviation of 1,000 normal numbers, whatever the factor."""
     theory = f'[[theory]]\nfigure = "spread_um"\nfactor = "sensor.camera.dark_noise"\n{law}\n'
@@ -141,8 +144,12 @@ def test_kinds_are_listed_with_their_options_and_figures(capsys):
     assert "\nIt reads scenario.*, sensor.rig.*, " in shown
     lines = [line.split() for line in shown.splitlines() if line]
     for kind in rows.KINDS.values():
-        assert all([name, column.unit] == [line[0], line[1]] for name, column in kind.columns.items()
-                   for line in lines if line[0] == name and column.unit not in ("1", "grey values", "N m"))
+        assert all(
+            [name, column.unit] == [line[0], line[1]]
+            for name, column in kind.columns.items()
+            for line in lines
+            if line[0] == name and column.unit not in ("1", "grey values", "N m")
+        )
         assert {*kind.columns, *(f"options.{name}" for name in kind.options.model_fields)} <= {one[0] for one in lines}
     assert ["options.stretch_s", "0.5", "s"] in [line[:3] for line in lines]
 

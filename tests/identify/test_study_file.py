@@ -48,7 +48,10 @@ def test_a_grid_has_every_combination_once_a_repeat_the_last_factor_fastest():
     rows = cases(study(repeats=2))
     assert [row.number for row in rows] == list(range(8))
     assert [tuple(row.factors.values()) for row in rows[:4]] == [
-        (13.0, "registration"), (13.0, "planes"), (26.0, "registration"), (26.0, "planes"),
+        (13.0, "registration"),
+        (13.0, "planes"),
+        (26.0, "registration"),
+        (26.0, "planes"),
     ]
     assert [row.repeat for row in rows] == [0] * 4 + [1] * 4
     assert [row.factors for row in rows[:4]] == [row.factors for row in rows[4:]]
@@ -70,7 +73,8 @@ def test_changes_hold_in_every_row_and_factors_in_their_own():
     for case in cases(study()):
         scenario = setup.row_scenario(case)
         assert scenario.sensor_changes == {
-            "rig.baseline": 0.8, "camera.dark_noise": case.factors["sensor.camera.dark_noise"],
+            "rig.baseline": 0.8,
+            "camera.dark_noise": case.factors["sensor.camera.dark_noise"],
         }
         assert (scenario.filter.order, scenario.pose_method) == (4, case.factors["scenario.pose_method"])
 
@@ -106,9 +110,18 @@ def test_a_sample_is_spread_as_its_factors_say():
 
 def test_every_key_of_a_sensor_has_its_unit_or_needs_none():
     """So that a new key is not drawn without its unit, and no unit stands for a key that is gone."""
-    without = {"timing.dropout", "camera.noise", "camera.prnu", "camera.pattern_seed", "lens.vignetting",
-               "stickers.placement_seed", "stickers.per_plane", "rig.left.distortion", "rig.right.distortion",
-               *(f"stickers.{what}_level" for what in ("sticker", "ring", "body", "obstacle", "background"))}
+    without = {
+        "timing.dropout",
+        "camera.noise",
+        "camera.prnu",
+        "camera.pattern_seed",
+        "lens.vignetting",
+        "stickers.placement_seed",
+        "stickers.per_plane",
+        "rig.left.distortion",
+        "rig.right.distortion",
+        *(f"stickers.{what}_level" for what in ("sticker", "ring", "body", "obstacle", "background")),
+    }
     sections = ("timing", "rig", "camera", "lens", "stickers")
     keys = {path.removeprefix("sensor.") for path in valid_keys(None) if path.startswith("sensor.")}
     assert {key for key in keys if key.partition(".")[0] in sections} == {*SENSOR_UNITS} | without
@@ -136,8 +149,10 @@ def test_built_in_studies_can_all_be_run():
         (toml("sample = 5", factors="sensor.rig.baseline = { low = 1.0, high = inf }"), ["high: inf is no finite"]),
         (toml("sample = 5", factors="sensor.rig.baseline = { low = true, high = 2 }"), ["low: True is no finite"]),
         (toml("sample = 5", factors="sensor.rig.baseline = { low = 1.0, hgh = 2.0 }"), ["'hgh'", "low, high, scale"]),
-        (toml("sample = 5", factors='sensor.rig.baseline = { low = 1, high = 2, scale = "lg" }'),
-         ["sensor.rig.baseline", "scale = 'lg'", "'linear' or 'log'"]),
+        (
+            toml("sample = 5", factors='sensor.rig.baseline = { low = 1, high = 2, scale = "lg" }'),
+            ["sensor.rig.baseline", "scale = 'lg'", "'linear' or 'log'"],
+        ),
         ("name = 1 = 2", ["not valid TOML"]),
     ],
 )

@@ -50,8 +50,9 @@ def with_others(scenario, paths):
     file, left = read_sensor_file(scenario.sensor, scenario.sensor_changes), set()
     for path in paths:
         root, _, key = path.partition(".")
-        for value in others(reduce(getattr, key.split("."), scenario if root == "scenario" else file),
-                            valid_keys(None)[path].annotation):
+        for value in others(
+            reduce(getattr, key.split("."), scenario if root == "scenario" else file), valid_keys(None)[path].annotation
+        ):
             try:
                 scenario = scenario.with_overrides(overrides({path: value}))
                 break
@@ -73,8 +74,14 @@ def with_others(scenario, paths):
 )
 def test_what_a_kind_does_not_read_changes_nothing_in_its_rows(kind, options):
     """All of it at once, each at another value, and not a digit of the row is another."""
-    given = {"renderer": "analytic", "timing.latency_s": 0.004, "timing.latency_jitter_s": 0.001,
-             "validation.duration_s": 0.5, "validation.count": 1, "identification.method": "command_driven"}
+    given = {
+        "renderer": "analytic",
+        "timing.latency_s": 0.004,
+        "timing.latency_jitter_s": 0.001,
+        "validation.duration_s": 0.5,
+        "validation.count": 1,
+        "identification.method": "command_driven",
+    }
     scenario, reads = load_scenario("quick").with_overrides(given), rows.find_kind(kind).reads
     unread = [path for path in valid_keys(None) if not reads.covers(path) and "prior." not in path]
     other, left = with_others(scenario, unread)
@@ -98,8 +105,10 @@ def test_what_a_held_pose_reads_acts_on_its_rows(path, value):
     assert rows.find_kind("static_pose").reads.covers(path)
     if path.startswith("options."):
         options |= {path.partition(".")[2]: value}
-    assert rows.run("static_pose", scenario.with_overrides(overrides({path: value})), np.random.SeedSequence(3),
-                    options) != one
+    assert (
+        rows.run("static_pose", scenario.with_overrides(overrides({path: value})), np.random.SeedSequence(3), options)
+        != one
+    )
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,12 @@ from identify.studies import row_sensor, rows
 from identify.studies.row_drawn_sensor import DrawnSensor
 from identify.studies.row_identification import prediction_figures
 
-NOISELESS = {"sensor_changes.camera.noise": False, "sensor_changes.camera.bit_depth": 12,
-             "sensor_changes.camera.gain": 2.08, "sensor_changes.camera.black_level": 256.0}
+NOISELESS = {
+    "sensor_changes.camera.noise": False,
+    "sensor_changes.camera.bit_depth": 12,
+    "sensor_changes.camera.gain": 2.08,
+    "sensor_changes.camera.black_level": 256.0,
+}
 
 
 def scenario(**overrides):

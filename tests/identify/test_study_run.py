@@ -87,7 +87,16 @@ def test_table_has_a_row_each_with_factors_seed_and_figures(whole):
     """Each row can be computed again from what the table says of it."""
     frame, paper = whole[1].frame, load_scenario("paper")
     assert list(frame.columns) == [
-        "row", "repeat", "seed_entropy", "seed_spawn_key", DARK, METHOD, "error_um", "spread_um", "rate_hz", "seconds",
+        "row",
+        "repeat",
+        "seed_entropy",
+        "seed_spawn_key",
+        DARK,
+        METHOD,
+        "error_um",
+        "spread_um",
+        "rate_hz",
+        "seconds",
         "error",
     ]
     assert frame["row"].tolist() == list(range(18))

@@ -20,9 +20,15 @@ POSITION, ORIENTATION = "position_rms_um", "orientation_rms_urad"
 
 
 def made_study(**changes):
-    settings = {"name": "made", "title": "Made up", "kind": "static_pose", "repeats": 8, "seed": 3,
-                "factors": {DARK: [10.0, 20.0, 40.0], BASELINE: [0.5, 1.0]},
-                "theory": [Law(figure=POSITION, factor=DARK, exponent=1.0)]}
+    settings = {
+        "name": "made",
+        "title": "Made up",
+        "kind": "static_pose",
+        "repeats": 8,
+        "seed": 3,
+        "factors": {DARK: [10.0, 20.0, 40.0], BASELINE: [0.5, 1.0]},
+        "theory": [Law(figure=POSITION, factor=DARK, exponent=1.0)],
+    }
     return Study(**settings | changes)
 
 
@@ -31,11 +37,21 @@ def made_table(study, failed=()):
     rng, count = np.random.default_rng(0), study.rows
     points = [(dark, base) for dark in study.factors[DARK] for base in study.factors[BASELINE]]
     dark, base = np.array([points[row % len(points)] for row in range(count)]).T
-    frame = pd.DataFrame({"row": range(count), "repeat": np.arange(count) // len(points), "seed_entropy": "3",
-                          "seed_spawn_key": range(count), DARK: dark, BASELINE: base,
-                          POSITION: 0.1 * dark * np.sqrt(rng.chisquare(12, count) / 12),
-                          ORIENTATION: 1.0 / base * np.sqrt(rng.chisquare(12, count) / 12),
-                          "lost_frames": 0.0, "seconds": 0.02, "error": ""})
+    frame = pd.DataFrame(
+        {
+            "row": range(count),
+            "repeat": np.arange(count) // len(points),
+            "seed_entropy": "3",
+            "seed_spawn_key": range(count),
+            DARK: dark,
+            BASELINE: base,
+            POSITION: 0.1 * dark * np.sqrt(rng.chisquare(12, count) / 12),
+            ORIENTATION: 1.0 / base * np.sqrt(rng.chisquare(12, count) / 12),
+            "lost_frames": 0.0,
+            "seconds": 0.02,
+            "error": "",
+        }
+    )
     for row in failed:
         frame.loc[row, [POSITION, ORIENTATION, "lost_frames"]] = np.nan
         frame.loc[row, "error"] = f"LostError: only {row % 2} stickers"
@@ -205,9 +221,18 @@ def test_law_against_a_figure_needs_no_factor(tmp_path):
     rng, count = np.random.default_rng(5), 60
     x = rng.uniform(1.0, 4.0, count)
     study = made_study(factors={}, repeats=count, theory=[Law(figure=POSITION, factor="sight_m", exponent=2.0)])
-    frame = pd.DataFrame({"row": range(count), "repeat": range(count), "seed_entropy": "3",
-                          "seed_spawn_key": range(count), "sight_m": x,
-                          POSITION: x**2 * np.sqrt(rng.chisquare(12, count) / 12), "seconds": 0.1, "error": ""})
+    frame = pd.DataFrame(
+        {
+            "row": range(count),
+            "repeat": range(count),
+            "seed_entropy": "3",
+            "seed_spawn_key": range(count),
+            "sight_m": x,
+            POSITION: x**2 * np.sqrt(rng.chisquare(12, count) / 12),
+            "seconds": 0.1,
+            "error": "",
+        }
+    )
     entry = summary.write(tmp_path, study, frame)
     assert entry["theory"][0]["verdict"] == "passed"
     assert (tmp_path / "figures" / "laws.png").exists()
@@ -217,9 +242,19 @@ def test_random_sample_is_summarised_as_a_whole_and_checked(tmp_path):
     rng, count = np.random.default_rng(4), 200
     study = made_study(sample=count, repeats=1, factors={DARK: Range(low=10.0, high=40.0), BASELINE: [0.5, 1.0]})
     dark = rng.uniform(10.0, 40.0, count)
-    frame = pd.DataFrame({"row": range(count), "repeat": 0, "seed_entropy": "3", "seed_spawn_key": range(count),
-                          DARK: dark, BASELINE: rng.choice([0.5, 1.0], count),
-                          POSITION: 0.1 * dark * np.sqrt(rng.chisquare(12, count) / 12), "seconds": 0.1, "error": ""})
+    frame = pd.DataFrame(
+        {
+            "row": range(count),
+            "repeat": 0,
+            "seed_entropy": "3",
+            "seed_spawn_key": range(count),
+            DARK: dark,
+            BASELINE: rng.choice([0.5, 1.0], count),
+            POSITION: 0.1 * dark * np.sqrt(rng.chisquare(12, count) / 12),
+            "seconds": 0.1,
+            "error": "",
+        }
+    )
     entry = summary.write(tmp_path, study, frame)
     assert [point["factors"] for point in entry["points"]] == [{}]
     assert entry["points"][0]["figures"][POSITION]["rows"] == count
@@ -230,8 +265,18 @@ def test_random_sample_is_summarised_as_a_whole_and_checked(tmp_path):
 def test_points_of_a_sample_stand_in_order_with_digits_to_read(tmp_path, undrawn):
     study = made_study(sample=3, repeats=2, factors={DARK: Range(low=10.0, high=40.0)}, theory=[])
     drawn = [31.23456789012345, 12.0, 25.5]
-    frame = pd.DataFrame({"row": range(6), "repeat": [0] * 3 + [1] * 3, "seed_entropy": "3", "seed_spawn_key": range(6),
-                          DARK: drawn * 2, POSITION: 1.0, "seconds": 0.1, "error": ""})
+    frame = pd.DataFrame(
+        {
+            "row": range(6),
+            "repeat": [0] * 3 + [1] * 3,
+            "seed_entropy": "3",
+            "seed_spawn_key": range(6),
+            DARK: drawn * 2,
+            POSITION: 1.0,
+            "seconds": 0.1,
+            "error": "",
+        }
+    )
     summary.write(tmp_path, study, frame)
     lines = (tmp_path / "summary.md").read_text().splitlines()
     assert [line.split("|")[1].strip() for line in lines[-3:]] == ["12", "25.5", "31.2346"]

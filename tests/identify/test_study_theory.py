@@ -19,14 +19,20 @@ def drawn(rng, exponent, rows=30, freedom=12, others=(1.0,)):
     """Rms errors of `freedom` normal numbers whose sigma is other * x ** exponent."""
     x, other = (a.ravel() for a in np.meshgrid(np.repeat(LEVELS, rows), others))
     squares = rng.chisquare(freedom, len(x)) / freedom
-    return pd.DataFrame({"row": range(len(x)), "x": x, "other": other, "error": "",
-                         "figure_um": other * x**exponent * np.sqrt(squares)})
+    return pd.DataFrame(
+        {"row": range(len(x)), "x": x, "other": other, "error": "", "figure_um": other * x**exponent * np.sqrt(squares)}
+    )
 
 
 def study(*laws, factors=("x",), **settings):
     values = {"x": LEVELS.tolist(), "other": [1.0, 5.0], "method": ["good", "bad"]}
-    return Study(name="made", kind="module:function", factors={name: values[name] for name in factors},
-                 theory=list(laws), **settings)
+    return Study(
+        name="made",
+        kind="module:function",
+        factors={name: values[name] for name in factors},
+        theory=list(laws),
+        **settings,
+    )
 
 
 def verdict(law, frame, **settings):
@@ -76,8 +82,10 @@ def test_few_rows_decide_nothing_in_favour_but_can_refute():
 
 def test_mean_square_scales_right_though_the_figures_distribution_changes_with_the_factor():
     rng = np.random.default_rng(5)
-    parts = [drawn(rng, -1.0, rows=400, freedom=freedom).query(f"x == {level}")
-             for level, freedom in zip(LEVELS, (1, 2, 6, 30), strict=True)]
+    parts = [
+        drawn(rng, -1.0, rows=400, freedom=freedom).query(f"x == {level}")
+        for level, freedom in zip(LEVELS, (1, 2, 6, 30), strict=True)
+    ]
     frame = pd.concat(parts)
     straight_line = np.polyfit(np.log(frame["x"]), np.log(frame["figure_um"]), 1)[0]
     assert straight_line > -0.8
@@ -115,8 +123,12 @@ def test_figures_that_must_be_equal():
 )
 def test_order_of_a_factors_values(good, bad, expected):
     rng = np.random.default_rng(9)
-    frame = pd.concat([drawn(rng, 0.0).assign(method=name, figure_um=lambda f, s=scale: s * f["figure_um"])
-                       for name, scale in (("good", good), ("bad", bad))])
+    frame = pd.concat(
+        [
+            drawn(rng, 0.0).assign(method=name, figure_um=lambda f, s=scale: s * f["figure_um"])
+            for name, scale in (("good", good), ("bad", bad))
+        ]
+    )
     law = Law(figure="figure_um", factor="method", order=["good", "bad"])
     found = verdict(law, frame, factors=("x", "method"))
     assert found.verdict == expected
@@ -131,10 +143,13 @@ def test_rows_that_failed_do_not_count():
     assert verdict(power(1.0), ruined).verdict == "passed"
 
 
-@pytest.mark.parametrize(("law", "reason"), [
-    (Law(figure="figur_um", factor="x", exponent=1.0), "no figure 'figur_um'; they have row, x"),
-    (Law(figure="figure_um", factor="y", exponent=1.0), "no factor or figure 'y'"),
-])
+@pytest.mark.parametrize(
+    ("law", "reason"),
+    [
+        (Law(figure="figur_um", factor="x", exponent=1.0), "no figure 'figur_um'; they have row, x"),
+        (Law(figure="figure_um", factor="y", exponent=1.0), "no factor or figure 'y'"),
+    ],
+)
 def test_law_of_what_the_rows_do_not_have_is_undecided_with_the_reason(law, reason):
     found = verdict(law, drawn(np.random.default_rng(11), 1.0))
     assert found.verdict == "undecided"
@@ -160,13 +175,16 @@ def test_regression_needs_more_rows_than_coefficients():
         scale_regression(np.ones(2), np.array([[1.0, 0.0], [1.0, 1.0]]))
 
 
-@pytest.mark.parametrize(("fields", "message"), [
-    ({"factor": "x"}, "states one of exponent, equals and order, got none"),
-    ({"factor": "x", "exponent": 1.0, "equals": "other"}, "got exponent, equals"),
-    ({"exponent": 1.0}, "needs a factor"),
-    ({"equals": "other", "factor": "x"}, "has no factor"),
-    ({"factor": "x", "order": ["one"]}, "two values"),
-])
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"factor": "x"}, "states one of exponent, equals and order, got none"),
+        ({"factor": "x", "exponent": 1.0, "equals": "other"}, "got exponent, equals"),
+        ({"exponent": 1.0}, "needs a factor"),
+        ({"equals": "other", "factor": "x"}, "has no factor"),
+        ({"factor": "x", "order": ["one"]}, "two values"),
+    ],
+)
 def test_law_states_one_thing(fields, message):
     with pytest.raises(ValidationError, match=message):
         Law(figure="figure_um", **fields)

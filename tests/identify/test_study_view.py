@@ -17,8 +17,13 @@ DARK, METHOD = "sensor.camera.dark_noise", "scenario.pose_method"
 
 def table(figures=("position_rms_um",), **entries):
     """A study and its table; row n has n in each figure."""
-    settings = {"name": "mine", "title": "Mine", "kind": "static_pose", "repeats": 2,
-                "factors": {DARK: [13.0, 26.0, 52.0], METHOD: ["registration", "planes"]}}
+    settings = {
+        "name": "mine",
+        "title": "Mine",
+        "kind": "static_pose",
+        "repeats": 2,
+        "factors": {DARK: [13.0, 26.0, 52.0], METHOD: ["registration", "planes"]},
+    }
     study = Study(**settings | entries)
     done = [Finished(row, dict.fromkeys(figures, float(row)), 0.5) for row in range(study.rows)]
     return tidy_table(study, done), study
@@ -27,7 +32,12 @@ def table(figures=("position_rms_um",), **entries):
 def test_figures_and_factors_carry_their_units():
     view = to_xarray(*table(figures=("position_rms_um", "stickers")))
     assert {name: view[name].attrs.get("units") for name in view.variables} == {
-        "position_rms_um": "um", "stickers": None, "seconds": "s", DARK: "electrons", METHOD: None, "repeat": None,
+        "position_rms_um": "um",
+        "stickers": None,
+        "seconds": "s",
+        DARK: "electrons",
+        METHOD: None,
+        "repeat": None,
     }
 
 

@@ -20,7 +20,13 @@ ALL = bool(os.environ.get("ALL_VARIATION"))
 RUNS = 10 if ALL else 3
 
 IDENTIFIED = {
-    "platform.mass", "platform.Ixx", "platform.Iyy", "platform.Izz", "joint_pid.lp", "joint_pid.li", "joint_pid.ld",
+    "platform.mass",
+    "platform.Ixx",
+    "platform.Iyy",
+    "platform.Izz",
+    "joint_pid.lp",
+    "joint_pid.li",
+    "joint_pid.ld",
     *(f"link{leg}.mass" for leg in range(1, 7)),
     *(f"joint{leg}.{law}" for leg in range(1, 7) for law in ("coulomb", "viscous")),
 }
