@@ -1,6 +1,5 @@
 """Synthetic stereo optical CMM: renders a posed platform with stickers, and measures its pose from the images."""
 
-from cmmsim.camera import PinholeCamera
 from cmmsim.errors import (
     CmmError,
     LostError,
@@ -12,19 +11,20 @@ from cmmsim.errors import (
     UnknownOptionError,
     UnknownSensorError,
 )
-from cmmsim.estimator import PoseEstimator, measure_frame
 from cmmsim.faults import FaultGenerator, fault_bodies
 from cmmsim.faulty_images import Fault, FaultyImages
-from cmmsim.images import StereoFrame
-from cmmsim.measurement import Measurement
-from cmmsim.pose import pose_to_transform, transform_to_pose
-from cmmsim.render import require_opengl
-from cmmsim.scene import rod, rod_transform
+from cmmsim.files.sensor_file import built_in_names
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.pose import pose_to_transform, transform_to_pose
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.imaging.pyrender_renderer import require_opengl
+from cmmsim.imaging.scene import rod, rod_transform
+from cmmsim.pose_estimation.estimator import PoseEstimator, measure_frame
+from cmmsim.pose_estimation.measurement import Measurement
+from cmmsim.pose_estimation.taught import Taught
+from cmmsim.radiometry.images import StereoFrame
 from cmmsim.sensor import Sensor, load_sensor
-from cmmsim.sensor_file import built_in_names
-from cmmsim.stereo_rig import StereoRig
-from cmmsim.taught import Taught
-from cmmsim.tracking import Tracker
+from cmmsim.tracker import Tracker
 
 __all__ = [
     "CmmError",

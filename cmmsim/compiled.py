@@ -35,5 +35,5 @@ def compiled(function: F) -> Dispatcher[F]:
 @lru_cache(maxsize=1)
 def _stamp() -> str:
     """Changes when any kernel changes."""
-    files = sorted(Path(__file__).parent.glob("*_kernel.py"))
+    files = sorted(Path(__file__).parent.rglob("*_kernel.py"))
     return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()

@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.cramer_rao import cramer_rao_bound
-from cmmsim.detected_centres import DetectedCentres
-from cmmsim.detectors import DETECTORS, Detector
+from cmmsim.detection.cramer_rao import cramer_rao_bound
+from cmmsim.detection.detected_centres import DetectedCentres
+from cmmsim.detection.detectors import DETECTORS, Detector
+from cmmsim.detection.ellipse_fit import FitLimits
 from cmmsim.drawn_discs import Condition, Scene, draw_discs, random_ellipses
-from cmmsim.ellipse_fit import FitLimits
 from cmmsim.errors import CmmError
-from cmmsim.noise import CameraNoise
-from cmmsim.pose import Array
+from cmmsim.geometry.pose import Array
+from cmmsim.radiometry.noise import CameraNoise
 
 FREE_PX = 3  # px between a disc's rim and the side of the part that is looked at
 RESAMPLES, CONFIDENCE = 1000, 0.95

@@ -7,16 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.camera import PinholeCamera
-from cmmsim.cramer_rao import light_shares
+from cmmsim.detection.cramer_rao import light_shares
 from cmmsim.errors import CmmError
-from cmmsim.marked_body import marked_body
-from cmmsim.noise import CameraNoise
-from cmmsim.pose import Array, apply, pose_to_transform
-from cmmsim.projected_disc import project_discs
-from cmmsim.rig_from_file import rig_from_file
+from cmmsim.files.marked_body import marked_body
+from cmmsim.files.rig import rig_from_file
+from cmmsim.files.schema import NARROWEST_PSF, SensorFile
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.pose import Array, apply, pose_to_transform
+from cmmsim.geometry.projected_disc import project_discs
+from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.sensor import Sensor
-from cmmsim.sensor_schema import NARROWEST_PSF, SensorFile
 
 TOGETHER = 100  # discs drawn at once
 SMALLEST_RADIUS_PX, LARGEST_RADIUS_PX = 1.0, 50.0

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from cmmsim.marked_body import marked_body
-from cmmsim.pose import invert
-from cmmsim.rig_from_file import rig_from_file
-from cmmsim.scene import placed_stickers
-from cmmsim.sensor_schema import SensorFile
-from cmmsim.taught import Taught
-from cmmsim.taught_setup import setup_of
+from cmmsim.files.marked_body import marked_body
+from cmmsim.files.rig import rig_from_file
+from cmmsim.files.schema import SensorFile
+from cmmsim.geometry.pose import invert
+from cmmsim.imaging.scene import placed_stickers
+from cmmsim.pose_estimation.taught import Taught
+from cmmsim.pose_estimation.taught_setup import setup_of
 
 
 def exactly_taught(file: SensorFile) -> Taught:

@@ -12,9 +12,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.ellipse_coverage import covered_area
-from cmmsim.noise import CameraNoise
-from cmmsim.pose import Array
+from cmmsim.geometry.ellipse_coverage import covered_area
+from cmmsim.geometry.pose import Array
+from cmmsim.radiometry.noise import CameraNoise
 
 FAINTEST = 1e-4  # radiance below which added light is not drawn
 

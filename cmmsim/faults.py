@@ -18,13 +18,13 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from cmmsim.arguments import require_kind
+from cmmsim.checks import require_kind
 from cmmsim.errors import UnknownOptionError
-from cmmsim.estimator import PoseEstimator
 from cmmsim.fault_marks import DiscMark, FillMark, GlintMark, PlateMark
 from cmmsim.faulty_images import Fault
-from cmmsim.outlines import sticker_outlines
-from cmmsim.pose import Array, apply, checked_pose, invert, pose_to_transform
+from cmmsim.geometry.outlines import sticker_outlines
+from cmmsim.geometry.pose import Array, apply, checked_pose, invert, pose_to_transform
+from cmmsim.pose_estimation.estimator import PoseEstimator
 
 BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)  # m, sides of the boxes that hide stickers
 FEW = 4

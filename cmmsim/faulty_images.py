@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.arguments import require_kind
+from cmmsim.checks import require_kind
 from cmmsim.fault_marks import Mark, paint
-from cmmsim.images import StereoFrame, StereoImages, Windows, readable
-from cmmsim.noise import CameraNoise
-from cmmsim.pose import Array
+from cmmsim.geometry.pose import Array
+from cmmsim.radiometry.images import StereoFrame, StereoImages, Windows, readable
+from cmmsim.radiometry.noise import CameraNoise
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cmmsim.pose import Array
-from cmmsim.sensor_schema import Timing
+from cmmsim.files.schema import Timing
+from cmmsim.geometry.pose import Array
 
 WIDEST = 3.0  # standard deviations: no frame's latency is farther from the mean
 

@@ -13,32 +13,32 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from cmmsim.arguments import finite_array, require_kind
-from cmmsim.blob_search import SMALLEST_STEP
-from cmmsim.ellipse_fit import FitLimits
+from cmmsim.checks import finite_array, require_kind
+from cmmsim.detection.blob_search import SMALLEST_STEP
+from cmmsim.detection.ellipse_fit import FitLimits
 from cmmsim.errors import CmmError, UnknownBodyError, UnknownOptionError
-from cmmsim.estimator import PoseEstimator
-from cmmsim.image_formation import ImageFormation
-from cmmsim.images import StereoFrame, StereoImages
-from cmmsim.marked_body import marked_body, require_corner
-from cmmsim.measurement import Measurement, lost_measurement
-from cmmsim.noise import CameraNoise
-from cmmsim.observation import DetectionSettings
-from cmmsim.optics import Optics
-from cmmsim.pose import Array, checked_pose, checked_transform, pose_to_transform
-from cmmsim.pose_methods import METHODS
-from cmmsim.renderers import RENDERER_NAMES, Renderer, choose_renderer
-from cmmsim.rig_from_file import rig_from_file
-from cmmsim.scene import Mesh, scene_body, solid_mesh
-from cmmsim.sensor_file import read_sensor_file
-from cmmsim.sensor_schema import SensorFile, Timing
-from cmmsim.taught import Taught
-from cmmsim.taught_setup import require_taught_for, setup_of
-from cmmsim.teaching import Progress, Teacher
-from cmmsim.tracking import Tracker
-from cmmsim.views import Drawable
-from cmmsim.virtual_camera import Quality, VirtualStereoCamera
-from cmmsim.window_sizes import WindowSizes, largest_radius, radius_at, window_sizes
+from cmmsim.files.marked_body import marked_body, require_corner
+from cmmsim.files.rig import rig_from_file
+from cmmsim.files.schema import SensorFile, Timing
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.geometry.pose import Array, checked_pose, checked_transform, pose_to_transform
+from cmmsim.imaging.image_formation import ImageFormation
+from cmmsim.imaging.renderer import RENDERER_NAMES, Renderer, choose_renderer
+from cmmsim.imaging.scene import Mesh, scene_body, solid_mesh
+from cmmsim.imaging.views import Drawable
+from cmmsim.imaging.virtual_camera import Quality, VirtualStereoCamera
+from cmmsim.pose_estimation.estimator import PoseEstimator
+from cmmsim.pose_estimation.measurement import Measurement, lost_measurement
+from cmmsim.pose_estimation.observation import DetectionSettings
+from cmmsim.pose_estimation.pose_methods import METHODS
+from cmmsim.pose_estimation.taught import Taught
+from cmmsim.pose_estimation.taught_setup import require_taught_for, setup_of
+from cmmsim.pose_estimation.teaching import Progress, Teacher
+from cmmsim.pose_estimation.window_sizes import WindowSizes, largest_radius, radius_at, window_sizes
+from cmmsim.radiometry.images import StereoFrame, StereoImages
+from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.radiometry.optics import Optics
+from cmmsim.tracker import Tracker
 
 TEACHING_STREAM, RUN_STREAM, DROPOUT_STREAM = 0, 1, 2
 

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmmsim.errors import LostError
-from cmmsim.marked_body import MarkedBody, marked_body
-from cmmsim.observation import DetectionSettings, faces_camera, observe
-from cmmsim.pose import Array, apply, compose_covariance, invert, pose_covariance, pose_to_transform
-from cmmsim.pose_methods import by_planes, by_registration
-from cmmsim.rig_from_file import rig_from_file
+from cmmsim.files.marked_body import MarkedBody, marked_body
+from cmmsim.files.rig import rig_from_file
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.geometry.pose import Array, apply, compose_covariance, invert, pose_covariance, pose_to_transform
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.pose_estimation.observation import DetectionSettings, faces_camera, observe
+from cmmsim.pose_estimation.pose_methods import by_planes, by_registration
 from cmmsim.sensor import load_sensor
-from cmmsim.sensor_file import read_sensor_file
-from cmmsim.stereo_rig import StereoRig
 
 EDGE_PX = DetectionSettings().window_size
 

@@ -23,7 +23,7 @@ import casadi as ca
 import platformdirs
 
 from dynamics.errors import DynamicsError
-from dynamics.geometry import Rss6Geometry
+from dynamics.kinematics.geometry import Rss6Geometry
 
 # CasADi exports its own `sq`: without -fno-semantic-interposition every square of a variable is a call. -O3 takes a
 # fifth longer to compile, for 2 % of speed in plain runs and a loss in sensitivities.
@@ -111,9 +111,8 @@ def _warn(reason: str) -> None:
 @cache
 def _package_digest() -> bytes:
     digest = hashlib.sha256()
-    for entry in sorted(resources.files("dynamics").iterdir(), key=lambda item: item.name):
-        if entry.name.endswith((".py", ".c", ".h")):
-            digest.update(entry.name.encode() + entry.read_bytes())
+    for entry in sorted(path for path in Path(__file__).parent.rglob("*") if path.suffix in (".py", ".c", ".h")):
+        digest.update(entry.name.encode() + entry.read_bytes())
     return digest.digest()
 
 
@@ -134,7 +133,7 @@ def _source(functions: list[ca.Function], drivers: tuple[str, ...]) -> str:
     generator = ca.CodeGenerator("robot.c")
     for function in functions:
         generator.add(function)
-    own = [(resources.files("dynamics") / driver).read_text(encoding="utf-8") for driver in drivers]
+    own = [(resources.files("dynamics.closed_loop") / driver).read_text(encoding="utf-8") for driver in drivers]
     return "".join([generator.dump(), *own])
 
 

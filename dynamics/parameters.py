@@ -6,9 +6,9 @@ The paper calls the driven arm of a leg its wrench; here it is the crank.
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dynamics.arrays import floats
+from dynamics.checks import floats
 from dynamics.errors import ParameterError
-from dynamics.geometry import LEGS
+from dynamics.kinematics.geometry import LEGS
 
 INERTIAL = ("mass", "Ixx", "Iyy", "Izz")
 

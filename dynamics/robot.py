@@ -7,12 +7,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dynamics import forward_kinematics, model
-from dynamics.arrays import check_type, floats, row_text, rows
+from dynamics.checks import check_type, floats, row_text, rows
 from dynamics.compilation import load_library, open_library
 from dynamics.errors import ParameterError, RobotFileError, ShapeError, SingularPoseError, UnreachablePoseError
-from dynamics.geometry import LEGS, Rss6Geometry
+from dynamics.kinematics import forward_kinematics
+from dynamics.kinematics.geometry import LEGS, Rss6Geometry
 from dynamics.parameters import PARAMETER_NAMES, check_ranges
+from dynamics.rigid_body import functions as model
 from dynamics.robot_file import ParameterSet, RobotDescription, read_robot_file
 
 # Below this the solution of M a = f loses all digits; a healthy robot is near 1e2 (poses in m and rad).

@@ -10,10 +10,10 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from dynamics.arrays import shown
+from dynamics.checks import shown
 from dynamics.errors import DynamicsError, RobotFileError
-from dynamics.geometry import LEGS, Rss6Geometry
-from dynamics.kinematics import check_home
+from dynamics.kinematics.geometry import LEGS, Rss6Geometry
+from dynamics.kinematics.inverse_kinematics import check_home
 from dynamics.parameters import check_parameters
 
 _PerLeg = float | list[float]

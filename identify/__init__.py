@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 from identify.errors import IdentifyError
 
 if TYPE_CHECKING:
-    from identify.accuracy.unseen import unseen_errors
     from identify.estimation.identification import IdentificationResult, identify
     from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
     from identify.experiment.run import run_experiment
     from identify.record.payload import payload_vector, store_payload
     from identify.record.recording import build_record
     from identify.scenario import Scenario, load_scenario, scenario_names
+    from identify.validation.unseen import unseen_errors
 
 _HOME = {
     "IdentificationResult": "identify.estimation.identification",
@@ -30,7 +30,7 @@ _HOME = {
     "Scenario": "identify.scenario",
     "load_scenario": "identify.scenario",
     "scenario_names": "identify.scenario",
-    "unseen_errors": "identify.accuracy.unseen",
+    "unseen_errors": "identify.validation.unseen",
 }
 
 __all__ = [

@@ -9,7 +9,7 @@ def main() -> None:
     """Run the command; exit status and one line on standard error where Ctrl-C ends it."""
     try:
         with honoured():
-            from identify import command_line
+            from identify.commands import app as command_line
 
             command_line.main()
     except KeyboardInterrupt:

@@ -9,13 +9,11 @@ import xarray as xr
 
 import cmmsim
 from dynamics import Robot, load_robot
+from dynamics.analysis.workspace import check_motion
 from dynamics.closed_loop import prepare
-from dynamics.workspace import check_motion
 from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
 from identify.estimation import identification
-from identify.estimation.loop_parameters import NAMES, check_parameter_set
-from identify.estimator_settings import estimator_settings, with_estimator_settings
 from identify.excitation import design_trajectories
 from identify.experiment.plant import check_plant, plant_robot
 from identify.experiment.run import excitation_run, taught_sensor, teach, untaught_sensor
@@ -26,16 +24,16 @@ from identify.files.atomic import write_text
 from identify.files.covariance_file import read_covariance, write_covariance
 from identify.files.result_file import check_entries, load_result, rms_figures, save_result
 from identify.files.run_folder import RunFolder
-from identify.files.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
 from identify.files.versions import versions
+from identify.loop_parameters import NAMES, check_parameter_set
 from identify.progress import Progress
 from identify.record import recording
+from identify.record.checks import check_length, check_trajectory
 from identify.record.loop_setup import frame_times
-from identify.record.record_checks import check_length, check_trajectory
+from identify.record.made_of import ENTRY, RECORDS, check_made_of, file_digests
+from identify.record.model_runs import build_model_run, write_model_runs
 from identify.record.recorded_robot import check_robot
 from identify.record.recorded_run import recorded_reference
-from identify.reporting.made_of import ENTRY, RECORDS, check_made_of, file_digests
-from identify.reporting.model_runs import build_model_run, write_model_runs
 from identify.reporting.report import write_report
 from identify.reporting.run_result import (
     add_truth,
@@ -46,7 +44,9 @@ from identify.reporting.run_result import (
     validation_entry,
 )
 from identify.scenario import Scenario, load_scenario
-from identify.validation import model_run, predicted_runs, run_unseen
+from identify.scenario.estimator_settings import estimator_settings, with_estimator_settings
+from identify.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
+from identify.validation.validation import model_run, predicted_runs, run_unseen
 
 
 def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:

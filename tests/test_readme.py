@@ -12,10 +12,10 @@ import pytest
 
 import dynamics
 import identify
-from identify import command_line
 from identify.accuracy.saved import read_saved
 from identify.accuracy.table import markdown_table
-from identify.command_line import app
+from identify.commands import app as command_line
+from identify.commands.app import app
 from identify.estimators.registry import ESTIMATORS
 from identify.files.result_file import load_result
 from identify.reporting.goals import check_goals

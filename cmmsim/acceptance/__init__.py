@@ -6,14 +6,14 @@ is true of them is used only to judge the result.
 
 from cmmsim.acceptance.artefact_sensor import SensorUnderTest
 from cmmsim.acceptance.bar_paths import BarPath, bar_paths
-from cmmsim.acceptance.errors import AcceptanceError
-from cmmsim.acceptance.latency import Latency, LatencyTest, estimate_latency, latency_test
+from cmmsim.acceptance.latency_test import Latency, LatencyTest, estimate_latency, latency_test
 from cmmsim.acceptance.length_test import LengthTest, MeasuredLength, length_test
 from cmmsim.acceptance.measuring_lines import MeasuringLine, require_rules, seven_lines
 from cmmsim.acceptance.moving_bar import BarRun, BarTest, bar_test
 from cmmsim.acceptance.published import PUBLISHED, PublishedFigure
 from cmmsim.acceptance.statistics import Statistics, interval_of_mean, summarise
 from cmmsim.acceptance.volume import MeasuringVolume, common_volume, volume_of_size
+from cmmsim.acceptance_errors import AcceptanceError
 
 __all__ = [
     "PUBLISHED",

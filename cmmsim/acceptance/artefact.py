@@ -12,8 +12,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmmsim.pose import Array
-from cmmsim.sensor_schema import Body, HalfSpace, Planes, Platform, Rig, SensorFile, StickerPlane
+from cmmsim.files.schema import Body, HalfSpace, Planes, Platform, Rig, SensorFile, StickerPlane
+from cmmsim.geometry.pose import Array
 
 H = TypeVar("H", bound=HalfSpace)
 SLOPE = np.deg2rad(15.0)

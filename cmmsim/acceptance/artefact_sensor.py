@@ -8,19 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.acceptance.artefact import artefact_file
-from cmmsim.acceptance.errors import AcceptanceError
+from cmmsim.acceptance_errors import AcceptanceError
 from cmmsim.errors import LostError
-from cmmsim.estimator import PoseEstimator
-from cmmsim.images import StereoImages
-from cmmsim.marked_body import MarkedBody
-from cmmsim.observation import StickerObservation, observe
-from cmmsim.pose import Array, invert, pose_to_transform, transform_to_pose
-from cmmsim.render import require_opengl
-from cmmsim.renderers import PYRENDER, choose_renderer
-from cmmsim.rig_from_file import rig_from_file
+from cmmsim.files.marked_body import MarkedBody
+from cmmsim.files.rig import rig_from_file
+from cmmsim.files.schema import Platform, SensorFile
+from cmmsim.geometry.pose import Array, invert, pose_to_transform, transform_to_pose
+from cmmsim.imaging.pyrender_renderer import require_opengl
+from cmmsim.imaging.renderer import PYRENDER, choose_renderer
+from cmmsim.pose_estimation.estimator import PoseEstimator
+from cmmsim.pose_estimation.observation import StickerObservation, observe
+from cmmsim.pose_estimation.taught import Taught
+from cmmsim.radiometry.images import StereoImages
 from cmmsim.sensor import Sensor
-from cmmsim.sensor_schema import Platform, SensorFile
-from cmmsim.taught import Taught
 
 
 @dataclass(frozen=True)

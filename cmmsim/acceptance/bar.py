@@ -6,8 +6,8 @@ import numpy as np
 
 from cmmsim.acceptance.artefact import HALF_RIDGE, SIDE, StickerRow, board
 from cmmsim.acceptance.artefact_sensor import part_of_body
-from cmmsim.marked_body import MarkedBody
-from cmmsim.sensor_schema import Platform
+from cmmsim.files.marked_body import MarkedBody
+from cmmsim.files.schema import Platform
 
 LENGTH = 0.300  # m between the origins of the clusters, which lie on the bar's x axis
 HALF_LENGTH, HALF_WIDTH = 0.5 * LENGTH + 0.065, HALF_RIDGE + SIDE

@@ -14,9 +14,9 @@ import numpy as np
 from cmmsim.acceptance.artefact import facing_rotation
 from cmmsim.acceptance.artefact_sensor import pose_in_base
 from cmmsim.acceptance.bar import HALF_LENGTH, HALF_WIDTH
-from cmmsim.acceptance.errors import AcceptanceError
 from cmmsim.acceptance.volume import MeasuringVolume
-from cmmsim.pose import Array, rotation_exp
+from cmmsim.acceptance_errors import AcceptanceError
+from cmmsim.geometry.pose import Array, rotation_exp
 
 SECONDS = 3.0  # of motion a run
 CYCLES = 1.5  # to and fro in this time

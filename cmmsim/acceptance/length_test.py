@@ -15,12 +15,12 @@ import numpy as np
 
 from cmmsim.acceptance.artefact import StickerRow, board, facing_rotation
 from cmmsim.acceptance.artefact_sensor import SensorUnderTest, estimator_of, locate, observe_stickers, pose_in_base
-from cmmsim.acceptance.errors import AcceptanceError
 from cmmsim.acceptance.measuring_lines import MeasuringLine, seven_lines
 from cmmsim.acceptance.volume import MeasuringVolume
-from cmmsim.pose import Array
+from cmmsim.acceptance_errors import AcceptanceError
+from cmmsim.files.schema import Platform
+from cmmsim.geometry.pose import Array
 from cmmsim.sensor import Sensor
-from cmmsim.sensor_schema import Platform
 
 STREAM = 1
 EXPOSURES = 5  # of the standing artefact, whose lengths are averaged

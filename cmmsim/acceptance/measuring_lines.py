@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmmsim.acceptance.errors import AcceptanceError
 from cmmsim.acceptance.volume import MeasuringVolume
-from cmmsim.pose import Array
+from cmmsim.acceptance_errors import AcceptanceError
+from cmmsim.geometry.pose import Array
 
 FEWEST_LINES, FEWEST_LENGTHS = 7, 5
 LONGEST_SHARE = 2.0 / 3.0  # of the volume's space diagonal

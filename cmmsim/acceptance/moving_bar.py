@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from cmmsim.acceptance.artefact_sensor import SensorUnderTest, estimator_of, locate, relative_pose
 from cmmsim.acceptance.bar import END_FROM_END, bar_ends, rigid_bar
 from cmmsim.acceptance.bar_paths import SECONDS, BarPath, bar_paths
-from cmmsim.acceptance.errors import AcceptanceError
 from cmmsim.acceptance.volume import MeasuringVolume
-from cmmsim.measurement import Measurement
-from cmmsim.pose import Array, euler_rates_matrix, pose_to_transform, rotation_log, skew
+from cmmsim.acceptance_errors import AcceptanceError
+from cmmsim.geometry.pose import Array, euler_rates_matrix, pose_to_transform, rotation_log, skew
+from cmmsim.pose_estimation.measurement import Measurement
 from cmmsim.sensor import Sensor
-from cmmsim.tracking import Tracker
+from cmmsim.tracker import Tracker
 
 STREAM = 101
 STANDING = 15  # exposures of the standing bar before each run

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from cmmsim.errors import ShapeError
-from cmmsim.pose import Array
+from cmmsim.geometry.pose import Array
 
 LEVEL = 0.95
 RESAMPLES = 1000

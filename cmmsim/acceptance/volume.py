@@ -11,11 +11,11 @@ from itertools import product
 
 import numpy as np
 
-from cmmsim.acceptance.errors import AcceptanceError
-from cmmsim.pose import Array, apply, invert
-from cmmsim.rig_from_file import rig_from_file
-from cmmsim.sensor_schema import Rig
-from cmmsim.stereo_rig import StereoRig
+from cmmsim.acceptance_errors import AcceptanceError
+from cmmsim.files.rig import rig_from_file
+from cmmsim.files.schema import Rig
+from cmmsim.geometry.pose import Array, apply, invert
+from cmmsim.geometry.stereo_rig import StereoRig
 
 MARGIN_PX = 40.0  # the corners stay this far inside the images: room for the width of the artefacts
 LARGEST_SHARE = 0.8  # the front face stays beyond a fifth of the way from the baseline to the target

@@ -9,7 +9,6 @@ from cmmsim.calibration.board_detection import BoardView, find_board
 from cmmsim.calibration.board_poses import board_poses, default_board
 from cmmsim.calibration.calibrate import CalibrationOptions, calibrate
 from cmmsim.calibration.calibration import PARAMETER_NAMES, Calibration
-from cmmsim.calibration.errors import CalibrationError
 from cmmsim.calibration.intrinsics import DISTORTIONS
 from cmmsim.calibration.photographs import ImagePair, pair_images, read_grey
 from cmmsim.calibration.rendering import render_pairs
@@ -17,6 +16,7 @@ from cmmsim.calibration.result_text import as_dict, rig_tables
 from cmmsim.calibration.sensor_template import SensorTemplate, require_sensor, sensor_template
 from cmmsim.calibration.sightings import PairView
 from cmmsim.calibration.views_of_images import view_pairs
+from cmmsim.calibration_errors import CalibrationError
 
 __all__ = [
     "DISTORTIONS",

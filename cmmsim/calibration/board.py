@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from cmmsim.calibration.errors import CalibrationError
-from cmmsim.pose import Array
+from cmmsim.calibration_errors import CalibrationError
+from cmmsim.geometry.pose import Array
 
 Length = Annotated[float, Field(gt=0.0, le=100.0)]
 Count = Annotated[int, Field(ge=3, le=200)]

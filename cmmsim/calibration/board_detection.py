@@ -12,7 +12,7 @@ from cmmsim.calibration.board import Board
 from cmmsim.calibration.chessboard_detection import find_chessboard
 from cmmsim.calibration.dot_detection import find_dots
 from cmmsim.calibration.dot_radius import differs
-from cmmsim.pose import Array
+from cmmsim.geometry.pose import Array
 
 FEWEST_SHARE = 0.7  # of the board's points that must be measured
 LARGEST_GAP = 0.25  # of the distance of neighbours, by which a point may leave the plane's perspective

@@ -6,10 +6,10 @@ import numpy as np
 
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.board_scene import plate_corners
-from cmmsim.calibration.errors import CalibrationError
-from cmmsim.camera import PinholeCamera
-from cmmsim.pose import Array, apply, invert, rotation_exp
-from cmmsim.stereo_rig import StereoRig
+from cmmsim.calibration_errors import CalibrationError
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.pose import Array, apply, invert, rotation_exp
+from cmmsim.geometry.stereo_rig import StereoRig
 
 LARGEST_TILT = 0.75  # rad between the board's normal and the view from the middle of the baseline
 DEPTH_RANGE = (0.8, 1.2)  # of the depth at which the optical axes come nearest

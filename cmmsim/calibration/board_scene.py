@@ -6,9 +6,9 @@ import numpy as np
 import trimesh
 
 from cmmsim.calibration.board import Board
-from cmmsim.pose import Array
-from cmmsim.scene import SUNK, Disc, DiscStack, Mesh, Patch, solid_mesh
-from cmmsim.views import Drawable
+from cmmsim.geometry.pose import Array
+from cmmsim.imaging.scene import SUNK, Disc, DiscStack, Mesh, Patch, solid_mesh
+from cmmsim.imaging.views import Drawable
 
 MARGIN = 1.0  # of the spacing: rim of the plate beyond its outermost points; a chessboard's outer squares reach there
 RIM = 0.35  # of the spacing: bright rim beyond the outer squares of a chessboard

@@ -10,7 +10,6 @@ import numpy as np
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.calibration import Calibration, UsedView
 from cmmsim.calibration.contradictions import contradictions
-from cmmsim.calibration.errors import CalibrationError
 from cmmsim.calibration.intrinsics import DEFAULT_DISTORTION, DISTORTIONS, camera_from, free_directions
 from cmmsim.calibration.joint_adjustment import Adjustment, adjust
 from cmmsim.calibration.named import some
@@ -18,9 +17,10 @@ from cmmsim.calibration.sightings import SIDES, PairView, Sightings, sightings_o
 from cmmsim.calibration.start_values import start_values
 from cmmsim.calibration.state import RigState
 from cmmsim.calibration.weaknesses import weaknesses
-from cmmsim.eccentricity import centre_offset
-from cmmsim.pose import Array
-from cmmsim.stereo_rig import StereoRig
+from cmmsim.calibration_errors import CalibrationError
+from cmmsim.geometry.eccentricity import centre_offset
+from cmmsim.geometry.pose import Array
+from cmmsim.geometry.stereo_rig import StereoRig
 
 FEWEST_PAIRS = 3
 LARGEST_RMS_RATIO = 4.0  # an image with residuals above this many medians of all images is given up

@@ -11,8 +11,8 @@ from cmmsim.calibration.board import Board
 from cmmsim.calibration.intrinsics import INTRINSIC_NAMES
 from cmmsim.calibration.joint_adjustment import Adjustment
 from cmmsim.calibration.sightings import Sightings
-from cmmsim.pose import Array, skew
-from cmmsim.stereo_rig import StereoRig
+from cmmsim.geometry.pose import Array, skew
+from cmmsim.geometry.stereo_rig import StereoRig
 
 PLACE_NAMES = ("tx_m", "ty_m", "tz_m", "rx_rad", "ry_rad", "rz_rad")
 PARAMETER_NAMES = (

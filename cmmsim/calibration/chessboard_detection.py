@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.pose import Array
+from cmmsim.geometry.pose import Array
 
 FINE_WINDOW_SHARE = 0.3  # half window of cornerSubPix over the distance of neighbouring corners
 

@@ -11,7 +11,7 @@ from cmmsim.calibration.board_detection import BoardView
 from cmmsim.calibration.dot_radius import differs
 from cmmsim.calibration.sightings import PairView
 from cmmsim.calibration.state import RigState
-from cmmsim.pose import apply, invert
+from cmmsim.geometry.pose import apply, invert
 
 BOARD_SIDES = 0.01, 5.0  # m, smallest and largest longer side of a board that is hardly a wrong unit
 LARGEST_UNUSED = 1.0 / 3.0  # of the pairs

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.dot_radius import covered_radius
-from cmmsim.ellipse_fit import FitLimits, fit_ellipses
-from cmmsim.images import FrameImages, StereoFrame
-from cmmsim.noise import CameraNoise
-from cmmsim.pose import Array
+from cmmsim.detection.ellipse_fit import FitLimits, fit_ellipses
+from cmmsim.geometry.pose import Array
+from cmmsim.radiometry.images import FrameImages, StereoFrame
+from cmmsim.radiometry.noise import CameraNoise
 
 SMALLEST_AREA_PX = 20.0
 FIND_SIDE_PX = 1600  # dots are first looked for in an image of at most this size: faster, and less noise

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.pose import Array
+from cmmsim.geometry.pose import Array
 
 CELL_SIDE = 41  # samples along each side of the square around a dot
 EXTREMES = (2.0, 98.0)  # percentiles of a cell whose middle parts ground from dot

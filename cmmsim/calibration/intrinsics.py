@@ -9,10 +9,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from cmmsim.camera import PinholeCamera
-from cmmsim.distortion import Distortion
 from cmmsim.errors import UnknownOptionError
-from cmmsim.pose import Array
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.distortion import Distortion
+from cmmsim.geometry.pose import Array
 
 INTRINSIC_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 DISTORTIONS = {"none": (), "radial2": ("k1", "k2"), "brown5": ("k1", "k2", "p1", "p2", "k3")}

@@ -14,12 +14,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from cmmsim.calibration.errors import CalibrationError
 from cmmsim.calibration.intrinsics import project
 from cmmsim.calibration.shared_errors import SharedErrors, shared_errors
 from cmmsim.calibration.sightings import Sightings
 from cmmsim.calibration.state import RigState
-from cmmsim.pose import Array, apply, skew
+from cmmsim.calibration_errors import CalibrationError
+from cmmsim.geometry.pose import Array, apply, skew
 
 MOST_STEPS = 60
 SMALLEST_GAIN = 1e-11  # relative decrease of the sum of squares that ends the iteration

@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.board_scene import board_drawable, plate_corners
-from cmmsim.calibration.errors import CalibrationError
-from cmmsim.camera import PinholeCamera
-from cmmsim.image_formation import ImageFormation, Side
-from cmmsim.images import StereoFrame
-from cmmsim.noise import CameraNoise
-from cmmsim.optics import Optics
-from cmmsim.pose import Array, apply
-from cmmsim.renderers import Renderer
-from cmmsim.stereo_rig import StereoRig
+from cmmsim.calibration_errors import CalibrationError
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.pose import Array, apply
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.imaging.image_formation import ImageFormation, Side
+from cmmsim.imaging.renderer import Renderer
+from cmmsim.radiometry.images import StereoFrame
+from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.radiometry.optics import Optics
 
 TILE_PX = 64
 SUPERSAMPLING = 12

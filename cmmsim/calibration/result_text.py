@@ -10,7 +10,7 @@ import numpy as np
 
 from cmmsim.calibration.calibration import PARAMETER_NAMES, Calibration
 from cmmsim.calibration.sightings import SIDES
-from cmmsim.pose import transform_to_pose
+from cmmsim.geometry.pose import transform_to_pose
 
 
 def rig_tables(found: Calibration) -> str:

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from cmmsim.calibration.calibration import Calibration
-from cmmsim.calibration.errors import CalibrationError
 from cmmsim.calibration.result_text import rig_tables
-from cmmsim.rig_from_file import rig_from_file
-from cmmsim.sensor_file import built_in_names, read_sensor_file, sensor_text
+from cmmsim.calibration_errors import CalibrationError
+from cmmsim.files.rig import rig_from_file
+from cmmsim.files.sensor_file import built_in_names, read_sensor_file, sensor_text
 
 TABLES = ("rig.left", "rig.right", "rig.right_from_left")
 HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(#.*)?$")

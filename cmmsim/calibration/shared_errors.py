@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from cmmsim.pose import Array
+from cmmsim.geometry.pose import Array
 
 CHANCE = 1e-3  # of a ratio at the limit where the errors of points are independent
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.calibration.board_detection import BoardView
-from cmmsim.pose import Array
+from cmmsim.geometry.pose import Array
 
 SIDES = ("left", "right")
 

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.board_detection import BoardView
-from cmmsim.calibration.errors import CalibrationError
 from cmmsim.calibration.sightings import SIDES, PairView
 from cmmsim.calibration.state import RigState
 from cmmsim.calibration.view_variety import require_variety
-from cmmsim.pose import Array, invert
+from cmmsim.calibration_errors import CalibrationError
+from cmmsim.geometry.pose import Array, invert
 
 ALIKE_ANGLE, ALIKE_SHARE = 0.06, 0.12  # rad; of the baseline: places of the right camera that count as the same
 FEWEST_VIEWS = 3

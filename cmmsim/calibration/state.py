@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmmsim.pose import Array, rotation_exp
+from cmmsim.geometry.pose import Array, rotation_exp
 
 
 @dataclass(frozen=True)

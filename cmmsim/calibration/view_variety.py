@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.calibration.board_detection import BoardView
-from cmmsim.calibration.errors import CalibrationError
-from cmmsim.pose import Array
+from cmmsim.calibration_errors import CalibrationError
+from cmmsim.geometry.pose import Array
 
 ALIKE_PX = 2.0  # rms distance of the points of two pictures that show the board in one place
 

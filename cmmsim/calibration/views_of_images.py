@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.board_detection import find_board
-from cmmsim.calibration.errors import CalibrationError
 from cmmsim.calibration.photographs import ImagePair, read_grey
 from cmmsim.calibration.sightings import PairView
+from cmmsim.calibration_errors import CalibrationError
 
 
 def view_pairs(

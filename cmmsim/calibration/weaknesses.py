@@ -7,8 +7,8 @@ import numpy as np
 
 from cmmsim.calibration.joint_adjustment import Adjustment
 from cmmsim.calibration.sightings import SIDES, Sightings
-from cmmsim.pose import Array
-from cmmsim.stereo_rig import StereoRig
+from cmmsim.geometry.pose import Array
+from cmmsim.geometry.stereo_rig import StereoRig
 
 LARGEST_FOCAL_STD = 0.003  # of the focal length
 LARGEST_CENTRE_STD = 0.005  # of the image width

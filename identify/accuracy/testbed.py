@@ -32,7 +32,7 @@ def check_options(config: pytest.Config) -> None:
     if not chosen:
         return
     from cmmsim.errors import CmmError
-    from cmmsim.sensor_file import read_sensor_file
+    from cmmsim.files.sensor_file import read_sensor_file
     from dynamics import DynamicsError, load_robot
     from identify import IdentifyError, load_scenario
 

@@ -53,9 +53,9 @@ def acceptance(
       cmmsim acceptance mine.toml --standard vdi --limit-um 30
       cmmsim acceptance --volume 0.6 --renderer analytic --seed 3
     """
-    from identify.acceptance.procedure import chosen_standards, do, prepare, require_limit
-    from identify.acceptance.result import acceptance_entry
     from identify.files.run_folder import new_run_folder
+    from identify.verification.acceptance_procedure import chosen_standards, do, prepare, require_limit
+    from identify.verification.result import acceptance_entry
 
     require_limit(limit_um)
     standards = chosen_standards(standard)
@@ -71,11 +71,11 @@ def acceptance(
 
 def _write(folder: Path, entry: dict[str, Any], run: Any, limit_um: float) -> None:
     """The report's files; the figures of tests that were not done are left out."""
-    from identify.acceptance import figures as draw
-    from identify.acceptance.tables import acceptance_markdown
     from identify.files.atomic import write_text
     from identify.files.result_file import save_result
     from identify.reporting.figures import save_figure
+    from identify.verification import figures as draw
+    from identify.verification.tables import acceptance_markdown
 
     save_result(folder / "acceptance.json", entry)
     write_text(folder / "acceptance.md", acceptance_markdown(entry))

@@ -7,7 +7,7 @@ import typer
 
 from identify.errors import OutputFolderError, ScenarioError
 from identify.progress import Progress, terminal_progress
-from identify.reporting.terminal import print_table, print_warnings
+from identify.terminal import print_table, print_warnings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -167,8 +167,8 @@ def _write(folder: Path, found: "Calibration", template: "SensorTemplate | None"
     from cmmsim.calibration import as_dict, rig_tables
     from identify.files.atomic import write_text
     from identify.files.result_file import save_result
-    from identify.reporting.calibration_figures import coverage_figure, distortion_figure, residual_figure
     from identify.reporting.figures import save_figure
+    from identify.verification.calibration_figures import coverage_figure, distortion_figure, residual_figure
 
     texts = {"rig.toml": rig_tables(found)}
     sensor = None if template is None else template.filled(found)
@@ -204,7 +204,7 @@ def _render(
 
     from cmmsim import load_sensor
     from cmmsim.calibration import board_poses, default_board, render_pairs
-    from cmmsim.renderers import choose_renderer
+    from cmmsim.imaging.renderer import choose_renderer
     from identify.files.atomic import atomic_contents
 
     source = load_sensor(sensor, seed)

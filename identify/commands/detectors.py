@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from identify.progress import terminal_progress
-from identify.reporting.terminal import print_table
+from identify.terminal import print_table
 
 if TYPE_CHECKING:
     from cmmsim.detector_leaderboard import Score
@@ -51,11 +51,11 @@ def detectors(
 
     from cmmsim.detector_leaderboard import CONFIDENCE, compete
     from cmmsim.drawn_discs import Condition, scene_of, working_point
-    from cmmsim.sensor_file import read_sensor_file
+    from cmmsim.files.sensor_file import read_sensor_file
     from identify.files.result_file import save_result
     from identify.files.run_folder import new_run_folder
-    from identify.reporting.detectors_figure import detectors_figure
     from identify.reporting.figures import save_figure
+    from identify.verification.detectors_figure import detectors_figure
 
     file = read_sensor_file(sensor)
     at_work = working_point(file)

@@ -7,7 +7,7 @@ import typer
 
 from identify.errors import OutputFolderError, VerificationError
 from identify.progress import terminal_progress
-from identify.reporting.terminal import print_table
+from identify.terminal import print_table
 
 if TYPE_CHECKING:
     from dynamics import Robot
@@ -58,8 +58,8 @@ def mjcf(
 ) -> None:
     """Write the robot as MJCF, a closed chain that MuJoCo loads."""
     from dynamics import load_robot
-    from dynamics.mjcf import mjcf_text
-    from identify.files.parameter_choice import choose_parameters
+    from dynamics.engines.mjcf import mjcf_text
+    from identify.commands.parameter_choice import choose_parameters
 
     with terminal_progress(quiet).stage("export", 1) as advance:
         chosen_robot = load_robot(robot)
@@ -76,8 +76,8 @@ def mjcf(
 
 def _changes(robot: "Robot", parameters: "Array") -> list[str]:
     """Lines: the inertias that the export changed, and by how much that changes the robot's accelerations."""
-    from dynamics.inertia_effect import acceleration_changes
-    from dynamics.physical_inertia import grouped, physical_inertias
+    from dynamics.analysis.inertia_effect import acceleration_changes
+    from dynamics.analysis.physical_inertia import grouped, physical_inertias
 
     inertias = physical_inertias(parameters, allow_changes=True)
     if not inertias.changes:
@@ -103,8 +103,8 @@ def verify_model(
     from identify.files.result_file import save_result
     from identify.files.run_folder import new_run_folder
     from identify.reporting.figures import save_figure
-    from identify.reporting.verification_figure import figure_8
-    from identify.robot_checks import model_verification
+    from identify.verification import model_verification
+    from identify.verification.verification_figure import figure_8
 
     chosen = load_robot(robot)
     folder = new_run_folder(out or Path("runs") / f"verify-{chosen.name}").path

@@ -9,11 +9,11 @@ import typer
 
 from identify.files.run_folder import RunFolder
 from identify.progress import terminal_progress
-from identify.reporting.terminal import print_table
+from identify.terminal import print_table
 
 if TYPE_CHECKING:
-    from identify.estimator_comparison import Score
     from identify.experiment.joint_instruments import JointInstruments
+    from identify.validation.estimator_comparison import Score
 
 HEADER = ("estimator", "groups\n%", "median\n%", "gains\n%", "pos.\num", "ori.\nurad", "time\ns", "iter.", "evals")
 
@@ -39,9 +39,9 @@ def estimators(
     from identify.estimators.registry import choose
     from identify.experiment.joint_instruments import JointInstruments
     from identify.files.result_file import save_result
-    from identify.reporting.estimators_figure import estimators_figure
+    from identify.record.made_of import check_folder
     from identify.reporting.figures import save_figure
-    from identify.reporting.made_of import check_folder
+    from identify.validation.estimators_figure import estimators_figure
 
     folder = RunFolder(out)
     folder.require("scenario.toml", "experiment.nc", "validation.nc")
@@ -63,15 +63,15 @@ def _scores(
 
     from dynamics import load_robot
     from identify.estimation.identification import output_error_problem
-    from identify.estimation.loop_parameters import NAMES
-    from identify.estimator_comparison import compare, examination
     from identify.estimators.evidence import Evidence, joint_channels
     from identify.experiment.joint_instruments import measure_joints, read_channels, write_channels
     from identify.experiment.sensor_in_loop import frame_latencies
     from identify.experiment.truth import read_truth, read_truth_runs, true_parameters
+    from identify.loop_parameters import NAMES
     from identify.random_streams import INSTRUMENTS, LATENCY, mixed_generator, stream_seed
     from identify.record import recording
     from identify.scenario import load_scenario
+    from identify.validation.estimator_comparison import compare, examination
 
     scenario = load_scenario(folder.scenario)
     record, truth = recording.read(folder.experiment), read_truth(folder.experiment)
@@ -91,7 +91,7 @@ def _scores(
 
 def _entry(score: "Score") -> dict[str, Any]:
     """A score with its parameters by name."""
-    from identify.estimation.loop_parameters import NAMES
+    from identify.loop_parameters import NAMES
 
     entry = asdict(score)
     estimate, std = entry.pop("parameters"), entry.pop("std")

@@ -9,7 +9,7 @@ import typer
 from identify.errors import StudyError, StudyInterrupted
 from identify.interrupts import STOPPED
 from identify.progress import terminal_progress
-from identify.reporting.terminal import print_table
+from identify.terminal import print_table
 
 if TYPE_CHECKING:
     from identify.studies.runner import Outcome, Workers
@@ -204,7 +204,7 @@ def _list() -> None:
 
 
 def _list_kinds() -> None:
-    from identify.studies.rows import KINDS
+    from identify.studies.rows.rows import KINDS
     from identify.studies.units import factor_unit
 
     for kind in KINDS.values():

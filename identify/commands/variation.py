@@ -7,7 +7,7 @@ import typer
 
 from identify.files.run_folder import RunFolder
 from identify.progress import Progress, terminal_progress
-from identify.reporting.terminal import print_table
+from identify.terminal import print_table
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from dynamics import Robot
     from identify.reporting.tables import Table
     from identify.scenario import Scenario
-    from identify.variation import Variation
+    from identify.validation.variation import Variation
 
 
 def variation(
@@ -47,11 +47,11 @@ def variation(
     """
     from dynamics import load_robot
     from identify.record import recording
-    from identify.reporting.made_of import check_folder
+    from identify.record.made_of import check_folder
     from identify.reporting.variation_tables import variation_table
     from identify.scenario import load_scenario
-    from identify.variation import identify_each
-    from identify.variation import variation as variation_of
+    from identify.validation.variation import identify_each
+    from identify.validation.variation import variation as variation_of
 
     folder = RunFolder(out)
     folder.require("scenario.toml", *(["trajectories.json"] if designed else ["validation.nc"]))
@@ -75,9 +75,9 @@ def variation(
 def _record_designed(
     folder: RunFolder, scenario: "Scenario", robot: "Robot", count: int, workers: int | None, progress: Progress
 ) -> list["xr.Dataset"]:
-    from identify.files.trajectory_file import load_trajectories
     from identify.record import recording
-    from identify.variation import designed_runs
+    from identify.trajectory_file import load_trajectories
+    from identify.validation.variation import designed_runs
 
     seed = load_trajectories(folder.trajectories).seed
     runs = designed_runs(scenario, robot, seed, count, workers, progress)

@@ -13,7 +13,7 @@ from scipy.linalg import null_space
 
 from identify.arrays import Array
 from identify.estimation.base_parameters import BaseParameters
-from identify.estimation.loop_parameters import StartingGuess
+from identify.loop_parameters import StartingGuess
 
 POOR = 1e13
 """Condition number of the poses' information beyond which double precision (1.1e-16) leaves the variance of the least

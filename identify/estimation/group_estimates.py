@@ -13,8 +13,8 @@ from dynamics.parameters import JOINT_PID_NAMES
 from identify.arrays import Array
 from identify.estimation.base_parameters import BaseParameters
 from identify.estimation.identifiability import Identifiability
-from identify.estimation.loop_parameters import StartingGuess
 from identify.estimation.propagation import combined_std
+from identify.loop_parameters import StartingGuess
 
 
 @dataclass(frozen=True)

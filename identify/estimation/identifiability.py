@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from dynamics import Robot
 from dynamics.parameters import COULOMB_NAMES, VISCOUS_NAMES
 from identify.arrays import Array
-from identify.estimation.loop_parameters import NAMES, StartingGuess, holding_torque
 from identify.estimation.propagation import combined_std
+from identify.loop_parameters import NAMES, StartingGuess, holding_torque
 
 IDENTIFIABLE_SHARE = 0.5
 """Of the guess's standard deviation and of the size: what the record may leave of an identified quantity."""

@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from dynamics import DynamicsError, Robot
-from dynamics.loop_checks import checked_loop_parameters
+from dynamics.closed_loop.loop_checks import checked_loop_parameters
 from identify.arrays import Array
 from identify.cores import one_thread
 from identify.errors import EstimationError, ScenarioError
@@ -24,11 +24,11 @@ from identify.estimation.estimate_covariance import DRAWS, Uncertainty, estimate
 from identify.estimation.explanation import Explanation, explanation
 from identify.estimation.group_estimates import GroupEstimates
 from identify.estimation.judgement import Judgement, judge
-from identify.estimation.loop_parameters import NAMES, StartingGuess, starting_guess
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor
 from identify.estimation.whiteness import Whiteness
+from identify.loop_parameters import NAMES, StartingGuess, starting_guess
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
 from identify.record.recorded_origin import recorded_seed

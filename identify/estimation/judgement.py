@@ -19,10 +19,10 @@ from identify.estimation.estimate_covariance import Uncertainty
 from identify.estimation.explanation import Explanation
 from identify.estimation.group_estimates import GroupEstimates, group_estimates, group_rows
 from identify.estimation.identifiability import identifiability
-from identify.estimation.loop_parameters import NAMES
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import bounds_of
 from identify.estimation.prior_support import rests_on_prior
+from identify.loop_parameters import NAMES
 from identify.scenario import Scenario
 
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from dynamics import DynamicsError
 from identify.arrays import Array
-from identify.estimation.loop_parameters import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor
+from identify.loop_parameters import StartingGuess
 from identify.record.recorded_run import RecordedRun
 
 

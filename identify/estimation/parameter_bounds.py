@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dynamics.analysis.physical_inertia import MOMENTS, SMALLEST, physical_inertias
 from dynamics.parameters import BODY_NAMES
-from dynamics.physical_inertia import MOMENTS, SMALLEST, physical_inertias
 from identify.arrays import Array
 from identify.estimation.bounded_least_squares import Problem
-from identify.estimation.loop_parameters import NAMES, StartingGuess, index_of
+from identify.loop_parameters import NAMES, StartingGuess, index_of
 
 SMALLEST_SHARE = 1e-3
 """Lower bound of platform mass and integral gain, as a share of the starting guess: the model needs both."""

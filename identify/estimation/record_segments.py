@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from dynamics.closed_loop import ClosedLoopRun, Reference, StartState, equilibrium, simulate
-from dynamics.loop_types import MAX_DELAY_FRAMES
+from dynamics.closed_loop.problem import MAX_DELAY_FRAMES
 from identify.arrays import Array
 from identify.estimation.warm_start import effective_command, running_integral
 from identify.record.filtering import filtered_derivatives

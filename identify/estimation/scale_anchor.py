@@ -17,8 +17,8 @@ import xarray as xr
 
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
-from identify.estimation.loop_parameters import NAMES, index_of, unit_of
-from identify.record.attribute_text import shown
+from identify.files.attribute_text import shown
+from identify.loop_parameters import NAMES, index_of, unit_of
 
 MEASURED_PARAMETER = {"platform_mass": "platform.mass", "joint_gain": "joint_pid.lp"}
 """Anchors that measure a parameter."""

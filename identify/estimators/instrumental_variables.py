@@ -14,11 +14,11 @@ import numpy as np
 from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.estimation.loop_parameters import NAMES, StartingGuess
 from identify.estimation.warm_start import REWEIGHTINGS
 from identify.estimators.evidence import Estimate, Evidence
 from identify.estimators.least_squares import fit_equations, row_noise, standard_deviations
 from identify.estimators.torque_equations import TorqueEquations, nearest_admissible, prior_of, torque_equations
+from identify.loop_parameters import NAMES, StartingGuess
 
 MAX_ITERATIONS = 10
 

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identify.arrays import Array
-from identify.estimation.loop_parameters import NAMES, StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.estimation.warm_start import REWEIGHTINGS, bounded_fit
 from identify.estimators.evidence import Estimate, Evidence
 from identify.estimators.torque_equations import TorqueEquations, lower_bounds, prior_of, torque_equations
+from identify.loop_parameters import NAMES, StartingGuess
 
 SMALLEST_NOISE_N_M = 1e-9
 

@@ -8,11 +8,11 @@ import numpy as np
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.estimate_covariance import estimate_uncertainty
-from identify.estimation.loop_parameters import NAMES, StartingGuess
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
 from identify.estimation.warm_start import REWEIGHTINGS, linear_warm_start
 from identify.estimators.evidence import Estimate, Evidence
+from identify.loop_parameters import NAMES, StartingGuess
 from identify.progress import SilentProgress
 from identify.random_streams import ROUTES_UNCERTAINTY, mixed_generator
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from identify.arrays import Array
-from identify.estimation.loop_parameters import NAMES, StartingGuess
 from identify.estimation.warm_start import joint_balance
+from identify.loop_parameters import NAMES, StartingGuess
 from identify.record.filtering import zero_phase_filter
 from identify.record.recorded_run import RecordedRun
 from identify.scenario import Filter, Timing

@@ -17,7 +17,6 @@ import numpy as np
 
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.estimation.loop_parameters import NAMES
 from identify.estimation.warm_start import REWEIGHTINGS
 from identify.estimators.evidence import Estimate, Evidence
 from identify.estimators.least_squares import fit_equations, information
@@ -29,6 +28,7 @@ from identify.estimators.torque_equations import (
     prior_of,
     torque_equations,
 )
+from identify.loop_parameters import NAMES
 from identify.random_streams import DISTURBED_COPIES, mixed_generator
 
 DRAWS = 4

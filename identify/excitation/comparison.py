@@ -11,10 +11,10 @@ from dynamics.closed_loop import prepare
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import Worst
 from identify.excitation.criterion_information import knowledge, log_information
-from identify.excitation.criterion_observability import log_observability, observability_index
 from identify.excitation.design import motion_check, prepare_search
 from identify.excitation.evolutionary_search import FEWEST_MEMBERS
 from identify.excitation.motion import sample_times
+from identify.excitation.observability import log_observability, observability_index
 from identify.excitation.random_trajectories import admissible_trajectories
 from identify.progress import Progress
 from identify.random_streams import EXCITATION, SEARCH, child

@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from dynamics import Robot
 from identify.excitation.comparison import Comparison
-from identify.reporting.blank_figure import blank_figure
+from identify.files.figure import blank_figure
 from identify.scenario import Scenario
 
 COMPONENTS = ("x", "y", "z", "α", "β", "γ")

@@ -24,9 +24,9 @@ import numpy as np
 
 from cmmsim.visibility import SightLines, sight_lines
 from dynamics import Robot
-from dynamics.jacobians import crank_leverage, loop_jacobians, pose_jacobian
-from dynamics.kinematics import leg_vectors
-from dynamics.workspace import LEAST_LEVERAGE, MOST_CONDITION, characteristic_length
+from dynamics.analysis.workspace import LEAST_LEVERAGE, MOST_CONDITION, characteristic_length
+from dynamics.kinematics.inverse_kinematics import leg_vectors
+from dynamics.kinematics.jacobians import crank_leverage, loop_jacobians, pose_jacobian
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.excitation.motion import is_whole_periods

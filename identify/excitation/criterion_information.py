@@ -18,8 +18,8 @@ from dynamics import Robot
 from dynamics.closed_loop import LoopFailure, simulate
 from identify.arrays import Array
 from identify.errors import TrajectoryError
-from identify.estimation.loop_parameters import NAMES, StartingGuess, index_of, starting_guess
 from identify.estimation.scale_anchor import DEFAULT_STD, MEASURED_PARAMETER
+from identify.loop_parameters import NAMES, StartingGuess, index_of, starting_guess
 from identify.record.loop_setup import frame_times, model_settings, reference_motion
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory

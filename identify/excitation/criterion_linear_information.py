@@ -15,12 +15,12 @@ import numpy as np
 
 from dynamics import Robot
 from identify.arrays import Array
-from identify.estimation.loop_parameters import NAMES
 from identify.excitation.criterion_information import Knowledge
 from identify.excitation.linear_loop import ComplexArray, pid_response, torque_response, tracking_response
 from identify.excitation.log_determinant import log_determinant
 from identify.excitation.motion import sample_times, torque_regressor, tracked_motion
 from identify.excitation.unknowns import Unknowns
+from identify.loop_parameters import NAMES
 from identify.scenario import Scenario
 
 HARMONICS_SEEN = 8

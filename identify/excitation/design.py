@@ -15,17 +15,17 @@ from identify.errors import TrajectoryError
 from identify.excitation.constraints import MotionConstraints, check_periods
 from identify.excitation.criterion_information import Knowledge, knowledge, log_information
 from identify.excitation.criterion_linear_information import log_linear_information
-from identify.excitation.criterion_observability import SMOOTHING_RAD_S, log_observability, observability_index
 from identify.excitation.evolutionary_search import FEWEST_MEMBERS, evolve
 from identify.excitation.gradient_search import climb
+from identify.excitation.observability import SMOOTHING_RAD_S, log_observability, observability_index
 from identify.excitation.random_trajectories import Check, admissible_trajectories
 from identify.excitation.search import SearchProblem, SearchResult
 from identify.excitation.unknowns import unknowns
-from identify.files.trajectory_file import TrajectorySet
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import EXCITATION, SEARCH, UNSEEN, child
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
+from identify.trajectory_file import TrajectorySet
 
 STARTS = 3
 """Random trajectories from which IPOPT climbs."""

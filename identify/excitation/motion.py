@@ -5,9 +5,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynamics import Robot
-from dynamics.jacobians import joint_jacobian
-from dynamics.rigid_body_dynamics import rigid_body_regressor
-from dynamics.rotation import pose_rate_to_twist, twist_bias
+from dynamics.kinematics.jacobians import joint_jacobian
+from dynamics.kinematics.rotation import pose_rate_to_twist, twist_bias
+from dynamics.rigid_body.virtual_work import rigid_body_regressor
 from identify.arrays import Array
 from identify.excitation.unknowns import Unknowns
 

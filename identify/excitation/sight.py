@@ -3,10 +3,10 @@
 import casadi as ca
 import numpy as np
 
-from cmmsim.observation import GRAZING
-from cmmsim.pose import apply, pose_to_transform
+from cmmsim.geometry.pose import apply, pose_to_transform
+from cmmsim.pose_estimation.observation import GRAZING
 from cmmsim.visibility import EDGE_PX, SightLines
-from dynamics.rotation import rotation_matrix
+from dynamics.kinematics.rotation import rotation_matrix
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 

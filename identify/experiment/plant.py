@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dynamics import Robot
+from dynamics.analysis.geometry_error import with_geometry_error
 from dynamics.closed_loop import ClosedLoopRun, LoopSettings, PoseSensor, RateSensor, Reference, simulate
-from dynamics.geometry_error import with_geometry_error
 from identify.arrays import Array
 from identify.record.loop_setup import plant_settings
 from identify.scenario import Scenario

@@ -4,7 +4,7 @@ import trimesh
 
 import cmmsim
 from dynamics import Robot
-from dynamics.body_frames import crank_rotations, crank_tips
+from dynamics.analysis.body_frames import crank_rotations, crank_tips
 from identify.arrays import Array
 
 CRANK_RADIUS_M = 0.010

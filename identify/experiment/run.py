@@ -13,13 +13,13 @@ import xarray as xr
 import cmmsim
 from dynamics import Robot, load_robot
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
-from identify.estimation.loop_parameters import NAMES, starting_guess
 from identify.estimation.scale_anchor import measured_anchor, store_anchor
 from identify.excitation import design_trajectories
 from identify.experiment.plant import mismatch, plant_robot, simulate_plant
 from identify.experiment.platform_load import PlatformLoad, drawn_load
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, frame_latencies, make_sensor, with_renderer
 from identify.experiment.truth import build_truth
+from identify.loop_parameters import NAMES, starting_guess
 from identify.progress import Advance, Progress, SilentProgress
 from identify.random_streams import ANCHOR, LATENCY, LOAD, NOISE, TEACHING, stream_seed
 from identify.record import recording

@@ -7,15 +7,15 @@ from typing import Protocol
 import numpy as np
 
 import cmmsim
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.imaging.renderer import choose_renderer
 from cmmsim.latency import drawn_latencies
-from cmmsim.renderers import choose_renderer
-from cmmsim.sensor_file import read_sensor_file
 from dynamics import Robot
 from identify.arrays import Array
 from identify.experiment.robot_bodies import robot_meshes, robot_transforms
 from identify.progress import Advance
 from identify.scenario import Scenario
-from identify.sensor_timing import sensor_timing
+from identify.scenario.timing import sensor_timing
 
 
 def make_sensor(scenario: Scenario, robot: Robot, seed: int, taught: cmmsim.Taught | None = None) -> cmmsim.Sensor:

@@ -4,7 +4,7 @@ import numpy as np
 import xarray as xr
 
 from identify.errors import RecordError, ScenarioError
-from identify.record.attribute_text import shown
+from identify.files.attribute_text import shown
 from identify.scenario import Scenario, scenario_from_toml
 
 

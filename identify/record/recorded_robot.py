@@ -10,7 +10,7 @@ import xarray as xr
 from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
-from identify.record.attribute_text import shown
+from identify.files.attribute_text import shown
 
 ATTRIBUTE = "robot_geometry"
 

@@ -13,9 +13,7 @@ from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, LoopSettings, Reference, simulate
 from identify.arrays import Array
 from identify.files.dataset import check_variables
-from identify.record.loop_setup import model_settings
-from identify.record.payload import recorded_payload, recorded_payload_std
-from identify.record.record_checks import (
+from identify.record.checks import (
     check_channels,
     check_good_share,
     check_length,
@@ -23,6 +21,8 @@ from identify.record.record_checks import (
     check_reference,
     checked_covariance,
 )
+from identify.record.loop_setup import model_settings
+from identify.record.payload import recorded_payload, recorded_payload_std
 from identify.record.recording import VARIABLES, poses
 from identify.scenario import Scenario
 

@@ -7,7 +7,7 @@ import typer
 
 from identify.reporting.goals import explanation_goals
 from identify.reporting.tables import goals_table, number
-from identify.reporting.terminal import print_table
+from identify.terminal import print_table
 
 
 def print_identification(result: dict[str, Any], path: Path) -> None:

@@ -6,9 +6,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dynamics.parameters import unit_of
-from identify.reporting.blank_figure import blank_figure
+from identify.files.figure import blank_figure
 from identify.reporting.tables import Table, number
-from identify.variation import Variation
+from identify.validation.variation import Variation
 
 GOAL_PERCENT = 5.0
 """What every identified parameter should keep to."""

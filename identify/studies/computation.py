@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from identify.interrupts import raise_noted
 from identify.studies.design import Case, Setup
-from identify.studies.kinds import row_function
+from identify.studies.rows.kinds import row_function
 
 FIRST = ("row", "repeat", "seed_entropy", "seed_spawn_key")
 LAST = ("seconds", "error")

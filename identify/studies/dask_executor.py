@@ -14,10 +14,10 @@ from uuid import uuid4
 from distributed import Client, Future, KilledWorker, get_worker
 
 from identify.errors import StudyError
+from identify.files.same_versions import product_version, require_product
 from identify.studies.batches import Batches
 from identify.studies.computation import Finished, compute
 from identify.studies.design import Case, Setup
-from identify.studies.same_versions import product_version, require_product
 
 WORKERLESS_SECONDS = 180
 """How long a cluster may be without any worker; one that starts again needs its time on a busy machine."""

@@ -14,10 +14,10 @@ from distributed.comm.registry import get_backend
 from tornado.ioloop import PeriodicCallback
 
 from identify.errors import StudyError
+from identify.files.same_versions import check_workers
 from identify.files.versions import versions
 from identify.interrupts import deaf_offspring, held
 from identify.studies.dask_executor import DaskExecutor, gone
-from identify.studies.same_versions import check_workers
 
 CONNECT_SECONDS = 5
 """How long a scheduler may take to answer at first."""

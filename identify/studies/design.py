@@ -17,8 +17,8 @@ from identify.experiment.sensor_in_loop import with_renderer
 from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
 from identify.scenario import Scenario, load_scenario
 from identify.studies.keys import check, is_integer, options_in, overrides
-from identify.studies.kinds import check_kind, kind_reads, options_model
 from identify.studies.law_names import check_law_names
+from identify.studies.rows.kinds import check_kind, kind_reads, options_model
 from identify.studies.study_file import Range, Study
 from identify.studies.unread_keys import check_ever_read, check_read_here
 

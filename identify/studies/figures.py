@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 
 from identify.arrays import Array
-from identify.reporting.blank_figure import blank_figure
+from identify.files.figure import blank_figure
 from identify.reporting.figures import save_figure
 from identify.studies.law import Law
 from identify.studies.point_statistics import CONFIDENCE as BANDS

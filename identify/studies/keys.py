@@ -9,7 +9,7 @@ from typing import Annotated, Any, get_args
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
-from cmmsim.sensor_schema import SensorFile
+from cmmsim.files.schema import SensorFile
 from identify.errors import StudyError
 from identify.scenario import Scenario
 

@@ -4,8 +4,8 @@ import difflib
 from collections.abc import Collection
 
 from identify.errors import StudyError
-from identify.studies.kinds import figure_names
 from identify.studies.law import Law
+from identify.studies.rows.kinds import figure_names
 from identify.studies.study_file import Study
 
 ROOTS = ("scenario.", "sensor.", "options.")

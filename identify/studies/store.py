@@ -11,13 +11,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from cmmsim.sensor_file import read_sensor_file
+from cmmsim.files.sensor_file import read_sensor_file
 from identify.errors import StudyError, StudyInterrupted
 from identify.files.atomic import write_text
+from identify.files.same_versions import check_folder
 from identify.files.versions import versions
 from identify.studies.design import Setup
 from identify.studies.journal import Journal
-from identify.studies.same_versions import check_folder
 from identify.studies.study_file import Study
 from identify.studies.table import study_in
 

@@ -33,8 +33,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError, field_validator, model_validator
 
 from identify.errors import StudyError
-from identify.files.built_in import built_in_names, named_text
-from identify.scenario_text import one_line
+from identify.scenario.built_in import built_in_names, named_text
+from identify.scenario.scenario_text import one_line
 from identify.studies.law import Law
 
 BUILT_IN = Path(__file__).parent / "built_in"

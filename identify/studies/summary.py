@@ -17,7 +17,7 @@ from identify.files.versions import versions
 from identify.studies import point_statistics, theory
 from identify.studies.figures import draw
 from identify.studies.point_statistics import Statistics
-from identify.studies.rows import find_kind
+from identify.studies.rows.rows import find_kind
 from identify.studies.study_file import Study
 from identify.studies.table import figure_names
 from identify.studies.theory import Verdict, check_laws

@@ -2,7 +2,7 @@
 
 from identify.errors import ScenarioError
 from identify.scenario import Scenario
-from identify.studies.rows import columns
+from identify.studies.rows.rows import columns
 from identify.studies.study_file import Study
 
 SENSOR_UNITS = {

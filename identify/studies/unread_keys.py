@@ -6,10 +6,10 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from cmmsim.sensor_file import read_sensor_file
+from cmmsim.files.sensor_file import read_sensor_file
 from identify.errors import StudyError
 from identify.scenario import Scenario
-from identify.studies.row_reads import Reads, among, timing
+from identify.studies.rows.row_reads import Reads, among, timing
 from identify.studies.study_file import Range, Study
 
 BESIDE = (

@@ -8,12 +8,12 @@ product's.
 import numpy as np
 import pytest
 
+from cmmsim.detection.detectors import DEFAULT_DETECTOR, DETECTORS
 from cmmsim.detector_leaderboard import compete
-from cmmsim.detectors import DEFAULT_DETECTOR, DETECTORS
 from cmmsim.drawn_discs import scene_of, working_point
-from cmmsim.plane_frame import frame_from_planes
-from cmmsim.pose import apply, pose_to_transform, transform_to_pose
-from cmmsim.sensor_file import read_sensor_file
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.geometry.plane_frame import frame_from_planes
+from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
 from cmmsim.visibility import sight_lines
 from tests.accuracy.test_own_figures import DETECTOR_GOAL, PLANES_GOAL, TRAVEL
 

@@ -13,7 +13,7 @@ from mujoco import rollout, sysid
 from mujoco.sysid import Parameter, ParameterDict, SignalType, TimeSeries
 from scipy.spatial.transform import Rotation
 
-from dynamics.mjcf import MjcfSolver, mjcf_text
+from dynamics.engines.mjcf import MjcfSolver, mjcf_text
 from tests.benchmarks.servo_estimator import Estimate
 from tests.benchmarks.servo_experiment import RATE_HZ, TIMES, felt_commands, robot, servo_gains, table, truth
 

@@ -5,11 +5,11 @@ import sys
 import numpy as np
 import pytest
 
+from cmmsim.detection.detectors import DEFAULT_DETECTOR, DETECTORS
 from cmmsim.detector_leaderboard import PEERS, compete
-from cmmsim.detectors import DEFAULT_DETECTOR, DETECTORS
 from cmmsim.drawn_discs import Condition, scene_of, working_point
 from cmmsim.errors import CmmError
-from cmmsim.sensor_file import read_sensor_file
+from cmmsim.files.sensor_file import read_sensor_file
 
 FILE = read_sensor_file("ctrack780")
 SCENE = scene_of(FILE)

@@ -11,7 +11,7 @@ import pytest
 
 import dynamics
 from dynamics import closed_loop, compilation
-from dynamics.batch import simulate_batch
+from dynamics.closed_loop.batch import simulate_batch
 from tests.benchmarks.timing import (
     FREE,
     WHOLE_SECOND_CORE,

@@ -12,9 +12,9 @@ import pytest
 
 import dynamics
 from dynamics import compilation
-from dynamics.forward_dynamics import fast_forward_dynamics
-from dynamics.mjcf import mjcf_text
-from dynamics.mujoco_engine import MujocoRobot
+from dynamics.analysis.fast_forward_dynamics import fast_forward_dynamics
+from dynamics.engines.mjcf import mjcf_text
+from dynamics.engines.mujoco_engine import MujocoRobot
 from tests.benchmarks.timing import OtherLoad, fastest, judge
 
 pytestmark = pytest.mark.slow

@@ -19,8 +19,8 @@ import identify
 from dynamics import DynamicsError, compilation
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.identification import output_error_problem
-from identify.estimation.loop_parameters import NAMES, index_of
 from identify.estimation.warm_start import linear_warm_start
+from identify.loop_parameters import NAMES, index_of
 from tests.benchmarks.timing import OtherLoad, judge, slowness
 from tests.identify.synthetic import rss6, run_plant
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import cmmsim
-from cmmsim import render
+from cmmsim.imaging import pyrender_renderer as render
 from tests.benchmarks.timing import WHOLE_SECOND_CORE, OtherLoad, judge, second_core_gain, slowness
 
 pytestmark = [pytest.mark.slow, pytest.mark.rendering]
@@ -162,8 +162,8 @@ def test_kernels_compile_within_fifteen_seconds(tmp_path, taught, record_propert
     code = (
         "import time, numpy as np, cmmsim; s = cmmsim.load_sensor('ctrack780', renderer='analytic');"
         "from cmmsim import teaching; c = time.process_time(); s.look(s.home).windows(np.full((2, 3, 2), 700), 16);"
-        "from cmmsim.ellipse_fit import fit_ellipses; from cmmsim.triangulation import triangulate;"
-        "from cmmsim.registration import register;"
+        "from cmmsim.detection.ellipse_fit import fit_ellipses; from cmmsim.geometry.triangulation import triangulate;"
+        "from cmmsim.geometry.registration import register;"
         "fit_ellipses(np.zeros((1, 16, 16)), np.zeros((1, 2), int), s.noise, 14);"
         "p = np.full((4, 2), 1000.0); e = np.tile(np.eye(2), (4, 1, 1)); triangulate(s.rig, p, p, e, e);"
         "x = np.eye(3); register(x, x, np.tile(np.eye(3), (3, 1, 1))); print(time.process_time() - c)"

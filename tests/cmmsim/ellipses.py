@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cmmsim.noise import CameraNoise
+from cmmsim.radiometry.noise import CameraNoise
 
 NOISE = CameraNoise(electrons_at_white=1600.0, gain=0.13, dark_noise=26.0, full_well=1800.0, black_level=16.0)
 

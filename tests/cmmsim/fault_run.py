@@ -13,10 +13,10 @@ import numpy as np
 import cmmsim
 from cmmsim.faults import FaultGenerator, fault_bodies
 from cmmsim.faulty_images import FaultyImages
-from cmmsim.pose import invert
-from cmmsim.sensor_file import read_sensor_file
-from cmmsim.taught import Taught
-from cmmsim.tracking import Tracker
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.geometry.pose import invert
+from cmmsim.pose_estimation.taught import Taught
+from cmmsim.tracker import Tracker
 
 REACH = np.array([0.009] * 3 + [0.035] * 3)  # m, rad: of the poses
 UNPREDICTED = np.array([3e-4] * 3 + [1e-3] * 3)  # m, rad: between two frames

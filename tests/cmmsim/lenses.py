@@ -3,9 +3,9 @@
 import numpy as np
 
 import cmmsim
-from cmmsim.eccentricity import centre_offset
-from cmmsim.pose import apply, pose_to_transform
-from cmmsim.sensor_file import sensor_text
+from cmmsim.files.sensor_file import sensor_text
+from cmmsim.geometry.eccentricity import centre_offset
+from cmmsim.geometry.pose import apply, pose_to_transform
 
 CAMERAS = """
 [rig.left]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ndtr
 
-from cmmsim.pose import Array
+from cmmsim.geometry.pose import Array
 
 POINTS_PER_SIGMA = 1.25  # rim points to one standard deviation of the point spread
 FEWEST_POINTS = 24

@@ -2,7 +2,14 @@
 
 import numpy as np
 
-from cmmsim.ellipse_fit import CORE_SHARE, RING_REACH, SMALLEST_RADIUS_PX, EllipseFits, FitLimits, largest_misfits
+from cmmsim.detection.ellipse_fit import (
+    CORE_SHARE,
+    RING_REACH,
+    SMALLEST_RADIUS_PX,
+    EllipseFits,
+    FitLimits,
+    largest_misfits,
+)
 from tests.cmmsim.numpy_coverage import coverage
 
 

@@ -18,10 +18,10 @@ from cmmsim.acceptance import (
 from cmmsim.acceptance.bar import rigid_bar
 from cmmsim.acceptance.length_test import length_artefact, lengths_from_first, measure_line
 from cmmsim.acceptance.moving_bar import bar_run, relative_covariance, relative_error
-from cmmsim.measurement import Measurement
-from cmmsim.pose import apply, rotation_exp, transform_to_pose
-from cmmsim.rig_from_file import rig_from_file
-from cmmsim.sensor_file import read_sensor_file
+from cmmsim.files.rig import rig_from_file
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.geometry.pose import apply, rotation_exp, transform_to_pose
+from cmmsim.pose_estimation.measurement import Measurement
 
 FILE = read_sensor_file("ctrack780")
 SILENT = FILE.model_copy(update={"camera": FILE.camera.model_copy(update={"noise": False})})

@@ -8,14 +8,14 @@ import pytest
 from cmmsim.acceptance import AcceptanceError, bar_paths, common_volume, require_rules, seven_lines, volume_of_size
 from cmmsim.acceptance.bar import LENGTH, bar_ends, rigid_bar
 from cmmsim.acceptance.bar_paths import SECONDS
-from cmmsim.acceptance.latency import require_room
+from cmmsim.acceptance.latency_test import require_room
 from cmmsim.acceptance.length_test import length_artefact
 from cmmsim.acceptance.measuring_lines import MeasuringLine
 from cmmsim.acceptance.volume import CORNERS, MARGIN_PX
-from cmmsim.marked_body import marked_body
-from cmmsim.pose import apply, pose_to_transform
-from cmmsim.rig_from_file import rig_from_file
-from cmmsim.sensor_file import read_sensor_file
+from cmmsim.files.marked_body import marked_body
+from cmmsim.files.rig import rig_from_file
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.geometry.pose import apply, pose_to_transform
 
 RIG = read_sensor_file("ctrack780").rig
 

@@ -7,17 +7,18 @@ import pytest
 import trimesh
 
 import cmmsim
-from cmmsim import render, renderers
-from cmmsim.analytic import draw_windows
-from cmmsim.camera import PinholeCamera
-from cmmsim.convex_solid import ConvexSolid
-from cmmsim.eccentricity import eccentricity
-from cmmsim.ellipse_fit import FitLimits, fit_ellipses
-from cmmsim.layer_kernel import Discs, Solids, cover_by_polygon, lay_layers, polygon_holds
-from cmmsim.noise import CameraNoise
-from cmmsim.pose import apply, pose_to_transform
-from cmmsim.projected_disc import project_discs
-from cmmsim.virtual_camera import SUPERSAMPLING
+from cmmsim.detection.ellipse_fit import FitLimits, fit_ellipses
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.eccentricity import eccentricity
+from cmmsim.geometry.pose import apply, pose_to_transform
+from cmmsim.geometry.projected_disc import project_discs
+from cmmsim.imaging import pyrender_renderer as render
+from cmmsim.imaging import renderer as renderers
+from cmmsim.imaging.analytic import draw_windows
+from cmmsim.imaging.convex_solid import ConvexSolid
+from cmmsim.imaging.layer_kernel import Discs, Solids, cover_by_polygon, lay_layers, polygon_holds
+from cmmsim.imaging.virtual_camera import SUPERSAMPLING
+from cmmsim.radiometry.noise import CameraNoise
 from tests.cmmsim import numpy_coverage
 from tests.cmmsim.lenses import expected_centres, lens_sensor, poses_about_home
 

@@ -5,9 +5,9 @@ import pytest
 from scipy.special import ndtr
 
 import cmmsim
-from cmmsim.blurred_coverage import blurred_coverage
-from cmmsim.ellipse_coverage import SHAPE_BASIS
-from cmmsim.ellipse_fit import fit_ellipses
+from cmmsim.detection.ellipse_fit import fit_ellipses
+from cmmsim.geometry.blurred_coverage import blurred_coverage
+from cmmsim.geometry.ellipse_coverage import SHAPE_BASIS
 from tests.cmmsim.ellipses import NOISE, random_ellipses
 
 SIZE = 20

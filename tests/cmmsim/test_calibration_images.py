@@ -19,15 +19,15 @@ from cmmsim.calibration import (
     render_pairs,
     sensor_template,
 )
-from cmmsim.camera import PinholeCamera
-from cmmsim.distortion import Distortion
-from cmmsim.eccentricity import centre_offset
-from cmmsim.noise import CameraNoise
-from cmmsim.optics import Optics
-from cmmsim.pose import apply, rotation_log
-from cmmsim.renderers import ANALYTIC, PYRENDER
-from cmmsim.sensor_file import sensor_text
-from cmmsim.stereo_rig import StereoRig, toed_in_rig
+from cmmsim.files.sensor_file import sensor_text
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.distortion import Distortion
+from cmmsim.geometry.eccentricity import centre_offset
+from cmmsim.geometry.pose import apply, rotation_log
+from cmmsim.geometry.stereo_rig import StereoRig, toed_in_rig
+from cmmsim.imaging.renderer import ANALYTIC, PYRENDER
+from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.radiometry.optics import Optics
 
 NOISE = CameraNoise(1600.0, 0.13, 26.0, 1800.0, 16.0)
 DOTS = Board(kind="dots", columns=9, rows=7, spacing=0.05, radius=0.0125)

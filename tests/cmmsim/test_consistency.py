@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from cmmsim.consistency import FEWEST, LARGEST_MISFIT, consistent, outline_misfits, place_misfits
 from cmmsim.errors import LostError
-from cmmsim.observation import Outlines, StickerObservation
-from cmmsim.outlines import sticker_outlines, symmetric_root
-from cmmsim.pose import apply, pose_to_transform
-from cmmsim.registration import register
-from cmmsim.triangulation import triangulate
+from cmmsim.geometry.outlines import sticker_outlines, symmetric_root
+from cmmsim.geometry.pose import apply, pose_to_transform
+from cmmsim.geometry.registration import register
+from cmmsim.geometry.triangulation import triangulate
+from cmmsim.pose_estimation.consistency import FEWEST, LARGEST_MISFIT, consistent, outline_misfits, place_misfits
+from cmmsim.pose_estimation.observation import Outlines, StickerObservation
 from tests.cmmsim.test_covariance import BODY, CAMERA_FROM_BASE, FILE, RIG, pixel_covariances
 
 RADIUS = 0.003

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cmmsim.camera import PinholeCamera
-from cmmsim.marked_body import marked_body
-from cmmsim.observation import StickerObservation
-from cmmsim.pose import apply, compose_covariance, pose_covariance, pose_to_transform, transform_to_pose
-from cmmsim.pose_methods import by_planes, by_registration
-from cmmsim.sensor_file import read_sensor_file
-from cmmsim.stereo_rig import toed_in_rig
-from cmmsim.triangulation import triangulate
+from cmmsim.files.marked_body import marked_body
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.pose import apply, compose_covariance, pose_covariance, pose_to_transform, transform_to_pose
+from cmmsim.geometry.stereo_rig import toed_in_rig
+from cmmsim.geometry.triangulation import triangulate
+from cmmsim.pose_estimation.observation import StickerObservation
+from cmmsim.pose_estimation.pose_methods import by_planes, by_registration
 
 DRAWS = 2000
 FILE = read_sensor_file("ctrack780")

@@ -7,11 +7,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.stats import norm
 
-from cmmsim import cramer_rao
-from cmmsim.cramer_rao import cramer_rao_bound, grey_value_information, light_shares
-from cmmsim.ellipse_coverage import SHAPE_BASIS
+from cmmsim.detection import cramer_rao
+from cmmsim.detection.cramer_rao import cramer_rao_bound, grey_value_information, light_shares
 from cmmsim.errors import CmmError
-from cmmsim.noise import CameraNoise
+from cmmsim.geometry.ellipse_coverage import SHAPE_BASIS
+from cmmsim.radiometry.noise import CameraNoise
 
 NOISE = CameraNoise(electrons_at_white=1600.0, gain=0.13, dark_noise=26.0, full_well=1800.0, black_level=16.0)
 WHITE = CameraNoise(electrons_at_white=1e7, gain=2e-5, dark_noise=2e5, full_well=2e7, black_level=16.0)  # 4 grey values

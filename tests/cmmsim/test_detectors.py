@@ -6,13 +6,13 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from cmmsim.detectors import DEFAULT_DETECTOR, DETECTORS, find_detector
+from cmmsim.detection.detectors import DEFAULT_DETECTOR, DETECTORS, find_detector
+from cmmsim.detection.ellipse_fit import FitLimits
 from cmmsim.drawn_discs import Condition, draw_discs, random_ellipses, scene_of
-from cmmsim.ellipse_fit import FitLimits
 from cmmsim.errors import CmmError, SensorFileError, UnknownOptionError
+from cmmsim.files.schema import Detection, SensorFile
+from cmmsim.files.sensor_file import read_sensor_file, sensor_text
 from cmmsim.sensor import Sensor
-from cmmsim.sensor_file import read_sensor_file, sensor_text
-from cmmsim.sensor_schema import Detection, SensorFile
 
 SCENE = scene_of(read_sensor_file("ctrack780"))
 SIZE, FIT = 18, 14

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cmmsim.disc_mesh import GROUND_SIDES, LARGEST_SAG, RIM_SAMPLES, disc_mesh
-from cmmsim.scene import Disc, DiscStack
+from cmmsim.imaging.disc_mesh import GROUND_SIDES, LARGEST_SAG, RIM_SAMPLES, disc_mesh
+from cmmsim.imaging.scene import Disc, DiscStack
 
 NORMAL = np.array([0.48, -0.6, 0.64])
 STICKER = Disc(np.array([0.1, -0.2, 0.3]), NORMAL, 0.003, 0.9)

@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import cmmsim
-from cmmsim.camera import PinholeCamera
-from cmmsim.distortion import Distortion
-from cmmsim.pose import apply, rotation_exp
-from cmmsim.rig_from_file import rig_from_file
-from cmmsim.sensor_file import read_sensor_file, sensor_text
-from cmmsim.sensor_schema import RightFromLeft
+from cmmsim.files.rig import rig_from_file
+from cmmsim.files.schema import RightFromLeft
+from cmmsim.files.sensor_file import read_sensor_file, sensor_text
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.distortion import Distortion
+from cmmsim.geometry.pose import apply, rotation_exp
 from tests.cmmsim.lenses import CAMERAS
 
 LENSES = {

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from cmmsim.camera import PinholeCamera
-from cmmsim.distortion import Distortion
-from cmmsim.eccentricity import bending, centre_offset, eccentricity
-from cmmsim.ellipse_fit import FitLimits, fit_ellipses
-from cmmsim.noise import CameraNoise
+from cmmsim.detection.ellipse_fit import FitLimits, fit_ellipses
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.distortion import Distortion
+from cmmsim.geometry.eccentricity import bending, centre_offset, eccentricity
+from cmmsim.radiometry.noise import CameraNoise
 
 NOISE = CameraNoise(1600.0, 0.13, 26.0, 1800.0, 16.0, enabled=False)
 CENTRE = np.array([0.62, 0.42, 1.8])  # seen near the corner of the image

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cmmsim.ellipse_coverage import SHAPE_BASIS, coverage
-from cmmsim.ellipse_fit import fit_ellipses
+from cmmsim.detection.ellipse_fit import fit_ellipses
+from cmmsim.geometry.ellipse_coverage import SHAPE_BASIS, coverage
 from tests.cmmsim.ellipses import NOISE, random_ellipses
 
 SIZE = 18

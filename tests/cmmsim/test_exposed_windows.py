@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from cmmsim.exposed_windows import exposed_windows
-from cmmsim.image_formation import ImageFormation, Side
-from cmmsim.pose import pose_to_transform
+from cmmsim.geometry.pose import pose_to_transform
+from cmmsim.imaging.exposed_windows import exposed_windows
+from cmmsim.imaging.image_formation import ImageFormation, Side
 from tests.cmmsim.lenses import lens_sensor
 
 SIZE = 64

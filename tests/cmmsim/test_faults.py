@@ -10,9 +10,9 @@ import cmmsim
 from cmmsim.fault_marks import DiscMark, FillMark, GlintMark, PlateMark, paint
 from cmmsim.faults import FaultGenerator, jump
 from cmmsim.faulty_images import Fault, FaultyImages
-from cmmsim.images import FrameImages, StereoFrame
-from cmmsim.noise import CameraNoise
-from cmmsim.tracking import Tracker
+from cmmsim.radiometry.images import FrameImages, StereoFrame
+from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.tracker import Tracker
 from tests.cmmsim.fault_run import exactly_taught, run_faults
 
 FIVE_SIGMA = 5.733e-7  # two-sided, of a normal variable

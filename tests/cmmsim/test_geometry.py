@@ -6,14 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cmmsim import pose as p
-from cmmsim.camera import PinholeCamera
-from cmmsim.eccentricity import eccentricity
 from cmmsim.errors import LostError, ShapeError
-from cmmsim.plane_frame import fit_plane, frame_from_planes, frame_of_points
-from cmmsim.registration import register
-from cmmsim.stereo_rig import toed_in_rig
-from cmmsim.triangulation import triangulate
+from cmmsim.geometry import pose as p
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.eccentricity import eccentricity
+from cmmsim.geometry.plane_frame import fit_plane, frame_from_planes, frame_of_points
+from cmmsim.geometry.registration import register
+from cmmsim.geometry.stereo_rig import toed_in_rig
+from cmmsim.geometry.triangulation import triangulate
 
 ANGLE = st.floats(-1.4, 1.4)
 CAMERA = PinholeCamera(2300.0, 1023.5, 767.5, 2048, 1536)

@@ -11,8 +11,8 @@ from scipy.stats import beta
 
 import cmmsim
 from cmmsim.errors import LostError
-from cmmsim.pose import pose_to_transform
-from cmmsim.tracking import Tracker
+from cmmsim.geometry.pose import pose_to_transform
+from cmmsim.tracker import Tracker
 from tests.cmmsim.fault_run import REACH, exactly_taught
 from tests.cmmsim.lenses import lens_sensor, pose_errors, poses_about_home
 

@@ -8,13 +8,13 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 import cmmsim
-from cmmsim.camera import PinholeCamera
-from cmmsim.ellipse_fit import fit_ellipses
-from cmmsim.observation import _evenly_lit
-from cmmsim.optics import Optics
-from cmmsim.pose import apply, pose_to_transform
-from cmmsim.views import View
-from cmmsim.virtual_camera import SUPERSAMPLING
+from cmmsim.detection.ellipse_fit import fit_ellipses
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.pose import apply, pose_to_transform
+from cmmsim.imaging.views import View
+from cmmsim.imaging.virtual_camera import SUPERSAMPLING
+from cmmsim.pose_estimation.observation import _evenly_lit
+from cmmsim.radiometry.optics import Optics
 from tests.cmmsim.lenses import LENSES, expected_centres, lens_sensor, placed_at, pose_errors, poses_about_home
 
 FINE = 16

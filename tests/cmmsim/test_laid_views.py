@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from cmmsim import render
-from cmmsim.camera import PinholeCamera
-from cmmsim.laid_views import Laid, LaidSolids
-from cmmsim.pooling_kernel import mean_of_cells
-from cmmsim.pose import pose_to_transform
-from cmmsim.scene import Disc, DiscStack, rod, rod_transform, solid_mesh
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.pose import pose_to_transform
+from cmmsim.imaging import pyrender_renderer as render
+from cmmsim.imaging.laid_views import Laid, LaidSolids
+from cmmsim.imaging.pooling_kernel import mean_of_cells
+from cmmsim.imaging.scene import Disc, DiscStack, rod, rod_transform, solid_mesh
+from cmmsim.imaging.views import NEAR, Drawable, View, same_exposure
+from cmmsim.imaging.virtual_camera import SUPERSAMPLING
 from cmmsim.sensor import load_sensor
-from cmmsim.views import NEAR, Drawable, View, same_exposure
-from cmmsim.virtual_camera import SUPERSAMPLING
 
 CAMERA = PinholeCamera(1000.0, 500.0, 400.0, 1001, 801)
 UP = np.array([0.0, 0.0, 1.0])

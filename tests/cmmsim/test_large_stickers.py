@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from cmmsim.observation import DetectionSettings, observe
-from cmmsim.pose import apply, pose_to_transform
+from cmmsim.files.schema import SensorFile
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.geometry.pose import apply, pose_to_transform
+from cmmsim.pose_estimation.observation import DetectionSettings, observe
 from cmmsim.sensor import Sensor
-from cmmsim.sensor_file import read_sensor_file
-from cmmsim.sensor_schema import SensorFile
 
 PLACES = {
     "A": [[0.12, 0.0], [-0.05, 0.12], [-0.08, -0.12]],

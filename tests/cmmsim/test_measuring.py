@@ -12,8 +12,8 @@ import trimesh
 from scipy.optimize import least_squares
 
 import cmmsim
-from cmmsim.pose import apply, pose_to_transform, rotation_log
-from cmmsim.registration import rigid_start
+from cmmsim.geometry.pose import apply, pose_to_transform, rotation_log
+from cmmsim.geometry.registration import rigid_start
 
 pytestmark = pytest.mark.rendering
 AXES = np.array([1e6] * 6)  # to um and urad

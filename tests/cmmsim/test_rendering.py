@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import cmmsim
-from cmmsim import render
-from cmmsim.eccentricity import eccentricity
-from cmmsim.ellipse_fit import fit_ellipses
-from cmmsim.noise import CameraNoise
-from cmmsim.pose import apply, pose_to_transform
-from cmmsim.renderers import PYRENDER
-from cmmsim.virtual_camera import SUPERSAMPLING
+from cmmsim.detection.ellipse_fit import fit_ellipses
+from cmmsim.geometry.eccentricity import eccentricity
+from cmmsim.geometry.pose import apply, pose_to_transform
+from cmmsim.imaging import pyrender_renderer as render
+from cmmsim.imaging.renderer import PYRENDER
+from cmmsim.imaging.virtual_camera import SUPERSAMPLING
+from cmmsim.radiometry.noise import CameraNoise
 
 pytestmark = pytest.mark.rendering
 NOISE = CameraNoise(1600.0, 0.13, 26.0, 1800.0, 16.0, enabled=False)

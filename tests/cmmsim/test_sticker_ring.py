@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cmmsim.errors import SensorFileError
-from cmmsim.sensor_file import read_sensor_file
+from cmmsim.files.sensor_file import read_sensor_file
 
 
 def places(count):

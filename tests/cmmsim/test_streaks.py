@@ -8,9 +8,9 @@ from scipy.stats import chi2, kstest
 
 import cmmsim
 from cmmsim.errors import LostError
-from cmmsim.observation import LONGEST_SMEAR_PX, read_windows
-from cmmsim.pose import apply, pose_to_transform
-from cmmsim.streaks import find_streaks
+from cmmsim.geometry.pose import apply, pose_to_transform
+from cmmsim.pose_estimation.observation import LONGEST_SMEAR_PX, read_windows
+from cmmsim.pose_estimation.streaks import find_streaks
 from tests.cmmsim.lenses import lens_sensor, poses_about_home
 
 EXPOSED = [(0.002, "perfect"), (0.004, "perfect")]

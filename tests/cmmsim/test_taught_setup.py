@@ -7,7 +7,7 @@ import pytest
 
 import cmmsim
 from cmmsim.exact_teaching import exactly_taught
-from cmmsim.sensor_file import read_sensor_file
+from cmmsim.files.sensor_file import read_sensor_file
 
 TAUGHT = exactly_taught(read_sensor_file("ctrack780"))
 

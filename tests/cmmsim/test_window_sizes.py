@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import cmmsim
-from cmmsim.pose import apply
+from cmmsim.geometry.pose import apply
 
 WIDE_RINGS = {"stickers.ring_radius": 0.012}
 LARGER = [

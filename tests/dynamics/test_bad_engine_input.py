@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from dynamics import mujoco_engine
+from dynamics.engines import mujoco_engine
+from dynamics.engines.mjcf import mjcf_text
 from dynamics.errors import DynamicsError, ParameterError
-from dynamics.mjcf import mjcf_text
 
 
 @pytest.mark.parametrize(

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from dynamics import closed_loop, forward_dynamics, mjcf
-from dynamics.batch import simulate_batch
+from dynamics import closed_loop
+from dynamics.analysis import fast_forward_dynamics as forward_dynamics
 from dynamics.closed_loop import FrameTiming, FrictionLaw, LoopSettings, Reference, ServoGains
+from dynamics.closed_loop.batch import simulate_batch
+from dynamics.engines import mjcf
 from dynamics.errors import DynamicsError, ParameterError, ShapeError, SimulationError, UnreachablePoseError
 
 BAD_NUMBERS = {

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from dynamics.batch import simulate_batch
+from dynamics.analysis.fast_forward_dynamics import fast_forward_dynamics
 from dynamics.closed_loop import simulate
+from dynamics.closed_loop.batch import simulate_batch
 from dynamics.errors import SimulationError, SingularPoseError
-from dynamics.forward_dynamics import fast_forward_dynamics
 
 
 @pytest.mark.parametrize("workers", [1, 3])

@@ -7,7 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from dynamics import closed_loop, compilation, plain_closed_loop, robot_file
+from dynamics import closed_loop, compilation, robot_file
+from dynamics import plain_loop as plain_closed_loop
 from dynamics import robot as robot_module
 from dynamics.errors import DynamicsError, SimulationError
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from dynamics.closed_loop.friction import FrictionLaw
+from dynamics.closed_loop.stick_slip import StickSlipMotion
 from dynamics.errors import SimulationError
-from dynamics.friction import FrictionLaw
-from dynamics.stick_slip import StickSlipMotion
 from tests.dynamics.test_stick_slip import COULOMB, MASS, STIFFNESS, _command, _displaced, _one_joint_functions
 
 STRIBECK = FrictionLaw("stribeck", static_ratio=1.5, stribeck_velocity=0.2)

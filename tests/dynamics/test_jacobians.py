@@ -4,10 +4,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from dynamics import jacobian_rates, jacobians
-from dynamics.kinematics import leg_vectors, platform_arms
+from dynamics.kinematics import jacobian_rates, jacobians
+from dynamics.kinematics.inverse_kinematics import leg_vectors, platform_arms
+from dynamics.kinematics.rotation import pose_rate_to_twist, rotation_matrix, twist_bias
 from dynamics.parameters import RIGID_BODY
-from dynamics.rotation import pose_rate_to_twist, rotation_matrix, twist_bias
 
 PER_LEG = {  # Jacobian of one leg and its closed-form rate
     "J_a1": (lambda leg, arm: jacobians.crank_leverage(leg), jacobian_rates.crank_leverage_rate),

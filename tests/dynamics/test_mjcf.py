@@ -12,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from dynamics.analysis.inertia_effect import acceleration_changes, travel_states
+from dynamics.analysis.physical_inertia import UnphysicalInertiaError, physical_inertias
+from dynamics.engines.mjcf import MjcfSolver, mjcf_text
+from dynamics.engines.mujoco_engine import MujocoMissingError, MujocoRobot
 from dynamics.errors import DynamicsError, ParameterError
-from dynamics.geometry import Rss6Geometry
-from dynamics.inertia_effect import acceleration_changes, travel_states
-from dynamics.mjcf import MjcfSolver, mjcf_text
-from dynamics.mujoco_engine import MujocoMissingError, MujocoRobot
+from dynamics.kinematics.geometry import Rss6Geometry
 from dynamics.parameters import BODY_NAMES, COULOMB, PARAMETER_NAMES, RIGID_BODY, VISCOUS
-from dynamics.physical_inertia import UnphysicalInertiaError, physical_inertias
 from dynamics.robot import Robot
 from dynamics.robot_file import RobotDescription
 

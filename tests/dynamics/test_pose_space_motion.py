@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dynamics import model
+from dynamics.rigid_body import functions as model
 
 
 @pytest.fixture(scope="module")

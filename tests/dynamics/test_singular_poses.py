@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from dynamics.analysis.fast_forward_dynamics import fast_forward_dynamics
 from dynamics.errors import SingularPoseError
-from dynamics.forward_dynamics import fast_forward_dynamics
 
 
 @pytest.fixture

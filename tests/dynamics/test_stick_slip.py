@@ -5,10 +5,11 @@ import itertools
 import numpy as np
 import pytest
 
-from dynamics import closed_loop, model
-from dynamics.loop_motion import Command, State
-from dynamics.loop_types import LENGTH, FrictionLaw
-from dynamics.stick_slip import StickSlipMotion
+from dynamics import closed_loop
+from dynamics.closed_loop.loop_motion import Command, State
+from dynamics.closed_loop.problem import LENGTH, FrictionLaw
+from dynamics.closed_loop.stick_slip import StickSlipMotion
+from dynamics.rigid_body import functions as model
 
 MASS, STIFFNESS, COULOMB = 0.8, 20.0, 1.0
 FREQUENCY = np.sqrt(STIFFNESS / MASS)

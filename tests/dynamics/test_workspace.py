@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import dynamics
-from dynamics import workspace
+from dynamics.analysis import workspace
 from dynamics.errors import DynamicsError, ShapeError, SingularPoseError, TravelError, UnreachablePoseError
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 
 from identify.estimation.identification import output_error_problem
-from identify.estimation.loop_parameters import NAMES
 from identify.estimators.evidence import Evidence, joint_channels
 from identify.experiment.joint_instruments import JointInstruments, measure_joints
 from identify.experiment.truth import build_truth
+from identify.loop_parameters import NAMES
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
 
 PERFECT = JointInstruments(0.0, 0.0, 0.0)

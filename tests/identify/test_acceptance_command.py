@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from identify.acceptance import procedure as acceptance
-from identify.acceptance.tables import acceptance_markdown
+from identify.verification import acceptance_procedure as acceptance
+from identify.verification.tables import acceptance_markdown
 from tests.identify.commands import command
 
 

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from dynamics import load_robot
 from dynamics.parameters import PARAMETER_NAMES
-from identify.command_line import app
+from identify.commands.app import app
 from identify.errors import EstimationError
 from identify.estimation.base_parameters import (
     angle_to_singular_vectors,

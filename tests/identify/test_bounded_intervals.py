@@ -8,8 +8,8 @@ import pytest
 
 from identify.estimation.bounded_intervals import BoundedEstimate, bounded_estimate
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
-from identify.estimation.loop_parameters import StartingGuess, index_of
 from identify.estimation.parameter_bounds import InCoordinates, ParameterBounds, parameter_bounds
+from identify.loop_parameters import StartingGuess, index_of
 
 CRITERIA = StopCriteria(1e-12, 1e-9, 200)
 DRAWS = 500

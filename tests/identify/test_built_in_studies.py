@@ -2,9 +2,10 @@
 
 import pytest
 
-from identify.studies import rows, summary
+from identify.studies import summary
 from identify.studies.computation import compute
 from identify.studies.design import Design, prepare
+from identify.studies.rows import rows
 from identify.studies.study_file import load_study, study_names
 from identify.studies.table import tidy_table
 from identify.studies.theory import check_laws

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from identify import command_line
+from identify.commands import app as command_line
 from identify.errors import OutputFolderError, ScenarioError
 from identify.files.result_file import load_result, save_result
 from identify.files.run_folder import RunFolder, new_run_folder

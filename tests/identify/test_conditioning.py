@@ -7,7 +7,7 @@ from identify.estimation.base_parameters import BaseParameters
 from identify.estimation.conditioning import POOR, conditioning
 from identify.estimation.correlation import correlation_matrix, strongest_pairs
 from identify.estimation.identification import identify
-from identify.estimation.loop_parameters import NAMES, StartingGuess
+from identify.loop_parameters import NAMES, StartingGuess
 from identify.scenario import load_scenario
 from tests.identify import synthetic
 

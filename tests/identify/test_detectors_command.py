@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from cmmsim.detection.detectors import DEFAULT_DETECTOR
 from cmmsim.detector_leaderboard import compete
-from cmmsim.detectors import DEFAULT_DETECTOR
 from cmmsim.drawn_discs import Condition, scene_of, working_point
 from cmmsim.errors import CmmError
-from cmmsim.sensor_file import read_sensor_file
-from identify.command_line import app, is_known
+from cmmsim.files.sensor_file import read_sensor_file
+from identify.commands.app import app, is_known
 
 OPTIONS = ["--radius", "3", "--noise", "1", "--noise", "5", "--tilt", "30", "--psf", "0", "--draws", "30"]
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from identify.errors import EstimationError, ScenarioError
-from identify.estimator_comparison import START, compare, examination
 from identify.estimators.evidence import Estimate, Evidence
 from identify.estimators.output_error_routes import known_pid
 from identify.estimators.registry import ESTIMATORS, Estimator, choose
 from identify.progress import SilentProgress
-from identify.reporting.estimators_figure import estimators_figure
+from identify.validation.estimator_comparison import START, compare, examination
+from identify.validation.estimators_figure import estimators_figure
 from tests.identify.estimator_evidence import evidence, unseen
 from tests.identify.synthetic import truth
 

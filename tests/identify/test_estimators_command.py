@@ -5,7 +5,7 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from identify.command_line import app
+from identify.commands.app import app
 from identify.errors import OutputFolderError, ScenarioError
 from identify.experiment.joint_instruments import read_channels
 from identify.record import recording

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from identify.errors import EstimationError, RecordError, ScenarioError
-from identify.estimation.loop_parameters import NAMES, StartingGuess
 from identify.estimators.encoder_route import encoder_route
 from identify.estimators.evidence import Evidence, joint_channels
 from identify.estimators.instrumental_variables import instrumental_variables, iv_fit
@@ -27,6 +26,7 @@ from identify.experiment.joint_instruments import (
     write_channels,
 )
 from identify.files.netcdf import write_groups
+from identify.loop_parameters import NAMES, StartingGuess
 from identify.record.recorded_run import recorded_run
 from tests.identify.estimator_evidence import PERFECT, evidence, truth_of
 from tests.identify.synthetic import quick, rss6, run_plant, truth

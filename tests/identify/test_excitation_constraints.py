@@ -7,7 +7,7 @@ import pytest
 
 from cmmsim.visibility import sight_lines
 from dynamics import load_robot
-from dynamics.workspace import measure
+from dynamics.analysis.workspace import measure
 from identify.errors import TrajectoryError
 from identify.excitation import design_trajectories
 from identify.excitation.constraints import MotionConstraints, check_periods

@@ -8,16 +8,12 @@ from dynamics import load_robot
 from dynamics.closed_loop import simulate
 from dynamics.parameters import VISCOUS
 from identify.errors import TrajectoryError
-from identify.estimation.loop_parameters import NAMES, index_of
 from identify.excitation.criterion_information import knowledge, log_information
-from identify.excitation.criterion_linear_information import (
-    harmonics,
-    log_linear_information,
-    sensitivity_spectrum,
-)
-from identify.excitation.criterion_observability import SMOOTHING_RAD_S, log_index, log_observability
+from identify.excitation.criterion_linear_information import harmonics, log_linear_information, sensitivity_spectrum
 from identify.excitation.motion import played_times, sample_times
+from identify.excitation.observability import SMOOTHING_RAD_S, log_index, log_observability
 from identify.excitation.unknowns import unknowns
+from identify.loop_parameters import NAMES, index_of
 from identify.record.loop_setup import frame_times, model_settings, reference_motion
 from identify.scenario import load_scenario
 from identify.trajectory import random_trajectory

@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 import cmmsim
-from cmmsim.measurement import lost_measurement
+from cmmsim.pose_estimation.measurement import lost_measurement
 from dynamics import load_robot
 from identify.errors import TrajectoryError
 from identify.experiment.robot_bodies import robot_transforms

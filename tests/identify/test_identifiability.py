@@ -6,7 +6,7 @@ import pytest
 from identify.estimation.base_parameters import base_parameters, structural_regressor
 from identify.estimation.group_estimates import group_estimates, group_rows
 from identify.estimation.identifiability import Identifiability, identifiability
-from identify.estimation.loop_parameters import NAMES, holding_torque, index_of, starting_guess
+from identify.loop_parameters import NAMES, holding_torque, index_of, starting_guess
 from tests.identify.synthetic import rss6, truth
 
 

@@ -9,10 +9,10 @@ import threading
 import pytest
 import typer
 
-from identify.commands.stopping import stoppable
 from identify.errors import StudyInterrupted
 from identify.interrupts import deaf_offspring, held, honoured, noted, raise_noted
 from identify.progress import SilentProgress
+from identify.stopping import stoppable
 from identify.studies import study_file
 from identify.studies.runner import run_study
 from identify.studies.study_file import Study
@@ -124,8 +124,8 @@ def test_other_errors_of_a_command_stay_what_they_are(capsys):
 
 
 def test_ctrl_c_that_became_another_error_in_any_command_is_one_line(monkeypatch, capsys):
-    monkeypatch.setattr("identify.scenario.load_scenario", lambda _: broken_import())
-    monkeypatch.setattr("identify.command_line.load_scenario", lambda _: broken_import())
+    monkeypatch.setattr("identify.scenario.scenario.load_scenario", lambda _: broken_import())
+    monkeypatch.setattr("identify.commands.app.load_scenario", lambda _: broken_import())
     assert command("excite", "quick") == 130
     assert capsys.readouterr().err == "aborted\n"
 
@@ -134,11 +134,11 @@ def test_ctrl_c_while_the_libraries_are_loaded_is_one_line(monkeypatch, capsys):
     class Slow:
         @staticmethod
         def find_spec(name, path, target=None):
-            if name == "identify.command_line":
+            if name == "identify.commands.app":
                 broken_import()
 
-    monkeypatch.delattr("identify.command_line")
-    monkeypatch.delitem(sys.modules, "identify.command_line")
+    monkeypatch.delattr("identify.commands.app")
+    monkeypatch.delitem(sys.modules, "identify.commands.app")
     monkeypatch.setattr(sys, "meta_path", [Slow, *sys.meta_path])
     assert command("--help") == 130
     assert capsys.readouterr() == ("", "aborted\n")

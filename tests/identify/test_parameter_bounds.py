@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from dynamics.physical_inertia import UnphysicalInertiaError, physical_inertias
+from dynamics.analysis.physical_inertia import UnphysicalInertiaError, physical_inertias
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.identification import identify
-from identify.estimation.loop_parameters import NAMES, StartingGuess
 from identify.estimation.parameter_bounds import InCoordinates, parameter_bounds
+from identify.loop_parameters import NAMES, StartingGuess
 from identify.scenario import load_scenario
 from tests.identify.synthetic import quick, rss6, run_plant, truth
 

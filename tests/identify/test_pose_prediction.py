@@ -11,7 +11,7 @@ from identify.estimation.pose_prediction import PosePrediction, predict_poses
 from identify.progress import SilentProgress
 from identify.record.recorded_run import recorded_run
 from identify.reporting.run_result import prediction_entry
-from identify.validation import predicted_runs
+from identify.validation.validation import predicted_runs
 from tests.identify.estimator_evidence import truth_of
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
 

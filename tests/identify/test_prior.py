@@ -5,8 +5,8 @@ import pytest
 
 from identify.errors import ScenarioError
 from identify.estimation.identification import identify
-from identify.estimation.loop_parameters import NAMES
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
+from identify.loop_parameters import NAMES
 from identify.scenario import load_scenario, scenario_from_toml
 from tests.identify.synthetic import quick, rss6, run_plant
 

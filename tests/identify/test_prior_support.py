@@ -7,9 +7,9 @@ from identify.estimation.base_parameters import base_parameters, structural_regr
 from identify.estimation.group_estimates import group_rows
 from identify.estimation.identifiability import identifiability
 from identify.estimation.identification import identify
-from identify.estimation.loop_parameters import NAMES, index_of, starting_guess
 from identify.estimation.prior_support import rests_on_prior
 from identify.estimation.scale_anchor import ScaleAnchor
+from identify.loop_parameters import NAMES, index_of, starting_guess
 from identify.record.recorded_run import recorded_run
 from identify.reporting.run_result import identification_entry
 from identify.reporting.tables import ON_GUESS, parameter_table

@@ -5,8 +5,8 @@ import pytest
 
 from identify.errors import EstimationError, RecordError
 from identify.estimation.identification import identify
-from identify.estimation.loop_parameters import index_of
 from identify.estimation.scale_anchor import ANCHORS, ScaleAnchor, read_anchor, store_anchor
+from identify.loop_parameters import index_of
 from tests.identify.synthetic import quick, rss6, run_plant
 
 

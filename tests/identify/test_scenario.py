@@ -3,7 +3,7 @@ import tomllib
 import pytest
 
 from identify.errors import ScenarioError
-from identify.estimation.loop_parameters import NAMES
+from identify.loop_parameters import NAMES
 from identify.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
 
 

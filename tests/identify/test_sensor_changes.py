@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cmmsim.sensor_file import read_sensor_file
+from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.visibility import sight_lines
 from dynamics import load_robot
 from identify.errors import ScenarioError

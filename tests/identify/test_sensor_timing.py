@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cmmsim.sensor_file import read_sensor_file
+from cmmsim.files.sensor_file import read_sensor_file
 from identify.experiment.run import run_plant, taught_sensor
 from identify.experiment.sensor_in_loop import SensorInLoop, frame_latencies, make_sensor
 from identify.experiment.truth import true_poses

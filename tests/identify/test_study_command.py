@@ -10,7 +10,8 @@ import pytest
 
 from identify.commands import study as study_command
 from identify.errors import StudyInterrupted
-from identify.studies import dask_runner, rows, runner, summary
+from identify.studies import dask_runner, runner, summary
+from identify.studies.rows import rows
 from identify.studies.study_file import study_names
 from identify.studies.table import read_table
 from tests.identify.commands import command, one_line

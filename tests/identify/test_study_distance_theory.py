@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import cmmsim
-from cmmsim.pose import apply, invert
+from cmmsim.geometry.pose import apply, invert
 from identify.studies.computation import compute
 from identify.studies.design import Design, prepare
-from identify.studies.row_sensor import row_sensor
+from identify.studies.rows.row_sensor import row_sensor
 from identify.studies.scale_regression import scale_regression
 from identify.studies.study_file import load_study
 from identify.studies.table import tidy_table

@@ -6,12 +6,12 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from cmmsim.sensor_file import read_sensor_file
+from cmmsim.files.sensor_file import read_sensor_file
 from identify.errors import IdentifyError, StudyError
 from identify.scenario import load_scenario
-from identify.studies import rows
 from identify.studies.design import prepare
 from identify.studies.keys import overrides, valid_keys
+from identify.studies.rows import rows
 from identify.studies.study_file import Study
 from tests.identify.study_rows import KIND
 

@@ -6,16 +6,16 @@ from scipy.stats import binom, chi2
 
 import cmmsim
 from cmmsim.exact_teaching import exactly_taught
-from cmmsim.pose import invert, rotation_log
-from cmmsim.sensor_file import read_sensor_file
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.geometry.pose import invert, rotation_log
 from dynamics import load_robot
 from dynamics.closed_loop import Reference
 from identify.errors import EstimationError, ScenarioError
 from identify.experiment.run import true_parameters
 from identify.scenario import load_scenario
-from identify.studies import row_sensor, rows
-from identify.studies.row_drawn_sensor import DrawnSensor
-from identify.studies.row_identification import prediction_figures
+from identify.studies.rows import row_sensor, rows
+from identify.studies.rows.identification import prediction_figures
+from identify.studies.rows.row_drawn_sensor import DrawnSensor
 
 NOISELESS = {
     "sensor_changes.camera.noise": False,

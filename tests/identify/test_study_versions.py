@@ -9,10 +9,10 @@ import warnings
 import pytest
 
 from identify.errors import StudyError
+from identify.files.same_versions import OtherVersionsWarning, check_workers
 from identify.files.versions import versions
 from identify.progress import SilentProgress
 from identify.studies.runner import run_study
-from identify.studies.same_versions import OtherVersionsWarning, check_workers
 from identify.studies.store import JOURNAL, STUDY
 from identify.studies.study_file import Study
 from tests.identify.study_rows import KIND

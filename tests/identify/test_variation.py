@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from identify.errors import EstimationError
 from identify.record import recording
 from identify.reporting.variation_tables import PAPER_PERCENT, PAPER_WORST_PERCENT, variation_table
-from identify.variation import variation
+from identify.validation.variation import variation
 from tests.identify.commands import command, one_line
 from tests.identify.synthetic import quick, run_plant
 

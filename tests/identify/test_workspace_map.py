@@ -9,7 +9,7 @@ import dynamics
 from dynamics.errors import UnreachablePoseError
 from identify.commands import workspace as workspace_command
 from identify.errors import OutputFolderError
-from identify.robot_checks import workspace_map
+from identify.verification import workspace_map
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,182 @@
+"""Latency in the style of ASTM E3124: how long after a motion its pose is reported.
+
+A body goes round and round; a reference with an exact clock knows where it truly is. Each reported pose is compared
+with the true motion at the time of its report: the motion must be set back by the latency to fit the reports.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from cmmsim.acceptance.artefact import facing_rotation
+from cmmsim.acceptance.artefact_sensor import SensorUnderTest, estimator_of, locate, pose_in_base
+from cmmsim.acceptance.bar import HALF_LENGTH, HALF_WIDTH, rigid_bar
+from cmmsim.acceptance.statistics import Interval, interval_of_mean
+from cmmsim.acceptance.volume import MeasuringVolume
+from cmmsim.acceptance_errors import AcceptanceError
+from cmmsim.errors import ShapeError
+from cmmsim.geometry.pose import Array
+from cmmsim.latency import drawn_latencies
+from cmmsim.tracker import Tracker
+
+STREAM = 201
+RADIUS, PERIOD = 0.05, 1.0  # m and s of the circle: 0.31 m/s
+FRAMES = 180
+STEP = 1e-5  # s, of the difference quotient of a motion
+ITERATIONS = 8
+Motion = Callable[[Array], Array]
+"""True positions (n,3) m at times (n,) s."""
+
+
+@dataclass(frozen=True)
+class Latency:
+    """delays (n,): of each report, s; mean, std and maximum of them, s; interval: 95 % interval of the mean, s;
+    resolution: standard deviation that the noise of the positions alone gives a single delay, s."""
+
+    delays: Array
+    mean: float
+    std: float
+    maximum: float
+    interval: Interval
+    resolution: float
+
+
+@dataclass(frozen=True)
+class LatencyTest:
+    """latency; reported (n,) times s of the reports; stated: the latency in the sensor's file, s; frame_period s."""
+
+    latency: Latency
+    reported: Array
+    stated: float
+    frame_period: float
+    lost: int
+
+
+def estimate_latency(
+    reported: Array, positions: Array, motion: Motion, largest: float, covariances: Array | None = None
+) -> Latency:
+    """Delay of each report by least squares: positions(k) = motion(reported(k) - delay(k)) + offset.
+
+    Parameters: reported (n,) s; positions (n,3) m; motion; largest: latencies from 0 to this are searched, s, at most
+    half the period of the motion; covariances (n,3,3) of the positions. The offset (3,) is constant and not a result.
+    Raises ShapeError for less than four reports or a motion that stands still.
+    """
+    if len(reported) < 4 or positions.shape != (len(reported), 3):
+        raise ShapeError(
+            f"latency needs four reports or more with positions (n,3), got {len(reported)} and {positions.shape}"
+        )
+    delays = np.full(len(reported), _coarse_delay(reported, positions, motion, largest))
+    offset = np.zeros(3)
+    for iteration in range(ITERATIONS):
+        times = reported - delays
+        velocity = (motion(times + STEP) - motion(times - STEP)) / (2.0 * STEP)
+        squared = np.sum(velocity**2, axis=1)
+        if squared.min() < 1e-8:
+            raise ShapeError(
+                "latency needs a motion that never stands still: its lowest speed is "
+                f"{1e3 * np.sqrt(squared.min()):.3g} mm/s, at least 0.1 mm/s is needed"
+            )
+        residuals = positions - motion(times) - offset
+        if iteration < ITERATIONS // 2:  # one common delay and the offset first, then each delay for itself
+            common, shift = _common_step(residuals, velocity)
+            delays, offset = delays + common, offset + shift
+        else:
+            delays = delays - np.sum(residuals * velocity, axis=1) / squared
+    return Latency(
+        delays,
+        float(delays.mean()),
+        float(delays.std(ddof=1)),
+        float(delays.max()),
+        interval_of_mean(delays),
+        _resolution(velocity, covariances),
+    )
+
+
+def require_room(volume: MeasuringVolume) -> None:
+    """Raise AcceptanceError unless the bar finds room for its circle."""
+    needed = 2.0 * np.array([HALF_LENGTH + RADIUS, HALF_WIDTH + RADIUS, 0.0])
+    if np.any(needed > volume.size):
+        raise AcceptanceError(
+            f"latency: the body on its circle needs {1e3 * needed[0]:.0f} x {1e3 * needed[1]:.0f} mm "
+            f"across the line of sight, the volume has {volume}"
+        )
+
+
+def latency_test(
+    under_test: SensorUnderTest,
+    volume: MeasuringVolume,
+    frames: int = FRAMES,
+    advance: Callable[[], None] = lambda: None,
+) -> LatencyTest:
+    """Move a body on a circle in the middle of the volume and report its measured positions; ``advance`` is called
+    after each frame. Raises AcceptanceError when it is not measured."""
+    require_room(volume)
+    sensor = under_test.facing(rigid_bar(), STREAM)
+    estimator = estimator_of(sensor, sensor.platform, under_test.base_from_camera)
+    facing = facing_rotation(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0]))
+
+    def pose(time: float) -> Array:
+        return pose_in_base(volume.base_from_volume, facing, _circle(np.array([time]))[0])
+
+    def rate(time: float) -> Array:
+        return (pose(time + STEP) - pose(time - STEP)) / (2.0 * STEP)
+
+    def motion(times: Array) -> Array:
+        return _circle(times) @ volume.base_from_volume[:3, :3].T + volume.base_from_volume[:3, 3]
+
+    locate(estimator, sensor.look(pose(0.0)))
+    tracker = Tracker(estimator)
+    taken = np.arange(frames) / sensor.timing.frame_rate
+    measured = []
+    for time in taken:
+        measured.append(tracker.measure(sensor.look(pose(time), pose_rate=rate(time))))
+        advance()
+    good = np.array([m.ok for m in measured])
+    if good.sum() < 4:
+        raise AcceptanceError(f"latency: {good.sum()} of {frames} frames are measured: {measured[-1].reason}")
+    reported = (taken + drawn_latencies(sensor.timing, frames, np.random.default_rng([under_test.seed, STREAM])))[good]
+    kept = [m for m in measured if m.ok]
+    latency = estimate_latency(
+        reported,
+        np.array([m.pose[:3] for m in kept]),
+        motion,
+        0.5 * PERIOD,
+        np.array([m.covariance[:3, :3] for m in kept]),
+    )
+    return LatencyTest(latency, reported, sensor.timing.latency, 1.0 / sensor.timing.frame_rate, int((~good).sum()))
+
+
+def _circle(times: Array) -> Array:
+    """Positions (n,3) in volume axes on a circle across the line of sight."""
+    angle = 2.0 * np.pi * times / PERIOD
+    return RADIUS * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(times))])
+
+
+def _coarse_delay(reported: Array, positions: Array, motion: Motion, largest: float) -> float:
+    """The best of a grid of common delays."""
+    grid = np.linspace(0.0, largest, 101)
+    misfit = []
+    for delay in grid:
+        residuals = positions - motion(reported - delay)
+        misfit.append(np.sum((residuals - residuals.mean(axis=0)) ** 2))
+    return float(grid[int(np.argmin(misfit))])
+
+
+def _common_step(residuals: Array, velocity: Array) -> tuple[float, Array]:
+    """Least-squares change of a common delay and of the offset (3,)."""
+    columns = np.zeros((residuals.size, 4))
+    columns[:, 0] = -velocity.ravel()
+    columns[:, 1:] = np.tile(np.eye(3), (len(residuals), 1))
+    solution = np.linalg.lstsq(columns, residuals.ravel(), rcond=None)[0]
+    return float(solution[0]), np.asarray(solution[1:], dtype=np.float64)
+
+
+def _resolution(velocity: Array, covariances: Array | None) -> float:
+    """Standard deviation of a delay from the positions' noise, rms over the reports; 0 without covariances."""
+    if covariances is None:
+        return 0.0
+    along = np.einsum("ni,nij,nj->n", velocity, covariances, velocity) / np.sum(velocity**2, axis=1) ** 2
+    return float(np.sqrt(along.mean()))

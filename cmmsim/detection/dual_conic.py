@@ -1,0 +1,125 @@
+"""Centre of an ellipse from the grey value gradients at all pixels of its edge: the dual conic operator.
+
+Each pixel of the edge gives a line l = (a, b, c), c = -(a x + b y), through the pixel and across the gradient (a, b).
+Lines that touch the ellipse fulfil l' C* l = 0 with its dual conic C* = [[A, B/2, D/2], [B/2, C, E/2], [D/2, E/2, 1]]:
+linear in the five unknowns, and (D/2, E/2) is the centre. The residual of each line of unit length is weighted by
+|gradient|², which is the same as leaving (a, b) unnormalised; so pixels away from the edge need not be sorted out.
+Source: J.-N. Ouellet, P. Hebert, Precise ellipse estimation without contour point extraction, Machine Vision and
+Applications 21 (2009).
+
+The noise of a pixel enters the gradients around it; its effect on the centre follows from the normal equations
+sum of k (k' u + c²) = 0, k = (a², a b, b², a c, b c), by the implicit function theorem.
+
+A line that is missing where the rim comes near the window's edge pulls the centre by up to a tenth of a pixel, so such
+a window is not good; EDGE_PX is what the lines need around the ellipse.
+
+Gradients of a sharp edge are not exact: noise-free and tilted by 45 degrees, the centre is off by about 0.004 px rms at
+radius 3.8 px, 0.007 at 2.5 and 0.002 at 10. This bias is no part of the covariance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from cmmsim.detection.detected_centres import DetectedCentres, no_centres
+from cmmsim.detection.ellipse_fit import FitLimits
+from cmmsim.detection.grey_centroid import BrightSpots, bright_spots, whole_inside
+from cmmsim.geometry.pose import Array
+from cmmsim.radiometry.noise import CameraNoise
+
+SLOPE = (-0.5, 0.0, 0.5)
+SMOOTHING = (0.1875, 0.625, 0.1875)  # across the slope (Scharr): the most nearly isotropic of this size
+EDGE_PX = 2  # from the rim to the window's side: a gradient reaches 1.5 px from a sharp rim, the last pixel has none
+SMALLEST_CONDITION = 1e-9  # reciprocal condition below which the lines do not determine an ellipse
+
+
+def detect_by_dual_conic(
+    windows: NDArray,
+    corners: NDArray[np.integer],
+    noise: CameraNoise,
+    fit_size: int,
+    limits: FitLimits | None = None,
+    psf_px: float = 0.0,
+    smears: Array | None = None,
+) -> DetectedCentres:
+    """Centres by the dual conic. Parameters as of ``DetectWindows``; the point spread only widens the rim, and smears
+    play no part."""
+    limits = limits or FitLimits()
+    if len(windows) == 0:
+        return no_centres()
+    spots = bright_spots(windows, corners, fit_size)
+    lines = _edge_lines(spots)
+    basis = np.stack([lines.a**2, lines.a * lines.b, lines.b**2, lines.a * lines.c, lines.b * lines.c])
+    normal = np.einsum("inyx,jnyx->nij", basis, basis)
+    determined = np.linalg.cond(normal) < 1.0 / SMALLEST_CONDITION
+    normal[~determined] = np.eye(5)
+    dual = np.linalg.solve(normal, -np.einsum("inyx,nyx->ni", basis, lines.c**2)[..., None])[..., 0]
+    centres = 0.5 * dual[:, 3:] * lines.unit_px[:, None] + spots.centroids
+    jacobian = _centre_by_pixels(spots, lines, basis, normal, dual)
+    variance = noise.variance(spots.windows)
+    covariances = np.einsum("niyx,njyx,nyx->nij", jacobian, jacobian, variance)
+    squared = _squared_shape(dual) * lines.unit_px[:, None, None] ** 2
+    good = (spots.contrast >= limits.smallest_contrast) & determined & (np.linalg.eigvalsh(squared)[:, 0] > 0.0)
+    good &= whole_inside(centres, 0.25 * squared, fit_size, EDGE_PX + psf_px)
+    return DetectedCentres(centres + spots.corners, covariances, good)
+
+
+class _EdgeLines:
+    """Lines (a, b, c), each (n, h, h), from the centroids and in units of unit_px (n,); x, y of the pixels."""
+
+    def __init__(self, a: Array, b: Array, x: Array, y: Array, unit_px: Array) -> None:
+        self.a, self.b, self.x, self.y, self.unit_px = a, b, x, y, unit_px
+        self.c = -(a * x + b * y)
+
+
+def _edge_lines(spots: BrightSpots) -> _EdgeLines:
+    """Lines from the gradients of the grey values, which are divided by the contrast."""
+    radius = 2.0 * np.sqrt(np.maximum(0.5 * np.trace(spots.spreads, axis1=1, axis2=2), 0.25))
+    ticks = np.arange(spots.windows.shape[1], dtype=float)
+    x = (ticks - spots.centroids[:, :1])[:, None, :] / radius[:, None, None]
+    y = (ticks - spots.centroids[:, 1:])[:, :, None] / radius[:, None, None]
+    scale = _counted(spots) / np.maximum(spots.contrast, 1.0)[:, None, None]
+    a = _filtered(spots.windows, SLOPE, SMOOTHING) * scale
+    b = _filtered(spots.windows, SMOOTHING, SLOPE) * scale
+    return _EdgeLines(a, b, x, y, radius)
+
+
+def _counted(spots: BrightSpots) -> NDArray[np.bool_]:
+    """Pixels whose lines count: within the dark ring, with all neighbours in the window."""
+    counted = spots.within.copy()
+    counted[:, [0, -1]] = counted[:, :, [0, -1]] = False
+    return counted
+
+
+def _filtered(values: Array, along_x: tuple[float, ...], along_y: tuple[float, ...], adjoint: bool = False) -> Array:
+    """Correlation of (n, h, h) with a separable kernel, or its adjoint; nothing lies outside of the window."""
+    turn = -1 if adjoint else 1
+    across = ndimage.correlate1d(values, along_x[::turn], axis=2, mode="constant")
+    return ndimage.correlate1d(across, along_y[::turn], axis=1, mode="constant")
+
+
+def _centre_by_pixels(spots: BrightSpots, lines: _EdgeLines, basis: Array, normal: Array, dual: Array) -> Array:
+    """Derivative (n, 2, h, h) of the centres by each grey value, px."""
+    a, b, c, x, y, zero = lines.a, lines.b, lines.c, lines.x, lines.y, np.zeros_like(lines.a)
+    rows = np.linalg.inv(normal)[:, 3:]  # of D and E
+    residual = np.einsum("ni,inyx->nyx", dual, basis) + c * c
+    scale = _counted(spots) / np.maximum(spots.contrast, 1.0)[:, None, None]
+    total = np.zeros((len(a), 2, *a.shape[1:]))
+    for by_line, c_by, kernels in (
+        (np.stack([2.0 * a, b, zero, c - a * x, -b * x]), -x, (SLOPE, SMOOTHING)),
+        (np.stack([zero, a, 2.0 * b, -a * y, c - b * y]), -y, (SMOOTHING, SLOPE)),
+    ):
+        residual_by = np.einsum("ni,inyx->nyx", dual, by_line) + 2.0 * c * c_by
+        change = -np.einsum("nki,inyx->nkyx", rows, by_line * residual + basis * residual_by)
+        for k in range(2):
+            total[:, k] += _filtered(change[:, k] * scale, *kernels, adjoint=True)
+    return 0.5 * lines.unit_px[:, None, None, None] * total
+
+
+def _squared_shape(dual: Array) -> Array:
+    """A A' (n,2,2) of the ellipse: centre centre' minus the upper left of C*."""
+    centre = 0.5 * dual[:, 3:]
+    upper_left = np.stack([dual[:, 0], 0.5 * dual[:, 1], 0.5 * dual[:, 1], dual[:, 2]], axis=1).reshape(-1, 2, 2)
+    return centre[:, :, None] * centre[:, None, :] - upper_left

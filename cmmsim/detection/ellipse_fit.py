@@ -1,0 +1,174 @@
+"""Maximum-likelihood fit of a bright ellipse on a dark ground to the grey values of many windows at once.
+
+Model of a pixel: ground + contrast * (exact share of the pixel covered by the ellipse, blurred by the point spread and,
+where it is known, by the movement during the exposure).
+Gauss-Newton on the seven parameters [c_x, c_y, A_xx, A_xy, A_yy, contrast, ground], weighted by the camera's noise
+variance at the fitted grey value. The inverse of the normal matrix is the covariance of the parameters.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.geometry.blurred_coverage import require_psf
+from cmmsim.geometry.pose import Array
+from cmmsim.radiometry.noise import CameraNoise
+
+RING_REACH = 2.4  # pixels beyond this many sticker radii may lie outside the dark ring and are left out
+SMALLEST_RADIUS_PX = 0.8
+ELLIPSE_UNKNOWNS = 5  # the first parameters: c_x, c_y, A_xx, A_xy, A_yy
+SMALLEST_START_PX = 1.2
+SMEAR_STEP_PX = 0.2  # or half a point spread: between two places of a moving ellipse whose light is added
+CONVERGED_PX = 1e-4  # a step shorter than this ends a fit
+MODEL_ERROR = 0.0025  # of the contrast: rms of what images and the model of a pixel differ by without noise
+FEWEST_FOR_A_THREAD = 16  # windows
+CORE_SHARE = 0.4  # a pixel with this share of the contrast belongs to the bright spot when the fit starts
+
+
+@dataclass(frozen=True)
+class EllipseFits:
+    """Result for n windows, in full-image px.
+
+    centres (n,2); covariances (n,2,2) of the centres, px²; shapes (n,2,2) the ellipses' matrices A;
+    shape_covariances (n,3,3) of A_xx, A_xy, A_yy, px²; contrast (n,) grey values; misfit (n,) the reduced chi-square of
+    the grey values; good (n,) whether the window holds one ellipse.
+    """
+
+    centres: Array
+    covariances: Array
+    shapes: Array
+    shape_covariances: Array
+    contrast: Array
+    misfit: Array
+    good: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class FitLimits:
+    """When a window counts as one whole sticker.
+
+    smallest_contrast in grey values; largest_misfit of the reduced chi-square, for noise of a grey value and more.
+    """
+
+    smallest_contrast: float = 40.0
+    largest_misfit: float = 1.8
+
+
+def fit_ellipses(
+    windows: NDArray,
+    corners: NDArray[np.integer],
+    noise: CameraNoise,
+    fit_size: int,
+    limits: FitLimits | None = None,
+    iterations: int = 8,
+    psf_px: float = 0.0,
+    smears: Array | None = None,
+) -> EllipseFits:
+    """Fit one ellipse in each window.
+
+    Parameters: windows (n, h, h) grey values; corners (n, 2) the full-image pixel (x, y) of each window's first pixel;
+    noise: the camera's noise; fit_size: side in px of the part around the bright spot that is fitted; psf_px:
+    sigma of the Gaussian point spread that blurs the ellipse; smears (n, 2) px: how far each spot moves during the
+    exposure, whose middle the centre is for. Raises CmmError for one too narrow to be followed.
+    """
+    require_psf(psf_px)
+    limits = limits or FitLimits()
+    from cmmsim.detection.fit_kernels import UNKNOWNS, FitSettings, fit_windows
+
+    n = len(windows)
+    inner, parameters, misfit = np.empty((n, 2)), np.empty((n, UNKNOWNS)), np.empty(n)
+    shapes, covariances = np.empty((n, 2, 2)), np.empty((n, ELLIPSE_UNKNOWNS, ELLIPSE_UNKNOWNS))
+    scale = noise.white_level / 255.0
+    greys = scale * _GREYS
+    variances = noise.variance(greys)
+    largest_step = _LARGEST_STEP * [1.0, 1.0, 1.0, 1.0, 1.0, scale, scale]
+    settings = FitSettings(
+        CORE_SHARE,
+        RING_REACH,
+        SMALLEST_START_PX,
+        SMALLEST_RADIUS_PX,
+        largest_step,
+        iterations,
+        CONVERGED_PX,
+        float(psf_px),
+        max(SMEAR_STEP_PX, 0.5 * psf_px),
+        variances,
+        greys[0],
+        1.0 / (greys[1] - greys[0]),
+    )
+    moved = np.zeros((n, 2)) if smears is None else np.ascontiguousarray(smears, dtype=float)
+    pixels = np.ascontiguousarray(windows, dtype=float)
+
+    def fit(part: slice) -> None:
+        fit_windows(
+            pixels[part],
+            moved[part],
+            fit_size,
+            settings,
+            inner[part],
+            parameters[part],
+            shapes[part],
+            covariances[part],
+            misfit[part],
+        )
+
+    _in_two_threads(fit, n)
+    good = parameters[:, 5] >= limits.smallest_contrast
+    good &= misfit <= largest_misfits(limits, noise, parameters[:, 5], parameters[:, 6])
+    good &= _inside(parameters[:, :2], shapes, fit_size)
+    return EllipseFits(
+        parameters[:, :2] + inner + corners,
+        covariances[:, :2, :2],
+        shapes,
+        covariances[:, 2:, 2:],
+        parameters[:, 5],
+        misfit,
+        good,
+    )
+
+
+def _in_two_threads(fit: Callable[[slice], None], count: int) -> None:
+    """Fit windows 0 to count, which know nothing of each other, half of them in a second thread where that pays.
+
+    The thread is a new one each time: it costs 50 us, and a lasting one would be missing in forked processes. Where
+    NUMBA_NUM_THREADS or the machine allows one thread only, as with a process a core, there is no second one.
+    """
+    from numba.core.config import NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # set when it loads, which is slow
+
+    if count < FEWEST_FOR_A_THREAD or NUMBA_NUM_THREADS == 1:
+        fit(slice(0, count))
+        return
+    other = threading.Thread(target=fit, args=(slice(count // 2, count),))
+    other.start()
+    fit(slice(0, count // 2))
+    other.join()
+
+
+_LARGEST_STEP = np.array([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0])
+_LARGEST_STEP.setflags(write=False)
+_GREYS = np.arange(-64.0, 512.0, 0.25)  # at these of 255 the noise variance is tabulated
+_GREYS.setflags(write=False)
+
+
+def largest_misfits(limits: FitLimits, noise: CameraNoise, contrast: Array, ground: Array) -> Array:
+    """Largest reduced chi-square (n,) of good fits with this contrast and ground, grey values.
+
+    The fit takes each grey value's variance for that over all means. With noise below half a grey value that of an even
+    ground differs, and what is left of the model's own error shows.
+    """
+    model = (MODEL_ERROR * contrast) ** 2 / noise.variance(ground)
+    return limits.largest_misfit * (noise.rounding_excess(ground) + model)
+
+
+def _inside(centres: Array, shapes: Array, size: int) -> NDArray[np.bool_]:
+    """Whether the whole ellipse lies inside the window and is larger than the smallest one."""
+    reach = np.linalg.norm(shapes, axis=2)  # half extent along x and y
+    inside = np.all((centres - reach > -0.5) & (centres + reach < size - 0.5), axis=1)
+    mean = 0.5 * (shapes[:, 0, 0] + shapes[:, 1, 1])
+    smallest = mean - np.hypot(0.5 * (shapes[:, 0, 0] - shapes[:, 1, 1]), shapes[:, 0, 1])
+    return inside & (smallest > 1.01 * SMALLEST_RADIUS_PX)

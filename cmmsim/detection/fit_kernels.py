@@ -1,0 +1,311 @@
+"""Compiled: the maximum-likelihood fit of one ellipse to the grey values of one window, see ``ellipse_fit``."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from cmmsim.compiled import compiled
+from cmmsim.geometry.blur_kernel import blur_window
+from cmmsim.geometry.cholesky_kernel import factor, invert_factored, solve_factored
+from cmmsim.geometry.coverage_kernel import cover_window, inverse_of
+
+UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
+
+
+class FitSettings(NamedTuple):
+    """core_share: a pixel with this share of the contrast belongs to the bright spot when the fit starts; ring_reach:
+    radii of the ellipse within which pixels are fitted; smallest_start and smallest radius px; largest_step (7,);
+    iterations at most, and the step in px below which they end; psf_px of the point spread, or 0; smear_step px between
+    two places of a moving ellipse whose light is added; variances of grey
+    values from ``first_grey`` on, ``entries_a_grey`` for each."""
+
+    core_share: float
+    ring_reach: float
+    smallest_start: float
+    smallest: float
+    largest_step: np.ndarray
+    iterations: int
+    converged: float
+    psf_px: float
+    smear_step: float
+    variances: np.ndarray
+    first_grey: float
+    entries_a_grey: float
+
+
+@compiled
+def nth_smallest(values: np.ndarray, n: int) -> float:
+    """The value with ``n`` smaller ones (Hoare's selection); reorders ``values``."""
+    first, last = 0, len(values) - 1
+    while first < last:
+        pivot, low, high = values[n], first, last
+        while low <= high:
+            while values[low] < pivot:
+                low += 1
+            while pivot < values[high]:
+                high -= 1
+            if low <= high:
+                values[low], values[high] = values[high], values[low]
+                low, high = low + 1, high - 1
+        if high < n:
+            first = low
+        if n < low:
+            last = high
+    return values[n]
+
+
+@compiled
+def moments(window: np.ndarray, core_share: float) -> tuple:
+    """Ground, contrast, centroid x, y and spread xx, xy, yy of the bright spot of a window (h, w) of floats."""
+    flat = window.flatten()
+    ground = nth_smallest(flat, len(flat) // 3)
+    contrast = max(nth_smallest(flat, len(flat) - 6) - ground, 1.0)
+    area, x, y, xx, xy, yy = 1e-300, 0.0, 0.0, 0.0, 0.0, 0.0
+    for row in range(window.shape[0]):
+        for column in range(window.shape[1]):
+            share = (window[row, column] - ground) / contrast
+            if share > core_share:
+                share = min(share, 1.0)
+                area += share
+                x += share * column
+                y += share * row
+                xx += share * column * column
+                xy += share * column * row
+                yy += share * row * row
+    x, y = x / area, y / area
+    return ground, contrast, x, y, xx / area - x * x, xy / area - x * y, yy / area - y * y
+
+
+@compiled
+def bound_radii(xx: float, xy: float, yy: float, lowest: float, highest: float) -> tuple:
+    """A symmetric (2,2) matrix with its eigenvalues kept between two limits, given and returned as xx, xy, yy."""
+    mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+    large, small = mean + half, mean - half
+    if small >= lowest and large <= highest:
+        return xx, xy, yy
+    bounded_large, bounded_small = min(max(large, lowest), highest), min(max(small, lowest), highest)
+    if half == 0.0:
+        return bounded_large, 0.0, bounded_large
+    scale, middle = (bounded_large - bounded_small) / (2.0 * half), 0.5 * (bounded_large + bounded_small)
+    return middle + scale * (xx - mean), scale * xy, middle + scale * (yy - mean)
+
+
+@compiled
+def variance_at(mean: float, settings: FitSettings) -> float:
+    """Noise variance of a grey value, linear between the table's entries."""
+    place = (mean - settings.first_grey) * settings.entries_a_grey
+    k = min(max(int(place), 0), len(settings.variances) - 2)
+    return settings.variances[k] + (place - k) * (settings.variances[k + 1] - settings.variances[k])
+
+
+@compiled
+def accumulate(
+    window: np.ndarray,
+    mask: np.ndarray,
+    shares: np.ndarray,
+    derivatives: np.ndarray,
+    contrast: float,
+    ground: float,
+    settings: FitSettings,
+    normal: np.ndarray,
+    right: np.ndarray,
+) -> float:
+    """Add up the normal matrix (7,7), lower triangle, and right-hand side (7,); returns the weighted squared misfit."""
+    normal[:], right[:], misfit = 0.0, 0.0, 0.0
+    row_of = np.empty(UNKNOWNS)
+    row_of[6] = 1.0
+    for row in range(window.shape[0]):
+        for column in range(window.shape[1]):
+            if not mask[row, column]:
+                continue
+            share, change = shares[row, column], derivatives[row, column]
+            mean = ground + contrast * share
+            weight = 1.0 / variance_at(mean, settings)
+            residual = window[row, column] - mean
+            misfit += weight * residual * residual
+            row_of[5] = share
+            on_rim = change[0] != 0.0 or change[1] != 0.0
+            if on_rim:
+                for i in range(5):
+                    row_of[i] = contrast * change[i]
+            for i in range(0 if on_rim else 5, UNKNOWNS):
+                weighted = weight * row_of[i]
+                right[i] += weighted * residual
+                for j in range(0 if on_rim else 5, i + 1):
+                    normal[i, j] += weighted * row_of[j]
+    return misfit
+
+
+@compiled
+def start_ellipse(window: np.ndarray, settings: FitSettings, parameters: np.ndarray) -> None:
+    """First parameters (7,) from the moments; a uniform ellipse has spread A A / 4."""
+    ground, contrast, x, y, xx, xy, yy = moments(window, settings.core_share)
+    xx, xy, yy = bound_radii(xx, xy, yy, (0.5 * settings.smallest_start) ** 2, (0.25 * window.shape[1]) ** 2)
+    root = math.sqrt(xx * yy - xy * xy)
+    scale = 2.0 / math.sqrt(xx + yy + 2.0 * root)  # the root of a matrix M is (M + sqrt(det) 1) / sqrt(...)
+    parameters[0], parameters[1] = x, y
+    parameters[2], parameters[3], parameters[4] = scale * (xx + root), scale * xy, scale * (yy + root)
+    parameters[5], parameters[6] = contrast, ground
+
+
+@compiled
+def mask_ring(parameters: np.ndarray, shape: np.ndarray, reach: float, mask: np.ndarray) -> int:
+    """Mark the pixels within ``reach`` radii of the ellipse; returns their number."""
+    m, count = inverse_of(shape), 0
+    for row in range(mask.shape[0]):
+        for column in range(mask.shape[1]):
+            x, y = column - parameters[0], row - parameters[1]
+            mask[row, column] = ((m[0, 0] * x + m[0, 1] * y) ** 2 + (m[1, 0] * x + m[1, 1] * y) ** 2) < reach * reach
+            count += mask[row, column]
+    return count
+
+
+@compiled
+def step_within_bounds(parameters: np.ndarray, step: np.ndarray, settings: FitSettings, size: int) -> float:
+    """Add a step (7,), cut to its largest values, and keep the centre in the window and the radii between limits.
+
+    Returns how far the ellipse was to move, px.
+    """
+    moved = 0.0
+    for k in range(UNKNOWNS):
+        change = min(max(step[k], -settings.largest_step[k]), settings.largest_step[k])
+        parameters[k] += change
+        if k < 5:
+            moved = max(moved, abs(change))
+    for k in range(2):
+        parameters[k] = min(max(parameters[k], 0.0), size - 1.0)
+    parameters[2], parameters[3], parameters[4] = bound_radii(
+        parameters[2], parameters[3], parameters[4], settings.smallest, float(size)
+    )
+    return moved
+
+
+@compiled
+def set_shape(parameters: np.ndarray, shape: np.ndarray) -> None:
+    """The matrix A (2,2) of an ellipse's parameters."""
+    shape[0, 0], shape[0, 1], shape[1, 0], shape[1, 1] = parameters[2], parameters[3], parameters[3], parameters[4]
+
+
+@compiled
+def light_of_still(
+    centre_x: float, centre_y: float, shape: np.ndarray, psf_px: float, shares: np.ndarray, derivatives: np.ndarray
+) -> None:
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that stands still."""
+    if psf_px > 0.0:
+        blur_window(centre_x, centre_y, shape, psf_px, shares, derivatives)
+    else:
+        cover_window(centre_x, centre_y, shape, shares, derivatives)
+
+
+@compiled
+def add_light(
+    shares: np.ndarray, derivatives: np.ndarray, weight: float, to_shares: np.ndarray, to_derivatives: np.ndarray
+) -> None:
+    """Add shares (h, w) and derivatives (h, w, 5), weighted, to others; whole-array sums would compile for seconds."""
+    for row in range(shares.shape[0]):
+        for column in range(shares.shape[1]):
+            to_shares[row, column] += weight * shares[row, column]
+            for k in range(derivatives.shape[2]):
+                to_derivatives[row, column, k] += weight * derivatives[row, column, k]
+
+
+@compiled
+def light_of_moving(
+    parameters: np.ndarray,
+    shape: np.ndarray,
+    smear: np.ndarray,
+    settings: FitSettings,
+    shares: np.ndarray,
+    derivatives: np.ndarray,
+) -> None:
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that moves evenly by ``smear`` (2,) px during
+    the exposure, by the midpoint rule; its parameters are those in the middle."""
+    count = math.ceil(math.hypot(smear[0], smear[1]) / settings.smear_step)
+    if count <= 1:
+        light_of_still(parameters[0], parameters[1], shape, settings.psf_px, shares, derivatives)
+        return
+    total, changes = np.zeros(shares.shape), np.zeros(derivatives.shape)
+    for k in range(count):
+        part = (k + 0.5) / count - 0.5
+        light_of_still(
+            parameters[0] + part * smear[0],
+            parameters[1] + part * smear[1],
+            shape,
+            settings.psf_px,
+            shares,
+            derivatives,
+        )
+        add_light(shares, derivatives, 1.0, total, changes)
+    shares[:] = 0.0
+    derivatives[:] = 0.0
+    add_light(total, changes, 1.0 / count, shares, derivatives)
+
+
+@compiled
+def fit_window(
+    window: np.ndarray,
+    smear: np.ndarray,
+    settings: FitSettings,
+    parameters: np.ndarray,
+    shape: np.ndarray,
+    covariance: np.ndarray,
+) -> float:
+    """Gauss-Newton from ``parameters`` (7,), which it moves; returns the reduced chi-square.
+
+    It ends when the ellipse moves by less than ``converged`` px: the normal matrix and the misfit of that last step
+    are those of the result. Fills the ellipse's ``shape`` (2,2) and the ``covariance`` (m,m) of its first m parameters.
+    """
+    size = len(window)
+    mask = np.empty((size, size), np.bool_)
+    shares, derivatives = np.empty((size, size)), np.empty((size, size, 5))
+    normal, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    set_shape(parameters, shape)
+    freedom = max(mask_ring(parameters, shape, settings.ring_reach, mask) - UNKNOWNS, 1)
+    misfit = 0.0
+    for iteration in range(settings.iterations + 1):
+        light_of_moving(parameters, shape, smear, settings, shares, derivatives)
+        misfit = accumulate(window, mask, shares, derivatives, parameters[5], parameters[6], settings, normal, right)
+        for k in range(UNKNOWNS):
+            normal[k, k] += 1e-9
+        factor(normal)
+        if iteration == settings.iterations:
+            break
+        solve_factored(normal, right)
+        moved = step_within_bounds(parameters, right, settings, size)
+        set_shape(parameters, shape)
+        if moved < settings.converged:
+            break
+    invert_factored(normal, covariance)
+    return misfit / freedom
+
+
+@compiled
+def fit_windows(
+    windows: np.ndarray,
+    smears: np.ndarray,
+    size: int,
+    settings: FitSettings,
+    corners: np.ndarray,
+    parameters: np.ndarray,
+    shapes: np.ndarray,
+    covariances: np.ndarray,
+    misfits: np.ndarray,
+) -> None:
+    """Fit the part of ``size`` px around the bright spot of each window (n,h,h) of floats, which moved by ``smears``
+    (n,2) px during the exposure.
+
+    Fills the corners (n,2) of these parts, and in their px the parameters (n,7), shapes (n,2,2), covariances (n,m,m) of
+    the first m parameters and misfits (n,).
+    """
+    for k in range(len(windows)):
+        spot = moments(windows[k], settings.core_share)
+        room = windows.shape[1] - size
+        left = min(max(int(np.rint(spot[2] - 0.5 * (size - 1))), 0), room)
+        top = min(max(int(np.rint(spot[3] - 0.5 * (size - 1))), 0), room)
+        part = windows[k, top : top + size, left : left + size]
+        start_ellipse(part, settings, parameters[k])
+        misfits[k] = fit_window(part, smears[k], settings, parameters[k], shapes[k], covariances[k])
+        corners[k, 0], corners[k, 1] = left, top

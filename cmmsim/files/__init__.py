@@ -1,0 +1,1 @@
+"""Sensor files (TOML): their schema, how they are read, and the rig and the bodies that they describe."""

@@ -1,0 +1,141 @@
+"""Reading sensor files (TOML): how a name becomes a file, and a file with changes a checked content."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from copy import deepcopy
+from functools import lru_cache
+from importlib import resources
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from cmmsim.checks import require_kind
+from cmmsim.errors import SensorFileError, UnknownSensorError
+from cmmsim.files.schema import SensorFile
+from cmmsim.files.sensor_changes import change, require_keys
+from cmmsim.files.sticker_ring import closest, ring_of_stickers
+
+
+def built_in_names() -> list[str]:
+    """Names of the sensors that come with the package."""
+    return sorted(
+        f.name[:-5] for f in resources.files(__package__).joinpath("sensors").iterdir() if f.name.endswith(".toml")
+    )
+
+
+def sensor_text(name: str | Path) -> str:
+    """Text of the sensor file of a built-in name or a path.
+
+    Raises UnknownSensorError for a name that is neither, SensorFileError for a file that cannot be read, and CmmError
+    for what is neither text nor a path.
+    """
+    require_kind(name, (str, PathLike), "a sensor must be a built-in name or the path of a TOML file")
+    if str(name) in built_in_names():
+        return resources.files(__package__).joinpath("sensors", f"{name}.toml").read_text(encoding="utf-8")
+    try:
+        if not Path(name).is_file():
+            raise UnknownSensorError(str(name), built_in_names())
+        return Path(name).read_text(encoding="utf-8")
+    except OSError as error:
+        raise SensorFileError(f"cannot read sensor file {str(name)[:200]}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise SensorFileError(f"sensor file {name} is not text, so it cannot be TOML: {error}") from error
+
+
+def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None) -> SensorFile:
+    """The sensor file of a built-in name or a path.
+
+    changes: entries that hold instead of the file's, by dotted key as ``{"camera.dark_noise": 40.0}`` or nested as in
+    the file. Raises UnknownSensorError for a name that is neither, SensorFileError (with the valid names) for a bad
+    content.
+    """
+    require_keys(name, changes)
+    source = f"sensor file {name}" + (f" with changes to {', '.join(changes)}" if changes else "")
+    content = _content(name)
+    change(content, changes or {}, source)
+    try:
+        return _with_stickers(SensorFile.model_validate(content), source)
+    except ValidationError as error:
+        lines = "; ".join(_explain(e) for e in error.errors())
+        raise SensorFileError(f"{source}: {lines}") from error
+
+
+def _with_stickers(file: SensorFile, source: str) -> SensorFile:
+    """The file with as many stickers on each plane of the platform as it asks for."""
+    count, room = file.stickers.per_plane, 2.0 * file.stickers.ring_radius
+    if count is None:
+        return file
+    planes = {}
+    for name, plane in file.platform.planes:
+        places = ring_of_stickers(plane.stickers, count)
+        if closest(places) < room:
+            raise SensorFileError(
+                f"{source}: stickers.per_plane = {count} puts stickers {closest(places):.4f} m apart "
+                f"on plane {name}, two rings need {room:g} m"
+            )
+        planes[name] = plane.model_copy(update={"stickers": [(u, v) for u, v in places.tolist()]})
+    platform = file.platform.model_copy(update={"planes": file.platform.planes.model_copy(update=planes)})
+    return file.model_copy(update={"platform": platform})
+
+
+def _content(name: str | Path) -> dict[str, Any]:
+    """What a file says, completed by the sensor it is based on: entry by entry in each section, no deeper."""
+    own = _table(name)
+    basis = own.get("based_on")
+    if not isinstance(basis, str):
+        return own
+    beside = basis if basis in built_in_names() else Path(name).parent / basis
+    try:
+        base = _table(beside)
+    except UnknownSensorError as error:
+        raise SensorFileError(f"sensor file {name}: based_on: {error}") from error
+    if "based_on" in base:
+        raise SensorFileError(
+            f"sensor file {name}: based_on = {basis!r}, which is itself based on "
+            f"{base['based_on']!r}: name a sensor whose file is complete"
+        )
+    merged = {
+        key: {**base[key], **value} if isinstance(value, dict) and isinstance(base.get(key), dict) else value
+        for key, value in own.items()
+    }
+    return base | merged
+
+
+def _table(name: str | Path) -> dict[str, Any]:
+    text = sensor_text(name)
+    try:
+        return deepcopy(_parsed(text))
+    except tomllib.TOMLDecodeError as error:
+        raise SensorFileError(f"sensor file {name}: {error}") from error
+
+
+@lru_cache(maxsize=8)
+def _parsed(text: str) -> dict[str, Any]:
+    """Kept, for a study reads the same sensor for every row, and parsing it is an eighth of the row's time."""
+    return tomllib.loads(text)
+
+
+def _explain(error: Any) -> str:
+    """One problem in words, with the valid names when a key is unknown."""
+    where = ".".join(str(part) for part in error["loc"])
+    if error["type"] == "extra_forbidden":
+        return f"unknown key {where!r}, valid are {', '.join(_valid_keys(error['loc'][:-1]))}"
+    if error["type"] == "missing":
+        return f"{where}: {error['msg']}"  # what was got instead is the whole section
+    if error["type"] == "value_error":
+        return f"{where}: {error['ctx']['error']}"
+    return f"{where}: {error['msg']} (got {error['input']!r})"
+
+
+def _valid_keys(section: tuple[Any, ...]) -> list[str]:
+    model: Any = SensorFile
+    for part in section:
+        if isinstance(part, int):
+            continue
+        annotation = model.model_fields[part].annotation
+        model = getattr(annotation, "__args__", (annotation,))[0]
+    return sorted(model.model_fields)

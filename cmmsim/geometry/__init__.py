@@ -1,0 +1,1 @@
+"""Poses, cameras, the stereo rig, frames from planes, and the image of a disc. Knows no file and no image."""

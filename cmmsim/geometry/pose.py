@@ -1,0 +1,125 @@
+"""Poses and transforms.
+
+A pose is ``[x y z alpha beta gamma]`` in m and rad with R = Rx(alpha) Ry(beta) Rz(gamma) (paper eq. 1). A transform
+is a 4x4 matrix named output-from-input, ``camera_from_base``, so that adjacent names cancel in a product.
+A small error of a transform is ``[dt, dphi]``: the shift of its origin and the rotation vector that is applied on
+the left, both in the axes of the output frame.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cmmsim.checks import finite_array
+from cmmsim.errors import ShapeError
+
+Array = NDArray[np.float64]
+
+RIGID = 1e-6
+"""By how much entries of what is given as a rigid transform may be off one: single precision passes."""
+
+
+def checked_pose(pose: ArrayLike) -> Array:
+    """The pose (6,) as an array of its own. Raises ShapeError when it is not six finite numbers."""
+    return finite_array(pose, (6,), "a pose is six finite numbers [x y z alpha beta gamma]")
+
+
+def pose_to_transform(pose: ArrayLike) -> Array:
+    """Transform (4,4) of a pose (6,). Raises ShapeError when the pose is not six finite numbers."""
+    values = checked_pose(pose)
+    (ca, cb, cg), (sa, sb, sg) = np.cos(values[3:]), np.sin(values[3:])
+    transform = np.eye(4)
+    transform[:3, :3] = [
+        [cb * cg, -cb * sg, sb],
+        [ca * sg + sa * sb * cg, ca * cg - sa * sb * sg, -sa * cb],
+        [sa * sg - ca * sb * cg, sa * cg + ca * sb * sg, ca * cb],
+    ]
+    transform[:3, 3] = values[:3]
+    return transform
+
+
+def checked_transform(transform: ArrayLike, name: str = "a transform") -> Array:
+    """The transform (4,4) as an array of its own. Raises ShapeError, with the ``name``, when it is not 4x4 finite
+    numbers or no rigid motion: transposed, scaled or mirrored."""
+    values = finite_array(transform, (4, 4), f"{name} must be (4,4) and finite")
+    rotation, last = values[:3, :3], values[3]
+    if np.abs(last - [0.0, 0.0, 0.0, 1.0]).max() > RIGID:
+        raise ShapeError(f"{name} must have the last row [0 0 0 1], got {last.tolist()}; is it transposed?")
+    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if error > RIGID or np.linalg.det(rotation) < 0.0:
+        raise ShapeError(
+            f"{name} must be rigid: its rotation R has |R^T R - I| = {error:.3g} (at most {RIGID:g}) and "
+            f"determinant {np.linalg.det(rotation):.6g} (1)"
+        )
+    return values
+
+
+def transform_to_pose(transform: ArrayLike) -> Array:
+    """Pose (6,) of a transform (4,4); beta lies in [-pi/2, pi/2]. Raises ShapeError when it is no rigid transform."""
+    values = checked_transform(transform)
+    r = values[:3, :3]
+    alpha = np.arctan2(-r[1, 2], r[2, 2])
+    beta = np.arctan2(r[0, 2], np.hypot(r[1, 2], r[2, 2]))
+    gamma = np.arctan2(-r[0, 1], r[0, 0])
+    return np.array([*values[:3, 3], alpha, beta, gamma])
+
+
+def invert(transform: Array) -> Array:
+    """Inverse (4,4) of a rigid transform."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = transform[:3, :3].T
+    inverse[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
+    return inverse
+
+
+def apply(transform: Array, points: Array) -> Array:
+    """Points (..., 3) carried by a transform (4,4)."""
+    return points @ transform[:3, :3].T + transform[:3, 3]
+
+
+def skew(vectors: Array) -> Array:
+    """Cross product matrices (..., 3, 3) of vectors (..., 3)."""
+    result = np.zeros((*vectors.shape, 3))
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    result[..., 0, 1], result[..., 0, 2], result[..., 1, 2] = -z, y, -x
+    result[..., 1, 0], result[..., 2, 0], result[..., 2, 1] = z, -y, x
+    return result
+
+
+def rotation_exp(vector: Array) -> Array:
+    """Rotation (3,3) of a rotation vector (3,) (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    k = skew(vector)
+    return np.eye(3) + np.sinc(angle / np.pi) * k + 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2 * k @ k
+
+
+def rotation_log(rotation: Array) -> Array:
+    """Rotation vector (3,) of a rotation (3,3) whose angle is well below pi."""
+    axis = 0.5 * np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    sine = float(np.linalg.norm(axis))
+    cosine = 0.5 * (np.trace(rotation) - 1.0)
+    return axis if sine < 1e-12 else axis * (np.arctan2(sine, cosine) / sine)
+
+
+def euler_rates_matrix(pose: Array) -> Array:
+    """Matrix (3,3) from [d alpha, d beta, d gamma] to the rotation vector, in the axes of the output frame."""
+    ca, sa = np.cos(pose[3]), np.sin(pose[3])
+    cb, sb = np.cos(pose[4]), np.sin(pose[4])
+    return np.array([[1.0, 0.0, sb], [0.0, ca, -sa * cb], [0.0, sa, ca * cb]])
+
+
+def pose_covariance(transform: Array, covariance: Array) -> Array:
+    """Covariance (6,6) of the pose from that of the transform's small error [dt, dphi] (first order)."""
+    jacobian = np.eye(6)
+    jacobian[3:, 3:] = np.linalg.inv(euler_rates_matrix(transform_to_pose(transform)))
+    return jacobian @ covariance @ jacobian.T
+
+
+def compose_covariance(outer: Array, covariance: Array) -> Array:
+    """Covariance (6,6) of the error of ``outer @ inner`` from that of ``inner``; ``outer`` (4,4) is exact."""
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = outer[:3, :3]
+    return turn @ covariance @ turn.T

@@ -1,0 +1,84 @@
+"""Weighted rigid registration (paper eq. 27): the transform that carries known points onto measured ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cmmsim.errors import LostError
+from cmmsim.geometry.pose import Array, apply, rotation_exp
+
+SMALLEST_SPREAD = 0.005  # m; points closer than this to one line do not determine a rotation
+
+
+@dataclass(frozen=True)
+class Registration:
+    """transform (4,4) output-from-input; covariance (6,6) of its small error [dt, dphi]; misfit (n,): squared residual
+    of each point in units of its noise (three degrees of freedom less its share of the fit)."""
+
+    transform: Array
+    covariance: Array
+    misfit: Array
+
+
+def rigid_start(source: Array, target: Array) -> Array:
+    """Unweighted rigid transform (4,4) from ``source`` (n,3) to ``target`` (n,3) by singular values."""
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    u, _, vt = np.linalg.svd((target - target_mean).T @ (source - source_mean))
+    rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    transform = np.eye(4)
+    transform[:3, :3] = rotation
+    transform[:3, 3] = target_mean - rotation @ source_mean
+    return transform
+
+
+def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:
+    """Rigid transforms (c,4,4) from ``source``, (n,3) or one each (c,n,3), to ``targets`` (c,n,3) with weights (c,n),
+    by singular values."""
+    shares = (weights / weights.sum(axis=1, keepdims=True))[..., None]
+    source_means, target_means = (shares * source).sum(axis=1), (shares * targets).sum(axis=1)
+    products = (weights[..., None] * (targets - target_means[:, None])).swapaxes(1, 2) @ (
+        source - source_means[:, None]
+    )
+    u, _, vt = np.linalg.svd(products)
+    turns = np.ones((len(targets), 3))
+    turns[:, 2] = np.sign(np.linalg.det(u @ vt))
+    transforms = np.tile(np.eye(4), (len(targets), 1, 1))
+    transforms[:, :3, :3] = (u * turns[:, None]) @ vt
+    transforms[:, :3, 3] = target_means - np.einsum("cij,cj->ci", transforms[:, :3, :3], source_means)
+    return transforms
+
+
+def require_spread(points: Array) -> None:
+    """Raise LostError unless ``points`` (n,3) hold three that are clearly not on one line."""
+    if len(points) < 3:
+        raise LostError(f"{len(points)} visible stickers, at least 3 that are not on one line are needed")
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]
+    if spread < SMALLEST_SPREAD:
+        raise LostError(
+            f"the {len(points)} visible stickers lie on one line to {spread * 1e3:.1f} mm, "
+            f"at least {SMALLEST_SPREAD * 1e3:.0f} mm of width is needed"
+        )
+
+
+def register(source: Array, target: Array, covariances: Array, iterations: int = 2) -> Registration:
+    """Maximum-likelihood transform with target = transform(source) + noise.
+
+    Parameters: source (n,3) known points; target (n,3) measured points, m; covariances (n,3,3) of the measured ones.
+    Raises LostError when fewer than three points off one line are given.
+    """
+    from cmmsim.geometry.point_kernel import rigid_step  # compiles, so it is loaded where it is first needed
+
+    require_spread(source)
+    transform = rigid_start(source, target)
+    weights = np.linalg.inv(covariances)
+    source, target = np.ascontiguousarray(source, dtype=float), np.ascontiguousarray(target, dtype=float)
+    covariance, change = np.empty((6, 6)), np.empty(6)
+    for _ in range(iterations):
+        rigid_step(source, target, weights, transform, covariance, change)
+        transform[:3, :3] = rotation_exp(change[3:]) @ transform[:3, :3]
+        transform[:3, 3] += change[:3]
+    residuals = target - apply(transform, source)
+    misfit = np.einsum("ni,nij,nj->n", residuals, weights, residuals)
+    return Registration(transform, covariance, misfit)

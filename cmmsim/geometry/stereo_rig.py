@@ -1,0 +1,127 @@
+"""Two cameras held by one rigid bar. The camera frame C of the sensor is the frame of the left camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from cmmsim.errors import ShapeError
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.distortion import NDArrayBool
+from cmmsim.geometry.pose import Array, apply, invert
+
+
+@dataclass(frozen=True)
+class StereoRig:
+    """Left and right camera, and the pose of the right one: ``right_from_left`` (4,4)."""
+
+    left: PinholeCamera
+    right: PinholeCamera
+    right_from_left: Array
+
+    def __post_init__(self) -> None:
+        if self.right_from_left.shape != (4, 4):
+            raise ShapeError(f"right_from_left must be (4,4), got {self.right_from_left.shape}")
+        self.right_from_left.setflags(write=False)
+
+    @property
+    def cameras(self) -> tuple[PinholeCamera, PinholeCamera]:
+        """Left and right camera."""
+        return self.left, self.right
+
+    @property
+    def from_camera(self) -> tuple[Array, Array]:
+        """Transforms (4,4) from the camera frame C into the axes of the left and of the right camera."""
+        return np.eye(4), self.right_from_left
+
+    @cached_property
+    def ideal(self) -> StereoRig:
+        """The same rig with perfect lenses."""
+        perfect = all(camera.distortion.is_zero for camera in self.cameras)
+        return self if perfect else replace(self, left=self.left.ideal, right=self.right.ideal)
+
+    @property
+    def projection_matrices(self) -> tuple[Array, Array]:
+        """Projection matrices (3,4) from the camera frame C to ideal left and right pixels."""
+        return self.left.matrix @ np.eye(4)[:3], self.right.matrix @ self.right_from_left[:3]
+
+    @property
+    def fundamental(self) -> Array:
+        """Fundamental matrix F (3,3): right' F left = 0 for homogeneous ideal pixels of the same point."""
+        rotation, shift = self.right_from_left[:3, :3], self.right_from_left[:3, 3]
+        essential = np.cross(np.eye(3), shift) @ rotation
+        return np.linalg.inv(self.right.matrix).T @ essential @ np.linalg.inv(self.left.matrix)
+
+    def project(self, points: Array) -> tuple[Array, NDArrayBool]:
+        """Pixels (2, n, 2) of points (n, 3) in C for the left and right camera, and their validity (2, n)."""
+        seen = [
+            camera.project(apply(move, points)) for camera, move in zip(self.cameras, self.from_camera, strict=True)
+        ]
+        return np.stack([s[0] for s in seen]), np.stack([s[1] for s in seen])
+
+    def undistort(self, pixels: Array, covariances: Array) -> tuple[Array, Array, NDArrayBool]:
+        """Ideal pixels (2, n, 2) and their covariances (2, n, 2, 2) px² for those of the left and right image.
+
+        Also whether each pixel has an ideal one (2, n); the values of those without one are finite and mean nothing.
+        """
+        if self.ideal is self:
+            return pixels, covariances, np.ones(pixels.shape[:2], dtype=bool)
+        ideal, found = (
+            np.stack(values)
+            for values in zip(
+                *(camera.undistort(side) for camera, side in zip(self.cameras, pixels, strict=True)), strict=True
+            )
+        )
+        jacobian = np.stack([c.distortion_jacobian(side) for c, side in zip(self.cameras, ideal, strict=True)])
+        inverse = np.linalg.inv(np.where(found[..., None, None], jacobian, np.eye(2)))
+        return ideal, inverse @ covariances @ inverse.swapaxes(-1, -2), found
+
+    def shifted(self, side: int, shift_px: tuple[float, float]) -> StereoRig:
+        """The rig with the principal point of camera ``side`` (0 left, 1 right) moved by (x, y) px."""
+        camera = self.cameras[side]
+        moved = replace(
+            camera, centre_x_px=camera.centre_x_px + shift_px[0], centre_y_px=camera.centre_y_px + shift_px[1]
+        )
+        return replace(self, left=moved) if side == 0 else replace(self, right=moved)
+
+
+def toed_in_rig(camera: PinholeCamera, baseline: float, position: Array, target: Array) -> tuple[StereoRig, Array]:
+    """Rig whose cameras look at one point, and the true ``camera_from_base`` (4,4).
+
+    ``position`` (3,) is the middle of the baseline and ``target`` (3,) the point looked at, base frame, m; the
+    baseline is horizontal and perpendicular to the viewing direction.
+    """
+    forward = target - position
+    right_axis = np.cross(forward, [0.0, 0.0, 1.0])
+    right_axis /= np.linalg.norm(right_axis)
+    eyes = [_look_at(position + side * 0.5 * baseline * right_axis, target) for side in (-1.0, 1.0)]
+    return StereoRig(camera, camera, eyes[1] @ invert(eyes[0])), eyes[0]
+
+
+def placed_rig(rig: StereoRig, position: Array, target: Array) -> Array:
+    """camera_from_base (4,4) of a rig whose baseline has its middle at ``position`` (3,) and which looks at ``target``.
+
+    The direction of view is the mean of both optical axes, made perpendicular to the baseline. A toed-in rig is put
+    where ``toed_in_rig`` puts it, as long as its baseline is horizontal there.
+    """
+    right_centre = invert(rig.right_from_left)[:3, 3]
+    x = right_centre / np.linalg.norm(right_centre)
+    y = np.cross(np.array([0.0, 0.0, 1.0]) + rig.right_from_left[2, :3], x)
+    y /= np.linalg.norm(y)
+    camera_from_middle = np.eye(4)
+    camera_from_middle[:3, :3] = np.column_stack([x, y, np.cross(x, y)])
+    camera_from_middle[:3, 3] = 0.5 * right_centre
+    return camera_from_middle @ _look_at(position, target)
+
+
+def _look_at(eye: Array, target: Array) -> Array:
+    """camera_from_base (4,4) of a camera at ``eye`` (3,) looking at ``target`` (3,), its x axis horizontal."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    base_from_camera = np.eye(4)
+    base_from_camera[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    base_from_camera[:3, 3] = eye
+    return invert(base_from_camera)

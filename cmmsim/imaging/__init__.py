@@ -1,0 +1,1 @@
+"""The true side: scene, renderers, exposure. Nothing that estimates may look in here."""

@@ -1,0 +1,98 @@
+"""Drawing without OpenGL: each disc covers exactly its share of each pixel.
+
+Layers are laid over each other: background, solids from far to near, discs. A disc turned away is not drawn. Where a
+solid stands before any of a disc's probed points, the disc shows only outside of that solid's outline. Simplified
+against `pyrender`: solids are convex hulls, ordered by the depth of their middles, and their edges are sampled by scan
+lines; in a pixel with the edges of two layers the covered shares are taken as independent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.imaging.convex_solid import ConvexSolid
+from cmmsim.imaging.disc_layers import DiscsInView, DiscTable
+from cmmsim.imaging.scene import Mesh
+from cmmsim.imaging.views import NEAR, Drawable, View, same_exposure
+
+if TYPE_CHECKING:
+    from cmmsim.imaging.layer_kernel import Solids
+
+
+def draw_windows(
+    drawable: Drawable, views: Sequence[View], supersampling: int, background: float = 0.0
+) -> NDArray[np.float32]:
+    """Radiance (n, h, w) float32, 0 to 1, of n windows of one size; ``supersampling``: scan lines a pixel at edges."""
+    if drawable not in _SCENES:
+        _SCENES[drawable] = _AnalyticScene(drawable)
+    scene = _SCENES[drawable]
+    width, height = views[0].size
+    images = np.full((len(views), height, width), background, dtype=np.float32)
+    for group in same_exposure(views):
+        scene.draw(images, views, group, supersampling)
+    return images
+
+
+class _AnalyticScene:
+    """Discs and solids of a drawable."""
+
+    def __init__(self, drawable: Drawable) -> None:
+        solids = {k: p for k, p in enumerate(drawable.patches) if isinstance(p, Mesh)}
+        self._discs = DiscTable(drawable)
+        self._solids = [ConvexSolid(mesh.vertices) for mesh in solids.values()]
+        self._bodies = drawable.body_index[list(solids)]
+        self._levels = [float(mesh.levels[0]) for mesh in solids.values()]
+
+    def draw(self, images: NDArray[np.float32], views: Sequence[View], group: list[int], lines: int) -> None:
+        """Draw the views ``group``, which share a camera and an exposure, into ``images`` (n, h, w)."""
+        from cmmsim.imaging.layer_kernel import Discs, lay_layers  # compiles, so it is loaded where it is first needed
+
+        view = views[group[0]]
+        seen = self._discs.seen(view)
+        hidden_by = self._hiding(view, seen)
+        discs = Discs(
+            seen.centres,
+            seen.shapes,
+            seen.reach,
+            seen.levels,
+            np.stack(list(hidden_by.values()), axis=1) if hidden_by else np.zeros((len(seen.levels), 0), dtype=bool),
+        )
+        corners = np.array([views[k].corner for k in group], dtype=float)
+        lay_layers(images, np.array(group), corners, self._outlined(view, list(hidden_by)), lines, discs)
+
+    def _outlined(self, view: View, hiding: list[int]) -> Solids:
+        """The solids in view from far to near; ``hiding``: those whose cover is kept, in the order of their slots."""
+        from cmmsim.imaging.layer_kernel import Solids
+
+        moves = [view.camera_from_bodies[b] for b in self._bodies]
+        depth = [float(m[2, :3] @ s.middle + m[2, 3]) for m, s in zip(moves, self._solids, strict=True)]
+        outlines = {k: self._solids[k].outline(view.camera, moves[k]) for k in np.argsort(depth)[::-1].tolist()}
+        shown = {k: outline for k, outline in outlines.items() if outline is not None}
+        starts = np.cumsum([0, *(len(outline.half_planes) for outline in shown.values())])
+        return Solids(
+            np.concatenate([np.zeros((0, 3)), *(outline.half_planes for outline in shown.values())]),
+            starts,
+            np.array([outline.box for outline in shown.values()]).reshape(-1, 4),
+            np.array([self._levels[k] for k in shown]),
+            np.array([hiding.index(k) if k in hiding else -1 for k in shown], dtype=int),
+        )
+
+    def _hiding(self, view: View, seen: DiscsInView) -> dict[int, NDArray[np.bool_]]:
+        """Solids that stand before one of a disc's probed points, and before which discs (m,)."""
+        hiding = {}
+        for k, (solid, body) in enumerate(zip(self._solids, self._bodies, strict=True)):
+            move = view.camera_from_bodies[body]
+            if move[2, 3] < -NEAR:
+                continue
+            behind = solid.hides(move, seen.probes).any(axis=1) & (seen.owners != body)
+            if behind.any():
+                hiding[k] = behind
+        return hiding
+
+
+_SCENES: WeakKeyDictionary[Drawable, _AnalyticScene] = WeakKeyDictionary()

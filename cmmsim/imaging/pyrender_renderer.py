@@ -1,0 +1,287 @@
+"""Rendering of many small windows in one pass. The only module that imports pyrender.
+
+pyrender supplies the OpenGL context, the mesh buffers and the flat shader; the frame buffers hold one channel only,
+which draws faster than pyrender's four. Each window is drawn into its own cell of one large frame buffer with its own
+projection, drawn larger by the supersampling factor, and averaged in linear light. Every drawn pixel has one sample:
+several of pyrender's multisampling cost more than they gain on the stickers' soft rims. A cell draws only the patches
+whose bounding box reaches into it. Projection and camera_from_body are multiplied in double precision, so that the
+shader sees one well-scaled matrix. Depths are asked for only where they are needed, and a solid that fills a cell is
+its ground, see `laid_views`.
+Pieces of the atlas are handed over as they are ready, so that OpenGL fills them while the next ones are prepared.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.errors import CmmError, OpenGLMissingError
+from cmmsim.imaging.disc_mesh import disc_mesh
+from cmmsim.imaging.laid_views import LaidSolids
+from cmmsim.imaging.scene import DiscStack, Mesh
+from cmmsim.imaging.views import Drawable, View, projections, same_exposure
+
+ATLAS_SIDE_PX = 2048
+KEPT_FRAME_BUFFERS = 12
+PIECES = 3  # of an atlas that are handed over one after another
+
+
+def render_windows(
+    drawable: Drawable, views: Sequence[View], supersampling: int, background: float = 0.0
+) -> NDArray[np.float32]:
+    """Radiance (n, h, w) float32, 0 to 1, of n windows of one size.
+
+    Each pixel is the mean of ``supersampling``² drawn pixels of one sample each. Raises OpenGLMissingError.
+    """
+    from cmmsim.imaging.pooling_kernel import mean_of_cells  # compiles, so it is loaded where it is first needed
+
+    width, height = views[0].size
+    cell_w, cell_h = width * supersampling, height * supersampling
+    columns = max(1, min(ATLAS_SIDE_PX // cell_w, int(np.ceil(np.sqrt(len(views))))))
+    per_pass = columns * max(1, ATLAS_SIDE_PX // cell_h)
+    windows = np.empty((len(views), height, width), dtype=np.float32)
+    for first in range(0, len(views), per_pass):
+        part = views[first : first + per_pass]
+        atlas = _shared_atlas().draw(drawable, part, (cell_w, cell_h), columns, -(-len(part) // columns), background)
+        mean_of_cells(atlas, columns, supersampling, windows[first : first + per_pass])
+    return windows
+
+
+def require_opengl() -> None:
+    """Raise OpenGLMissingError, naming the packages to install, where nothing can be rendered."""
+    _shared_atlas()
+
+
+@lru_cache(maxsize=1)
+def _shared_atlas() -> _Atlas:
+    """The one renderer of this process; making another would leak memory."""
+    if not os.environ.get("DISPLAY"):
+        os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
+    try:
+        import pyrender
+
+        return _Atlas(pyrender)
+    except Exception as error:  # PyOpenGL's platform plugins fail with many types
+        raise OpenGLMissingError(error) from error
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """A patch in OpenGL's memory: ``indices`` of its triangles from the front to the back, then, from ``backwards`` on,
+    as many for the other way."""
+
+    vertex_array: int
+    indices: int
+    backwards: ctypes.c_void_p
+
+
+@dataclass(frozen=True)
+class _Uploaded:
+    """What is known of a drawable: its patches by the number of drawn pixels a radian, and what lies over what."""
+
+    patches: dict[float, list[_Patch]]
+    solids: LaidSolids
+
+
+class _Atlas:
+    """Draws cells into pyrender's frame buffers."""
+
+    def __init__(self, pyrender: Any) -> None:
+        from OpenGL import GL
+        from OpenGL.raw.GL.VERSION import GL_1_0, GL_1_1, GL_2_0, GL_3_0  # without the conversion of arguments
+        from pyrender.renderer import Renderer
+
+        self._gl, self._pyrender = GL, pyrender
+        self._viewport, self._draw_elements = GL_1_0.glViewport, GL_1_1.glDrawElements
+        self._set_matrix, self._bind_mesh = GL_2_0.glUniformMatrix4fv, GL_3_0.glBindVertexArray
+        self._context = pyrender.OffscreenRenderer(64, 64)
+        self._shaders = Renderer(64, 64)
+        GL.glDepthFunc(GL.GL_LESS)
+        for switch in (GL.GL_CULL_FACE, GL.GL_BLEND, GL.GL_DEPTH_TEST):
+            GL.glDisable(switch)
+        GL.glPixelStorei(GL.GL_PACK_ALIGNMENT, 1)
+        self._flags = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.OFFSCREEN
+        self._frame_buffers: dict[tuple[int, int], _FrameBuffer] = {}
+        self._known: weakref.WeakKeyDictionary[Drawable, _Uploaded] = weakref.WeakKeyDictionary()
+
+    def draw(
+        self,
+        drawable: Drawable,
+        views: Sequence[View],
+        cell: tuple[int, int],
+        columns: int,
+        rows: int,
+        background: float,
+    ) -> NDArray[np.uint8]:
+        """The drawn atlas (rows * cell_h, columns * cell_w) uint8, cells in reading order; valid until the next."""
+        self._context._platform.make_current()
+        patches, solids = self._uploaded(drawable, views[0].camera.focal_px * cell[0] / views[0].size[0])
+        frame_buffer = self._frame_buffer(columns * cell[0], rows * cell[1])
+        frame_buffer.bind()
+        groups = [np.array(group) for group in same_exposure(views)]
+        reaching = drawable.reaching(views, groups)
+        laid = solids.laid(views, groups, reaching)
+        reaching[np.flatnonzero(laid.filled), laid.solid[laid.filled]] = False
+        places = [((k % columns) * cell[0], (k // columns) * cell[1], *cell) for k in range(len(views))]
+        self._clear(np.where(laid.filled, solids.levels[laid.solid], background), places, bool((laid.solid < 0).any()))
+        self._program._bind()
+        matrices, per_piece = self._matrices(views), -(-rows // PIECES) * columns
+        shown: list[list[int]] = [[] for _ in views]
+        for k, p in np.argwhere(reaching).tolist():
+            shown[k].append(p)
+        for k, place in enumerate(places):
+            if k and k % per_piece == 0:
+                self._gl.glFlush()
+            self._viewport(*place)
+            (self._draw_by_depth if laid.solid[k] < 0 else self._lay)(drawable, shown[k], patches, matrices[k])
+        self._gl.glBindVertexArray(0)
+        return frame_buffer.read()
+
+    def _draw_by_depth(
+        self, drawable: Drawable, shown: Sequence[int], patches: Sequence[_Patch], clip_from_bodies: NDArray[np.float32]
+    ) -> None:
+        """The patches ``shown`` in a cell, the nearest of which is seen."""
+        gl, body = self._gl, -1
+        gl.glEnable(gl.GL_DEPTH_TEST)
+        for p in shown:
+            if drawable.body_index[p] != body:
+                body = drawable.body_index[p]
+                self._set_matrix(self._matrix_location, 1, gl.GL_TRUE, clip_from_bodies[body])
+            self._bind_mesh(patches[p].vertex_array)
+            self._draw_elements(gl.GL_TRIANGLES, patches[p].indices, gl.GL_UNSIGNED_INT, None)
+        gl.glDisable(gl.GL_DEPTH_TEST)
+
+    def _lay(
+        self, drawable: Drawable, shown: Sequence[int], patches: Sequence[_Patch], clip_from_bodies: NDArray[np.float32]
+    ) -> None:
+        """The patches ``shown`` in a cell, all of one body, over each other: the solid, then what lies on it."""
+        gl = self._gl
+        if shown:
+            self._set_matrix(self._matrix_location, 1, gl.GL_TRUE, clip_from_bodies[drawable.body_index[shown[0]]])
+        for p in sorted(shown, key=lambda p: isinstance(drawable.patches[p], DiscStack)):
+            self._bind_mesh(patches[p].vertex_array)
+            self._draw_elements(gl.GL_TRIANGLES, patches[p].indices, gl.GL_UNSIGNED_INT, patches[p].backwards)
+
+    def _clear(self, grounds: NDArray[np.float64], places: Sequence[tuple[int, ...]], with_depth: bool) -> None:
+        """Give each cell its ground's level, and the farthest depth where depths are asked for."""
+        gl, level = self._gl, float(grounds[0])
+        gl.glClearColor(level, level, level, 1.0)
+        gl.glClear(gl.GL_COLOR_BUFFER_BIT | (gl.GL_DEPTH_BUFFER_BIT if with_depth else 0))
+        others = np.flatnonzero(grounds != level).tolist()
+        if others:
+            gl.glEnable(gl.GL_SCISSOR_TEST)
+            for k in others:
+                gl.glScissor(*places[k])
+                gl.glClearColor(*[float(grounds[k])] * 3, 1.0)
+                gl.glClear(gl.GL_COLOR_BUFFER_BIT)
+            gl.glDisable(gl.GL_SCISSOR_TEST)
+
+    @staticmethod
+    def _matrices(views: Sequence[View]) -> NDArray[np.float32]:
+        """Clip-from-body matrices (n views, bodies, 4, 4)."""
+        moves = np.array([view.camera_from_bodies for view in views])
+        return (projections(views)[:, None] @ moves).astype(np.float32)
+
+    def _uploaded(self, drawable: Drawable, samples: float) -> tuple[list[_Patch], LaidSolids]:
+        """The patches in OpenGL's memory, their discs made for ``samples`` drawn pixels a radian."""
+        known = self._known.get(drawable)
+        if known is None:
+            known = self._known[drawable] = _Uploaded({}, LaidSolids(drawable))
+        if samples not in known.patches:
+            made = [
+                disc_mesh(p, drawable.distance / samples) if isinstance(p, DiscStack) else p for p in drawable.patches
+            ]
+            known.patches[samples] = [self._patch(mesh) for mesh in made]
+        return known.patches[samples], known.solids
+
+    def _patch(self, mesh: Mesh) -> _Patch:
+        indices = mesh.faces.size
+        return _Patch(self._upload(mesh)._vaid, indices, ctypes.c_void_p(indices * np.dtype(np.uint32).itemsize))
+
+    def _upload(self, mesh: Mesh) -> Any:
+        grey = np.repeat(mesh.levels[:, None], 3, axis=1)
+        primitive = self._pyrender.Primitive(
+            positions=mesh.vertices.astype(np.float32),
+            indices=np.concatenate([mesh.faces, mesh.faces[::-1]]).astype(np.uint32),
+            color_0=np.column_stack([grey, np.ones(len(grey))]).astype(np.float32),
+            material=self._pyrender.MetallicRoughnessMaterial(baseColorFactor=(1.0, 1.0, 1.0, 1.0)),
+            mode=4,
+        )
+        primitive._add_to_context()
+        return primitive
+
+    def _frame_buffer(self, width: int, height: int) -> _FrameBuffer:
+        if (width, height) not in self._frame_buffers:
+            if len(self._frame_buffers) >= KEPT_FRAME_BUFFERS:
+                self._frame_buffers.pop(next(iter(self._frame_buffers))).delete()
+            self._frame_buffers[width, height] = _FrameBuffer(self._gl, width, height)
+        return self._frame_buffers[width, height]
+
+    @cached_property
+    def _matrix_location(self) -> int:
+        """Where the bound shader takes its matrix from."""
+        return int(self._gl.glGetUniformLocation(self._program._program_id, "P"))
+
+    @cached_property
+    def _program(self) -> Any:
+        """pyrender's flat shader with all matrices identity but P."""
+        from pyrender.constants import ProgramFlags
+
+        anything = self._upload(Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros(3)))
+        program = self._shaders._get_primitive_program(anything, self._flags, ProgramFlags.USE_MATERIAL)
+        program._bind()
+        for name in ("V", "M"):
+            program.set_uniform(name, np.eye(4))
+        program.set_uniform("material.base_color_factor", np.ones(4))
+        return program
+
+
+class _FrameBuffer:
+    """Red channel and depth with one sample a pixel."""
+
+    def __init__(self, gl: Any, width: int, height: int) -> None:
+        from OpenGL.raw.GL.VERSION import GL_1_0  # reads into given memory
+
+        self._gl, self._size, self._read_pixels = gl, (width, height), GL_1_0.glReadPixels
+        self._pixels = np.empty((height, width), dtype=np.uint8)
+        self._target = self._pixels.ctypes.data_as(ctypes.c_void_p)
+        self._name = gl.glGenFramebuffers(1)
+        self._buffers = [
+            self._attached(gl.GL_COLOR_ATTACHMENT0, gl.GL_R8),
+            self._attached(gl.GL_DEPTH_ATTACHMENT, gl.GL_DEPTH_COMPONENT24),
+        ]
+        self.bind()
+        state = gl.glCheckFramebufferStatus(gl.GL_FRAMEBUFFER)
+        if state != gl.GL_FRAMEBUFFER_COMPLETE:
+            raise CmmError(f"OpenGL cannot draw {self._size} px: frame buffer state {state}")
+
+    def bind(self) -> None:
+        """What is drawn from now on goes here, what is read comes from here."""
+        self._gl.glBindFramebuffer(self._gl.GL_FRAMEBUFFER, self._name)
+
+    def read(self) -> NDArray[np.uint8]:
+        """The image (height, width), in memory that the next one takes, too."""
+        self._read_pixels(0, 0, *self._size, self._gl.GL_RED, self._gl.GL_UNSIGNED_BYTE, self._target)
+        return self._pixels
+
+    def delete(self) -> None:
+        """Give the memory back."""
+        self._gl.glDeleteFramebuffers(1, [self._name])
+        self._gl.glDeleteRenderbuffers(len(self._buffers), self._buffers)
+
+    def _attached(self, attachment: int, kind: int) -> int:
+        gl = self._gl
+        buffer = int(gl.glGenRenderbuffers(1))
+        self.bind()
+        gl.glBindRenderbuffer(gl.GL_RENDERBUFFER, buffer)
+        gl.glRenderbufferStorage(gl.GL_RENDERBUFFER, kind, *self._size)
+        gl.glFramebufferRenderbuffer(gl.GL_FRAMEBUFFER, attachment, gl.GL_RENDERBUFFER, buffer)
+        return buffer

@@ -1,0 +1,171 @@
+"""What the cameras look at: solid bodies and where the stickers really are. Only the renderer sees this truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import HalfspaceIntersection, QhullError
+
+from cmmsim.checks import finite_array
+from cmmsim.errors import CmmError, SensorFileError
+from cmmsim.files.marked_body import MarkedBody
+from cmmsim.files.schema import Body, Stickers, unit
+from cmmsim.geometry.plane_frame import PLANE_NAMES
+from cmmsim.geometry.pose import Array
+
+SUNK = 0.0003  # m the solid surface lies below the sticker planes
+RING_SUNK = 0.0001  # m the dark ring lies below its sticker
+SHORTEST_ROD = 1e-9  # m: of a shorter one rounding is the direction
+
+
+@dataclass(frozen=True)
+class Disc:
+    """A flat disc: centre (3,) and radius m, outward unit normal (3,), level 0 to 1."""
+
+    centre: Array
+    normal: Array
+    radius: float
+    level: float
+
+
+@dataclass(frozen=True)
+class DiscStack:
+    """Discs that lie over each other, the largest and lowest first; each renderer draws them in its own way."""
+
+    discs: tuple[Disc, ...]
+
+    @property
+    def bounds(self) -> Array:
+        """Smallest and largest coordinates (2,3), m."""
+        reach = [d.radius * np.sqrt(np.maximum(1.0 - d.normal**2, 0.0)) for d in self.discs]
+        return np.stack(
+            [
+                np.min([d.centre - r for d, r in zip(self.discs, reach, strict=True)], axis=0),
+                np.max([d.centre + r for d, r in zip(self.discs, reach, strict=True)], axis=0),
+            ]
+        )
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """vertices (n,3) m, faces (m,3), levels (n,) 0 to 1 of the vertices; a solid has one level."""
+
+    vertices: Array
+    faces: NDArray[np.int_]
+    levels: Array
+
+    @property
+    def bounds(self) -> Array:
+        """Smallest and largest coordinates (2,3), m."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+
+Patch = DiscStack | Mesh
+"""A piece of a body that is drawn as one call."""
+
+
+@dataclass(frozen=True)
+class SceneBody:
+    """A rigid body as drawn: its solid and one stack of discs for each sticker; sticker_places (n,3) are the true ones,
+    m."""
+
+    solid: Mesh
+    stickers: tuple[DiscStack, ...]
+    sticker_places: Array
+
+
+def placed_stickers(body: MarkedBody, stickers: Stickers, stream: int) -> Array:
+    """True sticker places (n,3): the nominal ones moved within their planes, by a seeded distance and direction."""
+    rng = np.random.default_rng([stickers.placement_seed, stream])
+    distance = rng.uniform(*stickers.placement, len(body.nominal))
+    angle = rng.uniform(0.0, 2.0 * np.pi, len(body.nominal))
+    moves = distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return body.nominal + np.einsum("nij,nj->ni", body.in_plane, moves)
+
+
+def scene_body(body: MarkedBody, section: Body, stickers: Stickers, stream: int) -> SceneBody:
+    """The drawn body of a sensor file's section."""
+    places = placed_stickers(body, stickers, stream)
+    drawn = tuple(_sticker(place, axes, stickers) for place, axes in zip(places, body.in_plane, strict=True))
+    solid = solid_mesh(_solid(body, section), stickers.body_level / 255.0)
+    return SceneBody(solid, drawn, places)
+
+
+def solid_mesh(mesh: trimesh.Trimesh, level: float) -> Mesh:
+    """A solid in one grey level."""
+    vertices = np.asarray(mesh.vertices, dtype=float)
+    return Mesh(vertices, np.asarray(mesh.faces), np.full(len(vertices), level))
+
+
+def rod(length: float, radius: float) -> trimesh.Trimesh:
+    """A cylinder from the origin to (0, 0, length), m: a crank or a link between two points.
+
+    Raises ShapeError where length or radius is no finite number, CmmError where it is not above zero.
+    """
+    sizes = finite_array((length, radius), (2,), "length and radius of a rod are two finite numbers, m")
+    if sizes.min() <= 0.0:
+        raise CmmError(f"length and radius of a rod must be above 0 m, got {length:g} and {radius:g}")
+    mesh = trimesh.creation.cylinder(radius=radius, height=length, sections=24)
+    mesh.apply_translation([0.0, 0.0, 0.5 * length])
+    return mesh
+
+
+def rod_transform(start: ArrayLike, end: ArrayLike) -> Array:
+    """base_from_body (4,4) of a rod that begins at ``start`` (3,) and points to ``end`` (3,), m.
+
+    Raises ShapeError for anything but three finite numbers each, CmmError where the rod is shorter than SHORTEST_ROD.
+    """
+    begin = finite_array(start, (3,), "the start of a rod is three finite numbers, m")
+    along = finite_array(end, (3,), "the end of a rod is three finite numbers, m") - begin
+    length = float(np.linalg.norm(along))
+    if length < SHORTEST_ROD:
+        raise CmmError(
+            f"a rod of {length:g} m from {begin.tolist()} m points nowhere, at least {SHORTEST_ROD:g} m is needed"
+        )
+    z = unit(along)
+    x = unit(np.cross(z, np.eye(3)[np.argmin(np.abs(z))]))
+    transform = np.eye(4)
+    transform[:3, :3] = np.column_stack([x, np.cross(z, x), z])
+    transform[:3, 3] = begin
+    return transform
+
+
+def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:
+    """Convex solid of the sunk sticker planes and the cuts. Raises SensorFileError where they enclose none."""
+    normals = [*body.normals, *(unit(c.normal) for c in section.cuts)]
+    points = [
+        *(d * n - SUNK * n for n, d in zip(body.normals, body.offsets, strict=True)),
+        *(np.array(c.point) for c in section.cuts),
+    ]
+    half_spaces = np.array([[*n, -(n @ p)] for n, p in zip(normals, points, strict=True)])
+    inside = body.nominal.mean(axis=0) - 0.01 * body.normals.sum(axis=0)
+    outside = half_spaces @ [*inside, 1.0]
+    if outside.max() >= 0.0:
+        side = [*(f"plane {name}" for name in PLANE_NAMES), *(f"cut {k + 1}" for k in range(len(section.cuts)))]
+        raise SensorFileError(
+            f"{body.name}: the middle of its stickers, {np.round(inside, 4).tolist()} m, lies "
+            f"{outside.max():.4f} m outside of {side[outside.argmax()]}: the stickers do not sit on "
+            "the solid that its planes and cuts enclose"
+        )
+    try:
+        corners = HalfspaceIntersection(half_spaces, inside).intersections
+        if not np.isfinite(corners).all():
+            raise SensorFileError(f"{body.name}: its planes and cuts enclose no solid, it is open on a side")
+        return trimesh.convex.convex_hull(corners)
+    except QhullError as error:
+        reason = str(error).strip().splitlines()[0]
+        raise SensorFileError(f"{body.name}: its planes and cuts enclose no solid: {reason}") from error
+
+
+def _sticker(place: Array, axes: Array, stickers: Stickers) -> DiscStack:
+    """A bright disc, and RING_SUNK below it a dark one that shows as a ring."""
+    normal = np.cross(axes[:, 0], axes[:, 1])
+    return DiscStack(
+        (
+            Disc(place - RING_SUNK * normal, normal, stickers.ring_radius, stickers.ring_level / 255.0),
+            Disc(place, normal, stickers.radius, stickers.sticker_level / 255.0),
+        )
+    )

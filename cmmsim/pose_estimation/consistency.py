@@ -1,0 +1,148 @@
+"""Which observed stickers contradict the others, and whether what is left can be trusted.
+
+The taught places are laid onto the observed stickers. A sticker is left out, the worst one first, when
+
+- its place differs from where all others put it (data snooping: the residual r against its own covariance
+  S - J C J', which a sticker's pull on the pose makes smaller than its noise S), or
+- its ellipse in one image differs from the one a whole sticker would show there: a partly hidden sticker, or a bright
+  spot that touches it, moves the centre and the rim alike.
+
+Undetected errors of both kinds are then of the size of the noise. At least four stickers must be left, since with three
+a wrong one cannot be told, and more than were left out.
+
+All residuals may be larger than noise: a camera has drifted since its calibration, or several stickers are a little
+wrong. Places are then judged against the residuals of the others, and the covariances grow by the same factor (Birge
+ratio), up to a limit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.stats import chi2
+
+from cmmsim.errors import LostError
+from cmmsim.files.marked_body import MarkedBody
+from cmmsim.geometry.outlines import sticker_outlines
+from cmmsim.geometry.pose import Array, apply, skew
+from cmmsim.geometry.registration import Registration, register
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.pose_estimation.observation import StickerObservation
+
+CHANCE = 1e-4  # of a good sticker to be left out, for its place and for each of its two ellipses
+EXCESS_CHANCE = 1e-4  # of a good frame's residuals to be taken for larger than noise
+LARGEST_EXCESS = 6.0  # of the residuals' mean square over that of noise
+LARGEST_MISFIT = float(chi2.isf(CHANCE, 3))
+FEWEST = 4
+SMALLEST_REDUNDANCY = 0.01  # share of a sticker's noise that shows in its residual, below which nothing can be checked
+
+
+@dataclass(frozen=True)
+class StickerChecks:
+    """Squared differences (n,), three degrees of freedom each: of a sticker's place from where the others put it, in
+    units of its noise or of the others' larger residuals, and of its worse ellipse from that of a whole sticker."""
+
+    place: Array
+    outline: Array
+
+    @property
+    def worst(self) -> int:
+        """The sticker that differs most."""
+        return int(np.maximum(self.place, self.outline).argmax())
+
+    def passed(self, k: int) -> bool:
+        """Whether sticker k agrees."""
+        return max(float(self.place[k]), float(self.outline[k])) <= LARGEST_MISFIT
+
+    def reason(self, k: int) -> str:
+        """What is wrong with sticker k, with value and limit."""
+        name, value = ("place", self.place[k]) if self.place[k] >= self.outline[k] else ("outline", self.outline[k])
+        return f"squared misfit {value:.0f} of its {name}, at most {LARGEST_MISFIT:.1f}"
+
+
+def consistent(
+    observation: StickerObservation, rig: StereoRig, body: MarkedBody, places: Array, radius: float
+) -> tuple[StickerObservation, Registration]:
+    """The stickers that agree with each other, and their registration.
+
+    Parameters: places (n,3) taught ones and radius m of all stickers. Raises LostError when too few agree.
+    """
+    seen = len(observation.index)
+    left_out: list[str] = []
+    while True:
+        if len(observation.index) < FEWEST or len(observation.index) <= len(left_out):
+            raise LostError(_too_few(len(observation.index), seen, left_out))
+        result = register(places[observation.index], observation.points, observation.covariances)
+        checks = _checks(observation, result, rig, body, places, radius)
+        excess = residual_excess(float(result.misfit.sum()), 3 * len(result.misfit) - 6)
+        worst = checks.worst
+        if checks.passed(worst) and excess <= LARGEST_EXCESS:
+            return (
+                replace(observation, covariances=excess * observation.covariances),
+                replace(result, covariance=excess * result.covariance),
+            )
+        left_out.append(f"{body.sticker_ids[observation.index[worst]]}: {checks.reason(worst)}")
+        observation = observation.selected(np.arange(len(observation.index)) != worst)
+
+
+def place_misfits(result: Registration, points: Array, places: Array, covariances: Array) -> Array:
+    """Squared residuals (n,) of a registration, each in units of its own covariance.
+
+    Parameters: points (n,3) measured with covariances (n,3,3), and places (n,3) known. Directions in which a sticker
+    alone determines the pose are left out.
+    """
+    turned = places @ result.transform[:3, :3].T
+    jacobian = np.concatenate([np.broadcast_to(np.eye(3), (len(turned), 3, 3)), -skew(turned)], axis=2)
+    # in the axes in which the noise is the unit matrix
+    whiten = np.linalg.inv(np.linalg.cholesky(covariances))
+    pulled = whiten @ jacobian
+    redundancy, axes = np.linalg.eigh(np.eye(3) - pulled @ result.covariance @ pulled.swapaxes(1, 2))
+    residuals = np.einsum("nji,njk,nk->ni", axes, whiten, points - apply(result.transform, places))
+    shown = redundancy > SMALLEST_REDUNDANCY
+    return np.asarray((residuals**2 / np.where(shown, redundancy, np.inf)).sum(axis=1))
+
+
+def outline_misfits(observation: StickerObservation, shapes: Array) -> Array:
+    """Squared difference (2, n) of observed ellipses from expected ones with ``shapes`` (2, n, 2, 2), px."""
+    if observation.outlines is None:
+        return np.zeros((2, len(observation.index)))
+    change = (observation.outlines.shapes - shapes)[..., [0, 0, 1], [0, 1, 1]]
+    return np.asarray((change * np.linalg.solve(observation.outlines.covariances, change[..., None])[..., 0]).sum(-1))
+
+
+def _checks(
+    observation: StickerObservation,
+    result: Registration,
+    rig: StereoRig,
+    body: MarkedBody,
+    places: Array,
+    radius: float,
+) -> StickerChecks:
+    index = observation.index
+    place = place_misfits(result, observation.points, places[index], observation.covariances)
+    total, freedom = float(result.misfit.sum()), 3 * len(index) - 9  # without a sticker, its place misfit is missing
+    place = place / [residual_excess(total - own, freedom) for own in place]
+    shapes = sticker_outlines(rig, result.transform, places[index], body.sticker_normals[index], radius)[1]
+    return StickerChecks(place, outline_misfits(observation, shapes).max(axis=0))
+
+
+def residual_excess(total: float, freedom: int) -> float:
+    """Mean square of residuals in units of their noise where it is larger than noise makes it, else 1."""
+    return total / freedom if total > _largest_total(freedom) else 1.0
+
+
+@lru_cache(maxsize=64)
+def _largest_total(freedom: int) -> float:
+    return float(chi2.isf(EXCESS_CHANCE, freedom))
+
+
+def _too_few(left: int, seen: int, left_out: list[str]) -> str:
+    """The reason why what is left cannot be trusted."""
+    if not left_out:
+        return f"{seen} visible stickers, at least {FEWEST} are needed to tell a wrong one"
+    return (
+        f"{seen} visible stickers contradict each other, {left} are left where at least {FEWEST} and more than the "
+        f"{len(left_out)} that were left out are needed; the first was {left_out[0]}"
+    )

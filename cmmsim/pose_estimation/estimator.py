@@ -1,0 +1,195 @@
+"""From one stereo frame to a measurement (paper eq. 27 and 28). Knows nothing of true poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cmmsim.checks import finite_array, require_kind
+from cmmsim.detection.blob_search import find_ellipses
+from cmmsim.errors import LostError, ShapeError, UnknownOptionError
+from cmmsim.files.marked_body import MarkedBody
+from cmmsim.geometry.pose import Array, compose_covariance, pose_covariance, transform_to_pose
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.pose_estimation.consistency import consistent
+from cmmsim.pose_estimation.labelling import ENOUGH, find_layout
+from cmmsim.pose_estimation.matching import candidate_pairs
+from cmmsim.pose_estimation.measurement import Measurement, lost_measurement
+from cmmsim.pose_estimation.observation import (
+    DetectionSettings,
+    StickerObservation,
+    observe,
+    observe_windows,
+    read_windows,
+)
+from cmmsim.pose_estimation.pose_methods import METHODS, Solution, by_planes
+from cmmsim.pose_estimation.streaks import drawn_out, find_streaks
+from cmmsim.pose_estimation.taught import Taught
+from cmmsim.radiometry.images import FrameImages, StereoFrame, StereoImages
+from cmmsim.radiometry.noise import CameraNoise
+
+NOMINAL_TOLERANCE = 0.003  # m: nominal places are known to about a millimetre
+TAUGHT_TOLERANCE = 0.0005  # m: taught places are known to microns, points in a whole image to tenths of a millimetre
+FEWEST_NOMINAL, FEWEST_TAUGHT = 6, 4
+SEARCH_WINDOW_PX = 24  # at least
+SEARCH_ROOM_PX = 8  # a bright spot's rough centre differs from a prediction of it
+
+
+@dataclass(frozen=True)
+class PoseEstimator:
+    """Everything that turns images into poses: the known rig, noise, sticker bodies and what was taught."""
+
+    rig: StereoRig
+    noise: CameraNoise
+    settings: DetectionSettings
+    platform: MarkedBody
+    taught: Taught
+    method: str = "registration"
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise UnknownOptionError("method", self.method, METHODS)
+
+    def locate(self, images: StereoImages) -> Array:
+        """Rough camera_from_platform (4,4) from whole images, without prior. Raises LostError.
+
+        Where the cameras are exposed for some time and many stickers are missing, streaks are looked for as well.
+        """
+        frame, usual = images.full(), self.settings
+        if usual.exposed_share == 0.0:
+            return self._found(frame, usual)[0]
+        streaks = replace(usual, limits=replace(usual.limits, largest_misfit=np.inf))
+        try:
+            found, count = self._found(frame, usual)
+        except LostError:
+            return self._found(frame, streaks)[0]
+        if count < ENOUGH * len(self.taught.platform_places):
+            try:
+                longer, more = self._found(frame, streaks)
+            except LostError:
+                return found
+            return longer if more > count else found
+        return found
+
+    def measure(
+        self, images: StereoImages, expected: Array, swept: tuple[Array, Array] | None = None
+    ) -> tuple[Measurement, Array]:
+        """Measurement near an expected camera_from_platform (4,4), and the measured one. Raises LostError.
+
+        ``swept``: expected ones at the beginning and the end of the exposure. Where stickers are smeared over more than
+        half a pixel and it is not told, a pose without point spread is worse than its covariance: ``measure_anew``.
+        """
+        return self._measured(
+            observe(
+                images,
+                self.rig,
+                self.noise,
+                self.settings,
+                expected,
+                self.taught.platform_places,
+                self.platform.sticker_normals,
+                swept,
+            )
+        )
+
+    def measure_anew(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
+        """As ``measure`` where nothing is known of the movement: it is told from the streaks of the stickers.
+
+        Raises LostError, which states the length of the streaks where they show.
+        """
+        if self.settings.exposed_share == 0.0:
+            return self.measure(images, expected)
+        places, normals = self.taught.platform_places, self.platform.sticker_normals
+        read = read_windows(images, self.rig, self.noise, self.settings, expected, places, normals)
+        streaks = find_streaks(read, self.rig, self.noise, self.settings, places, normals)
+        swept = None if streaks is None else streaks.swept
+        try:
+            return self._measured(observe_windows(read, self.rig, self.noise, self.settings, places, swept))
+        except LostError as error:
+            if streaks is None:
+                raise
+            raise LostError(f"{error}; {drawn_out(streaks.longest_px)}") from error
+
+    def _found(self, frame: StereoFrame, settings: DetectionSettings) -> tuple[Array, int]:
+        """Rough camera_from_platform (4,4) and the number of stickers that were recognised. Raises LostError."""
+        points = points_in_frame(frame, self.rig, self.noise, settings)
+        place, stickers, _ = find_layout(
+            self.taught.platform_places, points, TAUGHT_TOLERANCE, FEWEST_TAUGHT, "platform"
+        )
+        return place, len(stickers)
+
+    def _measured(self, seen: StickerObservation) -> tuple[Measurement, Array]:
+        """Measurement, and measured camera_from_platform (4,4), from stickers. Raises LostError."""
+        camera_from_platform, covariance, used = self._solve(seen)
+        base_from_platform = self.taught.base_from_camera @ camera_from_platform
+        spread = compose_covariance(self.taught.base_from_camera, covariance)
+        measurement = Measurement(
+            transform_to_pose(base_from_platform),
+            pose_covariance(base_from_platform, spread),
+            used.points,
+            used.covariances,
+            used.left_pixels,
+            used.right_pixels,
+            self.platform.sticker_ids[used.index],
+            True,
+        )
+        return measurement, camera_from_platform
+
+    def _solve(self, seen: StickerObservation) -> Solution:
+        used, result = consistent(seen, self.rig, self.platform, self.taught.platform_places, self.settings.radius)
+        if self.method == "planes":
+            return by_planes(used, self.platform, self.platform.normals @ result.transform[:3, :3].T)
+        return result.transform, result.covariance, used
+
+
+def measure_frame(frame: StereoFrame, estimator: PoseEstimator, expected: Array | None = None) -> Measurement:
+    """Measure a stereo frame from any source.
+
+    ``expected`` (4,4) is a rough camera_from_platform; without it the stickers are searched in the whole images.
+    Raises ShapeError for images of another size or bit depth than the estimator's cameras have, and CmmError for
+    what is no frame or no estimator.
+    """
+    require_kind(frame, StereoFrame, "a frame must be a StereoFrame(left, right)")
+    require_kind(estimator, PoseEstimator, "an estimator must be a PoseEstimator, such as sensor.estimator")
+    require_fitting(frame, estimator)
+    if expected is not None:
+        expected = finite_array(expected, (4, 4), "the expected camera_from_platform must be (4,4) and finite")
+    images = FrameImages(frame)
+    try:
+        return estimator.measure_anew(images, estimator.locate(images) if expected is None else expected)[0]
+    except LostError as error:
+        return lost_measurement(str(error))
+
+
+def require_fitting(frame: StereoFrame, estimator: PoseEstimator) -> None:
+    """Raise ShapeError for images of another size or bit depth than the estimator's cameras have."""
+    for name, image, camera in zip(("left", "right"), (frame.left, frame.right), estimator.rig.cameras, strict=True):
+        if image.shape != (camera.height, camera.width):
+            raise ShapeError(
+                f"the {name} image is {image.shape[1]} x {image.shape[0]} px, but its camera has "
+                f"{camera.width} x {camera.height} px"
+            )
+        if image.dtype != estimator.noise.image_type:
+            raise ShapeError(
+                f"the {name} image is {image.dtype}, but the camera's bit_depth "
+                f"{estimator.noise.bit_depth} makes {estimator.noise.image_type}"
+            )
+
+
+def points_in_frame(frame: StereoFrame, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings) -> Array:
+    """Points (m,3) in the camera frame that may be stickers; true and false pairings together."""
+    window_size = max(SEARCH_WINDOW_PX, settings.window_size + SEARCH_ROOM_PX)
+    left, right = find_ellipses(frame, noise, window_size, settings.fit_size, settings.limits, settings.optics.psf_px)
+    if not len(left.centres) or not len(right.centres):
+        raise LostError(
+            f"{len(left.centres)} bright spots in the left image and {len(right.centres)} in the right, "
+            f"at least {FEWEST_TAUGHT} in each needed"
+        )
+    ideal = [
+        pixels[found]
+        for pixels, found in (
+            camera.undistort(side.centres) for camera, side in zip(rig.cameras, (left, right), strict=True)
+        )
+    ]
+    return candidate_pairs(rig.ideal, *ideal)[1]

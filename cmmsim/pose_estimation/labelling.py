@@ -1,0 +1,122 @@
+"""Which measured point is which sticker: search for the rigid layout in a cloud of points, with no prior pose.
+
+Three stickers far from each other are looked for by their three mutual distances; each find proposes a pose, which is
+judged by how many stickers of the layout then have a measured point close by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from cmmsim.errors import LostError
+from cmmsim.geometry.pose import Array, apply
+from cmmsim.geometry.registration import rigid_starts
+
+SMALLEST_TRIANGLE = 0.002  # m² area
+MOST_TOGETHER = 64  # triangles judged together
+ENOUGH = 0.8  # share of the layout that ends the search
+
+
+def find_layout(
+    layout: Array, points: Array, tolerance: float, fewest: int, name: str
+) -> tuple[Array, NDArray[np.int_], NDArray[np.int_]]:
+    """Pose of a layout in a cloud of points.
+
+    Parameters: layout (n,3) m in body axes; points (m,3) m in the camera frame; tolerance in m of the layout's places;
+    fewest stickers to be found.
+    Returns camera_from_body (4,4), and the indices of the stickers (k,) and of their points (k,).
+    Raises LostError when fewer are found, or two different poses explain the points about equally well.
+    """
+    gaps, tree = np.linalg.norm(points[:, None] - points[None], axis=2), cKDTree(points)
+    best: Array | None = None
+    count = rival = 0
+    for triples in _blocks(_triangles(layout)):
+        proposer, poses, counts = _proposed(layout, triples, points, gaps, tree, tolerance)
+        ended = len(triples)
+        for k in np.flatnonzero(counts > min(count, rival)).tolist():  # others change neither
+            if proposer[k] > ended:
+                break
+            if best is not None and not _same(best, poses[k], layout, tolerance):
+                rival = max(rival, min(count, int(counts[k])))
+            if counts[k] > count:
+                best, count = poses[k], int(counts[k])
+            if count >= ENOUGH * len(layout):
+                ended = min(ended, proposer[k])  # this triangle's other finds may be rivals yet
+        if count >= ENOUGH * len(layout):
+            break
+    if best is None or count < fewest:
+        raise LostError(
+            f"{name}: {count} of {len(layout)} stickers recognised among {len(points)} points, at least {fewest} needed"
+        )
+    if rival > count - 2:
+        raise LostError(f"{name}: two poses explain the points, with {count} and {rival} stickers")
+    nearest = _nearest(best[None], layout, tree, tolerance)[0]
+    stickers = np.flatnonzero(nearest >= 0)
+    return best, stickers, nearest[stickers]
+
+
+def _triangles(layout: Array) -> NDArray[np.int_]:
+    """Triples (t,3) of stickers with a large triangle, in a fixed mixed order."""
+    triples = np.array(list(combinations(range(len(layout)), 3)), dtype=int).reshape(-1, 3)
+    a, b, c = layout[triples.T]
+    triples = triples[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 2.0 * SMALLEST_TRIANGLE]
+    return np.random.default_rng(0).permutation(triples)
+
+
+def _blocks(triples: NDArray[np.int_]) -> Iterator[NDArray[np.int_]]:
+    """The triples (t,3) in parts that are judged together: the first ones alone, since they mostly end the search."""
+    first = 0
+    while first < len(triples):
+        size = min(1 + first, MOST_TOGETHER)
+        yield triples[first : first + size]
+        first += size
+
+
+def _congruent(gaps: Array, corners: Array, tolerance: float) -> NDArray[np.int_]:
+    """All ordered triples (c,3) of points whose distances (``gaps``, (m,m)) are those of three corners (3,3)."""
+    d01, d02, d12 = (np.linalg.norm(corners[a] - corners[b]) for a, b in ((0, 1), (0, 2), (1, 2)))
+    first, second = np.nonzero(np.abs(gaps - d01) < tolerance)
+    fits = (np.abs(gaps[first] - d02) < tolerance) & (np.abs(gaps[second] - d12) < tolerance)
+    pair, third = np.nonzero(fits)
+    return np.column_stack([first[pair], second[pair], third])
+
+
+def _proposed(
+    layout: Array, triples: NDArray[np.int_], points: Array, gaps: Array, tree: cKDTree, tolerance: float
+) -> tuple[NDArray[np.int_], Array, NDArray[np.int_]]:
+    """Which of the triples (t,3) of stickers propose poses (c,) where three points are as far from each other; the
+    poses (c,4,4), laid onto all stickers that then have a point close by; and how many (c,) have one in the end.
+
+    Poses with fewer than three stickers are left out.
+    """
+    corners = [_congruent(gaps, layout[triple], 2.0 * tolerance) for triple in triples]
+    proposer = np.repeat(np.arange(len(triples)), [len(c) for c in corners])
+    start = rigid_starts(layout[triples[proposer]], points[np.concatenate(corners)], np.ones((len(proposer), 3)))
+    nearest = _nearest(start, layout, tree, tolerance)
+    enough = (nearest >= 0).sum(axis=1) >= 3
+    nearest = nearest[enough]
+    poses = rigid_starts(layout, points[nearest], (nearest >= 0).astype(float))
+    return proposer[enough], poses, (_nearest(poses, layout, tree, tolerance) >= 0).sum(axis=1)
+
+
+def _nearest(poses: Array, layout: Array, tree: cKDTree, tolerance: float) -> NDArray[np.int_]:
+    """Measured point (c,n) of each sticker within the tolerance at poses (c,4,4), each point used once; -1: none."""
+    places = layout @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]
+    nearest = tree.query(places, distance_upper_bound=1.5 * tolerance)[1]
+    nearest[nearest == tree.n] = -1
+    candidate, sticker = np.nonzero(nearest >= 0)
+    point = tree.data[nearest[candidate, sticker]]
+    rivals = np.linalg.norm(places[candidate] - point[:, None], axis=2).argmin(axis=1)
+    lost = rivals != sticker
+    nearest[candidate[lost], sticker[lost]] = -1
+    return np.asarray(nearest)
+
+
+def _same(first: Array, second: Array, layout: Array, tolerance: float) -> bool:
+    """Whether two poses put the layout in the same place."""
+    return bool(np.linalg.norm(apply(first, layout) - apply(second, layout), axis=1).max() < 4.0 * tolerance)

@@ -1,0 +1,233 @@
+"""Stickers of one body, observed near where they are expected: windows, fits, triangulation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.detection.detected_centres import DetectedCentres
+from cmmsim.detection.detectors import DEFAULT_DETECTOR, find_detector
+from cmmsim.detection.ellipse_fit import SMEAR_STEP_PX, FitLimits
+from cmmsim.geometry.eccentricity import centre_offset
+from cmmsim.geometry.pose import Array, apply
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.geometry.triangulation import triangulate
+from cmmsim.radiometry.images import StereoImages, Windows
+from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.radiometry.optics import Optics
+
+LONGEST_SMEAR_PX = 8.0  # about the size of a sticker
+SHORTEST_SMEAR = 1.5  # standard deviations of the point spread: shorter ones do not change what the fit finds
+GRAZING = 0.15  # cosine between a sticker's normal and the view below which it is not looked for
+
+
+@dataclass(frozen=True)
+class DetectionSettings:
+    """window_size and fit_size px; radius of a sticker m; limits of a good fit; largest_ray_gap: squared distance of
+    the two rays of a sticker in units of its noise (one degree of freedom, so 25 is five sigma); centre_error_px: rms
+    error of a centre that is not noise, such as the image formation's own; it is added to the noise's covariance, as
+    is the detector's; detector: name of the one that is taken;
+    optics: point spread and vignetting of the cameras as known; exposed_share: share of the time from frame to frame
+    during which the cameras are exposed."""
+
+    window_size: int = 16
+    fit_size: int = 14
+    radius: float = 0.003
+    limits: FitLimits = field(default_factory=FitLimits)
+    largest_ray_gap: float = 25.0
+    centre_error_px: float = 0.0
+    detector: str = DEFAULT_DETECTOR
+    optics: Optics = field(default_factory=Optics)
+    exposed_share: float = 0.0
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """shapes (2,k,2,2): symmetric matrices A of the ellipses of k stickers in the left and the right image, px, and
+    covariances (2,k,3,3) of A_xx, A_xy, A_yy, px²."""
+
+    shapes: Array
+    covariances: Array
+
+    def selected(self, keep: NDArray[np.bool_]) -> Outlines:
+        """Those of only some of the stickers."""
+        return Outlines(self.shapes[:, keep], self.covariances[:, keep])
+
+
+@dataclass(frozen=True)
+class StickerObservation:
+    """k stickers seen by both cameras.
+
+    index (k,) into the body's stickers; left_pixels and right_pixels (k,2) of the sticker centres in the images as they
+    are, distorted (eccentricity removed); points (k,3) and covariances (k,3,3) in the camera frame, m. outlines: the
+    ellipses' shapes, where the detector states them.
+    """
+
+    index: NDArray[np.int_]
+    left_pixels: Array
+    right_pixels: Array
+    points: Array
+    covariances: Array
+    outlines: Outlines | None = None
+
+    def selected(self, keep: NDArray[np.bool_]) -> StickerObservation:
+        """The observation with only some of its stickers."""
+        return StickerObservation(
+            self.index[keep],
+            self.left_pixels[keep],
+            self.right_pixels[keep],
+            self.points[keep],
+            self.covariances[keep],
+            None if self.outlines is None else self.outlines.selected(keep),
+        )
+
+
+@dataclass(frozen=True)
+class StickerWindows:
+    """Grey values around the k stickers of a body that both cameras should see.
+
+    index (k,) into the body's stickers; camera_from_body (4,4) near which they are expected; corners (2,k,2) px of the
+    first pixels of windows (2,k,h,h), evenly lit; offsets (2,k,2) px of the ellipses' centres from those of the
+    stickers (eccentricity).
+    """
+
+    index: NDArray[np.int_]
+    camera_from_body: Array
+    corners: NDArray[np.int_]
+    windows: Windows
+    offsets: Array
+
+
+def observe(
+    images: StereoImages,
+    rig: StereoRig,
+    noise: CameraNoise,
+    settings: DetectionSettings,
+    camera_from_body: Array,
+    places: Array,
+    normals: Array,
+    swept: tuple[Array, Array] | None = None,
+) -> StickerObservation:
+    """Observe stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose of the body.
+
+    ``swept``: camera_from_body at the beginning and at the end of the exposure, where they are thought to be known.
+    """
+    read = read_windows(images, rig, noise, settings, camera_from_body, places, normals)
+    return observe_windows(read, rig, noise, settings, places, swept)
+
+
+def read_windows(
+    images: StereoImages,
+    rig: StereoRig,
+    noise: CameraNoise,
+    settings: DetectionSettings,
+    camera_from_body: Array,
+    places: Array,
+    normals: Array,
+) -> StickerWindows:
+    """Read the windows of stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose."""
+    centres = [apply(move @ camera_from_body, places) for move in rig.from_camera]
+    turned = [normals @ (move @ camera_from_body)[:3, :3].T for move in rig.from_camera]
+    pixels, valid = rig.project(apply(camera_from_body, places))
+    facing = np.stack([faces_camera(c, t) for c, t in zip(centres, turned, strict=True)])
+    index = np.flatnonzero(np.all(valid & facing, axis=0))
+    window_size = settings.window_size + 2 * find_detector(settings.detector).margin_px
+    corners = np.rint(pixels[:, index] - 0.5 * (window_size - 1)).astype(int)
+    if len(index) == 0:
+        none = np.zeros((2, 0, window_size, window_size))
+        return StickerWindows(index, camera_from_body, corners, none, np.zeros((2, 0, 2)))
+    windows = _evenly_lit(images.windows(corners, window_size), corners, rig, noise, settings)
+    offsets = np.stack(
+        [
+            centre_offset(camera, c[index], t[index], settings.radius)
+            for camera, c, t in zip(rig.cameras, centres, turned, strict=True)
+        ]
+    )
+    return StickerWindows(index, camera_from_body, corners, windows, offsets)
+
+
+def observe_windows(
+    read: StickerWindows,
+    rig: StereoRig,
+    noise: CameraNoise,
+    settings: DetectionSettings,
+    places: Array,
+    swept: tuple[Array, Array] | None = None,
+) -> StickerObservation:
+    """Observe the stickers in windows that have been read; ``places`` and ``swept`` as of ``observe``."""
+    if len(read.index) == 0:
+        return StickerObservation(read.index, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    detector = find_detector(settings.detector)
+    fit_size = settings.fit_size + 2 * detector.margin_px
+    windows, corners = read.windows.reshape(-1, *read.windows.shape[2:]), read.corners.reshape(-1, 2)
+
+    def detect(smears: Array | None) -> DetectedCentres:
+        return detector.detect(
+            windows, corners, noise, fit_size, settings.limits, psf_px=settings.optics.psf_px, smears=smears
+        )
+
+    smears = None if swept is None else _smears(rig, swept, places[read.index], settings.optics.psf_px)
+    fits = detect(None) if smears is None else _likelier(detect(None), detect(smears))
+    seen_at = fits.centres.reshape(2, -1, 2) - read.offsets
+    systematic = settings.centre_error_px**2 + detector.bias_px**2
+    spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
+    ideal, ideal_spread, found = rig.undistort(seen_at, spread)
+    good = np.all(fits.good.reshape(2, -1) & found, axis=0)
+    seen = triangulate(rig.ideal, *ideal, *ideal_spread)
+    outlines = _outlines(fits, settings.centre_error_px**2)
+    return StickerObservation(read.index, seen_at[0], seen_at[1], seen.points, seen.covariances, outlines).selected(
+        good & (seen.ray_gap < settings.largest_ray_gap)
+    )
+
+
+def faces_camera(centres: Array, normals: Array) -> NDArray[np.bool_]:
+    """Whether a camera sees stickers with centres (n,3) m and normals (n,3), camera axes, not at grazing incidence."""
+    return np.asarray(-np.einsum("ni,ni->n", centres, normals) > GRAZING * np.linalg.norm(centres, axis=1))
+
+
+def _smears(rig: StereoRig, swept: tuple[Array, Array], places: Array, psf_px: float) -> Array | None:
+    """Movement (2k, 2) px of k stickers in both images during the exposure.
+
+    None where it is too short to show beside the point spread, or so long that it cannot be told.
+    """
+    first, last = (rig.project(apply(pose, places))[0] for pose in swept)
+    shortest = max(SMEAR_STEP_PX, SHORTEST_SMEAR * psf_px)
+    longest = float(np.linalg.norm(last - first, axis=-1).max())
+    return (last - first).reshape(-1, 2) if shortest < longest < LONGEST_SMEAR_PX else None
+
+
+def _likelier(still: DetectedCentres, moving: DetectedCentres) -> DetectedCentres:
+    """What agrees better with the images: the movement is only expected, and the platform may have stopped."""
+    if still.misfits is None or moving.misfits is None:
+        return still
+    return moving if np.median(moving.misfits - still.misfits) < 0.0 else still
+
+
+def _outlines(fits: DetectedCentres, systematic: float) -> Outlines | None:
+    """Shapes of both images' ellipses; ``systematic`` px²: variance of a rim's place that is not noise."""
+    if fits.shapes is None or fits.shape_covariances is None:
+        return None
+    spread = fits.shape_covariances.reshape(2, -1, 3, 3) + systematic * np.eye(3)
+    return Outlines(fits.shapes.reshape(2, -1, 2, 2), spread)
+
+
+def _evenly_lit(
+    windows: Windows, corners: NDArray[np.int_], rig: StereoRig, noise: CameraNoise, settings: DetectionSettings
+) -> Windows:
+    """Windows (2, n, size, size) with the light within each made even: that of its middle.
+
+    Only the slope of the light across a sticker would move its centre; the noise stays what it is to a few per mille.
+    """
+    if settings.optics.vignetting == 0.0:
+        return windows
+    size, middle = windows.shape[-1], corners + 0.5 * (windows.shape[-1] - 1)
+    share = np.stack(
+        [
+            settings.optics.window_illumination(camera, at, size)
+            / settings.optics.illumination(camera, centre)[:, None, None]
+            for camera, at, centre in zip(rig.cameras, corners, middle, strict=True)
+        ]
+    )
+    return noise.black_level + (windows - noise.black_level) / share

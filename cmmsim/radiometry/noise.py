@@ -1,0 +1,144 @@
+"""Camera noise after the linear model of EMVA 1288.
+
+Radiance (0 to 1) becomes electrons, shot noise, dark noise and what differs from pixel to pixel are added, the gain K
+turns electrons into grey values, which are clipped and rounded. Shot noise is drawn as a normal variable of the Poisson
+variance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.errors import CmmError
+from cmmsim.geometry.pose import Array
+from cmmsim.radiometry.fixed_pattern import FixedPattern
+
+BIT_DEPTHS = (8, 10, 12)
+ROUNDING_TERMS = 50  # of a series, which leave 0.002 of 0.25 without noise
+NO_SWING = 1.5  # grey values squared: beyond, rounding_excess is 1 to 1e-11
+GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+@dataclass(frozen=True)
+class CameraNoise:
+    """EMVA 1288 figures of one camera.
+
+    electrons_at_white   electrons at radiance 1 after one exposure, e-
+    gain                 system gain K, grey values per e-
+    dark_noise           temporal noise in the dark, e- rms
+    full_well            saturation capacity, e-
+    black_level          grey value at no light
+    enabled              False: no noise at all; the mean grey value is still rounded
+    bit_depth            of the grey values: 8, 10 or 12; images of more than 8 are uint16
+    prnu                 photo response non-uniformity: std of the pixels' sensitivity, relative to its mean
+    dsnu                 dark signal non-uniformity: std of the pixels' offset, e-
+    frames               exposures averaged in each grey value, which divide the temporal noise but not the pattern
+    """
+
+    electrons_at_white: float
+    gain: float
+    dark_noise: float
+    full_well: float
+    black_level: float
+    enabled: bool = True
+    bit_depth: int = 8
+    prnu: float = 0.0
+    dsnu: float = 0.0
+    frames: int = 1
+
+    def __post_init__(self) -> None:
+        if min(self.electrons_at_white, self.gain, self.full_well) <= 0.0 or self.dark_noise < 0.0:
+            raise CmmError(f"camera noise needs positive electrons, gain and full well, got {self}")
+        if min(self.prnu, self.dsnu) < 0.0 or self.bit_depth not in BIT_DEPTHS or self.frames < 1:
+            raise CmmError(
+                f"camera noise needs prnu and dsnu >= 0, bit_depth of {BIT_DEPTHS} and frames >= 1, got {self}"
+            )
+
+    @property
+    def white_level(self) -> int:
+        """Largest grey value."""
+        return int(2**self.bit_depth - 1)
+
+    @property
+    def image_type(self) -> np.dtype:
+        """Type of the grey values."""
+        return np.dtype(np.uint8 if self.bit_depth == 8 else np.uint16)
+
+    @property
+    def has_pattern(self) -> bool:
+        """Whether pixels differ from each other."""
+        return self.enabled and (self.prnu > 0.0 or self.dsnu > 0.0)
+
+    def mean_grey(self, radiance: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Expected grey values of radiance 0 to 1."""
+        electrons = np.minimum(radiance * self.electrons_at_white, self.full_well)
+        return self.black_level + self.gain * electrons
+
+    def variance(self, mean_grey: Array) -> Array:
+        """Variance of a grey value with this mean: shot, dark and pattern noise, rounding (grey values squared)."""
+        electrons = np.maximum((mean_grey - self.black_level) / self.gain, 0.0)
+        constant, linear, quadratic = self.variance_coefficients
+        return constant + electrons * (linear + electrons * quadratic)
+
+    def rounding_excess(self, mean_grey: Array) -> Array:
+        """Largest variance of grey values with about this mean over their usual one, ``variance``: 1 with noise of a
+        grey value, up to 3 with little, where it decides to which of two numbers a mean half-way between is rounded.
+
+        The variance of a rounded normal variable whose mean lies half-way between two numbers, from the Fourier series
+        of the rounding error: s² + 1/12 + sum over k of exp(-2 pi² k² s²) (4 s² + 1 / (pi k)²). Over all means it is
+        s² + 1/12, but the pixels of an even ground share theirs.
+        """
+        usual = replace(self, frames=1).variance(np.asarray(mean_grey, dtype=float))
+        if np.all(usual > NO_SWING):
+            return np.ones(usual.shape)
+        spread = usual[..., None] - 1.0 / 12.0
+        k = np.arange(1, ROUNDING_TERMS + 1)
+        swing = np.exp(-2.0 * np.pi**2 * k**2 * spread) * (4.0 * spread + 1.0 / (np.pi * k) ** 2)
+        return np.asarray(1.0 + swing.sum(axis=-1) / usual)
+
+    @property
+    def variance_coefficients(self) -> tuple[float, float, float]:
+        """Variance of a grey value as a polynomial in its electrons: constant, linear, quadratic."""
+        temporal, pattern = self.gain**2 / self.frames, self.gain**2
+        return (
+            temporal * self.dark_noise**2 + pattern * self.dsnu**2 + 1.0 / (12.0 * self.frames),
+            temporal,
+            pattern * self.prnu**2,
+        )
+
+    def expose(
+        self, radiance: NDArray[np.float32], rng: np.random.Generator, pattern: FixedPattern | None = None
+    ) -> GreyImage:
+        """One exposure of a radiance image (float32, 0 to 1); ``pattern`` of the same shape, where pixels differ."""
+        grey = np.rint(np.clip(self._analog(radiance, rng, pattern), 0.0, float(self.white_level)))
+        return np.asarray(grey.astype(self.image_type))
+
+    def mean_of_exposures(
+        self, radiance: NDArray[np.float32], rng: np.random.Generator, frames: int, pattern: FixedPattern | None = None
+    ) -> Array:
+        """Mean grey values of ``frames`` independent exposures of a scene that stands still (float64).
+
+        Without noise it is not rounded: the mean that noisy exposures approach, as their noise dithers the rounding.
+        """
+        if not self.enabled:
+            return np.clip(self.mean_grey(radiance.astype(np.float64)), 0.0, float(self.white_level))
+        total = np.zeros(radiance.shape, dtype=np.int64)
+        for _ in range(frames):
+            total += self.expose(radiance, rng, pattern)
+        return total / frames
+
+    def _analog(
+        self, radiance: NDArray[np.float32], rng: np.random.Generator, pattern: FixedPattern | None
+    ) -> NDArray[np.floating]:
+        if not self.enabled:
+            return self.mean_grey(radiance)
+        light = radiance * np.float32(self.electrons_at_white)
+        electrons = np.minimum(light if pattern is None else light * pattern.sensitivity, np.float32(self.full_well))
+        noise = rng.standard_normal(radiance.shape, dtype=np.float32)
+        noise *= np.sqrt(electrons + np.float32(self.dark_noise**2))
+        if pattern is not None:
+            noise += pattern.offset
+        return np.float32(self.black_level) + np.float32(self.gain) * (electrons + noise)

@@ -1,0 +1,168 @@
+"""How far poses are from the limits of the robot: travel, reach, and its two kinds of singularity.
+
+- Travel: |theta| against the travel limit.
+- Reach: the reach margin of a leg is sin^2 of the angle between its crank and the direction to its platform joint in
+  the crank's plane; at 0 the leg is stretched or folded.
+- Actuator side (J_a1): the leverage |(w x l) . s| / (|w| |l|) of a crank on its link, in 0..1. It vanishes together
+  with the reach margin: the crank then moves the platform no more.
+- Platform side (J_a2): the condition number of J_a2 with its rows divided by the link length and its last three
+  columns by the characteristic length, so that all entries are plain numbers. At infinity the platform moves with all
+  cranks locked.
+
+The characteristic length is the RMS distance of the platform joints from the platform origin (0.2 m for rss6).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dynamics.checks import check_type, floats, real, row_text, rows
+from dynamics.errors import DynamicsError, ShapeError, SingularPoseError, TravelError, UnreachablePoseError
+from dynamics.kinematics.expressions import evaluate
+from dynamics.kinematics.geometry import Rss6Geometry
+from dynamics.robot import Robot
+
+LEAST_LEVERAGE = 0.05
+"""Below it a crank's torque is multiplied by more than 20 along its link; rss6 keeps above 0.09 within its travel."""
+
+MOST_CONDITION = 20.0
+"""Limit of the condition numbers for `check_motion`; rss6 keeps below 5 (J_a2) and 10 (J_ad) within its travel."""
+
+
+@dataclass(frozen=True)
+class WorkspaceMeasures:
+    """Measures of N poses; NaN where and only where a leg cannot reach, except for the reach margins.
+
+    theta (N, 6), rad; reach_margin (N, 6), negative out of reach; leverage (N, 6), of J_a1; platform_condition (N,),
+    of J_a2; joint_condition (N,), of J_ad = J_a1^-1 J_a2; travel_limit, rad.
+    """
+
+    theta: np.ndarray
+    reach_margin: np.ndarray
+    leverage: np.ndarray
+    platform_condition: np.ndarray
+    joint_condition: np.ndarray
+    travel_limit: float
+
+    @property
+    def reachable(self) -> np.ndarray:
+        """Whether all legs reach (N,)."""
+        return np.asarray((self.reach_margin > 0).all(axis=1))
+
+    @property
+    def travel_share(self) -> np.ndarray:
+        """Largest |theta| of the six cranks over the travel limit (N,)."""
+        return np.asarray(np.abs(self.theta).max(axis=1) / self.travel_limit)
+
+
+@dataclass(frozen=True)
+class Extreme:
+    """Where a motion comes nearest to a limit: value, limit, row, time [s] (NaN if none was given), and leg 1..6
+    (None where it concerns all)."""
+
+    value: float
+    limit: float
+    row: int
+    time: float
+    leg: int | None
+
+
+@dataclass(frozen=True)
+class MotionExtremes:
+    """The worst of a motion: reach margin, travel |theta| in rad, leverage of J_a1, condition of scaled J_a2."""
+
+    reach: Extreme
+    travel: Extreme
+    leverage: Extreme
+    condition: Extreme
+
+
+def characteristic_length(geometry: Rss6Geometry) -> float:
+    """Length in m that makes rotations comparable to translations: RMS distance of the joints A from the origin."""
+    return float(np.sqrt(np.mean(np.sum(geometry.platform_joints**2, axis=1))))
+
+
+def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
+    """Measures of poses (N, 6), or of one (6,) as N = 1. Poses out of reach give NaN and a negative reach margin.
+
+    Raises ShapeError for another shape or for entries that are not finite.
+    """
+    check_type("robot", robot, Robot, DynamicsError)
+    poses = np.atleast_2d(rows("pose", pose, 6))
+    geometry = robot.geometry
+    theta, margin = (part[..., 0] for part in evaluate(robot.functions["inverse_kinematics"], poses))
+    leverages, link_rows = evaluate(robot.functions["loop_jacobians"], poses)
+    margin[np.isnan(margin)] = -np.inf  # squares have overflowed
+    reachable = (margin > 0).all(axis=1)
+    theta[~reachable] = np.nan
+    leverage, platform, joint = (np.full(shape, np.nan) for shape in (theta.shape, len(poses), len(poses)))
+    leverage[reachable] = np.abs(leverages[reachable, :, 0]) / (geometry.crank_length * geometry.link_length)
+    scaled = link_rows[reachable] / (geometry.link_length * np.repeat([1.0, characteristic_length(geometry)], 3))
+    platform[reachable] = np.linalg.cond(scaled)
+    joint[reachable] = np.linalg.cond(scaled / leverage[reachable, :, None])
+    return WorkspaceMeasures(theta, margin, leverage, platform, joint, robot.travel_limit)
+
+
+def check_motion(
+    robot: Robot,
+    pose: ArrayLike,
+    times: ArrayLike | None = None,
+    *,
+    travel_margin: float = 0.0,
+    least_leverage: float = LEAST_LEVERAGE,
+    most_condition: float = MOST_CONDITION,
+) -> MotionExtremes:
+    """The worst of a motion sampled as poses (N, 6) at times (N,) in s, N >= 1, if all of it is within the limits.
+
+    Raises, with time (or row), leg, value and limit: UnreachablePoseError; TravelError beyond the travel limit less
+    `travel_margin` (rad); SingularPoseError for a leverage below `least_leverage` (J_a1) or a condition number of the
+    scaled J_a2 above `most_condition`; ShapeError for poses or times of the wrong shape, or times that do not increase.
+    """
+    poses = np.atleast_2d(rows("pose", pose, 6))
+    if not len(poses):
+        raise ShapeError("a motion needs at least one pose, got none")
+    moments = np.full(len(poses), np.nan) if times is None else _increasing(times, len(poses))
+    travel_margin = real("travel_margin", travel_margin, TravelError, least=0, unit=" rad")
+    least_leverage = real("least_leverage", least_leverage, DynamicsError, least=0)
+    most_condition = real("most_condition", most_condition, DynamicsError, least=1)
+    measures = measure(robot, poses)
+
+    def extreme(values: np.ndarray, limit: float, pick: Callable[..., np.intp]) -> Extreme:
+        row, *leg = (int(index) for index in np.unravel_index(pick(values), values.shape))
+        return Extreme(float(values[row, *leg]), limit, row, float(moments[row]), leg[0] + 1 if leg else None)
+
+    reach = extreme(measures.reach_margin, 0.0, np.argmin)
+    if not reach.value > 0:
+        raise _broken(UnreachablePoseError, robot, poses, reach, "reach margin", "must be > ")
+    travel = extreme(np.abs(measures.theta), robot.travel_limit - travel_margin, np.argmax)
+    if not travel.value <= travel.limit:
+        raise _broken(TravelError, robot, poses, travel, "|theta| in rad", "limit ")
+    leverage = extreme(measures.leverage, least_leverage, np.argmin)
+    if not leverage.value >= leverage.limit:
+        raise _broken(SingularPoseError, robot, poses, leverage, "leverage (J_a1)", "must be >= ")
+    condition = extreme(measures.platform_condition, most_condition, np.argmax)
+    if not condition.value <= condition.limit:
+        raise _broken(SingularPoseError, robot, poses, condition, "condition of J_a2", "limit ")
+    return MotionExtremes(reach, travel, leverage, condition)
+
+
+def _increasing(times: ArrayLike, count: int) -> np.ndarray:
+    moments = floats("times", times, (count,))
+    back = np.flatnonzero(np.diff(moments) <= 0)
+    if len(back):
+        row = int(back[0]) + 1
+        raise ShapeError(f"times must increase, but times[{row}] = {moments[row]} s follows {moments[row - 1]} s")
+    return moments
+
+
+def _broken(
+    kind: type[DynamicsError], robot: Robot, poses: np.ndarray, worst: Extreme, quantity: str, relation: str
+) -> DynamicsError:
+    when = f"row {worst.row}" if np.isnan(worst.time) else f"t = {worst.time:.4g} s"
+    who = f" of leg {worst.leg}" if worst.leg else ""
+    return kind(
+        f"{quantity}{who} of {robot.name} is {worst.value:.4g} at {when}, {relation}{worst.limit:.4g} "
+        f"(pose {row_text(poses[worst.row], 4)})"
+    )

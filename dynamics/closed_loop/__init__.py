@@ -1,0 +1,42 @@
+"""The sampled closed loop: visual servo (eq. 30) around joint PID (eq. 31) around the robot (eq. 40).
+
+Every frame the pose is measured, by the sensor that the caller passes or by an ideal one; the servo turns it into a
+command after the latency, and the command is held until the next. Unless a start is given the run starts at rest at the
+first reference pose, in equilibrium: integrators hold what keeps the robot there. One function serves plant and model.
+
+Two implementations, tested to be equal: compiled C (see `closed_loop.h`) and plain Python (`plain_closed_loop.py`).
+"""
+
+from dynamics.closed_loop.elasticity import JointElasticity
+from dynamics.closed_loop.loop_equilibrium import equilibrium
+from dynamics.closed_loop.problem import (
+    Controller,
+    FrameTiming,
+    FrictionLaw,
+    LoopSettings,
+    PoseSensor,
+    RateSensor,
+    Reference,
+    ServoGains,
+    StartState,
+)
+from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
+from dynamics.closed_loop.simulate import prepare, simulate
+
+__all__ = [
+    "ClosedLoopRun",
+    "Controller",
+    "FrameTiming",
+    "FrictionLaw",
+    "JointElasticity",
+    "LoopFailure",
+    "LoopSettings",
+    "PoseSensor",
+    "RateSensor",
+    "Reference",
+    "ServoGains",
+    "StartState",
+    "equilibrium",
+    "prepare",
+    "simulate",
+]

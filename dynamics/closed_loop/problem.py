@@ -1,0 +1,220 @@
+"""What goes into a closed-loop run: settings, reference, start state."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+from weakref import WeakSet
+
+import numpy as np
+
+from dynamics.checks import Shape, check_choice, check_type, floats, real, whole
+from dynamics.closed_loop.elasticity import JointElasticity
+from dynamics.closed_loop.friction import FrictionLaw
+from dynamics.errors import SimulationError
+from dynamics.parameters import PARAMETER_NAMES
+from dynamics.robot import Robot
+
+PARAMETER_COUNT = len(PARAMETER_NAMES) + 3
+LENGTH = PARAMETER_COUNT  # sensitivities inside a run: the column of the length of the present step, then the start
+START_COUNT = 24  # pose, pose rate, joint PID integral, servo integral
+MAX_DELAY_FRAMES = 60
+MAX_STEPS_PER_FRAME = 10_000
+LEFT_REACH = "the robot left the reachable set (the loop is unstable)"
+MEASURED_OUT_OF_REACH = "the measured pose is out of reach, so that the servo has no command"
+SINGULAR_MASS = "the mass matrix is not positive definite: masses or inertias are zero or overflow"
+
+Hold = Literal["zero", "linear"]
+
+# (frame index, time s, true pose (6,)) -> measured pose (6,), or None when the measurement is lost.
+PoseSensor = Callable[[int, float, np.ndarray], np.ndarray | None]
+
+# (frame index, time s, measured pose (6,), desired pose (6,), desired pose rate (6,)) -> joint command (6,), rad.
+Controller = Callable[[int, float, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class RateSensor:
+    """A pose sensor that depends on the motion too: measure(frame, time s, true pose (6,), true pose rate (6,))."""
+
+    measure: Callable[[int, float, np.ndarray, np.ndarray], np.ndarray | None]
+
+
+@dataclass(frozen=True)
+class ServoGains:
+    """Visual servo gains of eq. 30: kp (1), kd (s), ki (1/s)."""
+
+    kp: float
+    kd: float
+    ki: float
+
+    def __post_init__(self) -> None:
+        for name in ("kp", "kd", "ki"):
+            real(f"servo gain {name}", getattr(self, name), SimulationError, least=0)
+
+
+@dataclass(frozen=True)
+class FrameTiming:
+    """Frame rate (Hz), latency from exposure to command (s), and the hold of the joint command after its arrival.
+
+    hold "zero": the command jumps to its new value; "linear": it ramps there over one frame. In both the joint PID
+    takes the difference of the last two commands over the frame period for U_dot.
+    """
+
+    frame_rate_hz: float
+    latency_s: float = 0.0
+    hold: Hold = "zero"
+
+    def __post_init__(self) -> None:
+        real("frame rate", self.frame_rate_hz, SimulationError, above=0, unit=" Hz")
+        real("latency", self.latency_s, SimulationError, unit=" s")
+        if not 0 <= self.latency_s * self.frame_rate_hz <= MAX_DELAY_FRAMES:
+            raise SimulationError(
+                f"latency is {self.latency_s} s, must be >= 0 and at most {MAX_DELAY_FRAMES} frames "
+                f"({MAX_DELAY_FRAMES / self.frame_rate_hz:.3g} s)"
+            )
+        check_choice("hold", self.hold, get_args(Hold), SimulationError)
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """What the loop is made of besides the robot: servo, timing, friction law, Runge-Kutta steps per frame, and the
+    elasticity of the joints (None: rigid)."""
+
+    servo: ServoGains
+    timing: FrameTiming
+    friction: FrictionLaw = field(default_factory=FrictionLaw)
+    steps_per_frame: int = 4
+    elasticity: JointElasticity | None = None
+
+    def __post_init__(self) -> None:
+        for name, kind in (("servo", ServoGains), ("timing", FrameTiming), ("friction", FrictionLaw)):
+            check_type(name, getattr(self, name), kind, SimulationError)
+        if self.elasticity is not None:
+            check_type("elasticity", self.elasticity, JointElasticity, SimulationError)
+        steps = whole("steps_per_frame", self.steps_per_frame, SimulationError, least=1, most=MAX_STEPS_PER_FRAME)
+        object.__setattr__(self, "steps_per_frame", steps)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Desired motion at the frame times: poses (frames, 6) and pose rates (frames, 6), copied and frozen."""
+
+    poses: np.ndarray
+    rates: np.ndarray
+    _reached_by: WeakSet[Robot] = field(default_factory=WeakSet, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        for name in ("poses", "rates"):
+            array = floats(f"reference {name}", getattr(self, name), ("N", 6), error=SimulationError)
+            if len(array) < 2:
+                raise SimulationError(f"reference {name} must have at least 2 frames, got {len(array)}")
+            frozen = np.array(array, order="C")
+            frozen.setflags(write=False)
+            object.__setattr__(self, name, frozen)
+        if self.poses.shape != self.rates.shape:
+            raise SimulationError(f"reference poses {self.poses.shape} and rates {self.rates.shape} differ in shape")
+
+    def __reduce__(self) -> tuple[type["Reference"], tuple[np.ndarray, np.ndarray]]:
+        return Reference, (self.poses, self.rates)
+
+    def check_reach(self, robot: Robot) -> None:
+        """Raise UnreachablePoseError, naming frame and leg, for a pose out of a robot's reach; asked once a robot."""
+        if robot not in self._reached_by:
+            robot.check_reach(self.poses, "reference pose", "frame")
+            self._reached_by.add(robot)
+
+
+@dataclass(frozen=True)
+class StartState:
+    """State of the loop at the first frame, before that frame is measured.
+
+    pose (6,) and pose rate (6,); joint PID integral (6,), rad s; servo integral (6,), m s and rad s. These 24, in this
+    order, are what start_sensitivity differentiates by. commands (n, 6): the commands issued before, rad, oldest first
+    (the first one also acted before), and last_measured (6,): the pose measured one frame before; both are records.
+    joint_integral_sensitivity (6, 67): how the joint PID integral follows the parameters; zero where it is just given.
+    motor_angle (6,), rad, and motor_rate (6,): of elastic joints only.
+    Raises SimulationError for a wrong shape or a number that is not finite.
+    """
+
+    pose: np.ndarray
+    pose_rate: np.ndarray
+    joint_integral: np.ndarray
+    servo_integral: np.ndarray
+    commands: np.ndarray
+    last_measured: np.ndarray
+    joint_integral_sensitivity: np.ndarray = field(default_factory=lambda: np.zeros((6, PARAMETER_COUNT)))
+    motor_angle: np.ndarray | None = None
+    motor_rate: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        shapes: dict[str, Shape] = {"commands": ("N", 6), "joint_integral_sensitivity": (6, PARAMETER_COUNT)}
+        for name in self.__dataclass_fields__:
+            if getattr(self, name) is None and name in ("motor_angle", "motor_rate"):
+                continue
+            array = floats(f"start {name}", getattr(self, name), shapes.get(name, (6,)), error=SimulationError)
+            object.__setattr__(self, name, np.ascontiguousarray(array))
+        if not len(self.commands):
+            raise SimulationError("start commands must have at least 1 row, got 0")
+
+
+@dataclass(frozen=True)
+class LoopProblem:
+    """One run to be done, checked: what `closed_loop.simulate` was given, and the state it starts from."""
+
+    robot: Robot
+    parameters: np.ndarray
+    reference: Reference
+    settings: LoopSettings
+    start: StartState
+    sensor: PoseSensor | RateSensor | None
+    sensitivities: bool
+    start_sensitivities: bool
+    commands: np.ndarray | None
+    lost: np.ndarray | None
+    noise: np.ndarray | None
+    latencies: np.ndarray | None
+    servo_robot: Robot
+    controller: Controller | None = None
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return len(self.reference.poses)
+
+    @property
+    def period(self) -> float:
+        """Time between two frames, s."""
+        return 1.0 / self.settings.timing.frame_rate_hz
+
+
+def measurement(
+    sensor: PoseSensor | RateSensor, frame: int, time: float, pose: np.ndarray, rate: np.ndarray
+) -> np.ndarray | None:
+    """What a sensor returns, as (6,) floats or None for a lost measurement. Raises SimulationError otherwise."""
+    if isinstance(sensor, RateSensor):
+        measured = sensor.measure(frame, time, pose, rate)
+    else:
+        measured = sensor(frame, time, pose)
+    if measured is None:
+        return None
+    return floats(f"what the pose sensor returned at frame {frame}", measured, (6,), error=SimulationError)
+
+
+def own_command(controller: Controller, problem: LoopProblem, frame: int, measured: np.ndarray) -> np.ndarray:
+    """What a controller answers to a good measurement (6,), as (6,) floats. Raises SimulationError otherwise."""
+    reference = problem.reference
+    command = controller(frame, frame * problem.period, measured.copy(), reference.poses[frame], reference.rates[frame])
+    return np.array(floats(f"what the controller returned at frame {frame}", command, (6,), error=SimulationError))
+
+
+def checked_latencies(latencies: object, frames: int, timing: FrameTiming) -> np.ndarray:
+    """Latency (frames,), s, of each frame's command. Raises SimulationError for one that no `FrameTiming` may have."""
+    values = floats("latencies", latencies, (frames,), error=SimulationError)
+    in_frames = values * timing.frame_rate_hz
+    wrong = np.flatnonzero((in_frames < 0) | (in_frames > MAX_DELAY_FRAMES))
+    if len(wrong):
+        raise SimulationError(
+            f"latency of frame {wrong[0]} is {values[wrong[0]]:g} s, must be >= 0 and at most "
+            f"{MAX_DELAY_FRAMES} frames ({MAX_DELAY_FRAMES / timing.frame_rate_hz:.3g} s)"
+        )
+    return values

@@ -1,0 +1,1 @@
+"""Kinematics of a 6-RSS robot in CasADi: rotations, geometry, inverse and forward, Jacobians."""

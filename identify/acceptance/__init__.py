@@ -1,1 +1,0 @@
-"""Acceptance tests of a sensor: length errors, a moving bar, latency; beside published figures."""

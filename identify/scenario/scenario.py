@@ -1,0 +1,198 @@
+"""A scenario: everything that decides a synthetic experiment, read from TOML and checked as a whole.
+
+Each field states its unit; an error names the key, the value, the unit and, for a wrong name, the valid names.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from identify.errors import ScenarioError
+from identify.record.filtering import padding_samples
+from identify.scenario.built_in import built_in_names, named_text
+from identify.scenario.scenario_sections import (
+    Excitation,
+    Filter,
+    Identification,
+    Model,
+    Payload,
+    Plant,
+    Section,
+    Servo,
+    Timing,
+    Validation,
+)
+from identify.scenario.scenario_text import one_line, to_toml
+from identify.scenario.timing import NAMES, by_dotted_key, check_delay, sensor_timing, timing_in_file
+
+BUILT_IN = Path(__file__).parent / "built_in"
+
+
+class Scenario(Section):
+    """A whole synthetic experiment; load one with :func:`load_scenario`."""
+
+    name: str = Field(description="short name, used for folders", pattern=r"^[\w.-]+$")
+    description: str = ""
+    robot: str = Field("rss6", description="built-in robot or path of a robot file")
+    sensor: str = Field("ctrack780", description="built-in sensor or path of a sensor file")
+    sensor_note: str = Field("", description="what the sensor's file says about its own figures")
+    sensor_changes: dict[str, Any] = Field({}, description="entries that hold instead of the sensor file's")
+    renderer: Literal["pyrender", "analytic", "auto"] = Field(
+        "auto", description="what draws the images: pyrender, analytic, or auto: pyrender where OpenGL works"
+    )
+    pose_method: Literal["registration", "planes"] = "registration"
+    timing: Timing = Timing()
+    servo: Servo = Servo()
+    plant: Plant = Plant()
+    model: Model = Model()
+    excitation: Excitation = Excitation()
+    filter: Filter = Filter()
+    identification: Identification = Identification()
+    payload: Payload = Payload()
+    validation: Validation = Validation()
+
+    @field_validator("sensor_changes")
+    @classmethod
+    def _by_dotted_key(cls, changes: dict[str, Any]) -> dict[str, Any]:
+        return by_dotted_key(changes)
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Scenario":
+        self._complete_from_the_sensor()
+        check_delay(sensor_timing(self.timing.model_dump()))
+        self._check_filter()
+        self._check_excitation_fits_the_filter()
+        self._check_whole_frames("excitation.duration_s", self.excitation.duration_s)
+        self._check_whole_frames("validation.duration_s", self.validation.duration_s)
+        return self
+
+    def _complete_from_the_sensor(self) -> None:
+        """Fill in the timing and the note that the scenario leaves to its sensor.
+
+        They do not count as set: with another sensor they are taken from that one.
+        """
+        stated = self.timing.model_fields_set
+        if stated.issuperset(NAMES) and "sensor_note" in self.model_fields_set and not self.sensor_changes:
+            return
+        in_file, note = timing_in_file(self.sensor, self.sensor_changes)
+        own = {name: getattr(self.timing, name) for name in stated}
+        for name in stated & NAMES.keys():
+            if f"timing.{NAMES[name]}" in self.sensor_changes and own[name] != in_file[name]:
+                raise ValueError(
+                    f"sensor_changes.timing.{NAMES[name]} = {in_file[name]:g} has no effect where the scenario itself "
+                    f"states timing.{name} = {own[name]:g}"
+                )
+        try:
+            timing = Timing(**(in_file | own))
+        except ValidationError as error:
+            raise ValueError(f"timing of the sensor {self.sensor!r}: {one_line(error, Timing)}") from error
+        self.__dict__["timing"] = Timing.model_construct(_fields_set=set(stated), **timing.model_dump())
+        if "sensor_note" not in self.model_fields_set:
+            self.__dict__["sensor_note"] = note
+
+    def _check_filter(self) -> None:
+        nyquist, cutoff = self.timing.frame_rate_hz / 2, self.filter.cutoff_hz
+        highest = self.excitation.fundamental_hz * self.excitation.harmonics
+        if nyquist <= highest:
+            raise ValueError(
+                f"timing.frame_rate_hz = {self.timing.frame_rate_hz:g} Hz is not above twice the highest harmonic of "
+                f"the excitation, {highest:g} Hz"
+            )
+        if cutoff >= nyquist:
+            raise ValueError(
+                f"filter.cutoff_hz = {cutoff:g} Hz is not below the Nyquist frequency {nyquist:g} Hz "
+                f"of timing.frame_rate_hz = {self.timing.frame_rate_hz:g} Hz"
+            )
+        if cutoff <= highest:
+            raise ValueError(
+                f"filter.cutoff_hz = {cutoff:g} Hz would remove the excitation, "
+                f"whose highest harmonic is {highest:g} Hz"
+            )
+
+    def _check_excitation_fits_the_filter(self) -> None:
+        padding = padding_samples(self.timing.frame_rate_hz, self.filter.cutoff_hz, self.filter.order)
+        if self.timing.frames(self.excitation.duration_s) <= padding:
+            raise ValueError(
+                f"excitation.duration_s = {self.excitation.duration_s:g} s is too short for the filter, which needs "
+                f"more than {padding} frames ({padding / self.timing.frame_rate_hz:.3g} s)"
+            )
+
+    def _check_whole_frames(self, key: str, duration_s: float) -> None:
+        frames = duration_s * self.timing.frame_rate_hz
+        if abs(frames - round(frames)) > 1e-6 or round(frames) < 1:
+            raise ValueError(
+                f"{key} = {duration_s:g} s is {frames:g} frames at {self.timing.frame_rate_hz:g} Hz, "
+                "not a whole number of frames"
+            )
+
+    def with_overrides(self, overrides: Mapping[str, Any]) -> "Scenario":
+        """Copy with values replaced by dotted path, such as ``{"timing.frame_rate_hz": 30.0}``; None takes one back.
+
+        What this scenario took from its sensor is taken again, from the copy's.
+
+        Raises:
+            ScenarioError: a path that does not exist (with the valid names) or a value that does not fit.
+        """
+        data = self.model_dump(exclude_none=True, exclude_unset=True)
+        for path, value in overrides.items():
+            _replace(data, path, value)
+        return scenario_from_dict(data, source=f"scenario {self.name!r}")
+
+    def to_toml(self) -> str:
+        """Fully resolved TOML text, every default written out with its unit; reading it gives an equal scenario."""
+        return to_toml(self)
+
+
+def scenario_names() -> list[str]:
+    """Names of the built-in scenarios."""
+    return built_in_names(BUILT_IN)
+
+
+def load_scenario(name_or_path: str | Path) -> Scenario:
+    """Load a built-in scenario by name, or one from a TOML file.
+
+    Raises:
+        ScenarioError: no such scenario (with the built-in names), no TOML, or wrong content.
+    """
+    text, source = named_text(name_or_path, BUILT_IN, "scenario", ScenarioError)
+    return scenario_from_toml(text, source)
+
+
+def scenario_from_toml(text: str, source: str = "scenario") -> Scenario:
+    """Scenario from TOML text; ``source`` names it in error messages.
+
+    Raises:
+        ScenarioError: no TOML, or wrong content.
+    """
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{source} is not valid TOML: {error}") from error
+    return scenario_from_dict(data, source)
+
+
+def scenario_from_dict(data: Mapping[str, Any], source: str = "scenario") -> Scenario:
+    """Scenario from nested mappings, all wrong entries named in one line.
+
+    Raises:
+        ScenarioError: unknown keys, wrong types or values, or settings that contradict each other.
+    """
+    try:
+        return Scenario.model_validate(dict(data))
+    except ValidationError as error:
+        raise ScenarioError(f"{source}: {one_line(error, Scenario)}") from error
+
+
+def _replace(data: dict[str, Any], path: str, value: Any) -> None:
+    *sections, key = path.split(".", 1 if path.startswith("sensor_changes.") else -1)
+    for section in sections:
+        data = data.setdefault(section, {})
+        if not isinstance(data, dict):
+            raise ScenarioError(f"override {path!r}: {section!r} is a value, not a section")
+    if value is None:
+        data.pop(key, None)
+    else:
+        data[key] = value

@@ -1,0 +1,1 @@
+"""The kinds of row a study can have, one file each."""

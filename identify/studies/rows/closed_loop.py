@@ -1,0 +1,107 @@
+"""Rows of kind `closed_loop`: the plant follows an unseen trajectory with the images in the loop.
+
+Each row draws a trajectory in the scenario's box and runs it for `validation.duration_s`; sensor, timing, servo and
+plant are the scenario's. The sensor teaches itself, seeded by the row, unless exact teaching is asked for.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from cmmsim.exact_teaching import exactly_taught
+from dynamics import load_robot
+from identify.errors import EstimationError
+from identify.excitation.design import motion_check
+from identify.excitation.random_trajectories import admissible_trajectories
+from identify.experiment.run import run_plant
+from identify.experiment.sensor_in_loop import make_sensor
+from identify.experiment.truth import true_poses
+from identify.random_streams import stream_seed
+from identify.record import recording
+from identify.record.loop_setup import frame_times
+from identify.scenario import Scenario
+from identify.studies.rows.row_columns import POSE_COLUMNS, Column, Kind, Row, RowOptions, pose_figures, rms_um
+from identify.studies.rows.row_reads import NOISE_OFF, PICTURES, PLANT, Reads
+from identify.studies.rows.row_sensor import Teaching, sensor_file
+
+EXPERIMENT, TRAJECTORY = 0, 1
+
+COLUMNS = {
+    "frames": Column("1", "frames of the run"),
+    "lost_frames": Column("1", "frames without a pose; they do not count in the sensor's error"),
+    "tracking_position_rms_um": Column("um", "true position against the desired one, rms over frames and axes"),
+    "tracking_orientation_rms_urad": Column("urad", "true orientation against the desired one, rms likewise"),
+    **POSE_COLUMNS,
+    "torque_rms_N_m": Column("N m", "torque of the joint controllers, rms over frames and joints"),
+}
+MAIN = (
+    "tracking_position_rms_um",
+    "tracking_orientation_rms_urad",
+    "position_rms_um",
+    "orientation_rms_urad",
+    "lost_frames",
+    "torque_rms_N_m",
+)
+
+
+class ClosedLoopOptions(RowOptions):
+    """How the sensor was taught."""
+
+    teaching: Teaching = Field("sensor", description="by the sensor itself, seeded by the row, or exact")
+
+
+READS = Reads(
+    (
+        "scenario.robot",
+        *PICTURES,
+        "scenario.timing.",
+        "sensor.timing.",
+        "scenario.servo.",
+        "scenario.plant.",
+        *(
+            f"scenario.excitation.{name}"
+            for name in (
+                "fundamental_hz",
+                "harmonics",
+                "position_amplitude_m",
+                "orientation_amplitude_rad",
+                "travel_margin_rad",
+                "max_joint_velocity_rad_s",
+            )
+        ),
+        "scenario.validation.duration_s",
+    ),
+    idle=(NOISE_OFF, *PLANT),
+)
+
+
+def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoopOptions) -> Row:
+    """One row. Raises EstimationError where no frame was measured, LoopFailure, and what the sensor raises."""
+    robot = load_robot(scenario.robot)
+    number = stream_seed(seed, EXPERIMENT)
+    taught = exactly_taught(sensor_file(scenario)) if options.teaching == "exact" else None
+    sensor = make_sensor(scenario, robot, number, taught)
+    duration = scenario.validation.duration_s
+    drawn = np.random.SeedSequence(stream_seed(seed, TRAJECTORY))
+    check = motion_check(robot, scenario)
+    trajectory = admissible_trajectories(robot, scenario.excitation, duration, 1, drawn, check)[0]
+    run = run_plant(scenario, robot, sensor, trajectory, frame_times(scenario, duration), number, 1)
+    ok = run.record["measured_ok"].values.astype(bool)
+    if not ok.any():
+        raise EstimationError(f"no frame of {len(ok)} was measured, the first: {run.record.attrs['lost_frames']}")
+    true = true_poses(run.truth)
+    tracking = true - recording.poses(run.record, "reference")
+    errors = (recording.poses(run.record, "measured") - true)[ok]
+    return {
+        "frames": len(ok),
+        "lost_frames": int(np.sum(~ok)),
+        "tracking_position_rms_um": rms_um(tracking[:, :3]),
+        "tracking_orientation_rms_urad": rms_um(tracking[:, 3:]),
+        **pose_figures(errors, run.record["measured_covariance"].values[ok]),
+        "torque_rms_N_m": float(np.sqrt(np.mean(run.truth["joint_torque"].values ** 2))),
+    }
+
+
+WHAT = "the robot follows an unseen trajectory with the images in the loop"
+CLOSED_LOOP = Kind("closed_loop", WHAT, COLUMNS, MAIN, ClosedLoopOptions, READS, compute)

@@ -1,0 +1,218 @@
+"""Rows of kind `identification`: a record, the parameters identified from it, and how far they are from the truth.
+
+The sensor is `drawn` unless images are asked for: Gaussian noise of the covariance that the scenario's sensor states at
+the home pose, so that the sensor's entries act on it. The exciting and the unseen trajectories are those of
+`trajectory_seed`, the same in all rows: rows differ by their factors and their noise. With images the sensor teaches
+itself, seeded by the row.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from cmmsim.visibility import expected_covariance
+from dynamics import Robot, load_robot
+from dynamics.closed_loop import Reference, simulate
+from dynamics.parameters import COULOMB_NAMES, JOINT_PID_NAMES, VISCOUS_NAMES
+from identify.arrays import Array
+from identify.estimation.identification import IdentificationResult
+from identify.estimation.identification import identify as identify_record
+from identify.excitation import design_trajectories
+from identify.experiment.run import Experiment, excitation_run, run_plant, taught_sensor, true_parameters
+from identify.experiment.truth import true_poses
+from identify.progress import SilentProgress
+from identify.random_streams import stream_seed
+from identify.record.loop_setup import frame_times, model_settings
+from identify.record.recorded_run import recorded_reference
+from identify.scenario import Scenario, scenario_from_toml
+from identify.studies.rows.row_columns import Column, Kind, Row, RowOptions, rms_um, stated_um
+from identify.studies.rows.row_drawn_sensor import DrawnSensor
+from identify.studies.rows.row_reads import NOISE_OFF, PLANT, SENSOR, Idle, Reads, timing
+from identify.trajectory_file import TrajectorySet
+from identify.validation.validation import model_run
+
+EXPERIMENT = 0
+CHOSEN = {"coulomb": COULOMB_NAMES, "viscous": VISCOUS_NAMES, "gains": JOINT_PID_NAMES}
+"""Parameters that a record always shows, so that their spread follows the noise; rms over each set."""
+
+COLUMNS = {
+    "frames": Column("1", "frames of the record"),
+    "lost_frames": Column("1", "frames of the record without a pose"),
+    "pose_noise_um": Column("um", "stated standard deviation of a measured position, rms over frames and axes"),
+    "pose_noise_urad": Column("urad", "stated standard deviation of a measured orientation, rms over frames and axes"),
+    **{
+        f"{name}_std_percent": Column("%", f"stated standard deviation of {what}, rms relative to the truth")
+        for name, what in (("coulomb", "Coulomb friction"), ("viscous", "viscous friction"), ("gains", "joint gains"))
+    },
+    **{
+        f"{name}_error_percent": Column("%", f"error of {what}, rms relative to the truth")
+        for name, what in (("coulomb", "Coulomb friction"), ("viscous", "viscous friction"), ("gains", "joint gains"))
+    },
+    "identified_groups": Column("1", "base parameters that the record identifies"),
+    "group_std_percent": Column("%", "stated standard deviation of those, relative to the truth, median"),
+    "normalised_error": Column("1", "error of those over its stated standard deviation, rms; 1 where stated well"),
+    "noise_ratio": Column("1", "mean squared whitened residual; 1 where noise is all that is left"),
+    "iterations": Column("1", "iterations of all searches"),
+    "prediction_rms_um": Column(
+        "um",
+        "identified model against the true one on unseen trajectories, neither with noise: position, rms over axes",
+    ),
+    "stated_prediction_rms_um": Column("um", "the same, as the covariance of the parameters states it"),
+    "unseen_position_rms_um": Column("um", "model against true plant on unseen trajectories, rms over axes"),
+    "unseen_orientation_rms_urad": Column("urad", "model against true plant on unseen trajectories, rms over axes"),
+}
+MAIN = (
+    "coulomb_std_percent",
+    "viscous_std_percent",
+    "gains_std_percent",
+    "group_std_percent",
+    "unseen_position_rms_um",
+    "unseen_orientation_rms_urad",
+)
+
+
+class IdentificationOptions(RowOptions):
+    """How the record is made."""
+
+    sensor: Literal["drawn", "images"] = Field("drawn", description="noise of the stated covariance, or images")
+    trajectory_seed: int = Field(0, ge=0, description="seed of the exciting and of the unseen trajectories")
+
+
+DRAWN = {"options.sensor": lambda sensor: sensor == "drawn"}
+READS = Reads(
+    ("scenario.", *SENSOR, "sensor.timing."),
+    but=("scenario.name", "scenario.description", "scenario.sensor_note", "scenario.identification.qr_threshold"),
+    idle=(
+        Idle(NOISE_OFF.keys, {**NOISE_OFF.where, "options.sensor": lambda sensor: sensor == "images"}, NOISE_OFF.why),
+        Idle(("sensor.camera.noise",), DRAWN, "options.sensor is drawn: that noise is added all the same"),
+        Idle(
+            ("scenario.renderer", "sensor.stickers.obstacle_level", *timing("exposure_s")),
+            DRAWN,
+            "options.sensor is drawn: no picture of a motion is taken",
+        ),
+        Idle(
+            ("scenario.payload.",),
+            {"scenario.identification.scale_anchor": lambda anchor: anchor != "payload"},
+            "scenario.identification.scale_anchor is not payload",
+        ),
+        Idle(
+            ("scenario.excitation.generations",),
+            {"scenario.excitation.method": lambda how: how != "evolutionary"},
+            "scenario.excitation.method is not evolutionary",
+        ),
+        *PLANT,
+    ),
+)
+
+
+def compute(scenario: Scenario, seed: np.random.SeedSequence, options: IdentificationOptions) -> Row:
+    """One row. Raises EstimationError and what experiment and sensor raise."""
+    number = stream_seed(seed, EXPERIMENT)
+    robot = _robot(scenario.robot)
+    trajectories = _trajectories(scenario.to_toml(), options.trajectory_seed)
+    sensor = _drawn(scenario) if options.sensor == "drawn" else taught_sensor(scenario, robot, number, SilentProgress())
+    experiment = excitation_run(scenario, robot, sensor, trajectories.excitation, number)
+    records = [experiment.record]
+    if scenario.identification.scale_anchor == "payload":
+        records.append(excitation_run(scenario, robot, sensor, trajectories.excitation, number, payload=True).record)
+    result = identify_record(records, robot, scenario)
+    times = frame_times(scenario, scenario.validation.duration_s)
+    unseen = [
+        run_plant(scenario, robot, sensor, trajectory, times, number, run)
+        for run, trajectory in enumerate(trajectories.validation, start=1)
+    ]
+    errors = np.concatenate([_model_errors(robot, scenario, result.estimate, one) for one in unseen])
+    truth = true_parameters(robot, scenario)
+    return (
+        _record_figures(experiment)
+        | _parameter_figures(result, truth)
+        | prediction_figures(
+            robot,
+            scenario,
+            (result.estimate, result.covariance),
+            truth,
+            [recorded_reference(one.record) for one in unseen],
+        )
+        | {"unseen_position_rms_um": rms_um(errors[:, :3]), "unseen_orientation_rms_urad": rms_um(errors[:, 3:])}
+    )
+
+
+def _record_figures(experiment: Experiment) -> Row:
+    ok = experiment.record["measured_ok"].values.astype(bool)
+    position, orientation = stated_um(experiment.record["measured_covariance"].values[ok])
+    return {
+        "frames": len(ok),
+        "lost_frames": int(np.sum(~ok)),
+        "pose_noise_um": position,
+        "pose_noise_urad": orientation,
+    }
+
+
+def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
+    row: Row = {}
+    for figure, values in (("std", result.std), ("error", result.estimate - truth)):
+        for name, members in CHOSEN.items():
+            index = [result.names.index(member) for member in members]
+            row[f"{name}_{figure}_percent"] = 100.0 * float(np.sqrt(np.mean((values[index] / truth[index]) ** 2)))
+    groups = result.groups
+    true_groups = groups.combinations @ truth[: groups.combinations.shape[1]]
+    seen = groups.identifiable
+    row["identified_groups"] = int(seen.sum())
+    if seen.any():  # a wrong model identifies nothing, and the row has its other figures all the same
+        normalised = (groups.estimate - true_groups)[seen] / groups.std[seen]
+        row["group_std_percent"] = 100.0 * float(np.median(groups.std[seen] / np.abs(true_groups[seen])))
+        row["normalised_error"] = float(np.sqrt(np.mean(normalised**2)))
+    return row | {"noise_ratio": result.noise_ratio, "iterations": result.iterations}
+
+
+def prediction_figures(
+    robot: Robot, scenario: Scenario, estimated: tuple[Array, Array], truth: Array, references: list[Reference]
+) -> Row:
+    """What the error of parameters (67,), estimated with a covariance (67, 67), makes of the model's positions on
+    references, and what the covariance states of it.
+
+    Every direction in which the parameters can err counts as much as it shows; so the figure has the scatter of many
+    errors, where that of a few parameters that err together has the scatter of hardly two.
+    """
+    estimate, covariance = estimated
+    squares, stated = [], []
+    for reference in references:
+        model = simulate(robot, estimate, reference, model_settings(scenario), sensitivities=True)
+        assert model.pose_sensitivity is not None
+        slopes = model.pose_sensitivity[:, :3]
+        squares.append(np.mean((model.pose - model_run(robot, scenario, truth, reference))[:, :3] ** 2))
+        stated.append(np.mean(np.einsum("nip,pq,niq->ni", slopes, covariance, slopes, optimize=True)))
+    return {
+        "prediction_rms_um": 1e6 * float(np.sqrt(np.mean(squares))),
+        "stated_prediction_rms_um": 1e6 * float(np.sqrt(np.mean(stated))),
+    }
+
+
+def _model_errors(robot: Robot, scenario: Scenario, parameters: Array, unseen: Experiment) -> Array:
+    """Poses (N, 6) of the identified model less the true ones."""
+    return model_run(robot, scenario, parameters, recorded_reference(unseen.record)) - true_poses(unseen.truth)
+
+
+def _drawn(scenario: Scenario) -> DrawnSensor:
+    home = _robot(scenario.robot).home_pose
+    covariance = expected_covariance(scenario.sensor, home, scenario.pose_method, changes=scenario.sensor_changes)
+    return DrawnSensor(covariance, scenario.timing.dropout)
+
+
+@lru_cache(maxsize=4)
+def _robot(name: str) -> Robot:
+    return load_robot(name)
+
+
+@lru_cache(maxsize=64)
+def _trajectories(scenario_toml: str, seed: int) -> TrajectorySet:
+    scenario = scenario_from_toml(scenario_toml)
+    return design_trajectories(_robot(scenario.robot), scenario, seed)
+
+
+WHAT = "a record of the exciting trajectory, the parameters identified from it, and their errors"
+IDENTIFICATION = Kind("identification", WHAT, COLUMNS, MAIN, IdentificationOptions, READS, compute)

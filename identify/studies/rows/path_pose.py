@@ -1,0 +1,114 @@
+"""Rows of kind `path_pose`: the sensor alone follows a platform along a random path of the scenario's excitation.
+
+Exposure, latency, its jitter and dropout act as the scenario says. A row is a short stretch from a random instant of
+the path. The first picture is searched as a whole, the others are tracked. A measured pose counts as that in the middle
+of its exposure. Beside its error a row gives that of the pose in use: the last one that had arrived, held until the
+next one arrives. Teaching is exact unless asked for otherwise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+import cmmsim
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.experiment.sensor_in_loop import frame_latencies
+from identify.random_streams import stream_seed
+from identify.scenario import Scenario
+from identify.studies.rows.row_columns import POSE_COLUMNS, Column, Kind, Row, RowOptions, pose_figures, rms_um
+from identify.studies.rows.row_reads import NOISE_OFF, PICTURES, Reads, timing
+from identify.studies.rows.row_sensor import RowSensor, Teaching, row_sensor
+from identify.trajectory import FourierTrajectory, random_trajectory
+
+PATH, SENSOR, LATENCY = 0, 1, 2
+INSTANTS_PER_FRAME = 16
+"""Instants of a frame period at which the pose in use is compared with the true one."""
+
+COLUMNS = {
+    "frames": Column("1", "stereo pictures taken"),
+    "lost_frames": Column("1", "frames without a pose; they count in no other figure but the pose in use"),
+    "speed_rms_mm_s": Column("mm/s", "speed of the platform along each axis, rms over the frames"),
+    **POSE_COLUMNS,
+    "used_position_rms_um": Column("um", "last position that had arrived against the true one at all times"),
+    "used_orientation_rms_urad": Column("urad", "last orientation that had arrived against the true one at all times"),
+}
+MAIN = ("position_rms_um", "orientation_rms_urad", "used_position_rms_um", "used_orientation_rms_urad")
+
+
+class PathPoseOptions(RowOptions):
+    """How much a row looks at."""
+
+    stretch_s: float = Field(0.5, gt=0, le=3600, description="time along the path, at least two frames")
+    teaching: Teaching = Field("exact", description="exact, or by the sensor itself, seeded by the row")
+
+
+READS = Reads(
+    (
+        *PICTURES,
+        *timing("frame_rate_hz", "exposure_s", "latency_s", "latency_jitter_s", "dropout"),
+        "scenario.excitation.fundamental_hz",
+        "scenario.excitation.harmonics",
+        "scenario.excitation.position_amplitude_m",
+        "scenario.excitation.orientation_amplitude_rad",
+    ),
+    but=("sensor.stickers.obstacle_level",),
+    idle=(NOISE_OFF,),
+)
+
+
+def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseOptions) -> Row:
+    """One row. Raises EstimationError where fewer than two poses were measured, and what the sensor raises."""
+    eye = row_sensor(scenario, options.teaching, stream_seed(seed, SENSOR))
+    rng = np.random.default_rng(stream_seed(seed, PATH))
+    excitation = scenario.excitation
+    path = random_trajectory(
+        rng,
+        eye.sensor.home,
+        excitation.fundamental_hz,
+        excitation.harmonics,
+        excitation.position_amplitude_m,
+        excitation.orientation_amplitude_rad,
+    )
+    start = rng.uniform(0.0, 1.0 / excitation.fundamental_hz)
+    frames = max(2, scenario.timing.frames(options.stretch_s))
+    times: Array = start + scenario.timing.frame_period_s * np.arange(frames, dtype=float)
+    poses, covariances = _measured(eye, path, times)
+    ok = np.isfinite(poses[:, 0])
+    if ok.sum() < 2:
+        raise EstimationError(f"{ok.sum()} of {frames} frames along the path gave a pose, 2 are needed")
+    errors = (poses - path.pose(times))[ok]
+    latencies = frame_latencies(scenario, len(times), np.random.default_rng(stream_seed(seed, LATENCY)))
+    arrivals: Array = times + (scenario.timing.latency_s if latencies is None else latencies)
+    used = _used_errors(path, poses[ok], arrivals[ok], scenario.timing.frame_period_s)
+    return {
+        "frames": frames,
+        "lost_frames": int(np.sum(~ok)),
+        "speed_rms_mm_s": 1e-3 * rms_um(path.pose_rate(times)[:, :3]),
+        **pose_figures(errors, covariances[ok]),
+        "used_position_rms_um": rms_um(used[:, :3]),
+        "used_orientation_rms_urad": rms_um(used[:, 3:]),
+    }
+
+
+def _measured(eye: RowSensor, path: FourierTrajectory, times: Array) -> tuple[Array, Array]:
+    """Measured poses (N, 6) and covariances (N, 6, 6), NaN where a frame was lost."""
+    seen: list[cmmsim.Measurement] = [
+        eye.sensor.measure(pose, pose_rate=rate)
+        for pose, rate in zip(path.pose(times), path.pose_rate(times), strict=True)
+    ]
+    return np.array([one.pose for one in seen]), np.array([one.covariance for one in seen])
+
+
+def _used_errors(path: FourierTrajectory, poses: Array, arrivals: Array, period_s: float) -> Array:
+    """Errors (m, 6) of the pose in use from the first arrival to the last; poses come into use in their order."""
+    arrivals = np.maximum.accumulate(arrivals)
+    count = max(1, round(INSTANTS_PER_FRAME * float(arrivals[-1] - arrivals[0]) / period_s))
+    instants = arrivals[0] + (np.arange(count) + 0.5) / count * (arrivals[-1] - arrivals[0])
+    in_use = np.searchsorted(arrivals, instants, side="right") - 1
+    return np.asarray(poses[in_use] - path.pose(instants), dtype=float)
+
+
+WHAT = "the sensor alone follows a platform along a random path, with the scenario's timing"
+PATH_POSE = Kind("path_pose", WHAT, COLUMNS, MAIN, PathPoseOptions, READS, compute)

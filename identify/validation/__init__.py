@@ -1,0 +1,1 @@
+"""Judging against the truth: unseen trajectories, estimators side by side, variation of the estimates."""

@@ -1,0 +1,156 @@
+"""Estimators judged on one record against one truth; nothing but this module shows them the truth.
+
+Figures of merit of Leboutet et al., "Inertial parameter identification in robotics: a survey" (Applied Sciences 11(9),
+2021; their toolbox BIRDy): distance of the parameters, distance of the output, time, iterations, model evaluations.
+Single parameters cannot be compared, because no motion separates them. The parameter distance is the RMS relative error
+of those base parameters that the record shows: which these are follows from the information at the true parameters, so
+that no estimator chooses its own examination. The few that are only just shown decide this RMS, and there a fit that
+leans on the starting guess may look best; so the median, which is that of an ordinary one, stands beside it. The gains
+of the joint PID have their own column. The pose distance is that of the closed-loop model from the true plant on unseen
+trajectories, RMS of the worst axis and run.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from dynamics import DynamicsError, Robot
+from dynamics.errors import ParameterError, SimulationError
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.estimation.base_parameters import base_parameters, structural_regressor
+from identify.estimation.estimate_covariance import estimate_uncertainty
+from identify.estimation.group_estimates import group_estimates
+from identify.estimation.identifiability import IDENTIFIABLE_SHARE, identifiability
+from identify.estimators.evidence import Evidence
+from identify.estimators.registry import Estimator
+from identify.experiment.truth import true_poses
+from identify.files.result_file import rms_figures, rms_row
+from identify.progress import Progress
+from identify.record.recorded_run import recorded_reference
+from identify.scenario import Scenario
+from identify.validation.validation import model_run
+
+START = "starting guess"
+
+
+@dataclass(frozen=True)
+class Examination:
+    """The truth: parameters (67,), combinations (k, 64) of them that the record shows, and unseen runs of the plant."""
+
+    robot: Robot
+    scenario: Scenario
+    true: Array
+    combinations: Array
+    unseen: tuple[tuple[xr.Dataset, xr.Dataset], ...]
+
+    def group_errors(self, parameters: Array) -> Array:
+        """Relative errors (k,) of the base parameters that the record shows."""
+        true = self.combinations @ self.true[:64]
+        return np.asarray((self.combinations @ parameters[:64] - true) / np.abs(true), dtype=float)
+
+    def gain_errors(self, parameters: Array) -> Array:
+        """Relative errors (3,) of lp, li, ld."""
+        return np.asarray(parameters[64:] / self.true[64:] - 1, dtype=float)
+
+    def pose_distance(self, parameters: Array) -> tuple[float, float]:
+        """RMS of the worst axis and run, um and urad; NaN where the model's loop is unstable, or an estimator gives
+        parameters with which no model runs, such as a gain of zero."""
+        rows = []
+        for record, truth in self.unseen:
+            try:
+                poses = model_run(self.robot, self.scenario, parameters, recorded_reference(record))
+            except (ParameterError, SimulationError):
+                return float("nan"), float("nan")
+            rows.append(rms_row(rms_figures(poses - true_poses(truth))))
+        worst = np.max(np.array(rows), axis=0)
+        return float(worst[:3].max()), float(worst[3:].max())
+
+
+@dataclass(frozen=True)
+class Score:
+    """One row of the table. Distances: RMS and median relative errors of groups, RMS of gains, um and urad on
+    unseen trajectories; NaN with a reason in the note where an estimator gave nothing. parameters, std (67,): what it
+    gave."""
+
+    name: str
+    title: str
+    uses: str
+    group_distance: float
+    group_median: float
+    gain_distance: float
+    position_um: float
+    orientation_urad: float
+    seconds: float
+    iterations: int
+    evaluations: int
+    note: str
+    parameters: Array | None = None
+    std: Array | None = None
+
+
+def examination(evidence: Evidence, true: Array, unseen: Sequence[tuple[xr.Dataset, xr.Dataset]]) -> Examination:
+    """What is asked of the estimators, from the true parameters (67,) and unseen (record, truth) pairs.
+
+    Raises EstimationError where the record shows no base parameter, or no unseen run is given.
+    """
+    if not unseen:
+        raise EstimationError("no unseen trajectory to judge the estimators on")
+    robot = evidence.run.robot
+    base = base_parameters(structural_regressor(robot))
+    driven = evidence.problem.driven_by_commands()
+    covariance = estimate_uncertainty(driven, true, np.random.default_rng(0)).covariance
+    guess = evidence.problem.guess
+    groups = group_estimates(base, guess, identifiability(guess, robot), true, covariance)
+    # A relative error says nothing of a difference that almost vanishes.
+    shown: NDArray[np.bool_] = groups.identifiable & (groups.std < IDENTIFIABLE_SHARE * np.abs(groups.estimate))
+    if not shown.any():
+        raise EstimationError("the record shows no base parameter: there is nothing to compare")
+    return Examination(robot, evidence.scenario, true, base.combinations[shown], tuple(unseen))
+
+
+def compare(
+    evidence: Evidence, asked: Examination, estimators: Mapping[str, Estimator], progress: Progress
+) -> list[Score]:
+    """One score for the starting guess and each estimator; one that fails has its reason in the note."""
+    guess = evidence.problem.guess
+    scores = [_score(START, START, "", asked, guess.values, guess.std, 0.0, 0, 0, "")]
+    with progress.stage("estimators", len(estimators)) as advance:
+        for name, estimator in estimators.items():
+            scores.append(_examined(name, estimator, evidence, asked))
+            advance()
+    return scores
+
+
+def _examined(name: str, estimator: Estimator, evidence: Evidence, asked: Examination) -> Score:
+    try:
+        found = estimator.estimate(evidence)
+    except (EstimationError, DynamicsError) as error:
+        nothing = (np.nan, np.nan, np.nan, np.nan, np.nan, np.nan)
+        return Score(name, estimator.title, estimator.uses, *nothing, 0, 0, f"failed: {error}")
+    counts = (found.seconds, found.iterations, found.evaluations)
+    return _score(name, estimator.title, estimator.uses, asked, found.parameters, found.std, *counts, found.note)
+
+
+def _score(
+    name: str,
+    title: str,
+    uses: str,
+    asked: Examination,
+    parameters: Array,
+    std: Array | None,
+    seconds: float,
+    iterations: int,
+    evaluations: int,
+    note: str,
+) -> Score:
+    groups, gains = asked.group_errors(parameters), asked.gain_errors(parameters)
+    distances = (_rms(groups), float(np.median(np.abs(groups))), _rms(gains), *asked.pose_distance(parameters))
+    return Score(name, title, uses, *distances, seconds, iterations, evaluations, note, parameters, std)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,163 @@
+"""Validation: plant and models run trajectories the estimator never saw (section 4.3)."""
+
+import multiprocessing
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.sharedctypes import Synchronized
+
+import numpy as np
+import xarray as xr
+
+import cmmsim
+from dynamics import Robot, load_robot
+from dynamics.closed_loop import LoopFailure, Reference, simulate
+from identify.arrays import Array
+from identify.cores import cores
+from identify.estimation.pose_prediction import PosePrediction, predict_poses
+from identify.experiment.run import Experiment, run_plant
+from identify.experiment.sensor_in_loop import make_sensor
+from identify.progress import Advance, Progress
+from identify.random_streams import PREDICTION, stream_seed
+from identify.record.checks import TooFewFramesError
+from identify.record.loop_setup import frame_times, model_settings
+from identify.record.recorded_run import watched_run
+from identify.scenario import Scenario
+from identify.trajectory import FourierTrajectory
+
+POLL_S = 0.2
+
+
+@dataclass(frozen=True)
+class PlantRuns:
+    """What a worker process needs to run the plant: all of it can be pickled."""
+
+    scenario: Scenario
+    seed: int
+    taught: cmmsim.Taught
+
+
+def run_unseen(
+    scenario: Scenario,
+    trajectories: tuple[FourierTrajectory, ...],
+    seed: int,
+    taught: cmmsim.Taught,
+    workers: int | None,
+    progress: Progress,
+) -> list[Experiment]:
+    """Run the plant with images in the loop on every trajectory, in `workers` processes, None: one a core.
+
+    Every run has its own noise stream, and all share what the sensor was taught: results do not depend on the workers.
+    """
+    runs, workers = PlantRuns(scenario, seed, taught), workers or cores()
+    numbers = range(1, len(trajectories) + 1)
+    frames = len(frame_times(scenario, scenario.validation.duration_s)) * len(trajectories)
+    with progress.stage("validate", frames) as advance:
+        if workers == 1 or len(trajectories) == 1:
+            worker = _Worker(runs)
+            return [worker.run(number, path, advance) for number, path in zip(numbers, trajectories, strict=True)]
+        context = multiprocessing.get_context("spawn")
+        counter: Synchronized[int] = context.Value("q", 0)
+        with (
+            _followed(counter, advance),
+            ProcessPoolExecutor(workers, context, _start_worker, (runs, counter)) as pool,
+        ):
+            return list(pool.map(_run_in_worker, numbers, trajectories))
+
+
+def model_run(robot: Robot, scenario: Scenario, parameters: Array, reference: Reference) -> Array:
+    """Poses (N, 6) of the model on a reference; NaN throughout when its loop is unstable.
+
+    Raises dynamics.DynamicsError for what is no model: parameters of another shape or outside their range, poses out of
+    reach.
+    """
+    try:
+        return simulate(robot, parameters, reference, model_settings(scenario)).pose
+    except LoopFailure:
+        return np.full_like(reference.poses, np.nan)
+
+
+def predicted_runs(
+    robot: Robot,
+    scenario: Scenario,
+    records: Sequence[xr.Dataset],
+    parameters: Array,
+    covariance: Array,
+    seed: int,
+    progress: Progress,
+) -> list[PosePrediction]:
+    """What the identified model (67,) with its covariance (67, 67) predicts for the plant on the references of records.
+
+    NaN throughout where its loop is unstable, or too little was measured to know the sensor's noise.
+
+    Raises:
+        RecordError, EstimationError: a record that is damaged, or of another robot, timing or servo.
+        dynamics.DynamicsError: parameters that no model can have.
+    """
+    predictions = []
+    with progress.stage("predict", len(records)) as advance:
+        for number, record in enumerate(records, start=1):
+            rng = np.random.default_rng(stream_seed(seed, PREDICTION, number))
+            try:
+                prediction = predict_poses(watched_run(record, robot, scenario), parameters, covariance, rng)
+            except (LoopFailure, TooFewFramesError):
+                shape = (record.sizes["time"], 6)
+                prediction = PosePrediction(np.full(shape, np.nan), np.full((*shape, 6), np.nan))
+            predictions.append(prediction)
+            advance()
+    return predictions
+
+
+class _Worker:
+    """One process's robot and sensor; the renderer lives as long as the process."""
+
+    def __init__(self, runs: PlantRuns) -> None:
+        self._runs = runs
+        self._robot = load_robot(runs.scenario.robot)
+        self._sensor = make_sensor(runs.scenario, self._robot, runs.seed, runs.taught)
+
+    def run(self, number: int, trajectory: FourierTrajectory, advance: Advance) -> Experiment:
+        scenario = self._runs.scenario
+        times = frame_times(scenario, scenario.validation.duration_s)
+        return run_plant(scenario, self._robot, self._sensor, trajectory, times, self._runs.seed, number, advance)
+
+
+_worker: _Worker
+_counter: "Synchronized[int]"
+
+
+def _start_worker(runs: PlantRuns, counter: "Synchronized[int]") -> None:
+    global _worker, _counter
+    _worker, _counter = _Worker(runs), counter
+
+
+def _run_in_worker(number: int, trajectory: FourierTrajectory) -> Experiment:
+    def advance(n: int = 1) -> None:
+        with _counter.get_lock():
+            _counter.value += n
+
+    return _worker.run(number, trajectory, advance)
+
+
+@contextmanager
+def _followed(counter: "Synchronized[int]", advance: Advance) -> Iterator[None]:
+    """Pass what the workers have counted on to the progress bar until the context ends."""
+    done, ended = 0, threading.Event()
+
+    def follow() -> None:
+        nonlocal done
+        while not ended.wait(POLL_S):
+            now = counter.value
+            advance(now - done)
+            done = now
+
+    thread = threading.Thread(target=follow, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        advance(counter.value - done)

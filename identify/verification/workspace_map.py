@@ -1,0 +1,153 @@
+"""Maps of a robot's workspace: planes of poses around home, with travel, reach and conditioning at every point."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dynamics import Robot
+from dynamics.analysis import workspace
+from dynamics.kinematics import forward_kinematics
+from identify.arrays import Array
+from identify.progress import Progress, SilentProgress
+
+POINTS = 101
+"""Grid points along each side of a map."""
+
+JOINT_SAMPLES = 20_000
+"""Joint vectors within travel from which the extremes of the whole travel range are taken."""
+
+AXES = ("x_m", "y_m", "z_m", "alpha_rad", "beta_rad", "gamma_rad")
+
+
+@dataclass(frozen=True)
+class WorkspacePlane:
+    """One map: two pose components vary (``across``, ``up``: indices 0..5), a third is ``fixed`` at ``value``.
+
+    ``horizontal`` and ``vertical`` (n,) [m or rad] are the grid lines; ``travel_share`` and ``condition`` (n, n), row
+    by row of ``vertical``, are NaN out of reach; ``reach_margin`` (n, n) is that of the worst leg.
+    """
+
+    across: int
+    up: int
+    fixed: int
+    value: float
+    horizontal: Array
+    vertical: Array
+    travel_share: Array
+    condition: Array
+    reach_margin: Array
+
+    @property
+    def allowed(self) -> Array:
+        """Where all legs reach with cranks within the travel limit (n, n)."""
+        return np.asarray(self.travel_share <= 1)
+
+
+@dataclass(frozen=True)
+class WorkspaceMap:
+    """Planes, range of each pose component alone (6, 2) [m, rad from home], and measures at home and of
+    those of JOINT_SAMPLES random joint vectors within travel that have a pose."""
+
+    robot: str
+    characteristic_length_m: float
+    planes: tuple[WorkspacePlane, ...]
+    ranges: Array
+    home: workspace.WorkspaceMeasures
+    travel: workspace.WorkspaceMeasures
+
+    def summary(self) -> dict[str, Any]:
+        """The map in numbers, for JSON; units are in the names."""
+        return {
+            "robot": self.robot,
+            "travel_limit_rad": self.home.travel_limit,
+            "characteristic_length_m": self.characteristic_length_m,
+            "home": _extremes(self.home),
+            "whole_travel": {
+                "joint_vectors": JOINT_SAMPLES,
+                "without_pose": JOINT_SAMPLES - len(self.travel.theta),
+                **_extremes(self.travel),
+            },
+            "range_from_home": {axis: list(pair) for axis, pair in zip(AXES, self.ranges.tolist(), strict=True)},
+            "planes": [_plane_summary(plane) for plane in self.planes],
+        }
+
+
+def map_workspace(robot: Robot, progress: Progress | None = None, points: int = POINTS) -> WorkspaceMap:
+    """Maps of x-y at three heights with home's orientation, and of alpha-beta at three gamma with home's position.
+
+    The sides reach a crank's length from home, or 1.3 of it over the characteristic length in rotation.
+    """
+    progress = progress or SilentProgress()
+    length = workspace.characteristic_length(robot.geometry)
+    step, turn = robot.geometry.crank_length, 1.3 * robot.geometry.crank_length / length
+    layout = [(0, 1, 2, step, offset * step) for offset in (-0.4, 0.0, 0.4)]
+    layout += [(3, 4, 5, turn, offset * turn) for offset in (-0.4, 0.0, 0.4)]
+    planes = []
+    with progress.stage("workspace", len(layout) + 2) as advance:
+        for across, up, fixed, side, offset in layout:
+            planes.append(_plane(robot, (across, up, fixed), side, offset, points))
+            advance()
+        ranges = np.array([_range(robot, axis, step if axis < 3 else turn) for axis in range(6)])
+        advance()
+        limit = robot.travel_limit
+        theta = np.random.default_rng(0).uniform(-limit, limit, (JOINT_SAMPLES, 6))
+        poses, residual = forward_kinematics.search(robot, theta, np.tile(robot.home_pose, (JOINT_SAMPLES, 1)))
+        solved = (residual < forward_kinematics.ANGLE_TOLERANCE).all(axis=1)
+        travel = workspace.measure(robot, poses[solved])
+        advance()
+    return WorkspaceMap(robot.name, length, tuple(planes), ranges, workspace.measure(robot, robot.home_pose), travel)
+
+
+def _plane(robot: Robot, axes: tuple[int, int, int], side: float, offset: float, points: int) -> WorkspacePlane:
+    across, up, fixed = axes
+    steps = np.linspace(-side, side, points)
+    poses = np.tile(robot.home_pose, (points, points, 1))
+    poses[..., across] += steps[None, :]
+    poses[..., up] += steps[:, None]
+    poses[..., fixed] += offset
+    measures = workspace.measure(robot, poses.reshape(-1, 6))
+    grid = (points, points)
+    return WorkspacePlane(
+        *axes,
+        float(robot.home_pose[fixed] + offset),
+        robot.home_pose[across] + steps,
+        robot.home_pose[up] + steps,
+        measures.travel_share.reshape(grid),
+        measures.joint_condition.reshape(grid),
+        measures.reach_margin.min(axis=1).reshape(grid),
+    )
+
+
+def _range(robot: Robot, axis: int, side: float, points: int = 4001) -> tuple[float, float]:
+    """How far one pose component alone goes down and up from home before a crank reaches its travel limit."""
+    steps = np.linspace(0, 3 * side, points)
+    ends = []
+    for sign in (-1.0, 1.0):
+        share = workspace.measure(robot, robot.home_pose + sign * steps[:, None] * np.eye(6)[axis]).travel_share
+        outside = ~(share <= 1)
+        ends.append(sign * float(steps[max(int(np.argmax(outside)) - 1, 0)] if outside.any() else steps[-1]))
+    return ends[0], ends[1]
+
+
+def _extremes(measures: workspace.WorkspaceMeasures) -> dict[str, float]:
+    return {
+        "largest_angle_rad": float(np.abs(measures.theta).max()),
+        "least_reach_margin": float(measures.reach_margin.min()),
+        "least_leverage_J_a1": float(measures.leverage.min()),
+        "largest_condition_J_a2": float(measures.platform_condition.max()),
+        "largest_condition_J_ad": float(measures.joint_condition.max()),
+    }
+
+
+def _plane_summary(plane: WorkspacePlane) -> dict[str, Any]:
+    inside = plane.condition[plane.allowed]
+    return {
+        "axes": [AXES[plane.across], AXES[plane.up]],
+        AXES[plane.fixed]: plane.value,
+        "from": [float(plane.horizontal[0]), float(plane.vertical[0])],
+        "to": [float(plane.horizontal[-1]), float(plane.vertical[-1])],
+        "share_in_reach": float((plane.reach_margin > 0).mean()),
+        "share_within_travel": float(plane.allowed.mean()),
+        "largest_condition_J_ad_within_travel": float(inside.max()) if inside.size else None,
+    }
