@@ -11,16 +11,15 @@ from cmmsim.errors import (
     UnknownOptionError,
     UnknownSensorError,
 )
+from cmmsim.fault_images import Fault, FaultyImages
 from cmmsim.faults import FaultGenerator, fault_bodies
-from cmmsim.faulty_images import Fault, FaultyImages
 from cmmsim.files.sensor_file import built_in_names
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import pose_to_transform, transform_to_pose
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.pyrender_renderer import require_opengl
 from cmmsim.imaging.scene import rod, rod_transform
-from cmmsim.pose_estimation.estimator import PoseEstimator, measure_frame
-from cmmsim.pose_estimation.measurement import Measurement
+from cmmsim.pose_estimation.estimator import Measurement, PoseEstimator, measure_frame
 from cmmsim.pose_estimation.taught import Taught
 from cmmsim.radiometry.images import StereoFrame
 from cmmsim.sensor import Sensor, load_sensor

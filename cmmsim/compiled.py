@@ -1,6 +1,6 @@
 """How kernels are compiled: by numba, once, into a cache on disk.
 
-Modules called ``*_kernel`` hold functions of numbers and arrays only. They are imported where they are first needed,
+Modules called ``*kernels`` hold functions of numbers and arrays only. They are imported where they are first needed,
 because importing numba takes time.
 """
 
@@ -35,5 +35,5 @@ def compiled(function: F) -> Dispatcher[F]:
 @lru_cache(maxsize=1)
 def _stamp() -> str:
     """Changes when any kernel changes."""
-    files = sorted(Path(__file__).parent.rglob("*_kernel.py"))
+    files = sorted(Path(__file__).parent.rglob("*kernels.py"))
     return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()

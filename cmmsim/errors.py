@@ -57,3 +57,17 @@ class OpenGLMissingError(RuntimeError):
             "OpenGL is missing, so no images can be rendered: on Debian install the packages "
             f"libegl1, libgl1 and libgl1-mesa-dri, or choose the renderer analytic ({type(cause).__name__}: {cause})"
         )
+
+
+# Errors of calibration.
+
+
+class CalibrationError(CmmError):
+    """Images, board or poses from which no calibration can be made; the message says which and how to go on."""
+
+
+# What an acceptance test refuses.
+
+
+class AcceptanceError(CmmError):
+    """A volume that is not seen, lines that break a rule, or an artefact that cannot be measured."""

@@ -20,9 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmmsim.checks import require_kind
 from cmmsim.errors import UnknownOptionError
-from cmmsim.fault_marks import DiscMark, FillMark, GlintMark, PlateMark
-from cmmsim.faulty_images import Fault
-from cmmsim.geometry.outlines import sticker_outlines
+from cmmsim.fault_images import DiscMark, Fault, FillMark, GlintMark, PlateMark
+from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, checked_pose, invert, pose_to_transform
 from cmmsim.pose_estimation.estimator import PoseEstimator
 

@@ -22,22 +22,18 @@ from cmmsim.files.rig import rig_from_file
 from cmmsim.files.schema import SensorFile, Timing
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import Array, checked_pose, checked_transform, pose_to_transform
-from cmmsim.imaging.image_formation import ImageFormation
+from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
+from cmmsim.imaging.formation import ImageFormation
 from cmmsim.imaging.renderer import RENDERER_NAMES, Renderer, choose_renderer
 from cmmsim.imaging.scene import Mesh, scene_body, solid_mesh
 from cmmsim.imaging.views import Drawable
-from cmmsim.imaging.virtual_camera import Quality, VirtualStereoCamera
-from cmmsim.pose_estimation.estimator import PoseEstimator
-from cmmsim.pose_estimation.measurement import Measurement, lost_measurement
+from cmmsim.pose_estimation.estimator import METHODS, Measurement, PoseEstimator, lost_measurement
 from cmmsim.pose_estimation.observation import DetectionSettings
-from cmmsim.pose_estimation.pose_methods import METHODS
-from cmmsim.pose_estimation.taught import Taught
-from cmmsim.pose_estimation.taught_setup import require_taught_for, setup_of
-from cmmsim.pose_estimation.teaching import Progress, Teacher
-from cmmsim.pose_estimation.window_sizes import WindowSizes, largest_radius, radius_at, window_sizes
+from cmmsim.pose_estimation.taught import Taught, require_taught_for, setup_of
 from cmmsim.radiometry.images import StereoFrame, StereoImages
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.optics import Optics
+from cmmsim.teaching import Progress, Teacher, WindowSizes, largest_radius, radius_at, window_sizes
 from cmmsim.tracker import Tracker
 
 TEACHING_STREAM, RUN_STREAM, DROPOUT_STREAM = 0, 1, 2

@@ -7,8 +7,7 @@ import numpy as np
 from cmmsim.checks import require_kind
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import Array, invert, rotation_exp, rotation_log
-from cmmsim.pose_estimation.estimator import PoseEstimator, require_fitting
-from cmmsim.pose_estimation.measurement import Measurement, lost_measurement
+from cmmsim.pose_estimation.estimator import Measurement, PoseEstimator, lost_measurement, require_fitting
 from cmmsim.radiometry.images import StereoFrame, StereoImages, readable
 
 # A tracked frame that shows less than this share of the stickers seen before is searched as a whole too: most windows

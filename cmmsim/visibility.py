@@ -20,8 +20,8 @@ from cmmsim.files.rig import rig_from_file
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import Array, apply, compose_covariance, invert, pose_covariance, pose_to_transform
 from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.pose_estimation.estimator import by_planes, by_registration
 from cmmsim.pose_estimation.observation import DetectionSettings, faces_camera, observe
-from cmmsim.pose_estimation.pose_methods import by_planes, by_registration
 from cmmsim.sensor import load_sensor
 
 EDGE_PX = DetectionSettings().window_size

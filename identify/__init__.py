@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from identify.record.payload import payload_vector, store_payload
     from identify.record.recording import build_record
     from identify.scenario import Scenario, load_scenario, scenario_names
-    from identify.validation.unseen import unseen_errors
+    from identify.validation.validation import unseen_errors
 
 _HOME = {
     "IdentificationResult": "identify.estimation.identification",
@@ -30,7 +30,7 @@ _HOME = {
     "Scenario": "identify.scenario",
     "load_scenario": "identify.scenario",
     "scenario_names": "identify.scenario",
-    "unseen_errors": "identify.validation.unseen",
+    "unseen_errors": "identify.validation.validation",
 }
 
 __all__ = [

@@ -2,7 +2,7 @@
 
 import sys
 
-from identify.interrupts import STOPPED, honoured
+from identify.runtime import STOPPED, honoured
 
 
 def main() -> None:

@@ -1,16 +1,32 @@
-"""The 67 parameters of the closed loop, as the estimator sees them: names, units, typical sizes."""
+"""The 67 parameters of the closed loop as the estimator sees them, and dynamic parameters named on the command line."""
 
+import json
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from dynamics import Robot
-from dynamics.parameters import COULOMB_NAMES, JOINT_PID_NAMES, PARAMETER_NAMES, VISCOUS_NAMES, unit_of
+from dynamics.errors import ParameterError
+from dynamics.parameters import (
+    COULOMB_NAMES,
+    JOINT_PID_NAMES,
+    PARAMETER_NAMES,
+    VISCOUS_NAMES,
+    check_parameters,
+    unit_of,
+)
 from identify.arrays import Array
-from identify.errors import ScenarioError
+from identify.errors import RecordError, ScenarioError
+from identify.files.run_folder import load_result
 from identify.scenario import PriorValue
+
+# The 67 parameters of the closed loop, as the estimator sees them: names, units, typical sizes.
+
 
 NAMES: tuple[str, ...] = PARAMETER_NAMES + JOINT_PID_NAMES
 
@@ -68,3 +84,57 @@ def index_of(name: str) -> int:
 
 
 __all__ = ["NAMES", "StartingGuess", "holding_torque", "index_of", "starting_guess", "typical_sizes", "unit_of"]
+
+
+# Dynamic parameters named on the command line: a set of the robot file, or the estimates in a run's result.json.
+
+
+NOMINAL = "initial"
+
+
+@dataclass(frozen=True)
+class ParameterChoice:
+    """Dynamic parameters (64,) [SI] and, in words, where they come from."""
+
+    values: Array
+    source: str
+
+
+def choose_parameters(robot: Robot, choice: str | None = None) -> ParameterChoice:
+    """Parameters by the name of a set, or the estimates of a result file; the nominal set when nothing is named.
+
+    Raises:
+        ScenarioError: neither a set of the robot (with the valid names) nor a file.
+        RecordError: a result file without a complete set of estimates, or one that is no number in its range.
+    """
+    name = NOMINAL if choice is None else choice
+    if name in robot.parameter_sets:
+        return ParameterChoice(robot.parameter_sets[name].dynamic, f"parameter set {name}")
+    if not Path(name).is_file():
+        valid = ", ".join(sorted(robot.parameter_sets))
+        raise ScenarioError(f"{name!r} is neither a parameter set of robot {robot.name} ({valid}) nor a result.json")
+    return ParameterChoice(_estimates(name, load_result(name)), f"estimates of {name}")
+
+
+def _estimates(path: str, result: dict[str, Any]) -> Array:
+    entries = result.get("identification")
+    entries = entries.get("parameters") if isinstance(entries, dict) else None
+    if not isinstance(entries, dict):
+        raise RecordError(f"{path} has no identification.parameters; write it with: cmmsim identify")
+    found = {name: _estimate(entries.get(name)) for name in PARAMETER_NAMES}
+    absent = [name for name, value in found.items() if value is None]
+    if absent:
+        more = f" and {len(absent) - 3} more" if len(absent) > 3 else ""
+        raise RecordError(f"{path} has no estimate of {', '.join(absent[:3])}{more}")
+    for name, value in found.items():
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (number and abs(value) <= sys.float_info.max):
+            raise RecordError(f"{path}: estimate of {name} is {json.dumps(value):.60}, must be a finite number")
+    try:
+        return check_parameters(list(found.values()))
+    except ParameterError as error:
+        raise RecordError(f"{path}: {error}") from None
+
+
+def _estimate(entry: Any) -> Any:
+    return entry.get("estimate") if isinstance(entry, dict) else None

@@ -21,19 +21,17 @@ from identify.experiment.run import true_parameters as plant_parameters
 from identify.experiment.sensor_in_loop import with_renderer
 from identify.experiment.truth import read_truth, true_parameters
 from identify.files.atomic import write_text
-from identify.files.covariance_file import read_covariance, write_covariance
-from identify.files.result_file import check_entries, load_result, rms_figures, save_result
-from identify.files.run_folder import RunFolder
+from identify.files.dataset import read_covariance, write_covariance
+from identify.files.run_folder import RunFolder, check_entries, load_result, rms_figures, save_result
 from identify.files.versions import versions
 from identify.loop_parameters import NAMES, check_parameter_set
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.checks import check_length, check_trajectory
 from identify.record.loop_setup import frame_times
-from identify.record.made_of import ENTRY, RECORDS, check_made_of, file_digests
-from identify.record.model_runs import build_model_run, write_model_runs
-from identify.record.recorded_robot import check_robot
+from identify.record.provenance import ENTRY, RECORDS, check_made_of, check_robot, file_digests
 from identify.record.recorded_run import recorded_reference
+from identify.record.recording import build_model_run, write_model_runs
 from identify.reporting.report import write_report
 from identify.reporting.run_result import (
     add_truth,
@@ -44,8 +42,8 @@ from identify.reporting.run_result import (
     validation_entry,
 )
 from identify.scenario import Scenario, load_scenario
-from identify.scenario.estimator_settings import estimator_settings, with_estimator_settings
-from identify.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
+from identify.scenario.scenario import estimator_settings, with_estimator_settings
+from identify.trajectory import TrajectorySet, load_trajectories, save_trajectories
 from identify.validation.validation import model_run, predicted_runs, run_unseen
 
 

@@ -1,10 +1,12 @@
-"""Progress of the stages of a run: bars with the time left on a terminal, one plain line a stage elsewhere."""
+"""What a user sees at the terminal: progress of the stages of a run, tables in one look, and warnings."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import Protocol
 
+import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -16,7 +18,11 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.progress import Progress as RichBars
+from rich.table import Table as RichTable
 from rich.text import Text
+
+# Progress of the stages of a run: bars with the time left on a terminal, one plain line a stage elsewhere.
+
 
 Advance = Callable[..., None]
 """``advance(n=1)``: n more steps of the stage are done."""
@@ -96,3 +102,32 @@ class _RateColumn(ProgressColumn):
         """The rate of late, or over all where the stage has ended."""
         speed = task.finished_speed or task.speed
         return Text("" if speed is None else f"{speed:.3g} {self._unit}")
+
+
+# Tables at the terminal, all in one look: 80 columns must do, since that is what a pipe gets. And warnings.
+
+
+def print_warnings(warnings: Iterable[str]) -> None:
+    """One line each on standard error, `warning: ...`; they are no summary, and a quiet command gives them too."""
+    for warning in warnings:
+        typer.echo(f"warning: {' '.join(warning.split())}", err=True)
+
+
+def print_table(
+    header: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    words: Collection[str],
+    title: str | None = None,
+    note: str | None = None,
+) -> None:
+    """Print rows of text under a header to standard output, the title above and the note below.
+
+    words: headers of the columns that hold words, which stand to the left; numbers stand to the right. The first column
+    is never broken. All text is shown as it is: what stands in brackets, such as a unit, is no markup.
+    """
+    table = RichTable(title=title, caption=note, box=SIMPLE_HEAD, show_edge=False, padding=0)
+    for place, name in enumerate(header):
+        table.add_column(name, justify="left" if name in words else "right", no_wrap=not place)
+    for row in rows:
+        table.add_row(*row)
+    Console(markup=False, emoji=False).print(table)

@@ -12,10 +12,10 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("cmmsim", "dynamics", "identify")
 ESTIMATOR = ("identify/estimation", "identify/estimators")
 HEAVY = {
-    "pyrender": {"cmmsim/render.py"},
-    "mujoco": {"dynamics/mujoco_engine.py"},
-    "dask": {"identify/studies/dask_runner.py"},
-    "distributed": {"identify/studies/dask_executor.py", "identify/studies/dask_runner.py"},
+    "pyrender": {"cmmsim/imaging/pyrender_renderer.py"},
+    "mujoco": {"dynamics/engines/mujoco_engine.py"},
+    "dask": {"identify/studies/dask_cluster.py"},
+    "distributed": {"identify/studies/dask_cluster.py"},
     "rerun": set(),
 }
 

@@ -4,16 +4,20 @@ The artefacts are imaged by the sensor's own virtual cameras and measured by its
 is true of them is used only to judge the result.
 """
 
-from cmmsim.acceptance.artefact_sensor import SensorUnderTest
-from cmmsim.acceptance.bar_paths import BarPath, bar_paths
+from cmmsim.acceptance.artefacts import SensorUnderTest
 from cmmsim.acceptance.latency_test import Latency, LatencyTest, estimate_latency, latency_test
 from cmmsim.acceptance.length_test import LengthTest, MeasuredLength, length_test
-from cmmsim.acceptance.measuring_lines import MeasuringLine, require_rules, seven_lines
-from cmmsim.acceptance.moving_bar import BarRun, BarTest, bar_test
-from cmmsim.acceptance.published import PUBLISHED, PublishedFigure
-from cmmsim.acceptance.statistics import Statistics, interval_of_mean, summarise
-from cmmsim.acceptance.volume import MeasuringVolume, common_volume, volume_of_size
-from cmmsim.acceptance_errors import AcceptanceError
+from cmmsim.acceptance.moving_bar import BarPath, BarRun, BarTest, bar_paths, bar_test
+from cmmsim.acceptance.statistics import PUBLISHED, PublishedFigure, Statistics, interval_of_mean, summarise
+from cmmsim.acceptance.volume import (
+    MeasuringLine,
+    MeasuringVolume,
+    common_volume,
+    require_rules,
+    seven_lines,
+    volume_of_size,
+)
+from cmmsim.errors import AcceptanceError
 
 __all__ = [
     "PUBLISHED",

@@ -11,13 +11,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmmsim.acceptance.artefact import facing_rotation
-from cmmsim.acceptance.artefact_sensor import SensorUnderTest, estimator_of, locate, pose_in_base
-from cmmsim.acceptance.bar import HALF_LENGTH, HALF_WIDTH, rigid_bar
+from cmmsim.acceptance.artefacts import (
+    HALF_LENGTH,
+    HALF_WIDTH,
+    SensorUnderTest,
+    estimator_of,
+    facing_rotation,
+    locate,
+    pose_in_base,
+    rigid_bar,
+)
 from cmmsim.acceptance.statistics import Interval, interval_of_mean
 from cmmsim.acceptance.volume import MeasuringVolume
-from cmmsim.acceptance_errors import AcceptanceError
-from cmmsim.errors import ShapeError
+from cmmsim.errors import AcceptanceError, ShapeError
 from cmmsim.geometry.pose import Array
 from cmmsim.latency import drawn_latencies
 from cmmsim.tracker import Tracker

@@ -13,11 +13,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmmsim.acceptance.artefact import StickerRow, board, facing_rotation
-from cmmsim.acceptance.artefact_sensor import SensorUnderTest, estimator_of, locate, observe_stickers, pose_in_base
-from cmmsim.acceptance.measuring_lines import MeasuringLine, seven_lines
-from cmmsim.acceptance.volume import MeasuringVolume
-from cmmsim.acceptance_errors import AcceptanceError
+from cmmsim.acceptance.artefacts import (
+    SensorUnderTest,
+    StickerRow,
+    board,
+    estimator_of,
+    facing_rotation,
+    locate,
+    observe_stickers,
+    pose_in_base,
+)
+from cmmsim.acceptance.volume import MeasuringLine, MeasuringVolume, seven_lines
+from cmmsim.errors import AcceptanceError
 from cmmsim.files.schema import Platform
 from cmmsim.geometry.pose import Array
 from cmmsim.sensor import Sensor

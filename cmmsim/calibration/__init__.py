@@ -4,19 +4,22 @@ The way: a board description, pairs of image files, the board in each image, Ope
 adjustment of both cameras with its covariance.
 """
 
+from cmmsim.calibration.adjustment import DISTORTIONS
 from cmmsim.calibration.board import Board, read_board
-from cmmsim.calibration.board_detection import BoardView, find_board
-from cmmsim.calibration.board_poses import board_poses, default_board
 from cmmsim.calibration.calibrate import CalibrationOptions, calibrate
-from cmmsim.calibration.calibration import PARAMETER_NAMES, Calibration
-from cmmsim.calibration.intrinsics import DISTORTIONS
-from cmmsim.calibration.photographs import ImagePair, pair_images, read_grey
-from cmmsim.calibration.rendering import render_pairs
-from cmmsim.calibration.result_text import as_dict, rig_tables
-from cmmsim.calibration.sensor_template import SensorTemplate, require_sensor, sensor_template
-from cmmsim.calibration.sightings import PairView
-from cmmsim.calibration.views_of_images import view_pairs
-from cmmsim.calibration_errors import CalibrationError
+from cmmsim.calibration.detection import BoardView, find_board
+from cmmsim.calibration.rendered_boards import board_poses, default_board, render_pairs
+from cmmsim.calibration.result import (
+    PARAMETER_NAMES,
+    Calibration,
+    SensorTemplate,
+    as_dict,
+    require_sensor,
+    rig_tables,
+    sensor_template,
+)
+from cmmsim.calibration.sightings import ImagePair, PairView, pair_images, read_grey, view_pairs
+from cmmsim.errors import CalibrationError
 
 __all__ = [
     "DISTORTIONS",

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from cmmsim.calibration_errors import CalibrationError
+from cmmsim.errors import CalibrationError
 from cmmsim.geometry.pose import Array
 
 Length = Annotated[float, Field(gt=0.0, le=100.0)]

@@ -7,18 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cmmsim.calibration.adjustment import (
+    DEFAULT_DISTORTION,
+    DISTORTIONS,
+    Adjustment,
+    RigState,
+    adjust,
+    camera_from,
+    free_directions,
+)
 from cmmsim.calibration.board import Board
-from cmmsim.calibration.calibration import Calibration, UsedView
-from cmmsim.calibration.contradictions import contradictions
-from cmmsim.calibration.intrinsics import DEFAULT_DISTORTION, DISTORTIONS, camera_from, free_directions
-from cmmsim.calibration.joint_adjustment import Adjustment, adjust
-from cmmsim.calibration.named import some
-from cmmsim.calibration.sightings import SIDES, PairView, Sightings, sightings_of
+from cmmsim.calibration.result import Calibration, UsedView
+from cmmsim.calibration.sightings import SIDES, PairView, Sightings, sightings_of, some
 from cmmsim.calibration.start_values import start_values
-from cmmsim.calibration.state import RigState
-from cmmsim.calibration.weaknesses import weaknesses
-from cmmsim.calibration_errors import CalibrationError
-from cmmsim.geometry.eccentricity import centre_offset
+from cmmsim.calibration.warnings import contradictions, weaknesses
+from cmmsim.errors import CalibrationError
+from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import Array
 from cmmsim.geometry.stereo_rig import StereoRig
 

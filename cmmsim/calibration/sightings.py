@@ -1,15 +1,117 @@
-"""All that both cameras saw of the board, as the adjustment takes it."""
+"""All that both cameras saw of the board, as the adjustment takes it, and how pictures become it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.calibration.board_detection import BoardView
+from cmmsim.calibration.board import Board
+from cmmsim.calibration.detection import BoardView, find_board
+from cmmsim.errors import CalibrationError
 from cmmsim.geometry.pose import Array
+
+# Names in messages: a few, and how many there are besides.
+
+
+MOST = 3
+
+
+def some(names: Sequence[str]) -> str:
+    """The first three names and the number of the others; "none" where there is none."""
+    more = f" and {len(names) - MOST} more" if len(names) > MOST else ""
+    return ", ".join(names[:MOST]) + more if names else "none"
+
+
+# Pairs of image files in two folders, and their grey values.
+
+
+SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp")
+WHITE_SHARE = 99.9  # percentile of an image of more than 8 bit that becomes 255: 12-bit cameras fill 1/16 of 16 bit
+HOW_PAIRED = "pairs are made in the order of the sorted file names"
+
+
+@dataclass(frozen=True)
+class ImagePair:
+    """Files of one exposure of both cameras; name is the left file's, with the right one's where they differ."""
+
+    left: Path
+    right: Path
+
+    @property
+    def name(self) -> str:
+        """How the pair is called in results and messages."""
+        return self.left.name if self.left.name == self.right.name else f"{self.left.name} | {self.right.name}"
+
+
+def pair_images(left: str | Path, right: str | Path) -> list[ImagePair]:
+    """Pairs of the images in two folders.
+
+    The order of the sorted names makes the pairs; the names may differ throughout (left_01.png, right_01.png), but
+    where some are the same all must be. Raises CalibrationError: a folder is missing or empty, both are one, or
+    numbers or names differ, with names that stand in one folder only.
+    """
+    if Path(left).resolve() == Path(right).resolve():
+        raise CalibrationError(f"{left} is named for both cameras; name a folder of left and a folder of right images")
+    found = [_image_files(Path(folder)) for folder in (left, right)]
+    names = [{path.stem for path in side} for side in found]
+    if len(found[0]) != len(found[1]) or (names[0] & names[1] and names[0] != names[1]):
+        alone = [sorted(names[0] - names[1]), sorted(names[1] - names[0])]
+        raise CalibrationError(
+            f"{left} holds {len(found[0])} images and {right} {len(found[1])}; {HOW_PAIRED}, so each image needs its "
+            f"partner. Only on the left: {some(alone[0])}; only on the right: {some(alone[1])}"
+        )
+    return [ImagePair(a, b) for a, b in zip(*found, strict=True)]
+
+
+def read_grey(path: Path) -> NDArray[np.uint8]:
+    """Grey values (height, width) of an image file as the camera took it: a turn noted beside it is not applied.
+
+    Colours become grey; more than 8 bit are scaled so that the brightest 0.1 % are white. Raises CalibrationError.
+    """
+    try:
+        data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+    except OSError as error:
+        raise CalibrationError(f"cannot read image {path}: {error.strerror or error}") from error
+    except cv2.error as error:
+        raise CalibrationError(f"cannot read image {path}: {error.err}") from error
+    if image is None:
+        raise CalibrationError(f"cannot read image {path}: it is truncated or not an image")
+    if image.ndim == 3 and image.shape[2] in (3, 4):
+        image = cv2.cvtColor(_eight_bit(image), cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY)
+    elif image.ndim == 3:
+        raise CalibrationError(f"cannot read image {path}: it has {image.shape[2]} channels, not 1, 3 or 4")
+    return _eight_bit(image)
+
+
+def _eight_bit(image: NDArray) -> NDArray[np.uint8]:
+    if image.dtype == np.uint8:
+        return image
+    values = np.nan_to_num(image.astype(np.float32), posinf=0.0, neginf=0.0)
+    white = max(float(np.percentile(values, WHITE_SHARE)), 1e-9)
+    return np.rint(np.clip(values * (255.0 / white), 0.0, 255.0)).astype(np.uint8)
+
+
+def _image_files(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise CalibrationError(f"no folder {folder}; name a folder of left and a folder of right images")
+    files = sorted(
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
+    )
+    if not files:
+        raise CalibrationError(f"folder {folder} holds no images, which end in {', '.join(SUFFIXES)}")
+    return files
+
+
+# All that both cameras saw of the board, as the adjustment takes it.
+
 
 SIDES = ("left", "right")
 
@@ -73,3 +175,33 @@ def sightings_of(pairs: Sequence[PairView]) -> tuple[Sightings, Sightings]:
             )
         )
     return both[0], both[1]
+
+
+# From image files to what they show of the board.
+
+
+def view_pairs(
+    pairs: Sequence[ImagePair], board: Board, advance: Callable[[], None] = lambda: None
+) -> tuple[list[PairView], tuple[int, int]]:
+    """What each pair shows of the board, and the size (width, height) px that all images have.
+
+    advance is called after each pair. Raises CalibrationError for images that cannot be read or differ in size.
+    """
+    seen, size, first = [], None, None
+    for pair in pairs:
+        sides = []
+        for path in (pair.left, pair.right):
+            grey = read_grey(path)
+            if size is None:
+                size, first = (grey.shape[1], grey.shape[0]), path
+            if (grey.shape[1], grey.shape[0]) != size:
+                raise CalibrationError(
+                    f"{path} is {grey.shape[1]} x {grey.shape[0]} px, {first} {size[0]} x "
+                    f"{size[1]}: all images must have one size, unturned and uncropped"
+                )
+            sides.append(find_board(grey, board))
+        seen.append(PairView(pair.name, *sides))
+        advance()
+    if size is None:
+        raise CalibrationError("no pairs of images")
+    return seen, size

@@ -14,8 +14,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from cmmsim.errors import CmmError
-from cmmsim.geometry.blurred_coverage import blurred_coverage
-from cmmsim.geometry.ellipse_coverage import coverage, covered_area
+from cmmsim.geometry.coverage import blurred_coverage, coverage, covered_area
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.geometry.blurred_coverage import require_psf
+from cmmsim.geometry.coverage import require_psf
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
 

@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compiled import compiled
-from cmmsim.geometry.blur_kernel import blur_window
-from cmmsim.geometry.cholesky_kernel import factor, invert_factored, solve_factored
-from cmmsim.geometry.coverage_kernel import cover_window, inverse_of
+from cmmsim.geometry.disc_kernels import blur_window, cover_window, inverse_of
+from cmmsim.geometry.point_kernels import factor, invert_factored, solve_factored
 
 UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
 

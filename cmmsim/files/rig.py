@@ -8,8 +8,7 @@ import numpy as np
 
 from cmmsim.errors import SensorFileError
 from cmmsim.files.schema import Calibrated, Rig, RightFromLeft
-from cmmsim.geometry.camera import PinholeCamera
-from cmmsim.geometry.distortion import Distortion
+from cmmsim.geometry.camera import Distortion, PinholeCamera
 from cmmsim.geometry.pose import Array, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig, placed_rig, toed_in_rig
 

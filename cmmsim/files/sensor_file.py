@@ -1,9 +1,14 @@
-"""Reading sensor files (TOML): how a name becomes a file, and a file with changes a checked content."""
+"""Reading sensor files (TOML): how a name becomes a file, and a file with changes a checked content.
+
+Any number of stickers on a plane with the same middle and the same spread, so that their number alone differs.
+Points evenly spaced in angle on an ellipse have the same mean and the same second moments whatever their number is,
+from three on: n stickers know a plane or a pose sqrt(n) times better than one would.
+"""
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from functools import lru_cache
 from importlib import resources
@@ -11,13 +16,76 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
 from cmmsim.checks import require_kind
 from cmmsim.errors import SensorFileError, UnknownSensorError
 from cmmsim.files.schema import SensorFile
-from cmmsim.files.sensor_changes import change, require_keys
-from cmmsim.files.sticker_ring import closest, ring_of_stickers
+from cmmsim.geometry.pose import Array
+
+# Changes to the entries of a sensor file, by dotted key as `{"camera.dark_noise": 40.0}` or nested as in it.
+
+
+def dotted(changes: Mapping[str, Any], section: str = "") -> dict[str, Any]:
+    """Changes by dotted key, whether given so or as tables in tables; a later one replaces an earlier one."""
+    found: dict[str, Any] = {}
+    for key, value in changes.items():
+        path = f"{section}{key}"
+        found |= dotted(value, f"{path}.") if isinstance(value, Mapping) else {path: value}
+    return found
+
+
+def require_keys(name: str | Path, changes: object) -> None:
+    """Raise SensorFileError for changes that are no tables with names for keys."""
+    if changes is None:
+        return
+    if not isinstance(changes, Mapping):
+        raise SensorFileError(
+            f"sensor file {name}: changes = {changes!r} must be given by key, as {{'camera.dark_noise': 40.0}}"
+        )
+    for key, value in changes.items():
+        if not isinstance(key, str):
+            raise SensorFileError(
+                f"sensor file {name}: key {key!r} of the changes is no name such as 'camera.dark_noise'"
+            )
+        if isinstance(value, Mapping):
+            require_keys(name, value)
+
+
+def change(content: dict[str, Any], changes: Mapping[str, Any], source: str) -> None:
+    """Put changes in their places in a file's content; what is no key of it is found later, with the valid names.
+
+    source: what the content is of, for messages. Raises SensorFileError for what no change can be.
+    """
+    for path, value in dotted(changes).items():
+        if path == "based_on":
+            raise SensorFileError(f"{source}: based_on = {value!r} cannot be changed; name another sensor")
+        _replace(content, path, value, source)
+
+
+def _replace(content: dict[str, Any], path: str, value: Any, source: str) -> None:
+    *sections, key = path.split(".")
+    for section in sections:
+        content = content.setdefault(section, {})
+        if not isinstance(content, dict):
+            raise SensorFileError(f"{source}: {section!r} in {path!r} is a value, not a section")
+    if isinstance(content.get(key), dict):
+        raise SensorFileError(f"{source}: {path} = {value!r} is a section; its keys are {', '.join(content[key])}")
+    content[key] = value
+
+
+def ring_of_stickers(listed: Sequence[tuple[float, float]], count: int) -> Array:
+    """Places (count, 2) [u, v], m, on the ellipse one standard deviation around the middle of those listed (n, 2)."""
+    places = np.asarray(listed, dtype=float)
+    reach = np.linalg.cholesky(np.cov(places.T, bias=True))
+    angle = 2.0 * np.pi * np.arange(count) / count
+    return np.asarray(places.mean(axis=0) + np.column_stack([np.cos(angle), np.sin(angle)]) @ reach.T, dtype=float)
+
+
+def closest(places: Array) -> float:
+    """Smallest distance between two neighbours of a ring (n, 2), m."""
+    return float(np.linalg.norm(places - np.roll(places, 1, axis=0), axis=1).min())
 
 
 def built_in_names() -> list[str]:

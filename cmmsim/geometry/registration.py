@@ -68,7 +68,7 @@ def register(source: Array, target: Array, covariances: Array, iterations: int =
     Parameters: source (n,3) known points; target (n,3) measured points, m; covariances (n,3,3) of the measured ones.
     Raises LostError when fewer than three points off one line are given.
     """
-    from cmmsim.geometry.point_kernel import rigid_step  # compiles, so it is loaded where it is first needed
+    from cmmsim.geometry.point_kernels import rigid_step  # compiles, so it is loaded where it is first needed
 
     require_spread(source)
     transform = rigid_start(source, target)

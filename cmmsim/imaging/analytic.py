@@ -9,19 +9,76 @@ lines; in a pixel with the edges of two layers the covered shares are taken as i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.imaging.convex_solid import ConvexSolid
-from cmmsim.imaging.disc_layers import DiscsInView, DiscTable
-from cmmsim.imaging.scene import Mesh
+from cmmsim.geometry.disc_image import project_discs
+from cmmsim.geometry.pose import Array
+from cmmsim.imaging.scene import ConvexSolid, DiscStack, Mesh
 from cmmsim.imaging.views import NEAR, Drawable, View, same_exposure
 
+# Discs of a scene as one camera sees them.
+
+
+PROBES = 8  # points on a disc's rim, asked with its middle whether a solid hides them
+
+
+@dataclass(frozen=True)
+class DiscsInView:
+    """Discs turned towards one camera, far to near and outer before inner.
+
+    centres (m,2) and shapes (m,2,2) of their ellipses, px; reach (m,2) half extents along x and y, px; levels (m,);
+    owners (m,) body index; probes (m,k,3) points of each in camera axes, m.
+    """
+
+    centres: Array
+    shapes: Array
+    reach: Array
+    levels: Array
+    owners: NDArray[np.int_]
+    probes: Array
+
+
+class DiscTable:
+    """All discs of a drawable in the axes of their bodies."""
+
+    def __init__(self, drawable: Drawable) -> None:
+        rows = [
+            (disc, body)
+            for patch, body in zip(drawable.patches, drawable.body_index, strict=True)
+            if isinstance(patch, DiscStack)
+            for disc in patch.discs
+        ]
+        self._places = np.array([d.centre for d, _ in rows]).reshape(-1, 3)
+        self._normals = np.array([d.normal for d, _ in rows]).reshape(-1, 3)
+        self._radii = np.array([d.radius for d, _ in rows])
+        self._levels = np.array([d.level for d, _ in rows])
+        self._owners = np.array([body for _, body in rows], dtype=int)
+
+    def seen(self, view: View) -> DiscsInView:
+        """The discs that face a view's camera."""
+        from cmmsim.geometry.disc_kernels import place_discs, probe_discs
+
+        centres, normals = np.empty_like(self._places), np.empty_like(self._places)
+        place_discs(view.camera_from_bodies, self._owners, self._places, self._normals, centres, normals)
+        facing = (np.einsum("ni,ni->n", centres, normals) < 0.0) & (centres[:, 2] - self._radii > NEAR)
+        kept = np.flatnonzero(facing)
+        kept = kept[np.lexsort((-self._radii[kept], -np.round(centres[kept, 2], 3)))]
+        centres, normals, radii = centres[kept], normals[kept], self._radii[kept]
+        pixels, shapes = project_discs(view.camera, centres, normals, radii)
+        probes = np.empty((len(kept), PROBES + 1, 3))
+        probe_discs(centres, normals, radii, probes)
+        return DiscsInView(
+            pixels, shapes, np.linalg.norm(shapes, axis=2), self._levels[kept], self._owners[kept], probes
+        )
+
+
 if TYPE_CHECKING:
-    from cmmsim.imaging.layer_kernel import Solids
+    from cmmsim.imaging.kernels import Solids
 
 
 def draw_windows(
@@ -50,7 +107,7 @@ class _AnalyticScene:
 
     def draw(self, images: NDArray[np.float32], views: Sequence[View], group: list[int], lines: int) -> None:
         """Draw the views ``group``, which share a camera and an exposure, into ``images`` (n, h, w)."""
-        from cmmsim.imaging.layer_kernel import Discs, lay_layers  # compiles, so it is loaded where it is first needed
+        from cmmsim.imaging.kernels import Discs, lay_layers  # compiles, so it is loaded where it is first needed
 
         view = views[group[0]]
         seen = self._discs.seen(view)
@@ -67,7 +124,7 @@ class _AnalyticScene:
 
     def _outlined(self, view: View, hiding: list[int]) -> Solids:
         """The solids in view from far to near; ``hiding``: those whose cover is kept, in the order of their slots."""
-        from cmmsim.imaging.layer_kernel import Solids
+        from cmmsim.imaging.kernels import Solids
 
         moves = [view.camera_from_bodies[b] for b in self._bodies]
         depth = [float(m[2, :3] @ s.middle + m[2, 3]) for m, s in zip(moves, self._solids, strict=True)]

@@ -24,8 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.errors import CmmError, OpenGLMissingError
-from cmmsim.imaging.disc_mesh import disc_mesh
-from cmmsim.imaging.laid_views import LaidSolids
+from cmmsim.imaging.pyrender_meshes import LaidSolids, disc_mesh
 from cmmsim.imaging.scene import DiscStack, Mesh
 from cmmsim.imaging.views import Drawable, View, projections, same_exposure
 
@@ -41,7 +40,7 @@ def render_windows(
 
     Each pixel is the mean of ``supersampling``² drawn pixels of one sample each. Raises OpenGLMissingError.
     """
-    from cmmsim.imaging.pooling_kernel import mean_of_cells  # compiles, so it is loaded where it is first needed
+    from cmmsim.imaging.kernels import mean_of_cells  # compiles, so it is loaded where it is first needed
 
     width, height = views[0].size
     cell_w, cell_h = width * supersampling, height * supersampling

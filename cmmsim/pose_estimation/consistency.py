@@ -25,7 +25,7 @@ from scipy.stats import chi2
 
 from cmmsim.errors import LostError
 from cmmsim.files.marked_body import MarkedBody
-from cmmsim.geometry.outlines import sticker_outlines
+from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, skew
 from cmmsim.geometry.registration import Registration, register
 from cmmsim.geometry.stereo_rig import StereoRig

@@ -5,17 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cmmsim.checks import finite_array, require_kind
 from cmmsim.detection.blob_search import find_ellipses
 from cmmsim.errors import LostError, ShapeError, UnknownOptionError
 from cmmsim.files.marked_body import MarkedBody
-from cmmsim.geometry.pose import Array, compose_covariance, pose_covariance, transform_to_pose
+from cmmsim.geometry.plane_frame import frame_of_points
+from cmmsim.geometry.pose import Array, compose_covariance, invert, pose_covariance, skew, transform_to_pose
+from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.pose_estimation.consistency import consistent
-from cmmsim.pose_estimation.labelling import ENOUGH, find_layout
-from cmmsim.pose_estimation.matching import candidate_pairs
-from cmmsim.pose_estimation.measurement import Measurement, lost_measurement
+from cmmsim.pose_estimation.labelling import ENOUGH, candidate_pairs, find_layout
 from cmmsim.pose_estimation.observation import (
     DetectionSettings,
     StickerObservation,
@@ -23,11 +24,96 @@ from cmmsim.pose_estimation.observation import (
     observe_windows,
     read_windows,
 )
-from cmmsim.pose_estimation.pose_methods import METHODS, Solution, by_planes
 from cmmsim.pose_estimation.streaks import drawn_out, find_streaks
 from cmmsim.pose_estimation.taught import Taught
 from cmmsim.radiometry.images import FrameImages, StereoFrame, StereoImages
 from cmmsim.radiometry.noise import CameraNoise
+
+# The result of measuring one stereo frame.
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Pose of the platform in the base frame, and what it was made from.
+
+    pose (6,) m, rad and covariance (6,6): observation noise only, the error of teaching is the same in every frame
+    and stands in ``Taught.calibration_covariance``. points (n,3) and point_covariances (n,3,3) in the camera frame, m;
+    left_pixels and right_pixels (n,2) sticker centres in the images as they are, distorted; target_ids (n,) such as
+    "A1". When nothing could be measured ok is False, reason says why, and pose and covariance are NaN.
+    """
+
+    pose: Array
+    covariance: Array
+    points: Array
+    point_covariances: Array
+    left_pixels: Array
+    right_pixels: Array
+    target_ids: NDArray[np.str_]
+    ok: bool
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        if self.pose.shape != (6,) or self.covariance.shape != (6, 6):
+            raise ShapeError(f"pose (6,) and covariance (6,6) expected, got {self.pose.shape}, {self.covariance.shape}")
+        finite = bool(np.isfinite(self.pose).all() and np.isfinite(self.covariance).all())
+        if self.ok != finite or self.ok == bool(self.reason):
+            raise ShapeError(
+                f"a measurement is either ok and finite or lost for a reason, got ok={self.ok}, "
+                f"finite={finite}, reason={self.reason!r}"
+            )
+
+
+def lost_measurement(reason: str) -> Measurement:
+    """A measurement that holds no pose, and says why."""
+    return Measurement(
+        np.full(6, np.nan),
+        np.full((6, 6), np.nan),
+        np.zeros((0, 3)),
+        np.zeros((0, 3, 3)),
+        np.zeros((0, 2)),
+        np.zeros((0, 2)),
+        np.array([], dtype=str),
+        False,
+        reason,
+    )
+
+
+# The two ways from observed stickers to the pose of the body in the camera frame.
+
+
+Solution = tuple[Array, Array, StickerObservation]
+
+
+def by_registration(observation: StickerObservation, places: Array) -> Solution:
+    """camera_from_body (4,4), its covariance (6,6) and the stickers used, by a rigid fit of taught ``places`` (n,3).
+
+    Raises LostError with fewer than three stickers off one line.
+    """
+    result = register(places[observation.index], observation.points, observation.covariances)
+    return result.transform, result.covariance, observation
+
+
+def by_planes(observation: StickerObservation, body: MarkedBody, towards: Array) -> Solution:
+    """camera_from_body (4,4), its covariance (6,6) and the stickers used, by intersecting the three sticker planes.
+
+    ``towards`` (3,3): rough normals of planes A, B, C in the camera frame. Raises LostError that names the plane.
+    """
+    frame, covariance = frame_of_points(
+        observation.points, observation.covariances, body.plane_index[observation.index], towards
+    )
+    planes_from_body = invert(body.body_from_planes)
+    return frame @ planes_from_body, move_origin(frame, covariance, planes_from_body[:3, 3]), observation
+
+
+def move_origin(frame: Array, covariance: Array, origin: Array) -> Array:
+    """Covariance (6,6) of [dt, dphi] for another origin of the same rigid frame, ``origin`` (3,) in its own axes."""
+    lever = np.eye(6)
+    lever[:3, 3:] = -skew(frame[:3, :3] @ origin)
+    return lever @ covariance @ lever.T
+
+
+METHODS: tuple[str, ...] = ("registration", "planes")
+
 
 NOMINAL_TOLERANCE = 0.003  # m: nominal places are known to about a millimetre
 TAUGHT_TOLERANCE = 0.0005  # m: taught places are known to microns, points in a whole image to tenths of a millimetre

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from cmmsim.detection.detected_centres import DetectedCentres
 from cmmsim.detection.detectors import DEFAULT_DETECTOR, find_detector
 from cmmsim.detection.ellipse_fit import SMEAR_STEP_PX, FitLimits
-from cmmsim.geometry.eccentricity import centre_offset
+from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import Array, apply
-from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.geometry.triangulation import triangulate
+from cmmsim.geometry.stereo_rig import StereoRig, triangulate
 from cmmsim.radiometry.images import StereoImages, Windows
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.radiometry.optics import Optics

@@ -24,7 +24,7 @@ from scipy.stats import chi2
 
 from cmmsim.detection.ellipse_fit import EllipseFits, fit_ellipses
 from cmmsim.errors import LostError
-from cmmsim.geometry.outlines import sticker_outlines
+from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.pose_estimation.observation import LONGEST_SMEAR_PX, DetectionSettings, StickerWindows

@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 
 from dynamics.checks import check_type, floats, real, row_text, rows
 from dynamics.errors import DynamicsError, ShapeError, SingularPoseError, TravelError, UnreachablePoseError
-from dynamics.kinematics.expressions import evaluate
 from dynamics.kinematics.geometry import Rss6Geometry
+from dynamics.kinematics.rotation import evaluate
 from dynamics.robot import Robot
 
 LEAST_LEVERAGE = 0.05

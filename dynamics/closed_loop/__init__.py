@@ -8,7 +8,7 @@ Two implementations, tested to be equal: compiled C (see `closed_loop.h`) and pl
 """
 
 from dynamics.closed_loop.elasticity import JointElasticity
-from dynamics.closed_loop.loop_equilibrium import equilibrium
+from dynamics.closed_loop.preparation import equilibrium
 from dynamics.closed_loop.problem import (
     Controller,
     FrameTiming,

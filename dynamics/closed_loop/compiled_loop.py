@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dynamics.closed_loop.command_schedule import CommandSchedule, command_schedule
 from dynamics.closed_loop.problem import (
     LEFT_REACH,
     MEASURED_OUT_OF_REACH,
@@ -19,6 +18,7 @@ from dynamics.closed_loop.problem import (
     measurement,
 )
 from dynamics.closed_loop.run import ClosedLoopRun, empty_run, failure
+from dynamics.closed_loop.servo import CommandSchedule, command_schedule
 from dynamics.compilation import load_library, open_library
 from dynamics.errors import SimulationError
 from dynamics.kinematics.geometry import Rss6Geometry

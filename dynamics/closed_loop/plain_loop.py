@@ -6,9 +6,7 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
-from dynamics.closed_loop.command_schedule import CommandSchedule, command_schedule
-from dynamics.closed_loop.elastic_motion import elastic_functions, with_motors
-from dynamics.closed_loop.loop_motion import MotionFunctions
+from dynamics.closed_loop.motion import MotionFunctions, elastic_functions, with_motors
 from dynamics.closed_loop.problem import (
     LENGTH,
     MEASURED_OUT_OF_REACH,
@@ -20,8 +18,8 @@ from dynamics.closed_loop.problem import (
     own_command,
 )
 from dynamics.closed_loop.run import ClosedLoopRun, empty_run, failure
+from dynamics.closed_loop.servo import CommandSchedule, VisualServo, command_schedule
 from dynamics.closed_loop.stick_slip import Command, MotionStopped, State, StickSlipMotion
-from dynamics.closed_loop.visual_servo import VisualServo
 from dynamics.kinematics.geometry import Rss6Geometry
 from dynamics.rigid_body import functions as model
 from dynamics.robot import Robot

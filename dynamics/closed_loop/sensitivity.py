@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from dynamics.closed_loop.friction import FrictionLaw
-from dynamics.closed_loop.loop_motion import Command, Evaluation, MotionFunctions, State, compliance
+from dynamics.closed_loop.motion import Command, Evaluation, MotionFunctions, State, compliance
 from dynamics.closed_loop.problem import LENGTH
 from dynamics.parameters import COULOMB, RIGID_BODY, VISCOUS, split_parameters
 

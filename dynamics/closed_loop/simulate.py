@@ -5,7 +5,7 @@ import numpy as np
 from dynamics.checks import check_type, flag
 from dynamics.closed_loop import compiled_loop as compiled_closed_loop
 from dynamics.closed_loop import plain_loop as plain_closed_loop
-from dynamics.closed_loop.loop_checks import (
+from dynamics.closed_loop.preparation import (
     check_elasticity,
     check_kinds,
     check_start_pose,
@@ -13,8 +13,8 @@ from dynamics.closed_loop.loop_checks import (
     checked_loop_parameters,
     checked_lost,
     checked_rows,
+    equilibrium,
 )
-from dynamics.closed_loop.loop_equilibrium import equilibrium
 from dynamics.closed_loop.problem import (
     Controller,
     LoopProblem,

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from dynamics.closed_loop.friction import FrictionLaw
-from dynamics.closed_loop.loop_motion import Command, Evaluation, MotionFunctions, State, compliance
+from dynamics.closed_loop.motion import Command, Evaluation, MotionFunctions, State, compliance
 from dynamics.closed_loop.problem import LEFT_REACH, SINGULAR_MASS
 from dynamics.closed_loop.sensitivity import FRACTION, WEIGHT, StepSensitivity
 from dynamics.parameters import split_parameters

@@ -19,13 +19,80 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from dynamics.analysis.body_frames import BodyFrames, body_frames, crank_rotations
-from dynamics.analysis.physical_inertia import BodyInertias, grouped, physical_inertias
+from dynamics.analysis.inertia import BodyInertias, grouped, physical_inertias
 from dynamics.checks import check_choice, check_type, flag, real
-from dynamics.engines.mjcf_looks import add_assets, add_base_looks, add_crank_looks, add_link_looks, add_platform_looks
 from dynamics.errors import DynamicsError
-from dynamics.kinematics.geometry import LEGS
+from dynamics.kinematics.geometry import LEGS, Rss6Geometry
 from dynamics.parameters import COULOMB, VISCOUS, check_parameters
 from dynamics.robot import Robot
+
+# What the exported robot looks like: geoms without mass or contact, so that a viewer shows a 6-RSS robot.
+
+
+CRANK_RADIUS, LINK_RADIUS, BALL_RADIUS = 0.010, 0.006, 0.009
+PLATE_THICKNESS = 0.012
+COLOURS = {
+    "base": "0.35 0.37 0.40 1",
+    "crank": "0.85 0.45 0.15 1",
+    "link": "0.75 0.77 0.80 1",
+    "plate": "0.2 0.45 0.7 1",
+}
+
+
+def add_assets(root: Xml.Element) -> None:
+    """Sky, light and view, and the colours of the bodies."""
+    visual = Xml.SubElement(root, "visual")
+    Xml.SubElement(visual, "headlight", ambient="0.4 0.4 0.4", diffuse="0.5 0.5 0.5")
+    Xml.SubElement(root, "statistic", center="0 0 0.1", extent="0.6")
+    asset = Xml.SubElement(root, "asset")
+    sky = {"type": "skybox", "builtin": "gradient", "rgb1": "0.9 0.93 0.97", "rgb2": "0.5 0.55 0.6"}
+    Xml.SubElement(asset, "texture", sky, width="64", height="384")
+    for name, colour in COLOURS.items():
+        Xml.SubElement(asset, "material", name=name, rgba=colour)
+
+
+def add_base_looks(world: Xml.Element, geometry: Rss6Geometry) -> None:
+    """A plate below the cranks and a motor on each crank axis."""
+    centre, radius = _disc(geometry.base_joints)
+    drop = np.array([0.0, 0.0, 0.05])
+    _rod(world, "cylinder", centre - drop, centre - drop - [0, 0, 0.01], radius + 0.04, "base")
+    for foot, axis in zip(geometry.base_joints, geometry.crank_axes, strict=True):
+        _rod(world, "cylinder", foot - 0.04 * axis, foot + 0.012 * axis, 0.022, "base")
+
+
+def add_platform_looks(body: Xml.Element, geometry: Rss6Geometry) -> None:
+    """A plate through the platform's joints and a ball on each."""
+    centre, radius = _disc(geometry.platform_joints)
+    half = np.array([0.0, 0.0, PLATE_THICKNESS / 2])
+    _rod(body, "cylinder", centre - half, centre + half, radius, "plate")
+    for joint in geometry.platform_joints:
+        Xml.SubElement(body, "geom", type="sphere", pos=_text(joint), size=_text([BALL_RADIUS]), material="link")
+
+
+def add_crank_looks(body: Xml.Element, geometry: Rss6Geometry) -> None:
+    """A rod along x from the axis to the tip."""
+    _rod(body, "capsule", [0, 0, 0], [geometry.crank_length, 0, 0], CRANK_RADIUS, "crank")
+
+
+def add_link_looks(body: Xml.Element, geometry: Rss6Geometry) -> None:
+    """A rod along z from the tip to the platform, with a ball at the tip."""
+    _rod(body, "capsule", [0, 0, 0], [0, 0, geometry.link_length], LINK_RADIUS, "link")
+    Xml.SubElement(body, "geom", type="sphere", pos="0 0 0", size=_text([BALL_RADIUS]), material="link")
+
+
+def _disc(points: np.ndarray) -> tuple[np.ndarray, float]:
+    centre = points.mean(axis=0)
+    return centre, float(np.linalg.norm(points - centre, axis=1).max())
+
+
+def _rod(parent: Xml.Element, kind: str, start: ArrayLike, end: ArrayLike, radius: float, material: str) -> None:
+    ends = np.concatenate([np.asarray(start, dtype=float), np.asarray(end, dtype=float)])
+    Xml.SubElement(parent, "geom", type=kind, fromto=_text(ends), size=_text([radius]), material=material)
+
+
+def _text(values: ArrayLike) -> str:
+    return " ".join(f"{value:.6g}" for value in np.asarray(values, dtype=float))
+
 
 # MuJoCo silently lowers larger ones.
 MAX_IMPEDANCE = 0.9999
@@ -128,16 +195,16 @@ def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver) -> None:
     Xml.SubElement(
         root,
         "option",
-        timestep=_text(solver.timestep_s),
+        timestep=_numbers(solver.timestep_s),
         integrator=solver.integrator,
         solver="Newton",
         tolerance="1e-14",
         iterations="50",
-        gravity=_text(robot.geometry.gravity),
+        gravity=_numbers(robot.geometry.gravity),
     )
     stiff = {
-        "solref": _text([solver.time_constant_steps * solver.timestep_s, 1.0]),
-        "solimp": _text([solver.impedance, solver.impedance, 1e-3, 0.5, 2.0]),
+        "solref": _numbers([solver.time_constant_steps * solver.timestep_s, 1.0]),
+        "solimp": _numbers([solver.impedance, solver.impedance, 1e-3, 0.5, 2.0]),
     }
     default = Xml.SubElement(root, "default")
     _add_comment(default, "Stiffest stable loops: time constant of two steps, critically damped, impedance near 1.")
@@ -151,11 +218,11 @@ def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver) -> None:
 def _add_platform(world: Xml.Element, robot: Robot, inertias: BodyInertias) -> None:
     pose = robot.home_pose
     turned = quaternion(Rotation.from_euler("XYZ", pose[3:6]).as_matrix())
-    body = Xml.SubElement(world, "body", name="platform", pos=_text(pose[:3]), quat=_text(turned))
+    body = Xml.SubElement(world, "body", name="platform", pos=_numbers(pose[:3]), quat=_numbers(turned))
     Xml.SubElement(body, "freejoint", name="platform")
     _add_inertia(body, np.zeros(3), inertias.values[0])
     for leg, joint in enumerate(robot.geometry.platform_joints):
-        Xml.SubElement(body, "site", name=f"platform_joint{leg + 1}", pos=_text(joint))
+        Xml.SubElement(body, "site", name=f"platform_joint{leg + 1}", pos=_numbers(joint))
     add_platform_looks(body, robot.geometry)
 
 
@@ -169,23 +236,23 @@ def _add_leg(
 ) -> None:
     geometry, number = robot.geometry, leg + 1
     at_zero = crank_rotations(robot, np.zeros(LEGS))[leg]
-    place = {"pos": _text(geometry.base_joints[leg]), "quat": _text(quaternion(at_zero))}
+    place = {"pos": _numbers(geometry.base_joints[leg]), "quat": _numbers(quaternion(at_zero))}
     crank = Xml.SubElement(world, "body", name=f"crank{number}", attrib=place)
-    rubbing = {"frictionloss": _text(friction[0]), "damping": _text(friction[1])}
+    rubbing = {"frictionloss": _numbers(friction[0]), "damping": _numbers(friction[1])}
     Xml.SubElement(crank, "joint", name=f"joint{number}", type="hinge", axis="0 0 1", attrib=rubbing)
     _add_inertia(crank, np.array([geometry.crank_length / 2, 0, 0]), inertias.values[number])
     add_crank_looks(crank, geometry)
     relative = quaternion(frames.crank[leg].T @ frames.link[leg])
-    tip = {"pos": _text([geometry.crank_length, 0, 0]), "quat": _text(relative)}
+    tip = {"pos": _numbers([geometry.crank_length, 0, 0]), "quat": _numbers(relative)}
     link = Xml.SubElement(crank, "body", name=f"link{number}", attrib=tip)
     Xml.SubElement(link, "joint", name=f"tip{number}", type="ball")
     _add_inertia(link, np.array([0, 0, geometry.link_length / 2]), inertias.values[LEGS + number])
-    Xml.SubElement(link, "site", name=f"link_end{number}", pos=_text([0, 0, geometry.link_length]))
+    Xml.SubElement(link, "site", name=f"link_end{number}", pos=_numbers([0, 0, geometry.link_length]))
     add_link_looks(link, geometry)
 
 
 def _add_inertia(body: Xml.Element, centre: np.ndarray, inertia: np.ndarray) -> None:
-    Xml.SubElement(body, "inertial", pos=_text(centre), mass=_text(inertia[0]), diaginertia=_text(inertia[1:]))
+    Xml.SubElement(body, "inertial", pos=_numbers(centre), mass=_numbers(inertia[0]), diaginertia=_numbers(inertia[1:]))
 
 
 def _add_loops_and_motors(root: Xml.Element) -> None:
@@ -201,7 +268,7 @@ def _add_home(root: Xml.Element, robot: Robot, frames: BodyFrames) -> None:
     for angle in frames.angle:
         coordinates += [angle, 1.0, 0.0, 0.0, 0.0]
     keyframe = Xml.SubElement(root, "keyframe")
-    Xml.SubElement(keyframe, "key", name="home", qpos=_text(coordinates))
+    Xml.SubElement(keyframe, "key", name="home", qpos=_numbers(coordinates))
 
 
 def _add_comment(parent: Xml.Element, text: str) -> None:
@@ -209,6 +276,6 @@ def _add_comment(parent: Xml.Element, text: str) -> None:
     parent.append(Xml.Comment(f" {re.sub('-(?=-)', '- ', NOT_IN_XML.sub('?', text))} "))
 
 
-def _text(values: ArrayLike) -> str:
+def _numbers(values: ArrayLike) -> str:
     """Numbers as MJCF writes them, with all their digits."""
     return " ".join(repr(float(value)) for value in np.atleast_1d(np.asarray(values, dtype=float)))

@@ -1,6 +1,32 @@
 """Rotations of the platform: R = Rx(alpha) Ry(beta) Rz(gamma) (eq. 1) and its rates (eq. 2 and 38), in CasADi."""
 
 import casadi as ca
+import numpy as np
+
+# From CasADi expressions to functions, and from functions to arrays.
+
+
+def function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
+    """A CasADi function with dense outputs, in which every common subexpression is evaluated once.
+
+    Legs share rotations and lever arms: forward dynamics halves in size and time.
+    """
+    return ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs]))
+
+
+def symmetric_from_lower(matrix: ca.SX) -> ca.SX:
+    """A matrix known to be symmetric, its upper triangle taken from the lower: each entry is formed once."""
+    return ca.tril2symm(ca.tril(matrix))
+
+
+def evaluate(function: ca.Function, *batches: np.ndarray) -> list[np.ndarray]:
+    """All outputs (N, rows, columns) of a function over batches (N, columns) of its arguments, NaN included."""
+    if not len(batches[0]):
+        return [np.zeros((0, *function.size_out(index))) for index in range(function.n_out())]
+    values = function(*[batch.T for batch in batches])
+    outputs = values if isinstance(values, tuple) else (values,)
+    count = len(batches[0])
+    return [np.asarray(v, dtype=float).reshape(v.shape[0], count, -1).transpose(1, 0, 2) for v in outputs]
 
 
 def rotation_matrix(angles: ca.SX) -> ca.SX:

@@ -2,13 +2,12 @@
 
 import casadi as ca
 
-from dynamics.kinematics.expressions import function
 from dynamics.kinematics.geometry import Rss6Geometry
 from dynamics.kinematics.inverse_kinematics import leg_vectors, loop_closure, reach_margin
 from dynamics.kinematics.jacobians import joint_jacobian, loop_jacobians, pose_jacobian
-from dynamics.kinematics.rotation import pose_rate_to_twist, twist_bias
+from dynamics.kinematics.rotation import function, pose_rate_to_twist, twist_bias
 from dynamics.parameters import COULOMB, PARAMETER_NAMES, RIGID_BODY, VISCOUS
-from dynamics.rigid_body.pose_space_motion import equation_of_motion, motion_derivatives, rate_map_derivative
+from dynamics.rigid_body.equation_of_motion import equation_of_motion, motion_derivatives, rate_map_derivative
 from dynamics.rigid_body.virtual_work import (
     coriolis_matrix,
     friction_regressor,

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from dynamics.kinematics.expressions import symmetric_from_lower
 from dynamics.kinematics.inverse_kinematics import LegVectors
 from dynamics.kinematics.jacobians import crank_leverage
+from dynamics.kinematics.rotation import symmetric_from_lower
 
 
 @dataclass(frozen=True)

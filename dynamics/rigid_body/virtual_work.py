@@ -6,12 +6,16 @@ positive definite, G the wrench that holds the robot up, and tau_g = M twist_dot
 
 import casadi as ca
 
-from dynamics.kinematics.expressions import symmetric_from_lower
 from dynamics.kinematics.geometry import LEGS, Rss6Geometry
 from dynamics.kinematics.inverse_kinematics import LegVectors, leg_vectors, platform_arms
-from dynamics.kinematics.jacobian_rates import crank_jacobian_rate, link_jacobian_rate, moving_leg
-from dynamics.kinematics.jacobians import crank_jacobian, link_jacobian
-from dynamics.kinematics.rotation import rotation_matrix
+from dynamics.kinematics.jacobians import (
+    crank_jacobian,
+    crank_jacobian_rate,
+    link_jacobian,
+    link_jacobian_rate,
+    moving_leg,
+)
+from dynamics.kinematics.rotation import rotation_matrix, symmetric_from_lower
 from dynamics.rigid_body.leg_dynamics import leg_columns, leg_force, leg_mass, leg_motion, link_axes
 
 

@@ -3,9 +3,9 @@
 import sys
 from pathlib import Path
 
-from identify.accuracy.errors import AccuracyError
+from identify.accuracy.figure import AccuracyError
 from identify.accuracy.saved import read_saved
-from identify.accuracy.table import markdown_table
+from identify.accuracy.session import markdown_table
 
 
 def main(arguments: list[str]) -> int | str:

@@ -23,7 +23,7 @@ from identify.accuracy.testbed import (
 )
 
 if TYPE_CHECKING:
-    from identify.accuracy.recorder import Accuracy
+    from identify.accuracy.figure import Accuracy
 
 __all__ = ["accuracy", "cmmsim_robot", "cmmsim_scenario", "cmmsim_seed", "cmmsim_sensor", "cmmsim_taught"]
 
@@ -72,7 +72,7 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture
 def accuracy(request: pytest.FixtureRequest) -> Accuracy:
     """Record figures of accuracy: `accuracy.record(name, value, ...)`, `accuracy.sample(name, values, ...)`."""
-    from identify.accuracy.recorder import Accuracy
+    from identify.accuracy.figure import Accuracy
 
     properties = request.node.user_properties
     properties[:] = [entry for entry in properties if entry[0] != PROPERTY]  # of an earlier try of the same test

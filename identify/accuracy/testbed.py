@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from identify.accuracy.errors import AccuracyError
+from identify.accuracy.figure import AccuracyError
 
 if TYPE_CHECKING:
     from cmmsim import Sensor, Taught

@@ -55,7 +55,7 @@ def acceptance(
     """
     from identify.files.run_folder import new_run_folder
     from identify.verification.acceptance_procedure import chosen_standards, do, prepare, require_limit
-    from identify.verification.result import acceptance_entry
+    from identify.verification.acceptance_report import acceptance_entry
 
     require_limit(limit_um)
     standards = chosen_standards(standard)
@@ -72,10 +72,10 @@ def acceptance(
 def _write(folder: Path, entry: dict[str, Any], run: Any, limit_um: float) -> None:
     """The report's files; the figures of tests that were not done are left out."""
     from identify.files.atomic import write_text
-    from identify.files.result_file import save_result
+    from identify.files.run_folder import save_result
     from identify.reporting.figures import save_figure
-    from identify.verification import figures as draw
-    from identify.verification.tables import acceptance_markdown
+    from identify.verification import sensor_figures as draw
+    from identify.verification.acceptance_report import acceptance_markdown
 
     save_result(folder / "acceptance.json", entry)
     write_text(folder / "acceptance.md", acceptance_markdown(entry))

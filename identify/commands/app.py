@@ -19,13 +19,10 @@ from identify.commands.study import STUDY_HELP, study
 from identify.commands.variation import variation
 from identify.commands.workspace import workspace
 from identify.errors import IdentifyError, ScenarioError
-from identify.files.result_file import load_result
-from identify.files.run_folder import RunFolder, new_run_folder
-from identify.interrupts import STOPPED
-from identify.progress import terminal_progress
+from identify.files.run_folder import RunFolder, load_result, new_run_folder
+from identify.progress import print_warnings, terminal_progress
+from identify.runtime import STOPPED, stoppable
 from identify.scenario import Scenario, load_scenario, scenario_names
-from identify.stopping import stoppable
-from identify.terminal import print_warnings
 
 HELP = """
 Identify a parallel robot from rendered stereo images, and prove how good the result is.
@@ -228,7 +225,7 @@ def excite(
     name = f"excite-{chosen.name}-{seed}" if compare else f"{chosen.name}-{seed}"
     folder = new_run_folder(out or Path("runs") / name)
     if compare:
-        from identify.excitation import compare_excitation
+        from identify.commands import compare_excitation
 
         compare_excitation.compare(chosen, seed, folder.path, terminal_progress(quiet), quiet)
         return
@@ -321,7 +318,7 @@ def _warned(folder: RunFolder) -> dict[str, Any]:
 
 def _summary() -> Any:
     """What a run says of itself, imported late as the stages are."""
-    from identify.reporting import run_summary
+    from identify.reporting import tables as run_summary
 
     return run_summary
 

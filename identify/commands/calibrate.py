@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from identify.errors import OutputFolderError, ScenarioError
-from identify.progress import Progress, terminal_progress
-from identify.terminal import print_table, print_warnings
+from identify.progress import Progress, print_table, print_warnings, terminal_progress
 
 if TYPE_CHECKING:
     import numpy as np
@@ -100,8 +99,8 @@ def calibrate(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary; warnings stay.")] = False,
 ) -> None:
     """Calibrate a stereo camera from pictures of a board, or render such pictures."""
+    from cmmsim.calibration import read_board
     from cmmsim.calibration import read_board, sensor_template
-    from identify.files.run_folder import new_run_folder
 
     folder = new_run_folder(out).path
     progress = terminal_progress(quiet)
@@ -166,9 +165,9 @@ def _write(folder: Path, found: "Calibration", template: "SensorTemplate | None"
     """All files, the texts made before the first is written; a line where no sensor can have these cameras."""
     from cmmsim.calibration import as_dict, rig_tables
     from identify.files.atomic import write_text
-    from identify.files.result_file import save_result
+    from identify.files.run_folder import save_result
     from identify.reporting.figures import save_figure
-    from identify.verification.calibration_figures import coverage_figure, distortion_figure, residual_figure
+    from identify.verification.sensor_figures import coverage_figure, distortion_figure, residual_figure
 
     texts = {"rig.toml": rig_tables(found)}
     sensor = None if template is None else template.filled(found)

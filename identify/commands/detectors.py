@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from identify.progress import terminal_progress
-from identify.terminal import print_table
+from identify.progress import print_table, terminal_progress
 
 if TYPE_CHECKING:
-    from cmmsim.detector_leaderboard import Score
-    from cmmsim.drawn_discs import Condition
+    from cmmsim.detector_leaderboard import Condition, Score
 
 RADII_PX, NOISES_PERCENT, TILTS_DEG = (2.5, 5.0, 10.0), (0.2, 1.0, 5.0), (0.0, 30.0, 60.0)
 
@@ -49,13 +47,11 @@ def detectors(
     """
     import numpy as np
 
-    from cmmsim.detector_leaderboard import CONFIDENCE, compete
-    from cmmsim.drawn_discs import Condition, scene_of, working_point
+    from cmmsim.detector_leaderboard import CONFIDENCE, Condition, compete, scene_of, working_point
     from cmmsim.files.sensor_file import read_sensor_file
-    from identify.files.result_file import save_result
-    from identify.files.run_folder import new_run_folder
+    from identify.files.run_folder import new_run_folder, save_result
     from identify.reporting.figures import save_figure
-    from identify.verification.detectors_figure import detectors_figure
+    from identify.verification.sensor_figures import detectors_figure
 
     file = read_sensor_file(sensor)
     at_work = working_point(file)

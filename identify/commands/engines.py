@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from identify.errors import OutputFolderError, VerificationError
-from identify.progress import terminal_progress
-from identify.terminal import print_table
+from identify.progress import print_table, terminal_progress
 
 if TYPE_CHECKING:
     from dynamics import Robot
@@ -59,7 +58,7 @@ def mjcf(
     """Write the robot as MJCF, a closed chain that MuJoCo loads."""
     from dynamics import load_robot
     from dynamics.engines.mjcf import mjcf_text
-    from identify.commands.parameter_choice import choose_parameters
+    from identify.loop_parameters import choose_parameters
 
     with terminal_progress(quiet).stage("export", 1) as advance:
         chosen_robot = load_robot(robot)
@@ -76,8 +75,7 @@ def mjcf(
 
 def _changes(robot: "Robot", parameters: "Array") -> list[str]:
     """Lines: the inertias that the export changed, and by how much that changes the robot's accelerations."""
-    from dynamics.analysis.inertia_effect import acceleration_changes
-    from dynamics.analysis.physical_inertia import grouped, physical_inertias
+    from dynamics.analysis.inertia import acceleration_changes, grouped, physical_inertias
 
     inertias = physical_inertias(parameters, allow_changes=True)
     if not inertias.changes:
@@ -100,11 +98,10 @@ def verify_model(
 ) -> None:
     """Compare the model with MuJoCo in the paper's loop (figure 7): writes verification.json and figure8.png."""
     from dynamics import load_robot
-    from identify.files.result_file import save_result
-    from identify.files.run_folder import new_run_folder
+    from identify.files.run_folder import new_run_folder, save_result
     from identify.reporting.figures import save_figure
-    from identify.verification import model_verification
-    from identify.verification.verification_figure import figure_8
+    from identify.verification import figure7 as model_verification
+    from identify.verification.figure7 import figure_8
 
     chosen = load_robot(robot)
     folder = new_run_folder(out or Path("runs") / f"verify-{chosen.name}").path

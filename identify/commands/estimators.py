@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from identify.files.run_folder import RunFolder
-from identify.progress import terminal_progress
-from identify.terminal import print_table
+from identify.progress import print_table, terminal_progress
 
 if TYPE_CHECKING:
     from identify.experiment.joint_instruments import JointInstruments
@@ -38,10 +37,10 @@ def estimators(
     """
     from identify.estimators.registry import choose
     from identify.experiment.joint_instruments import JointInstruments
-    from identify.files.result_file import save_result
-    from identify.record.made_of import check_folder
+    from identify.files.run_folder import save_result
+    from identify.record.provenance import check_folder
     from identify.reporting.figures import save_figure
-    from identify.validation.estimators_figure import estimators_figure
+    from identify.validation.estimator_comparison import estimators_figure
 
     folder = RunFolder(out)
     folder.require("scenario.toml", "experiment.nc", "validation.nc")

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from identify.errors import StudyError, StudyInterrupted
-from identify.interrupts import STOPPED
-from identify.progress import terminal_progress
-from identify.terminal import print_table
+from identify.progress import print_table, terminal_progress
+from identify.runtime import STOPPED
 
 if TYPE_CHECKING:
     from identify.studies.runner import Outcome, Workers
@@ -149,8 +148,8 @@ def _workers(scheduler: str | None, workers: int | None) -> "Workers":
         from identify.studies.runner import in_this_process
 
         return in_this_process
-    from identify.cores import cores
-    from identify.studies.dask_runner import local_cluster, running_cluster
+    from identify.runtime import cores
+    from identify.studies.dask_cluster import local_cluster, running_cluster
 
     return partial(running_cluster, scheduler) if scheduler else partial(local_cluster, workers or cores())
 
@@ -204,8 +203,8 @@ def _list() -> None:
 
 
 def _list_kinds() -> None:
-    from identify.studies.rows.rows import KINDS
-    from identify.studies.units import factor_unit
+    from identify.studies.rows.kinds import KINDS
+    from identify.studies.table import factor_unit
 
     for kind in KINDS.values():
         typer.echo(f"{kind.name}: {kind.what}\n\nIt reads {kind.reads}, and its options; no other factor is taken.\n")

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from identify.files.run_folder import RunFolder
-from identify.progress import Progress, terminal_progress
-from identify.terminal import print_table
+from identify.progress import Progress, print_table, terminal_progress
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -47,7 +46,7 @@ def variation(
     """
     from dynamics import load_robot
     from identify.record import recording
-    from identify.record.made_of import check_folder
+    from identify.record.provenance import check_folder
     from identify.reporting.variation_tables import variation_table
     from identify.scenario import load_scenario
     from identify.validation.variation import identify_each
@@ -76,7 +75,7 @@ def _record_designed(
     folder: RunFolder, scenario: "Scenario", robot: "Robot", count: int, workers: int | None, progress: Progress
 ) -> list["xr.Dataset"]:
     from identify.record import recording
-    from identify.trajectory_file import load_trajectories
+    from identify.trajectory import load_trajectories
     from identify.validation.variation import designed_runs
 
     seed = load_trajectories(folder.trajectories).seed
@@ -87,7 +86,7 @@ def _record_designed(
 
 def _write(folder: RunFolder, found: "Variation", runs: str, table: "Table") -> None:
     from identify.files.atomic import write_text
-    from identify.files.result_file import save_result
+    from identify.files.run_folder import save_result
     from identify.reporting.figures import save_figure
     from identify.reporting.variation_tables import variation_entry, variation_figure
 

@@ -21,8 +21,7 @@ def workspace(
     from identify.files.atomic import write_text
     from identify.files.run_folder import new_run_folder
     from identify.reporting.figures import save_figure
-    from identify.verification.workspace_figure import conditioning_figure, travel_figure
-    from identify.verification.workspace_map import map_workspace
+    from identify.verification.workspace_map import conditioning_figure, map_workspace, travel_figure
 
     chosen = load_robot(robot)
     folder = new_run_folder(out or Path("runs") / f"workspace-{chosen.name}").path

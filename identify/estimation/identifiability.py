@@ -1,5 +1,6 @@
-"""Which quantities a record identifies: one criterion for parameters and for groups of them.
+"""What the records decide of each parameter and group: whether it is identified, in what interval, and at what risk.
 
+Which quantities a record identifies: one criterion for parameters and for groups of them.
 A quantity counts as identified when the record
 
     at least halves the standard deviation that the starting guess leaves, and
@@ -11,6 +12,19 @@ that of its guess. Of friction that is guessed to be zero it is a tenth of the t
 size of a group is the root of the summed squares of what its members contribute. So a difference of large masses is as
 large as they are, though the guess may have it vanish: known to a fraction of that, it is known to be small, while its
 own relative error may be anything.
+
+What an identification says about the base parameters: the combinations that a record can show.
+A group's estimate and standard deviation follow from those of its parameters by linear propagation; it is often known
+well where none of its members is.
+
+Which parameters a record tells on their own, and which only with the help of the starting guess.
+Poses show the base parameters, sums of parameters, and the gains; the scale anchor adds what it measures. A parameter
+that is none of these, nor a combination of them, may be estimated with a small standard deviation all the same: where
+the guess knows the other members of a sum well enough for that, however vaguely in their own units. Such an estimate
+is as good as what the guess says of them, and its interval holds the truth where that does. A mass shown only in
+link4.Ixx - 0.0227 link4.mass is one: it rests on the guess of link4.Ixx.
+
+The common factor of all parameters counts as known by its anchor; where that is the prior, no parameter is on its own.
 """
 
 from dataclasses import dataclass
@@ -19,10 +33,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynamics import Robot
-from dynamics.parameters import COULOMB_NAMES, VISCOUS_NAMES
+from dynamics.parameters import COULOMB_NAMES, JOINT_PID_NAMES, VISCOUS_NAMES
 from identify.arrays import Array
-from identify.estimation.propagation import combined_std
+from identify.estimation.base_parameters import (
+    BaseParameters,
+    Conditioning,
+    base_parameters,
+    conditioning,
+    rank_by_threshold,
+    reference_regressor,
+    structural_regressor,
+)
+from identify.estimation.bounded_least_squares import Solution
+from identify.estimation.bounds import bounded_estimate, combined_std
+from identify.estimation.covariance import Uncertainty
+from identify.estimation.explanation import Explanation
+from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_search import bounds_of
+from identify.estimation.scale_anchor import ScaleAnchor
 from identify.loop_parameters import NAMES, StartingGuess, holding_torque
+from identify.scenario import Scenario
 
 IDENTIFIABLE_SHARE = 0.5
 """Of the guess's standard deviation and of the size: what the record may leave of an identified quantity."""
@@ -52,3 +82,126 @@ def identifiability(guess: StartingGuess, robot: Robot, model_holds: bool = True
     friction = np.isin(NAMES, COULOMB_NAMES + VISCOUS_NAMES)
     unsaid = np.where(friction, FRICTION_SHARE * holding_torque(robot, guess.values[: len(robot.parameter_names)]), 1.0)
     return Identifiability(guess.std, np.where(guess.values != 0, np.abs(guess.values), unsaid), model_holds)
+
+
+@dataclass(frozen=True)
+class GroupEstimates:
+    """Base parameters of the 64 dynamic parameters, one row each: what they are, and what is known of them.
+
+    combinations (rank, 64); initial, estimate, std (rank,), SI units of the leading parameter; identifiable (rank,).
+    """
+
+    names: tuple[str, ...]
+    expressions: tuple[str, ...]
+    combinations: Array
+    initial: Array
+    estimate: Array
+    std: Array
+    identifiable: NDArray[np.bool_]
+
+
+def group_rows(base: BaseParameters) -> Array:
+    """The groups as combinations (rank, 67) of all parameters: the gains of the joint PID belong to none."""
+    return np.pad(base.combinations, ((0, 0), (0, len(JOINT_PID_NAMES))))
+
+
+def group_estimates(
+    base: BaseParameters, guess: StartingGuess, criterion: Identifiability, estimate: Array, covariance: Array
+) -> GroupEstimates:
+    """Estimates of the groups from parameters (67,) and their covariance (67, 67)."""
+    rows = group_rows(base)
+    return GroupEstimates(
+        names=base.group_names(),
+        expressions=base.expressions(),
+        combinations=base.combinations,
+        initial=rows @ guess.values,
+        estimate=rows @ estimate,
+        std=combined_std(rows, covariance),
+        identifiable=criterion.judge(rows, covariance),
+    )
+
+
+ROUNDING = 1e-6
+"""Of a unit vector: what may be left of it outside the combinations that are shown, in units of the sizes."""
+
+
+def rests_on_prior(base: BaseParameters, anchor: ScaleAnchor, estimate: Array, sizes: Array) -> NDArray[np.bool_]:
+    """Whether each of the 67 parameters is no combination of what record and anchor show.
+
+    estimate (67,): the direction of the common factor; sizes (67,): the unit in which each parameter is counted.
+    """
+    gains = np.eye(len(sizes))[base.combinations.shape[1] :]
+    shown = np.concatenate([group_rows(base), gains, anchor.row()[0]]) * sizes
+    if anchor.name == "prior":
+        factor = estimate / sizes
+        shown = shown - np.outer(shown @ factor, factor) / (factor @ factor)
+    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
+    _, singular, directions = np.linalg.svd(shown, full_matrices=False)
+    span = directions[singular > ROUNDING * singular[0]]
+    outside = np.eye(len(sizes)) - span.T @ span
+    return np.asarray(np.linalg.norm(outside, axis=1) > ROUNDING)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """identifiable, rests_on_prior (67,) bool; intervals (67, 2) and group_intervals: 95 %, cut at the bounds;
+    base_rank: independent groups that the references excite by the paper's rule; active_bounds: what holds the estimate
+    back; warnings: what a reader must know before believing any of it."""
+
+    identifiable: NDArray[np.bool_]
+    rests_on_prior: NDArray[np.bool_]
+    intervals: Array
+    groups: GroupEstimates
+    group_intervals: Array
+    conditioning: Conditioning
+    base_rank: int
+    active_bounds: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def judge(
+    problem: OutputErrorProblem,
+    scenario: Scenario,
+    solution: Solution,
+    uncertainty: Uncertainty,
+    explanation: Explanation,
+) -> Judgement:
+    """Judge what a search found, given its uncertainty and how well it explains the records."""
+    robot, guess, estimate = problem.runs[0].robot, problem.guess, solution.parameters
+    base, known = base_parameters(structural_regressor(robot)), problem.known_information()
+    criterion = identifiability(guess, robot, model_holds=explanation.model_holds)
+    identifiable = criterion.judge(np.eye(len(NAMES)), uncertainty.covariance)
+    conditioned = conditioning(uncertainty.information, known, base, guess, estimate)
+    bounded = bounded_estimate(
+        estimate,
+        solution.at_bound,
+        uncertainty.gradient,
+        uncertainty.information + known,
+        uncertainty.covariance,
+        bounds_of(problem, scenario),
+    )
+    of_the_records = (warning for run in problem.runs for warning in run.warnings())
+    return Judgement(
+        identifiable=identifiable,
+        rests_on_prior=identifiable & rests_on_prior(base, problem.anchor, estimate, criterion.sizes),
+        intervals=bounded.intervals(np.eye(len(NAMES))),
+        groups=group_estimates(base, guess, criterion, estimate, uncertainty.covariance),
+        group_intervals=bounded.intervals(group_rows(base)),
+        conditioning=conditioned,
+        base_rank=_excited_rank(problem, scenario),
+        active_bounds=bounded.active_bounds,
+        warnings=(
+            *of_the_records,
+            *uncertainty.warnings(),
+            *explanation.warnings(),
+            *bounded.warnings(),
+            *conditioned.warnings(),
+        ),
+    )
+
+
+def _excited_rank(problem: OutputErrorProblem, scenario: Scenario) -> int:
+    """Independent groups that the records' references excite, by the paper's rule."""
+    rate_hz = scenario.timing.frame_rate_hz
+    excited = [reference_regressor(run.robot, run.reference, rate_hz) for run in problem.runs]
+    return rank_by_threshold(np.concatenate(excited), scenario.identification.qr_threshold)

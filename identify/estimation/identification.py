@@ -13,26 +13,24 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from dynamics import DynamicsError, Robot
-from dynamics.closed_loop.loop_checks import checked_loop_parameters
+from dynamics.closed_loop.preparation import checked_loop_parameters
 from identify.arrays import Array
-from identify.cores import one_thread
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation import warm_start
+from identify.estimation.base_parameters import Conditioning
 from identify.estimation.bounded_least_squares import Solution
-from identify.estimation.conditioning import Conditioning
-from identify.estimation.estimate_covariance import DRAWS, Uncertainty, estimate_uncertainty
-from identify.estimation.explanation import Explanation, explanation
-from identify.estimation.group_estimates import GroupEstimates
-from identify.estimation.judgement import Judgement, judge
+from identify.estimation.covariance import DRAWS, Uncertainty, estimate_uncertainty
+from identify.estimation.explanation import Explanation, Whiteness, explanation
+from identify.estimation.identifiability import GroupEstimates, Judgement, judge
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor
-from identify.estimation.whiteness import Whiteness
 from identify.loop_parameters import NAMES, StartingGuess, starting_guess
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
-from identify.record.recorded_origin import recorded_seed
+from identify.record.provenance import recorded_seed
 from identify.record.recorded_run import recorded_run
+from identify.runtime import one_thread
 from identify.scenario import Scenario
 
 

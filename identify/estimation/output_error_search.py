@@ -13,10 +13,9 @@ from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.bounded_least_squares import Problem, Solution, StopCriteria, minimise
-from identify.estimation.multiple_shooting import MultipleShooting
+from identify.estimation.bounds import InCoordinates, ParameterBounds, parameter_bounds
+from identify.estimation.multiple_shooting import MultipleShooting, measured_states, segments
 from identify.estimation.output_error import OutputErrorProblem
-from identify.estimation.parameter_bounds import InCoordinates, ParameterBounds, parameter_bounds
-from identify.estimation.record_segments import measured_states, segments
 from identify.progress import Advance, Progress
 from identify.scenario import Scenario
 

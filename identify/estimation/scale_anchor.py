@@ -17,7 +17,7 @@ import xarray as xr
 
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
-from identify.files.attribute_text import shown
+from identify.files.dataset import shown
 from identify.loop_parameters import NAMES, index_of, unit_of
 
 MEASURED_PARAMETER = {"platform_mass": "platform.mass", "joint_gain": "joint_pid.lp"}

@@ -16,8 +16,15 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.warm_start import REWEIGHTINGS
 from identify.estimators.evidence import Estimate, Evidence
-from identify.estimators.least_squares import fit_equations, row_noise, standard_deviations
-from identify.estimators.torque_equations import TorqueEquations, nearest_admissible, prior_of, torque_equations
+from identify.estimators.least_squares import (
+    TorqueEquations,
+    fit_equations,
+    nearest_admissible,
+    prior_of,
+    row_noise,
+    standard_deviations,
+    torque_equations,
+)
 from identify.loop_parameters import NAMES, StartingGuess
 
 MAX_ITERATIONS = 10

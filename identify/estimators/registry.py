@@ -4,10 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from identify.errors import ScenarioError
-from identify.estimators.encoder_route import encoder_route
 from identify.estimators.evidence import Estimate, Evidence
 from identify.estimators.instrumental_variables import instrumental_variables
-from identify.estimators.least_squares import least_squares, weighted_least_squares
+from identify.estimators.least_squares import encoder_route, least_squares, weighted_least_squares
 from identify.estimators.output_error_routes import closed_loop, command_driven, known_pid, warm_start_alone
 from identify.estimators.total_least_squares import total_least_squares
 

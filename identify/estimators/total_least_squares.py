@@ -19,11 +19,12 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.warm_start import REWEIGHTINGS
 from identify.estimators.evidence import Estimate, Evidence
-from identify.estimators.least_squares import fit_equations, information
-from identify.estimators.torque_equations import (
+from identify.estimators.least_squares import (
     DYNAMIC,
     UNKNOWNS,
     TorqueEquations,
+    fit_equations,
+    information,
     nearest_admissible,
     prior_of,
     torque_equations,

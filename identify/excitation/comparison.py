@@ -1,25 +1,29 @@
-"""The three methods side by side: same criterion, same seed, same random candidates."""
+"""The methods of excitation side by side: same criterion, same seed, same random candidates; with a figure."""
 
 import time
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from dynamics import Robot
 from dynamics.closed_loop import prepare
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import Worst
-from identify.excitation.criterion_information import knowledge, log_information
-from identify.excitation.design import motion_check, prepare_search
-from identify.excitation.evolutionary_search import FEWEST_MEMBERS
+from identify.excitation.design import admissible_trajectories, motion_check, prepare_search
+from identify.excitation.information import knowledge, log_information
 from identify.excitation.motion import sample_times
 from identify.excitation.observability import log_observability, observability_index
-from identify.excitation.random_trajectories import admissible_trajectories
+from identify.excitation.search import FEWEST_MEMBERS
+from identify.files.figure import blank_figure
 from identify.progress import Progress
 from identify.random_streams import EXCITATION, SEARCH, child
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
+
+# The three methods side by side: same criterion, same seed, same random candidates.
+
 
 METHODS = ("random", "evolutionary", "gradient")
 
@@ -108,3 +112,44 @@ def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progr
             )
         )
     return Comparison(settings.criterion, seed, count, prepared, tuple(entries))
+
+
+# The trajectories of all methods: paths of the pose and crank angles with their limits.
+
+
+COMPONENTS = ("x", "y", "z", "α", "β", "γ")
+POINTS = 1000
+
+
+def comparison_figure(robot: Robot, scenario: Scenario, comparison: Comparison) -> Figure:
+    """One column a method: position, orientation and crank angles over one period, limits dashed."""
+    settings = scenario.excitation
+    figure = blank_figure(5 * len(comparison.entries), 9)
+    panels = figure.subplots(3, len(comparison.entries), sharex=True, sharey="row", squeeze=False)
+    time = np.linspace(0.0, 1.0 / settings.fundamental_hz, POINTS)
+    travel = robot.travel_limit - settings.travel_margin_rad
+    boxes = (1e3 * settings.position_amplitude_m, 1e3 * settings.orientation_amplitude_rad)
+    for column, entry in enumerate(comparison.entries):
+        poses = entry.trajectory.pose(time)
+        away = 1e3 * (poses - robot.home_pose)
+        angles = robot.inverse_kinematics(poses)
+        rows = [
+            (away[:, :3], COMPONENTS[:3], boxes[0]),
+            (away[:, 3:], COMPONENTS[3:], boxes[1]),
+            (angles, [f"crank {k}" for k in range(1, 7)], travel),
+        ]
+        for axes, (values, names, limit) in zip(panels[:, column], rows, strict=True):
+            for name, line in zip(names, values.T, strict=True):
+                axes.plot(time, line, label=name, linewidth=1.0)
+            for sign in (-1, 1):
+                axes.axhline(sign * limit, color="black", linestyle="--", linewidth=0.8)
+            axes.grid(alpha=0.3)
+        panels[0, column].set_title(f"{entry.method}: index {entry.observability:.3f}, {entry.seconds:.1f} s")
+        panels[2, column].set_xlabel("time [s]")
+    for axes, label in zip(
+        panels[:, 0], ("position from home [mm]", "orientation from home [mrad]", "crank angle [rad]"), strict=True
+    ):
+        axes.set_ylabel(label)
+        axes.legend(loc="upper right", fontsize="small", ncols=2)
+    figure.suptitle(f"Exciting trajectories, criterion {comparison.criterion}, seed {comparison.seed}; dashed: limits")
+    return figure

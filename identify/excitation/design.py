@@ -5,6 +5,7 @@ best few of them. Criteria: the observability index (eq. 39), or the D-criterion
 searches go; what IPOPT found from several starts is then ranked by the D-criterion of the simulated loop.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,19 +14,67 @@ from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import MotionConstraints, check_periods
-from identify.excitation.criterion_information import Knowledge, knowledge, log_information
-from identify.excitation.criterion_linear_information import log_linear_information
-from identify.excitation.evolutionary_search import FEWEST_MEMBERS, evolve
 from identify.excitation.gradient_search import climb
+from identify.excitation.information import Knowledge, knowledge, log_information, log_linear_information
+from identify.excitation.motion import SAMPLES_PER_HARMONIC, unknowns
 from identify.excitation.observability import SMOOTHING_RAD_S, log_observability, observability_index
-from identify.excitation.random_trajectories import Check, admissible_trajectories
-from identify.excitation.search import SearchProblem, SearchResult
-from identify.excitation.unknowns import unknowns
+from identify.excitation.search import FEWEST_MEMBERS, SearchProblem, SearchResult, evolve
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import EXCITATION, SEARCH, UNSEEN, child
-from identify.scenario import Scenario
-from identify.trajectory import FourierTrajectory
-from identify.trajectory_file import TrajectorySet
+from identify.scenario import Excitation, Scenario
+from identify.trajectory import FourierTrajectory, TrajectorySet, check_travel, random_trajectory
+
+# Random trajectories that a robot can be given: inside its travel and the other limits.
+
+
+ATTEMPTS = 50
+"""Random trajectories tried, on the average, for each one that has to be admissible."""
+
+Check = Callable[[FourierTrajectory, Array], object]
+"""Raises TrajectoryError for a trajectory that is not admissible at some instants (N,) [s]."""
+
+
+def admissible_trajectories(
+    robot: Robot,
+    settings: Excitation,
+    duration_s: float,
+    count: int,
+    seed: np.random.SeedSequence,
+    check: Check = lambda trajectory, times: None,
+) -> list[FourierTrajectory]:
+    """Random trajectories that stay inside the travel less the margin and pass `check`.
+
+    Raises TrajectoryError, with the last reason, when too few of them do.
+    """
+    rng = np.random.default_rng(seed)
+    rate_hz = 4 * SAMPLES_PER_HARMONIC * settings.harmonics * settings.fundamental_hz
+    t = np.arange(round(duration_s * rate_hz) + 1) / rate_hz
+    accepted: list[FourierTrajectory] = []
+    reason = TrajectoryError("none tried")
+    for _ in range(ATTEMPTS * count):
+        candidate = random_trajectory(
+            rng,
+            robot.home_pose,
+            settings.fundamental_hz,
+            settings.harmonics,
+            settings.position_amplitude_m,
+            settings.orientation_amplitude_rad,
+        )
+        try:
+            check_travel(robot, candidate, t, settings.travel_margin_rad)
+            check(candidate, t)
+        except TrajectoryError as error:
+            reason = error
+            continue
+        accepted.append(candidate)
+        if len(accepted) == count:
+            return accepted
+    raise TrajectoryError(
+        f"only {len(accepted)} of {ATTEMPTS * count} random trajectories of ±{settings.position_amplitude_m:g} m and "
+        f"±{settings.orientation_amplitude_rad:g} rad stay inside the travel and the other limits, {count} are needed; "
+        f"the last: {reason}"
+    )
+
 
 STARTS = 3
 """Random trajectories from which IPOPT climbs."""

@@ -13,12 +13,11 @@ import casadi as ca
 import numpy as np
 
 from identify.arrays import Array
-from identify.cores import one_thread
 from identify.errors import TrajectoryError
 from identify.excitation.motion import motion
 from identify.excitation.search import SearchProblem, SearchResult
-from identify.interrupts import honoured, raise_noted
 from identify.progress import Advance
+from identify.runtime import honoured, one_thread, raise_noted
 
 MOST_ITERATIONS = 150
 

@@ -22,9 +22,7 @@ from scipy.linalg import qr, solve_triangular
 from dynamics import Robot
 from identify.arrays import Array
 from identify.estimation.base_parameters import base_parameters, structural_regressor
-from identify.excitation.log_determinant import log_determinant
-from identify.excitation.motion import motion, played_times, wrench_regressor
-from identify.excitation.unknowns import Unknowns
+from identify.excitation.motion import Unknowns, log_determinant, motion, played_times, wrench_regressor
 
 SMOOTHING_RAD_S = 0.02
 """v_s in tanh(theta_dot / v_s) where derivatives are asked for: as much as a velocity changes between two samples."""

@@ -16,8 +16,7 @@ import xarray as xr
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.experiment.truth import true_parameters
-from identify.files.dataset import Variables, check_finite, check_variables, described_dataset
-from identify.files.netcdf import read_group, write_groups
+from identify.files.dataset import Variables, check_finite, check_variables, described_dataset, read_group, write_groups
 from identify.scenario import Timing
 
 VARIABLES: Variables = {

@@ -1,6 +1,6 @@
-"""The simulated real robot of a scenario: what it does, and where it is not the robot that servo and estimator know."""
+"""The simulated real robot of a scenario: what it does and carries, and where it is not the robot that is known."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,7 +10,43 @@ from dynamics.analysis.geometry_error import with_geometry_error
 from dynamics.closed_loop import ClosedLoopRun, LoopSettings, PoseSensor, RateSensor, Reference, simulate
 from identify.arrays import Array
 from identify.record.loop_setup import plant_settings
+from identify.record.payload import payload_vector
 from identify.scenario import Scenario
+
+# The load on the platform in the second run of an experiment: as its experimenter states it, and as it is.
+
+
+@dataclass(frozen=True)
+class PlatformLoad:
+    """What a load adds to the parameters (67,): the stated values with their standard deviations, and the true ones."""
+
+    stated: Array
+    std: Array
+    true: Array
+
+
+def drawn_load(scenario: Scenario, rng: np.random.Generator) -> PlatformLoad:
+    """The scenario's load, whose true figures miss the stated ones by the stated deviations; no figure is negative."""
+    stated, std = scenario_payload(scenario), scenario_payload_std(scenario)
+    true = stated + std * rng.standard_normal(stated.shape)
+    while (true < 0).any():
+        true = stated + std * rng.standard_normal(stated.shape)
+    return PlatformLoad(stated, std, true)
+
+
+def scenario_payload(scenario: Scenario) -> Array:
+    """What the scenario's load adds to the parameters (67,), as stated."""
+    load = scenario.payload
+    return payload_vector(load.mass_kg, (load.Ixx_kg_m2, load.Iyy_kg_m2, load.Izz_kg_m2))
+
+
+def scenario_payload_std(scenario: Scenario) -> Array:
+    """Standard deviations (67,) of what the scenario's load adds to the parameters."""
+    load = scenario.payload
+    return payload_vector(load.mass_std_kg, (load.Ixx_std_kg_m2, load.Iyy_std_kg_m2, load.Izz_std_kg_m2))
+
+
+# The simulated real robot of a scenario: what it does, and where it is not the robot that servo and estimator know.
 
 
 def plant_robot(scenario: Scenario, nominal: Robot) -> Robot:

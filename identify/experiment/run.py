@@ -15,8 +15,7 @@ from dynamics import Robot, load_robot
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
 from identify.estimation.scale_anchor import measured_anchor, store_anchor
 from identify.excitation import design_trajectories
-from identify.experiment.plant import mismatch, plant_robot, simulate_plant
-from identify.experiment.platform_load import PlatformLoad, drawn_load
+from identify.experiment.plant import PlatformLoad, drawn_load, mismatch, plant_robot, simulate_plant
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, frame_latencies, make_sensor, with_renderer
 from identify.experiment.truth import build_truth
 from identify.loop_parameters import NAMES, starting_guess
@@ -25,7 +24,7 @@ from identify.random_streams import ANCHOR, LATENCY, LOAD, NOISE, TEACHING, stre
 from identify.record import recording
 from identify.record.loop_setup import frame_times, reference_motion
 from identify.record.payload import store_payload
-from identify.record.recorded_robot import store_robot
+from identify.record.provenance import store_robot
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory, check_travel
 

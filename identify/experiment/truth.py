@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.files.dataset import Variables, check_finite, check_variables, described_dataset, pose_array
-from identify.files.netcdf import read_group
+from identify.files.dataset import Variables, check_finite, check_variables, described_dataset, pose_array, read_group
 from identify.record.recording import TRUTH_GROUP, run_names
 
 VARIABLES: Variables = {

@@ -1,13 +1,79 @@
-"""Described xarray datasets over time: every variable has dimensions, a unit and a name, and is checked for them."""
+"""Described xarray datasets over time, checked for dimensions, units and names, and their groups in netCDF files."""
 
-from typing import Any
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
 
+import h5py
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from dynamics.parameters import unit_of
 from identify.arrays import Array
 from identify.errors import RecordError
+from identify.files.atomic import atomic_path
+
+# Groups of xarray datasets in one netCDF file: written whole or not at all, read with clear errors.
+
+
+ENGINE: Literal["h5netcdf"] = "h5netcdf"
+
+
+def write_groups(path: Path | str, groups: Mapping[str, xr.Dataset]) -> None:
+    """Write datasets as groups of one file; the name ``""`` is the main group.
+
+    Nothing is left behind, and an older file of this name stays as it was, when writing fails.
+    """
+    with atomic_path(path) as temporary:
+        mode: Literal["w", "a"] = "w"
+        for name, dataset in groups.items():
+            dataset.to_netcdf(temporary, mode=mode, group=name or None, engine=ENGINE, encoding=_encoding(dataset))
+            mode = "a"
+
+
+def read_group(path: Path | str, group: str = "") -> xr.Dataset:
+    """Read one group into memory.
+
+    Raises:
+        RecordError: no such file, not a whole netCDF file, or no such group.
+    """
+    names = group_names(path)
+    if group and group not in names:
+        raise RecordError(f"{path} has no group {group!r}; it has {', '.join(names) or 'none'}")
+    try:
+        with xr.open_dataset(path, group=group or None, engine=ENGINE) as dataset:
+            return dataset.load()
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        raise RecordError(f"{path} is truncated or not a netCDF file: {error}") from error
+
+
+def group_names(path: Path | str) -> list[str]:
+    """Names of all groups, nested ones as ``run01/truth``.
+
+    Raises:
+        RecordError: no such file, or not a whole netCDF file.
+    """
+    if not Path(path).is_file():
+        raise RecordError(f"there is no file {path}")
+    names: list[str] = []
+    try:
+        with h5py.File(path, "r") as file:
+            file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Group) else None)
+    except (OSError, RuntimeError) as error:
+        raise RecordError(f"{path} is truncated or not a netCDF file: {error}") from error
+    return sorted(names)
+
+
+def _encoding(dataset: xr.Dataset) -> dict[str, dict[str, object]]:
+    numbers = [name for name, variable in dataset.variables.items() if variable.dtype.kind in "fiu"]
+    compressed = {str(name): {"zlib": True, "complevel": 4} for name in numbers if dataset[name].ndim > 1}
+    plain = {str(name): {"_FillValue": None} for name in numbers}
+    return {name: {**plain[name], **compressed.get(name, {})} for name in plain}
+
+
+# Described xarray datasets over time: every variable has dimensions, a unit and a name, and is checked for them.
+
 
 Variables = dict[str, tuple[tuple[str, ...], str, str]]
 """Dimensions, unit and description of each variable."""
@@ -100,3 +166,46 @@ def check_finite(values: Array, name: str, source: str) -> None:
 def _description(dim: str) -> dict[str, str]:
     unit, text = COORDINATES.get(dim, ("", dim))
     return {"units": unit, "long_name": text} if unit else {"long_name": text}
+
+
+# An attribute of a record as messages show it.
+
+
+def shown(value: object) -> str:
+    """The value in at most 60 characters of one line; a number of numpy, as netCDF gives it, as a plain one."""
+    plain = value.item() if isinstance(value, np.generic) else value
+    return " ".join(repr(plain).split())[:60]
+
+
+# `covariance.nc`: the covariance of the estimated parameters, netCDF, in the SI units of the parameters.
+
+
+VARIABLE = "covariance"
+DIMENSIONS = ("parameter", "parameter_2")
+
+
+def write_covariance(path: Path | str, names: tuple[str, ...], covariance: Array) -> None:
+    """Write the covariance (n, n) of named parameters."""
+    labels = {name: list(names) for name in DIMENSIONS}
+    described = {"units": "product of the units of both parameters", "long_name": "covariance of the estimates"}
+    data = xr.Dataset({VARIABLE: (DIMENSIONS, covariance, described)}, coords=labels)
+    write_groups(path, {"": data.assign_coords(unit=(DIMENSIONS[0], [unit_of(name) for name in names]))})
+
+
+def read_covariance(path: Path | str, names: tuple[str, ...]) -> Array:
+    """Read the covariance (n, n) of the parameters `names`.
+
+    Raises:
+        RecordError: a file that is damaged, of other parameters, or with variances that are none.
+    """
+    data = read_group(path)
+    if VARIABLE not in data or data[VARIABLE].dims != DIMENSIONS:
+        raise RecordError(f"{path} lacks {VARIABLE} on {' and '.join(DIMENSIONS)}")
+    found = tuple(map(str, data[DIMENSIONS[0]].values)) if DIMENSIONS[0] in data.coords else ()
+    if found != tuple(names):
+        different = sorted(set(found) ^ set(names))
+        raise RecordError(f"{path} is of other parameters than the result: {', '.join(different) or 'another order'}")
+    covariance = np.asarray(data[VARIABLE].values, dtype=float)
+    if not np.isfinite(covariance).all() or not (np.diag(covariance) > 0).all():
+        raise RecordError(f"{path}: {VARIABLE} has variances that are not positive numbers")
+    return covariance

@@ -1,10 +1,19 @@
-"""The folder of a run: which stage writes what, and what is refused."""
+"""The folder of a run: which stage writes what, what is refused, and its result.json."""
 
+import json
+import math
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from identify.errors import OutputFolderError
+import numpy as np
+
+from identify.errors import OutputFolderError, RecordError
+from identify.files.atomic import write_text
+
+# The folder of a run: which stage writes what, and what is refused.
+
 
 WRITTEN_BY = {
     "scenario.toml": "excite",
@@ -110,3 +119,92 @@ def new_run_folder(path: Path | str) -> RunFolder:
             f"output folder {folder} cannot be made: {above} is not a folder one may write to"
         ) from None
     return RunFolder(folder)
+
+
+# `result.json`: the figures of a run, standard JSON (a figure that does not exist is null).
+
+
+AXES = ("x", "y", "z", "alpha", "beta", "gamma")
+"""Order of the RMS figures: three positions in um, three orientations in urad."""
+
+ENTRIES = {"identify": ("identification", "before", "after", "seconds"), "validate": ("sensor", "validation")}
+"""What the stages write into a result, and later ones read."""
+
+
+def save_result(path: Path | str, result: dict[str, Any]) -> None:
+    """Write a result, whole or not at all; arrays become lists, and numbers that are not finite become null."""
+    write_text(path, json.dumps(_plain(result), indent=2, allow_nan=False) + "\n")
+
+
+def load_result(path: Path | str) -> dict[str, Any]:
+    """Read a result.
+
+    Raises:
+        RecordError: no such file, or no JSON object in it.
+    """
+    try:
+        result = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RecordError(f"cannot read result: {error}") from error
+    except ValueError as error:
+        raise RecordError(f"{path} is truncated or not JSON: {error}") from error
+    if not isinstance(result, dict):
+        raise RecordError(f"{path} holds no JSON object")
+    return result
+
+
+def check_entries(path: Path | str, result: dict[str, Any], *stages: str) -> None:
+    """Refuse a result without the entries of these stages, ``identify`` and ``validate``.
+
+    Raises:
+        RecordError: naming what is missing and the stage that writes it.
+    """
+    missing = {stage: [name for name in ENTRIES[stage] if name not in result] for stage in stages}
+    first = next((stage for stage in stages if missing[stage]), None)
+    if first is not None:
+        names = ", ".join(name for stage in stages for name in missing[stage])
+        raise RecordError(f"{path} lacks {names}; write it with: cmmsim {first} --out {Path(path).parent}")
+
+
+def rms_figures(errors: Any, counted: Any = None) -> dict[str, list[float]]:
+    """Root mean square of pose errors (N, 6) [m, rad] as a result holds it, in um and urad.
+
+    ``counted`` (N,) bool names the rows that count, such as the frames that were not lost (default all). All figures
+    are NaN when none does, or when one of those that count is not finite: a model that diverged has no error.
+    """
+    rows = np.asarray(errors, dtype=float)
+    rows = rows if counted is None else rows[np.asarray(counted, dtype=bool)]
+    usable = len(rows) > 0 and bool(np.isfinite(rows).all())
+    rms = 1e6 * np.sqrt(np.mean(rows**2, axis=0)) if usable else np.full(6, np.nan)
+    return {"position_rms_um": rms[:3].tolist(), "orientation_rms_urad": rms[3:].tolist()}
+
+
+def rms_row(figures: dict[str, Any] | None) -> list[float]:
+    """The six RMS figures [um, urad] of one entry; NaN where they are null or the entry is absent."""
+    if not figures:
+        return [math.nan] * 6
+    values = [*figures["position_rms_um"], *figures["orientation_rms_urad"]]
+    return [math.nan if value is None else float(value) for value in values]
+
+
+def predicted_row(run: dict[str, Any]) -> list[float]:
+    """The six predicted standard deviations [um, urad] of a validation entry; NaN where nothing was predicted."""
+    predicted = run.get("predicted")
+    if not predicted:
+        return [math.nan] * 6
+    values = [*predicted["position_std_um"], *predicted["orientation_std_urad"]]
+    return [math.nan if value is None else float(value) for value in values]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

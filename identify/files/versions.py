@@ -1,7 +1,38 @@
-"""Versions of the software that made a result, for records and reports."""
+"""Versions of the software that made a result, digests of its numbers, and whether workers compute with the same.
+
+Whether all rows of a study are computed by the same software, wherever and whenever: with another they may differ.
+Another cmmsim is refused, for its rows are those of another simulation. Other versions of what it computes with change
+figures by little, or not at all, and are warned of.
+"""
 
 import platform
+import warnings
+from collections.abc import Mapping
+from functools import cache
+from hashlib import sha256
 from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from identify.errors import StudyError
+
+# A digest of arrays: of their numbers, not of a file's bytes, which differ from one writing to the next.
+
+
+def array_digest(arrays: Mapping[str, ArrayLike]) -> str:
+    """Digest of named arrays of numbers, hexadecimal; their order and their type do not matter."""
+    whole = sha256()
+    for name in sorted(arrays):
+        values = np.ascontiguousarray(arrays[name], dtype="<f8")
+        whole.update(f"{name} {values.shape}\n".encode())
+        whole.update(np.where(np.isnan(values), np.nan, values).tobytes())  # one of the many bit patterns of NaN
+    return whole.hexdigest()
+
+
+# Versions of the software that made a result, for records and reports.
+
 
 PACKAGES = ("cmmsim", "numpy", "scipy", "casadi", "opencv-python-headless", "pyrender", "trimesh", "xarray", "h5netcdf")
 
@@ -16,3 +47,66 @@ def _version(name: str) -> str:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return "not installed"
+
+
+class OtherVersionsWarning(UserWarning):
+    """Some rows are computed with other versions of packages than are installed here."""
+
+
+@cache
+def product_version() -> str:
+    """Version of cmmsim in this process."""
+    return versions()["cmmsim"]
+
+
+def check_workers(there: Mapping[str, dict[str, str] | Exception]) -> None:
+    """Compare with the versions here those that workers answered, by address; warn once of all that differ.
+
+    A worker that answered with an error cannot run cmmsim, but one that did not answer (OSError) is gone.
+
+    Raises:
+        StudyError: a worker has another cmmsim, or none.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for worker, answer in there.items():
+        if isinstance(answer, dict):
+            require_product(worker, answer["cmmsim"], product_version())
+            found[worker] = answer
+        elif not isinstance(answer, OSError):
+            raise StudyError(f"worker {worker} cannot run cmmsim {product_version()}: {' '.join(str(answer).split())}")
+    _warn_of_others(found)
+
+
+def check_folder(folder: Path, begun: dict[str, str]) -> None:
+    """Compare with the versions here those that began a study to which rows are added.
+
+    Raises:
+        StudyError: its rows are of another cmmsim.
+    """
+    if begun["cmmsim"] != product_version():
+        raise StudyError(
+            f"study folder {folder} has rows of cmmsim {begun['cmmsim']}, here is {product_version()}; go on with that "
+            "version, or name another folder with --out"
+        )
+    _warn_of_others({str(folder): begun})
+
+
+def require_product(worker: str, there: str, here: str) -> None:
+    """Refuse a worker with another version of cmmsim. Raises StudyError with both."""
+    if there != here:
+        raise StudyError(f"worker {worker} has cmmsim {there}, here is {here}; install the same on all machines")
+
+
+def _warn_of_others(there: Mapping[str, Mapping[str, str]]) -> None:
+    """One warning of all packages with other versions than here, each with the places where it has it."""
+    here, places = versions(), dict[tuple[str, str], list[str]]()
+    for place, theirs in there.items():
+        for package, version in theirs.items():
+            if version != here.get(package, version):
+                places.setdefault((package, version), []).append(place)
+    if places:
+        text = "; ".join(
+            f"{package} {version} ({first}{f' and {len(more)} more' if more else ''}), here {here[package]}"
+            for (package, version), (first, *more) in places.items()
+        )
+        warnings.warn(f"figures may differ a little where versions do: {text}", OtherVersionsWarning, stacklevel=3)

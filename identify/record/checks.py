@@ -12,12 +12,10 @@ from dynamics import Robot
 from dynamics.closed_loop import Reference
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.files.attribute_text import shown
-from identify.files.dataset import POSE
-from identify.record.filtering import SPLINE_DEGREE, padding_samples
+from identify.files.dataset import POSE, shown
+from identify.filtering import SPLINE_DEGREE, padding_samples
 from identify.record.loop_setup import frame_times
-from identify.record.recorded_origin import recorded_scenario
-from identify.record.recorded_robot import check_robot
+from identify.record.provenance import check_robot, recorded_scenario
 from identify.record.recording import poses
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory

@@ -10,9 +10,9 @@ import xarray as xr
 
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.files.attribute_text import shown
+from identify.files.dataset import shown
 from identify.loop_parameters import NAMES, index_of
-from identify.scenario.scenario_checks import check_load_std, check_moments
+from identify.scenario.sections import check_load_std, check_moments
 
 ADDED = {
     "payload_mass": ("platform.mass", "kg"),

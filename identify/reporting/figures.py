@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from identify.arrays import Array
 from identify.files.atomic import atomic_path
 from identify.files.figure import blank_figure
-from identify.files.result_file import predicted_row, rms_figures, rms_row
+from identify.files.run_folder import predicted_row, rms_figures, rms_row
 from identify.reporting.goals import VALIDATION_UM, VALIDATION_URAD, is_friction_or_pid
 
 COMPONENTS = ("x", "y", "z", "α", "β", "γ")

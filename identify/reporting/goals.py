@@ -4,9 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from identify.estimation.misfit import SIGNIFICANT
-from identify.estimation.whiteness import SUSPICIOUS
-from identify.files.result_file import rms_row
+from identify.estimation.explanation import SIGNIFICANT, SUSPICIOUS
+from identify.files.run_folder import rms_row
 
 VALIDATION_UM, VALIDATION_URAD = 2.0, 10.0
 SENSOR_UM, SENSOR_URAD = 20.0, 100.0

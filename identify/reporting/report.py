@@ -11,23 +11,20 @@ import xarray as xr
 
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.estimation.correlation import correlation_matrix
+from identify.estimation.base_parameters import correlation_matrix
 from identify.experiment.truth import read_truth_runs, true_poses
 from identify.files.atomic import write_text
-from identify.files.covariance_file import read_covariance
-from identify.files.result_file import check_entries, load_result
-from identify.files.run_folder import RunFolder
+from identify.files.dataset import read_covariance
+from identify.files.run_folder import RunFolder, check_entries, load_result
 from identify.loop_parameters import NAMES
 from identify.progress import Progress, SilentProgress
-from identify.record.made_of import RECORDS, check_made_of
-from identify.record.model_runs import EXCITATION, read_model_runs
-from identify.record.recording import poses, read, read_runs, run_name
+from identify.record.provenance import RECORDS, check_made_of
+from identify.record.recording import EXCITATION, poses, read, read_model_runs, read_runs, run_name
 from identify.reporting import figures, report_plots, tables
 from identify.reporting.goals import check_goals
-from identify.reporting.paper_results import INDEX_BEST, INDEX_FIRST
 from identify.reporting.run_result import check_intervals
-from identify.reporting.tables import Table
-from identify.trajectory_file import TrajectorySet, load_trajectories
+from identify.reporting.tables import INDEX_BEST, INDEX_FIRST, Table
+from identify.trajectory import TrajectorySet, load_trajectories
 
 TEMPLATES = Path(__file__).parent / "templates"
 

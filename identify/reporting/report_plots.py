@@ -8,7 +8,7 @@ import plotly.offline
 from plotly.subplots import make_subplots
 
 from identify.arrays import Array
-from identify.files.result_file import rms_row
+from identify.files.run_folder import rms_row
 from identify.reporting.figures import BAND, COMPONENTS, LETTERS, interval_bars
 from identify.reporting.goals import VALIDATION_UM, VALIDATION_URAD
 

@@ -8,14 +8,14 @@ import numpy as np
 import xarray as xr
 
 from dynamics import DynamicsError
-from dynamics.closed_loop.loop_checks import checked_loop_parameters
+from dynamics.closed_loop.preparation import checked_loop_parameters
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.estimation.correlation import Pair, correlation_matrix, strongest_pairs
+from identify.estimation.base_parameters import Pair, correlation_matrix, strongest_pairs
+from identify.estimation.covariance import PosePrediction
 from identify.estimation.identification import IdentificationResult
-from identify.estimation.pose_prediction import PosePrediction
 from identify.experiment.truth import true_poses
-from identify.files.result_file import AXES, rms_figures
+from identify.files.run_folder import AXES, rms_figures
 from identify.loop_parameters import NAMES, unit_of
 from identify.record import recording
 

@@ -38,7 +38,7 @@ def timing_in_file(sensor: str, changes: Mapping[str, Any]) -> tuple[dict[str, f
 
 def by_dotted_key(changes: Mapping[str, Any]) -> dict[str, Any]:
     """A scenario's ``[sensor_changes]``, also as tables in tables, by dotted key of the sensor's file."""
-    from cmmsim.files.sensor_changes import dotted
+    from cmmsim.files.sensor_file import dotted
 
     return dotted(changes)
 

@@ -1,13 +1,17 @@
-"""The rows of a study, one by one: what holds in each. None is kept, so that a large grid takes no memory.
+"""The rows of a study, one by one, and their computation in batches; a large grid takes no memory.
 
+The rows of a study, one by one: what holds in each. None is kept, so that a large grid takes no memory.
 Rows are numbered repeat by repeat, and within a repeat point by point, the last factor fastest. The seed of row n is
 the n-th child that ``numpy.random.SeedSequence(seed).spawn`` gives. So neither the machines, nor the order of work, nor
 further repeats change the numbers of a row; nor do further points of a sample, as long as there are no repeats.
 """
 
-from collections.abc import Mapping
+import math
+import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -15,12 +19,19 @@ import numpy as np
 from identify.errors import ScenarioError, StudyError
 from identify.experiment.sensor_in_loop import with_renderer
 from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
+from identify.runtime import raise_noted
 from identify.scenario import Scenario, load_scenario
-from identify.studies.keys import check, is_integer, options_in, overrides
-from identify.studies.law_names import check_law_names
-from identify.studies.rows.kinds import check_kind, kind_reads, options_model
+from identify.studies.keys import (
+    check,
+    check_ever_read,
+    check_law_names,
+    check_read_here,
+    is_integer,
+    options_in,
+    overrides,
+)
+from identify.studies.rows.kinds import check_kind, kind_reads, options_model, row_function
 from identify.studies.study_file import Range, Study
-from identify.studies.unread_keys import check_ever_read, check_read_here
 
 
 @dataclass(frozen=True)
@@ -147,3 +158,87 @@ def _check_factor(path: str, values: list[Any] | Range) -> None:
         raise StudyError(f"factors.{path} = {values} has values of several kinds: {', '.join(sorted(kinds))}")
     if len({repr(value) for value in values}) < len(values):
         raise StudyError(f"factors.{path} = {values} has a value twice; repeats = N computes every point N times")
+
+
+# Computing rows: the only part of a study that runs on other processes and machines.
+
+
+FIRST = ("row", "repeat", "seed_entropy", "seed_spawn_key")
+LAST = ("seconds", "error")
+"""Columns of a study's table before its factors and behind its figures."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A row that is done: its figures, or in one line why there are none; the seconds it took."""
+
+    number: int
+    figures: dict[str, float]
+    seconds: float
+    error: str = ""
+
+
+def compute(setup: Setup, cases: list[Case]) -> list[Finished]:
+    """Compute rows one after the other; what goes wrong in one is noted there, and the others go on."""
+    return [_compute(setup, case) for case in cases]
+
+
+def _compute(setup: Setup, case: Case) -> Finished:
+    start = time.perf_counter()
+    try:
+        figures = _checked(
+            row_function(setup.kind)(setup.row_scenario(case), setup.row_seed(case.number), setup.row_options(case)),
+            {*FIRST, *case.factors, *LAST},
+        )
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # also sys.exit() ends the row and not the study
+        raise_noted()
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        return Finished(case.number, {}, time.perf_counter() - start, text)
+    return Finished(case.number, figures, time.perf_counter() - start)
+
+
+def _checked(figures: Mapping[str, float], taken: set[str]) -> dict[str, float]:
+    """Figures as plain numbers; one that is none is an error of the row, so that no average hides it, and so is one
+    that no column of the table is left for."""
+    if hidden := sorted(taken & set(figures)):
+        raise ValueError(f"a figure must not be called {hidden[0]!r}: the table has a column of this name")
+    plain = {name: float(value) for name, value in figures.items()}
+    for name, value in plain.items():
+        if not math.isfinite(value):
+            raise ArithmeticError(f"{name} is {value}")
+    return plain
+
+
+# Rows in batches: as many a task as keep a worker busy for a while, so that sending them costs little.
+
+
+BATCH_SECONDS = 0.25
+"""Work in a batch; what is lost at most with each worker when everything is killed at once."""
+
+LARGEST_BATCH = 500
+
+
+class Batches:
+    """Hands out the rows that are still to be done, in batches sized by how long the last ones took."""
+
+    def __init__(self, cases: Iterator[Case], count: int) -> None:
+        self._cases, self._left = cases, count
+        self._row_seconds = BATCH_SECONDS
+
+    def take(self, workers: int) -> list[Case]:
+        """The next batch for one of so many workers; empty when all rows are handed out.
+
+        Towards the end batches become smaller, so that all workers end together.
+        """
+        fair = max(1, self._left // (4 * workers))
+        size = max(1, min(int(BATCH_SECONDS / self._row_seconds), LARGEST_BATCH, fair, self._left))
+        batch = list(islice(self._cases, size))
+        self._left -= len(batch)
+        return batch
+
+    def learn(self, finished: list[Finished]) -> None:
+        """Take from a finished batch how long rows take."""
+        mean = sum(row.seconds for row in finished) / len(finished)
+        self._row_seconds = max(0.5 * (self._row_seconds + mean), 1e-6)

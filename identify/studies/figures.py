@@ -14,13 +14,11 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 from identify.arrays import Array
 from identify.files.figure import blank_figure
 from identify.reporting.figures import save_figure
-from identify.studies.law import Law
-from identify.studies.point_statistics import CONFIDENCE as BANDS
-from identify.studies.point_statistics import point_statistics
-from identify.studies.study_file import Study
+from identify.studies.study_file import Law, Study
+from identify.studies.table import factor_unit, figure_unit, labelled
+from identify.studies.theory import BAND_CONFIDENCE as BANDS
 from identify.studies.theory import CONFIDENCE as LAWS
-from identify.studies.theory import Verdict, law_data, with_data
-from identify.studies.units import factor_unit, figure_unit, labelled
+from identify.studies.theory import Verdict, law_data, point_statistics, with_data
 
 LEAST_SPAN = 2.0
 """Smallest ratio of the ends of a logarithmic axis: small differences shall look small."""

@@ -1,17 +1,24 @@
-"""What a study may vary: the keys of a scenario, of a sensor file and of a kind's options, with their types."""
+"""What a study may vary and its laws may name, and whether its rows read it: asked before any row is computed."""
 
 import difflib
 import json
-from collections.abc import Mapping
-from functools import lru_cache
+from collections.abc import Callable, Collection, Mapping
+from functools import lru_cache, reduce
 from typing import Annotated, Any, get_args
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from cmmsim.files.schema import SensorFile
+from cmmsim.files.sensor_file import read_sensor_file
 from identify.errors import StudyError
 from identify.scenario import Scenario
+from identify.studies.rows.columns import Reads, among, timing
+from identify.studies.rows.kinds import figure_names
+from identify.studies.study_file import Law, Range, Study
+
+# What a study may vary: the keys of a scenario, of a sensor file and of a kind's options, with their types.
+
 
 SENSOR_CHANGES = "sensor_changes"
 """The table of a scenario into which the keys ``sensor.`` go."""
@@ -99,3 +106,116 @@ def _nearest(path: str, known: Mapping[str, Any]) -> list[str]:
     last = [key for key in known if key.rpartition(".")[2] == path.rpartition(".")[2]]
     same_root = [key for key in known if key.startswith(path.partition(".")[0] + ".")]
     return list(dict.fromkeys([*last, *alike]))[:4] or same_root[:4] or ["scenario.KEY", "sensor.KEY", "options.KEY"]
+
+
+# Whether a study's laws speak of what its rows will have: asked before any row is computed.
+
+
+ROOTS = ("scenario.", "sensor.", "options.")
+"""How factors begin, and figures do not."""
+NEAREST = 4
+"""Valid names that a refusal gives."""
+
+
+def check_law_names(study: Study) -> None:
+    """Refuse laws of figures that the kind's rows do not have, or of factors and values that the study does not vary.
+
+    The figures of a kind of one's own are not known before its rows are, and are not checked here.
+
+    Raises:
+        StudyError: with the law, the name and the nearest valid ones.
+    """
+    figures = figure_names(study.kind)
+    for place, law in enumerate(study.theory, start=1):
+        try:
+            _check(law, study, figures)
+        except StudyError as error:
+            raise StudyError(f"[[theory]] {place}: {error}") from error
+
+
+def _check(law: Law, study: Study, figures: list[str] | None) -> None:
+    for key in ("figure", "per", "equals"):
+        name = getattr(law, key)
+        if figures is not None and name is not None and name not in figures:
+            raise StudyError(f"{key} = {name!r} is no figure of {study.kind}; {_suggestion(name, figures)}")
+    if law.factor is None:
+        return
+    known = [*study.factors, *(figures or [])]
+    if law.factor not in known and (figures is not None or law.factor.startswith(ROOTS)):
+        raise StudyError(f"factor = {law.factor!r} is not varied by the study; {_suggestion(law.factor, known)}")
+    values = study.factors.get(law.factor)
+    unknown = [value for value in law.order or [] if isinstance(values, list) and value not in values]
+    if unknown:
+        raise StudyError(f"order has {unknown[0]!r}, and {law.factor} has the values {values}")
+
+
+def _suggestion(name: str, known: Collection[str]) -> str:
+    """The valid names most like a name, or the first of them where none is alike."""
+    near = difflib.get_close_matches(name, known, n=NEAREST, cutoff=0.5) or list(known)[:NEAREST]
+    return f"the nearest are {', '.join(near)}" if near else "it has no factors"
+
+
+# Whether a study's rows read what it sets: asked before any row is computed, so that no factor varies nothing.
+
+
+BESIDE = (
+    "scenario.name", "scenario.description", "scenario.sensor_note", "sensor.name", "sensor.note", "scenario.renderer",
+    *timing("frame_rate_hz", "exposure_s", "latency_s", "latency_jitter_s"), "scenario.filter.",
+    "scenario.excitation.fundamental_hz", "scenario.excitation.harmonics", "scenario.excitation.duration_s",
+    "scenario.validation.duration_s",
+)  # fmt: skip
+"""What may stand among the changes of any kind: labels, what draws if anything does, and what a scenario checks against
+its frame rate, for a change of that may need one of these."""
+
+
+def check_ever_read(study: Study, reads: Reads) -> None:
+    """Refuse factors that the kind never reads, and changes likewise but for those of BESIDE.
+
+    Raises:
+        StudyError: with all that it does read.
+    """
+    changes = [path for path in study.changes if not among(path, BESIDE)]
+    for table, paths in (("factors", list(study.factors)), ("changes", changes)):
+        for path in paths:
+            if not reads.covers(path):
+                raise StudyError(
+                    f"{table}.{path} does nothing: rows of kind {study.kind!r} do not read it; they read {reads}, and "
+                    "their options"
+                )
+
+
+def check_read_here(study: Study, reads: Reads, first: Scenario, options: BaseModel) -> None:
+    """Refuse factors, changes and options that do nothing with all values of the others.
+
+    ``first``: the scenario of the first row, ``options``: its options, with their defaults.
+
+    Raises:
+        StudyError: with the setting that leaves them without effect.
+    """
+    changes = [f"changes.{path}" for path in study.changes if not among(path, BESIDE)]
+    settings = [f"factors.{path}" for path in study.factors] + changes + [f"options.{name}" for name in study.options]
+    for idle in reads.idle:
+        if not all(_always(holds, path, study, first, options) for path, holds in idle.where.items()):
+            continue
+        for setting in settings:
+            if among(setting.removeprefix("factors.").removeprefix("changes."), idle.keys):
+                raise StudyError(f"{setting} does nothing in rows of kind {study.kind!r} where {idle.why}")
+
+
+def _always(holds: Callable[[Any], bool], path: str, study: Study, first: Scenario, options: BaseModel) -> bool:
+    """Whether something holds of a path's value in all rows; no where another sensor may say otherwise."""
+    twins = next((pair for pair in _TWINS if path in pair), (path,))
+    for twin in twins:
+        if twin in study.factors:
+            values = study.factors[twin]
+            return all(map(holds, [values.low, values.high] if isinstance(values, Range) else values))
+    root, _, key = path.partition(".")
+    if root == "options":
+        return holds(getattr(options, key))
+    if "scenario.sensor" in study.factors and (root == "sensor" or len(twins) > 1):
+        return False
+    owner: BaseModel = first if root == "scenario" else read_sensor_file(first.sensor, first.sensor_changes)
+    return holds(reduce(getattr, key.split("."), owner))
+
+
+_TWINS = [timing(name) for name in ("frame_rate_hz", "exposure_s", "latency_s", "latency_jitter_s", "dropout")]

@@ -8,13 +8,10 @@ from pathlib import Path
 import pandas as pd
 
 from identify.errors import StudyInterrupted
-from identify.interrupts import honoured, raise_noted
 from identify.progress import Progress
-from identify.studies.batches import Batches
-from identify.studies.computation import Finished, compute
-from identify.studies.design import Design, Setup, prepare
-from identify.studies.journal import Journal
-from identify.studies.store import TABLE, VIEW, open_folder, resolved
+from identify.runtime import honoured, raise_noted
+from identify.studies.design import Batches, Design, Finished, Setup, compute, prepare
+from identify.studies.store import TABLE, VIEW, Journal, open_folder, resolved
 from identify.studies.study_file import Study
 from identify.studies.table import tidy_table, write_table, write_view
 

@@ -12,16 +12,14 @@ import pandas as pd
 
 from identify.errors import ScenarioError
 from identify.files.atomic import write_text
-from identify.files.result_file import save_result
+from identify.files.run_folder import save_result
 from identify.files.versions import versions
-from identify.studies import point_statistics, theory
+from identify.studies import theory
 from identify.studies.figures import draw
-from identify.studies.point_statistics import Statistics
-from identify.studies.rows.rows import find_kind
+from identify.studies.rows.kinds import find_kind
 from identify.studies.study_file import Study
-from identify.studies.table import figure_names
-from identify.studies.theory import Verdict, check_laws
-from identify.studies.units import factor_unit, figure_unit, labelled, unit_of
+from identify.studies.table import factor_unit, figure_names, figure_unit, labelled, unit_of
+from identify.studies.theory import Statistics, Verdict, check_laws
 
 JSON, MARKDOWN = "summary.json", "summary.md"
 NAMED = 20
@@ -53,7 +51,7 @@ def write(folder: Path, study: Study, frame: pd.DataFrame) -> dict[str, Any]:
             "missing": study.rows - len(frame),
         },
         "failures": _failures(study, frame),
-        "confidence": {"bands": point_statistics.CONFIDENCE, "laws": theory.CONFIDENCE},
+        "confidence": {"bands": theory.BAND_CONFIDENCE, "laws": theory.CONFIDENCE},
         "units": {name: unit for name in [*study.factors, *names] if (unit := unit_of(name, study))},
         "theory": [theory.as_entry(verdict) for verdict in verdicts],
         "points": [
@@ -97,7 +95,7 @@ def _points(study: Study, done: pd.DataFrame, names: list[str]) -> list[tuple[di
 def _statistics(rows: pd.DataFrame, names: list[str]) -> dict[str, Statistics]:
     """Of each figure, over the rows that have it."""
     values = {name: rows[name].dropna().to_numpy(dtype=float) for name in names}
-    return {name: point_statistics.point_statistics(found) for name, found in values.items() if len(found)}
+    return {name: theory.point_statistics(found) for name, found in values.items() if len(found)}
 
 
 def _failures(study: Study, frame: pd.DataFrame) -> dict[str, Any]:
@@ -151,7 +149,7 @@ def _law_row(verdict: Verdict) -> str:
 def _bands_text(points: list[tuple[dict[str, Any], dict[str, Statistics]]]) -> str:
     if points and all(one.rows < 2 for _, figures in points for one in figures.values()):
         return "Rms over rows. With a single repeat there is no band: the same command with --repeats 10 adds some."
-    return f"Rms over rows, with its {point_statistics.CONFIDENCE:.0%} band."
+    return f"Rms over rows, with its {theory.BAND_CONFIDENCE:.0%} band."
 
 
 def _table(study: Study, points: list[tuple[dict[str, Any], dict[str, Statistics]]], shown: list[str]) -> list[str]:

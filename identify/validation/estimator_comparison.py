@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dynamics import DynamicsError, Robot
@@ -22,13 +23,13 @@ from dynamics.errors import ParameterError, SimulationError
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.base_parameters import base_parameters, structural_regressor
-from identify.estimation.estimate_covariance import estimate_uncertainty
-from identify.estimation.group_estimates import group_estimates
-from identify.estimation.identifiability import IDENTIFIABLE_SHARE, identifiability
+from identify.estimation.covariance import estimate_uncertainty
+from identify.estimation.identifiability import IDENTIFIABLE_SHARE, group_estimates, identifiability
 from identify.estimators.evidence import Evidence
 from identify.estimators.registry import Estimator
 from identify.experiment.truth import true_poses
-from identify.files.result_file import rms_figures, rms_row
+from identify.files.figure import blank_figure
+from identify.files.run_folder import rms_figures, rms_row
 from identify.progress import Progress
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario
@@ -154,3 +155,28 @@ def _score(
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
+
+
+# Figure of the estimators: distances of parameters and poses, and time, one point each.
+
+
+PANELS = (
+    ("base parameters", "median error [%]", "group_median", 100.0),
+    ("unseen position", "worst RMS [um]", "position_um", 1.0),
+    ("unseen orientation", "worst RMS [urad]", "orientation_urad", 1.0),
+    ("time", "seconds", "seconds", 1.0),
+)
+
+
+def estimators_figure(scores: Sequence[Score]) -> Figure:
+    """Points on logarithmic axes, one panel a figure of merit; what does not exist (an unstable model) has none."""
+    figure = blank_figure(14, 1.2 + 0.42 * len(scores))
+    places = np.arange(len(scores))[::-1]
+    for axes, (title, label, field, factor) in zip(figure.subplots(1, len(PANELS), sharey=True), PANELS, strict=True):
+        values = np.array([factor * getattr(score, field) for score in scores], dtype=float)
+        axes.plot(np.where(values > 0, values, np.nan), places, "o", color="tab:blue")
+        axes.set(title=title, xlabel=label, xscale="log")
+        axes.grid(alpha=0.3, which="both")
+    figure.axes[0].set_yticks(places, [score.title for score in scores])
+    figure.suptitle("Estimators on one record, against one truth")
+    return figure

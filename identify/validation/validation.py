@@ -10,20 +10,24 @@ from multiprocessing.sharedctypes import Synchronized
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 import cmmsim
 from dynamics import Robot, load_robot
 from dynamics.closed_loop import LoopFailure, Reference, simulate
+from dynamics.closed_loop.preparation import checked_loop_parameters
 from identify.arrays import Array
-from identify.cores import cores
-from identify.estimation.pose_prediction import PosePrediction, predict_poses
-from identify.experiment.run import Experiment, run_plant
+from identify.estimation.covariance import PosePrediction, predict_poses
+from identify.excitation.design import unseen_trajectories
+from identify.experiment.plant import simulate_plant
+from identify.experiment.run import Experiment, run_plant, true_parameters
 from identify.experiment.sensor_in_loop import make_sensor
 from identify.progress import Advance, Progress
 from identify.random_streams import PREDICTION, stream_seed
 from identify.record.checks import TooFewFramesError
-from identify.record.loop_setup import frame_times, model_settings
+from identify.record.loop_setup import frame_times, model_settings, reference_motion
 from identify.record.recorded_run import watched_run
+from identify.runtime import cores
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
@@ -161,3 +165,25 @@ def _followed(counter: "Synchronized[int]", advance: Advance) -> Iterator[None]:
         ended.set()
         thread.join()
         advance(counter.value - done)
+
+
+# How wrong estimated parameters are: plant and model on trajectories that the estimator never saw.
+
+
+def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed: int = 0) -> Array:
+    """Pose errors (runs, N, 6) [m, rad] of the model with these parameters (67,) against the plant with the true ones.
+
+    On the scenario's unseen trajectories for this seed; plant and model each with their own friction law and steps.
+    Both see by an ideal sensor, so that only the parameters and what the model leaves out make the error. NaN where the
+    model's loop is unstable, and only there.
+
+    Raises:
+        dynamics.DynamicsError: parameters of another shape, not finite, or outside their range.
+        TrajectoryError: no unseen trajectory keeps the robot's limits.
+    """
+    values, true = checked_loop_parameters(parameters), true_parameters(robot, scenario)
+    times = frame_times(scenario, scenario.validation.duration_s)
+    references = [reference_motion(path, times) for path in unseen_trajectories(robot, scenario, seed)]
+    plant = [simulate_plant(scenario, robot, true, reference).pose for reference in references]
+    model = [model_run(robot, scenario, values, reference) for reference in references]
+    return np.array(model) - np.array(plant)

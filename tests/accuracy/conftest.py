@@ -4,7 +4,7 @@ import textwrap
 
 import pytest
 
-from identify.accuracy import recorder, saved  # noqa: F401  before any project: NumPy cannot be loaded twice
+from identify.accuracy import figure as recorder  # noqa: F401  before any project: NumPy cannot be loaded twice
 
 collect_ignore = ["guide"]  # an outsider's files: test_guide.py runs them as an outsider would
 

@@ -11,8 +11,7 @@ import pytest
 
 import identify
 from cmmsim.detection.detectors import DEFAULT_DETECTOR, DETECTORS
-from cmmsim.detector_leaderboard import compete
-from cmmsim.drawn_discs import scene_of, working_point
+from cmmsim.detector_leaderboard import compete, scene_of, working_point
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import apply, pose_to_transform
 from identify.experiment.sensor_in_loop import make_sensor
@@ -99,7 +98,7 @@ def test_dynamics_against_pinocchio(accuracy, cmmsim_robot, cmmsim_seed):
 @pytest.mark.slow
 def test_papers_loop_against_mujoco(accuracy, cmmsim_robot):
     pytest.importorskip("mujoco")
-    from identify.verification.model_verification import judge, verify
+    from identify.verification.figure7 import judge, verify
 
     verdict = judge(verify(cmmsim_robot))
     accuracy.record("the paper's loop against MuJoCo, position", verdict.position_steady_um, unit="um", limit=10)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from cmmsim.detection.detectors import DEFAULT_DETECTOR, DETECTORS
-from cmmsim.detector_leaderboard import compete
-from cmmsim.drawn_discs import scene_of, working_point
+from cmmsim.detector_leaderboard import compete, scene_of, working_point
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.plane_frame import frame_from_planes
 from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from identify.accuracy.recorder import mean_interval
+from identify.accuracy.figure import mean_interval
 
 pytest_plugins = "pytester"
 
@@ -126,7 +126,7 @@ def test_what_is_no_figure_is_one_line(project, call, says):
     done = project(f"def test_it(accuracy): accuracy.{call}")
     done.assert_outcomes(failed=1)
     evidence = [line[1:].strip() for line in done.outlines if line.startswith("E ")]
-    assert evidence == [f"identify.accuracy.errors.AccuracyError: {says}"]
+    assert evidence == [f"identify.accuracy.figure.AccuracyError: {says}"]
     assert not [line for line in done.outlines if "= accuracy =" in line]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import dynamics
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.warm_start import SLIPPING_SHARE
-from identify.record.filtering import filtered_derivatives, zero_phase_filter
+from identify.filtering import filtered_derivatives, zero_phase_filter
 from tests.benchmarks.servo_experiment import (
     FREE,
     POSITION_STD,

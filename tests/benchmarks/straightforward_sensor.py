@@ -6,7 +6,7 @@ import pyrender
 
 from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
 from cmmsim.geometry.registration import rigid_start
-from cmmsim.imaging.disc_mesh import disc_mesh
+from cmmsim.imaging.pyrender_meshes import disc_mesh
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 NEAREST_PX = 6.0

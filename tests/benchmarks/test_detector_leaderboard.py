@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cmmsim.detection.detectors import DEFAULT_DETECTOR, DETECTORS
-from cmmsim.detector_leaderboard import PEERS, compete
-from cmmsim.drawn_discs import Condition, scene_of, working_point
+from cmmsim.detector_leaderboard import PEERS, Condition, compete, scene_of, working_point
 from cmmsim.errors import CmmError
 from cmmsim.files.sensor_file import read_sensor_file
 

@@ -8,9 +8,9 @@ import pytest
 import cmmsim
 import dynamics
 from cmmsim.geometry.pose import compose_covariance, pose_covariance, pose_to_transform, transform_to_pose
-from cmmsim.geometry.triangulation import triangulate
+from cmmsim.geometry.stereo_rig import triangulate
+from cmmsim.pose_estimation.estimator import METHODS, by_planes, by_registration
 from cmmsim.pose_estimation.observation import StickerObservation
-from cmmsim.pose_estimation.pose_methods import METHODS, by_planes, by_registration
 from dynamics import compilation
 
 pytestmark = [pytest.mark.slow, pytest.mark.rendering]

@@ -162,7 +162,7 @@ def test_kernels_compile_within_fifteen_seconds(tmp_path, taught, record_propert
     code = (
         "import time, numpy as np, cmmsim; s = cmmsim.load_sensor('ctrack780', renderer='analytic');"
         "from cmmsim import teaching; c = time.process_time(); s.look(s.home).windows(np.full((2, 3, 2), 700), 16);"
-        "from cmmsim.detection.ellipse_fit import fit_ellipses; from cmmsim.geometry.triangulation import triangulate;"
+        "from cmmsim.detection.ellipse_fit import fit_ellipses; from cmmsim.geometry.stereo_rig import triangulate;"
         "from cmmsim.geometry.registration import register;"
         "fit_ellipses(np.zeros((1, 16, 16)), np.zeros((1, 2), int), s.noise, 14);"
         "p = np.full((4, 2), 1000.0); e = np.tile(np.eye(2), (4, 1, 1)); triangulate(s.rig, p, p, e, e);"

@@ -12,8 +12,7 @@ import psutil
 import pytest
 
 from identify.progress import SilentProgress
-from identify.studies.dask_executor import DaskExecutor
-from identify.studies.dask_runner import local_cluster
+from identify.studies.dask_cluster import DaskExecutor, local_cluster
 from identify.studies.runner import Outcome, run_study
 from identify.studies.study_file import Range, Study, load_study
 from tests.benchmarks.study_rows import EMPTY

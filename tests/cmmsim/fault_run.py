@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import cmmsim
+from cmmsim.fault_images import FaultyImages
 from cmmsim.faults import FaultGenerator, fault_bodies
-from cmmsim.faulty_images import FaultyImages
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import invert
 from cmmsim.pose_estimation.taught import Taught

@@ -4,7 +4,7 @@ import numpy as np
 
 import cmmsim
 from cmmsim.files.sensor_file import sensor_text
-from cmmsim.geometry.eccentricity import centre_offset
+from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import apply, pose_to_transform
 
 CAMERAS = """

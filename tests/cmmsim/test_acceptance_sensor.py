@@ -6,22 +6,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cmmsim.acceptance import (
-    AcceptanceError,
-    SensorUnderTest,
-    bar_paths,
-    common_volume,
-    latency_test,
-    length_test,
-    seven_lines,
-)
-from cmmsim.acceptance.bar import rigid_bar
+from cmmsim.acceptance import AcceptanceError, SensorUnderTest, common_volume, latency_test, length_test, seven_lines
+from cmmsim.acceptance import moving_bar as bar_paths
+from cmmsim.acceptance.artefacts import rigid_bar
 from cmmsim.acceptance.length_test import length_artefact, lengths_from_first, measure_line
 from cmmsim.acceptance.moving_bar import bar_run, relative_covariance, relative_error
 from cmmsim.files.rig import rig_from_file
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import apply, rotation_exp, transform_to_pose
-from cmmsim.pose_estimation.measurement import Measurement
+from cmmsim.pose_estimation.estimator import Measurement
 
 FILE = read_sensor_file("ctrack780")
 SILENT = FILE.model_copy(update={"camera": FILE.camera.model_copy(update={"noise": False})})

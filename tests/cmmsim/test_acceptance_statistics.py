@@ -6,7 +6,7 @@ from scipy.stats import norm
 
 import cmmsim
 from cmmsim.acceptance import PUBLISHED, estimate_latency, interval_of_mean, summarise
-from cmmsim.acceptance.published import published
+from cmmsim.acceptance.statistics import published
 
 
 def test_statistics_of_known_values():

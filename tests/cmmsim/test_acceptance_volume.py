@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cmmsim.acceptance import AcceptanceError, bar_paths, common_volume, require_rules, seven_lines, volume_of_size
-from cmmsim.acceptance.bar import LENGTH, bar_ends, rigid_bar
-from cmmsim.acceptance.bar_paths import SECONDS
+from cmmsim.acceptance import AcceptanceError, common_volume, require_rules, seven_lines, volume_of_size
+from cmmsim.acceptance import moving_bar as bar_paths
+from cmmsim.acceptance.artefacts import LENGTH, bar_ends, rigid_bar
 from cmmsim.acceptance.latency_test import require_room
 from cmmsim.acceptance.length_test import length_artefact
-from cmmsim.acceptance.measuring_lines import MeasuringLine
-from cmmsim.acceptance.volume import CORNERS, MARGIN_PX
+from cmmsim.acceptance.moving_bar import SECONDS
+from cmmsim.acceptance.volume import CORNERS, MARGIN_PX, MeasuringLine
 from cmmsim.files.marked_body import marked_body
 from cmmsim.files.rig import rig_from_file
 from cmmsim.files.sensor_file import read_sensor_file

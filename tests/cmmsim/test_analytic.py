@@ -9,15 +9,14 @@ import trimesh
 import cmmsim
 from cmmsim.detection.ellipse_fit import FitLimits, fit_ellipses
 from cmmsim.geometry.camera import PinholeCamera
-from cmmsim.geometry.eccentricity import eccentricity
+from cmmsim.geometry.disc_image import eccentricity, project_discs
 from cmmsim.geometry.pose import apply, pose_to_transform
-from cmmsim.geometry.projected_disc import project_discs
 from cmmsim.imaging import pyrender_renderer as render
 from cmmsim.imaging import renderer as renderers
 from cmmsim.imaging.analytic import draw_windows
-from cmmsim.imaging.convex_solid import ConvexSolid
-from cmmsim.imaging.layer_kernel import Discs, Solids, cover_by_polygon, lay_layers, polygon_holds
-from cmmsim.imaging.virtual_camera import SUPERSAMPLING
+from cmmsim.imaging.exposure import SUPERSAMPLING
+from cmmsim.imaging.kernels import Discs, Solids, cover_by_polygon, lay_layers, polygon_holds
+from cmmsim.imaging.scene import ConvexSolid
 from cmmsim.radiometry.noise import CameraNoise
 from tests.cmmsim import numpy_coverage
 from tests.cmmsim.lenses import expected_centres, lens_sensor, poses_about_home

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import cmmsim
-from cmmsim.drawn_discs import Condition
-from cmmsim.exact_teaching import exactly_taught
+from cmmsim.detector_leaderboard import Condition
 from cmmsim.files.sensor_file import read_sensor_file, sensor_text
 from cmmsim.imaging.scene import rod, rod_transform
+from cmmsim.teaching import exactly_taught
 
 TEXT = sensor_text("ctrack780")
 MOVED = cmmsim.pose_to_transform([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])

@@ -6,8 +6,7 @@ from scipy.special import ndtr
 
 import cmmsim
 from cmmsim.detection.ellipse_fit import fit_ellipses
-from cmmsim.geometry.blurred_coverage import blurred_coverage
-from cmmsim.geometry.ellipse_coverage import SHAPE_BASIS
+from cmmsim.geometry.coverage import SHAPE_BASIS, blurred_coverage
 from tests.cmmsim.ellipses import NOISE, random_ellipses
 
 SIZE = 20

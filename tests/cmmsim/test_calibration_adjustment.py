@@ -11,13 +11,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from cmmsim.calibration import CalibrationError, CalibrationOptions, PairView, calibrate
+from cmmsim.calibration.adjustment import RigState, adjust, free_directions, project
 from cmmsim.calibration.board import Board
-from cmmsim.calibration.board_detection import BoardView
-from cmmsim.calibration.calibration import PARAMETER_NAMES
-from cmmsim.calibration.intrinsics import free_directions, project
-from cmmsim.calibration.joint_adjustment import adjust
+from cmmsim.calibration.detection import BoardView
+from cmmsim.calibration.result import PARAMETER_NAMES
 from cmmsim.calibration.sightings import sightings_of
-from cmmsim.calibration.state import RigState
 
 BOARD = Board(kind="chessboard", columns=9, rows=7, spacing=0.05)
 SIZE = (2048, 1536)

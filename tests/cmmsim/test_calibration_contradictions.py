@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cmmsim.calibration import Board, CalibrationError, PairView, calibrate, find_board
-from cmmsim.calibration.dot_radius import covered_radius
+from cmmsim.calibration.detection import covered_radius
 from cmmsim.radiometry.optics import Optics
 from tests.cmmsim.test_calibration_adjustment import BOARD, SHIFT, SIZE, board_poses, seen_pairs
 from tests.cmmsim.test_calibration_images import ASYMMETRIC, BENT, DOTS, PERFECT, rendered, views_of

@@ -13,16 +13,15 @@ from cmmsim.calibration import (
     CalibrationOptions,
     PairView,
     as_dict,
-    board_poses,
     calibrate,
     find_board,
     render_pairs,
-    sensor_template,
 )
+from cmmsim.calibration import rendered_boards as board_poses
+from cmmsim.calibration import result as sensor_template
 from cmmsim.files.sensor_file import sensor_text
-from cmmsim.geometry.camera import PinholeCamera
-from cmmsim.geometry.distortion import Distortion
-from cmmsim.geometry.eccentricity import centre_offset
+from cmmsim.geometry.camera import Distortion, PinholeCamera
+from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import apply, rotation_log
 from cmmsim.geometry.stereo_rig import StereoRig, toed_in_rig
 from cmmsim.imaging.renderer import ANALYTIC, PYRENDER

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from cmmsim.calibration import PairView, calibrate
+from cmmsim.calibration.adjustment import adjust, free_directions
 from cmmsim.calibration.board import Board
-from cmmsim.calibration.board_detection import BoardView
-from cmmsim.calibration.intrinsics import free_directions
-from cmmsim.calibration.joint_adjustment import adjust
+from cmmsim.calibration.detection import BoardView
 from cmmsim.calibration.shared_errors import CHANCE, shared_errors
 from cmmsim.calibration.sightings import sightings_of
 from tests.cmmsim.test_calibration_adjustment import (

@@ -8,8 +8,7 @@ import trimesh
 from scipy.stats import norm
 
 import cmmsim
-from cmmsim.radiometry.fixed_pattern import draw_pattern
-from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.radiometry.noise import CameraNoise, draw_pattern
 from tests.cmmsim.lenses import lens_sensor
 
 GAIN, DARK_NOISE, WHITE, BLACK = 0.13, 26.0, 1600.0, 16.0

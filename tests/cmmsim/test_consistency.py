@@ -5,10 +5,10 @@ import pytest
 from scipy.stats import kstest
 
 from cmmsim.errors import LostError
-from cmmsim.geometry.outlines import sticker_outlines, symmetric_root
+from cmmsim.geometry.disc_image import sticker_outlines, symmetric_root
 from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.geometry.registration import register
-from cmmsim.geometry.triangulation import triangulate
+from cmmsim.geometry.stereo_rig import triangulate
 from cmmsim.pose_estimation.consistency import FEWEST, LARGEST_MISFIT, consistent, outline_misfits, place_misfits
 from cmmsim.pose_estimation.observation import Outlines, StickerObservation
 from tests.cmmsim.test_covariance import BODY, CAMERA_FROM_BASE, FILE, RIG, pixel_covariances

@@ -8,10 +8,9 @@ from cmmsim.files.marked_body import marked_body
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import apply, compose_covariance, pose_covariance, pose_to_transform, transform_to_pose
-from cmmsim.geometry.stereo_rig import toed_in_rig
-from cmmsim.geometry.triangulation import triangulate
+from cmmsim.geometry.stereo_rig import toed_in_rig, triangulate
+from cmmsim.pose_estimation.estimator import by_planes, by_registration
 from cmmsim.pose_estimation.observation import StickerObservation
-from cmmsim.pose_estimation.pose_methods import by_planes, by_registration
 
 DRAWS = 2000
 FILE = read_sensor_file("ctrack780")

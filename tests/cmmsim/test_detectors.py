@@ -8,7 +8,7 @@ import pytest
 
 from cmmsim.detection.detectors import DEFAULT_DETECTOR, DETECTORS, find_detector
 from cmmsim.detection.ellipse_fit import FitLimits
-from cmmsim.drawn_discs import Condition, draw_discs, random_ellipses, scene_of
+from cmmsim.detector_leaderboard import Condition, draw_discs, random_ellipses, scene_of
 from cmmsim.errors import CmmError, SensorFileError, UnknownOptionError
 from cmmsim.files.schema import Detection, SensorFile
 from cmmsim.files.sensor_file import read_sensor_file, sensor_text

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cmmsim.imaging.disc_mesh import GROUND_SIDES, LARGEST_SAG, RIM_SAMPLES, disc_mesh
+from cmmsim.imaging.pyrender_meshes import GROUND_SIDES, LARGEST_SAG, RIM_SAMPLES, disc_mesh
 from cmmsim.imaging.scene import Disc, DiscStack
 
 NORMAL = np.array([0.48, -0.6, 0.64])

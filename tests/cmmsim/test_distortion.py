@@ -10,8 +10,7 @@ import cmmsim
 from cmmsim.files.rig import rig_from_file
 from cmmsim.files.schema import RightFromLeft
 from cmmsim.files.sensor_file import read_sensor_file, sensor_text
-from cmmsim.geometry.camera import PinholeCamera
-from cmmsim.geometry.distortion import Distortion
+from cmmsim.geometry.camera import Distortion, PinholeCamera
 from cmmsim.geometry.pose import apply, rotation_exp
 from tests.cmmsim.lenses import CAMERAS
 

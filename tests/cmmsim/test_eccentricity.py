@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from cmmsim.detection.ellipse_fit import FitLimits, fit_ellipses
-from cmmsim.geometry.camera import PinholeCamera
-from cmmsim.geometry.distortion import Distortion
-from cmmsim.geometry.eccentricity import bending, centre_offset, eccentricity
+from cmmsim.geometry.camera import Distortion, PinholeCamera
+from cmmsim.geometry.disc_image import bending, centre_offset, eccentricity
 from cmmsim.radiometry.noise import CameraNoise
 
 NOISE = CameraNoise(1600.0, 0.13, 26.0, 1800.0, 16.0, enabled=False)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from cmmsim.geometry.pose import pose_to_transform
-from cmmsim.imaging.exposed_windows import exposed_windows
-from cmmsim.imaging.image_formation import ImageFormation, Side
+from cmmsim.imaging.exposure import exposed_windows
+from cmmsim.imaging.formation import ImageFormation, Side
 from tests.cmmsim.lenses import lens_sensor
 
 SIZE = 64

@@ -7,9 +7,8 @@ import pytest
 from scipy.stats import binom, chi2
 
 import cmmsim
-from cmmsim.fault_marks import DiscMark, FillMark, GlintMark, PlateMark, paint
+from cmmsim.fault_images import DiscMark, Fault, FaultyImages, FillMark, GlintMark, PlateMark, paint
 from cmmsim.faults import FaultGenerator, jump
-from cmmsim.faulty_images import Fault, FaultyImages
 from cmmsim.radiometry.images import FrameImages, StereoFrame
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.tracker import Tracker

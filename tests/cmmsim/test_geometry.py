@@ -9,11 +9,10 @@ from scipy.spatial.transform import Rotation
 from cmmsim.errors import LostError, ShapeError
 from cmmsim.geometry import pose as p
 from cmmsim.geometry.camera import PinholeCamera
-from cmmsim.geometry.eccentricity import eccentricity
+from cmmsim.geometry.disc_image import eccentricity
 from cmmsim.geometry.plane_frame import fit_plane, frame_from_planes, frame_of_points
 from cmmsim.geometry.registration import register
-from cmmsim.geometry.stereo_rig import toed_in_rig
-from cmmsim.geometry.triangulation import triangulate
+from cmmsim.geometry.stereo_rig import toed_in_rig, triangulate
 
 ANGLE = st.floats(-1.4, 1.4)
 CAMERA = PinholeCamera(2300.0, 1023.5, 767.5, 2048, 1536)

@@ -11,8 +11,8 @@ import cmmsim
 from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import apply, pose_to_transform
+from cmmsim.imaging.exposure import SUPERSAMPLING
 from cmmsim.imaging.views import View
-from cmmsim.imaging.virtual_camera import SUPERSAMPLING
 from cmmsim.pose_estimation.observation import _evenly_lit
 from cmmsim.radiometry.optics import Optics
 from tests.cmmsim.lenses import LENSES, expected_centres, lens_sensor, placed_at, pose_errors, poses_about_home

@@ -6,7 +6,7 @@ import pytest
 import cmmsim
 from cmmsim.detection.cramer_rao import light_shares
 from cmmsim.detection.ellipse_fit import fit_ellipses
-from cmmsim.imaging.motion_blur import LARGEST_STEP_PX, sub_frame_poses
+from cmmsim.imaging.exposure import LARGEST_STEP_PX, sub_frame_poses
 from tests.cmmsim.ellipses import NOISE, random_ellipses
 from tests.cmmsim.lenses import expected_centres, lens_sensor, pose_errors, poses_about_home
 

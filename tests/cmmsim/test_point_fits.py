@@ -5,10 +5,10 @@ import pytest
 from scipy.optimize import least_squares
 
 import cmmsim
-from cmmsim.geometry import point_kernel
+from cmmsim.geometry import point_kernels as point_kernel
 from cmmsim.geometry.pose import apply, rotation_exp
 from cmmsim.geometry.registration import register
-from cmmsim.geometry.triangulation import triangulate
+from cmmsim.geometry.stereo_rig import triangulate
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,11 @@ import pytest
 
 import cmmsim
 from cmmsim.detection.ellipse_fit import fit_ellipses
-from cmmsim.geometry.eccentricity import eccentricity
+from cmmsim.geometry.disc_image import eccentricity
 from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.imaging import pyrender_renderer as render
+from cmmsim.imaging.exposure import SUPERSAMPLING
 from cmmsim.imaging.renderer import PYRENDER
-from cmmsim.imaging.virtual_camera import SUPERSAMPLING
 from cmmsim.radiometry.noise import CameraNoise
 
 pytestmark = pytest.mark.rendering

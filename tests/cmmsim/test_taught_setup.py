@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 
 import cmmsim
-from cmmsim.exact_teaching import exactly_taught
 from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.teaching import exactly_taught
 
 TAUGHT = exactly_taught(read_sensor_file("ctrack780"))
 

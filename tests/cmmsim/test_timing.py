@@ -11,8 +11,7 @@ from cmmsim.acceptance import SensorUnderTest, common_volume, latency_test
 from cmmsim.files.schema import Timing
 from cmmsim.files.sensor_file import read_sensor_file, sensor_text
 from cmmsim.latency import drawn_latencies, largest_latency
-from cmmsim.pose_estimation.estimator import PoseEstimator
-from cmmsim.pose_estimation.measurement import lost_measurement
+from cmmsim.pose_estimation.estimator import PoseEstimator, lost_measurement
 from cmmsim.tracker import Tracker
 
 DROPPING = 'name = "ctrack780"\nbased_on = "ctrack780"\nrenderer = "analytic"\n[timing]\ndropout = {}\n'

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dynamics import closed_loop, compilation, robot_file
-from dynamics import plain_loop as plain_closed_loop
 from dynamics import robot as robot_module
+from dynamics.closed_loop import plain_loop as plain_closed_loop
 from dynamics.errors import DynamicsError, SimulationError
 
 PERIOD = 1 / 60

@@ -4,7 +4,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from dynamics.kinematics import jacobian_rates, jacobians
+from dynamics.kinematics import jacobians
+from dynamics.kinematics import jacobians as jacobian_rates
 from dynamics.kinematics.inverse_kinematics import leg_vectors, platform_arms
 from dynamics.kinematics.rotation import pose_rate_to_twist, rotation_matrix, twist_bias
 from dynamics.parameters import RIGID_BODY

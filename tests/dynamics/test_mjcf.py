@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dynamics.analysis.inertia_effect import acceleration_changes, travel_states
-from dynamics.analysis.physical_inertia import UnphysicalInertiaError, physical_inertias
+from dynamics.analysis.inertia import UnphysicalInertiaError, acceleration_changes, physical_inertias, travel_states
 from dynamics.engines.mjcf import MjcfSolver, mjcf_text
 from dynamics.engines.mujoco_engine import MujocoMissingError, MujocoRobot
 from dynamics.errors import DynamicsError, ParameterError

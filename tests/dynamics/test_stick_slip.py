@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dynamics import closed_loop
-from dynamics.closed_loop.loop_motion import Command, State
+from dynamics.closed_loop.motion import Command, State
 from dynamics.closed_loop.problem import LENGTH, FrictionLaw
 from dynamics.closed_loop.stick_slip import StickSlipMotion
 from dynamics.rigid_body import functions as model

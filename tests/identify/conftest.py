@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 
 from identify.experiment.truth import build_truth
-from identify.files.covariance_file import write_covariance
-from identify.files.result_file import rms_figures, save_result
-from identify.files.run_folder import RunFolder
+from identify.files.dataset import write_covariance
+from identify.files.run_folder import RunFolder, rms_figures, save_result
 from identify.loop_parameters import NAMES
-from identify.record.model_runs import build_model_run, write_model_runs
-from identify.record.recording import build_record, write, write_runs
+from identify.record.recording import build_model_run, build_record, write, write_model_runs, write_runs
 from identify.scenario import load_scenario
 
 HOME = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from identify.verification import acceptance_procedure as acceptance
-from identify.verification.tables import acceptance_markdown
+from identify.verification.acceptance_report import acceptance_markdown
 from tests.identify.commands import command
 
 

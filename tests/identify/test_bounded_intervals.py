@@ -6,9 +6,14 @@ The linear problems have known statistics: the estimate without bounds is that o
 import numpy as np
 import pytest
 
-from identify.estimation.bounded_intervals import BoundedEstimate, bounded_estimate
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
-from identify.estimation.parameter_bounds import InCoordinates, ParameterBounds, parameter_bounds
+from identify.estimation.bounds import (
+    BoundedEstimate,
+    InCoordinates,
+    ParameterBounds,
+    bounded_estimate,
+    parameter_bounds,
+)
 from identify.loop_parameters import StartingGuess, index_of
 
 CRITERIA = StopCriteria(1e-12, 1e-9, 200)

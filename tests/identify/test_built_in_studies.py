@@ -3,9 +3,8 @@
 import pytest
 
 from identify.studies import summary
-from identify.studies.computation import compute
-from identify.studies.design import Design, prepare
-from identify.studies.rows import rows
+from identify.studies.design import Design, compute, prepare
+from identify.studies.rows import kinds as rows
 from identify.studies.study_file import load_study, study_names
 from identify.studies.table import tidy_table
 from identify.studies.theory import check_laws

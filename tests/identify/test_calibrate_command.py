@@ -13,7 +13,7 @@ from tests.identify.commands import command
 
 SENSOR = (
     resources.files("cmmsim")
-    .joinpath("sensors", "ctrack780.toml")
+    .joinpath("files", "sensors", "ctrack780.toml")
     .read_text(encoding="utf-8")
     .replace("width = 2048", "width = 640")
     .replace("height = 1536", "height = 480")
@@ -123,7 +123,7 @@ def test_what_cannot_be_done_is_one_line_and_leaves_nothing(pictures, monkeypatc
 
 
 def test_images_of_another_size_are_refused_before_the_board_is_looked_for(pictures, monkeypatch, tmp_path, capfd):
-    monkeypatch.setattr("cmmsim.calibration.views_of_images.find_board", lambda *_: pytest.fail("searched"))
+    monkeypatch.setattr("cmmsim.calibration.sightings.find_board", lambda *_: pytest.fail("searched"))
     assert command("calibrate", *arguments(pictures), "--sensor", "ctrack780_29hz", "--out", tmp_path / "new") == 1
     assert "those of the sensor file ctrack780_29hz 2048 x 1536" in capfd.readouterr().err
 

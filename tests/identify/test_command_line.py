@@ -6,8 +6,7 @@ import pytest
 
 from identify.commands import app as command_line
 from identify.errors import OutputFolderError, ScenarioError
-from identify.files.result_file import load_result, save_result
-from identify.files.run_folder import RunFolder, new_run_folder
+from identify.files.run_folder import RunFolder, load_result, new_run_folder, save_result
 from tests.identify.commands import command, one_line
 from tests.identify.conftest import make_result
 

@@ -8,8 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cmmsim.detection.detectors import DEFAULT_DETECTOR
-from cmmsim.detector_leaderboard import compete
-from cmmsim.drawn_discs import Condition, scene_of, working_point
+from cmmsim.detector_leaderboard import Condition, compete, scene_of, working_point
 from cmmsim.errors import CmmError
 from cmmsim.files.sensor_file import read_sensor_file
 from identify.commands.app import app, is_known

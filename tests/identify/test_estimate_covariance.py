@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from identify.estimation.estimate_covariance import estimate_uncertainty
+from identify.estimation.covariance import estimate_uncertainty
 
 FRAMES, SIZE = 40, 12
 SINGULAR = np.logspace(10, -2, SIZE)

@@ -5,11 +5,11 @@ import pytest
 
 from dynamics.closed_loop import equilibrium, simulate
 from identify.errors import EstimationError, RecordError
-from identify.estimation.estimate_covariance import estimate_uncertainty
+from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identification import identify, output_error_problem
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor, store_anchor
 from identify.estimation.warm_start import linear_warm_start, regression_columns
-from identify.experiment.platform_load import scenario_payload
+from identify.experiment.plant import scenario_payload
 from identify.loop_parameters import NAMES, starting_guess
 from identify.record.loop_setup import model_settings, plant_settings
 from identify.record.payload import store_payload

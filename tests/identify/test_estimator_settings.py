@@ -6,16 +6,15 @@ import pytest
 from identify import pipeline
 from identify.errors import ScenarioError
 from identify.estimation.identification import identify
-from identify.files.result_file import load_result
-from identify.files.run_folder import RunFolder
+from identify.files.run_folder import RunFolder, load_result
 from identify.progress import SilentProgress
 from identify.record.recording import read, write
 from identify.reporting.report import provenance_section, read_report_data
 from identify.reporting.run_result import parameter_vector
 from identify.reporting.tables import changed_settings_table
 from identify.scenario import Scenario, load_scenario
-from identify.scenario.estimator_settings import SECTIONS, estimator_settings, with_estimator_settings
-from identify.trajectory_file import TrajectorySet, save_trajectories
+from identify.scenario.scenario import SECTIONS, estimator_settings, with_estimator_settings
+from identify.trajectory import TrajectorySet, save_trajectories
 from tests.identify.commands import command, one_line
 from tests.identify.synthetic import quick, rss6, run_plant, trajectory
 

@@ -8,8 +8,7 @@ from identify.estimators.evidence import Estimate, Evidence
 from identify.estimators.output_error_routes import known_pid
 from identify.estimators.registry import ESTIMATORS, Estimator, choose
 from identify.progress import SilentProgress
-from identify.validation.estimator_comparison import START, compare, examination
-from identify.validation.estimators_figure import estimators_figure
+from identify.validation.estimator_comparison import START, compare, estimators_figure, examination
 from tests.identify.estimator_evidence import evidence, unseen
 from tests.identify.synthetic import truth
 

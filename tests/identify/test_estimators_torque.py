@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 
 from identify.errors import EstimationError, RecordError, ScenarioError
-from identify.estimators.encoder_route import encoder_route
 from identify.estimators.evidence import Evidence, joint_channels
 from identify.estimators.instrumental_variables import instrumental_variables, iv_fit
-from identify.estimators.least_squares import least_squares, weighted_least_squares
-from identify.estimators.torque_equations import (
+from identify.estimators.least_squares import (
     UNKNOWNS,
     TorqueEquations,
+    encoder_route,
+    least_squares,
     lower_bounds,
     nearest_admissible,
     torque_equations,
+    weighted_least_squares,
 )
 from identify.estimators.total_least_squares import total_least_squares, truncated_tls
 from identify.experiment.joint_instruments import (
@@ -25,7 +26,7 @@ from identify.experiment.joint_instruments import (
     read_channels,
     write_channels,
 )
-from identify.files.netcdf import write_groups
+from identify.files.dataset import write_groups
 from identify.loop_parameters import NAMES, StartingGuess
 from identify.record.recorded_run import recorded_run
 from tests.identify.estimator_evidence import PERFECT, evidence, truth_of

@@ -8,7 +8,7 @@ from identify.errors import TrajectoryError
 from identify.excitation import design_trajectories
 from identify.excitation.design import unseen_trajectories
 from identify.scenario import load_scenario
-from identify.trajectory_file import load_trajectories, save_trajectories
+from identify.trajectory import load_trajectories, save_trajectories
 
 QUICK = load_scenario("quick").with_overrides({"excitation.candidates": 4})
 

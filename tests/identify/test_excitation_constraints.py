@@ -10,8 +10,7 @@ from dynamics import load_robot
 from dynamics.analysis.workspace import measure
 from identify.errors import TrajectoryError
 from identify.excitation import design_trajectories
-from identify.excitation.constraints import MotionConstraints, check_periods
-from identify.excitation.sight import required_stickers, within_sight
+from identify.excitation.constraints import MotionConstraints, check_periods, required_stickers, within_sight
 from identify.scenario import load_scenario
 from identify.trajectory import random_trajectory
 

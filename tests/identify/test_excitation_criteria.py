@@ -8,11 +8,15 @@ from dynamics import load_robot
 from dynamics.closed_loop import simulate
 from dynamics.parameters import VISCOUS
 from identify.errors import TrajectoryError
-from identify.excitation.criterion_information import knowledge, log_information
-from identify.excitation.criterion_linear_information import harmonics, log_linear_information, sensitivity_spectrum
-from identify.excitation.motion import played_times, sample_times
+from identify.excitation.information import (
+    harmonics,
+    knowledge,
+    log_information,
+    log_linear_information,
+    sensitivity_spectrum,
+)
+from identify.excitation.motion import played_times, sample_times, unknowns
 from identify.excitation.observability import SMOOTHING_RAD_S, log_index, log_observability
-from identify.excitation.unknowns import unknowns
 from identify.loop_parameters import NAMES, index_of
 from identify.record.loop_setup import frame_times, model_settings, reference_motion
 from identify.scenario import load_scenario

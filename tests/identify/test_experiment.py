@@ -10,12 +10,11 @@ import pytest
 import xarray as xr
 
 import cmmsim
-from cmmsim.pose_estimation.measurement import lost_measurement
+from cmmsim.pose_estimation.estimator import lost_measurement
 from dynamics import load_robot
 from identify.errors import TrajectoryError
-from identify.experiment.robot_bodies import robot_transforms
 from identify.experiment.run import run_experiment, run_plant, taught_sensor
-from identify.experiment.sensor_in_loop import SensorInLoop
+from identify.experiment.sensor_in_loop import SensorInLoop, robot_transforms
 from identify.experiment.truth import read_truth, true_poses
 from identify.progress import SilentProgress
 from identify.record.loop_setup import frame_times

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from identify.errors import FilterError
-from identify.record.filtering import filtered_derivatives, padding_samples, spline_derivatives, zero_phase_filter
+from identify.filtering import filtered_derivatives, padding_samples, spline_derivatives, zero_phase_filter
 
 RATE = 60.0
 T = np.arange(1200) / RATE

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from identify.estimation.base_parameters import base_parameters, structural_regressor
-from identify.estimation.group_estimates import group_estimates, group_rows
-from identify.estimation.identifiability import Identifiability, identifiability
+from identify.estimation.identifiability import Identifiability, group_estimates, group_rows, identifiability
 from identify.loop_parameters import NAMES, holding_torque, index_of, starting_guess
 from tests.identify.synthetic import rss6, truth
 

@@ -10,9 +10,8 @@ import pytest
 import typer
 
 from identify.errors import StudyInterrupted
-from identify.interrupts import deaf_offspring, held, honoured, noted, raise_noted
 from identify.progress import SilentProgress
-from identify.stopping import stoppable
+from identify.runtime import deaf_offspring, held, honoured, noted, raise_noted, stoppable
 from identify.studies import study_file
 from identify.studies.runner import run_study
 from identify.studies.study_file import Study

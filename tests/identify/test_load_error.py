@@ -9,17 +9,17 @@ import pytest
 from scipy.stats import chi2
 
 from identify.errors import EstimationError, RecordError
-from identify.estimation.estimate_covariance import estimate_uncertainty
+from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identification import identify, output_error_problem
 from identify.estimation.output_error_search import search
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
-from identify.experiment.platform_load import drawn_load, scenario_payload, scenario_payload_std
+from identify.experiment.plant import drawn_load, scenario_payload, scenario_payload_std
 from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses
 from identify.loop_parameters import NAMES, index_of
 from identify.record.payload import recorded_payload_std, store_payload
 from identify.record.recording import poses
-from identify.studies.rows.row_drawn_sensor import DrawnSensor
+from identify.studies.rows.sensor import DrawnSensor
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, trajectory, truth
 
 MASS, GAIN = index_of("platform.mass"), index_of("joint_pid.lp")

@@ -6,18 +6,15 @@ import pytest
 from identify import pipeline
 from identify.errors import OutputFolderError, RecordError
 from identify.experiment.truth import build_truth, read_truth
-from identify.files.covariance_file import write_covariance
-from identify.files.digest import array_digest
-from identify.files.result_file import load_result, save_result
-from identify.files.run_folder import RunFolder
+from identify.files.dataset import write_covariance
+from identify.files.run_folder import RunFolder, load_result, save_result
+from identify.files.versions import array_digest
 from identify.loop_parameters import NAMES
 from identify.progress import SilentProgress
-from identify.record.made_of import ENTRY, file_digests
-from identify.record.model_runs import EXCITATION, read_model_runs, write_model_runs
-from identify.record.record_digest import record_digest
-from identify.record.recording import read, read_runs, write, write_runs
+from identify.record.provenance import ENTRY, file_digests, record_digest
+from identify.record.recording import EXCITATION, read, read_model_runs, read_runs, write, write_model_runs, write_runs
 from identify.reporting.report import read_report_data, write_report
-from identify.trajectory_file import TrajectorySet, save_trajectories
+from identify.trajectory import TrajectorySet, save_trajectories
 from tests.identify.commands import command, one_line
 from tests.identify.synthetic import quick, run_plant, trajectory, truth
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white
 from identify.estimation.identification import identify
-from identify.estimation.misfit import Misfit, coloured_score_covariance, misfit_of_white
 from tests.identify.synthetic import quick, rss6, run_plant
 
 LASTING = 0.9

@@ -8,19 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cmmsim.pose_estimation.measurement import lost_measurement
+from cmmsim.pose_estimation.estimator import lost_measurement
 from dynamics.closed_loop import simulate
 from dynamics.errors import SimulationError
 from identify.errors import RecordError, ScenarioError
+from identify.estimation.explanation import SUSPICIOUS
 from identify.estimation.identification import identify
-from identify.estimation.whiteness import SUSPICIOUS
 from identify.experiment import run as experiment
 from identify.experiment.joint_instruments import JointInstruments, measure_joints
 from identify.experiment.plant import check_plant, plant_robot, simulate_plant
 from identify.experiment.truth import check_truth, true_poses
 from identify.record.loop_setup import frame_times, model_settings, plant_settings, reference_motion
 from identify.scenario import scenario_from_toml
-from identify.validation.unseen import unseen_errors
+from identify.validation.validation import unseen_errors
 from tests.identify.synthetic import quick, rss6, run_plant, trajectory, truth
 
 ELASTIC = {"plant.joint_stiffness_N_m_rad": 1000.0}

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from dynamics.analysis.physical_inertia import UnphysicalInertiaError, physical_inertias
+from dynamics.analysis.inertia import UnphysicalInertiaError, physical_inertias
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
+from identify.estimation.bounds import InCoordinates, parameter_bounds
 from identify.estimation.identification import identify
-from identify.estimation.parameter_bounds import InCoordinates, parameter_bounds
 from identify.loop_parameters import NAMES, StartingGuess
 from identify.scenario import load_scenario
 from tests.identify.synthetic import quick, rss6, run_plant, truth

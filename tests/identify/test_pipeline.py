@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from identify.files.result_file import load_result
+from identify.files.run_folder import load_result
 from identify.record.recording import read, read_runs
 from identify.reporting.goals import check_goals
 from identify.scenario import load_scenario

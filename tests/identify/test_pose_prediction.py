@@ -6,8 +6,8 @@ import pytest
 from dynamics.closed_loop import LoopFailure
 from dynamics.errors import ParameterError
 from identify.errors import EstimationError
+from identify.estimation.covariance import PosePrediction, predict_poses
 from identify.estimation.identification import identify
-from identify.estimation.pose_prediction import PosePrediction, predict_poses
 from identify.progress import SilentProgress
 from identify.record.recorded_run import recorded_run
 from identify.reporting.run_result import prediction_entry

@@ -4,10 +4,8 @@ import numpy as np
 from scipy.linalg import null_space
 
 from identify.estimation.base_parameters import base_parameters, structural_regressor
-from identify.estimation.group_estimates import group_rows
-from identify.estimation.identifiability import identifiability
+from identify.estimation.identifiability import group_rows, identifiability, rests_on_prior
 from identify.estimation.identification import identify
-from identify.estimation.prior_support import rests_on_prior
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.loop_parameters import NAMES, index_of, starting_guess
 from identify.record.recorded_run import recorded_run

@@ -10,15 +10,14 @@ from dynamics import load_robot
 from identify import pipeline
 from identify.errors import EstimationError, RecordError
 from identify.estimation.identification import identify
-from identify.files.covariance_file import write_covariance
-from identify.files.result_file import load_result, save_result
-from identify.files.run_folder import RunFolder
+from identify.files.dataset import write_covariance
+from identify.files.run_folder import RunFolder, load_result, save_result
 from identify.loop_parameters import NAMES
 from identify.progress import SilentProgress
 from identify.record.checks import check_trajectory
-from identify.record.recorded_robot import check_robot, store_robot
+from identify.record.provenance import check_robot, store_robot
 from identify.record.recording import read, write
-from identify.trajectory_file import TrajectorySet, load_trajectories, save_trajectories
+from identify.trajectory import TrajectorySet, load_trajectories, save_trajectories
 from tests.identify.synthetic import quick, rss6, run_plant, trajectory
 
 SCENARIO = quick(**{"excitation.duration_s": 2.0})

@@ -7,10 +7,18 @@ import xarray as xr
 
 from identify.errors import RecordError
 from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
-from identify.files.netcdf import group_names, write_groups
+from identify.files.dataset import group_names, write_groups
 from identify.record import recording
-from identify.record.model_runs import build_model_run, read_model_runs, write_model_runs
-from identify.record.recording import poses, read, read_runs, write, write_runs
+from identify.record.recording import (
+    build_model_run,
+    poses,
+    read,
+    read_model_runs,
+    read_runs,
+    write,
+    write_model_runs,
+    write_runs,
+)
 
 
 def test_record_and_truth_read_back_identical(tmp_path, make_record, make_truth):

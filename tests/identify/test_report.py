@@ -7,12 +7,11 @@ import pytest
 from matplotlib.image import imread
 
 from identify.errors import OutputFolderError, RecordError
-from identify.files.result_file import load_result, save_result
-from identify.record.model_runs import build_model_run, write_model_runs
+from identify.files.run_folder import load_result, save_result
+from identify.record.recording import build_model_run, write_model_runs
 from identify.reporting import figures
 from identify.reporting.report import SECTIONS, read_report_data, render, write_report
-from identify.trajectory import random_trajectory
-from identify.trajectory_file import TrajectorySet, save_trajectories
+from identify.trajectory import TrajectorySet, random_trajectory, save_trajectories
 
 FIGURES = {"excitation", "fit_excitation", "fit_validation", "validation_errors", "parameters", "correlation"}
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from identify.errors import RecordError
-from identify.files.result_file import load_result, rms_figures, rms_row, save_result
-from identify.reporting import paper_results
+from identify.files.run_folder import load_result, rms_figures, rms_row, save_result
+from identify.reporting import tables as paper_results
 from identify.reporting.goals import check_goals, within_tolerance
 from identify.reporting.tables import (
     excitation_error_table,

@@ -18,10 +18,9 @@ import pandas as pd
 import pytest
 
 from identify.errors import StudyError
-from identify.files.same_versions import OtherVersionsWarning
-from identify.files.versions import versions
+from identify.files.versions import OtherVersionsWarning, versions
 from identify.progress import SilentProgress
-from identify.studies.dask_runner import local_cluster, running_cluster
+from identify.studies.dask_cluster import local_cluster, running_cluster
 from identify.studies.runner import run_study
 from identify.studies.store import JOURNAL
 from identify.studies.study_file import Study

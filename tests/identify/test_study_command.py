@@ -10,8 +10,9 @@ import pytest
 
 from identify.commands import study as study_command
 from identify.errors import StudyInterrupted
-from identify.studies import dask_runner, runner, summary
-from identify.studies.rows import rows
+from identify.studies import dask_cluster as dask_runner
+from identify.studies import runner, summary
+from identify.studies.rows import kinds as rows
 from identify.studies.study_file import study_names
 from identify.studies.table import read_table
 from tests.identify.commands import command, one_line

@@ -10,13 +10,11 @@ import pytest
 
 import cmmsim
 from cmmsim.geometry.pose import apply, invert
-from identify.studies.computation import compute
-from identify.studies.design import Design, prepare
-from identify.studies.rows.row_sensor import row_sensor
-from identify.studies.scale_regression import scale_regression
+from identify.studies.design import Design, compute, prepare
+from identify.studies.rows.sensor import row_sensor
 from identify.studies.study_file import load_study
 from identify.studies.table import tidy_table
-from identify.studies.theory import CONFIDENCE
+from identify.studies.theory import CONFIDENCE, scale_regression
 
 POSES, RIM_POINTS, STEP_M = 6, 60, 1e-4
 DEPTH, DISPARITY = "point_depth_rms_um", "disparity_rms_px"

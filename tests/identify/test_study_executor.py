@@ -7,11 +7,9 @@ import pytest
 from distributed import KilledWorker
 
 from identify.errors import StudyError
-from identify.studies import dask_executor
-from identify.studies.batches import Batches
-from identify.studies.computation import Finished
-from identify.studies.dask_executor import DaskExecutor
-from identify.studies.design import Case
+from identify.studies import dask_cluster as dask_executor
+from identify.studies.dask_cluster import DaskExecutor
+from identify.studies.design import Batches, Case, Finished
 
 LOST = TimeoutError("its worker died with the result")
 DIED = KilledWorker("task", SimpleNamespace(address="tcp://a:1"), 0)

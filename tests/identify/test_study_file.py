@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 
 from identify.errors import StudyError
-from identify.studies.computation import compute
-from identify.studies.design import Design, prepare
+from identify.studies.design import Design, compute, prepare
 from identify.studies.keys import valid_keys
-from identify.studies.law import Law
-from identify.studies.study_file import Study, load_study, study_from_toml, study_names
-from identify.studies.units import SENSOR_UNITS
+from identify.studies.study_file import Law, Study, load_study, study_from_toml, study_names
+from identify.studies.table import SENSOR_UNITS
 from tests.identify.study_rows import KIND
 
 FACTORS = {"sensor.camera.dark_noise": [13.0, 26.0], "scenario.pose_method": ["registration", "planes"]}

@@ -11,7 +11,7 @@ from identify.errors import IdentifyError, StudyError
 from identify.scenario import load_scenario
 from identify.studies.design import prepare
 from identify.studies.keys import overrides, valid_keys
-from identify.studies.rows import rows
+from identify.studies.rows import kinds as rows
 from identify.studies.study_file import Study
 from tests.identify.study_rows import KIND
 

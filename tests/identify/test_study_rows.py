@@ -5,17 +5,18 @@ import pytest
 from scipy.stats import binom, chi2
 
 import cmmsim
-from cmmsim.exact_teaching import exactly_taught
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import invert, rotation_log
+from cmmsim.teaching import exactly_taught
 from dynamics import load_robot
 from dynamics.closed_loop import Reference
 from identify.errors import EstimationError, ScenarioError
 from identify.experiment.run import true_parameters
 from identify.scenario import load_scenario
-from identify.studies.rows import row_sensor, rows
+from identify.studies.rows import kinds as rows
+from identify.studies.rows import sensor as row_sensor
 from identify.studies.rows.identification import prediction_figures
-from identify.studies.rows.row_drawn_sensor import DrawnSensor
+from identify.studies.rows.sensor import DrawnSensor
 
 NOISELESS = {
     "sensor_changes.camera.noise": False,

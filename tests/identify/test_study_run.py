@@ -14,9 +14,7 @@ from identify.errors import StudyError, StudyInterrupted
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
 from identify.studies import runner
-from identify.studies.batches import BATCH_SECONDS, LARGEST_BATCH, Batches
-from identify.studies.computation import Finished, compute
-from identify.studies.design import Case
+from identify.studies.design import BATCH_SECONDS, LARGEST_BATCH, Batches, Case, Finished, compute
 from identify.studies.runner import run_study
 from identify.studies.store import JOURNAL, LOCK, STUDY, TABLE
 from identify.studies.study_file import Study

@@ -10,10 +10,8 @@ from scipy import stats
 
 from identify.studies import summary
 from identify.studies.figures import laws_figure
-from identify.studies.law import Law
-from identify.studies.point_statistics import point_statistics
-from identify.studies.study_file import Range, Study
-from identify.studies.theory import check_laws
+from identify.studies.study_file import Law, Range, Study
+from identify.studies.theory import check_laws, point_statistics
 
 DARK, BASELINE = "sensor.camera.dark_noise", "sensor.rig.baseline"
 POSITION, ORIENTATION = "position_rms_um", "orientation_rms_urad"

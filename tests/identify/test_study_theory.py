@@ -7,10 +7,8 @@ from pydantic import ValidationError
 from scipy.stats import binom
 
 from identify.errors import StudyError
-from identify.studies.law import Law
-from identify.studies.scale_regression import scale_regression
-from identify.studies.study_file import Study
-from identify.studies.theory import CONFIDENCE, check_laws
+from identify.studies.study_file import Law, Study
+from identify.studies.theory import CONFIDENCE, check_laws, scale_regression
 
 LEVELS = np.array([0.5, 1.0, 2.0, 4.0])
 

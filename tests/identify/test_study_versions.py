@@ -9,8 +9,7 @@ import warnings
 import pytest
 
 from identify.errors import StudyError
-from identify.files.same_versions import OtherVersionsWarning, check_workers
-from identify.files.versions import versions
+from identify.files.versions import OtherVersionsWarning, check_workers, versions
 from identify.progress import SilentProgress
 from identify.studies.runner import run_study
 from identify.studies.store import JOURNAL, STUDY

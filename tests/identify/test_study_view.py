@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 from identify.errors import StudyError
-from identify.studies.computation import Finished
+from identify.studies.design import Finished
 from identify.studies.study_file import Study
 from identify.studies.table import read_table, tidy_table, to_xarray, write_table, write_view
 

@@ -1,6 +1,6 @@
 """Tables at the terminal show what they were given."""
 
-from identify.terminal import print_table
+from identify.progress import print_table
 
 HEADER = ("parameter", "std [um]", "remark")
 ROWS = [("joint1.coulomb", "0.12", "fixed"), ("lp [a]", "-1234.5", "from the [red]prior[/red] :smile:")]

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import kstest
 
 from identify.errors import EstimationError
-from identify.estimation.whiteness import whiteness
+from identify.estimation.explanation import whiteness
 
 
 def noise(seed, frames=600, memory=0.0):

@@ -9,11 +9,10 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from cmmsim.exact_teaching import exactly_taught
+from cmmsim.teaching import exactly_taught
 from dynamics import load_robot
 from identify.errors import EstimationError
-from identify.excitation.design import motion_check
-from identify.excitation.random_trajectories import admissible_trajectories
+from identify.excitation.design import admissible_trajectories, motion_check
 from identify.experiment.run import run_plant
 from identify.experiment.sensor_in_loop import make_sensor
 from identify.experiment.truth import true_poses
@@ -21,9 +20,20 @@ from identify.random_streams import stream_seed
 from identify.record import recording
 from identify.record.loop_setup import frame_times
 from identify.scenario import Scenario
-from identify.studies.rows.row_columns import POSE_COLUMNS, Column, Kind, Row, RowOptions, pose_figures, rms_um
-from identify.studies.rows.row_reads import NOISE_OFF, PICTURES, PLANT, Reads
-from identify.studies.rows.row_sensor import Teaching, sensor_file
+from identify.studies.rows.columns import (
+    NOISE_OFF,
+    PICTURES,
+    PLANT,
+    POSE_COLUMNS,
+    Column,
+    Kind,
+    Reads,
+    Row,
+    RowOptions,
+    pose_figures,
+    rms_um,
+)
+from identify.studies.rows.sensor import Teaching, sensor_file
 
 EXPERIMENT, TRAJECTORY = 0, 1
 

@@ -29,10 +29,22 @@ from identify.random_streams import stream_seed
 from identify.record.loop_setup import frame_times, model_settings
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, scenario_from_toml
-from identify.studies.rows.row_columns import Column, Kind, Row, RowOptions, rms_um, stated_um
-from identify.studies.rows.row_drawn_sensor import DrawnSensor
-from identify.studies.rows.row_reads import NOISE_OFF, PLANT, SENSOR, Idle, Reads, timing
-from identify.trajectory_file import TrajectorySet
+from identify.studies.rows.columns import (
+    NOISE_OFF,
+    PLANT,
+    SENSOR,
+    Column,
+    Idle,
+    Kind,
+    Reads,
+    Row,
+    RowOptions,
+    rms_um,
+    stated_um,
+    timing,
+)
+from identify.studies.rows.sensor import DrawnSensor
+from identify.trajectory import TrajectorySet
 from identify.validation.validation import model_run
 
 EXPERIMENT = 0

@@ -17,9 +17,20 @@ from identify.errors import EstimationError
 from identify.experiment.sensor_in_loop import frame_latencies
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
-from identify.studies.rows.row_columns import POSE_COLUMNS, Column, Kind, Row, RowOptions, pose_figures, rms_um
-from identify.studies.rows.row_reads import NOISE_OFF, PICTURES, Reads, timing
-from identify.studies.rows.row_sensor import RowSensor, Teaching, row_sensor
+from identify.studies.rows.columns import (
+    NOISE_OFF,
+    PICTURES,
+    POSE_COLUMNS,
+    Column,
+    Kind,
+    Reads,
+    Row,
+    RowOptions,
+    pose_figures,
+    rms_um,
+    timing,
+)
+from identify.studies.rows.sensor import RowSensor, Teaching, row_sensor
 from identify.trajectory import FourierTrajectory, random_trajectory
 
 PATH, SENSOR, LATENCY = 0, 1, 2

@@ -18,9 +18,21 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
-from identify.studies.rows.row_columns import POSE_COLUMNS, Column, Kind, Row, RowOptions, pose_figures, rms_um
-from identify.studies.rows.row_reads import NOISE_OFF, PICTURES, Idle, Reads, timing
-from identify.studies.rows.row_sensor import RowSensor, Teaching, row_sensor
+from identify.studies.rows.columns import (
+    NOISE_OFF,
+    PICTURES,
+    POSE_COLUMNS,
+    Column,
+    Idle,
+    Kind,
+    Reads,
+    Row,
+    RowOptions,
+    pose_figures,
+    rms_um,
+    timing,
+)
+from identify.studies.rows.sensor import RowSensor, Teaching, row_sensor
 
 POSES, SENSOR, DROPOUT = 0, 1, 2
 PREDICTION_ERROR = np.repeat([1e-4, 5e-4], 3)

@@ -1,0 +1,294 @@
+"""One least-squares adjustment of both cameras, their relative pose and all board poses to all measured pixels.
+
+The numbers that describe one camera, and which of them a calibration sets free.
+Order: focal lengths fx, fy and principal point cx, cy in px, then k1, k2, p1, p2, k3 of Brown and Conrady as OpenCV
+orders them.
+
+Levenberg and Marquardt's method on the normal equations. A board pose is seen by its own view only, so that the poses
+are eliminated view by view (Schur complement) and what remains is the reduced normal matrix N of the free intrinsics
+and of right_from_left. All pixels count alike; their variance sigma² is estimated from the residuals, and
+sigma² N^-1 is the covariance of independent errors, enlarged where the points of a view share theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from cmmsim.calibration.shared_errors import SharedErrors, shared_errors
+from cmmsim.calibration.sightings import Sightings
+from cmmsim.errors import CalibrationError, UnknownOptionError
+from cmmsim.geometry.camera import Distortion, PinholeCamera
+from cmmsim.geometry.pose import Array, apply, rotation_exp, skew
+
+INTRINSIC_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
+DISTORTIONS = {"none": (), "radial2": ("k1", "k2"), "brown5": ("k1", "k2", "p1", "p2", "k3")}
+DEFAULT_DISTORTION = "brown5"
+
+
+def free_directions(distortion: str, fix_aspect: bool) -> Array:
+    """Matrix (9, k) from the k free numbers of a camera to all nine.
+
+    distortion: which terms are free, a key of DISTORTIONS; fix_aspect: fx = fy. Raises UnknownOptionError.
+    """
+    if distortion not in DISTORTIONS:
+        raise UnknownOptionError("distortion", distortion, DISTORTIONS)
+    free = np.eye(len(INTRINSIC_NAMES))[
+        :, [k for k, name in enumerate(INTRINSIC_NAMES) if name.endswith("_px") or name in DISTORTIONS[distortion]]
+    ]
+    if fix_aspect:
+        free[:, 0] += free[:, 1]
+        free = np.delete(free, 1, axis=1)
+    return free
+
+
+def camera_from(values: Array, width: int, height: int) -> PinholeCamera:
+    """The camera of nine intrinsics (9,)."""
+    fx, fy, cx, cy, *terms = (float(value) for value in values)
+    return PinholeCamera(fx, cx, cy, width, height, aspect=fy / fx, distortion=Distortion(*terms))
+
+
+def project(values: Array, points: Array) -> tuple[Array, Array, Array]:
+    """Pixels (n, 2) of points (n, 3) in camera axes, and their derivatives by the intrinsics (n, 2, 9) and by the
+    points (n, 2, 3), px/m. The points must lie before the camera."""
+    matrix = np.array([[values[0], 0.0, values[2]], [0.0, values[1], values[3]], [0.0, 0.0, 1.0]])
+    pixels, jacobian = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, values[4:])
+    by_all = np.asarray(jacobian, dtype=float).reshape(len(points), 2, -1)  # turn 3, shift 3, f 2, c 2, distortion 5
+    return np.asarray(pixels, dtype=float).reshape(-1, 2), by_all[:, :, 6:15], by_all[:, :, 3:6]
+
+
+# What the adjustment estimates.
+
+
+@dataclass(frozen=True)
+class RigState:
+    """intrinsics (2,9) of the left and right camera, right_from_left (4,4), left_from_boards (v,4,4) of the views."""
+
+    intrinsics: Array
+    right_from_left: Array
+    left_from_boards: Array
+
+    @property
+    def largest_tilt(self) -> float:
+        """Largest angle between the normals of any two boards, rad."""
+        normals = self.left_from_boards[:, :3, 2]
+        return float(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0)))
+
+    def moved(self, intrinsics: Array, right: Array, boards: Array) -> RigState:
+        """The state after changes of the intrinsics (2,9), and small errors [dt, dphi] of right_from_left (6,) and of
+        the boards (v,6)."""
+        return RigState(
+            self.intrinsics + intrinsics,
+            _moved(self.right_from_left, right),
+            np.stack([_moved(b, change) for b, change in zip(self.left_from_boards, boards, strict=True)]),
+        )
+
+
+def _moved(transform: Array, change: Array) -> Array:
+    moved = transform.copy()
+    moved[:3, 3] += change[:3]
+    moved[:3, :3] = rotation_exp(change[3:]) @ transform[:3, :3]
+    return moved
+
+
+MOST_STEPS = 60
+SMALLEST_GAIN = 1e-11  # relative decrease of the sum of squares that ends the iteration
+SINGULAR = 1e-14  # smallest eigenvalue of N, scaled to a unit diagonal, below which nothing is determined
+POSE = 6
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """state; residuals (m,2) px of each camera, measured minus computed; sigma_px: estimated standard deviation of a
+    pixel coordinate; covariance (24,24) of the left and right intrinsics (9 each) and of the small error [dt, dphi] of
+    right_from_left, and independent_covariance that it would be if no points of a view erred alike; condition of N
+    scaled to a unit diagonal; steps; freedom: observations minus unknowns; shared: errors that points of a view
+    share."""
+
+    state: RigState
+    residuals: tuple[Array, Array]
+    sigma_px: float
+    covariance: Array
+    independent_covariance: Array
+    condition: float
+    steps: int
+    freedom: int
+    shared: SharedErrors
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """Blocks of the normal equations by view: common (v,c,c), mixed (v,c,6), boards (v,6,6), right-hand sides (v,c)
+    and (v,6); residuals of both cameras; cost: sum of squares, px²."""
+
+    common: Array
+    mixed: Array
+    boards: Array
+    common_side: Array
+    board_side: Array
+    residuals: tuple[Array, Array]
+    cost: float
+
+
+def adjust(points: Array, sightings: tuple[Sightings, Sightings], start: RigState, free: Array) -> Adjustment:
+    """Adjust the rig and the board poses.
+
+    Parameters: points (n,3) m of the board; sightings of the left and right camera, each view seen by at least one;
+    start; free (9,k) from ``free_directions``. Raises CalibrationError where the views do not determine the cameras.
+    """
+
+    def build(state: RigState) -> _Normal:
+        return _normal_equations(points, sightings, state, free)
+
+    state, steps = _minimise(build, start, free)
+    normal = build(state)
+    size = normal.common.shape[1]
+    freedom = sum(2 * len(s.view) for s in sightings) - size - POSE * len(state.left_from_boards)
+    if freedom < 1:
+        raise CalibrationError(
+            f"too few points: {freedom + size} more observations than board poses, more than {size} needed"
+        )
+    information, scores = _reduced(normal, 0.0)
+    reduced = information.sum(axis=0)
+    scale = 1.0 / np.sqrt(np.diag(reduced))
+    eigenvalues = np.linalg.eigvalsh(reduced * scale[:, None] * scale)
+    if not eigenvalues[0] > SINGULAR:
+        raise CalibrationError(
+            "these views do not determine the cameras (smallest eigenvalue of the scaled normal "
+            f"matrix {eigenvalues[0]:.1e}): show the board tilted to several sides, all over "
+            "the image"
+        )
+    sigma2 = normal.cost / freedom
+    shared = shared_errors(scores, information, sigma2)
+    spread = _spread(free)
+    return Adjustment(
+        state,
+        normal.residuals,
+        float(np.sqrt(sigma2)),
+        spread @ shared.covariance @ spread.T,
+        spread @ shared.independent @ spread.T,
+        float(eigenvalues[-1] / eigenvalues[0]),
+        steps,
+        freedom,
+        shared,
+    )
+
+
+def _minimise(build: Callable[[RigState], _Normal], state: RigState, free: Array) -> tuple[RigState, int]:
+    """Levenberg-Marquardt: the state of least cost and the steps taken."""
+    damping = 1e-4
+    normal = build(state)
+    k = free.shape[1]
+    for step in range(1, MOST_STEPS + 1):
+        common, boards = _solve(normal, damping)
+        trial = state.moved((free @ common[: 2 * k].reshape(2, k).T).T, common[2 * k :], boards)
+        attempt = build(trial)
+        if attempt.cost < normal.cost:
+            gain = (normal.cost - attempt.cost) / normal.cost
+            state, normal, damping = trial, attempt, max(0.1 * damping, 1e-12)
+            if gain < SMALLEST_GAIN:
+                return state, step
+        elif damping > 1e6 or _is_small(common, normal):
+            return state, step
+        else:
+            damping *= 10.0
+    raise CalibrationError(
+        f"the adjustment has not converged in {MOST_STEPS} steps (rms {_rms(normal):.3g} px, board "
+        f"normals differ by at most {np.degrees(state.largest_tilt):.1f} degrees): show the board "
+        "tilted to several sides, by 30 degrees and more, or free fewer terms of distortion"
+    )
+
+
+def _is_small(change: Array, normal: _Normal) -> bool:
+    """Whether a change that does not help is rounding: it would lower the cost by next to nothing."""
+    return bool(abs(change @ normal.common_side.sum(axis=0)) <= 1e-8 * normal.cost)
+
+
+def _rms(normal: _Normal) -> float:
+    return float(np.sqrt(normal.cost / sum(len(r) for r in normal.residuals)))
+
+
+def _normal_equations(points: Array, sightings: tuple[Sightings, Sightings], state: RigState, free: Array) -> _Normal:
+    k, views = free.shape[1], len(state.left_from_boards)
+    size = 2 * k + POSE
+    common, mixed = np.zeros((views, size, size)), np.zeros((views, size, POSE))
+    boards = np.zeros((views, POSE, POSE))
+    common_side, board_side, residuals = np.zeros((views, size)), np.zeros((views, POSE)), []
+    for side, seen in enumerate(sightings):
+        computed, by_common, by_board = _predict(points, seen, state, side, free)
+        error = seen.pixels - computed
+        residuals.append(error)
+        edges = np.searchsorted(seen.view, np.arange(views + 1))
+        for v, (first, last) in enumerate(pairwise(edges)):
+            jc = by_common[first:last].reshape(-1, size)
+            jb, e = by_board[first:last].reshape(-1, POSE), error[first:last].ravel()
+            common[v] += jc.T @ jc
+            mixed[v] += jc.T @ jb
+            boards[v] += jb.T @ jb
+            common_side[v] += jc.T @ e
+            board_side[v] += jb.T @ e
+    cost = float(sum(np.sum(r**2) for r in residuals))
+    return _Normal(
+        common,
+        mixed,
+        boards,
+        common_side,
+        board_side,
+        (residuals[0], residuals[1]),
+        cost if np.isfinite(cost) else np.inf,
+    )
+
+
+def _predict(points: Array, seen: Sightings, state: RigState, side: int, free: Array) -> tuple[Array, Array, Array]:
+    """Pixels (m,2) of one camera, and their derivatives by the common unknowns (m,2,c) and the view's board (m,2,6)."""
+    k = free.shape[1]
+    moves = state.left_from_boards[seen.view]
+    turned = np.einsum("mij,mj->mi", moves[:, :3, :3], points[seen.point])
+    places = turned + moves[:, :3, 3]
+    place_by_board = np.concatenate([np.broadcast_to(np.eye(3), (len(places), 3, 3)), -skew(turned)], axis=2)
+    by_common = np.zeros((len(places), 2, 2 * k + POSE))
+    if side == 1:
+        rotation = state.right_from_left[:3, :3]
+        turned = places @ rotation.T
+        places = apply(state.right_from_left, places)
+        place_by_board = rotation @ place_by_board
+    ahead = places[:, 2] > 1e-6
+    pixels, by_intrinsics, by_place = project(state.intrinsics[side], np.where(ahead[:, None], places, [0.0, 0.0, 1.0]))
+    pixels[~ahead] = np.inf  # a step that puts a board behind a camera is no improvement
+    by_common[:, :, side * k : (side + 1) * k] = by_intrinsics @ free
+    if side == 1:
+        by_common[:, :, 2 * k : 2 * k + 3] = by_place
+        by_common[:, :, 2 * k + 3 :] = by_place @ -skew(turned)
+    return pixels, by_common, by_place @ place_by_board
+
+
+def _reduced(normal: _Normal, damping: float) -> tuple[Array, Array]:
+    """Each view's share of the reduced normal matrix (v,c,c) and of its right-hand side (v,c)."""
+    boards = normal.boards + damping * normal.boards * np.eye(POSE)
+    eliminated = np.asarray(np.linalg.solve(boards, normal.mixed.swapaxes(1, 2)).swapaxes(1, 2), dtype=np.float64)
+    matrix = normal.common + damping * normal.common * np.eye(normal.common.shape[1])
+    matrix = matrix - eliminated @ normal.mixed.swapaxes(1, 2)
+    return matrix, normal.common_side - np.einsum("vci,vi->vc", eliminated, normal.board_side)
+
+
+def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
+    """Damped step: changes of the common unknowns (c,) and of the boards (v,6)."""
+    matrix, side = (part.sum(axis=0) for part in _reduced(normal, damping))
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    common = scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * side, rcond=1e-15)[0]
+    boards = normal.boards + damping * normal.boards * np.eye(POSE)
+    rest = normal.board_side - np.einsum("vci,c->vi", normal.mixed, common)
+    return common, np.linalg.solve(boards, rest[..., None])[..., 0]
+
+
+def _spread(free: Array) -> Array:
+    """Matrix (24,c) from the free unknowns to all intrinsics and the small error of right_from_left."""
+    rows, k = free.shape
+    spread = np.zeros((2 * rows + POSE, 2 * k + POSE))
+    spread[:rows, :k] = spread[rows : 2 * rows, k : 2 * k] = free
+    spread[2 * rows :, 2 * k :] = np.eye(POSE)
+    return spread

@@ -1,0 +1,217 @@
+"""Rendered calibration images: seeded poses of a board, and what the cameras of a sensor see of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from cmmsim.calibration.board import Board
+from cmmsim.errors import CalibrationError
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.pose import Array, apply, invert, rotation_exp
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.imaging.formation import ImageFormation, Side
+from cmmsim.imaging.renderer import Renderer
+from cmmsim.imaging.scene import SUNK, Disc, DiscStack, Mesh, Patch, solid_mesh
+from cmmsim.imaging.views import Drawable
+from cmmsim.radiometry.images import StereoFrame
+from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.radiometry.optics import Optics
+
+# The drawn board: a bright plate with dark dots or squares, as both renderers or pyrender take it.
+
+
+MARGIN = 1.0  # of the spacing: rim of the plate beyond its outermost points; a chessboard's outer squares reach there
+RIM = 0.35  # of the spacing: bright rim beyond the outer squares of a chessboard
+THICKNESS = 0.008  # m
+BRIGHT, DARK = 0.86, 0.06  # share of white light sent back
+FRONT = np.array([0.0, 0.0, -1.0])  # the front looks against the board's z axis
+FRONT.setflags(write=False)
+
+
+def board_drawable(board: Board, distance: float) -> Drawable:
+    """Everything of a board as one body in the board frame, seen from ``distance`` m; the points lie in z = 0."""
+    ground, mark = (BRIGHT, DARK) if board.dark else (DARK, BRIGHT)
+    marks: list[Patch] = [*(_squares(board, mark) if board.kind == "chessboard" else _dots(board, mark))]
+    patches = [*marks, _plate(board, ground)]
+    return Drawable(patches, [0] * len(patches), distance)
+
+
+def plate_corners(board: Board) -> Array:
+    """Corners (4,3) of the plate's front, m."""
+    points = board.points
+    rim = board.spacing * (MARGIN + (RIM if board.kind == "chessboard" else 0.0))
+    (x0, y0), (x1, y1) = points[:, :2].min(axis=0) - rim, points[:, :2].max(axis=0) + rim
+    return np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
+
+
+def _plate(board: Board, level: float) -> Mesh:
+    corners = plate_corners(board)
+    size = [*(corners[2, :2] - corners[0, :2]), THICKNESS]
+    mesh = trimesh.creation.box(extents=size)
+    mesh.apply_translation([*corners[:, :2].mean(axis=0), SUNK + 0.5 * THICKNESS])
+    return solid_mesh(mesh, level)
+
+
+def _dots(board: Board, level: float) -> list[DiscStack]:
+    return [DiscStack((Disc(point, FRONT, float(board.radius or 0.0), level),)) for point in board.points]
+
+
+def _squares(board: Board, level: float) -> list[Mesh]:
+    """The dark squares of a chessboard, its outermost ones included."""
+    corners = board.spacing * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+    places = [
+        np.array([column, row, 0.0]) * board.spacing
+        for row in range(-1, board.rows)
+        for column in range(-1, board.columns)
+        if (row + column) % 2 == 0
+    ]
+    return [Mesh(corners + place, np.array([[0, 1, 2], [0, 2, 3]]), np.full(4, level)) for place in places]
+
+
+# Seeded poses in which both cameras see a whole board, all over their images and tilted to all sides.
+
+
+LARGEST_TILT = 0.75  # rad between the board's normal and the view from the middle of the baseline
+DEPTH_RANGE = (0.8, 1.2)  # of the depth at which the optical axes come nearest
+CELLS = 3  # each image is divided into 3 x 3 cells that the board visits in turn
+GRAZING = 0.35  # cosine between the board's normal and the view of either camera, at the least
+TRIES = 4000  # poses drawn for one image before giving up
+
+
+def default_board(rig: StereoRig) -> Board:
+    """A board of 13 x 9 dots whose width is a third of what the left camera sees where the axes meet."""
+    spacing = round(meeting_depth(rig) * rig.left.width / rig.left.focal_px / 3.0 / 13.0, 3)
+    return Board(kind="dots", columns=13, rows=9, spacing=spacing, radius=round(0.25 * spacing, 5))
+
+
+def meeting_depth(rig: StereoRig) -> float:
+    """Depth along the left axis at which the right one comes nearest, m; for parallel axes 1.5 baselines."""
+    right_axis, eye = invert(rig.right_from_left)[:3, 2], _right_eye(rig)
+    across = 1.0 - right_axis[2] ** 2
+    depth = (eye[2] - (eye @ right_axis) * right_axis[2]) / across if across > 1e-6 else 0.0
+    return float(depth) if depth > 0.0 else 1.5 * float(np.linalg.norm(eye))
+
+
+def board_poses(rig: StereoRig, board: Board, count: int, rng: np.random.Generator) -> list[Array]:
+    """``count`` poses left_from_board (4,4).
+
+    Raises CalibrationError when no such pose is found: the board is too large or too small for the rig.
+    """
+    return [_draw_pose(rig, board, k, rng) for k in range(count)]
+
+
+def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generator) -> Array:
+    """One pose in the cell whose turn it is, or in any where that cell shows no whole board to both cameras."""
+    corners = plate_corners(board)
+    middle, side = corners.mean(axis=0), number % 2
+    camera, from_left = rig.cameras[side], rig.from_camera[side]
+    for attempt in range(TRIES):
+        cell = (4 + 2 * number) % CELLS**2 if attempt < TRIES // 2 else int(rng.integers(CELLS**2))
+        depth = meeting_depth(rig) * rng.uniform(*DEPTH_RANGE)
+        place = apply(invert(from_left), _point_in_cell(camera, cell, depth, rng))
+        pose = np.eye(4)
+        pose[:3, :3] = _facing(0.5 * _right_eye(rig) - place) @ _tilt(rng)
+        pose[:3, 3] = place - pose[:3, :3] @ middle
+        if rig.project(apply(pose, corners))[1].all() and _front_to_both(rig, pose, middle):
+            return pose
+    width, height = np.ptp(corners[:, :2], axis=0)
+    raise CalibrationError(
+        f"none of {TRIES} poses shows the whole board of {width:.3g} x {height:.3g} m to both "
+        f"cameras at about {meeting_depth(rig):.3g} m: take a smaller one"
+    )
+
+
+def _point_in_cell(camera: PinholeCamera, cell: int, depth: float, rng: np.random.Generator) -> Array:
+    """A point (3,) in camera axes that shows anywhere in one cell of the image, lens distortion aside."""
+    row, column = divmod(cell, CELLS)
+    pixel = (np.array([column, row]) + rng.random(2)) / CELLS * (camera.width, camera.height)
+    return depth * np.append((pixel - camera.centre) / camera.focal_lengths, 1.0)
+
+
+def _right_eye(rig: StereoRig) -> Array:
+    return invert(rig.right_from_left)[:3, 3]
+
+
+def _facing(towards: Array) -> Array:
+    """Rotation (3,3) of a board whose front looks along ``towards`` (3,), its x axis horizontal in the left image."""
+    z = -towards / np.linalg.norm(towards)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def _tilt(rng: np.random.Generator) -> Array:
+    """A turn within the board's plane, then a tilt about a random axis in it."""
+    about, tilt, turn = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.0, LARGEST_TILT), rng.uniform(-np.pi, np.pi)
+    axis = np.array([np.cos(about), np.sin(about), 0.0])
+    return rotation_exp(tilt * axis) @ rotation_exp(np.array([0.0, 0.0, turn]))
+
+
+def _front_to_both(rig: StereoRig, pose: Array, middle: Array) -> bool:
+    """Whether both cameras see the front, at more than a grazing angle."""
+    place = apply(pose, middle)
+    return all(
+        float(pose[:3, 2] @ view) > GRAZING * float(np.linalg.norm(view)) for view in (place, place - _right_eye(rig))
+    )
+
+
+# Rendered calibration images: what the cameras of a sensor see of a board.
+
+
+TILE_PX = 64
+SUPERSAMPLING = 12
+OUTLINE_POINTS = 15  # along each side of the plate, to know where a bent one reaches
+
+
+def render_pairs(
+    rig: StereoRig,
+    board: Board,
+    poses: Sequence[Array],
+    renderer: Renderer,
+    optics: Optics,
+    noise: CameraNoise,
+    rng: np.random.Generator,
+) -> Iterator[StereoFrame]:
+    """Noisy images of both cameras for each pose left_from_board (4,4).
+
+    Raises CalibrationError for a chessboard with the analytic renderer, which draws discs and convex solids only.
+    """
+    if board.kind == "chessboard" and renderer.name == "analytic":
+        raise CalibrationError("the analytic renderer draws no chessboard: take the renderer pyrender, or a dot board")
+    distance = float(np.mean([np.linalg.norm(pose[:3, 3]) for pose in poses]))
+    formation = ImageFormation(renderer, board_drawable(board, distance), 0.0, optics)
+    for pose in poses:
+        sides = [
+            noise.expose(_radiance(formation, camera, move @ pose, board), rng)
+            for camera, move in zip(rig.cameras, rig.from_camera, strict=True)
+        ]
+        yield StereoFrame(*sides)
+
+
+def _radiance(
+    formation: ImageFormation, camera: PinholeCamera, camera_from_board: Array, board: Board
+) -> NDArray[np.float32]:
+    """Radiance (height, width) of one image; only tiles that the board reaches are drawn."""
+    image = np.zeros((-(-camera.height // TILE_PX) * TILE_PX, -(-camera.width // TILE_PX) * TILE_PX), dtype=np.float32)
+    corners = _reached_tiles(camera, camera_from_board, board, formation.optics.margin_px)
+    tiles = formation.windows([Side(camera, camera_from_board[None], corners)], TILE_PX, SUPERSAMPLING)[0]
+    for (x, y), tile in zip(corners, tiles, strict=True):
+        image[y : y + TILE_PX, x : x + TILE_PX] = tile
+    return image[: camera.height, : camera.width]
+
+
+def _reached_tiles(camera: PinholeCamera, camera_from_board: Array, board: Board, margin: int) -> NDArray[np.int_]:
+    """First pixels (k,2) of the tiles within the bounds of the board's plate."""
+    plate = plate_corners(board)
+    share = np.linspace(0.0, 1.0, OUTLINE_POINTS)[:, None, None]
+    outline = ((1.0 - share) * plate + share * np.roll(plate, -1, axis=0)).reshape(-1, 3)
+    pixels = camera.project(apply(camera_from_board, outline))[0]
+    size = np.array([camera.width, camera.height])
+    first = np.clip(pixels.min(axis=0) - margin - 2.0, 0, size - 1).astype(int) // TILE_PX
+    last = np.clip(pixels.max(axis=0) + margin + 2.0, 0, size - 1).astype(int) // TILE_PX
+    x, y = np.meshgrid(*(TILE_PX * np.arange(a, b + 1) for a, b in zip(first, last, strict=True)))
+    return np.column_stack([x.ravel(), y.ravel()])

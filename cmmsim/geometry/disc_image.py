@@ -1,0 +1,121 @@
+"""The image of a disc: its ellipse, exact in perspective, and the eccentricity of the ellipse's centre.
+
+The ellipse in which a camera sees a disc, exact in perspective.
+With C the centre, n the unit normal and R the radius in camera axes, C C' - R² (I - n n') is the dual conic of the
+rim; carried to pixels by the camera matrix it gives the ellipse's centre and, in its upper left, its shape.
+
+The centre of a circle's image is not the image of the circle's centre.
+Through a perfect lens the image is an ellipse. With C the centre, n the unit normal and R the radius in camera axes,
+D = C C' - R² (I - n n') is the dual conic of the image, whose centre is f (D13/D33, D23/D33); the centre itself
+projects to f (X/Z, Y/Z).
+
+Distortion bends this ellipse c + A u, |u| = 1, into a curve, and what is fitted to it is an ellipse again. With J the
+Jacobian of the distortion d at c, the curve is d(c) + J A (u + w) with small w(u). A fit to grey values minimises the
+squared distance between curve and ellipse along its length, which is the integral over the angle of u of
+(u'w - u'a)² / |J A t|, where t is the tangent of the unit circle and a the shift of the ellipse's centre. So
+
+    a = (∫ u u' / |J A t|)^-1 ∫ u (u'w) / |J A t|,    and the fitted centre is d(c) + J A a.
+
+For a round J A and a quadratic w_i = ½ H_ijk u_j u_k this is a_i = (H_ijj + 2 H_jij) / 8.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.pose import Array, apply
+from cmmsim.geometry.stereo_rig import StereoRig
+
+
+def project_discs(camera: PinholeCamera, centres: Array, normals: Array, radii: Array) -> tuple[Array, Array]:
+    """Ellipses of n discs wholly before the camera: ideal centres (n,2) px and shapes A (n,2,2) px, symmetric.
+
+    Parameters: centres (n,3) m and normals (n,3) unit, in camera axes; radii (n,) m. The ellipse is the image of the
+    unit disc under x -> centre + A x.
+    """
+    from cmmsim.geometry.disc_kernels import project_all  # compiles, so it is loaded where it is first needed
+
+    pixels, shapes = np.empty((len(centres), 2)), np.empty((len(centres), 2, 2))
+    project_all(
+        np.ascontiguousarray(centres, dtype=float),
+        np.ascontiguousarray(normals, dtype=float),
+        np.ascontiguousarray(radii, dtype=float),
+        camera.focal_lengths,
+        camera.centre,
+        pixels,
+        shapes,
+    )
+    return pixels, shapes
+
+
+# The ellipses in which both cameras see the stickers of a body, in the images as they are.
+
+
+def sticker_outlines(
+    rig: StereoRig, camera_from_body: Array, places: Array, normals: Array, radius: float
+) -> tuple[Array, Array]:
+    """Centres (2, n, 2) px and shapes A (2, n, 2, 2) px of the ellipses of n stickers before both cameras.
+
+    Parameters: camera_from_body (4,4); places (n,3) m and normals (n,3) in body axes; radius m. Distortion is taken as
+    linear across a sticker.
+    """
+    centres, shapes = [], []
+    for camera, from_camera in zip(rig.cameras, rig.from_camera, strict=True):
+        move = from_camera @ camera_from_body
+        middles, shape = project_discs(
+            camera.ideal, apply(move, places), normals @ move[:3, :3].T, np.full(len(places), radius)
+        )
+        if not camera.distortion.is_zero:
+            local = camera.distortion_jacobian(middles) @ shape
+            middles, shape = camera.distort(middles)[0], symmetric_root(local @ local.swapaxes(-1, -2))
+        centres.append(middles)
+        shapes.append(shape)
+    return np.stack(centres), np.stack(shapes)
+
+
+def symmetric_root(matrices: Array) -> Array:
+    """Symmetric positive definite roots (..., 2, 2) of such matrices: (M + d I) / sqrt(trace M + 2 d), d² = det M."""
+    d = np.sqrt(np.linalg.det(matrices))[..., None, None]
+    trace = np.trace(matrices, axis1=-2, axis2=-1)[..., None, None]
+    return (matrices + d * np.eye(2)) / np.sqrt(trace + 2.0 * d)
+
+
+RIM_POINTS = 24
+
+
+def centre_offset(camera: PinholeCamera, centres: Array, normals: Array, radius: float) -> Array:
+    """Centre of the ellipse fitted to a circle's image, minus the projected circle centre, px of the image (n, 2).
+
+    Parameters: centres (n, 3) m and normals (n, 3) unit, in camera axes; radius in m.
+    """
+    if camera.distortion.is_zero:
+        return eccentricity(centres, normals, radius, camera.focal_lengths)
+    middles, shapes = project_discs(camera.ideal, centres, normals, np.full(len(centres), radius))
+    return camera.distort(middles)[0] + bending(camera, middles, shapes) - camera.project(centres)[0]
+
+
+def eccentricity(centres: Array, normals: Array, radius: float, focal_px: float | Array) -> Array:
+    """Ellipse centre minus projected circle centre through a perfect lens, px (n, 2).
+
+    Parameters: centres (n, 3) m and normals (n, 3) unit, in camera axes; radius in m; focal length in px, one or (2,).
+    """
+    d13_d23 = centres[:, :2] * centres[:, 2:] + radius**2 * normals[:, :2] * normals[:, 2:]
+    d33 = centres[:, 2:] ** 2 - radius**2 * (1.0 - normals[:, 2:] ** 2)
+    return focal_px * (d13_d23 / d33 - centres[:, :2] / centres[:, 2:])
+
+
+def bending(camera: PinholeCamera, middles: Array, shapes: Array) -> Array:
+    """Centre fitted to a distorted ellipse minus the distorted centre of the ellipse, px of the image (n, 2).
+
+    Parameters: middles (n, 2) and shapes A (n, 2, 2) of the ellipses in ideal px.
+    """
+    angle = 2.0 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
+    u, tangent = np.stack([np.cos(angle), np.sin(angle)]), np.stack([-np.sin(angle), np.cos(angle)])
+    local = camera.distortion_jacobian(middles) @ shapes
+    rim = camera.distort(middles[:, None] + (shapes @ u).swapaxes(1, 2))[0] - camera.distort(middles)[0][:, None]
+    bulge = np.einsum("kp,nkp->np", u, np.linalg.solve(local, rim.swapaxes(1, 2))) - 1.0  # u'w
+    weight = 1.0 / np.linalg.norm(local @ tangent, axis=1)
+    normal = np.einsum("np,ip,jp->nij", weight, u, u)
+    shift = np.linalg.solve(normal, np.einsum("np,np,ip->ni", weight, bulge, u)[..., None])
+    return (local @ shift)[..., 0]

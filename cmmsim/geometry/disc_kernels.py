@@ -1,0 +1,286 @@
+"""Compiled: discs as a camera sees them, and their light in each pixel, sharp and blurred.
+
+Compiled: exact share of pixels that an ellipse covers, see ``ellipse_coverage`` for the formulas.
+An ellipse comes as its centre and the matrix m = A^-1 (2,2) that carries px into the axes of the unit disc.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cmmsim.compiled import compiled
+
+# Compiled: discs as a camera sees them.
+
+
+@compiled
+def project_disc(
+    centre: np.ndarray,
+    normal: np.ndarray,
+    radius: float,
+    focal: np.ndarray,
+    principal: np.ndarray,
+    middle: np.ndarray,
+    shape: np.ndarray,
+) -> None:
+    """Ellipse of a disc, see ``projected_disc``: ``middle`` (2,) px and ``shape`` (2,2) px, the root of a matrix M:
+    (M + d I) / sqrt(trace M + 2 d), d² = det M."""
+    depth = centre[2] ** 2 - radius**2 * (1.0 - normal[2] ** 2)
+    at = np.empty(2)
+    for i in range(2):
+        at[i] = (centre[i] * centre[2] + radius**2 * normal[i] * normal[2]) / depth
+        middle[i] = focal[i] * at[i] + principal[i]
+    for i in range(2):
+        for j in range(2):
+            across = 1.0 if i == j else 0.0
+            dual = (centre[i] * centre[j] - radius**2 * (across - normal[i] * normal[j])) / depth
+            shape[i, j] = focal[i] * focal[j] * (at[i] * at[j] - dual)
+    d = math.sqrt(shape[0, 0] * shape[1, 1] - shape[0, 1] ** 2)
+    scale = math.sqrt(shape[0, 0] + shape[1, 1] + 2.0 * d)
+    shape[0, 0] += d
+    shape[1, 1] += d
+    for i in range(2):
+        for j in range(2):
+            shape[i, j] /= scale
+
+
+@compiled
+def project_all(
+    centres: np.ndarray,
+    normals: np.ndarray,
+    radii: np.ndarray,
+    focal: np.ndarray,
+    principal: np.ndarray,
+    middles: np.ndarray,
+    shapes: np.ndarray,
+) -> None:
+    """``project_disc`` for n discs: centres (n,3), normals (n,3), radii (n,), middles (n,2), shapes (n,2,2)."""
+    for n in range(len(centres)):
+        project_disc(centres[n], normals[n], radii[n], focal, principal, middles[n], shapes[n])
+
+
+@compiled
+def place_discs(
+    moves: np.ndarray,
+    owners: np.ndarray,
+    places: np.ndarray,
+    directions: np.ndarray,
+    centres: np.ndarray,
+    normals: np.ndarray,
+) -> None:
+    """Centres and normals (n,3) in camera axes of discs at ``places`` with normals ``directions`` (n,3) in the axes of
+    their ``owners`` (n,); moves (b,4,4) camera from bodies."""
+    for n in range(len(places)):
+        move = moves[owners[n]]
+        for i in range(3):
+            centres[n, i], normals[n, i] = move[i, 3], 0.0
+            for j in range(3):
+                centres[n, i] += move[i, j] * places[n, j]
+                normals[n, i] += move[i, j] * directions[n, j]
+
+
+@compiled
+def probe_discs(centres: np.ndarray, normals: np.ndarray, radii: np.ndarray, probes: np.ndarray) -> None:
+    """Fill probes (n,k,3): the middle of each disc, then k - 1 points on its rim."""
+    count = probes.shape[1] - 1
+    u = np.empty(3)
+    for n in range(len(centres)):
+        normal = normals[n]
+        least = 0
+        for i in range(1, 3):
+            if abs(normal[i]) < abs(normal[least]):
+                least = i
+        length = math.sqrt(1.0 - normal[least] ** 2)
+        i, j = (least + 1) % 3, (least + 2) % 3  # u = normal x e_least / length, which lies in the plane
+        u[least], u[i], u[j] = 0.0, normal[j] / length, -normal[i] / length
+        for k in range(count + 1):
+            angle, distance = 2.0 * math.pi * k / count, 0.0 if k == 0 else radii[n]
+            for a in range(3):
+                b, c = (a + 1) % 3, (a + 2) % 3
+                v = normal[b] * u[c] - normal[c] * u[b]
+                probes[n, k, a] = centres[n, a] + distance * (math.cos(angle) * u[a] + math.sin(angle) * v)
+
+
+@compiled
+def inside_part(start2: float, dot: float, step2: float) -> tuple[float, float]:
+    """Where the side start + t step, t in [0, 1], enters and leaves the unit disc (equal when it stays outside).
+
+    Given |start|², start . step and |step|².
+    """
+    discriminant = dot * dot - step2 * (start2 - 1.0)
+    root = math.sqrt(max(discriminant, 0.0))
+    enter = min(max((-dot - root) / step2, 0.0), 1.0)
+    leave = min(max((-dot + root) / step2, 0.0), 1.0)
+    return enter, leave
+
+
+@compiled
+def side_share(start_x: float, start_y: float, step_x: float, step_y: float) -> tuple[float, float, float]:
+    """Twice the signed area, in disc units, between the disc's centre and one side: its part inside gives a triangle,
+    the parts outside give sectors. Also where the side enters and leaves the disc."""
+    start2 = start_x * start_x + start_y * start_y
+    step2 = step_x * step_x + step_y * step_y
+    dot = start_x * step_x + start_y * step_y
+    cross = start_x * step_y - start_y * step_x
+    enter, leave = inside_part(start2, dot, step2)
+    if enter == leave:  # outside: one sector
+        return math.atan2(cross, start2 + dot), enter, leave
+    area = (leave - enter) * cross
+    if enter > 0.0:
+        area += math.atan2(enter * cross, start2 + enter * dot)
+    if leave < 1.0:
+        area += math.atan2((1.0 - leave) * cross, start2 + (1.0 + leave) * dot + leave * step2)
+    return area, enter, leave
+
+
+@compiled
+def reach_of_pixel(m: np.ndarray) -> float:
+    """Largest distance, in disc units, of a pixel's points from its middle."""
+    return 0.5 * math.sqrt(
+        max((m[0, 0] + m[0, 1]) ** 2 + (m[1, 0] + m[1, 1]) ** 2, (m[0, 0] - m[0, 1]) ** 2 + (m[1, 0] - m[1, 1]) ** 2)
+    )
+
+
+@compiled
+def cover_pixel(x: float, y: float, m: np.ndarray) -> tuple[float, float, float, float, float, float]:
+    """Share of the pixel with middle (x, y), px from the ellipse's centre, and its derivatives by [c_x, c_y, A_xx,
+    A_xy, A_yy]: along each side the boundary moves by v = dc + dA A^-1 (x - c)."""
+    det = 1.0 / (m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0])
+    left, right, low, high = x - 0.5, x + 0.5, y - 0.5, y + 0.5
+    a_x, a_y = m[0, 0] * left + m[0, 1] * low, m[1, 0] * left + m[1, 1] * low  # the corner (left, low)
+    b_x, b_y = a_x + m[0, 0], a_y + m[1, 0]  # (right, low)
+    d_x, d_y = a_x + m[0, 1], a_y + m[1, 1]  # (left, high)
+    area_low, low_in, low_out = side_share(a_x, a_y, m[0, 0], m[1, 0])
+    area_high, high_in, high_out = side_share(d_x, d_y, m[0, 0], m[1, 0])
+    area_left, left_in, left_out = side_share(a_x, a_y, m[0, 1], m[1, 1])
+    area_right, right_in, right_out = side_share(b_x, b_y, m[0, 1], m[1, 1])
+    share = 0.5 * det * (area_low - area_high + area_right - area_left)
+
+    in_low, in_high, in_left, in_right = low_out - low_in, high_out - high_in, left_out - left_in, right_out - right_in
+    mid_low, mid_high = left + 0.5 * (low_in + low_out), left + 0.5 * (high_in + high_out)
+    mid_left, mid_right = low + 0.5 * (left_in + left_out), low + 0.5 * (right_in + right_out)
+    # flux through the sides of m (x - c), row by row: up through those along x, rightwards through those along y
+    up_0 = in_high * (m[0, 0] * mid_high + m[0, 1] * high) - in_low * (m[0, 0] * mid_low + m[0, 1] * low)
+    up_1 = in_high * (m[1, 0] * mid_high + m[1, 1] * high) - in_low * (m[1, 0] * mid_low + m[1, 1] * low)
+    across_0 = in_right * (m[0, 0] * right + m[0, 1] * mid_right) - in_left * (m[0, 0] * left + m[0, 1] * mid_left)
+    across_1 = in_right * (m[1, 0] * right + m[1, 1] * mid_right) - in_left * (m[1, 0] * left + m[1, 1] * mid_left)
+    by_xx = m[0, 0] * share - across_0
+    by_xy = (m[0, 1] + m[1, 0]) * share - across_1 - up_0
+    by_yy = m[1, 1] * share - up_1
+    return share, in_left - in_right, in_low - in_high, by_xx, by_xy, by_yy
+
+
+@compiled
+def inverse_of(shape: np.ndarray) -> np.ndarray:
+    """Inverse (2,2) of a (2,2) matrix."""
+    det = shape[0, 0] * shape[1, 1] - shape[0, 1] * shape[1, 0]
+    m = np.empty((2, 2))
+    m[0, 0], m[0, 1], m[1, 0], m[1, 1] = shape[1, 1] / det, -shape[0, 1] / det, -shape[1, 0] / det, shape[0, 0] / det
+    return m
+
+
+@compiled
+def cover_window(
+    centre_x: float, centre_y: float, shape: np.ndarray, shares: np.ndarray, derivatives: np.ndarray
+) -> None:
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5); only pixels on the rim need more than a distance."""
+    m = inverse_of(shape)
+    reach = reach_of_pixel(m)
+    for row in range(shares.shape[0]):
+        for column in range(shares.shape[1]):
+            x, y = column - centre_x, row - centre_y
+            distance = math.sqrt((m[0, 0] * x + m[0, 1] * y) ** 2 + (m[1, 0] * x + m[1, 1] * y) ** 2)
+            if abs(distance - 1.0) < reach:
+                share, by_x, by_y, by_xx, by_xy, by_yy = cover_pixel(x, y, m)
+                shares[row, column] = share
+                into = derivatives[row, column]
+                into[0], into[1], into[2], into[3], into[4] = by_x, by_y, by_xx, by_xy, by_yy
+            else:
+                shares[row, column] = 1.0 if distance < 1.0 else 0.0
+                derivatives[row, column] = 0.0
+
+
+@compiled
+def cover_windows(centres: np.ndarray, shapes: np.ndarray, shares: np.ndarray, derivatives: np.ndarray) -> None:
+    """``cover_window`` for n ellipses: centres (n,2), shapes (n,2,2), shares (n,h,w), derivatives (n,h,w,5)."""
+    for k in range(len(centres)):
+        cover_window(centres[k, 0], centres[k, 1], shapes[k], shares[k], derivatives[k])
+
+
+# Compiled: light of an ellipse blurred by a Gaussian in each pixel, see `blurred_coverage` for the formulas.
+
+
+REACH = 5.5  # standard deviations from the rim beyond which no light is followed: 4e-8 of it
+POINTS_PER_SIGMA = 1.1  # rim points to one standard deviation of the point spread
+FEWEST_POINTS = 24
+SQRT_HALF, SQRT_TWO_PI = math.sqrt(0.5), math.sqrt(2.0 * math.pi)
+
+
+@compiled
+def carried(start: float, first: int, last: int, psf_px: float, across: np.ndarray, passed: np.ndarray) -> None:
+    """What the point spread carries from ``start``, px along one axis, into pixels first..last: ``across`` g is the
+    share of a point's light, ``passed`` P its integral from -infinity to ``start``."""
+    u = (first - 0.5 - start) / psf_px
+    below = 0.5 * (1.0 + math.erf(u * SQRT_HALF))
+    integral = u * below + math.exp(-0.5 * u * u) / SQRT_TWO_PI
+    for k in range(first, last + 1):
+        u = (k + 0.5 - start) / psf_px
+        below_next = 0.5 * (1.0 + math.erf(u * SQRT_HALF))
+        integral_next = u * below_next + math.exp(-0.5 * u * u) / SQRT_TWO_PI
+        across[k] = below_next - below
+        passed[k] = 1.0 - psf_px * (integral_next - integral)
+        below, integral = below_next, integral_next
+
+
+@compiled
+def rim_points(shape: np.ndarray, psf_px: float) -> int:
+    """Points on the rim so close that the trapezoidal rule has converged."""
+    extent = math.sqrt(max(shape[0, 0] ** 2 + shape[0, 1] ** 2, shape[1, 0] ** 2 + shape[1, 1] ** 2))
+    return max(FEWEST_POINTS, math.ceil(2.0 * math.pi * extent * POINTS_PER_SIGMA / psf_px))
+
+
+@compiled
+def blur_window(
+    centre_x: float, centre_y: float, shape: np.ndarray, psf_px: float, shares: np.ndarray, derivatives: np.ndarray
+) -> None:
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5)."""
+    height, width = shares.shape
+    shares[:] = 0.0
+    derivatives[:] = 0.0
+    across_x, passed_x, across_y, passed_y = np.empty(width), np.empty(width), np.empty(height), np.empty(height)
+    m, count = inverse_of(shape), rim_points(shape, psf_px)
+    scale = 2.0 * math.pi / count * (shape[0, 0] * shape[1, 1] - shape[0, 1] * shape[1, 0])
+    reach = REACH * psf_px + 0.5
+    for k in range(count):
+        angle = 2.0 * math.pi * k / count
+        u, v = math.cos(angle), math.sin(angle)
+        x, y = centre_x + shape[0, 0] * u + shape[0, 1] * v, centre_y + shape[1, 0] * u + shape[1, 1] * v
+        n_x, n_y = scale * (m[0, 0] * u + m[1, 0] * v), scale * (m[0, 1] * u + m[1, 1] * v)
+        left, right = max(0, math.ceil(x - reach)), min(width - 1, math.floor(x + reach))
+        low, high = max(0, math.ceil(y - reach)), min(height - 1, math.floor(y + reach))
+        carried(x, left, right, psf_px, across_x, passed_x)
+        carried(y, low, high, psf_px, across_y, passed_y)
+        for row in range(low, high + 1):
+            through = across_y[row] * n_x
+            for column in range(min(left, width)):  # all that lies left of here has been passed
+                shares[row, column] += through
+            for column in range(left, right + 1):
+                shares[row, column] += through * passed_x[column]
+                light = across_y[row] * across_x[column]
+                into = derivatives[row, column]
+                into[0] += light * n_x
+                into[1] += light * n_y
+                into[2] += light * u * n_x
+                into[3] += light * (v * n_x + u * n_y)
+                into[4] += light * v * n_y
+
+
+@compiled
+def blur_windows(
+    centres: np.ndarray, shapes: np.ndarray, psf_px: float, shares: np.ndarray, derivatives: np.ndarray
+) -> None:
+    """``blur_window`` for n ellipses: centres (n,2), shapes (n,2,2), shares (n,h,w), derivatives (n,h,w,5)."""
+    for k in range(len(centres)):
+        blur_window(centres[k, 0], centres[k, 1], shapes[k], psf_px, shares[k], derivatives[k])

@@ -1,0 +1,151 @@
+"""Compiled: Gauss-Newton steps of points seen by two cameras and of rigid fits, on small systems of equations."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cmmsim.compiled import compiled
+
+# Compiled: small symmetric systems of equations, where a call of LAPACK costs more than the work.
+
+
+SMALLEST_PIVOT = 1e-300
+
+
+@compiled
+def factor(matrix: np.ndarray) -> None:
+    """Cholesky factor of a symmetric matrix (n,n), in its lower triangle."""
+    for j in range(len(matrix)):
+        for i in range(j, len(matrix)):
+            rest = matrix[i, j]
+            for k in range(j):
+                rest -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = math.sqrt(max(rest, SMALLEST_PIVOT)) if i == j else rest / matrix[j, j]
+
+
+@compiled
+def solve_factored(lower: np.ndarray, right: np.ndarray) -> None:
+    """Solve L L' x = right (n,) in place."""
+    n = len(right)
+    for i in range(n):
+        for k in range(i):
+            right[i] -= lower[i, k] * right[k]
+        right[i] /= lower[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            right[i] -= lower[k, i] * right[k]
+        right[i] /= lower[i, i]
+
+
+@compiled
+def invert_factored(lower: np.ndarray, inverse: np.ndarray) -> None:
+    """Fill ``inverse``, the leading (m,m) part of the inverse of L L'."""
+    column = np.empty(len(lower))
+    for k in range(len(inverse)):
+        column[:] = 0.0
+        column[k] = 1.0
+        solve_factored(lower, column)
+        for i in range(len(inverse)):
+            inverse[i, k] = column[i]
+
+
+# Compiled: Gauss-Newton steps of points seen by two cameras, and of a rigid fit of points to points.
+
+
+@compiled
+def project_point(projection: np.ndarray, point: np.ndarray, pixel: np.ndarray, jacobian: np.ndarray) -> None:
+    """Pixel (2,) of a point (3,) by a projection matrix (3,4), and its derivative (2,3) by the point."""
+    depth = projection[2, 3]
+    for i in range(3):
+        depth += projection[2, i] * point[i]
+    for k in range(2):
+        pixel[k] = projection[k, 3]
+        for i in range(3):
+            pixel[k] += projection[k, i] * point[i]
+        pixel[k] /= depth
+        for i in range(3):
+            jacobian[k, i] = (projection[k, i] - pixel[k] * projection[2, i]) / depth
+
+
+@compiled
+def add_weighted(
+    jacobian: np.ndarray, weight: np.ndarray, residual: np.ndarray, normal: np.ndarray, right: np.ndarray
+) -> float:
+    """Add J' W J to ``normal`` and J' W r to ``right``; returns r' W r."""
+    rows, columns = jacobian.shape
+    squared = 0.0
+    for k in range(rows):
+        for m in range(rows):
+            squared += residual[k] * weight[k, m] * residual[m]
+            for i in range(columns):
+                weighted = jacobian[k, i] * weight[k, m]
+                right[i] += weighted * residual[m]
+                for j in range(columns):
+                    normal[i, j] += weighted * jacobian[m, j]
+    return squared
+
+
+@compiled
+def refine_points(
+    projections: np.ndarray,
+    observed: np.ndarray,
+    weights: np.ndarray,
+    steps: int,
+    points: np.ndarray,
+    covariances: np.ndarray,
+    gaps: np.ndarray,
+) -> None:
+    """Move n points to where they explain their pixels best.
+
+    projections (c,3,4); observed (n,c,2) px; weights (n,c,2,2), inverse covariances; points (n,3) from start to result;
+    fills covariances (n,3,3) and gaps (n,): the squared residual in units of its noise.
+    """
+    pixel, residual, jacobian = np.empty(2), np.empty(2), np.empty((2, 3))
+    normal, right = np.empty((3, 3)), np.empty(3)
+    for n in range(len(points)):
+        for step in range(steps + 1):
+            normal[:], right[:], gaps[n] = 0.0, 0.0, 0.0
+            for c in range(len(projections)):
+                project_point(projections[c], points[n], pixel, jacobian)
+                for k in range(2):
+                    residual[k] = observed[n, c, k] - pixel[k]
+                gaps[n] += add_weighted(jacobian, weights[n, c], residual, normal, right)
+            if step < steps:
+                factor(normal)
+                invert_factored(normal, covariances[n])
+                solve_factored(normal, right)
+                for i in range(3):
+                    points[n, i] += right[i]
+
+
+@compiled
+def rigid_step(
+    source: np.ndarray,
+    target: np.ndarray,
+    weights: np.ndarray,
+    transform: np.ndarray,
+    covariance: np.ndarray,
+    change: np.ndarray,
+) -> None:
+    """One step of the rigid fit target = transform(source): ``change`` (6,) is [dt, dphi], ``covariance`` (6,6) its
+    covariance.
+
+    source and target (n,3) m; weights (n,3,3), inverse covariances of the target; transform (4,4).
+    """
+    normal, jacobian, turned, residual = np.zeros((6, 6)), np.zeros((3, 6)), np.empty(3), np.empty(3)
+    change[:] = 0.0
+    for n in range(len(source)):
+        for i in range(3):
+            turned[i] = 0.0
+            for j in range(3):
+                turned[i] += transform[i, j] * source[n, j]
+            residual[i] = target[n, i] - turned[i] - transform[i, 3]
+            jacobian[i, i] = 1.0
+        jacobian[0, 4], jacobian[0, 5], jacobian[1, 5] = turned[2], -turned[1], turned[0]
+        jacobian[1, 3], jacobian[2, 3], jacobian[2, 4] = -turned[2], turned[1], -turned[0]
+        add_weighted(jacobian, weights[n], residual, normal, change)
+    factor(normal)
+    invert_factored(normal, covariance)
+    solve_factored(normal, change)

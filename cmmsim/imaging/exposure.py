@@ -1,0 +1,320 @@
+"""One exposure of a camera: the poses that it sees, the light of windows or whole images over it, and noise.
+
+Windows of one camera's image over the moments of an exposure, in which most of the scene stands still.
+A window that nothing reaches shows the background and is not drawn; one that no moving body reaches is drawn once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.errors import CmmError
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.pose import Array, apply, pose_to_transform
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.imaging.formation import ImageFormation, Side
+from cmmsim.imaging.scene import DiscStack
+from cmmsim.imaging.views import View
+from cmmsim.radiometry.images import StereoFrame, Windows
+from cmmsim.radiometry.noise import CameraNoise, FixedPattern, draw_pattern
+
+# The poses through which a moving platform goes during one exposure.
+
+
+LARGEST_STEP_PX = 0.3  # between two sub-frames no sticker moves farther
+MOST_SUB_FRAMES = 500
+
+
+def sub_frame_poses(pose: Array, pose_rate: Array, exposure: float, sticker_pixels: Callable[[Array], Array]) -> Array:
+    """Poses (m, 6) whose mean image is that of the whole exposure, by the midpoint rule.
+
+    Parameters: pose (6,) in the middle of the exposure; pose_rate (6,) its time derivative, which is constant; exposure
+    s; sticker_pixels: places (..., 2) px of all stickers in the images at a pose. Raises CmmError where the stickers
+    move farther than an image can show.
+    """
+    half = 0.5 * exposure * pose_rate
+    moved = float(np.linalg.norm(sticker_pixels(pose + half) - sticker_pixels(pose - half), axis=-1).max())
+    count = max(1, int(np.ceil(moved / LARGEST_STEP_PX)))
+    if count > MOST_SUB_FRAMES:
+        raise CmmError(
+            f"a sticker moves {moved:.0f} px during the exposure of {exposure:g} s at pose rate "
+            f"{pose_rate.tolist()}, at most {MOST_SUB_FRAMES * LARGEST_STEP_PX:.0f} px can be drawn"
+        )
+    share = (2.0 * np.arange(count) + 1.0) / count - 1.0
+    return pose + share[:, None] * half
+
+
+def exposed_windows(
+    formation: ImageFormation,
+    camera: PinholeCamera,
+    moments: Sequence[Array],
+    corners: NDArray[np.int_],
+    size: int,
+    supersampling: int,
+    sub_pixels: int | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean and largest radiance (k, size, size) over moments with bodies (b,4,4) each, without vignetting.
+
+    Parameters: corners (k,2) px; supersampling and sub_pixels as of ``ImageFormation.windows``.
+    """
+    reached = formation.reached(camera, moments, corners, size, sub_pixels)
+    moves = np.ptp(np.stack(moments), axis=0).any(axis=(1, 2))[formation.drawable.body_index]
+    drawn_often = np.asarray(reached[:, :, moves].any(axis=(0, 2)))
+    drawn_once = np.asarray(reached.any(axis=(0, 2))) & ~drawn_often
+
+    def draw(bodies: Array, which: NDArray[np.bool_]) -> NDArray[np.float32]:
+        if not which.any():
+            return np.empty((0, size, size), dtype=np.float32)
+        return formation.windows([Side(camera, bodies, corners[which])], size, supersampling, sub_pixels, shade=False)[
+            0
+        ]
+
+    mean = np.full((len(corners), size, size), formation.background, dtype=np.float32)
+    mean[drawn_once] = draw(moments[0], drawn_once)
+    total = draw(moments[0], drawn_often)
+    largest = total.copy()
+    for bodies in moments[1:]:
+        window = draw(bodies, drawn_often)
+        total += window
+        np.maximum(largest, window, out=largest)
+    brightest = mean.copy()
+    mean[drawn_often], brightest[drawn_often] = total / np.float32(len(moments)), largest
+    return mean, brightest
+
+
+# Whole images: drawn coarsely, and as finely as windows are around each bright spot.
+
+
+PASTED_SIZE = 24  # px side of the finely drawn window around a bright spot
+LARGEST_PASTED_SIZE = 96  # px: a larger spot is left coarse
+DARK_RIM = 8  # px of the surroundings that are drawn finely with a spot that is longer than a sticker
+BRIGHT = 0.4  # radiance above which a spot is drawn finely
+TILE = 64  # px side of the pieces that are bent and blurred at a time
+COARSE = 2  # drawn samples a pixel and axis away from bright spots
+
+
+def whole_image(
+    formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array], supersampling: int
+) -> NDArray[np.float32]:
+    """Mean radiance (height, width) of one camera's image over moments with bodies (b,4,4) each."""
+    image, bright = _coarse(formation, camera, moments)
+    corners, size = _spots(bright, fixed_size=len(moments) == 1 and formation.draws_pixels([camera]))
+    if len(corners):
+        fine = exposed_windows(formation, camera, moments, corners, size, supersampling)[0]
+        for (x, y), window in zip(corners, fine, strict=True):
+            image[y : y + size, x : x + size] = window
+    return image if formation.optics.vignetting == 0.0 else image * _illumination(formation, camera)
+
+
+def _coarse(
+    formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Mean radiance (height, width) with COARSE² drawn samples a pixel, and where it is bright at any moment."""
+    if len(moments) == 1 and formation.draws_pixels([camera]):
+        view = View(camera.ideal, moments[0], (0, 0), (camera.width, camera.height))
+        image = formation.renderer.draw(formation.drawable, [view], COARSE, formation.background)[0]
+        return image, image > BRIGHT
+    rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
+    x, y = np.meshgrid(TILE * np.arange(columns), TILE * np.arange(rows))
+    corners = np.column_stack([x.ravel(), y.ravel()])
+    mean, brightest = (
+        tiles.reshape(rows, columns, TILE, TILE)
+        .swapaxes(1, 2)
+        .reshape(rows * TILE, columns * TILE)[: camera.height, : camera.width]
+        for tiles in exposed_windows(formation, camera, moments, corners, TILE, COARSE, sub_pixels=1)
+    )
+    return mean, brightest > BRIGHT
+
+
+def _spots(bright: NDArray[np.bool_], fixed_size: bool) -> tuple[NDArray[np.int_], int]:
+    """First pixels (k, 2) of the windows around bright spots, and their side in px."""
+    _, _, stats, centres = cv2.connectedComponentsWithStats(bright.astype(np.uint8))
+    keep = np.isfinite(centres[1:]).all(axis=1)
+    sides = stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
+    size = PASTED_SIZE
+    if not fixed_size:
+        keep &= sides <= LARGEST_PASTED_SIZE - 2 * DARK_RIM
+        size = max(size, int(sides[keep].max(initial=0)) + 2 * DARK_RIM)
+    size = min(size, *bright.shape)
+    highest = np.array(bright.shape[::-1]) - size
+    return np.clip(np.rint(centres[1:][keep]).astype(int) - size // 2, 0, highest), size
+
+
+def _illumination(formation: ImageFormation, camera: PinholeCamera) -> NDArray[np.float32]:
+    """Relative illumination (height, width) of the whole image."""
+    pixels = np.stack(np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), axis=-1)
+    return formation.optics.illumination(camera, pixels).astype(np.float32)
+
+
+# The two virtual cameras: they look at the true scene and hand out noisy grey values.
+
+
+SUPERSAMPLING = 9
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How windows are made: supersampling per pixel and axis, and the number of exposures that are averaged."""
+
+    supersampling: int = SUPERSAMPLING
+    exposures: int = 1
+
+
+class VirtualStereoCamera:
+    """The true rig, its true place in the base frame, and what stands before it.
+
+    Parameters: rig; camera_from_base (4,4); formation: how its light becomes images, its drawable's body 0 the
+    platform and body 1 the base, the others being ``obstacle_names`` in order; noise; exposure in s; pattern_seed: of
+    what differs from pixel to pixel.
+    """
+
+    def __init__(
+        self,
+        rig: StereoRig,
+        camera_from_base: Array,
+        formation: ImageFormation,
+        noise: CameraNoise,
+        obstacle_names: Sequence[str] = (),
+        exposure: float = 0.0,
+        pattern_seed: int = 0,
+    ) -> None:
+        self._rig, self._noise, self._formation = rig, noise, formation
+        self._obstacle_names, self._exposure, self._pattern_seed = tuple(obstacle_names), exposure, pattern_seed
+        self._from_base = [move @ camera_from_base for move in rig.from_camera]
+
+    def look(
+        self,
+        pose: Array,
+        rng: np.random.Generator,
+        obstacles: Mapping[str, Array] | None = None,
+        quality: Quality | None = None,
+        pose_rate: Array | None = None,
+    ) -> LiveImages:
+        """One exposure of the platform and of the obstacles at base_from_body (4,4) each.
+
+        ``pose`` (6,) of the platform in the middle of the exposure, ``pose_rate`` (6,) its time derivative; obstacles
+        stand still.
+        """
+        poses = pose[None]
+        if pose_rate is not None and self._exposure > 0.0:
+            poses = sub_frame_poses(pose, pose_rate, self._exposure, self._sticker_pixels)
+        moments = [self._placed(pose_to_transform(p), obstacles or {}) for p in poses]
+        return LiveImages(self, moments, rng, quality or Quality())
+
+    def radiance(
+        self, placed: Sequence[Array], corners: NDArray[np.int_], size: int, supersampling: int
+    ) -> NDArray[np.float32]:
+        """Radiance (2, n, size, size) of windows at ``corners`` (2, n, 2) in the left and right image.
+
+        ``placed``: camera_from_body (b,4,4) of all bodies for the left and the right camera.
+        """
+        sides = [Side(*side) for side in zip(self._rig.cameras, placed, corners, strict=True)]
+        return np.stack(self._formation.windows(sides, size, supersampling))
+
+    def whole_exposure(self, side: int, moments: Sequence[Array], supersampling: int) -> NDArray[np.float32]:
+        """Mean radiance (height, width) of one whole image over the moments of an exposure."""
+        return whole_image(self._formation, self._rig.cameras[side], moments, supersampling)
+
+    def patterns(self) -> Sequence[FixedPattern | None]:
+        """What differs from pixel to pixel of the left and of the right camera; None where nothing does."""
+        return self._patterns if self._noise.has_pattern else (None, None)
+
+    def centre_error_px(self, quality: Quality) -> float:
+        """What drawing leaves in a sticker's centre, px rms."""
+        return self._formation.centre_error_px(self._rig.cameras, quality.supersampling)
+
+    @property
+    def noise(self) -> CameraNoise:
+        """The cameras' noise figures."""
+        return self._noise
+
+    @cached_property
+    def _patterns(self) -> Sequence[FixedPattern]:
+        return [
+            draw_pattern(
+                (camera.height, camera.width),
+                self._noise.prnu,
+                self._noise.dsnu,
+                np.random.default_rng([self._pattern_seed, side]),
+            )
+            for side, camera in enumerate(self._rig.cameras)
+        ]
+
+    def _placed(self, base_from_platform: Array, obstacles: Mapping[str, Array]) -> list[Array]:
+        """camera_from_body (b,4,4) of all bodies for the left and the right camera."""
+        absent = np.diag([1.0, 1.0, 1.0, 1.0])
+        absent[2, 3] = -1e3  # an obstacle without a place stands far behind both cameras
+        return [
+            np.stack(
+                [c @ p for p in (base_from_platform, np.eye(4))]
+                + [c @ obstacles[n] if n in obstacles else absent for n in self._obstacle_names]
+            )
+            for c in self._from_base
+        ]
+
+    def _sticker_pixels(self, pose: Array) -> Array:
+        """Pixels (2, n, 2) of the platform's stickers."""
+        drawable = self._formation.drawable
+        places = np.array(
+            [
+                patch.discs[-1].centre
+                for patch, body in zip(drawable.patches, drawable.body_index, strict=True)
+                if body == 0 and isinstance(patch, DiscStack)
+            ]
+        )
+        return np.stack(
+            [
+                camera.project(apply(c @ pose_to_transform(pose), places))[0]
+                for camera, c in zip(self._rig.cameras, self._from_base, strict=True)
+            ]
+        )
+
+
+class LiveImages:
+    """One exposure, drawn as far as it is read; moments: the placed bodies at each of its sub-frames."""
+
+    def __init__(
+        self,
+        camera: VirtualStereoCamera,
+        moments: Sequence[Sequence[Array]],
+        rng: np.random.Generator,
+        quality: Quality,
+    ) -> None:
+        self._camera, self._moments, self._rng, self._quality = camera, moments, rng, quality
+
+    def full(self) -> StereoFrame:
+        """Both whole images."""
+        return StereoFrame(
+            *(
+                self._camera.noise.expose(
+                    self._camera.whole_exposure(
+                        side, [placed[side] for placed in self._moments], self._quality.supersampling
+                    ),
+                    self._rng,
+                    pattern,
+                )
+                for side, pattern in enumerate(self._camera.patterns())
+            )
+        )
+
+    def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
+        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x, y)."""
+        radiance = self._camera.radiance(self._moments[0], corners, size, self._quality.supersampling)
+        for placed in self._moments[1:]:
+            radiance += self._camera.radiance(placed, corners, size, self._quality.supersampling)
+        if len(self._moments) > 1:
+            radiance /= np.float32(len(self._moments))
+        pattern = self._pattern(corners, size)
+        if self._quality.exposures == 1:
+            return self._camera.noise.expose(radiance, self._rng, pattern)
+        return self._camera.noise.mean_of_exposures(radiance, self._rng, self._quality.exposures, pattern)
+
+    def _pattern(self, corners: NDArray[np.int_], size: int) -> FixedPattern | None:
+        cut = [p.windows(at, size) for p, at in zip(self._camera.patterns(), corners, strict=True) if p is not None]
+        return FixedPattern(np.stack([c.sensitivity for c in cut]), np.stack([c.offset for c in cut])) if cut else None

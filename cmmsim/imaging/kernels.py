@@ -1,0 +1,314 @@
+"""Compiled: drawing without OpenGL, and what both renderers do with drawn windows."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from cmmsim.compiled import compiled
+from cmmsim.geometry.disc_kernels import cover_pixel, inverse_of, reach_of_pixel
+
+# Compiled: which bounding boxes reach into which windows.
+
+
+@compiled
+def boxes_reaching(
+    pixels_from_bodies: np.ndarray,
+    body_index: np.ndarray,
+    boxes: np.ndarray,
+    windows: np.ndarray,
+    near: float,
+    reaching: np.ndarray,
+) -> None:
+    """Fill reaching (n, patches) for windows (n,4) of one exposure: lowest x, y and highest x, y, px.
+
+    Projection matrices pixels_from_bodies (b,3,4); corners of each patch's box as columns boxes (patches,4,8), m and 1.
+    A box not wholly farther than ``near`` may show anywhere, one behind the camera nowhere.
+    """
+    box, point = np.empty(4), np.empty(3)
+    for p in range(len(boxes)):
+        move = pixels_from_bodies[body_index[p]]
+        box[:2], box[2:] = np.inf, -np.inf
+        nearest, farthest = np.inf, -np.inf
+        for c in range(8):
+            for i in range(3):
+                point[i] = (
+                    move[i, 0] * boxes[p, 0, c] + move[i, 1] * boxes[p, 1, c] + move[i, 2] * boxes[p, 2, c] + move[i, 3]
+                )
+            nearest, farthest = min(nearest, point[2]), max(farthest, point[2])
+            if point[2] > near:
+                for i in range(2):
+                    box[i], box[2 + i] = min(box[i], point[i] / point[2]), max(box[2 + i], point[i] / point[2])
+        for n in range(len(windows)):
+            if nearest <= near:
+                reaching[n, p] = farthest > 0.0
+            else:
+                reaching[n, p] = (
+                    box[2] >= windows[n, 0]
+                    and box[3] >= windows[n, 1]
+                    and box[0] <= windows[n, 2]
+                    and box[1] <= windows[n, 3]
+                )
+
+
+# Compiled: drawn cells averaged into the pixels of windows.
+
+
+@compiled
+def mean_of_cells(drawn: np.ndarray, columns: int, supersampling: int, windows: np.ndarray) -> None:
+    """Fill windows (n, h, w) float32, 0 to 1, with the means of ``supersampling``² drawn pixels, 0 to 255.
+
+    ``drawn`` holds the cell of each window in reading order, ``columns`` of them a row.
+    """
+    count, height, width = windows.shape
+    share, white = np.float32(1.0 / (supersampling * supersampling)), np.float32(255.0)
+    sums = np.empty(width * supersampling, dtype=np.uint32)
+    for n in range(count):
+        top, left = n // columns * height * supersampling, n % columns * width * supersampling
+        for y in range(height):
+            sums[:] = 0
+            for i in range(supersampling):
+                row = drawn[top + y * supersampling + i, left : left + width * supersampling]
+                for x in range(len(row)):
+                    sums[x] += row[x]
+            for x in range(width):
+                total = np.uint32(0)
+                for i in range(supersampling):
+                    total += sums[x * supersampling + i]
+                windows[n, y, x] = np.float32(total) * share / white
+
+
+# Compiled: values of drawn windows between their pixels, see `resampling`.
+
+
+@compiled
+def keys_weights(share: float) -> tuple:
+    """Weights of the four pixels around a place that lies ``share`` (0 to 1) after the second one."""
+    s = min(max(share, 0.0), 1.0)
+    return (
+        s * (-0.5 + s * (1.0 - 0.5 * s)),
+        1.0 + s * s * (-2.5 + 1.5 * s),
+        s * (0.5 + s * (2.0 - 1.5 * s)),
+        s * s * (-0.5 + 0.5 * s),
+    )
+
+
+@compiled
+def resample_windows(drawn: np.ndarray, coefficients: np.ndarray, result: np.ndarray) -> None:
+    """Fill windows (n, size, size) from drawn ones (n, h, w) at places given by biquadratic coefficients (n,3,3,2)."""
+    n, height, width = drawn.shape
+    size = result.shape[1]
+    at = np.empty((3, 2))
+    for k in range(n):
+        for row in range(size):
+            t = 2.0 * row / (size - 1) - 1.0
+            for b in range(3):
+                for axis in range(2):
+                    at[b, axis] = (
+                        coefficients[k, 0, b, axis]
+                        + t * coefficients[k, 1, b, axis]
+                        + t * t * coefficients[k, 2, b, axis]
+                    )
+            for column in range(size):
+                s = 2.0 * column / (size - 1) - 1.0
+                x = at[0, 0] + s * (at[1, 0] + s * at[2, 0])
+                y = at[0, 1] + s * (at[1, 1] + s * at[2, 1])
+                first_x = min(max(int(np.floor(x)), 1), width - 3)
+                first_y = min(max(int(np.floor(y)), 1), height - 3)
+                weights_x, weights_y = keys_weights(x - first_x), keys_weights(y - first_y)
+                value = 0.0
+                for i in range(4):
+                    line = 0.0
+                    for j in range(4):
+                        line += weights_x[j] * drawn[k, first_y - 1 + i, first_x - 1 + j]
+                    value += weights_y[i] * line
+                result[k, row, column] = value
+
+
+# Compiled: solids and discs laid over windows one after another, see `analytic`.
+
+
+class Solids(NamedTuple):
+    """Solids from far to near: half_planes (m,3) are a, b, c of a x + b y <= c, px, those of solid k from starts[k] to
+    starts[k + 1]; boxes (k,4) are lowest x, y and highest x, y; levels (k,); slots (k,) where its cover is kept, or
+    -1."""
+
+    half_planes: np.ndarray
+    starts: np.ndarray
+    boxes: np.ndarray
+    levels: np.ndarray
+    slots: np.ndarray
+
+
+class Discs(NamedTuple):
+    """Discs in the order in which they are laid: ellipses' centres (m,2) px, shapes (m,2,2) px, half extents (m,2) px;
+    levels (m,); behind (m,slots) whether the solid of that slot stands before the disc."""
+
+    centres: np.ndarray
+    shapes: np.ndarray
+    extents: np.ndarray
+    levels: np.ndarray
+    behind: np.ndarray
+
+
+@compiled
+def half_planes_of(corners: np.ndarray, half_planes: np.ndarray) -> int:
+    """Fill half_planes with a, b, c of a x + b y <= c for the sides of a convex polygon (n,2); returns their number,
+    sides of no length being left out."""
+    n, count, middle_x, middle_y = len(corners), 0, 0.0, 0.0
+    for k in range(n):
+        middle_x += corners[k, 0] / n
+        middle_y += corners[k, 1] / n
+    for k in range(n):
+        x, y = corners[k]
+        a, b = corners[(k + 1) % n, 1] - y, x - corners[(k + 1) % n, 0]
+        if abs(a) + abs(b) > 1e-6:
+            outwards = 1.0 if a * (x - middle_x) + b * (y - middle_y) > 0.0 else -1.0
+            half_planes[count, 0], half_planes[count, 1] = outwards * a, outwards * b
+            half_planes[count, 2] = outwards * (a * x + b * y)
+            count += 1
+    return count
+
+
+@compiled
+def polygon_holds(half_planes: np.ndarray, x: float, y: float, width: int, height: int) -> bool:
+    """Whether the box from (x, y) on lies wholly inside a convex polygon."""
+    for k in range(len(half_planes)):
+        a, b, c = half_planes[k]
+        if max(a * x, a * (x + width)) + max(b * y, b * (y + height)) > c:
+            return False
+    return True
+
+
+@compiled
+def cover_by_polygon(half_planes: np.ndarray, x: float, y: float, lines: int, share: np.ndarray) -> None:
+    """Share (h, w) of the pixels of a box from (x, y) on: exact along x, the mean of ``lines`` scan lines along y."""
+    height, width = share.shape
+    share[:] = 0.0
+    for row in range(height):
+        for line in range(lines):
+            at, left, right = y + row + (line + 0.5) / lines, 0.0, float(width)
+            for k in range(len(half_planes)):
+                a, b, c = half_planes[k]
+                room = c - b * at - a * x
+                if a > 0.0:
+                    right = min(right, room / a)
+                elif a < 0.0:
+                    left = max(left, room / a)
+                elif room < 0.0:
+                    right = 0.0
+            if left < right:
+                for column in range(int(left), min(math.ceil(right), width)):
+                    share[row, column] += (min(right, column + 1.0) - max(left, float(column))) / lines
+
+
+@compiled
+def lay_solids(image: np.ndarray, x: float, y: float, solids: Solids, lines: int, covers: np.ndarray) -> None:
+    """Lay solids over a window (h, w) whose first pixel begins at (x, y), and note the ``covers`` (slots, h, w)."""
+    height, width = image.shape
+    share = np.empty((height, width))
+    for k in range(len(solids.levels)):
+        low_x, low_y, high_x, high_y = solids.boxes[k]
+        if high_x <= x or low_x >= x + width or high_y <= y or low_y >= y + height:
+            continue
+        half_planes = solids.half_planes[solids.starts[k] : solids.starts[k + 1]]
+        if polygon_holds(half_planes, x, y, width, height):
+            share[:] = 1.0
+        else:
+            cover_by_polygon(half_planes, x, y, lines, share)
+        for row in range(height):
+            for column in range(width):
+                image[row, column] += share[row, column] * (solids.levels[k] - image[row, column])
+                if solids.slots[k] >= 0:
+                    covers[solids.slots[k], row, column] = share[row, column]
+
+
+@compiled
+def shown_share(behind: np.ndarray, covers: np.ndarray, row: int, column: int) -> float:
+    """Share of a pixel that none of the solids before a disc covers."""
+    shown = 1.0
+    for slot in range(len(behind)):
+        if behind[slot]:
+            shown *= 1.0 - covers[slot, row, column]
+    return shown
+
+
+@compiled
+def lay_disc(image: np.ndarray, centre_x: float, centre_y: float, k: int, discs: Discs, covers: np.ndarray) -> None:
+    """Lay disc ``k`` over a window (h, w), its centre given in px of the window."""
+    height, width = image.shape
+    m = inverse_of(discs.shapes[k])
+    reach = reach_of_pixel(m)
+    extent_x, extent_y = discs.extents[k]
+    for row in range(max(0, math.ceil(centre_y - extent_y - 0.5)), min(height, math.floor(centre_y + extent_y + 1.5))):
+        for column in range(
+            max(0, math.ceil(centre_x - extent_x - 0.5)), min(width, math.floor(centre_x + extent_x + 1.5))
+        ):
+            x, y = column - centre_x, row - centre_y
+            distance = math.sqrt((m[0, 0] * x + m[0, 1] * y) ** 2 + (m[1, 0] * x + m[1, 1] * y) ** 2)
+            if distance >= 1.0 + reach:
+                continue
+            share = 1.0 if distance <= 1.0 - reach else cover_pixel(x, y, m)[0]
+            share *= shown_share(discs.behind[k], covers, row, column)
+            image[row, column] += share * (discs.levels[k] - image[row, column])
+
+
+@compiled
+def lay_layers(
+    images: np.ndarray, group: np.ndarray, corners: np.ndarray, solids: Solids, lines: int, discs: Discs
+) -> None:
+    """Lay solids, then discs, over the windows ``images[group]`` (h, w) with first pixels ``corners`` (n, 2)."""
+    _, height, width = images.shape
+    covers = np.empty((discs.behind.shape[1], height, width))
+    for n in range(len(group)):
+        image, x, y = images[group[n]], corners[n, 0], corners[n, 1]
+        covers[:] = 0.0
+        lay_solids(image, x - 0.5, y - 0.5, solids, lines, covers)
+        for k in range(len(discs.levels)):
+            gap_x, gap_y = discs.centres[k, 0] - x, discs.centres[k, 1] - y
+            if (
+                gap_x + discs.extents[k, 0] > -0.5
+                and gap_x - discs.extents[k, 0] < width - 0.5
+                and gap_y + discs.extents[k, 1] > -0.5
+                and gap_y - discs.extents[k, 1] < height - 0.5
+            ):
+                lay_disc(image, gap_x, gap_y, k, discs, covers)
+
+
+@compiled
+def hides(eye: np.ndarray, point: np.ndarray, normals: np.ndarray, offsets: np.ndarray, touching: float) -> bool:
+    """Whether the convex solid normal . x + offset <= 0 stands between an eye (3,) and a point (3,) in its axes."""
+    enter, leave = -np.inf, np.inf
+    for k in range(len(normals)):
+        distance, closing = -offsets[k], 0.0
+        for i in range(3):
+            distance -= normals[k, i] * eye[i]
+            closing += normals[k, i] * (point[i] - eye[i])
+        if closing < 0.0:
+            enter = max(enter, distance / closing)
+        elif closing > 0.0:
+            leave = min(leave, distance / closing)
+        elif distance < 0.0:
+            return False
+    return enter < leave and leave > 0.0 and enter < 1.0 - touching
+
+
+@compiled
+def hidden_points(
+    body_from_camera: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    offsets: np.ndarray,
+    touching: float,
+    hidden: np.ndarray,
+) -> None:
+    """``hides`` for points (n,3) in camera axes, into ``hidden`` (n,)."""
+    eye, point = np.empty(3), np.empty(3)
+    for n in range(len(points)):
+        for i in range(3):
+            point[i] = eye[i] = body_from_camera[i, 3]
+            for j in range(3):
+                point[i] += body_from_camera[i, j] * points[n, j]
+        hidden[n] = hides(eye, point, normals, offsets, touching)

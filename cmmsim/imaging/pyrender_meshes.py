@@ -1,0 +1,192 @@
+"""What pyrender is given: stickers as softened triangles, and patches laid over each other in a known order.
+
+Stickers as triangles, softened as far as they are sampled.
+The rim of a sharp disc aliases between the samples that a pixel is drawn with. Here the uppermost disc's rim falls off
+to the level around it over RIM_SAMPLES distances of samples, which leaves its centre and its light what they are, so
+that what is drawn comes close to the disc faster with more samples than that of a sharp rim.
+
+Windows in which patches lie over each other in a known order, so that no depths are needed to draw them.
+They show one solid and at most one stack of discs that lies on it: a camera before the plane of a disc sees the disc,
+for all of the solid lies behind that plane. Where the solid is convex and fills a window, its level is all that shows
+of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from cmmsim.geometry.pose import Array
+from cmmsim.imaging.scene import ConvexSolid, Disc, DiscStack, Mesh
+from cmmsim.imaging.views import FAR, NEAR, Drawable, View, window_bounds
+
+RIM_SAMPLES = 1.8
+LARGEST_SAG = 0.08  # samples by which a side of the polygon may fall short of the rim
+FEWEST_SIDES, GROUND_SIDES = 16, 16
+
+
+def disc_mesh(stack: DiscStack, sample: float) -> Mesh:
+    """Triangles of discs that are drawn with samples ``sample`` m apart.
+
+    The uppermost disc has a soft rim where another one lies below it; the others are coarse and sharp.
+    """
+    *grounds, top = stack.discs
+    pieces = [
+        _soft_disc(top, grounds[-1].level, sample) if grounds else _sharp_disc(top, _sides(top.radius, sample)),
+        *(_sharp_disc(disc, GROUND_SIDES) for disc in reversed(grounds)),
+    ]
+    first = np.cumsum([0, *(len(p.vertices) for p in pieces)])
+    return Mesh(
+        np.concatenate([p.vertices for p in pieces]),
+        np.concatenate([p.faces + start for p, start in zip(pieces, first, strict=False)]),
+        np.concatenate([p.levels for p in pieces]),
+    )
+
+
+def _soft_disc(disc: Disc, around: float, sample: float) -> Mesh:
+    """A disc whose level falls to that ``around`` it within a band that is laid about its rim."""
+    width = min(RIM_SAMPLES * sample, disc.radius)
+    middle = np.sqrt(disc.radius**2 - width**2 / 12.0)  # as much light as the sharp disc
+    sides = _sides(disc.radius, sample)
+    corners = np.concatenate([_corners(disc, middle - 0.5 * width, sides), _corners(disc, middle + 0.5 * width, sides)])
+    triangles = np.concatenate([_balanced_triangles(sides), _band_triangles(sides)])
+    return Mesh(corners, triangles, np.concatenate([np.full(sides, disc.level), np.full(sides, around)]))
+
+
+def _sharp_disc(disc: Disc, sides: int) -> Mesh:
+    return Mesh(_corners(disc, disc.radius, sides), _balanced_triangles(sides), np.full(sides, disc.level))
+
+
+def _sides(radius: float, sample: float) -> int:
+    """Sides of a polygon that follows a circle to LARGEST_SAG."""
+    return max(FEWEST_SIDES, int(np.ceil(np.pi * np.sqrt(radius / (2.0 * LARGEST_SAG * sample)))))
+
+
+def _corners(disc: Disc, radius: float, sides: int) -> Array:
+    """Corners (sides, 3) of the regular polygon in a disc's plane that has the area of the circle."""
+    u, v = np.linalg.svd(disc.normal[None])[2][1:]
+    angles = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
+    fill = np.sqrt(2.0 * np.pi / (sides * np.sin(2.0 * np.pi / sides)))
+    return disc.centre + fill * radius * (np.cos(angles)[:, None] * u + np.sin(angles)[:, None] * v)
+
+
+def _band_triangles(sides: int) -> NDArray[np.int_]:
+    """Triangles (2 sides, 3) between ``sides`` corners and as many around them."""
+    here, there = np.arange(sides), np.roll(np.arange(sides), -1)
+    return np.concatenate(
+        [np.column_stack([here, there, sides + here]), np.column_stack([there, sides + there, sides + here])]
+    )
+
+
+def _balanced_triangles(sides: int) -> NDArray[np.int_]:
+    """Triangles (sides - 2, 3) of a convex polygon, large ones inside: faster to draw than a fan of slivers."""
+    triangles: list[tuple[int, int, int]] = []
+    arcs = [(0, sides - 1)]
+    while arcs:
+        start, end = arcs.pop()
+        if end - start >= 2:
+            middle = (start + end) // 2
+            triangles.append((start, middle, end))
+            arcs += [(start, middle), (middle, end)]
+    return np.array(triangles)
+
+
+RIM_PX = 0.5  # around a window that the solid must fill, too: far more than rounding
+CLEARANCE = 1e-6  # m by which a disc must lie over its solid
+FLATTEST = 1e-6  # volume of a solid over that of a cube as long; a flatter one fills no window
+OUTWARDS = np.array([-1.0, -1.0, 1.0, 1.0])
+OUTWARDS.setflags(write=False)
+CORNERS = [[0, 1], [2, 1], [0, 3], [2, 3]]  # of bounds: lowest x, y and highest x, y
+
+
+@dataclass(frozen=True)
+class Laid:
+    """For each of n windows the patch of its only solid, or -1 where depths are needed; and whether that fills it."""
+
+    solid: NDArray[np.int_]
+    filled: NDArray[np.bool_]
+
+
+class LaidSolids:
+    """The convex solids of a drawable, each of one level, and the stacks of discs that lie on them.
+
+    levels (patches,): of the solids, NaN for other patches.
+    """
+
+    def __init__(self, drawable: Drawable) -> None:
+        patches, self._body_index = drawable.patches, drawable.body_index
+        self._solids = {
+            k: ConvexSolid(p.vertices) for k, p in enumerate(patches) if isinstance(p, Mesh) and _is_plain_convex(p)
+        }
+        self.levels = np.array(
+            [p.levels[0] if k in self._solids and isinstance(p, Mesh) else np.nan for k, p in enumerate(patches)]
+        )
+        self._normals = np.array([p.discs[-1].normal if isinstance(p, DiscStack) else np.zeros(3) for p in patches])
+        self._heights = np.array(
+            [p.discs[-1].centre @ p.discs[-1].normal if isinstance(p, DiscStack) else 0.0 for p in patches]
+        )
+        self._lying = {
+            k: np.array(
+                [
+                    isinstance(p, DiscStack) and body == self._body_index[k] and _lies_over(p, solid.vertices)
+                    for p, body in zip(patches, self._body_index, strict=True)
+                ]
+            )
+            for k, solid in self._solids.items()
+        }
+
+    def laid(self, views: Sequence[View], groups: Sequence[NDArray[np.int_]], reaching: NDArray[np.bool_]) -> Laid:
+        """Which windows need no depths.
+
+        ``groups``: indices of the views of each camera and exposure; ``reaching`` (n views, patches): see Drawable.
+        """
+        laid = Laid(np.full(len(views), -1), np.zeros(len(views), dtype=bool))
+        few, bounds = reaching.sum(axis=1) <= 2, window_bounds(views)
+        for group in groups:
+            for k in self._solids:
+                members = group[few[group] & reaching[group, k]]
+                if len(members):
+                    others = reaching[members] & ~self._seen_over(k, views[members[0]])
+                    alone = members[~others.any(axis=1)]
+                    laid.solid[alone] = k
+                    laid.filled[alone] = self._fills(k, views[members[0]], bounds[alone])
+        return laid
+
+    def _seen_over(self, solid: int, view: View) -> NDArray[np.bool_]:
+        """The solid itself, and the stacks of discs on it that show their upper side (patches,)."""
+        move = view.camera_from_bodies[self._body_index[solid]]
+        eye = -move[:3, 3] @ move[:3, :3]
+        seen = self._lying[solid] & (self._normals @ eye - self._heights > CLEARANCE)
+        seen[solid] = True
+        return seen
+
+    def _fills(self, solid: int, view: View, bounds: Array) -> NDArray[np.bool_]:
+        """Whether the solid shows at all corners of windows with ``bounds`` (n,4), px, and so all over them."""
+        camera, move = view.camera, view.camera_from_bodies[self._body_index[solid]]
+        depths = self._solids[solid].vertices @ move[2, :3] + move[2, 3]
+        if depths.min() <= NEAR or depths.max() >= FAR:
+            return np.zeros(len(bounds), dtype=bool)
+        rays = np.ones((len(bounds), 4, 3))
+        rays[..., :2] = ((bounds + RIM_PX * OUTWARDS)[:, CORNERS] - camera.centre) / camera.focal_lengths
+        return np.asarray(self._solids[solid].hides(move, FAR * rays).all(axis=1))
+
+
+def _is_plain_convex(mesh: Mesh) -> bool:
+    """Whether a mesh is the whole surface of a convex solid, of one level."""
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
+    if not solid.is_watertight or np.ptp(mesh.levels) > 0.0:
+        return False
+    volume = abs(float(solid.volume))
+    return volume > FLATTEST * float(np.max(solid.extents)) ** 3 and volume > (1.0 - 1e-9) * solid.convex_hull.volume
+
+
+def _lies_over(stack: DiscStack, vertices: Array) -> bool:
+    """Whether discs are parallel, each over the one before, and all above vertices (n,3)."""
+    normal = stack.discs[0].normal
+    heights = np.array([disc.centre @ normal for disc in stack.discs])
+    parallel = all(np.allclose(disc.normal, normal, rtol=0.0, atol=1e-9) for disc in stack.discs)
+    return parallel and bool(np.diff(heights, prepend=(vertices @ normal).max()).min() > CLEARANCE)

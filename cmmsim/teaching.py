@@ -1,0 +1,295 @@
+"""Teaching (paper section 4.2): the frames of base and platform from their sticker planes, once, before measuring.
+
+The base stands still: its stickers are averaged over many exposures. The platform goes through a smooth path; in each
+pose its stickers are observed, all observations are laid onto each other by registration, and the planes are put
+through the mean constellation. Different poses put the stickers on different parts of a pixel, so that what is left of
+the image formation's own error averages out as well.
+
+Whatever detector the sensor measures with, the centres are those of the maximum-likelihood fit, which is the one
+without a bias: the base is seen in one pose only, so that another detector's bias would stay in every pose.
+
+How large the windows are in which stickers are looked for: large enough for the largest image of a sticker.
+That is the image of a sticker in the nearest place of work, which is taken for a fifth nearer than the rig's target, or
+of one that both cameras see on base and platform at teaching.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.detection.detectors import DEFAULT_DETECTOR
+from cmmsim.errors import LostError, TeachingError
+from cmmsim.files.marked_body import MarkedBody, marked_body
+from cmmsim.files.rig import rig_from_file
+from cmmsim.files.schema import SensorFile
+from cmmsim.geometry.disc_image import sticker_outlines
+from cmmsim.geometry.pose import Array, apply, compose_covariance, invert
+from cmmsim.geometry.registration import register
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
+from cmmsim.imaging.scene import placed_stickers
+from cmmsim.pose_estimation.estimator import FEWEST_NOMINAL, NOMINAL_TOLERANCE, by_planes, points_in_frame
+from cmmsim.pose_estimation.labelling import find_layout
+from cmmsim.pose_estimation.observation import DetectionSettings, StickerObservation, faces_camera, observe
+from cmmsim.pose_estimation.taught import Taught, setup_of
+from cmmsim.radiometry.noise import CameraNoise
+
+Progress = Callable[[int, int], None]
+SHIFT, TURN = 0.008, 0.03  # m, rad: reach of the teaching path about home
+CYCLES = np.array([1, 2, 3, 3, 1, 2])
+LARGEST_GAP = 1e-4  # m: in averaged exposures a whole sticker is within a few microns of its place
+PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
+
+
+@dataclass(frozen=True)
+class TeachingPlan:
+    """How much is looked at: base quality; platform poses and quality at each; window sizes px."""
+
+    base: Quality = field(default_factory=lambda: Quality(supersampling=32, exposures=4000))
+    platform: Quality = field(default_factory=lambda: Quality(supersampling=12, exposures=30))
+    poses: int = 64
+    base_window: int = 20
+    first_window: int = 24
+    platform_window: int = 16
+
+
+@dataclass(frozen=True)
+class Teacher:
+    """The instruments of teaching."""
+
+    camera: VirtualStereoCamera
+    rig: StereoRig
+    noise: CameraNoise
+    settings: DetectionSettings
+    platform: MarkedBody
+    base: MarkedBody
+    plan: TeachingPlan = field(default_factory=TeachingPlan)
+
+    def teach(
+        self, sensor_name: str, home: Array, rng: np.random.Generator, progress: Progress | None = None
+    ) -> Taught:
+        """Teach base and platform around the pose ``home`` (6,). Raises TeachingError."""
+        steps = self.plan.poses + 2
+        report = progress or (lambda done, total: None)
+        report(0, steps)
+        try:
+            path = teaching_path(home, self.plan.poses)
+            points = points_in_frame(self.camera.look(path[0], rng).full(), self.rig, self.noise, self.settings)
+            start = [
+                find_layout(body.nominal, points, NOMINAL_TOLERANCE, FEWEST_NOMINAL, body.name)[0]
+                for body in (self.base, self.platform)
+            ]
+            report(1, steps)
+            base = self._look_at(
+                self.base, start[0], self.base.nominal, path[0], rng, self.plan.base, self.plan.base_window
+            )
+            camera_from_base, base_covariance, base = by_planes(base, self.base, _towards(self.base, start[0]))
+            report(2, steps)
+            seen = self._platform_views(start[1], path, rng, lambda k: report(k + 2, steps))
+        except LostError as error:
+            raise TeachingError(f"teaching failed: {error}") from error
+        base_from_camera = invert(camera_from_base)
+        places, place_covariances, platform_covariance = self._platform_places(seen)
+        return Taught(
+            sensor_name,
+            base_from_camera,
+            compose_covariance(base_from_camera, base_covariance),
+            places,
+            place_covariances,
+            platform_covariance,
+            apply(base_from_camera, base.points),
+        )
+
+    def _look_at(
+        self,
+        body: MarkedBody,
+        expected: Array,
+        places: Array,
+        pose: Array,
+        rng: np.random.Generator,
+        quality: Quality,
+        window_size: int,
+    ) -> StickerObservation:
+        """All stickers of a body from averaged exposures. Raises LostError when one is missing."""
+        limits = replace(self.settings.limits, largest_misfit=np.inf)
+        noise = replace(self.noise, frames=quality.exposures)
+        settings = replace(
+            self.settings,
+            window_size=window_size,
+            limits=limits,
+            largest_ray_gap=np.inf,
+            detector=DEFAULT_DETECTOR,
+            centre_error_px=self.camera.centre_error_px(quality),
+        )
+        seen = observe(
+            self.camera.look(pose, rng, quality=quality),
+            self.rig,
+            noise,
+            settings,
+            expected,
+            places,
+            body.sticker_normals,
+        )
+        if len(seen.index) < len(places):
+            missing = np.setdiff1d(np.arange(len(places)), seen.index)
+            raise LostError(
+                f"{body.name}: stickers {', '.join(body.sticker_ids[missing])} not seen by both cameras"
+                + self._outside(body, missing, apply(expected, places))
+            )
+        return seen
+
+    def _outside(self, body: MarkedBody, missing: NDArray[np.int_], points: Array) -> str:
+        """Which of the missing stickers no window could have found, for they lie beside an image."""
+        outside = missing[~np.all(self.rig.project(points[missing])[1], axis=0)]
+        return f"; {', '.join(body.sticker_ids[outside])} lie outside of an image" if len(outside) else ""
+
+    def _platform_views(
+        self, rough: Array, path: Array, rng: np.random.Generator, report: Callable[[int], None]
+    ) -> list[StickerObservation]:
+        """Observations along the teaching path, each expected where the ones before lead to."""
+        places, last, step, seen = self.platform.nominal, rough, np.eye(4), []
+        for k, pose in enumerate(path):
+            size = self.plan.first_window if k < 2 else self.plan.platform_window
+            seen.append(self._look_at(self.platform, last @ step, places, pose, rng, self.plan.platform, size))
+            if k == 0:
+                body_from_camera = invert(by_planes(seen[0], self.platform, _towards(self.platform, rough))[0])
+                places = apply(body_from_camera, seen[0].points)
+            now = register(places, seen[-1].points, seen[-1].covariances).transform
+            self._require_rigid(places, now, seen[-1])
+            step = invert(last) @ now if k else step
+            last = now
+            report(k + 1)
+        return seen
+
+    def _require_rigid(self, places: Array, camera_from_body: Array, seen: StickerObservation) -> None:
+        """Raise LostError when a sticker has moved against the others: it is partly hidden."""
+        gaps = np.linalg.norm(apply(camera_from_body, places) - seen.points, axis=1)
+        if gaps.max() > LARGEST_GAP:
+            worst = self.platform.sticker_ids[gaps.argmax()]
+            raise LostError(
+                f"{self.platform.name}: sticker {worst} is {gaps.max() * 1e6:.0f} um off its place, "
+                f"at most {LARGEST_GAP * 1e6:.0f} um; it may be partly hidden"
+            )
+
+    def _platform_places(self, seen: list[StickerObservation]) -> tuple[Array, Array, Array]:
+        """Sticker places (n,3), their covariances (n,3,3) and the covariance (6,6) of the platform frame."""
+        mean, covariances = seen[0].points, seen[0].covariances
+        for _ in range(3):
+            mean, covariances = _mean_constellation(mean, seen)
+        towards = _towards(self.platform, register(self.platform.nominal, mean, covariances).transform)
+        whole = replace(seen[0], points=mean, covariances=covariances)
+        mean_from_body, frame_covariance, _ = by_planes(whole, self.platform, towards)
+        body_from_mean = invert(mean_from_body)
+        turn = body_from_mean[:3, :3]
+        return (
+            apply(body_from_mean, mean),
+            turn @ covariances @ turn.T,
+            compose_covariance(body_from_mean, frame_covariance),
+        )
+
+
+def teaching_path(home: Array, count: int) -> Array:
+    """Smooth closed path of poses (count, 6) that starts near ``home`` and visits many sub-pixel positions."""
+    angle = 2.0 * np.pi * np.arange(count)[:, None] / count * CYCLES + PHASES
+    return home + np.array([SHIFT] * 3 + [TURN] * 3) * np.sin(angle)
+
+
+def _towards(body: MarkedBody, camera_from_body: Array) -> Array:
+    """Normals (3,3) of the planes in the camera frame."""
+    return body.normals @ camera_from_body[:3, :3].T
+
+
+def _mean_constellation(reference: Array, seen: list[StickerObservation]) -> tuple[Array, Array]:
+    """Weighted mean (n,3) of all observations laid onto ``reference`` (n,3), and its covariances (n,3,3)."""
+    information, weighted = np.zeros((len(reference), 3, 3)), np.zeros((len(reference), 3))
+    for observation in seen:
+        to_reference = invert(register(reference, observation.points, observation.covariances).transform)
+        turn = to_reference[:3, :3]
+        weight = np.linalg.inv(turn @ observation.covariances @ turn.T)
+        information += weight
+        weighted += np.einsum("nij,nj->ni", weight, apply(to_reference, observation.points))
+    covariances = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    return np.einsum("nij,nj->ni", covariances, weighted), covariances
+
+
+ROOM = 1.35  # half the side of what is fitted over a sticker's radius at the rig's target
+SMALLEST_ROOM_PX = 0.7  # on each side of the largest sticker at teaching: half a pixel goes into rounding
+SMALLEST_FIT, SMALLEST_BLURRED_FIT = 12, 14  # px
+BLUR_ROOM = 1.0  # px on each side, at least, for what point spread and exposure blur
+WINDOW_SHARE = 7 / 6  # side of a window over that of the part that is fitted
+
+
+@dataclass(frozen=True)
+class WindowSizes:
+    """Sides in px of windows and of the part around the bright spot that is fitted; growth: of what is fitted, over
+    what the smallest stickers get."""
+
+    window: int
+    fit: int
+    growth: float
+
+    def plan(self) -> TeachingPlan:
+        """Teaching with windows that have grown alike."""
+        plan = TeachingPlan()
+        sizes = {
+            name: 2 * round(0.5 * self.growth * getattr(plan, name))
+            for name in ("base_window", "first_window", "platform_window")
+        }
+        return replace(plan, **sizes)
+
+
+def window_sizes(target_px: float, largest_px: float, psf_px: float, blurred: bool) -> WindowSizes:
+    """Sizes for stickers whose radius looks ``target_px`` large at the rig's target and ``largest_px`` at teaching.
+
+    Parameters: psf_px: sigma of the point spread; blurred: by it or by a moving platform.
+    """
+    smallest, blur = (SMALLEST_BLURRED_FIT, max(BLUR_ROOM, psf_px)) if blurred else (SMALLEST_FIT, 0.0)
+    reach = max(ROOM * target_px, largest_px + SMALLEST_ROOM_PX)
+    fit = max(smallest, 2 * int(np.ceil(reach + blur)))
+    return WindowSizes(2 * int(0.5 * WINDOW_SHARE * fit), fit, fit / smallest)
+
+
+def radius_at(rig: StereoRig, camera_from_base: Array, target: Array, radius: float) -> float:
+    """Radius in px of a sticker of ``radius`` m that faces the nearer camera at ``target`` (3,) m, base axes."""
+    distances = [float(np.linalg.norm(apply(move @ camera_from_base, target))) for move in rig.from_camera]
+    return max(
+        radius * float(camera.focal_lengths.max()) / distance
+        for camera, distance in zip(rig.cameras, distances, strict=True)
+    )
+
+
+def largest_radius(rig: StereoRig, camera_from_body: Array, body: MarkedBody, radius: float) -> float:
+    """Longest half axis in px of the stickers of a body that both cameras see; 0 where there is none."""
+    normals = body.sticker_normals
+    seen = np.all(rig.project(apply(camera_from_body, body.nominal))[1], axis=0)
+    for move in rig.from_camera:
+        placed = move @ camera_from_body
+        seen &= faces_camera(apply(placed, body.nominal), normals @ placed[:3, :3].T)
+    _, shapes = sticker_outlines(rig, camera_from_body, body.nominal[seen], normals[seen], radius)
+    return float(np.linalg.eigvalsh(shapes).max(initial=0.0))
+
+
+def exactly_taught(file: SensorFile) -> Taught:
+    """What teaching would find without any error: the true frames and sticker places of a sensor file's scene.
+
+    For studies of the observation noise alone: all covariances are zero. Raises SensorFileError.
+    """
+    _, camera_from_base = rig_from_file(file.rig)
+    platform, base = (
+        placed_stickers(marked_body(name, section), file.stickers, stream)
+        for stream, (name, section) in enumerate((("platform", file.platform), ("base", file.base)))
+    )
+    return Taught(
+        file.name,
+        invert(camera_from_base),
+        np.zeros((6, 6)),
+        platform,
+        np.zeros((len(platform), 3, 3)),
+        np.zeros((6, 6)),
+        base,
+        setup_of(file),
+    )

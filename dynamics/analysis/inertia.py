@@ -1,0 +1,167 @@
+"""Inertias that a rigid body can have, and what changed inertias do to the motion.
+
+Principal inertias that a rigid body can have: positive mass, and no moment larger than the sum of the other two.
+Published tables break this (the cranks and links of the paper's Table 1 do), and multibody engines refuse such bodies.
+`physical_inertias` names them, or changes as little as possible, and where it can what the motion does not feel:
+
+- a crank turns about its own z alone, so Ixx and Iyy give way and Izz stays;
+- a link without spin does no work against Izz, so Izz gives way and Ixx and Iyy stay;
+- the platform feels all three, so they share the change equally (the nearest moments in the least-squares sense).
+
+What changed inertias do to the motion: accelerations of the robot with its own parameters and with changed ones.
+Measured at random states over the travel, so that an export that has to change inertias can say what that means.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynamics.analysis.workspace import measure
+from dynamics.errors import ParameterError
+from dynamics.kinematics.geometry import LEGS
+from dynamics.parameters import BODY_NAMES, RIGID_BODY, check_parameters
+from dynamics.robot import Robot
+
+MOMENTS = ("Ixx", "Iyy", "Izz")
+
+# Engines refuse a moving body without mass or inertia; MuJoCo's limit is 1e-15.
+SMALLEST = 1e-12
+
+# A sum of two rounded moments may fall below the third by one unit of the last digit; MuJoCo compares exactly.
+ROUNDING = 1e-14
+
+
+class UnphysicalInertiaError(ParameterError):
+    """Bodies whose mass and principal inertias no rigid body can have."""
+
+
+@dataclass(frozen=True)
+class BodyInertias:
+    """Mass (kg) and principal moments Ixx, Iyy, Izz (kg m^2) of each body, (13, 4) in the order of `BODY_NAMES`, and
+    what was changed, in words by body (empty: nothing)."""
+
+    values: np.ndarray
+    changes: dict[str, str]
+
+
+def physical_inertias(parameters: np.ndarray, allow_changes: bool = False) -> BodyInertias:
+    """Inertias of parameters (64,) that a multibody engine accepts.
+
+    Raises UnphysicalInertiaError, naming bodies and values, where one must be changed and `allow_changes` is False.
+    """
+    given = np.array(parameters[: 4 * len(BODY_NAMES)], dtype=float).reshape(-1, 4)
+    broken = {body: fault for body, row in zip(BODY_NAMES, given, strict=True) if (fault := _fault(row))}
+    if broken and not allow_changes:
+        raise UnphysicalInertiaError(
+            f"no rigid body has these inertias [kg, kg m^2]: {'; '.join(grouped(broken))}; "
+            "pass allow_unphysical_inertia (--allow-unphysical-inertia on the command line) to take the nearest ones "
+            "that engines accept"
+        )
+    values, changes = given.copy(), dict[str, str]()
+    for index, body in enumerate(BODY_NAMES):
+        if body in broken:
+            values[index] = _repaired(body, given[index])
+            changes[body] = _difference(given[index], values[index])
+    return BodyInertias(values, changes)
+
+
+def grouped(texts: dict[str, str]) -> list[str]:
+    """Texts by body as lines `body, body: text`, one for all bodies that share a text, in the order of the bodies."""
+    bodies: dict[str, list[str]] = {}
+    for body, text in texts.items():
+        bodies.setdefault(text, []).append(body)
+    return [f"{', '.join(names)}: {text}" for text, names in bodies.items()]
+
+
+def _fault(row: np.ndarray) -> str:
+    """What is wrong with a body's mass and moments (4,), with its values; empty when nothing is."""
+    for name, value in zip(("mass", *MOMENTS), row, strict=True):
+        if value < SMALLEST:
+            return f"{name} = {value:g} is below {SMALLEST:g}"
+    largest = int(np.argmax(row[1:]))
+    others = [index for index in range(3) if index != largest]
+    half = row[1:] / 2  # sums of two of the largest floats overflow
+    if half[largest] <= half[others[0]] + half[others[1]]:
+        return ""
+    total = " + ".join(f"{MOMENTS[index]} {row[1 + index]:g}" for index in others)
+    return f"{MOMENTS[largest]} {row[1 + largest]:g} > {total}"
+
+
+def _repaired(body: str, row: np.ndarray) -> np.ndarray:
+    mass = max(row[0], SMALLEST)
+    moments = np.maximum(row[1:], SMALLEST) / 4  # sums of three of the largest floats overflow
+    if body.startswith("crank"):
+        moments = _crank_moments(*moments)
+    elif body.startswith("link"):
+        moments = _link_moments(*moments)
+    else:
+        moments = _nearest_moments(moments)
+    return np.array([mass, *4 * np.array(moments)])
+
+
+def _crank_moments(x: float, y: float, z: float) -> list[float]:
+    if x + y < z:
+        half = (z - x - y) / 2 + ROUNDING * z
+        return [x + half, y + half, z]
+    return [min(x, (y + z) * (1 - ROUNDING)), min(y, (x + z) * (1 - ROUNDING)), z]
+
+
+def _link_moments(x: float, y: float, z: float) -> list[float]:
+    slack = ROUNDING * (x + y)
+    return [x, y, min(max(z, abs(x - y) + slack), x + y - slack)]
+
+
+def _nearest_moments(moments: np.ndarray) -> list[float]:
+    largest = int(np.argmax(moments))
+    excess = 2 * moments[largest] - moments.sum()
+    if excess > 0:
+        share = excess / 3 + ROUNDING * moments[largest]
+        moments = moments + share
+        moments[largest] -= 2 * share
+    return [float(value) for value in moments]
+
+
+def _difference(before: np.ndarray, after: np.ndarray) -> str:
+    named = zip(("mass", *MOMENTS), before, after, strict=True)
+    return ", ".join(f"{name} {old:g} -> {new:g}" for name, old, new in named if old != new)
+
+
+STATES = 300
+CRANK_RATE_RAD_S, TORQUE_NM = 1.0, 3.0
+"""Standard deviations of crank rates, and of torques on top of those that hold the robot."""
+
+
+def acceleration_changes(robot: Robot, parameters: np.ndarray, inertias: np.ndarray) -> dict[str, float]:
+    """How much each changed body alters forward dynamics, by body: the largest |change| / |acceleration|.
+
+    `inertias` (13, 4) are masses and moments in the order of `BODY_NAMES`; bodies that have them already in the
+    parameters (64,) are left out. Linear and angular acceleration count separately, over the states of
+    `travel_states`. Raises ParameterError for parameters outside their range.
+    """
+    own = check_parameters(parameters)
+    state = travel_states(robot, own)
+    before = robot.forward_dynamics(*state, own).reshape(-1, 2, 3)
+    effects = {}
+    for index, body in enumerate(BODY_NAMES):
+        other = own.copy()
+        other[RIGID_BODY].reshape(-1, 4)[index] = inertias[index]
+        if not np.array_equal(other, own):
+            change = robot.forward_dynamics(*state, other).reshape(-1, 2, 3) - before
+            effects[body] = float((np.linalg.norm(change, axis=2) / np.linalg.norm(before, axis=2)).max())
+    return effects
+
+
+def travel_states(robot: Robot, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Random poses within the travel limit, twists and torques, (STATES, 6) each; always the same for a robot."""
+    rng = np.random.default_rng(0)
+    at_home = robot.pose_jacobian(robot.home_pose)
+    pose = np.empty((0, 6))
+    while len(pose) < STATES:
+        # The linear map from angles to poses leaves the reach far from home: the factor keeps some draws near it.
+        angles = robot.travel_limit * rng.uniform(0, 1, (STATES, 1)) * rng.uniform(-1, 1, (STATES, LEGS))
+        drawn = robot.home_pose + np.linalg.solve(at_home, angles.T).T
+        pose = np.concatenate([pose, drawn[measure(robot, drawn).travel_share <= 1]])
+    pose = pose[:STATES]
+    rates = CRANK_RATE_RAD_S * rng.standard_normal((STATES, LEGS, 1))
+    twist = np.linalg.solve(robot.joint_jacobian(pose), rates)[..., 0]
+    return pose, twist, robot.static_torque(pose, parameters) + TORQUE_NM * rng.standard_normal((STATES, LEGS))

@@ -1,0 +1,193 @@
+"""Equation of motion in pose coordinates and its derivatives, as the closed-loop integrator evaluates them (CasADi).
+
+With q the pose, the wrench balance is premultiplied by T^T (twist = T q_dot, eq. 29):
+
+    M(q) q_ddot + b(q, q_dot) = J_theta^T (torque - friction)
+
+Legs enter through the motion of their platform joints A only, so derivatives are formed leg by leg with respect to
+three vectors of length 3 and chained through dA/dq.
+"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from dynamics.kinematics.geometry import LEGS, Rss6Geometry
+from dynamics.kinematics.inverse_kinematics import leg_to
+from dynamics.kinematics.rotation import function, pose_rate_to_twist, rotation_matrix, symmetric_from_lower, twist_bias
+from dynamics.parameters import RIGID_BODY
+from dynamics.rigid_body.leg_dynamics import leg_columns, leg_force, leg_mass, leg_motion, torque_to_force
+from dynamics.rigid_body.virtual_work import crank_parameters, link_parameters, platform_columns
+
+# Motion of the six platform joints A = h + R a in pose coordinates, with the derivatives the legs chain through.
+
+
+class PlatformJointMotion:
+    """Symbolic motion of the joints A for a pose q (6,), rate and acceleration (6,); base axes, SI.
+
+    Lists over the legs: position, velocity, acceleration (3,); gradient dA/dq = d(velocity)/d(rate) (3, 6);
+    gradient_rate d(velocity)/dq (3, 6); acceleration_by_pose d(acceleration)/dq (3, 6).
+    d(acceleration)/d(rate) is twice gradient_rate.
+    """
+
+    def __init__(self, geometry: Rss6Geometry, pose: ca.SX, rate: ca.SX, acceleration: ca.SX) -> None:
+        angles, spin, spin_rate = pose[3:6], rate[3:6], acceleration[3:6]
+        rotation = rotation_matrix(angles)
+        first = _by_angles(rotation, angles)
+        self._second = [_by_angles(matrix, angles) for matrix in first]
+        first_rate = [_combine(row, spin) for row in self._second]
+        rotation_second_rate = _combine(first, spin_rate) + _combine(first_rate, spin)
+        third = _by_angles(rotation_second_rate, angles)
+        arms = [geometry.platform_joints[leg] for leg in range(LEGS)]
+        self._arms = arms
+        self.position = [pose[0:3] + rotation @ arm for arm in arms]
+        self.velocity = [rate[0:3] + _combine(first, spin) @ arm for arm in arms]
+        self.acceleration = [acceleration[0:3] + rotation_second_rate @ arm for arm in arms]
+        self.gradient = [ca.horzcat(ca.SX.eye(3), *[matrix @ arm for matrix in first]) for arm in arms]
+        self.gradient_rate = [ca.horzcat(ca.SX.zeros(3, 3), *[m @ arm for m in first_rate]) for arm in arms]
+        self.acceleration_by_pose = [ca.horzcat(ca.SX.zeros(3, 3), *[m @ arm for m in third]) for arm in arms]
+
+    def curvature(self, leg: int, force: ca.SX) -> ca.SX:
+        """d(gradient^T force)/dq (6, 6) for a force (3,) held constant at the joint of one leg."""
+        arm = self._arms[leg]
+        rows = [ca.horzcat(*[ca.dot(force, matrix @ arm) for matrix in row]) for row in self._second]
+        return ca.diagcat(ca.SX.zeros(3, 3), ca.vertcat(*rows))
+
+
+def _by_angles(matrix: ca.SX, angles: ca.SX) -> list[ca.SX]:
+    columns = ca.jacobian(ca.vec(matrix), angles)
+    return [ca.reshape(columns[:, axis], 3, 3) for axis in range(3)]
+
+
+def _combine(matrices: list[ca.SX], weights: ca.SX) -> ca.SX:
+    return matrices[0] * weights[0] + matrices[1] * weights[1] + matrices[2] * weights[2]
+
+
+def equation_of_motion(geometry: Rss6Geometry) -> ca.Function:
+    """(pose, rate, rigid) -> M (6, 6), b (6,), J_theta (6, 6), J_theta_dot rate (6,), theta (6,)."""
+    pose, rate, rigid = ca.SX.sym("pose", 6), ca.SX.sym("rate", 6), ca.SX.sym("rigid", RIGID_BODY.stop)
+    rest = ca.SX.zeros(6)
+    joints = PlatformJointMotion(geometry, pose, rate, rest)
+    mass = _platform_mass(pose, rigid[0:4])
+    bias = _platform_columns(geometry, pose, rate, rest) @ rigid[0:4]
+    rows, crank_accelerations, angles = [], [], []
+    for leg in range(LEGS):
+        vectors = leg_to(geometry, leg, joints.position[leg])
+        motion = leg_motion(vectors, joints.velocity[leg], joints.acceleration[leg])
+        crank, link = crank_parameters(rigid, leg), link_parameters(rigid, leg)
+        gradient = joints.gradient[leg]
+        mass += gradient.T @ leg_mass(vectors, crank, link) @ gradient
+        bias += gradient.T @ leg_force(vectors, motion, crank, link, ca.DM(geometry.gravity))
+        rows.append(torque_to_force(vectors).T @ gradient)
+        crank_accelerations.append(motion.crank_acceleration)
+        angles.append(vectors.angle)
+    mass = symmetric_from_lower(mass)
+    outputs = [mass, bias, ca.vertcat(*rows), ca.vertcat(*crank_accelerations), ca.vertcat(*angles)]
+    return function("equation_of_motion", [pose, rate, rigid], outputs)
+
+
+def motion_derivatives(geometry: Rss6Geometry) -> ca.Function:
+    """(pose, rate, acceleration, torque, rigid) -> derivatives at fixed acceleration and net joint torque.
+
+    Of the residual M q_ddot + b - J_theta^T torque: with respect to pose (6, 6), rate (6, 6) and rigid (6, 52).
+    Of the crank accelerations: with respect to pose (6, 6) and rate (6, 6); the latter is 2 J_theta_dot.
+    The linear solve for q_ddot is left to the caller and never differentiated.
+    """
+    pose, rate, acceleration = (ca.SX.sym(name, 6) for name in ("pose", "rate", "acceleration"))
+    torque, rigid = ca.SX.sym("torque", 6), ca.SX.sym("rigid", RIGID_BODY.stop)
+    joints = PlatformJointMotion(geometry, pose, rate, acceleration)
+    platform = _platform_columns(geometry, pose, rate, acceleration)
+    by_pose = ca.jacobian(platform @ rigid[0:4], pose)
+    by_rate = ca.jacobian(platform @ rigid[0:4], rate)
+    cranks, links, crank_by_pose, crank_by_rate = [], [], [], []
+    for leg in range(LEGS):
+        local = _leg_derivatives(geometry, leg, joints, torque[leg], rigid)
+        gradient = joints.gradient[leg]
+        by_pose += gradient.T @ _by_pose(local.force, joints, leg) + joints.curvature(leg, local.net_force)
+        by_rate += gradient.T @ _by_rate(local.force, joints, leg)
+        crank_by_pose.append(_by_pose(local.crank, joints, leg))
+        crank_by_rate.append(_by_rate(local.crank, joints, leg))
+        cranks.append(gradient.T @ local.columns[:, 0:4])
+        links.append(gradient.T @ local.columns[:, 4:8])
+    columns = ca.horzcat(platform, *cranks, *links)
+    outputs = [by_pose, by_rate, columns, ca.vertcat(*crank_by_pose), ca.vertcat(*crank_by_rate)]
+    return function("motion_derivatives", [pose, rate, acceleration, torque, rigid], outputs)
+
+
+@dataclass(frozen=True)
+class _LegDerivatives:
+    """Derivatives with respect to position, velocity, acceleration of A: of the net force, and of theta_ddot."""
+
+    columns: ca.SX
+    net_force: ca.SX
+    force: tuple[ca.SX, ca.SX, ca.SX]
+    crank: tuple[ca.SX, ca.SX, ca.SX]
+
+
+def _leg_derivatives(
+    geometry: Rss6Geometry, leg: int, joints: PlatformJointMotion, torque: ca.SX, rigid: ca.SX
+) -> _LegDerivatives:
+    inputs = [ca.SX.sym(name, 3) for name in ("position", "velocity", "acceleration")]
+    vectors = leg_to(geometry, leg, inputs[0])
+    motion = leg_motion(vectors, inputs[1], inputs[2])
+    columns = leg_columns(vectors, motion, ca.DM(geometry.gravity))
+    own = ca.vertcat(crank_parameters(rigid, leg), link_parameters(rigid, leg))
+    moving = leg_force(vectors, motion, own[0:4], own[4:8], ca.DM(geometry.gravity))
+    force = moving - torque_to_force(vectors) * torque
+    by_acceleration = leg_mass(vectors, own[0:4], own[4:8])
+    crank = motion.crank_acceleration
+    expressions = [
+        columns,
+        force,
+        ca.jacobian(force, inputs[0]),
+        ca.jacobian(force, inputs[1]),
+        by_acceleration,
+        ca.jacobian(crank, inputs[0]),
+        ca.jacobian(crank, inputs[1]),
+        torque_to_force(vectors).T,
+    ]
+    values = [joints.position[leg], joints.velocity[leg], joints.acceleration[leg]]
+    columns, force, *rows = ca.substitute(ca.cse(expressions), inputs, values)
+    return _LegDerivatives(columns, force, (rows[0], rows[1], rows[2]), (rows[3], rows[4], rows[5]))
+
+
+def _by_pose(rows: tuple[ca.SX, ca.SX, ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
+    by_position, by_velocity, by_acceleration = rows
+    return (
+        by_position @ joints.gradient[leg]
+        + by_velocity @ joints.gradient_rate[leg]
+        + by_acceleration @ joints.acceleration_by_pose[leg]
+    )
+
+
+def _by_rate(rows: tuple[ca.SX, ca.SX, ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
+    _, by_velocity, by_acceleration = rows
+    return by_velocity @ joints.gradient[leg] + 2 * by_acceleration @ joints.gradient_rate[leg]
+
+
+def rate_map_derivative(geometry: Rss6Geometry) -> ca.Function:
+    """(pose, g) -> d(J_theta g)/d(pose) (6, 6) for a constant pose rate g (6,)."""
+    pose, rate = ca.SX.sym("pose", 6), ca.SX.sym("rate", 6)
+    joints = PlatformJointMotion(geometry, pose, rate, ca.SX.zeros(6))
+    rows = []
+    for leg in range(LEGS):
+        position = ca.SX.sym("position", 3)
+        gradient = torque_to_force(leg_to(geometry, leg, position))
+        curvature = ca.substitute(ca.jacobian(gradient, position), position, joints.position[leg])
+        at_joint = ca.substitute(gradient, position, joints.position[leg])
+        along = joints.velocity[leg].T @ curvature @ joints.gradient[leg]
+        rows.append(at_joint.T @ joints.gradient_rate[leg] + along)
+    return function("rate_map_derivative", [pose, rate], [ca.vertcat(*rows)])
+
+
+def _platform_columns(geometry: Rss6Geometry, pose: ca.SX, rate: ca.SX, acceleration: ca.SX) -> ca.SX:
+    to_twist = pose_rate_to_twist(pose)
+    twist_dot = to_twist @ acceleration + twist_bias(pose, rate)
+    return to_twist.T @ platform_columns(pose, to_twist @ rate, twist_dot, ca.DM(geometry.gravity))
+
+
+def _platform_mass(pose: ca.SX, platform: ca.SX) -> ca.SX:
+    frame = rotation_matrix(pose[3:6])
+    to_twist = pose_rate_to_twist(pose)
+    at_origin = ca.diagcat(platform[0] * ca.SX.eye(3), frame @ ca.diag(platform[1:4]) @ frame.T)
+    return to_twist.T @ at_origin @ to_twist

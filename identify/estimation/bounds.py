@@ -1,0 +1,180 @@
+"""Where a search may go, and 95 % intervals of what is estimated within bounds.
+
+Where a search may go: no negative parameter, and on demand only bodies that can exist.
+A rigid body has a positive mass, and none of its principal moments of inertia exceeds the sum of the other two. With
+the second moments of its mass along its axes, J_x = integral of x^2 dm and so on,
+
+    Ixx = J_y + J_z,    Iyy = J_x + J_z,    Izz = J_x + J_y,
+
+and the triangle inequality of the moments is nothing but J >= 0: a search in J instead of I needs bounds only, see
+Traversaro et al., "Identification of fully physical consistent inertial parameters" (IROS 2016).
+
+95 % intervals of what is estimated within bounds.
+The covariance of an estimate is that of the problem without bounds. Where bounds hold the estimate back, they pull all
+of it from where the record and the starting guess alone would have it. Linearised about the estimate, that is
+
+    unheld = estimate - W^-1 g,
+
+with the information W and that part g of the cost's gradient which the active bounds balance. The interval of the
+unheld estimate, cut to what is allowed, holds the truth as often as it says; but it may be empty, or leave the estimate
+outside. The interval given spans that of the unheld and that of the held estimate, cut at the least allowed value: it
+is never empty, holds the estimate, and covers at least as often. (The interval of the held estimate alone, cut there,
+would not: a sum of many quantities near their bounds is estimated too high by more than its standard deviation.)
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from dynamics.analysis.inertia import MOMENTS, SMALLEST, physical_inertias
+from dynamics.parameters import BODY_NAMES
+from identify.arrays import Array
+from identify.estimation.bounded_least_squares import Problem
+from identify.loop_parameters import NAMES, StartingGuess, index_of
+
+# Linear propagation of uncertainty.
+
+
+def combined_std(rows: Array, covariance: Array) -> Array:
+    """Standard deviations (n,) of the combinations rows (n, p) @ parameters, from the parameters' covariance (p, p)."""
+    return np.asarray(np.sqrt(np.einsum("gi,ij,gj->g", rows, covariance, rows)))
+
+
+SMALLEST_SHARE = 1e-3
+"""Lower bound of platform mass and integral gain, as a share of the starting guess: the model needs both."""
+
+MOMENTS_FROM_SECOND = np.ones((3, 3)) - np.eye(3)
+"""(Ixx, Iyy, Izz) from (J_x, J_y, J_z)."""
+
+
+@dataclass(frozen=True)
+class ParameterBounds:
+    """Coordinates (p,) of a search and their lower bounds (p,), with parameters = matrix (p, p) @ coordinates.
+
+    statements: what each bound says of the parameters; physical: only bodies that can exist.
+    """
+
+    matrix: Array
+    lower: Array
+    statements: tuple[str, ...]
+    physical: bool
+
+    def nearest(self, parameters: Array) -> Array:
+        """Parameters (67,) within the bounds: negative ones raised, and bodies changed where they cannot exist, if it
+        can be in what the motion does not feel."""
+        allowed = np.maximum(parameters, 0.0)
+        if self.physical:
+            bodies = physical_inertias(allowed[:64], allow_changes=True).values
+            allowed[: bodies.size] = bodies.ravel()
+        return self.parameters(np.maximum(self.coordinates(allowed), self.lower))
+
+    def coordinates(self, parameters: Array) -> Array:
+        """Coordinates (p,) of parameters (p,)."""
+        return np.asarray(np.linalg.solve(self.matrix, parameters), dtype=float)
+
+    def parameters(self, coordinates: Array) -> Array:
+        """Parameters (p,) of coordinates (p,)."""
+        return np.asarray(self.matrix @ coordinates, dtype=float)
+
+    def least(self, rows: Array) -> Array:
+        """Least values (n,) that rows (n, p) @ parameters take within the bounds; -inf where there is none."""
+        weights = rows @ self.matrix
+        return np.where((weights >= 0).all(axis=1), weights @ self.lower, -np.inf)
+
+    def balanced(self, gradient: Array, at_bound: NDArray[np.bool_]) -> Array:
+        """The part (p,) of a cost's gradient (p,) that the coordinates (p,) at their bounds balance."""
+        multipliers = np.where(at_bound, np.maximum(self.matrix.T @ gradient, 0.0), 0.0)
+        return np.asarray(np.linalg.solve(self.matrix.T, multipliers), dtype=float)
+
+
+@dataclass(frozen=True)
+class InCoordinates:
+    """A least-squares problem as a function of the coordinates; see `bounded_least_squares.Problem`."""
+
+    problem: Problem
+    bounds: ParameterBounds
+
+    def cost(self, parameters: Array) -> float:
+        """Cost at coordinates (p,)."""
+        return self.problem.cost(self.bounds.parameters(parameters))
+
+    def linearise(self, parameters: Array) -> tuple[float, Array, Array]:
+        """Cost and linearisation at coordinates (p,)."""
+        cost, factor, residual = self.problem.linearise(self.bounds.parameters(parameters))
+        return cost, factor @ self.bounds.matrix, residual
+
+
+def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
+    """Bounds of the 67 parameters; physical: only masses and inertias that a rigid body can have."""
+    matrix, lower = np.eye(len(NAMES)), np.zeros(len(NAMES))
+    for name in ("platform.mass", "joint_pid.li"):
+        lower[index_of(name)] = SMALLEST_SHARE * guess.values[index_of(name)]
+    if physical:
+        lower[: 4 * len(BODY_NAMES)] = np.maximum(lower[: 4 * len(BODY_NAMES)], SMALLEST)
+    statements = [f"{name} >= {bound:g}" for name, bound in zip(NAMES, lower, strict=True)]
+    for body in BODY_NAMES if physical else ():
+        first = index_of(f"{body}.Ixx")
+        matrix[first : first + 3, first : first + 3] = MOMENTS_FROM_SECOND
+        for axis, moment in enumerate(MOMENTS):
+            others = [one for one in MOMENTS if one != moment]
+            statements[first + axis] = f"{body}.{moment} <= {' + '.join(others)}"
+    return ParameterBounds(matrix, lower, tuple(statements), physical)
+
+
+HALF_WIDTH = float(norm.ppf(0.975))
+"""Of a 95 % interval, in standard deviations."""
+
+
+@dataclass(frozen=True)
+class BoundedEstimate:
+    """An estimate (p,) within bounds, and where it is at them (p,) bool, in the order of the bounds' coordinates.
+
+    unheld (p,): where record and starting guess alone would have it; covariance (p, p): of that.
+    """
+
+    estimate: Array
+    at_bound: NDArray[np.bool_]
+    unheld: Array
+    covariance: Array
+    bounds: ParameterBounds
+
+    def intervals(self, rows: Array) -> Array:
+        """95 % intervals (n, 2) of the quantities rows (n, p) @ parameters, cut at the least value allowed."""
+        half = HALF_WIDTH * combined_std(rows, self.covariance)
+        centres = np.stack([rows @ self.estimate, rows @ self.unheld])
+        low = np.maximum(centres.min(axis=0) - half, self.bounds.least(rows))
+        return np.stack([low, centres.max(axis=0) + half], axis=1)
+
+    @property
+    def active_bounds(self) -> tuple[str, ...]:
+        """What the bounds that hold the estimate say of the parameters, as "platform.Izz <= Ixx + Iyy"."""
+        return tuple(self.bounds.statements[k] for k in np.flatnonzero(self.at_bound))
+
+    def warnings(self) -> tuple[str, ...]:
+        """One line where bounds hold the estimate: which, and how far beyond them it would go."""
+        if not self.at_bound.any():
+            return ()
+        beyond = self.bounds.lower - self.bounds.coordinates(self.unheld)
+        std = combined_std(np.asarray(np.linalg.inv(self.bounds.matrix), dtype=float), self.covariance)
+        said = ", ".join(
+            f"{self.bounds.statements[k]} ({max(beyond[k] / std[k], 0):.2g})" for k in np.flatnonzero(self.at_bound)
+        )
+        return (
+            f"the estimate is held at {self.at_bound.sum()} bounds; in brackets the standard deviations by which "
+            f"record and starting guess would go beyond: {said}; the intervals allow for it",
+        )
+
+
+def bounded_estimate(
+    estimate: Array,
+    at_bound: NDArray[np.bool_],
+    gradient: Array,
+    information: Array,
+    covariance: Array,
+    bounds: ParameterBounds,
+) -> BoundedEstimate:
+    """The estimate (p,) of a search within bounds, where J^T r is `gradient` (p,) and J^T J is `information` (p, p)."""
+    unheld = estimate - np.linalg.solve(information, bounds.balanced(gradient, at_bound))
+    return BoundedEstimate(estimate, at_bound, unheld, covariance, bounds)

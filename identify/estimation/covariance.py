@@ -1,0 +1,232 @@
+"""Covariance of an output-error estimate, by propagating the sensor's noise, and of the poses that it predicts.
+
+What the error of a known load does to an estimate that takes the load at its stated figures.
+Under the load L the model has the parameters p + L: an error of the load moves the residuals of its records by J dL,
+with J their Jacobian by the parameters, and the scores by J^T J dL. With S the covariance of the load, the scores
+spread by H S H beside the noise, where H = J^T J sums over all records made under this load. The estimate follows the
+scores as it follows those of noise (`estimate_covariance`). Where the load shows the scale, a load that is a percent
+heavier than stated makes all parameters about a percent too small.
+
+Covariance of an output-error estimate, by propagating the sensor's noise through the experiment.
+Sensor noise enters twice: in the measured poses, and through the servo in the plant's motion, which a model that
+closes its own loop cannot follow (its residuals are coloured, and stick-slip makes the response nonlinear). So the
+experiment is repeated on the identified model with drawn noise: each draw gives residuals r, and their scores J^T r
+spread as those of the real record do. With W the information of data and prior, the covariance of the estimate is
+W^-1 (cov(J^T r) + prior information) W^-1. A model driven by the logged commands has white residuals, and W^-1 is all.
+Where either misses the record by more than noise explains, what its error does to the scores is added (`misfit`); and
+what the error of a load does that is not known exactly (`load_error`). It is all computed in units where W is one.
+
+How far the true plant may be from what the identified model predicts, on a motion that it was not identified from.
+Two things keep the plant away from the model. The parameters are uncertain: their covariance C comes through the exact
+sensitivities S of the model's poses as S C S^T. And the sensor's noise goes through the servo into the plant's motion,
+which no model can foretell: its covariance is sampled by repeated experiments on the identified model, and is taken to
+be the same all along the motion. What the sensor has wrong in every frame alike, such as the frames it was taught,
+moves the whole motion with it and is not predicted: no record of this sensor shows it.
+"""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from dynamics.closed_loop import ClosedLoopRun, LoopFailure, simulate
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white
+from identify.estimation.output_error import OutputErrorProblem
+from identify.progress import Advance
+from identify.record.recorded_run import RecordedRun
+from identify.runtime import cores
+
+
+def load_score_covariance(runs: Sequence[RecordedRun], information: Sequence[Array], units: Array) -> Array:
+    """Covariance (p, p) of the scores T^T J^T r that the loads' standard deviations make, to first order.
+
+    information: J^T J (p, p) of each run's residuals; units: T (p, p). Runs that state the same load, equally well
+    known, share its error; different loads err independently.
+    """
+    size = len(units)
+    shown: dict[tuple[float, ...], Array] = {}
+    for run, one in zip(runs, information, strict=True):
+        load = (*run.payload, *run.payload_std)
+        shown[load] = shown.get(load, np.zeros((size, size))) + one
+    spread = [units.T @ total * np.array(load[size:]) for load, total in shown.items()]
+    return np.asarray(sum(one @ one.T for one in spread), dtype=float)
+
+
+DRAWS = 100
+"""Repetitions: they know a standard deviation to 7 %."""
+
+FEWEST = 50
+"""Repetitions that must have run to their end."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Covariance (67, 67) of the estimate, were there no bounds; information (67, 67) that the poses alone hold;
+    gradient (67,): J^T r of poses and all that is known beside them, at the estimate; misfit of the record; unstable:
+    repeated experiments that ended early and were left out."""
+
+    covariance: Array
+    information: Array
+    gradient: Array
+    misfit: Misfit
+    unstable: int = 0
+
+    def warnings(self) -> tuple[str, ...]:
+        """A misfit that the sensor's noise does not explain, and a model whose loop is close to unstable."""
+        if not self.unstable:
+            return self.misfit.warnings()
+        return (
+            *self.misfit.warnings(),
+            f"{self.unstable} of {DRAWS} repeated experiments on the identified model were unstable and are left "
+            "out of the intervals",
+        )
+
+
+def estimate_uncertainty(
+    problem: OutputErrorProblem, parameters: Array, rng: np.random.Generator, advance: Advance = lambda n=1: None
+) -> Uncertainty:
+    """Uncertainty of the estimate `parameters` (67,), from DRAWS repeated experiments.
+
+    Raises EstimationError when too many of them are unstable.
+    """
+    found = [run.residuals(parameters) for run in problem.runs]
+    known, known_rows = problem.known(parameters)
+    gradient = known @ known_rows + sum(np.tensordot(r, j, 2) for r, j in found)
+    informations = [_information(j) for _, j in found]
+    information = np.asarray(sum(informations))
+    units = _units([known_rows, *(j.reshape(-1, len(parameters)) for _, j in found)])
+    shown = [(r, j @ units) for r, j in found]
+    scores, misfit, unstable = _noise(problem, parameters, shown, rng, advance)
+    if misfit.significant:
+        model = sum(coloured_score_covariance(r, j, run.ok) for (r, j), run in zip(shown, problem.runs, strict=True))
+        scores = scores + misfit.share_of_model * model
+    if any(run.payload_std.any() for run in problem.runs):
+        scores = scores + load_score_covariance(problem.runs, informations, units)
+    prior = _information(known_rows @ units)
+    covariance = units @ (scores + prior) @ units.T
+    return Uncertainty((covariance + covariance.T) / 2, information, np.asarray(gradient), misfit, unstable)
+
+
+def _units(rows: list[Array]) -> Array:
+    """Matrix T (p, p) with T^T W T = 1, where W is the information of all rows (n, p) together, and so W^-1 = T T^T.
+
+    From the rows themselves: W has the square of their condition number, beyond what its inverse can bear where a
+    record contradicts the model.
+    """
+    triangle: Array = np.asarray(np.linalg.qr(np.vstack(rows), mode="r"))
+    return np.asarray(solve_triangular(triangle, np.eye(triangle.shape[1])))
+
+
+def _information(jacobian: Array) -> Array:
+    """J^T J (p, p) of rows (..., p)."""
+    rows = jacobian.reshape(-1, jacobian.shape[-1])
+    return np.asarray(rows.T @ rows, dtype=float)
+
+
+def _noise(
+    problem: OutputErrorProblem,
+    parameters: Array,
+    found: list[tuple[Array, Array]],
+    rng: np.random.Generator,
+    advance: Advance,
+) -> tuple[Array, Misfit, int]:
+    """Covariance (67, 67) of the scores that noise makes, the misfit beyond it, and how many repetitions ended early.
+
+    found: residuals (n, 6) of each run and their Jacobian (n, 6, 67), in the units of the scores. Where the model's
+    error decides, or its residuals are white, no experiment is repeated.
+    """
+    white = misfit_of_white(np.concatenate([residual for residual, _ in found]))
+    if white.decides or all(run.driven for run in problem.runs):
+        advance(DRAWS)
+        return np.asarray(sum(_information(jacobian) for _, jacobian in found)), white, 0
+    scores, squares = _repeated_scores(problem, parameters, found, rng, advance)
+    unstable = DRAWS - len(scores)
+    if len(scores) < FEWEST:
+        raise EstimationError(
+            f"{unstable} of {DRAWS} repeated experiments on the identified model ended in an unstable loop: "
+            "its servo cannot bear the sensor's noise, and no interval can be given"
+        )
+    misfit = Misfit(white.found, float(np.mean(squares)), float(np.std(squares, ddof=1)))
+    return np.cov(np.array(scores).T), misfit, unstable
+
+
+def _repeated_scores(
+    problem: OutputErrorProblem,
+    parameters: Array,
+    found: list[tuple[Array, Array]],
+    rng: np.random.Generator,
+    advance: Advance,
+) -> tuple[list[Array], list[float]]:
+    """Scores J^T r and mean squared residuals of the repeated experiments whose loop is stable."""
+
+    def repeat(draws: np.random.Generator) -> tuple[Array, float] | None:
+        try:
+            repeated = [repeated_experiment(run, parameters, draws).measured for run in problem.runs]
+        except LoopFailure:
+            return None
+        drawn = [
+            residual + run.whiten(run.measured - poses)
+            for run, (residual, _), poses in zip(problem.runs, found, repeated, strict=True)
+        ]
+        score = np.asarray(sum(np.tensordot(r, j, 2) for r, (_, j) in zip(drawn, found, strict=True)))
+        return score, float(np.mean(np.concatenate(drawn) ** 2))
+
+    results = []
+    with ThreadPoolExecutor(cores()) as pool:  # the compiled loop runs without Python's lock
+        for result in pool.map(repeat, rng.spawn(DRAWS)):
+            results += [result] if result else []
+            advance()
+    return [score for score, _ in results], [square for _, square in results]
+
+
+def repeated_experiment(run: RecordedRun, parameters: Array, rng: np.random.Generator) -> ClosedLoopRun:
+    """A repeated experiment whose plant is the identified model and whose sensor has drawn noise; NaN where lost.
+
+    Raises LoopFailure where the loop is unstable.
+    """
+    noise = rng.standard_normal(run.measured.shape) @ np.linalg.cholesky(run.covariance).T
+    return simulate(run.robot, parameters + run.payload, run.reference, run.settings, lost=~run.ok, noise=noise)
+
+
+REPETITIONS = 4
+"""Repeated experiments a motion: with hundreds of frames each they know the noise's share of a deviation to 5 %."""
+
+
+@dataclass(frozen=True)
+class PosePrediction:
+    """The model's poses (N, 6) [m, rad], and the covariance (N, 6, 6) of the plant's true ones about them."""
+
+    poses: Array
+    covariance: Array
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (N, 6) [m, rad]."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)), dtype=float)
+
+    def normalised_squared_error(self, true: Array) -> float:
+        """Mean over the frames of e^T P^-1 e / 6 with the error e of the true poses (N, 6): near one where P is right.
+
+        Errors of parameters last for the whole motion: of a single run the figure spreads widely about one.
+        """
+        errors = true - self.poses
+        weighted = np.linalg.solve(self.covariance, errors[..., None])[..., 0]
+        return float(np.mean(np.sum(errors * weighted, axis=1))) / 6
+
+
+def predict_poses(run: RecordedRun, parameters: Array, covariance: Array, rng: np.random.Generator) -> PosePrediction:
+    """Predict a run with estimated parameters (67,) of covariance (67, 67).
+
+    Of the run only the reference, the sensor's covariance and the lost frames count, not what was measured.
+    Raises LoopFailure where the model, or its repetition with the sensor's noise, is unstable.
+    """
+    model = run.simulate(parameters, sensitivities=True)
+    assert model.pose_sensitivity is not None
+    drawn = [repeated_experiment(run, parameters, rng).pose - model.pose for _ in range(REPETITIONS)]
+    noise = np.concatenate(drawn)
+    from_parameters = model.pose_sensitivity @ covariance @ model.pose_sensitivity.transpose(0, 2, 1)
+    return PosePrediction(model.pose, from_parameters + noise.T @ noise / len(noise))

@@ -1,0 +1,196 @@
+"""D-optimality of the output error's information: through the closed loop, and with the loop linearised about home.
+
+D-optimality of the output error's information, through the closed loop and with the sensor's covariance.
+With J = d(poses)/d(67 parameters) of the simulated closed loop at the starting guess, Sigma the covariance that the
+sensor states, and what is known before (starting guess, the scenario's prior of single parameters, scale anchor),
+
+    W = sum over frames J^T Sigma^-1 J + prior,      D = (det(S W S))^(1 / (2 67)),      S = diag(prior deviations).
+
+D is the factor by which the experiment narrows the prior, the geometric mean over all directions of the parameter
+space; it has no unit. That the sensor's noise also moves the plant (through the servo) is left out.
+
+The closed loop, linearised about rest at home: how it follows a reference, and how missing torque moves it.
+With s = i omega, C = kp + kd s + ki / s the servo, L = lp + ld s + li / s the joint PID and t_d the latency plus half
+a frame of hold, the pose x follows a torque error d (Nm, joints) as
+
+    x = -S d,   S = (J_ad^-T M E s^2 + F_v J_theta s + d(holding torque)/dx + L J_theta (1 + C exp(-s t_d)))^-1,
+
+E from pose rates to twists, and follows a reference x_d as x = T x_d with T = S L J_theta C exp(-s t_d). Friction
+counts with its viscous part only.
+
+The D-criterion with the loop linearised about home: a function of the unknowns with exact derivatives.
+The information of `criterion_information` comes from a simulation and has no exact derivative by the trajectory. In
+the linearised loop the robot follows each harmonic of the trajectory with a known lag, and the sensitivities are
+filtered columns of the torque regressor along that motion: with Y its Fourier coefficients at a harmonic, tau = Y Xi
+the torques and e = tau / L the joint error that the PID needs for them,
+
+    d(pose)/d(Xi) = -S Y,    d(pose)/d(lp, li, ld) = S (e, e / s, e s).
+
+One period in the steady state counts for all, so the start of the run is left out.
+"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.visibility import expected_covariance
+from dynamics import Robot
+from dynamics.closed_loop import LoopFailure, simulate
+from dynamics.parameters import VISCOUS
+from identify.arrays import Array
+from identify.errors import TrajectoryError
+from identify.estimation.scale_anchor import DEFAULT_STD, MEASURED_PARAMETER
+from identify.excitation.motion import Unknowns, log_determinant, sample_times, torque_regressor, tracked_motion
+from identify.loop_parameters import NAMES, StartingGuess, index_of, starting_guess
+from identify.record.loop_setup import frame_times, model_settings, reference_motion
+from identify.scenario import Scenario
+from identify.trajectory import FourierTrajectory
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What is known before the run: starting guess, covariance (6, 6) of a measured pose [m, rad], and the prior's
+    information (67, 67) in units of its own standard deviations."""
+
+    guess: StartingGuess
+    covariance: Array
+    scaled_prior: Array
+
+
+def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
+    """The scenario's starting guess with its prior, anchor and sensor."""
+    settings = scenario.identification
+    guess = starting_guess(robot, scenario.model.start_parameters, settings.start_std, settings.prior)
+    prior = np.eye(len(NAMES))
+    anchor = settings.scale_anchor
+    if anchor in MEASURED_PARAMETER:
+        place = index_of(MEASURED_PARAMETER[anchor])
+        std = settings.anchor_std or DEFAULT_STD[anchor]
+        prior[place, place] += (guess.std[place] / std) ** 2
+    covariance = expected_covariance(
+        scenario.sensor, robot.home_pose, scenario.pose_method, changes=scenario.sensor_changes
+    )
+    return Knowledge(guess, covariance, prior)
+
+
+def log_information(robot: Robot, scenario: Scenario, known: Knowledge, trajectory: FourierTrajectory) -> float:
+    """ln D of a trajectory run for `excitation.duration_s`.
+
+    Raises TrajectoryError where the model with the starting guess is unstable on it.
+    """
+    times = frame_times(scenario, scenario.excitation.duration_s)
+    try:
+        run = simulate(
+            robot,
+            known.guess.values,
+            reference_motion(trajectory, times),
+            model_settings(scenario),
+            sensitivities=True,
+        )
+    except LoopFailure as error:
+        raise TrajectoryError(
+            f"no D-criterion: the closed loop with the parameters model.start_parameters = "
+            f"{scenario.model.start_parameters!r} is unstable on this trajectory: {error}"
+        ) from error
+    assert run.pose_sensitivity is not None
+    whitener = np.linalg.inv(np.linalg.cholesky(known.covariance))
+    rows = (whitener @ run.pose_sensitivity).reshape(-1, len(NAMES)) * known.guess.std
+    return float(np.linalg.slogdet(rows.T @ rows + known.scaled_prior)[1] / (2 * len(NAMES)))
+
+
+ComplexArray = NDArray[np.complex128]
+
+STEP = 1e-6
+"""Step [m, rad] of the difference quotient of the holding torque."""
+
+
+def pid_response(parameters: Array, s: ComplexArray) -> ComplexArray:
+    """L (K,) [Nm/rad] of the joint PID of `parameters` (67,) at s (K,) [1/s]."""
+    lp, li, ld = parameters[64:]
+    return np.asarray(lp + ld * s + li / s)
+
+
+def torque_response(robot: Robot, parameters: Array, scenario: Scenario, s: ComplexArray) -> ComplexArray:
+    """S (K, 6, 6) [m/Nm, rad/Nm] for `parameters` (67,) at s = i omega (K,) [1/s], none of them zero."""
+    home, xi = robot.home_pose, parameters[:64]
+    to_twist = robot.twist(np.tile(home, (6, 1)), np.eye(6)).T
+    joint_rates = robot.pose_jacobian(home)
+    inertia = np.linalg.solve(robot.joint_jacobian(home).T, robot.mass_matrix(home, xi) @ to_twist)
+    steps = STEP * np.eye(6)
+    stiffness = (robot.static_torque(home + steps, xi) - robot.static_torque(home - steps, xi)).T / (2 * STEP)
+    damping = xi[VISCOUS][:, None] * joint_rates
+    loop = pid_response(parameters, s) * (1 + servo_response(scenario, s))
+    total = np.multiply.outer(s**2, inertia) + np.multiply.outer(s, damping) + stiffness
+    return np.asarray(np.linalg.inv(total + np.multiply.outer(loop, joint_rates)))
+
+
+def tracking_response(robot: Robot, parameters: Array, scenario: Scenario, s: ComplexArray) -> ComplexArray:
+    """T (K, 6, 6) from desired to actual poses, as `torque_response`."""
+    gain = pid_response(parameters, s) * servo_response(scenario, s)
+    drive = np.multiply.outer(gain, robot.pose_jacobian(robot.home_pose))
+    return np.asarray(torque_response(robot, parameters, scenario, s) @ drive)
+
+
+def servo_response(scenario: Scenario, s: ComplexArray) -> ComplexArray:
+    """C exp(-s t_d) (K,) of the visual servo at s (K,) [1/s]."""
+    servo, timing = scenario.servo, scenario.timing
+    delay = np.exp(-s * (timing.latency_s + timing.frame_period_s / 2))
+    return np.asarray((servo.kp + servo.kd * s + servo.ki / s) * delay)
+
+
+HARMONICS_SEEN = 8
+"""Sensitivities count up to this multiple of the highest harmonic of the trajectory."""
+
+
+def log_linear_information(
+    robot: Robot, unknowns: Unknowns, scenario: Scenario, known: Knowledge, smoothing_rad_s: float | None = None
+) -> ca.Function:
+    """z -> ln D in the linearised loop; `smoothing_rad_s` as in `criterion_observability`."""
+    z = ca.MX.sym("z", unknowns.size)
+    rows = sensitivity_spectrum(robot, unknowns, scenario, known.guess.values, z, smoothing_rad_s)
+    whitener = np.linalg.inv(np.linalg.cholesky(known.covariance))
+    rows = rows @ ca.DM(np.kron(np.eye(2 * len(harmonics(unknowns))), whitener.T))
+    frames = scenario.timing.frames(scenario.excitation.duration_s)
+    scaled = ca.diag(known.guess.std * np.sqrt(frames / 2)) @ rows
+    determinant = log_determinant(len(NAMES))(scaled @ scaled.T + ca.DM(known.scaled_prior))
+    return ca.Function("log_linear_information", [z], [determinant / (2 * len(NAMES))], ["z"], ["value"])
+
+
+def harmonics(unknowns: Unknowns) -> ComplexArray:
+    """s = i omega (K,) [1/s] of the harmonics that count."""
+    order = np.arange(1, HARMONICS_SEEN * unknowns.harmonics + 1)
+    return np.asarray(2j * np.pi * unknowns.fundamental_hz * order, dtype=complex)
+
+
+def sensitivity_spectrum(
+    robot: Robot,
+    unknowns: Unknowns,
+    scenario: Scenario,
+    parameters: Array,
+    z: ca.MX,
+    smoothing_rad_s: float | None = None,
+) -> ca.MX:
+    """Fourier coefficients of d(pose)/d(67 parameters), (67, 12 K): six real and six imaginary parts a harmonic.
+
+    A coefficient x_k means Re(x_k exp(s_k t)).
+    """
+    times, s = sample_times(unknowns.fundamental_hz, unknowns.harmonics), harmonics(unknowns)
+    response = torque_response(robot, parameters, scenario, s)
+    tracking = tracking_response(robot, parameters, scenario, s[: unknowns.harmonics])
+    moved = tracked_motion(unknowns, z, times, tracking)
+    sampled = torque_regressor(robot, smoothing_rad_s).map(len(times))(*moved)
+    waves = np.exp(-np.outer(times, s)) * 2 / len(times)
+    transform = np.stack([waves.real, waves.imag], axis=-1).reshape(len(times), -1)
+    spectrum = ca.reshape(ca.reshape(sampled, 64 * 6, len(times)) @ ca.DM(transform), 64, 12 * len(s))
+    error = 1 / pid_response(parameters, s)
+    torque = ca.DM(parameters[:64]).T @ spectrum
+    gains = [torque @ _real_filter(response * f[:, None, None]) for f in (error, error / s, error * s)]
+    return ca.vertcat(-spectrum @ _real_filter(response), *gains)
+
+
+def _real_filter(response: ComplexArray) -> ca.DM:
+    """Block-diagonal (12 K, 12 K): rows (Re y_k, Im y_k) times it are (Re x_k, Im x_k) of x_k = response_k y_k."""
+    blocks = [np.block([[r.real.T, r.imag.T], [-r.imag.T, r.real.T]]) for r in response]
+    return ca.diagcat(*[ca.DM(block) for block in blocks])

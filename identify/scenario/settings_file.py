@@ -1,0 +1,132 @@
+"""Files of settings (TOML): names that there are, how one becomes a text, and why one is refused, in a line."""
+
+import json
+from pathlib import Path
+from typing import Any, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from identify.errors import IdentifyError
+
+# Files that come with the package, or a user's own: which names there are, and how a name becomes a text.
+
+
+def built_in_names(folder: Path) -> list[str]:
+    """Names of the TOML files in a folder of the package."""
+    return sorted(path.stem for path in folder.glob("*.toml"))
+
+
+def named_text(name_or_path: str | Path, folder: Path, kind: str, error_class: type[IdentifyError]) -> tuple[str, str]:
+    """Text of a built-in file by name, or of a user's by path, and how messages call it; `kind`: as ``scenario``.
+
+    Raises:
+        IdentifyError: of `error_class`, with the built-in names, where it is neither or cannot be read.
+    """
+    name = str(name_or_path)
+    built_in = built_in_names(folder)
+    path, source = Path(name), f"{kind} file {name}"
+    if name in built_in:
+        path, source = folder / f"{name}.toml", f"{kind} {name!r}"
+    try:
+        return path.read_text(encoding="utf-8"), source
+    except (OSError, UnicodeDecodeError) as error:
+        reason = f", and {error}" if path.exists() else " nor a file"
+        raise error_class(f"{kind} {name!r} is neither built in ({', '.join(built_in)}){reason}") from error
+
+
+# Scenarios as text: TOML with units, and the reasons for a refusal in one line.
+
+
+def to_toml(model: BaseModel) -> str:
+    """TOML text of a two-level pydantic model: plain values first, then one table a section, units as comments.
+
+    Fields whose value is None have no TOML form and are left out.
+    """
+    lines, sections = [], []
+    for name, field in type(model).model_fields.items():
+        value = getattr(model, name)
+        if isinstance(value, BaseModel):
+            sections += ["", f"[{name}]", *_entries(value)]
+        elif isinstance(value, dict):
+            entries = [f"{key} = {_toml_value(one)}" for key, one in value.items()]
+            sections += ["", f"[{name}]  # {field.description or ''}", *entries]
+        elif value is not None:
+            lines.append(_entry(name, value, field))
+    return "\n".join(lines + sections) + "\n"
+
+
+def one_line(error: ValidationError, model: type[BaseModel]) -> str:
+    """All complaints of a validation in one line, each with key, value, unit and, where wrong, the valid names."""
+    return "; ".join(_complaint(details, model) for details in error.errors())
+
+
+def _entries(section: BaseModel) -> list[str]:
+    fields = type(section).model_fields
+    return [_entry(n, getattr(section, n), f) for n, f in fields.items() if getattr(section, n) is not None]
+
+
+def _entry(name: str, value: Any, field: FieldInfo) -> str:
+    comment = "".join([f" [{unit}]" if (unit := _unit(field)) else "", f" {field.description or ''}"]).strip()
+    entry = f"{name} = {_toml_value(value)}"
+    return f"{entry:<40} # {comment}" if comment else entry
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(_toml_value(one) for one in value)}]"
+    if isinstance(value, BaseModel):
+        return _toml_value(dict(value))
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{json.dumps(key)} = {_toml_value(one)}' for key, one in value.items())}}}"
+    return repr(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _complaint(details: ErrorDetails, model: type[BaseModel]) -> str:
+    path = [str(part) for part in details["loc"]]
+    key = ".".join(path)
+    if details["type"] == "extra_forbidden":
+        return f"unknown key {key!r}; valid names{_within(path)}: {', '.join(_siblings(path, model))}"
+    if details["type"] == "value_error":
+        return f"{key}: {details['ctx']['error']}" if key else str(details["ctx"]["error"])
+    if details["type"] == "missing":
+        return f"{key} is missing"
+    field = _field(path, model)
+    unit = f" [{u}]" if field is not None and (u := _unit(field)) else ""
+    message = details["msg"]
+    return f"{key} = {details['input']!r}{unit}: {message[0].lower()}{message[1:]}"
+
+
+def _within(path: list[str]) -> str:
+    return f" in [{'.'.join(path[:-1])}]" if len(path) > 1 else ""
+
+
+def _owner(path: list[str], model: type[BaseModel]) -> type[BaseModel] | None:
+    """The model whose field the path's last part names; a part of the path may be the key of a mapping to models."""
+    owner: Any = model
+    for part in path[:-1]:
+        if get_origin(owner) is dict:
+            owner = get_args(owner)[1]
+        elif isinstance(owner, type) and issubclass(owner, BaseModel) and part in owner.model_fields:
+            owner = owner.model_fields[part].annotation
+        else:
+            return None
+    return owner if isinstance(owner, type) and issubclass(owner, BaseModel) else None
+
+
+def _siblings(path: list[str], model: type[BaseModel]) -> list[str]:
+    owner = _owner(path, model)
+    return list(owner.model_fields) if owner is not None else []
+
+
+def _field(path: list[str], model: type[BaseModel]) -> FieldInfo | None:
+    owner = _owner(path, model)
+    return owner.model_fields.get(path[-1]) if owner is not None and path else None
+
+
+def _unit(field: FieldInfo) -> str:
+    extra = field.json_schema_extra
+    return str(extra["unit"]) if isinstance(extra, dict) and "unit" in extra else ""

@@ -1,0 +1,109 @@
+"""The sensor of a row: taught exactly or by itself, built once a process, or a sensor without images.
+
+The sensor of a row: built once a process for each content of a sensor file, taught exactly or by itself.
+A row that is taught exactly depends on nothing that another row left behind: every picture has a noise stream of its
+own, begun by `start_run`. So a sensor from the cache gives the same numbers as a new one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+import cmmsim
+from cmmsim.files.schema import SensorFile
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.pose_estimation.estimator import lost_measurement
+from cmmsim.teaching import exactly_taught
+from identify.arrays import Array
+from identify.scenario import Scenario
+from identify.scenario.timing import sensor_timing
+
+SENSORS_KEPT = 16
+"""Sensors a process keeps; one of them takes about a megabyte."""
+
+Teaching = Literal["exact", "sensor"]
+"""``exact``: frames and sticker places without error, so that rows show observation noise alone; ``sensor``: the sensor
+teaches itself from images, seeded by the row (1.4 s a row)."""
+
+
+@dataclass(frozen=True)
+class RowSensor:
+    """A sensor and what it cannot know: truth, a teaching without error; middle (3,), that of the baseline in the base
+    frame, m; rim: radiance half-way between a sticker and its ring."""
+
+    sensor: cmmsim.Sensor
+    truth: cmmsim.Taught
+    middle: Array
+    rim: float
+
+
+def row_sensor(scenario: Scenario, teaching: Teaching, seed: int) -> RowSensor:
+    """The sensor of a scenario without the robot's links in its view, at the beginning of a run of its own."""
+    file = sensor_file(scenario)
+    if teaching == "exact":
+        built = _exact_sensor(file.model_dump_json(), scenario.pose_method, scenario.renderer)
+    else:
+        built = _built(file, scenario.pose_method, scenario.renderer, None, seed)
+    built.sensor.start_run(seed)
+    return built
+
+
+def sensor_file(scenario: Scenario) -> SensorFile:
+    """The sensor's file with the scenario's changes and timing."""
+    file = read_sensor_file(scenario.sensor, scenario.sensor_changes)
+    return file.model_copy(update={"timing": sensor_timing(scenario.timing.model_dump())})
+
+
+@lru_cache(maxsize=SENSORS_KEPT)
+def _exact_sensor(file_json: str, method: str, renderer: str) -> RowSensor:
+    file = SensorFile.model_validate_json(file_json)
+    return _built(file, method, renderer, exactly_taught(file), 0)
+
+
+def _built(file: SensorFile, method: str, renderer: str, taught: cmmsim.Taught | None, seed: int) -> RowSensor:
+    sensor = cmmsim.Sensor(file, seed, method, taught, renderer=renderer)
+    rim = 0.5 * (file.stickers.sticker_level + file.stickers.ring_level) / 255.0
+    return RowSensor(sensor, taught or exactly_taught(file), np.array(file.rig.position), rim)
+
+
+# A sensor without images: the true pose with noise of a covariance, drawn. Fast, and with known statistics.
+
+
+class DrawnSensor:
+    """Measures as a `cmmsim.Sensor` does, with Gaussian noise of one covariance (6, 6) [m, rad] and with dropout."""
+
+    sees_bodies = False
+
+    def __init__(self, covariance: Array, dropout: float = 0.0) -> None:
+        self._covariance, self._dropout = covariance, dropout
+        self._factor = np.linalg.cholesky(covariance)
+        self.start_run(0)
+
+    def start_run(self, seed: int) -> None:
+        """Begin a new run with noise of its own."""
+        self._rng = np.random.default_rng(seed)
+
+    def measure(
+        self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
+    ) -> cmmsim.Measurement:
+        """The pose (6,) with noise; what stands in the way and how fast it moves make no difference."""
+        noise, dropped = self._factor @ self._rng.standard_normal(6), self._rng.random() < self._dropout
+        if dropped:
+            return lost_measurement("dropped frame")
+        none = np.zeros((0, 2))
+        return cmmsim.Measurement(
+            np.asarray(pose, dtype=float) + noise,
+            self._covariance,
+            np.zeros((0, 3)),
+            np.zeros((0, 3, 3)),
+            none,
+            none,
+            np.array([], dtype=str),
+            True,
+        )

@@ -1,0 +1,266 @@
+"""Figures of acceptance tests, of a calibration and of the detectors (PNG)."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+
+from cmmsim.acceptance import BarTest, LatencyTest, LengthTest, MeasuringVolume, bar_paths, seven_lines
+from cmmsim.acceptance.moving_bar import SECONDS
+from cmmsim.acceptance.statistics import published
+from cmmsim.acceptance.volume import CORNERS
+from cmmsim.calibration import Calibration
+from cmmsim.detector_leaderboard import Condition, Score
+from cmmsim.geometry.pose import apply, invert
+from identify.files.figure import blank_figure
+
+# Figures of acceptance tests: the volume with its lines, length errors, errors of the bar, latency (PNG).
+
+
+EDGES = [(a, b) for a in range(8) for b in range(a) if np.sum(CORNERS[a] != CORNERS[b]) == 1]
+
+
+def lines_figure(volume: MeasuringVolume) -> Figure:
+    """The volume with the seven measuring lines; axes in mm."""
+    curves = {line.name: np.stack([line.start, line.end]) for line in seven_lines(volume)}
+    return _in_volume(volume, "Measuring lines (VDI/VDE 2634-1)", curves)
+
+
+def paths_figure(volume: MeasuringVolume) -> Figure:
+    """The volume with the paths of the bar's middle; axes in mm."""
+    to_volume = invert(volume.base_from_volume)
+    curves = {
+        path.name: apply(to_volume, np.array([path.pose(time)[:3] for time in np.linspace(0.0, SECONDS, 200)]))
+        for path in bar_paths(volume)
+    }
+    return _in_volume(volume, "Paths of the bar's middle (ASTM E3064)", curves)
+
+
+def length_figure(test: LengthTest, limit_um: float) -> Figure:
+    """Length measurement error against length: single exposures as dots, the mean of each length as a line."""
+    figure = blank_figure(9, 5.5)
+    axes = figure.subplots()
+    for number, line in enumerate(test.lines):
+        lengths = test.of_line(line.name)
+        true = np.array([1e3 * length.true for length in lengths])
+        single = 1e6 * np.array([length.measured - length.true for length in lengths])
+        shown = axes.plot(true, [1e6 * length.error for length in lengths], "o-", label=line.name)
+        axes.plot(true[:, None] + 1.5 * (number - 3), single, ".", color=shown[0].get_color(), alpha=0.35, markersize=4)
+    for sign in (-1.0, 1.0):
+        axes.axhline(sign * limit_um, color="black", linestyle="--", linewidth=1)
+    axes.set_xlabel("certified length [mm]")
+    axes.set_ylabel("length measurement error [um]")
+    axes.set_title(
+        f"VDI/VDE 2634-1: largest error {1e6 * test.largest.error:+.1f} um, limit ± {limit_um:g} um (dashes)"
+        "\ndots: single exposures, lines: their mean"
+    )
+    axes.legend(fontsize="small", ncols=2)
+    axes.grid(alpha=0.3)
+    return figure
+
+
+def bar_figure(test: BarTest) -> Figure:
+    """Relative pose error of the bar over time, and its distribution beside the published limits."""
+    figure = blank_figure(12, 8)
+    panels = figure.subplots(2, 2, width_ratios=(3, 2))
+    for run in test.runs:
+        for row, columns, scale in ((0, slice(0, 3), 1e6), (1, slice(3, 6), 1e6)):
+            panels[row, 0].plot(
+                run.time, scale * np.linalg.norm(run.errors[:, columns], axis=1), linewidth=0.7, label=run.name
+            )
+    for row, (name, unit) in enumerate((("position", "um"), ("orientation", "urad"))):
+        panels[row, 0].set_ylabel(f"{name} error [{unit}]")
+        panels[row, 0].axvline(0.0, color="black", linestyle="--", linewidth=1)
+        panels[row, 0].grid(alpha=0.3)
+        _distribution(panels[row, 1], test, row, name, unit)
+    panels[0, 0].set_title("error of the second end relative to the first (dashes: the bar starts to move)")
+    panels[0, 0].legend(fontsize="x-small", ncols=2)
+    panels[1, 0].set_xlabel("time [s]")
+    figure.suptitle("Rigid bar in the style of ASTM E3064-16")
+    return figure
+
+
+def latency_figure(test: LatencyTest) -> Figure:
+    """Delay of each report, their mean with its interval, and what the sensor file states."""
+    figure = blank_figure(9, 4.5)
+    series, spread = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
+    found = test.latency
+    series.plot(test.reported, 1e3 * found.delays, ".", markersize=4, label="one report")
+    low, high = (1e3 * bound for bound in found.interval)
+    series.axhspan(low, high, color="tab:orange", alpha=0.4, label="95 % interval of the mean")
+    series.axhline(1e3 * test.stated, color="black", linestyle="--", linewidth=1, label="stated in the sensor file")
+    spread.hist(1e3 * found.delays, bins=30, orientation="horizontal")
+    series.set_xlabel("time of the report [s]")
+    series.set_ylabel("latency [ms]")
+    spread.set_xlabel("reports")
+    series.set_title(f"ASTM E3124: mean {1e3 * found.mean:.4f} ms, standard deviation {1e3 * found.std:.4f} ms")
+    series.legend(fontsize="small")
+    series.grid(alpha=0.3)
+    return figure
+
+
+def _distribution(axes: Axes, test: BarTest, row: int, name: str, unit: str) -> None:
+    """Share of frames below an error, standing and moving, with published figures as vertical lines."""
+    for moving, word in ((False, "standing"), (True, "moving")):
+        magnitudes = np.sort(1e6 * np.linalg.norm(test.errors(moving)[:, 3 * row : 3 * row + 3], axis=1))
+        axes.plot(magnitudes, np.arange(1, len(magnitudes) + 1) / len(magnitudes), label=f"this sensor, {word}")
+    figures = [*published(f"{name}, static"), *published(f"{name}, moving")]
+    for number, figure in enumerate(figures):
+        value = 1e3 * figure.value if figure.unit == "mm" else 1e6 * np.deg2rad(figure.value)
+        style = ":" if figure.quantity.endswith("static") else "-."
+        axes.axvline(
+            value,
+            color=f"C{number + 2}",
+            linestyle=style,
+            label=f"{figure.instrument}, {figure.quantity.split(', ')[1]}",
+        )
+    axes.set_xscale("log")
+    axes.set_xlabel(f"{name} error [{unit}]")
+    axes.set_ylabel("share of frames")
+    axes.legend(fontsize="x-small")
+    axes.grid(alpha=0.3)
+
+
+def _in_volume(volume: MeasuringVolume, title: str, curves: dict[str, np.ndarray]) -> Figure:
+    """Curves (n,3) m in the volume, drawn as a reader sees it: x to the right, depth away, up."""
+    figure = blank_figure(8, 6.5)
+    axes: Any = figure.add_subplot(projection="3d")
+    for a, b in EDGES:
+        axes.plot(*_shown(CORNERS[[a, b]] * volume.size), color="grey", linewidth=0.8)
+    for name, curve in curves.items():
+        axes.plot(*_shown(curve), label=name)
+    near, far = volume.depth_range
+    axes.set(
+        xlabel="x [mm]",
+        ylabel="z, away from the rig [mm]",
+        zlabel="−y, up [mm]",
+        title=f"{title}\nvolume {volume}, {1e3 * near:.0f} to {1e3 * far:.0f} mm from the baseline",
+    )
+    axes.set_box_aspect(volume.size[[0, 2, 1]], zoom=0.85)
+    axes.view_init(elev=16, azim=-72)
+    axes.legend(loc="upper left", fontsize="x-small")
+    return figure
+
+
+def _shown(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """x, z and -y (n,) mm of points (n,3) m."""
+    return 1e3 * points[:, 0], 1e3 * points[:, 2], -1e3 * points[:, 1]
+
+
+# Figures of a calibration: residuals over the image, where board points were seen, and what the lenses bend.
+
+
+SIDES = ("left", "right")
+ARROW_SHARE = 0.06
+"""Of the image width: length of an arrow for a residual of three sigma."""
+GRID = 25
+"""Points along the width of the image at which distortion is drawn."""
+
+
+def residual_figure(found: Calibration) -> Figure:
+    """Residuals, measured minus computed, as arrows where they were seen."""
+    figure, panels = _panels(found, f"residuals, sigma {found.adjustment.sigma_px:.3g} px")
+    for k, axes in enumerate(panels):
+        pixels, residuals = found.sightings[k].pixels, found.adjustment.residuals[k]
+        three_sigma = 3.0 * max(found.adjustment.sigma_px, 1e-9)
+        arrows = axes.quiver(
+            *pixels.T,
+            *residuals.T,
+            angles="xy",
+            scale_units="xy",
+            width=0.0015,
+            scale=three_sigma / (ARROW_SHARE * found.rig.left.width),
+        )
+        axes.quiverkey(arrows, 0.85, 1.03, three_sigma, f"{three_sigma:.2g} px")
+        rms = np.sqrt(np.mean(residuals**2))
+        axes.set_title(f"{SIDES[k]}: {len(residuals)} points, rms {rms:.3g} px", loc="left", fontsize="medium")
+    return figure
+
+
+def coverage_figure(found: Calibration) -> Figure:
+    """All board points of all images: where none were seen, distortion is extrapolated."""
+    figure, panels = _panels(found, "board points of all used images")
+    for k, axes in enumerate(panels):
+        seen = found.sightings[k]
+        axes.scatter(seen.pixels[:, 0], seen.pixels[:, 1], s=3, c=seen.view, cmap="turbo")
+        axes.set_title(f"{SIDES[k]}: {len(np.unique(seen.view))} images", loc="left", fontsize="medium")
+    return figure
+
+
+def distortion_figure(found: Calibration) -> Figure:
+    """How far the lenses move each point of the image, in px; white crosses: principal points."""
+    figure, panels = _panels(found, "lens distortion")
+    for axes, camera, name in zip(panels, found.rig.cameras, SIDES, strict=True):
+        step = camera.width / GRID
+        x, y = np.meshgrid(np.arange(0.0, camera.width, step), np.arange(0.0, camera.height, step))
+        pixels = np.stack([x, y], axis=-1)
+        ideal, known = camera.undistort(pixels)
+        moved = np.where(known[..., None], pixels - ideal, np.nan)
+        length = np.linalg.norm(moved, axis=-1)
+        shown = axes.pcolormesh(x, y, length, shading="nearest", cmap="viridis")
+        axes.plot(*camera.centre, "w+", markersize=10)
+        figure.colorbar(shown, ax=axes, label="shift [px]", shrink=0.8)
+        axes.set_title(f"{name}: up to {np.nanmax(length):.3g} px", loc="left", fontsize="medium")
+    return figure
+
+
+def _panels(found: Calibration, title: str) -> tuple[Figure, list[Axes]]:
+    figure = blank_figure(12, 5)
+    panels = list(figure.subplots(1, 2).flat)
+    for axes in panels:
+        axes.set_xlim(-0.5, found.rig.left.width - 0.5)
+        axes.set_ylim(found.rig.left.height - 0.5, -0.5)
+        axes.set_aspect("equal")
+        axes.set_xlabel("x [px]")
+        axes.set_ylabel("y [px]")
+    figure.suptitle(title)
+    return figure, panels
+
+
+# Figure of the detectors: error over noise beside the Cramer-Rao bound, one panel for each way a disc is seen.
+
+
+COLUMNS = 3
+
+
+def detectors_figure(scores: Sequence[Score], at_work: Condition) -> Figure:
+    """Rms error over noise, logarithmic; one panel for each radius, tilt and point spread, the working point first."""
+    views = list(dict.fromkeys(_view(score.condition) for score in scores))
+    columns = min(COLUMNS, len(views))
+    rows = -(-len(views) // columns)
+    figure = blank_figure(4.5 * columns, 0.8 + 3.2 * rows)
+    panels = figure.subplots(rows, columns, squeeze=False, sharey=True).flat
+    for view, axes in zip(views, panels, strict=False):
+        _panel(axes, [score for score in scores if _view(score.condition) == view])
+        radius, tilt, psf = view
+        work = "working point: " if view == _view(at_work) else ""
+        seen = f"radius {radius:.3g} px, tilt {np.degrees(tilt):.0f}°, σ_psf {psf:.2g} px"
+        axes.set_title(work + seen, fontsize="small")
+    for axes in list(panels):
+        axes.set_visible(False)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    figure.suptitle("Error of a sticker's centre in the image")
+    return figure
+
+
+def _view(condition: Condition) -> tuple[float, float, float]:
+    return condition.radius_px, condition.tilt, condition.psf_px
+
+
+def _panel(axes: Axes, scores: Sequence[Score]) -> None:
+    noise = sorted({score.condition.noise for score in scores})
+    bound = {score.condition.noise: score.bound_px for score in scores}
+    axes.plot(100.0 * np.array(noise), [bound[n] for n in noise], "k--", marker="_", label="Cramer-Rao bound")
+    for name in dict.fromkeys(score.detector for score in scores):
+        mine = sorted((s for s in scores if s.detector == name), key=lambda s: s.condition.noise)
+        error = np.array([s.rms_px for s in mine])  # infinite where all was lost: not drawn
+        at = [100.0 * s.condition.noise for s in mine]
+        axes.plot(at, np.where(np.isfinite(error), error, np.nan), "o-", markersize=3, label=name.replace("_", " "))
+    axes.set(xscale="log", yscale="log", xlabel="noise [% of contrast]", ylabel="rms error [px]")
+    axes.set_xticks(100.0 * np.array(noise), [f"{100.0 * n:.2g}" for n in noise])
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.grid(alpha=0.3, which="both")
