@@ -99,8 +99,8 @@ def calibrate(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary; warnings stay.")] = False,
 ) -> None:
     """Calibrate a stereo camera from pictures of a board, or render such pictures."""
-    from cmmsim.calibration import read_board
     from cmmsim.calibration import read_board, sensor_template
+    from identify.files.run_folder import new_run_folder
 
     folder = new_run_folder(out).path
     progress = terminal_progress(quiet)

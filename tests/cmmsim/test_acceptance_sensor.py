@@ -6,8 +6,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cmmsim.acceptance import AcceptanceError, SensorUnderTest, common_volume, latency_test, length_test, seven_lines
-from cmmsim.acceptance import moving_bar as bar_paths
+from cmmsim.acceptance import (
+    AcceptanceError,
+    SensorUnderTest,
+    bar_paths,
+    common_volume,
+    latency_test,
+    length_test,
+    seven_lines,
+)
 from cmmsim.acceptance.artefacts import rigid_bar
 from cmmsim.acceptance.length_test import length_artefact, lengths_from_first, measure_line
 from cmmsim.acceptance.moving_bar import bar_run, relative_covariance, relative_error

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cmmsim.acceptance import AcceptanceError, common_volume, require_rules, seven_lines, volume_of_size
-from cmmsim.acceptance import moving_bar as bar_paths
+from cmmsim.acceptance import AcceptanceError, bar_paths, common_volume, require_rules, seven_lines, volume_of_size
 from cmmsim.acceptance.artefacts import LENGTH, bar_ends, rigid_bar
 from cmmsim.acceptance.latency_test import require_room
 from cmmsim.acceptance.length_test import length_artefact

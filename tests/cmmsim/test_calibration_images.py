@@ -13,12 +13,12 @@ from cmmsim.calibration import (
     CalibrationOptions,
     PairView,
     as_dict,
+    board_poses,
     calibrate,
     find_board,
     render_pairs,
+    sensor_template,
 )
-from cmmsim.calibration import rendered_boards as board_poses
-from cmmsim.calibration import result as sensor_template
 from cmmsim.files.sensor_file import sensor_text
 from cmmsim.geometry.camera import Distortion, PinholeCamera
 from cmmsim.geometry.disc_image import centre_offset
