@@ -8,15 +8,15 @@ units in the names. Workers import it, so it must be in a module that they find.
 
 from __future__ import annotations
 
-import importlib
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
 
 from identify.errors import ScenarioError, StudyError
+from identify.plugins import is_own, own_function
 from identify.scenario import Scenario
 from identify.studies.rows.closed_loop import CLOSED_LOOP
 from identify.studies.rows.columns import Column, Kind, Reads, Row
@@ -67,8 +67,8 @@ def row_function(kind: str) -> RowFunction:
     Raises:
         StudyError: no such kind, with the built-in ones; no such module or function, or one that takes other arguments.
     """
-    if ":" in kind:
-        function = _own(kind)
+    if is_own(kind):
+        function = own_function(kind, "kind", StudyError)
         if _takes_options(kind, function):
             return function
         return lambda scenario, seed, options: function(scenario, seed)
@@ -78,7 +78,7 @@ def row_function(kind: str) -> RowFunction:
 
 def options_model(kind: str) -> type[BaseModel] | None:
     """The model of a kind's options; None for a function of one's own, which takes any."""
-    if ":" in kind:
+    if is_own(kind):
         return None
     try:
         return find_kind(kind).options
@@ -88,7 +88,7 @@ def options_model(kind: str) -> type[BaseModel] | None:
 
 def kind_reads(kind: str) -> Reads | None:
     """What a kind's rows read; None for a function of one's own, which reads what it likes."""
-    return None if ":" in kind else find_kind(kind).reads
+    return None if is_own(kind) else find_kind(kind).reads
 
 
 def figure_names(kind: str) -> list[str] | None:
@@ -98,7 +98,7 @@ def figure_names(kind: str) -> list[str] | None:
         StudyError: no such kind.
     """
     options_model(kind)
-    return None if ":" in kind else list(columns(kind))
+    return None if is_own(kind) else list(columns(kind))
 
 
 def check_kind(kind: str, options: Mapping[str, Any]) -> None:
@@ -108,8 +108,8 @@ def check_kind(kind: str, options: Mapping[str, Any]) -> None:
         StudyError: with the valid names.
     """
     row_function(kind)
-    if ":" in kind:
-        if options and not _takes_options(kind, _own(kind)):
+    if is_own(kind):
+        if options and not _takes_options(kind, own_function(kind, "kind", StudyError)):
             raise StudyError(
                 f"kind {kind!r} takes no options, got {', '.join(options)}; a function that does is "
                 "run(scenario, seed, options)"
@@ -136,16 +136,3 @@ def _takes_options(kind: str, function: Callable[..., Any]) -> bool:
     raise StudyError(
         f"kind {kind!r} takes {signature}; a row's function takes (scenario, seed) or (scenario, seed, options)"
     )
-
-
-def _own(kind: str) -> Callable[..., Any]:
-    module, _, name = kind.partition(":")
-    try:
-        function = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise StudyError(
-            f"kind {kind!r} is no importable module:function: {error}; its folder must be on PYTHONPATH"
-        ) from error
-    if not callable(function):
-        raise StudyError(f"kind {kind!r} is not a function")
-    return cast("Callable[..., Any]", function)
