@@ -1,4 +1,4 @@
-"""The goals of a run and whether its result meets them."""
+"""The goals of a run and whether its result meets them: accuracy and honesty, the same on every machine."""
 
 import math
 from dataclasses import dataclass
@@ -9,9 +9,7 @@ from identify.files.run_folder import rms_row
 
 VALIDATION_UM, VALIDATION_URAD = 2.0, 10.0
 SENSOR_UM, SENSOR_URAD = 20.0, 100.0
-FRAMES_PER_SECOND = 60.0
 PARAMETER_FRACTION, PARAMETER_STDS = 0.05, 3.0
-SECONDS = {"paper": 180.0, "quick": 90.0}
 
 
 @dataclass(frozen=True)
@@ -33,7 +31,7 @@ class Goal:
 
 def check_goals(result: dict[str, Any]) -> list[Goal]:
     """The goals that the parts of a result allow to judge; accuracy is that of the worst axis of the worst run."""
-    parts = (_validation, _sensor, explanation_goals, _parameters, _time)
+    parts = (_validation, _sensor, explanation_goals, _parameters)
     return [goal for part in parts for goal in part(result)]
 
 
@@ -70,15 +68,11 @@ def _sensor(result: dict[str, Any]) -> list[Goal]:
         return []
     row = rms_row(sensor)
     text = f"measured pose against truth, {sensor['frames']} frames"
-    goals = [
+    return [
         Goal("sensor position", _worst(row[:3]), "<=", SENSOR_UM, "um", text),
         Goal("sensor orientation", _worst(row[3:]), "<=", SENSOR_URAD, "urad", text),
         Goal("lost frames", float(sensor["lost_frames"]), "<=", 0.0, "", text),
     ]
-    rate = sensor.get("stereo_frames_per_second")
-    if rate is not None:
-        goals.append(Goal("stereo frames", float(rate), ">=", FRAMES_PER_SECOND, "1/s", "rendered and measured"))
-    return goals
 
 
 def _parameters(result: dict[str, Any]) -> list[Goal]:
@@ -89,15 +83,6 @@ def _parameters(result: dict[str, Any]) -> list[Goal]:
     outside = [name for name, p in judged.items() if not within_tolerance(p)]
     text = f"of {len(judged)} within 5 % of truth or 3 std" + (f"; outside: {', '.join(outside)}" if outside else "")
     return [Goal("friction and PID outside", float(len(outside)), "<=", 0.0, "", text)]
-
-
-def _time(result: dict[str, Any]) -> list[Goal]:
-    limit, seconds = SECONDS.get(str(result.get("scenario"))), result.get("seconds")
-    if limit is None or not seconds:
-        return []
-    stages = [value for name, value in seconds.items() if name != "total" and "." not in name and value is not None]
-    total = seconds.get("total") or sum(stages)
-    return [Goal("whole run", float(total), "<=", limit, "s", "all stages so far, compiling included")]
 
 
 def is_friction_or_pid(name: str) -> bool:

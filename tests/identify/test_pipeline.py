@@ -42,15 +42,10 @@ def run(request, tmp_path_factory):
     return request.param, folder, load_result(folder / "result.json")
 
 
-def accuracy_goals(result):
-    """All goals but those of time, which belong to a quiet machine."""
-    return [goal for goal in check_goals(result) if goal.unit not in ("s", "1/s")]
-
-
-def test_every_accuracy_goal_is_met(run):
+def test_every_goal_is_met(run):
     _, _, result = run
-    missed = [goal for goal in accuracy_goals(result) if not goal.passed]
-    assert len(accuracy_goals(result)) >= 6
+    missed = [goal for goal in check_goals(result) if not goal.passed]
+    assert len(check_goals(result)) >= 6
     assert missed == []
 
 
@@ -205,7 +200,7 @@ def test_planes_and_commands_identify_too(tmp_path):
     (unseen,) = (run["true"] for run in result["validation"])
     assert max(unseen["position_rms_um"]) <= 5
     assert max(unseen["orientation_rms_urad"]) <= 25
-    assert [g for g in accuracy_goals(result) if not g.passed and not g.name.startswith("unseen")] == []
+    assert [g for g in check_goals(result) if not g.passed and not g.name.startswith("unseen")] == []
     assert result["identification"]["iterations"] > 0
     assert result["identification"]["noise_ratio"] == pytest.approx(1.0, abs=0.15)
 

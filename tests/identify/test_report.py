@@ -60,7 +60,7 @@ def check_figures(folder):
 def test_report_shows_goals_parameters_and_the_papers_numbers(run_folder):
     text = render(read_report_data(run_folder))
     for shown in (
-        "All 10 goals are met.",
+        "All 8 goals are met.",
         "joint1.coulomb",
         "not identifiable",
         "1260",
