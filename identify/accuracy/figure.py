@@ -1,24 +1,21 @@
-"""A figure of accuracy, a value or a mean with its interval beside its limit, and the fixture that records it."""
+"""A figure of accuracy, a value or a mean with its interval beside its limit, and what records it in a test.
+
+Imported at every start of pytest: NumPy and SciPy are imported when a test records something.
+"""
+
+from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, get_args
+from math import isfinite
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
-import numpy as np
 import pytest
-from numpy.typing import ArrayLike, NDArray
-from scipy.special import stdtrit
 
 from identify.errors import IdentifyError
 
-# What can be wrong with a figure of accuracy, or with a file of them.
-
-
-class AccuracyError(IdentifyError):
-    """A figure that is none, or a file of figures that cannot be read or written."""
-
-
-# A figure of accuracy: a value, or a mean with its interval, beside its limit.
-
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import ArrayLike, NDArray
 
 Better = Literal["lower", "higher"]
 BETTER: tuple[str, ...] = get_args(Better)
@@ -27,6 +24,10 @@ PROPERTY = "cmmsim_accuracy"
 
 CONFIDENCE = 0.95
 """Probability with which the interval of a sample holds the true mean."""
+
+
+class AccuracyError(IdentifyError):
+    """A figure that is none, or a file of figures that cannot be read or written."""
 
 
 @dataclass(frozen=True)
@@ -117,9 +118,6 @@ def percent(share: float, form: str) -> str:
     return f"{share:{form}%}" if abs(share) < 100 else f"{100 * share:{form}e}%"
 
 
-# The fixture `accuracy`: checks what a test hands in, keeps it as a figure, and fails the test beyond the limit.
-
-
 class Accuracy:
     """Records figures of accuracy of one test; get it from the fixture `accuracy`.
 
@@ -150,11 +148,10 @@ class Accuracy:
         numbers = _numbers(name, "values", values, dimensions=1)
         if len(numbers) < 2:
             raise AccuracyError(f"{name}: a sample needs at least 2 values, got {len(numbers)}")
-        mean, interval = mean_interval(numbers)
-        if not np.isfinite([mean, *interval]).all():
-            low, high = interval
+        mean, (low, high) = mean_interval(numbers)
+        if not (isfinite(low) and isfinite(high)):
             raise AccuracyError(f"{name}: the interval of the mean is {low:.4g} .. {high:.4g}, not finite")
-        self._keep(name, unit, limit, better, value=mean, interval=interval, count=len(numbers))
+        self._keep(name, unit, limit, better, value=mean, interval=(low, high), count=len(numbers))
 
     def _keep(self, name: str, unit: str, limit: float | None, better: Better, **found: Any) -> None:
         __tracebackhide__ = True
@@ -178,6 +175,9 @@ def mean_interval(values: NDArray[np.float64]) -> tuple[float, tuple[float, floa
 
     An end beyond the largest float is infinite.
     """
+    import numpy as np
+    from scipy.special import stdtrit
+
     count, (_, exponent) = len(values), np.frexp(np.abs(values).max())
     scaled = np.ldexp(values, -exponent)  # exactly, to within +-1: no square of them overflows
     mean = np.mean(scaled)
@@ -190,6 +190,8 @@ def mean_interval(values: NDArray[np.float64]) -> tuple[float, tuple[float, floa
 def _numbers(name: object, what: str, given: ArrayLike, dimensions: int) -> NDArray[np.float64]:
     """The given as finite floats with so many dimensions. Raises AccuracyError."""
     __tracebackhide__ = True
+    import numpy as np
+
     wanted = "one number" if dimensions == 0 else "a row of numbers"
     try:
         array = np.asarray(given)

@@ -1,4 +1,7 @@
-"""Saved sessions, one JSON file a name, and what got worse, is held to another limit or is gone since."""
+"""Saved sessions, one JSON file a name, and what got worse, is held to another limit or is gone since.
+
+Imported at every start of pytest: what reads and writes files is imported when there is one.
+"""
 
 import os
 import platform
@@ -10,14 +13,7 @@ from json import JSONDecodeError, dumps, loads
 from pathlib import Path
 from tempfile import TemporaryFile
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
-
 from identify.accuracy.figure import CONFIDENCE, AccuracyError, Figure, percent, with_unit
-from identify.files.atomic import write_text
-from identify.files.versions import versions
-
-# Figures of this session beside those of a saved one: what got worse, what is held to another limit, what is gone.
-
 
 Key = tuple[str, str]
 
@@ -32,10 +28,8 @@ class Comparison:
     @property
     def mismatch(self) -> str:
         """Why the two cannot be compared, or nothing."""
-        for what, new, old in (
-            ("unit", self.now.unit, self.saved.unit),
-            ("better", self.now.better, self.saved.better),
-        ):
+        for what in ("unit", "better"):
+            new, old = getattr(self.now, what), getattr(self.saved, what)
             if new != old:
                 return f"{what} is {new!r}, was {old!r}"
         return ""
@@ -43,10 +37,7 @@ class Comparison:
     @property
     def limit_change(self) -> str:
         """One line: name, limit and the saved one, where they differ; or nothing."""
-        now, saved = (
-            "none" if figure.limit is None else with_unit(figure.limit_text, figure.unit)
-            for figure in (self.now, self.saved)
-        )
+        now, saved = (f"{f.limit_text} {f.unit}".strip() if f.limit_text else "none" for f in (self.now, self.saved))
         return "" if now == saved else f"{self.now.test}: the limit of {self.now.name} is {now}, was {saved}"
 
     @property
@@ -102,9 +93,6 @@ def missing(figures: Sequence[Figure], saved: Sequence[Figure]) -> Mapping[str, 
     return gone
 
 
-# Saved sessions: one JSON file a name, with the figures and what measured them.
-
-
 FORMAT, SCHEMA = "cmmsim accuracy", 1
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
@@ -117,18 +105,24 @@ def _machine() -> dict[str, str]:
     return {"system": platform.platform(), "processor": platform.machine(), "cores": str(os.cpu_count())}
 
 
+def _versions() -> dict[str, str]:
+    from identify.files.versions import versions
+
+    return versions()
+
+
 @dataclass(frozen=True, kw_only=True)
 class SavedSession:
     """A file's content: figures, the testbed's seed, and when, where and with which software they were measured."""
 
-    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
+    __pydantic_config__ = {"extra": "forbid", "allow_inf_nan": False}  # noqa: RUF012  as pydantic wants it
 
     format: str = FORMAT
     schema: int = SCHEMA
     name: str
     created: str = field(default_factory=_now)
     machine: dict[str, str] = field(default_factory=_machine)
-    versions: dict[str, str] = field(default_factory=versions)
+    versions: dict[str, str] = field(default_factory=_versions)
     seed: int
     confidence: float = CONFIDENCE
     figures: list[Figure]
@@ -143,22 +137,19 @@ def saved_path(folder: Path, name: str) -> Path:
     return folder / f"{name}.json"
 
 
-def saved_names(folder: Path) -> list[str]:
-    """Names that can be compared with."""
-    return sorted(path.stem for path in folder.glob("*.json"))
-
-
 def find_saved(folder: Path, name: str) -> SavedSession:
     """The session saved under a name. Raises AccuracyError, with the saved names, where there is none."""
     path = saved_path(folder, name)
     if not path.is_file():
-        names = ", ".join(saved_names(folder)) or "none"
+        names = ", ".join(sorted(path.stem for path in folder.glob("*.json"))) or "none"
         raise AccuracyError(f"no accuracy figures are saved as {name!r} in {folder}; saved are: {names}")
     return read_saved(path)
 
 
 def read_saved(path: Path) -> SavedSession:
     """The session in a file. Raises AccuracyError for a file that holds none, or one of another version."""
+    from pydantic import TypeAdapter, ValidationError
+
     try:
         content = loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -170,12 +161,11 @@ def read_saved(path: Path) -> SavedSession:
     if content.get("schema") != SCHEMA:
         raise AccuracyError(f"{path} has schema {content.get('schema')!r}, this version reads {SCHEMA}")
     try:
-        session = TypeAdapter(SavedSession).validate_python(content)
+        return TypeAdapter(SavedSession).validate_python(content)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
         raise AccuracyError(f"{path}: {where}: {first['msg']} (got {first['input']!r:.60})") from error
-    return session
 
 
 def check_writable(path: Path) -> None:
@@ -191,6 +181,8 @@ def check_writable(path: Path) -> None:
 
 def save(path: Path, session: SavedSession) -> None:
     """Write a session, whole or not at all. Raises AccuracyError, also where it would lose figures of another."""
+    from identify.files.atomic import write_text
+
     lost = missing(session.figures, read_saved(path).figures) if path.exists() else {}
     if lost:
         names = "; ".join(f"{test}: {', '.join(figures)}" for test, figures in lost.items())

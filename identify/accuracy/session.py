@@ -12,10 +12,17 @@ from typing import Any
 import pytest
 
 from identify.accuracy.figure import CONFIDENCE, PROPERTY, AccuracyError, Figure, percent
-from identify.accuracy.saved import Comparison, Key, compare, missing
-
-# Figures as text: the table at the end of a session, and the same as Markdown.
-
+from identify.accuracy.saved import (
+    Comparison,
+    Key,
+    SavedSession,
+    check_writable,
+    compare,
+    find_saved,
+    missing,
+    save,
+    saved_path,
+)
 
 Row = tuple[str, ...]
 UNDECIDED = "undecided"
@@ -103,8 +110,6 @@ class AccuracySession:
             raise pytest.UsageError("--accuracy-fail needs --accuracy-compare NAME: worse than what?")
         if self._save is None and self._compare is None:
             return
-        from identify.accuracy.saved import check_writable, find_saved, saved_path
-
         try:
             if self._save is not None:
                 check_writable(saved_path(self._folder, self._save))
@@ -136,7 +141,8 @@ class AccuracySession:
         if report.when == "setup" or report.outcome != "passed":
             self._outcomes[report.nodeid] = report.outcome
         if report.when == "teardown":
-            found = [_figure(value) for name, value in report.user_properties if name == PROPERTY]
+            properties: list[tuple[str, Any]] = report.user_properties
+            found = [Figure(**value) for name, value in properties if name == PROPERTY]
             if found:
                 self._figures[found[0].test] = found
 
@@ -192,8 +198,6 @@ class AccuracySession:
         return None
 
     def _keep(self, session: pytest.Session) -> None:
-        from identify.accuracy.saved import SavedSession, save, saved_path
-
         path = saved_path(self._folder, self._save)
         if session.exitstatus != pytest.ExitCode.OK or not self._figures:
             why = "the session did not pass" if self._figures else "no figures were recorded"
@@ -224,10 +228,6 @@ class AccuracySession:
         self._remark(text, bad=True)
         if session.exitstatus == pytest.ExitCode.OK:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
-
-
-def _figure(properties: Any) -> Figure:
-    return Figure(**properties)
 
 
 def _shown(path: Path) -> str:

@@ -2,9 +2,8 @@
 
 import textwrap
 
+import numpy  # noqa: F401  before any project: it cannot be loaded twice
 import pytest
-
-from identify.accuracy import figure as recorder  # noqa: F401  before any project: NumPy cannot be loaded twice
 
 collect_ignore = ["guide"]  # an outsider's files: test_guide.py runs them as an outsider would
 
