@@ -16,7 +16,6 @@ from identify.excitation.information import knowledge, log_information
 from identify.excitation.motion import sample_times
 from identify.excitation.observability import log_observability, observability_index
 from identify.excitation.search import FEWEST_MEMBERS
-from identify.files.figure import blank_figure
 from identify.progress import Progress
 from identify.random_streams import EXCITATION, SEARCH, child
 from identify.scenario import Scenario
@@ -124,7 +123,7 @@ POINTS = 1000
 def comparison_figure(robot: Robot, scenario: Scenario, comparison: Comparison) -> Figure:
     """One column a method: position, orientation and crank angles over one period, limits dashed."""
     settings = scenario.excitation
-    figure = blank_figure(5 * len(comparison.entries), 9)
+    figure = Figure(figsize=(5 * len(comparison.entries), 9), layout="constrained")
     panels = figure.subplots(3, len(comparison.entries), sharex=True, sharey="row", squeeze=False)
     time = np.linspace(0.0, 1.0 / settings.fundamental_hz, POINTS)
     travel = robot.travel_limit - settings.travel_margin_rad

@@ -1,6 +1,5 @@
-"""Versions of the software that made a result, digests of its numbers, and whether workers compute with the same.
+"""Versions of the software that made a result, and whether all rows of a study are computed by the same.
 
-Whether all rows of a study are computed by the same software, wherever and whenever: with another they may differ.
 Another cmmsim is refused, for its rows are those of another simulation. Other versions of what it computes with change
 figures by little, or not at all, and are warned of.
 """
@@ -9,30 +8,10 @@ import platform
 import warnings
 from collections.abc import Mapping
 from functools import cache
-from hashlib import sha256
 from importlib import metadata
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import ArrayLike
-
 from identify.errors import StudyError
-
-# A digest of arrays: of their numbers, not of a file's bytes, which differ from one writing to the next.
-
-
-def array_digest(arrays: Mapping[str, ArrayLike]) -> str:
-    """Digest of named arrays of numbers, hexadecimal; their order and their type do not matter."""
-    whole = sha256()
-    for name in sorted(arrays):
-        values = np.ascontiguousarray(arrays[name], dtype="<f8")
-        whole.update(f"{name} {values.shape}\n".encode())
-        whole.update(np.where(np.isnan(values), np.nan, values).tobytes())  # one of the many bit patterns of NaN
-    return whole.hexdigest()
-
-
-# Versions of the software that made a result, for records and reports.
-
 
 PACKAGES = ("cmmsim", "numpy", "scipy", "casadi", "opencv-python-headless", "pyrender", "trimesh", "xarray", "h5netcdf")
 

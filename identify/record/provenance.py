@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import EstimationError, RecordError, ScenarioError
 from identify.files.dataset import read_covariance, shown
 from identify.files.run_folder import RunFolder, load_result
-from identify.files.versions import array_digest
 from identify.loop_parameters import NAMES
 from identify.record.payload import ADDED
 from identify.record.recording import VARIABLES, read, read_model_runs, read_runs
@@ -120,6 +120,16 @@ STATED = (
     *ADDED, *(f"{name}_std" for name in ADDED),
 )  # fmt: skip
 """Attributes that an identification reads; beside them timing and servo of the scenario."""
+
+
+def array_digest(arrays: Mapping[str, ArrayLike]) -> str:
+    """Digest of named arrays of numbers, hexadecimal; their order and their type do not matter."""
+    whole = sha256()
+    for name in sorted(arrays):
+        values = np.ascontiguousarray(arrays[name], dtype="<f8")
+        whole.update(f"{name} {values.shape}\n".encode())
+        whole.update(np.where(np.isnan(values), np.nan, values).tobytes())  # one of the many bit patterns of NaN
+    return whole.hexdigest()
 
 
 def record_digest(*records: xr.Dataset) -> str:

@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from identify.arrays import Array
 from identify.files.atomic import atomic_path
-from identify.files.figure import blank_figure
 from identify.files.run_folder import predicted_row, rms_figures, rms_row
 from identify.reporting.goals import VALIDATION_UM, VALIDATION_URAD, is_friction_or_pid
 
@@ -24,7 +23,7 @@ MEASURED, INITIAL, IDENTIFIED, TRUE = "black", "tab:green", "tab:blue", "tab:red
 
 def excitation_figure(time: Array, poses: Array, title: str = "Exciting trajectory") -> Figure:
     """Position and orientation of a trajectory: ``time`` (N,) [s], ``poses`` (N, 6) [m, rad]; like figure 11."""
-    figure = blank_figure(8, 6)
+    figure = Figure(figsize=(8, 6), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
     panels = ((upper, range(3), "position from start [mm]"), (lower, range(3, 6), "orientation from start [mrad]"))
     for axes, columns, label in panels:
@@ -53,7 +52,7 @@ def fit_figure(
     Poses are (N, 6) [m, rad]; NaN where a measurement was lost or a model has diverged. Where the ``truth`` is given,
     the model's error against it is drawn in red, and where ``std`` (N, 6) is, the band of ± 2 predicted deviations.
     """
-    figure = blank_figure(13, 12)
+    figure = Figure(figsize=(13, 12), layout="constrained")
     axes = figure.subplots(4, 3, sharex=True)
     for i in range(6):
         _fit_panel(axes[i // 3, i % 3], time, measured, initial, identified, i)
@@ -69,7 +68,7 @@ def fit_figure(
 def validation_figure(validation: list[dict[str, Any]]) -> Figure:
     """RMS of the identified model on each unseen trajectory, against truth and measurement, with what was predicted and
     the goals."""
-    figure = blank_figure(11, 7)
+    figure = Figure(figsize=(11, 7), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
     runs = np.arange(1, len(validation) + 1)
     for axes, first, limit, unit in ((panels[0], 0, VALIDATION_UM, "um"), (panels[1], 3, VALIDATION_URAD, "urad")):
@@ -97,7 +96,7 @@ def parameter_figure(parameters: dict[str, dict[str, Any]]) -> Figure:
         ("friction and joint controller", [n for n in shown if is_friction_or_pid(n)]),
         ("mass and inertia", [n for n in shown if not is_friction_or_pid(n)]),
     )
-    figure = blank_figure(11, max(5.0, 0.28 * max(len(names) for _, names in groups)))
+    figure = Figure(figsize=(11, max(5.0, 0.28 * max(len(names) for _, names in groups))), layout="constrained")
     for axes, (title, names) in zip(figure.subplots(1, 2), groups, strict=True):
         true = np.array([abs(shown[n]["true"]) for n in names])
         error = np.array([shown[n]["estimate"] - shown[n]["true"] for n in names])
@@ -123,7 +122,7 @@ def interval_bars(parameter: dict[str, Any]) -> tuple[float, float]:
 def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
     """Correlations (n, n) of estimates as a coloured matrix; a line of text where nothing is identified."""
     side = max(5.0, 2.0 + 0.28 * len(names))
-    figure = blank_figure(side + 0.5, side)
+    figure = Figure(figsize=(side + 0.5, side), layout="constrained")
     axes = figure.subplots()
     if not names:
         axes.set_axis_off()

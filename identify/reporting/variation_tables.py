@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dynamics.parameters import unit_of
-from identify.files.figure import blank_figure
 from identify.reporting.tables import Table, number
 from identify.validation.variation import Variation
 
@@ -94,7 +93,7 @@ def variation_table(found: Variation) -> Table:
 def variation_figure(found: Variation) -> Figure:
     """Variation of each identified parameter, with what was expected, the paper's, and both limits."""
     shown = np.flatnonzero(found.identified)
-    figure = blank_figure(9, 2.0 + 0.28 * len(shown))
+    figure = Figure(figsize=(9, 2.0 + 0.28 * len(shown)), layout="constrained")
     axes, places = figure.subplots(), np.arange(len(shown))
     axes.barh(places, 100 * found.variation[shown], color="tab:blue", label="variation")
     axes.plot(100 * found.expected[shown], places, "kd", markersize=5, markerfacecolor="none", label="expected")

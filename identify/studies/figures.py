@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 
 from identify.arrays import Array
-from identify.files.figure import blank_figure
 from identify.reporting.figures import save_figure
 from identify.studies.study_file import Law, Study
 from identify.studies.table import factor_unit, figure_unit, labelled
@@ -123,7 +122,7 @@ def _levels(study: Study, rows: pd.DataFrame, factor: str) -> pd.Series:
 def _panels(count: int) -> tuple[Figure, list[Axes]]:
     columns = min(count, 3)
     rows = -(-count // columns)
-    figure = blank_figure(5.0 * columns, 3.8 * rows)
+    figure = Figure(figsize=(5.0 * columns, 3.8 * rows), layout="constrained")
     panels = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel().tolist()
     for axes in panels[count:]:
         axes.set_visible(False)

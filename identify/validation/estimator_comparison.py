@@ -28,7 +28,6 @@ from identify.estimation.identifiability import IDENTIFIABLE_SHARE, group_estima
 from identify.estimators.evidence import Evidence
 from identify.estimators.registry import Estimator
 from identify.experiment.truth import true_poses
-from identify.files.figure import blank_figure
 from identify.files.run_folder import rms_figures, rms_row
 from identify.progress import Progress
 from identify.record.recorded_run import recorded_reference
@@ -170,7 +169,7 @@ PANELS = (
 
 def estimators_figure(scores: Sequence[Score]) -> Figure:
     """Points on logarithmic axes, one panel a figure of merit; what does not exist (an unstable model) has none."""
-    figure = blank_figure(14, 1.2 + 0.42 * len(scores))
+    figure = Figure(figsize=(14, 1.2 + 0.42 * len(scores)), layout="constrained")
     places = np.arange(len(scores))[::-1]
     for axes, (title, label, field, factor) in zip(figure.subplots(1, len(PANELS), sharey=True), PANELS, strict=True):
         values = np.array([factor * getattr(score, field) for score in scores], dtype=float)

@@ -22,7 +22,6 @@ from dynamics.engines.mujoco_engine import MujocoRobot, import_mujoco
 from dynamics.parameters import COULOMB, VISCOUS
 from identify.arrays import Array
 from identify.errors import TrajectoryError
-from identify.files.figure import blank_figure
 from identify.progress import Progress, SilentProgress
 from identify.trajectory import FourierTrajectory, check_travel, random_trajectory
 
@@ -257,7 +256,7 @@ COMPONENTS = ("x", "y", "z", "α", "β", "γ")
 
 def figure_8(runs: EngineRuns) -> Figure:
     """Differences of MuJoCo and this model, and how far MuJoCo's loops are open, over time."""
-    figure = blank_figure(9, 9)
+    figure = Figure(figsize=(9, 9), layout="constrained")
     position, angle, closure = figure.subplots(3, 1, sharex=True)
     verdict, difference = judge(runs), 1e6 * runs.difference
     for i in range(3):

@@ -15,7 +15,6 @@ from cmmsim.acceptance.volume import CORNERS
 from cmmsim.calibration import Calibration
 from cmmsim.detector_leaderboard import Condition, Score
 from cmmsim.geometry.pose import apply, invert
-from identify.files.figure import blank_figure
 
 # Figures of acceptance tests: the volume with its lines, length errors, errors of the bar, latency (PNG).
 
@@ -41,7 +40,7 @@ def paths_figure(volume: MeasuringVolume) -> Figure:
 
 def length_figure(test: LengthTest, limit_um: float) -> Figure:
     """Length measurement error against length: single exposures as dots, the mean of each length as a line."""
-    figure = blank_figure(9, 5.5)
+    figure = Figure(figsize=(9, 5.5), layout="constrained")
     axes = figure.subplots()
     for number, line in enumerate(test.lines):
         lengths = test.of_line(line.name)
@@ -64,7 +63,7 @@ def length_figure(test: LengthTest, limit_um: float) -> Figure:
 
 def bar_figure(test: BarTest) -> Figure:
     """Relative pose error of the bar over time, and its distribution beside the published limits."""
-    figure = blank_figure(12, 8)
+    figure = Figure(figsize=(12, 8), layout="constrained")
     panels = figure.subplots(2, 2, width_ratios=(3, 2))
     for run in test.runs:
         for row, columns, scale in ((0, slice(0, 3), 1e6), (1, slice(3, 6), 1e6)):
@@ -85,7 +84,7 @@ def bar_figure(test: BarTest) -> Figure:
 
 def latency_figure(test: LatencyTest) -> Figure:
     """Delay of each report, their mean with its interval, and what the sensor file states."""
-    figure = blank_figure(9, 4.5)
+    figure = Figure(figsize=(9, 4.5), layout="constrained")
     series, spread = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
     found = test.latency
     series.plot(test.reported, 1e3 * found.delays, ".", markersize=4, label="one report")
@@ -126,7 +125,7 @@ def _distribution(axes: Axes, test: BarTest, row: int, name: str, unit: str) -> 
 
 def _in_volume(volume: MeasuringVolume, title: str, curves: dict[str, np.ndarray]) -> Figure:
     """Curves (n,3) m in the volume, drawn as a reader sees it: x to the right, depth away, up."""
-    figure = blank_figure(8, 6.5)
+    figure = Figure(figsize=(8, 6.5), layout="constrained")
     axes: Any = figure.add_subplot(projection="3d")
     for a, b in EDGES:
         axes.plot(*_shown(CORNERS[[a, b]] * volume.size), color="grey", linewidth=0.8)
@@ -208,7 +207,7 @@ def distortion_figure(found: Calibration) -> Figure:
 
 
 def _panels(found: Calibration, title: str) -> tuple[Figure, list[Axes]]:
-    figure = blank_figure(12, 5)
+    figure = Figure(figsize=(12, 5), layout="constrained")
     panels = list(figure.subplots(1, 2).flat)
     for axes in panels:
         axes.set_xlim(-0.5, found.rig.left.width - 0.5)
@@ -231,7 +230,7 @@ def detectors_figure(scores: Sequence[Score], at_work: Condition) -> Figure:
     views = list(dict.fromkeys(_view(score.condition) for score in scores))
     columns = min(COLUMNS, len(views))
     rows = -(-len(views) // columns)
-    figure = blank_figure(4.5 * columns, 0.8 + 3.2 * rows)
+    figure = Figure(figsize=(4.5 * columns, 0.8 + 3.2 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False, sharey=True).flat
     for view, axes in zip(views, panels, strict=False):
         _panel(axes, [score for score in scores if _view(score.condition) == view])

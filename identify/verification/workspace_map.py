@@ -13,7 +13,6 @@ from dynamics import Robot
 from dynamics.analysis import workspace
 from dynamics.kinematics import forward_kinematics
 from identify.arrays import Array
-from identify.files.figure import blank_figure
 from identify.progress import Progress, SilentProgress
 
 # Maps of a robot's workspace: planes of poses around home, with travel, reach and conditioning at every point.
@@ -182,7 +181,7 @@ def conditioning_figure(workspace: WorkspaceMap) -> Figure:
 
 
 def _maps(workspace: WorkspaceMap, quantity: str, title: str, label: str, norm: Normalize) -> Figure:
-    figure = blank_figure(12, 8)
+    figure = Figure(figsize=(12, 8), layout="constrained")
     panels = figure.subplots(-(-len(workspace.planes) // COLUMNS), COLUMNS, squeeze=False)
     for axes, plane in zip(panels.flat, workspace.planes, strict=False):
         shown = _panel(axes, plane, getattr(plane, quantity), norm)

@@ -8,10 +8,9 @@ from identify.errors import OutputFolderError, RecordError
 from identify.experiment.truth import build_truth, read_truth
 from identify.files.dataset import write_covariance
 from identify.files.run_folder import RunFolder, load_result, save_result
-from identify.files.versions import array_digest
 from identify.loop_parameters import NAMES
 from identify.progress import SilentProgress
-from identify.record.provenance import ENTRY, file_digests, record_digest
+from identify.record.provenance import ENTRY, array_digest, file_digests, record_digest
 from identify.record.recording import EXCITATION, read, read_model_runs, read_runs, write, write_model_runs, write_runs
 from identify.reporting.report import read_report_data, write_report
 from identify.trajectory import TrajectorySet, save_trajectories
