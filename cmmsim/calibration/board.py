@@ -6,15 +6,15 @@ points lie in z = 0. Points run along x first, then row by row, as OpenCV orders
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cmmsim.errors import CalibrationError
+from cmmsim.files.settings import checked, parsed, read_text
 from cmmsim.geometry.pose import Array
 
 Length = Annotated[float, Field(gt=0.0, le=100.0)]
@@ -99,26 +99,6 @@ def read_board(path: str | Path) -> Board:
 
     Raises CalibrationError with the valid names for an unknown key, and with the value for a wrong one.
     """
-    try:
-        values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CalibrationError(f"cannot read board file {path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CalibrationError(f"board file {path} is not TOML: {error}") from error
-    for name in ("spacing", "radius"):  # TOML's 1 and 1.0 mean the same length
-        if type(values.get(name)) is int:
-            values[name] = float(values[name])
-    try:
-        return Board.model_validate(values)
-    except ValidationError as error:
-        reasons = "; ".join(_explain(e["type"], e["loc"], e["msg"], e["input"]) for e in error.errors())
-        raise CalibrationError(f"board file {path}: {reasons}") from error
-
-
-def _explain(kind: str, where: tuple[int | str, ...], message: str, value: object) -> str:
-    name = ".".join(str(part) for part in where)
-    if kind == "extra_forbidden":
-        return f"unknown key {name!r}, valid are {', '.join(sorted(Board.model_fields))}"
-    if kind == "missing":
-        return f"{name} is missing"
-    return message.removeprefix("Value error, ") if not name else f"{name}: {message} (got {value!r})"
+    source = f"board file {path}"
+    content = parsed(read_text(path, source, CalibrationError), source, CalibrationError)
+    return checked(Board, content, source, CalibrationError)

@@ -7,21 +7,18 @@ from three on: n stickers know a plane or a pose sqrt(n) times better than one w
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
-from functools import lru_cache
 from importlib import resources
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from cmmsim.checks import require_kind
 from cmmsim.errors import SensorFileError, UnknownSensorError
 from cmmsim.files.schema import SensorFile
+from cmmsim.files.settings import checked, parsed, read_text
 from cmmsim.geometry.pose import Array
 
 # Changes to the entries of a sensor file, by dotted key as `{"camera.dark_noise": 40.0}` or nested as in it.
@@ -105,13 +102,12 @@ def sensor_text(name: str | Path) -> str:
     if str(name) in built_in_names():
         return resources.files(__package__).joinpath("sensors", f"{name}.toml").read_text(encoding="utf-8")
     try:
-        if not Path(name).is_file():
-            raise UnknownSensorError(str(name), built_in_names())
-        return Path(name).read_text(encoding="utf-8")
-    except OSError as error:
+        is_file = Path(name).is_file()
+    except OSError as error:  # such as a name that is too long
         raise SensorFileError(f"cannot read sensor file {str(name)[:200]}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise SensorFileError(f"sensor file {name} is not text, so it cannot be TOML: {error}") from error
+    if not is_file:
+        raise UnknownSensorError(str(name), built_in_names())
+    return read_text(name, f"sensor file {name}", SensorFileError)
 
 
 def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None) -> SensorFile:
@@ -125,11 +121,7 @@ def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None)
     source = f"sensor file {name}" + (f" with changes to {', '.join(changes)}" if changes else "")
     content = _content(name)
     change(content, changes or {}, source)
-    try:
-        return _with_stickers(SensorFile.model_validate(content), source)
-    except ValidationError as error:
-        lines = "; ".join(_explain(e) for e in error.errors())
-        raise SensorFileError(f"{source}: {lines}") from error
+    return _with_stickers(checked(SensorFile, content, source, SensorFileError), source)
 
 
 def _with_stickers(file: SensorFile, source: str) -> SensorFile:
@@ -174,36 +166,4 @@ def _content(name: str | Path) -> dict[str, Any]:
 
 
 def _table(name: str | Path) -> dict[str, Any]:
-    text = sensor_text(name)
-    try:
-        return deepcopy(_parsed(text))
-    except tomllib.TOMLDecodeError as error:
-        raise SensorFileError(f"sensor file {name}: {error}") from error
-
-
-@lru_cache(maxsize=8)
-def _parsed(text: str) -> dict[str, Any]:
-    """Kept, for a study reads the same sensor for every row, and parsing it is an eighth of the row's time."""
-    return tomllib.loads(text)
-
-
-def _explain(error: Any) -> str:
-    """One problem in words, with the valid names when a key is unknown."""
-    where = ".".join(str(part) for part in error["loc"])
-    if error["type"] == "extra_forbidden":
-        return f"unknown key {where!r}, valid are {', '.join(_valid_keys(error['loc'][:-1]))}"
-    if error["type"] == "missing":
-        return f"{where}: {error['msg']}"  # what was got instead is the whole section
-    if error["type"] == "value_error":
-        return f"{where}: {error['ctx']['error']}"
-    return f"{where}: {error['msg']} (got {error['input']!r})"
-
-
-def _valid_keys(section: tuple[Any, ...]) -> list[str]:
-    model: Any = SensorFile
-    for part in section:
-        if isinstance(part, int):
-            continue
-        annotation = model.model_fields[part].annotation
-        model = getattr(annotation, "__args__", (annotation,))[0]
-    return sorted(model.model_fields)
+    return parsed(sensor_text(name), f"sensor file {name}", SensorFileError)

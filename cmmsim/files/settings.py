@@ -1,0 +1,68 @@
+"""Files of settings (TOML): how one is read and checked, and how it is refused in a line that names what is wrong."""
+
+from __future__ import annotations
+
+import tomllib
+from copy import deepcopy
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from cmmsim.errors import CmmError
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def read_text(path: str | Path, source: str, refusal: type[CmmError]) -> str:
+    """Text of a file. Raises ``refusal`` where it cannot be read; source: how messages call it, as "board file x"."""
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise refusal(f"cannot read {source}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise refusal(f"{source} is not text, so it cannot be TOML: {error}") from error
+
+
+def parsed(text: str, source: str, refusal: type[CmmError]) -> dict[str, Any]:
+    """Content of a text, the caller's to change. Raises ``refusal`` where it is not TOML."""
+    try:
+        return deepcopy(_parsed(text))
+    except tomllib.TOMLDecodeError as error:
+        raise refusal(f"{source} is not TOML: {error}") from error
+
+
+def checked(model: type[M], content: dict[str, Any], source: str, refusal: type[CmmError]) -> M:
+    """Content as a model. Raises ``refusal`` with all that is wrong, and with the valid names of an unknown key."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise refusal(f"{source}: {'; '.join(_explain(details, model) for details in error.errors())}") from error
+
+
+@lru_cache(maxsize=8)
+def _parsed(text: str) -> dict[str, Any]:
+    """Kept, for a study reads the same sensor for every row, and parsing it is an eighth of the row's time."""
+    return tomllib.loads(text)
+
+
+def _explain(error: Any, model: type[BaseModel]) -> str:
+    """One problem in words."""
+    where = ".".join(str(part) for part in error["loc"])
+    if error["type"] == "extra_forbidden":
+        return f"unknown key {where!r}, valid are {', '.join(_valid_keys(error['loc'][:-1], model))}"
+    if error["type"] == "missing":
+        return f"{where}: {error['msg']}"  # what was got instead is the whole section
+    if error["type"] == "value_error":
+        return f"{where}: {error['ctx']['error']}" if where else str(error["ctx"]["error"])
+    return f"{where}: {error['msg']} (got {error['input']!r})"
+
+
+def _valid_keys(section: tuple[Any, ...], model: Any) -> list[str]:
+    for part in section:
+        if isinstance(part, int):
+            continue
+        annotation = model.model_fields[part].annotation
+        model = getattr(annotation, "__args__", (annotation,))[0]
+    return sorted(model.model_fields)
