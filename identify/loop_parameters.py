@@ -1,4 +1,4 @@
-"""The 67 parameters of the closed loop as the estimator sees them, and dynamic parameters named on the command line."""
+"""The closed loop of a scenario: its settings, its 67 parameters, and those that a command line names."""
 
 import json
 import sys
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dynamics import Robot
+from dynamics.closed_loop import FrameTiming, FrictionLaw, LoopSettings, ServoGains
 from dynamics.errors import ParameterError
 from dynamics.parameters import (
     COULOMB_NAMES,
@@ -18,17 +19,34 @@ from dynamics.parameters import (
     PARAMETER_NAMES,
     VISCOUS_NAMES,
     check_parameters,
-    unit_of,
 )
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import load_result
-from identify.scenario import PriorValue
-
-# The 67 parameters of the closed loop, as the estimator sees them: names, units, typical sizes.
-
+from identify.scenario import Model, Plant, PriorValue, Scenario
 
 NAMES: tuple[str, ...] = PARAMETER_NAMES + JOINT_PID_NAMES
+
+NOMINAL = "initial"
+"""The parameter set that is meant where none is named."""
+
+
+def model_settings(scenario: Scenario) -> LoopSettings:
+    """The loop around the estimator's model: of the latency it knows the mean only."""
+    return loop_settings(scenario, scenario.model)
+
+
+def loop_settings(scenario: Scenario, side: Plant | Model) -> LoopSettings:
+    """The scenario's servo and timing, with the friction law and the steps of the plant or of the model."""
+    servo, timing = scenario.servo, scenario.timing
+    return LoopSettings(
+        servo=ServoGains(servo.kp, servo.kd, servo.ki),
+        timing=FrameTiming(timing.frame_rate_hz, timing.latency_s, timing.hold),
+        friction=FrictionLaw(
+            side.friction, side.smoothing_velocity_rad_s, side.static_ratio, side.stribeck_velocity_rad_s
+        ),
+        steps_per_frame=side.steps_per_frame,
+    )
 
 
 @dataclass(frozen=True)
@@ -81,15 +99,6 @@ def typical_sizes(values: Array, torque: float) -> Array:
 def index_of(name: str) -> int:
     """Position of a parameter in the vector."""
     return NAMES.index(name)
-
-
-__all__ = ["NAMES", "StartingGuess", "holding_torque", "index_of", "starting_guess", "typical_sizes", "unit_of"]
-
-
-# Dynamic parameters named on the command line: a set of the robot file, or the estimates in a run's result.json.
-
-
-NOMINAL = "initial"
 
 
 @dataclass(frozen=True)

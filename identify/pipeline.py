@@ -15,9 +15,8 @@ from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
 from identify.estimation import identification
 from identify.excitation import design_trajectories
-from identify.experiment.plant import check_plant, plant_robot
+from identify.experiment.plant import build_plant
 from identify.experiment.run import excitation_run, taught_sensor, teach, untaught_sensor
-from identify.experiment.run import true_parameters as plant_parameters
 from identify.experiment.sensor_in_loop import with_renderer
 from identify.experiment.truth import read_truth, true_parameters
 from identify.files.atomic import write_text
@@ -28,7 +27,6 @@ from identify.loop_parameters import NAMES, check_parameter_set
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.checks import check_length, check_trajectory
-from identify.record.loop_setup import frame_times
 from identify.record.provenance import ENTRY, RECORDS, check_made_of, check_robot, file_digests
 from identify.record.recorded_run import recorded_reference
 from identify.record.recording import build_model_run, write_model_runs
@@ -81,12 +79,12 @@ def record(
     began = time.perf_counter()
     sensor = sensor or taught_sensor(scenario, robot, trajectories.seed, progress)
     targets = [run_folder.experiment, *_payload_files(run_folder, scenario)]
-    frames = len(frame_times(scenario, scenario.excitation.duration_s))
+    plant, frames = build_plant(scenario, robot), scenario.timing.frames(scenario.excitation.duration_s)
     with progress.stage("record", frames * len(targets)) as advance:
         for target in targets:
             payload = target == run_folder.payload
             arguments = (trajectories.excitation, trajectories.seed, advance, payload)
-            experiment = excitation_run(scenario, robot, sensor, *arguments)
+            experiment = excitation_run(plant, sensor, *arguments)
             stored = experiment.record.assign_attrs(record_seconds=time.perf_counter() - began)
             recording.write(target, stored, experiment.truth)
     return sensor.taught
@@ -205,16 +203,16 @@ def _payload_files(run_folder: RunFolder, scenario: Scenario) -> list[Path]:
 def _designed(scenario: Scenario, seed: int, progress: Progress) -> TrajectorySet:
     """Trajectories that stay clear of limits and singularities; compiles the robot on first use."""
     check_length(scenario.timing.frames(scenario.excitation.duration_s), scenario, "excitation.duration_s gives")
-    robot = load_robot(scenario.robot)
-    for name in (scenario.plant.parameters, scenario.model.start_parameters):
-        check_parameter_set(robot, name)
+    plant = build_plant(scenario)
+    robot = plant.nominal
+    check_parameter_set(robot, scenario.model.start_parameters)
     with progress.stage("compile the robot", 4) as advance:
-        for one in (robot, plant_robot(scenario, robot)):
+        for one in (robot, plant.robot):
             _ = one.functions
             advance()
             prepare(one)
             advance()
-    check_plant(scenario, robot, plant_parameters(robot, scenario))
+    plant.check()
     trajectories = design_trajectories(robot, scenario, seed, progress)
     _check_singularities(robot, scenario, trajectories)
     return trajectories
@@ -230,7 +228,7 @@ def _check_singularities(robot: Robot, scenario: Scenario, trajectories: Traject
     """Raise SingularPoseError, with time and leg, where a trajectory comes near a singularity (section 3.3)."""
     durations = [scenario.excitation.duration_s] + [scenario.validation.duration_s] * len(trajectories.validation)
     for trajectory, duration in zip((trajectories.excitation, *trajectories.validation), durations, strict=True):
-        times = frame_times(scenario, duration)
+        times = scenario.timing.frame_times(duration)
         check_motion(robot, trajectory.pose(times), times)
 
 

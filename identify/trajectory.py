@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dynamics import Robot
+from dynamics.closed_loop import Reference
 from dynamics.errors import DynamicsError
 from identify.arrays import Array
 from identify.errors import TrajectoryError
@@ -66,6 +67,10 @@ class FourierTrajectory:
         """Second time derivative of the pose, (N, 6) [m/s², rad/s²] (eq. 36 without its stray factor t)."""
         w, sin, cos = self._waves(t)
         return cos @ (self.cosine * w).T - sin @ (self.sine * w).T
+
+    def reference(self, times: ArrayLike) -> Reference:
+        """Desired poses and pose rates at the frames ``times`` (N,) [s]."""
+        return Reference(self.pose(times), self.pose_rate(times))
 
     def _waves(self, t: ArrayLike) -> tuple[Array, Array, Array]:
         w: Array = 2 * np.pi * self.fundamental_hz * np.arange(1, self.harmonics + 1, dtype=float)

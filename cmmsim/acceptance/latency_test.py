@@ -25,7 +25,6 @@ from cmmsim.acceptance.statistics import Interval, interval_of_mean
 from cmmsim.acceptance.volume import MeasuringVolume
 from cmmsim.errors import AcceptanceError, ShapeError
 from cmmsim.geometry.pose import Array
-from cmmsim.latency import drawn_latencies
 from cmmsim.tracker import Tracker
 
 STREAM = 201
@@ -143,7 +142,7 @@ def latency_test(
     good = np.array([m.ok for m in measured])
     if good.sum() < 4:
         raise AcceptanceError(f"latency: {good.sum()} of {frames} frames are measured: {measured[-1].reason}")
-    reported = (taken + drawn_latencies(sensor.timing, frames, np.random.default_rng([under_test.seed, STREAM])))[good]
+    reported = (taken + sensor.timing.drawn_latencies(frames, np.random.default_rng([under_test.seed, STREAM])))[good]
     kept = [m for m in measured if m.ok]
     latency = estimate_latency(
         reported,

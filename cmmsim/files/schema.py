@@ -14,6 +14,7 @@ Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 Level = Annotated[int, Field(ge=0, le=255)]
+WIDEST_JITTER = 3.0  # standard deviations: no frame's latency is farther from the mean
 NARROWEST_PSF = 0.1  # px: a narrower point spread is lost between the points that images are drawn on
 
 
@@ -22,7 +23,7 @@ class _Section(BaseModel):
 
 
 class Timing(_Section):
-    """When the sensor looks, and when its poses can be used: see also :mod:`cmmsim.latency`.
+    """When the sensor looks, and when its poses can be used.
 
     frame_rate Hz; exposure s: a measured pose is that in its middle; latency s, from the middle of the exposure to the
     use of the pose, and latency_jitter s, its standard deviation from frame to frame; dropout: probability that a frame
@@ -45,6 +46,24 @@ class Timing(_Section):
         if self.latency_jitter > self.latency:
             raise ValueError(f"latency_jitter {self.latency_jitter:g} s is larger than latency {self.latency:g} s")
         return self
+
+    @property
+    def largest_latency(self) -> float:
+        """The longest latency that can be drawn, s."""
+        return self.latency + self._widest_deviation
+
+    def drawn_latencies(self, frames: int, rng: np.random.Generator) -> Array:
+        """Latency of each frame (frames,), s, from the middle of its exposure to the use of its pose.
+
+        Normal about ``latency`` with standard deviation ``latency_jitter``, clipped on both sides to 3 of those or to
+        the latency itself, whichever is less: none is negative, and the mean stays the stated latency.
+        """
+        widest = self._widest_deviation
+        return self.latency + np.clip(rng.normal(0.0, self.latency_jitter, frames), -widest, widest)
+
+    @property
+    def _widest_deviation(self) -> float:
+        return min(WIDEST_JITTER * self.latency_jitter, self.latency)
 
 
 class Calibrated(_Section):

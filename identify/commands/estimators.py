@@ -64,7 +64,6 @@ def _scores(
     from identify.estimation.identification import output_error_problem
     from identify.estimators.evidence import Evidence, joint_channels
     from identify.experiment.joint_instruments import measure_joints, read_channels, write_channels
-    from identify.experiment.sensor_in_loop import frame_latencies
     from identify.experiment.truth import read_truth, read_truth_runs, true_parameters
     from identify.loop_parameters import NAMES
     from identify.random_streams import INSTRUMENTS, LATENCY, mixed_generator, stream_seed
@@ -78,7 +77,7 @@ def _scores(
     rng = mixed_generator(INSTRUMENTS, seed)
     channels = folder.path / "instruments.nc"
     draws = np.random.default_rng(stream_seed(int(record.attrs["seed"]), LATENCY, 0))
-    latencies = frame_latencies(scenario, record.sizes["time"], draws)
+    latencies = scenario.timing.drawn_latencies(record.sizes["time"], draws)
     write_channels(channels, measure_joints(record, truth, scenario.timing, instruments, rng, latencies))
     known = true_parameters(truth)
     true = np.array([known[name] for name in NAMES])

@@ -15,10 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from dynamics.parameters import unit_of
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.dataset import shown
-from identify.loop_parameters import NAMES, index_of, unit_of
+from identify.loop_parameters import NAMES, index_of
 
 MEASURED_PARAMETER = {"platform_mass": "platform.mass", "joint_gain": "joint_pid.lp"}
 """Anchors that measure a parameter."""

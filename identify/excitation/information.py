@@ -43,8 +43,7 @@ from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.estimation.scale_anchor import DEFAULT_STD, MEASURED_PARAMETER
 from identify.excitation.motion import Unknowns, log_determinant, sample_times, torque_regressor, tracked_motion
-from identify.loop_parameters import NAMES, StartingGuess, index_of, starting_guess
-from identify.record.loop_setup import frame_times, model_settings, reference_motion
+from identify.loop_parameters import NAMES, StartingGuess, index_of, model_settings, starting_guess
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
@@ -80,12 +79,12 @@ def log_information(robot: Robot, scenario: Scenario, known: Knowledge, trajecto
 
     Raises TrajectoryError where the model with the starting guess is unstable on it.
     """
-    times = frame_times(scenario, scenario.excitation.duration_s)
+    times = scenario.timing.frame_times(scenario.excitation.duration_s)
     try:
         run = simulate(
             robot,
             known.guess.values,
-            reference_motion(trajectory, times),
+            trajectory.reference(times),
             model_settings(scenario),
             sensitivities=True,
         )

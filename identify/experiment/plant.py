@@ -1,19 +1,117 @@
-"""The simulated real robot of a scenario: what it does and carries, and where it is not the robot that is known."""
+"""The simulated real robot of a scenario: what it is, does and carries, and where it is not the robot that is known."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+import xarray as xr
 from numpy.typing import ArrayLike
 
-from dynamics import Robot
+from dynamics import Robot, load_robot
 from dynamics.analysis.geometry_error import with_geometry_error
-from dynamics.closed_loop import ClosedLoopRun, LoopSettings, PoseSensor, RateSensor, Reference, simulate
+from dynamics.closed_loop import (
+    ClosedLoopRun,
+    JointElasticity,
+    LoopSettings,
+    PoseSensor,
+    RateSensor,
+    Reference,
+    simulate,
+)
 from identify.arrays import Array
-from identify.record.loop_setup import plant_settings
+from identify.experiment.truth import build_truth
+from identify.loop_parameters import NAMES, loop_settings, starting_guess
 from identify.record.payload import payload_vector
 from identify.scenario import Scenario
 
-# The load on the platform in the second run of an experiment: as its experimenter states it, and as it is.
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """The true robot in its loop, made once by :func:`build_plant`.
+
+    nominal: the robot that servo and estimator know; robot: the true one, the same object where there is no geometry
+    error; parameters (67,): the true ones; settings: of its loop, whose joints may be elastic.
+    """
+
+    scenario: Scenario
+    nominal: Robot
+    robot: Robot
+    parameters: Array
+    settings: LoopSettings
+
+    def check(self) -> None:
+        """Raise dynamics.DynamicsError, with the evidence, where it cannot be simulated."""
+        self._settings_at(self.parameters, self.nominal.home_pose)
+
+    def run(
+        self,
+        reference: Reference,
+        sensor: PoseSensor | RateSensor | None = None,
+        latencies: Array | None = None,
+        load: Array | None = None,
+    ) -> ClosedLoopRun:
+        """Follow a reference under a servo that knows the nominal robot; sensor None: an ideal one.
+
+        load (67,): what the platform carries, as it adds to the parameters. Raises what `dynamics.closed_loop.simulate`
+        does.
+        """
+        parameters = self.parameters if load is None else self.parameters + load
+        settings = self._settings_at(parameters, reference.poses[0])
+        known = None if self.robot is self.nominal else self.nominal
+        return simulate(self.robot, parameters, reference, settings, sensor, latencies=latencies, servo_robot=known)
+
+    def truth(self, run: ClosedLoopRun) -> xr.Dataset:
+        """The truth of a run: what it did, the parameters without a load, and what the model has no place for."""
+        truth = build_truth(
+            time=run.time,
+            pose=run.pose,
+            joint_angle=self.robot.inverse_kinematics(run.pose),
+            joint_velocity=np.einsum("nij,nj->ni", self.robot.pose_jacobian(run.pose), run.pose_rate),
+            joint_torque=run.torque,
+            parameter_names=list(NAMES),
+            parameters=self.parameters,
+            mismatch=self._mismatch(run),
+        )
+        switches = self.scenario.plant.model_dump(exclude_none=True)
+        return truth.assign_attrs({f"plant_{name}": value for name, value in switches.items()})
+
+    def _mismatch(self, run: ClosedLoopRun) -> dict[str, ArrayLike]:
+        geometry, known = self.robot.geometry, self.nominal.geometry
+        found: dict[str, ArrayLike] = {}
+        if geometry != known:
+            found["base_joint_error"] = geometry.base_joints - known.base_joints
+            found["platform_joint_error"] = geometry.platform_joints - known.platform_joints
+        if run.motor_angle is not None:
+            found["motor_angle"] = run.motor_angle
+        return found
+
+    def _settings_at(self, parameters: Array, pose: Array) -> LoopSettings:
+        """The settings, with more steps a frame where elastic joints vibrate too fast for theirs."""
+        settings, springs = self.settings, self.settings.elasticity
+        if springs is None:
+            return settings
+        period = self.scenario.timing.frame_period_s
+        needed = springs.steps_needed(self.robot, parameters, pose, period, settings.friction)
+        return replace(settings, steps_per_frame=max(settings.steps_per_frame, needed))
+
+
+def build_plant(scenario: Scenario, nominal: Robot | None = None) -> Plant:
+    """The plant of a scenario, about its robot as it is known; None: loaded from the scenario's.
+
+    Raises:
+        ScenarioError: no such parameter set (with the valid names).
+    """
+    nominal, switches = nominal or load_robot(scenario.robot), scenario.plant
+    settings = loop_settings(scenario, switches)
+    if switches.joint_stiffness_N_m_rad is not None:
+        stiffness, inertia = switches.joint_stiffness_N_m_rad, switches.motor_inertia_kg_m2
+        settings = replace(settings, elasticity=JointElasticity(stiffness, inertia, switches.joint_damping_N_m_s_rad))
+    return Plant(
+        scenario=scenario,
+        nominal=nominal,
+        robot=with_geometry_error(nominal, switches.geometry_error_m, np.random.default_rng(switches.geometry_seed)),
+        parameters=starting_guess(nominal, switches.parameters, 1.0).values,
+        settings=settings,
+    )
 
 
 @dataclass(frozen=True)
@@ -27,73 +125,10 @@ class PlatformLoad:
 
 def drawn_load(scenario: Scenario, rng: np.random.Generator) -> PlatformLoad:
     """The scenario's load, whose true figures miss the stated ones by the stated deviations; no figure is negative."""
-    stated, std = scenario_payload(scenario), scenario_payload_std(scenario)
+    load = scenario.payload
+    stated = payload_vector(load.mass_kg, (load.Ixx_kg_m2, load.Iyy_kg_m2, load.Izz_kg_m2))
+    std = payload_vector(load.mass_std_kg, (load.Ixx_std_kg_m2, load.Iyy_std_kg_m2, load.Izz_std_kg_m2))
     true = stated + std * rng.standard_normal(stated.shape)
     while (true < 0).any():
         true = stated + std * rng.standard_normal(stated.shape)
     return PlatformLoad(stated, std, true)
-
-
-def scenario_payload(scenario: Scenario) -> Array:
-    """What the scenario's load adds to the parameters (67,), as stated."""
-    load = scenario.payload
-    return payload_vector(load.mass_kg, (load.Ixx_kg_m2, load.Iyy_kg_m2, load.Izz_kg_m2))
-
-
-def scenario_payload_std(scenario: Scenario) -> Array:
-    """Standard deviations (67,) of what the scenario's load adds to the parameters."""
-    load = scenario.payload
-    return payload_vector(load.mass_std_kg, (load.Ixx_std_kg_m2, load.Iyy_std_kg_m2, load.Izz_std_kg_m2))
-
-
-# The simulated real robot of a scenario: what it does, and where it is not the robot that servo and estimator know.
-
-
-def plant_robot(scenario: Scenario, nominal: Robot) -> Robot:
-    """The nominal robot with the scenario's geometry error; itself where there is none."""
-    plant = scenario.plant
-    return with_geometry_error(nominal, plant.geometry_error_m, np.random.default_rng(plant.geometry_seed))
-
-
-def check_plant(scenario: Scenario, nominal: Robot, parameters: Array) -> None:
-    """Raise dynamics.DynamicsError, with the evidence, where a plant with parameters (67,) cannot be simulated."""
-    _with_steps_enough(plant_settings(scenario), plant_robot(scenario, nominal), parameters, nominal.home_pose)
-
-
-def simulate_plant(
-    scenario: Scenario,
-    nominal: Robot,
-    parameters: Array,
-    reference: Reference,
-    sensor: PoseSensor | RateSensor | None = None,
-    latencies: Array | None = None,
-) -> ClosedLoopRun:
-    """Run the plant with parameters (67,) under a servo that knows the nominal robot; sensor None: an ideal one.
-
-    Raises what `dynamics.closed_loop.simulate` does.
-    """
-    plant = plant_robot(scenario, nominal)
-    settings = _with_steps_enough(plant_settings(scenario), plant, parameters, reference.poses[0])
-    known = None if plant is nominal else nominal
-    return simulate(plant, parameters, reference, settings, sensor, latencies=latencies, servo_robot=known)
-
-
-def mismatch(scenario: Scenario, nominal: Robot, run: ClosedLoopRun) -> dict[str, ArrayLike]:
-    """What of the plant's truth the model has no place for, by the names of `identify.experiment.truth.MISMATCH`."""
-    geometry, known = plant_robot(scenario, nominal).geometry, nominal.geometry
-    found: dict[str, ArrayLike] = {}
-    if geometry != known:
-        found["base_joint_error"] = geometry.base_joints - known.base_joints
-        found["platform_joint_error"] = geometry.platform_joints - known.platform_joints
-    if run.motor_angle is not None:
-        found["motor_angle"] = run.motor_angle
-    return found
-
-
-def _with_steps_enough(settings: LoopSettings, plant: Robot, parameters: Array, pose: Array) -> LoopSettings:
-    """The settings, with more steps a frame where elastic joints vibrate too fast for theirs."""
-    if settings.elasticity is None:
-        return settings
-    period = 1 / settings.timing.frame_rate_hz
-    needed = settings.elasticity.steps_needed(plant, parameters, pose, period, settings.friction)
-    return replace(settings, steps_per_frame=max(settings.steps_per_frame, needed))

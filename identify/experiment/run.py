@@ -11,18 +11,15 @@ import platformdirs
 import xarray as xr
 
 import cmmsim
-from dynamics import Robot, load_robot
+from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
 from identify.estimation.scale_anchor import measured_anchor, store_anchor
 from identify.excitation import design_trajectories
-from identify.experiment.plant import PlatformLoad, drawn_load, mismatch, plant_robot, simulate_plant
-from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, frame_latencies, make_sensor, with_renderer
-from identify.experiment.truth import build_truth
-from identify.loop_parameters import NAMES, starting_guess
+from identify.experiment.plant import Plant, PlatformLoad, build_plant, drawn_load
+from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, make_sensor, with_renderer
 from identify.progress import Advance, Progress, SilentProgress
 from identify.random_streams import ANCHOR, LATENCY, LOAD, NOISE, TEACHING, stream_seed
 from identify.record import recording
-from identify.record.loop_setup import frame_times, reference_motion
 from identify.record.payload import store_payload
 from identify.record.provenance import store_robot
 from identify.scenario import Scenario
@@ -57,12 +54,11 @@ def run_experiment(
     Raises ScenarioError, TrajectoryError, cmmsim.CmmError, dynamics.DynamicsError.
     """
     progress, scenario = progress or SilentProgress(), with_renderer(scenario)
-    robot = load_robot(scenario.robot)
-    trajectories = design_trajectories(robot, scenario, seed, progress)
-    sensor = taught_sensor(scenario, robot, seed, progress)
-    frames = len(frame_times(scenario, scenario.excitation.duration_s))
-    with progress.stage("record", frames) as advance:
-        experiment = excitation_run(scenario, robot, sensor, trajectories.excitation, seed, advance, payload)
+    plant = build_plant(scenario)
+    trajectories = design_trajectories(plant.nominal, scenario, seed, progress)
+    sensor = taught_sensor(scenario, plant.nominal, seed, progress)
+    with progress.stage("record", scenario.timing.frames(scenario.excitation.duration_s)) as advance:
+        experiment = excitation_run(plant, sensor, trajectories.excitation, seed, advance, payload)
     target = Path(path) if path else _default_path(scenario, seed, payload)
     target.parent.mkdir(parents=True, exist_ok=True)
     recording.write(target, experiment.record, experiment.truth)
@@ -95,8 +91,7 @@ def teach(sensor: cmmsim.Sensor, progress: Progress) -> None:
 
 
 def excitation_run(
-    scenario: Scenario,
-    robot: Robot,
+    plant: Plant,
     sensor: PoseSensor,
     trajectory: FourierTrajectory,
     seed: int,
@@ -104,54 +99,44 @@ def excitation_run(
     payload: bool = False,
 ) -> Experiment:
     """Run the plant along the exciting trajectory, bare or under the scenario's load. Raises as `run_plant` does."""
-    times = frame_times(scenario, scenario.excitation.duration_s)
+    duration_s = plant.scenario.excitation.duration_s
     if not payload:
-        return run_plant(scenario, robot, sensor, trajectory, times, seed, 0, advance)
-    load = drawn_load(scenario, np.random.default_rng(stream_seed(seed, LOAD)))
-    return run_plant(scenario, robot, sensor, trajectory, times, seed, PAYLOAD_RUN, advance, load)
+        return run_plant(plant, sensor, trajectory, duration_s, seed, 0, advance)
+    load = drawn_load(plant.scenario, np.random.default_rng(stream_seed(seed, LOAD)))
+    return run_plant(plant, sensor, trajectory, duration_s, seed, PAYLOAD_RUN, advance, load)
 
 
 def run_plant(
-    scenario: Scenario,
-    robot: Robot,
+    plant: Plant,
     sensor: PoseSensor,
     trajectory: FourierTrajectory,
-    times: np.ndarray,
+    duration_s: float,
     seed: int,
     run: int,
     advance: Advance = lambda n=1: None,
     load: PlatformLoad | None = None,
 ) -> Experiment:
-    """Run the plant of the nominal `robot` along a trajectory at the frames `times` (N,) [s]; `run`: number of the run
-    (0: excitation); `load`: what the platform carries.
+    """Run the plant along a trajectory; `run`: number of the run (0: excitation); `load`: what the platform carries.
 
     Raises TrajectoryError before the run when the trajectory leaves the travel, LoopFailure when the loop is unstable.
     """
-    check_travel(robot, trajectory, times)
-    reference = reference_motion(trajectory, times)
-    parameters = true_parameters(robot, scenario)
-    eye = SensorInLoop(sensor, plant_robot(scenario, robot), stream_seed(seed, NOISE, run), advance)
-    loaded = parameters if load is None else parameters + load.true
-    latencies = frame_latencies(scenario, len(times), np.random.default_rng(stream_seed(seed, LATENCY, run)))
-    done = simulate_plant(scenario, robot, loaded, reference, RateSensor(eye.measure), latencies)
-    record = _record(scenario, robot, reference, done, eye, seed)
+    scenario, times = plant.scenario, plant.scenario.timing.frame_times(duration_s)
+    check_travel(plant.nominal, trajectory, times)
+    reference = trajectory.reference(times)
+    eye = SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, run), advance)
+    latencies = scenario.timing.drawn_latencies(len(times), np.random.default_rng(stream_seed(seed, LATENCY, run)))
+    true_load = None if load is None else load.true
+    done = plant.run(reference, RateSensor(eye.measure), latencies, true_load)
+    record, truth = _record(plant, reference, done, eye, seed), plant.truth(done)
     settings, rng = scenario.identification, np.random.default_rng(stream_seed(seed, ANCHOR))
-    store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, parameters, rng))
-    truth = _truth(scenario, robot, done, parameters)
+    store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, plant.parameters, rng))
     if load is not None:
         store_payload(record, load.stated, load.std)
         store_payload(truth, load.true)
     return Experiment(record, truth)
 
 
-def true_parameters(robot: Robot, scenario: Scenario) -> np.ndarray:
-    """The plant's parameters (67,). Raises ScenarioError for an unknown set (with the valid names)."""
-    return starting_guess(robot, scenario.plant.parameters, 1.0).values
-
-
-def _record(
-    scenario: Scenario, robot: Robot, reference: Reference, run: ClosedLoopRun, eye: SensorInLoop, seed: int
-) -> xr.Dataset:
+def _record(plant: Plant, reference: Reference, run: ClosedLoopRun, eye: SensorInLoop, seed: int) -> xr.Dataset:
     record = recording.build_record(
         time=run.time,
         reference_pose=reference.poses,
@@ -160,30 +145,13 @@ def _record(
         measured_covariance=np.array(eye.covariances),
         measured_ok=run.measured_ok,
         command=run.command,
-        scenario_toml=scenario.to_toml(),
-        robot=robot.name,
+        scenario_toml=plant.scenario.to_toml(),
+        robot=plant.nominal.name,
         seed=seed,
-        frame_rate_hz=scenario.timing.frame_rate_hz,
+        frame_rate_hz=plant.scenario.timing.frame_rate_hz,
     )
-    store_robot(record, robot)
+    store_robot(record, plant.nominal)
     return record.assign_attrs(sensor_seconds=eye.seconds, lost_frames="; ".join(eye.lost[:20]))
-
-
-def _truth(scenario: Scenario, robot: Robot, run: ClosedLoopRun, parameters: np.ndarray) -> xr.Dataset:
-    plant = plant_robot(scenario, robot)
-    jacobian = plant.pose_jacobian(run.pose)
-    truth = build_truth(
-        time=run.time,
-        pose=run.pose,
-        joint_angle=plant.inverse_kinematics(run.pose),
-        joint_velocity=np.einsum("nij,nj->ni", jacobian, run.pose_rate),
-        joint_torque=run.torque,
-        parameter_names=list(NAMES),
-        parameters=parameters,
-        mismatch=mismatch(scenario, robot, run),
-    )
-    settings = scenario.plant.model_dump(exclude_none=True)
-    return truth.assign_attrs({f"plant_{name}": value for name, value in settings.items()})
 
 
 def _default_path(scenario: Scenario, seed: int, payload: bool) -> Path:

@@ -8,15 +8,13 @@ import numpy as np
 import trimesh
 
 import cmmsim
-from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.files import SensorFile, read_sensor_file
 from cmmsim.imaging.renderer import choose_renderer
-from cmmsim.latency import drawn_latencies
 from dynamics import Robot
 from dynamics.analysis.body_frames import crank_rotations, crank_tips
 from identify.arrays import Array
 from identify.progress import Advance
 from identify.scenario import Scenario
-from identify.scenario.timing import sensor_timing
 
 # Cranks and links as the cameras see them: rods between the joints, which can hide stickers.
 
@@ -51,22 +49,20 @@ def make_sensor(scenario: Scenario, robot: Robot, seed: int, taught: cmmsim.Taug
 
     One a process: it owns the renderer.
     """
-    file = read_sensor_file(scenario.sensor, scenario.sensor_changes)
-    file = file.model_copy(update={"timing": sensor_timing(scenario.timing.model_dump())})
-    sensor = cmmsim.Sensor(file, seed, scenario.pose_method, taught, renderer=scenario.renderer)
+    sensor = cmmsim.Sensor(sensor_file(scenario), seed, scenario.pose_method, taught, renderer=scenario.renderer)
     sensor.add_bodies(robot_meshes(robot))
     return sensor
+
+
+def sensor_file(scenario: Scenario) -> SensorFile:
+    """The file of the scenario's sensor with the scenario's changes and timing."""
+    file = read_sensor_file(scenario.sensor, scenario.sensor_changes)
+    return file.model_copy(update={"timing": scenario.timing.of_sensor()})
 
 
 def with_renderer(scenario: Scenario) -> Scenario:
     """The scenario with what draws on this machine in place of "auto"; one line of warning where OpenGL is missing."""
     return scenario.with_overrides({"renderer": choose_renderer(scenario.renderer).name})
-
-
-def frame_latencies(scenario: Scenario, frames: int, rng: np.random.Generator) -> Array | None:
-    """Latency of each frame (frames,) [s] of a run; None where all have the mean."""
-    timing = sensor_timing(scenario.timing.model_dump())
-    return drawn_latencies(timing, frames, rng) if timing.latency_jitter else None
 
 
 class PoseSensor(Protocol):

@@ -14,7 +14,6 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.files.dataset import POSE, shown
 from identify.filtering import SPLINE_DEGREE, padding_samples
-from identify.record.loop_setup import frame_times
 from identify.record.provenance import check_robot, recorded_scenario
 from identify.record.recording import poses
 from identify.scenario import Scenario
@@ -76,7 +75,7 @@ def _check_stated_rate(record: xr.Dataset, rate_hz: float) -> None:
 
 def check_trajectory(record: xr.Dataset, trajectory: FourierTrajectory, scenario: Scenario) -> None:
     """The record's reference must be the exciting trajectory (eq. 37) at the frames that the scenario asks for."""
-    asked = frame_times(scenario, scenario.excitation.duration_s)
+    asked = scenario.timing.frame_times(scenario.excitation.duration_s)
     if record.sizes["time"] != len(asked):
         raise EstimationError(
             f"the record has {record.sizes['time']} frames, and the scenario asks for {len(asked)} "

@@ -13,6 +13,7 @@ from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, LoopSettings, Reference, simulate
 from identify.arrays import Array
 from identify.files.dataset import check_variables
+from identify.loop_parameters import model_settings
 from identify.record.checks import (
     check_channels,
     check_good_share,
@@ -21,7 +22,6 @@ from identify.record.checks import (
     check_reference,
     checked_covariance,
 )
-from identify.record.loop_setup import model_settings
 from identify.record.payload import recorded_payload, recorded_payload_std
 from identify.record.recording import VARIABLES, poses
 from identify.scenario import Scenario

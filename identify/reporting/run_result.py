@@ -9,6 +9,7 @@ import xarray as xr
 
 from dynamics import DynamicsError
 from dynamics.closed_loop.preparation import checked_loop_parameters
+from dynamics.parameters import unit_of
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.estimation.base_parameters import Pair, correlation_matrix, strongest_pairs
@@ -16,7 +17,7 @@ from identify.estimation.covariance import PosePrediction
 from identify.estimation.identification import IdentificationResult
 from identify.experiment.truth import true_poses
 from identify.files.run_folder import AXES, rms_figures
-from identify.loop_parameters import NAMES, unit_of
+from identify.loop_parameters import NAMES
 from identify.record import recording
 
 STRONGEST = 10

@@ -21,11 +21,10 @@ from identify.scenario.sections import (
     Plant,
     Section,
     Servo,
-    Timing,
     Validation,
 )
 from identify.scenario.settings_file import built_in_names, named_text, one_line, to_toml
-from identify.scenario.timing import NAMES, by_dotted_key, check_delay, sensor_timing, timing_in_file
+from identify.scenario.timing import IN_FILE, Timing, by_dotted_key, completed
 
 BUILT_IN = Path(__file__).parent / "built_in"
 
@@ -61,7 +60,7 @@ class Scenario(Section):
     @model_validator(mode="after")
     def _fits_together(self) -> "Scenario":
         self._complete_from_the_sensor()
-        check_delay(sensor_timing(self.timing.model_dump()))
+        self.timing.check()
         self._check_filter()
         self._check_excitation_fits_the_filter()
         self._check_whole_frames("excitation.duration_s", self.excitation.duration_s)
@@ -69,26 +68,12 @@ class Scenario(Section):
         return self
 
     def _complete_from_the_sensor(self) -> None:
-        """Fill in the timing and the note that the scenario leaves to its sensor.
-
-        They do not count as set: with another sensor they are taken from that one.
-        """
-        stated = self.timing.model_fields_set
-        if stated.issuperset(NAMES) and "sensor_note" in self.model_fields_set and not self.sensor_changes:
+        """Fill in the timing and the note that the scenario leaves to its sensor."""
+        whole = self.timing.model_fields_set.issuperset(IN_FILE) and "sensor_note" in self.model_fields_set
+        if whole and not self.sensor_changes:
             return
-        in_file, note = timing_in_file(self.sensor, self.sensor_changes)
-        own = {name: getattr(self.timing, name) for name in stated}
-        for name in stated & NAMES.keys():
-            if f"timing.{NAMES[name]}" in self.sensor_changes and own[name] != in_file[name]:
-                raise ValueError(
-                    f"sensor_changes.timing.{NAMES[name]} = {in_file[name]:g} has no effect where the scenario itself "
-                    f"states timing.{name} = {own[name]:g}"
-                )
-        try:
-            timing = Timing(**(in_file | own))
-        except ValidationError as error:
-            raise ValueError(f"timing of the sensor {self.sensor!r}: {one_line(error, Timing)}") from error
-        self.__dict__["timing"] = Timing.model_construct(_fields_set=set(stated), **timing.model_dump())
+        timing, note = completed(self.timing, self.sensor, self.sensor_changes)
+        self.__dict__["timing"] = timing
         if "sensor_note" not in self.model_fields_set:
             self.__dict__["sensor_note"] = note
 

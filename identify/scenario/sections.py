@@ -69,7 +69,8 @@ FRICTION_CONSTANTS = {
 """The constants each law needs; it takes no others."""
 
 
-def _quantity(default: Any, unit: str, what: str, **limits: Any) -> Any:
+def quantity(default: Any, unit: str, what: str, **limits: Any) -> Any:
+    """A field with a unit; `limits`: as pydantic names them, such as ge and lt."""
     return Field(default, description=what, json_schema_extra={"unit": unit}, **limits)
 
 
@@ -79,43 +80,19 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-class Timing(Section):
-    """Sampling of the pose sensor and of the visual servo.
-
-    All but the hold is the sensor file's where a scenario does not state it. A measured pose is that in the middle of
-    its exposure, which is the time of its frame.
-    """
-
-    frame_rate_hz: float = _quantity(60.0, "Hz", "stereo frames a second; the servo acts once a frame", gt=0, le=2000)
-    exposure_s: float = _quantity(0.0, "s", "time in which a picture gathers light; 0 is an instant", ge=0, le=1)
-    latency_s: float = _quantity(0.0, "s", "mean delay from the middle of the exposure to the command", ge=0, le=1)
-    latency_jitter_s: float = _quantity(0.0, "s", "standard deviation of the latency between frames", ge=0, le=1)
-    dropout: float = _quantity(0.0, "1", "probability that a frame is lost on its way", ge=0, le=1)
-    hold: Literal["zero", "linear"] = Field("zero", description="joint command between two frames")
-
-    @property
-    def frame_period_s(self) -> float:
-        """Time between two frames [s]."""
-        return 1.0 / self.frame_rate_hz
-
-    def frames(self, duration_s: float) -> int:
-        """Number of frame periods in ``duration_s``."""
-        return round(duration_s * self.frame_rate_hz)
-
-
 class Servo(Section):
     """Gains of the outer visual servo (eq. 30)."""
 
-    kp: float = _quantity(0.3, "1", "proportional gain", ge=0)
-    kd: float = _quantity(0.001, "s", "derivative gain", ge=0)
-    ki: float = _quantity(2.4, "1/s", "integral gain", ge=0)
+    kp: float = quantity(0.3, "1", "proportional gain", ge=0)
+    kd: float = quantity(0.001, "s", "derivative gain", ge=0)
+    ki: float = quantity(2.4, "1/s", "integral gain", ge=0)
 
 
 class _Friction(Section):
     friction: FrictionName = Field("coulomb_viscous", description="friction law of the joints")
-    smoothing_velocity_rad_s: float | None = _quantity(None, "rad/s", "v_s of the law smoothed", gt=0)
-    static_ratio: float | None = _quantity(None, "1", "breakaway over Coulomb torque of the law stribeck", ge=1)
-    stribeck_velocity_rad_s: float | None = _quantity(None, "rad/s", "velocity at which the excess fades", gt=0)
+    smoothing_velocity_rad_s: float | None = quantity(None, "rad/s", "v_s of the law smoothed", gt=0)
+    static_ratio: float | None = quantity(None, "1", "breakaway over Coulomb torque of the law stribeck", ge=1)
+    stribeck_velocity_rad_s: float | None = quantity(None, "rad/s", "velocity at which the excess fades", gt=0)
 
     @model_validator(mode="after")
     def _constants_fit_the_law(self) -> "_Friction":
@@ -137,35 +114,35 @@ class Plant(_Friction):
     """
 
     parameters: str = Field("identified", description="named parameter set of the robot file, the truth")
-    steps_per_frame: int = _quantity(16, "1", "integration steps a frame; elastic joints take more", ge=1, le=10_000)
-    geometry_error_m: float = _quantity(
+    steps_per_frame: int = quantity(16, "1", "integration steps a frame; elastic joints take more", ge=1, le=10_000)
+    geometry_error_m: float = quantity(
         0.0, "m", "standard deviation of each coordinate of the joint centres from the robot file's", ge=0, le=1e-3
     )
-    geometry_seed: int = _quantity(0, "1", "which of the robots with such errors", ge=0)
-    joint_stiffness_N_m_rad: float | None = _quantity(
+    geometry_seed: int = quantity(0, "1", "which of the robots with such errors", ge=0)
+    joint_stiffness_N_m_rad: float | None = quantity(
         None, "N m/rad", "of a spring between motor and crank, makes the joints elastic", gt=0, le=1e6
     )
-    joint_damping_N_m_s_rad: float = _quantity(0.05, "N m s/rad", "damping of that spring", ge=0)
-    motor_inertia_kg_m2: float = _quantity(3e-4, "kg m2", "share of a crank's inertia before that spring", gt=0)
+    joint_damping_N_m_s_rad: float = quantity(0.05, "N m s/rad", "damping of that spring", ge=0)
+    motor_inertia_kg_m2: float = quantity(3e-4, "kg m2", "share of a crank's inertia before that spring", gt=0)
 
 
 class Model(_Friction):
     """The estimator's model of the robot."""
 
     start_parameters: str = Field("initial", description="named parameter set of the robot file, the starting guess")
-    steps_per_frame: int = _quantity(4, "1", "integration steps a frame", ge=1, le=10_000)
+    steps_per_frame: int = quantity(4, "1", "integration steps a frame", ge=1, le=10_000)
 
 
 class Excitation(Section):
     """The exciting trajectory (eq. 37) and its optimisation (eq. 39)."""
 
-    fundamental_hz: float = _quantity(0.1, "Hz", "fundamental frequency f0", gt=0)
-    harmonics: int = _quantity(5, "1", "number of harmonics n", ge=2, le=100)
-    duration_s: float = _quantity(20.0, "s", "length of the excitation run", gt=0, le=3600)
-    position_amplitude_m: float = _quantity(0.010, "m", "largest distance from home in x, y and z", gt=0)
-    orientation_amplitude_rad: float = _quantity(0.04, "rad", "largest angle from home in each axis", gt=0, lt=1.5)
-    travel_margin_rad: float = _quantity(0.10, "rad", "distance kept from the travel limit of the cranks", ge=0)
-    candidates: int = _quantity(
+    fundamental_hz: float = quantity(0.1, "Hz", "fundamental frequency f0", gt=0)
+    harmonics: int = quantity(5, "1", "number of harmonics n", ge=2, le=100)
+    duration_s: float = quantity(20.0, "s", "length of the excitation run", gt=0, le=3600)
+    position_amplitude_m: float = quantity(0.010, "m", "largest distance from home in x, y and z", gt=0)
+    orientation_amplitude_rad: float = quantity(0.04, "rad", "largest angle from home in each axis", gt=0, lt=1.5)
+    travel_margin_rad: float = quantity(0.10, "rad", "distance kept from the travel limit of the cranks", ge=0)
+    candidates: int = quantity(
         64, "1", "random trajectories: the best is chosen, is where a search begins, or they evolve", ge=1, le=100_000
     )
     method: Literal["random", "evolutionary", "gradient"] = Field(
@@ -174,22 +151,22 @@ class Excitation(Section):
     criterion: Literal["observability", "information"] = Field(
         "observability", description="eq. 39, or D-optimality of the output error's information"
     )
-    max_joint_velocity_rad_s: float = _quantity(2.0, "rad/s", "largest velocity of a crank", gt=0)
-    generations: int = _quantity(324, "1", "generations of the evolutionary method (the paper: 324)", ge=1, le=100_000)
+    max_joint_velocity_rad_s: float = quantity(2.0, "rad/s", "largest velocity of a crank", gt=0)
+    generations: int = quantity(324, "1", "generations of the evolutionary method (the paper: 324)", ge=1, le=100_000)
 
 
 class Filter(Section):
     """Zero-phase Butterworth filter of the measured poses."""
 
-    order: int = _quantity(8, "1", "order of the filter, applied forward and reverse", ge=1, le=20)
-    cutoff_hz: float = _quantity(10.0, "Hz", "cutoff frequency", gt=0)
+    order: int = quantity(8, "1", "order of the filter, applied forward and reverse", ge=1, le=20)
+    cutoff_hz: float = quantity(10.0, "Hz", "cutoff frequency", gt=0)
 
 
 class PriorValue(Section):
     """What is known of a parameter before the experiment, in its SI unit."""
 
-    value: float = _quantity(..., "SI", "expected value", ge=0)
-    std: float = _quantity(..., "SI", "its standard deviation", gt=0)
+    value: float = quantity(..., "SI", "expected value", ge=0)
+    std: float = quantity(..., "SI", "its standard deviation", gt=0)
 
 
 class Identification(Section):
@@ -201,18 +178,18 @@ class Identification(Section):
     scale_anchor: Literal["platform_mass", "joint_gain", "payload", "prior"] = Field(
         "platform_mass", description="what fixes the overall scale of the parameters; payload records a second run"
     )
-    anchor_std: float | None = _quantity(None, "unit of the anchor", "standard deviation of the anchor", gt=0)
-    start_std: float = _quantity(1.0, "1", "standard deviation of the starting guess, relative to each value", gt=0)
+    anchor_std: float | None = quantity(None, "unit of the anchor", "standard deviation of the anchor", gt=0)
+    start_std: float = quantity(1.0, "1", "standard deviation of the starting guess, relative to each value", gt=0)
     prior: dict[str, PriorValue] = Field(
         {}, description="parameters known better than the starting guess: { name = { value, std } }"
     )
     physical_consistency: bool = Field(
         False, description="only masses and moments of inertia that a rigid body can have (the paper's have others)"
     )
-    max_iterations: int = _quantity(30, "1", "iterations at most", ge=1, le=1000)
-    cost_tolerance: float = _quantity(1e-6, "1", "tol1 of eq. 35, relative change of the cost", gt=0, lt=1)
-    parameter_tolerance: float = _quantity(1e-3, "1", "tol2 of eq. 35, relative change of a parameter", gt=0, lt=1)
-    qr_threshold: float = _quantity(1e-3, "1", "entries of R below it count as zero in base_rank (section 4.2)", gt=0)
+    max_iterations: int = quantity(30, "1", "iterations at most", ge=1, le=1000)
+    cost_tolerance: float = quantity(1e-6, "1", "tol1 of eq. 35, relative change of the cost", gt=0, lt=1)
+    parameter_tolerance: float = quantity(1e-3, "1", "tol2 of eq. 35, relative change of a parameter", gt=0, lt=1)
+    qr_threshold: float = quantity(1e-3, "1", "entries of R below it count as zero in base_rank (section 4.2)", gt=0)
 
     @field_validator("prior", mode="before")
     @classmethod
@@ -240,14 +217,14 @@ class Payload(Section):
     state how well it is known: intervals allow for it, and a synthetic experiment draws its true load accordingly.
     """
 
-    mass_kg: float = _quantity(8.0, "kg", "mass, its centre in the origin of the platform frame", gt=0)
-    Ixx_kg_m2: float = _quantity(0.02, "kg m2", "moment of inertia about the platform's x axis", ge=0)
-    Iyy_kg_m2: float = _quantity(0.02, "kg m2", "moment of inertia about the platform's y axis", ge=0)
-    Izz_kg_m2: float = _quantity(0.04, "kg m2", "moment of inertia about the platform's z axis", ge=0)
-    mass_std_kg: float = _quantity(0.0, "kg", "standard deviation of the mass, as weighed; 0: exactly known", ge=0)
-    Ixx_std_kg_m2: float = _quantity(0.0, "kg m2", "standard deviation of Ixx_kg_m2", ge=0)
-    Iyy_std_kg_m2: float = _quantity(0.0, "kg m2", "standard deviation of Iyy_kg_m2", ge=0)
-    Izz_std_kg_m2: float = _quantity(0.0, "kg m2", "standard deviation of Izz_kg_m2", ge=0)
+    mass_kg: float = quantity(8.0, "kg", "mass, its centre in the origin of the platform frame", gt=0)
+    Ixx_kg_m2: float = quantity(0.02, "kg m2", "moment of inertia about the platform's x axis", ge=0)
+    Iyy_kg_m2: float = quantity(0.02, "kg m2", "moment of inertia about the platform's y axis", ge=0)
+    Izz_kg_m2: float = quantity(0.04, "kg m2", "moment of inertia about the platform's z axis", ge=0)
+    mass_std_kg: float = quantity(0.0, "kg", "standard deviation of the mass, as weighed; 0: exactly known", ge=0)
+    Ixx_std_kg_m2: float = quantity(0.0, "kg m2", "standard deviation of Ixx_kg_m2", ge=0)
+    Iyy_std_kg_m2: float = quantity(0.0, "kg m2", "standard deviation of Iyy_kg_m2", ge=0)
+    Izz_std_kg_m2: float = quantity(0.0, "kg m2", "standard deviation of Izz_kg_m2", ge=0)
 
     @model_validator(mode="after")
     def _can_exist(self) -> "Payload":
@@ -265,5 +242,5 @@ class Payload(Section):
 class Validation(Section):
     """Unseen trajectories on which the identified model is judged."""
 
-    count: int = _quantity(10, "1", "number of unseen trajectories", ge=1, le=1000)
-    duration_s: float = _quantity(10.0, "s", "length of each", gt=0, le=3600)
+    count: int = quantity(10, "1", "number of unseen trajectories", ge=1, le=1000)
+    duration_s: float = quantity(10.0, "s", "length of each", gt=0, le=3600)

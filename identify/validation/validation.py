@@ -13,19 +13,19 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 import cmmsim
-from dynamics import Robot, load_robot
+from dynamics import Robot
 from dynamics.closed_loop import LoopFailure, Reference, simulate
 from dynamics.closed_loop.preparation import checked_loop_parameters
 from identify.arrays import Array
 from identify.estimation.covariance import PosePrediction, predict_poses
 from identify.excitation.design import unseen_trajectories
-from identify.experiment.plant import simulate_plant
-from identify.experiment.run import Experiment, run_plant, true_parameters
+from identify.experiment.plant import build_plant
+from identify.experiment.run import Experiment, run_plant
 from identify.experiment.sensor_in_loop import make_sensor
+from identify.loop_parameters import model_settings
 from identify.progress import Advance, Progress
 from identify.random_streams import PREDICTION, stream_seed
 from identify.record.checks import TooFewFramesError
-from identify.record.loop_setup import frame_times, model_settings, reference_motion
 from identify.record.recorded_run import watched_run
 from identify.runtime import cores
 from identify.scenario import Scenario
@@ -57,7 +57,7 @@ def run_unseen(
     """
     runs, workers = PlantRuns(scenario, seed, taught), workers or cores()
     numbers = range(1, len(trajectories) + 1)
-    frames = len(frame_times(scenario, scenario.validation.duration_s)) * len(trajectories)
+    frames = scenario.timing.frames(scenario.validation.duration_s) * len(trajectories)
     with progress.stage("validate", frames) as advance:
         if workers == 1 or len(trajectories) == 1:
             worker = _Worker(runs)
@@ -115,17 +115,16 @@ def predicted_runs(
 
 
 class _Worker:
-    """One process's robot and sensor; the renderer lives as long as the process."""
+    """One process's plant and sensor; the renderer lives as long as the process."""
 
     def __init__(self, runs: PlantRuns) -> None:
         self._runs = runs
-        self._robot = load_robot(runs.scenario.robot)
-        self._sensor = make_sensor(runs.scenario, self._robot, runs.seed, runs.taught)
+        self._plant = build_plant(runs.scenario)
+        self._sensor = make_sensor(runs.scenario, self._plant.nominal, runs.seed, runs.taught)
 
     def run(self, number: int, trajectory: FourierTrajectory, advance: Advance) -> Experiment:
-        scenario = self._runs.scenario
-        times = frame_times(scenario, scenario.validation.duration_s)
-        return run_plant(scenario, self._robot, self._sensor, trajectory, times, self._runs.seed, number, advance)
+        duration_s = self._runs.scenario.validation.duration_s
+        return run_plant(self._plant, self._sensor, trajectory, duration_s, self._runs.seed, number, advance)
 
 
 _worker: _Worker
@@ -181,9 +180,8 @@ def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed:
         dynamics.DynamicsError: parameters of another shape, not finite, or outside their range.
         TrajectoryError: no unseen trajectory keeps the robot's limits.
     """
-    values, true = checked_loop_parameters(parameters), true_parameters(robot, scenario)
-    times = frame_times(scenario, scenario.validation.duration_s)
-    references = [reference_motion(path, times) for path in unseen_trajectories(robot, scenario, seed)]
-    plant = [simulate_plant(scenario, robot, true, reference).pose for reference in references]
+    values, plant = checked_loop_parameters(parameters), build_plant(scenario, robot)
+    times = scenario.timing.frame_times(scenario.validation.duration_s)
+    references = [path.reference(times) for path in unseen_trajectories(robot, scenario, seed)]
     model = [model_run(robot, scenario, values, reference) for reference in references]
-    return np.array(model) - np.array(plant)
+    return np.array(model) - np.array([plant.run(reference).pose for reference in references])

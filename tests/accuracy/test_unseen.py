@@ -8,7 +8,7 @@ import identify
 from dynamics.closed_loop import LoopFailure, simulate
 from dynamics.errors import DynamicsError
 from identify.excitation.design import design_trajectories
-from identify.record.loop_setup import frame_times, model_settings, reference_motion
+from identify.loop_parameters import model_settings
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def test_wrong_parameters_err_as_two_runs_of_the_loop_differ(scenario, robot):
     wrong[52:58] = 0.0
     errors = identify.unseen_errors(wrong, robot, scenario, seed=3)
     path = design_trajectories(robot, scenario, 3).validation[1]
-    reference = reference_motion(path, frame_times(scenario, 1.0))
+    reference = path.reference(scenario.timing.frame_times(1.0))
     settings = model_settings(scenario)
     runs = [simulate(robot, p, reference, settings).pose for p in (wrong, robot.parameter_sets["identified"].vector)]
     assert np.abs(errors[1]).max() > 1e-5
@@ -46,7 +46,7 @@ def test_wrong_parameters_err_as_two_runs_of_the_loop_differ(scenario, robot):
 def test_an_unstable_model_has_no_error(scenario, robot):
     unstable = robot.parameter_sets["initial"].vector.copy()
     unstable[64:67] = [0.1, 500.0, 0.0]
-    reference = reference_motion(design_trajectories(robot, scenario, 0).validation[0], frame_times(scenario, 1.0))
+    reference = design_trajectories(robot, scenario, 0).validation[0].reference(scenario.timing.frame_times(1.0))
     with pytest.raises(LoopFailure):
         simulate(robot, unstable, reference, model_settings(scenario))
     assert np.isnan(identify.unseen_errors(unstable, robot, scenario)).all()

@@ -10,7 +10,6 @@ import cmmsim
 from cmmsim.acceptance import SensorUnderTest, common_volume, latency_test
 from cmmsim.files.schema import Timing
 from cmmsim.files.sensor_file import read_sensor_file, sensor_text
-from cmmsim.latency import drawn_latencies, largest_latency
 from cmmsim.pose_estimation.estimator import PoseEstimator, lost_measurement
 from cmmsim.tracker import Tracker
 
@@ -92,10 +91,10 @@ def test_contradictions_in_the_timing_are_refused(tmp_path, entry, message):
 def test_latencies_are_a_clipped_normal_distribution(jitter):
     """Against SciPy's distribution function, and its mass at the two clips."""
     timing = Timing(frame_rate=60.0, latency=0.020, latency_jitter=jitter)
-    drawn = drawn_latencies(timing, 20_000, np.random.default_rng(1))
+    drawn = timing.drawn_latencies(20_000, np.random.default_rng(1))
     widest = min(3 * jitter, 0.020)
     assert (drawn.min(), drawn.max()) == (0.020 - widest, 0.020 + widest)
-    assert drawn.max() == largest_latency(timing)
+    assert drawn.max() == timing.largest_latency
     inside = drawn[np.abs(drawn - 0.020) < widest]
     ends = widest / jitter
     assert stats.kstest(inside, stats.truncnorm(-ends, ends, 0.020, jitter).cdf).pvalue > 0.001
@@ -105,7 +104,7 @@ def test_latencies_are_a_clipped_normal_distribution(jitter):
 
 
 def test_without_jitter_every_latency_is_the_stated_one():
-    drawn = drawn_latencies(Timing(frame_rate=60.0, latency=0.020), 50, np.random.default_rng(1))
+    drawn = Timing(frame_rate=60.0, latency=0.020).drawn_latencies(50, np.random.default_rng(1))
     assert np.array_equal(drawn, np.full(50, 0.020))
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from identify.estimation.identification import identify
 from identify.excitation import design_trajectories
+from identify.experiment.plant import build_plant
 from identify.experiment.run import excitation_run, taught_sensor
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
@@ -52,7 +53,7 @@ def _block(scenario, trajectory, numbers: list[int]) -> list[dict]:
 
 
 def _row(scenario, trajectory, sensor, number: int) -> dict:
-    record = excitation_run(scenario, rss6(), sensor, trajectory, number).record
+    record = excitation_run(build_plant(scenario, rss6()), sensor, trajectory, number).record
     return row_of(number, identify(record, rss6(), scenario))
 
 

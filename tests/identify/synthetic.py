@@ -1,13 +1,13 @@
 """Records of the reference robot with drawn measurement noise instead of images: fast, and with known statistics."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
 from dynamics import Robot, load_robot
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
-from identify.experiment.plant import simulate_plant
-from identify.record.loop_setup import frame_times, reference_motion
+from identify.experiment.plant import build_plant
 from identify.record.recording import build_record
 from identify.scenario import load_scenario
 from identify.trajectory import random_trajectory
@@ -34,15 +34,16 @@ def run_plant(scenario, seed, sigma=SIGMA, lost=(), parameters=None, duration_s=
     size: of the motion, as a share of the usual box.
     """
     rng = np.random.default_rng(seed)
-    parameters = truth() if parameters is None else parameters
-    times = frame_times(scenario, duration_s)
-    reference = reference_motion(trajectory(trajectory_seed, size), times)
+    plant = build_plant(scenario, rss6())
+    plant = plant if parameters is None else replace(plant, parameters=parameters)
+    times = scenario.timing.frame_times(duration_s)
+    reference = trajectory(trajectory_seed, size).reference(times)
 
     def sensor(frame, t, pose):
         noise = sigma * rng.standard_normal(6)
         return None if frame in lost else pose + noise
 
-    run = simulate_plant(scenario, rss6(), parameters, reference, sensor)
+    run = plant.run(reference, sensor)
     covariance = np.broadcast_to(np.diag(np.maximum(sigma, 1e-9) ** 2), (len(times), 6, 6)).copy()
     covariance[~run.measured_ok] = np.nan
     record = build_record(
@@ -58,7 +59,7 @@ def run_plant(scenario, seed, sigma=SIGMA, lost=(), parameters=None, duration_s=
         seed=seed,
         frame_rate_hz=scenario.timing.frame_rate_hz,
     )
-    store_anchor(record, ScaleAnchor("platform_mass", parameters[0], 0.005))
+    store_anchor(record, ScaleAnchor("platform_mass", plant.parameters[0], 0.005))
     return record, run
 
 

@@ -9,9 +9,8 @@ from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identification import identify, output_error_problem
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor, store_anchor
 from identify.estimation.warm_start import linear_warm_start, regression_columns
-from identify.experiment.plant import scenario_payload
-from identify.loop_parameters import NAMES, starting_guess
-from identify.record.loop_setup import model_settings, plant_settings
+from identify.experiment.plant import build_plant, drawn_load
+from identify.loop_parameters import NAMES, model_settings, starting_guess
 from identify.record.payload import store_payload
 from identify.record.recorded_run import recorded_run
 from identify.scenario import load_scenario
@@ -44,7 +43,7 @@ def test_warm_start_equation_holds_for_the_true_parameters(scenario):
     parameters[52:58] = 0
     _, run = run_plant(scenario, 0, np.zeros(6), parameters=parameters)
     columns = regression_columns(rss6(), run.pose, run.command, scenario.timing, scenario.filter)
-    start = equilibrium(rss6(), parameters, run.pose[0], plant_settings(scenario).servo)
+    start = equilibrium(rss6(), parameters, run.pose[0], build_plant(scenario, rss6()).settings.servo)
     unknowns = np.concatenate([parameters, start.joint_integral * parameters[65]])
     balance = columns @ unknowns
     assert np.sqrt(np.mean(balance**2)) < 1e-3 * np.sqrt(np.mean((columns[:, 64:67] @ parameters[64:]) ** 2))
@@ -213,7 +212,7 @@ def test_simulate_agrees_with_the_model_of_the_problem(scenario):
 
 def loaded(scenario, seed):
     """A record of the bare robot, and one with the scenario's known load on the platform."""
-    load, duration = scenario_payload(scenario), scenario.excitation.duration_s
+    load, duration = drawn_load(scenario, np.random.default_rng(0)).stated, scenario.excitation.duration_s
     bare, _ = run_plant(scenario, seed=seed, duration_s=duration)
     heavy, _ = run_plant(scenario, seed=seed + 1000, parameters=truth() + load, duration_s=duration)
     for record in (bare, heavy):

@@ -17,8 +17,7 @@ from identify.excitation.information import (
 )
 from identify.excitation.motion import played_times, sample_times, unknowns
 from identify.excitation.observability import SMOOTHING_RAD_S, log_index, log_observability
-from identify.loop_parameters import NAMES, index_of
-from identify.record.loop_setup import frame_times, model_settings, reference_motion
+from identify.loop_parameters import NAMES, index_of, model_settings
 from identify.scenario import load_scenario
 from identify.trajectory import random_trajectory
 
@@ -142,7 +141,7 @@ def test_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
     run = simulate(
         robot,
         parameters,
-        reference_motion(trajectory, frame_times(scenario, 20.0)),
+        trajectory.reference(scenario.timing.frame_times(20.0)),
         model_settings(scenario),
         sensitivities=True,
     )
@@ -178,7 +177,7 @@ def test_information_is_the_determinant_of_rows_and_prior(robot, known, prior):
     run = simulate(
         robot,
         values,
-        reference_motion(trajectory, frame_times(SCENARIO, 10.0)),
+        trajectory.reference(SCENARIO.timing.frame_times(10.0)),
         model_settings(SCENARIO),
         sensitivities=True,
     )

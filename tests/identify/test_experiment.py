@@ -13,11 +13,11 @@ import cmmsim
 from cmmsim.pose_estimation.estimator import lost_measurement
 from dynamics import load_robot
 from identify.errors import TrajectoryError
+from identify.experiment.plant import build_plant
 from identify.experiment.run import run_experiment, run_plant, taught_sensor
 from identify.experiment.sensor_in_loop import SensorInLoop, robot_transforms
 from identify.experiment.truth import read_truth, true_poses
 from identify.progress import SilentProgress
-from identify.record.loop_setup import frame_times
 from identify.record.recording import poses
 from identify.trajectory import random_trajectory
 from tests.identify.synthetic import quick, rss6, trajectory
@@ -52,8 +52,7 @@ def test_rods_join_the_robots_joints():
 
 
 def test_the_measured_pose_is_the_true_one_to_the_sensors_accuracy(scenario, sensor):
-    times = frame_times(scenario, 1.0)
-    experiment = run_plant(scenario, rss6(), sensor, trajectory(3), times, 0, 0)
+    experiment = run_plant(build_plant(scenario, rss6()), sensor, trajectory(3), 1.0, 0, 0)
     errors = poses(experiment.record, "measured") - true_poses(experiment.truth)
     rms = np.sqrt(np.mean(errors**2, axis=0))
     assert experiment.record["measured_ok"].values.all()
@@ -63,9 +62,8 @@ def test_the_measured_pose_is_the_true_one_to_the_sensors_accuracy(scenario, sen
 
 
 def test_the_same_seed_gives_the_same_record_and_another_does_not(scenario, sensor):
-    times = frame_times(scenario, 0.2)
     one, two, other = (
-        poses(run_plant(scenario, rss6(), sensor, trajectory(3), times, seed, 0).record, "measured")
+        poses(run_plant(build_plant(scenario, rss6()), sensor, trajectory(3), 0.2, seed, 0).record, "measured")
         for seed in (4, 4, 5)
     )
     assert np.array_equal(one, two)
@@ -74,9 +72,8 @@ def test_the_same_seed_gives_the_same_record_and_another_does_not(scenario, sens
 
 def test_a_lost_frame_is_counted_holds_the_command_and_does_not_end_the_run(scenario, sensor):
     """A plate in front of the platform for five frames: lost, then found again."""
-    times = frame_times(scenario, 0.5)
     blind = _blinded(sensor, frames=range(10, 15))
-    experiment = run_plant(scenario, rss6(), blind, trajectory(3), times, 0, 0)
+    experiment = run_plant(build_plant(scenario, rss6()), blind, trajectory(3), 0.5, 0, 0)
     record = experiment.record
     assert list(np.flatnonzero(record["measured_ok"].values == 0)) == [10, 11, 12, 13, 14]
     assert np.isnan(poses(record, "measured")[10:15]).all()
@@ -119,7 +116,7 @@ def test_run_experiment_returns_what_it_writes(scenario, tmp_path):
 def test_a_trajectory_beyond_the_travel_is_refused_before_the_run(scenario, sensor):
     wild = random_trajectory(np.random.default_rng(0), rss6().home_pose, 0.1, 5, 0.02, 0.08)
     with pytest.raises(TrajectoryError, match=r"crank \d|leg \d"):
-        run_plant(scenario, rss6(), sensor, wild, frame_times(scenario, 10.0), 0, 0)
+        run_plant(build_plant(scenario, rss6()), sensor, wild, 10.0, 0, 0)
 
 
 def test_sensor_in_loop_passes_obstacles_and_keeps_covariances(sensor):

@@ -13,7 +13,7 @@ from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identification import identify, output_error_problem
 from identify.estimation.output_error_search import search
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
-from identify.experiment.plant import drawn_load, scenario_payload, scenario_payload_std
+from identify.experiment.plant import build_plant, drawn_load
 from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses
 from identify.loop_parameters import NAMES, index_of
@@ -37,12 +37,18 @@ def scenario():
 @pytest.fixture(scope="module")
 def records(scenario):
     """A bare record, and one under the scenario's load, as stated."""
-    load = scenario_payload(scenario)
+    load, std = stated_load(scenario)
     bare, _ = run_plant(scenario, seed=1, duration_s=3.0)
     heavy, _ = run_plant(scenario, seed=2, parameters=truth() + load, duration_s=3.0)
     store_anchor(bare, ScaleAnchor("payload"))
-    store_payload(heavy, load, scenario_payload_std(scenario))
+    store_payload(heavy, load, std)
     return [bare, heavy]
+
+
+def stated_load(scenario):
+    """What the scenario's load adds to the parameters (67,), and its standard deviations (67,)."""
+    load = drawn_load(scenario, np.random.default_rng(0))
+    return load.stated, load.std
 
 
 def stating(records, scenario, load, std=None):
@@ -59,7 +65,7 @@ def covariance(problem, parameters):
 @pytest.fixture(scope="module")
 def moved(records, scenario):
     """Where the optimum lies (67,), and how far it moves where the load is stated a standard deviation too heavy."""
-    load, std = scenario_payload(scenario), scenario_payload_std(scenario)
+    load, std = stated_load(scenario)
     heavier, lighter = (
         search(stating(records, scenario, load + sign * std), truth(), scenario, lambda n=1: None).parameters
         for sign in (1, -1)
@@ -70,7 +76,7 @@ def moved(records, scenario):
 def test_the_intervals_allow_for_how_far_a_wrong_load_moves_the_estimate(records, scenario, moved):
     """Covariance of friction and gains, with all their correlations; all members of the scale move together."""
     at, shift = moved
-    load, std = scenario_payload(scenario), scenario_payload_std(scenario)
+    load, std = stated_load(scenario)
     known, weighed = (covariance(stating(records, scenario, load, one), at) for one in (None, std))
     added, expected = (weighed - known)[np.ix_(JOINTS, JOINTS)], np.outer(shift[JOINTS], shift[JOINTS])
     assert np.abs(added - expected).max() < 0.02 * np.abs(expected).max()
@@ -81,7 +87,7 @@ def test_a_gain_errs_as_the_load_does(records, scenario, moved):
     """The load alone shows the scale: its relative error is that of the gain, beside what noise leaves."""
     at, shift = moved
     assert shift[GAIN] / truth()[GAIN] == pytest.approx(SHARE, rel=0.05)
-    load, std = scenario_payload(scenario), scenario_payload_std(scenario)
+    load, std = stated_load(scenario)
     relative = [
         np.sqrt(covariance(stating(records, scenario, load, deviation), at)[GAIN, GAIN]) / truth()[GAIN]
         for deviation in (np.zeros(67), std)
@@ -92,7 +98,7 @@ def test_a_gain_errs_as_the_load_does(records, scenario, moved):
 
 def test_records_under_the_same_load_share_its_error_and_others_do_not(records, scenario):
     """A second record under the load repeats its error; under another load, known as well, the errors average."""
-    load, std = scenario_payload(scenario), scenario_payload_std(scenario)
+    load, std = stated_load(scenario)
 
     def added(other, deviation):
         again, second = (records[1].copy() for _ in range(2))
@@ -109,13 +115,13 @@ def test_records_under_the_same_load_share_its_error_and_others_do_not(records, 
 def test_an_exactly_known_load_leaves_every_digit_as_it_was(records, scenario):
     """Stated with a deviation of zero, or with none, as records of before have it."""
     silent = records[1].copy()
-    store_payload(silent, scenario_payload(scenario))
+    store_payload(silent, stated_load(scenario)[0])
     stated = covariance(output_error_problem([records[0], silent], rss6(), scenario).driven_by_commands(), truth())
     silent.attrs = {name: value for name, value in silent.attrs.items() if not name.endswith("_std")}
     unsaid = output_error_problem([records[0], silent], rss6(), scenario).driven_by_commands()
     assert np.array_equal(covariance(unsaid, truth()), stated)
     exact = drawn_load(quick(), np.random.default_rng(0))
-    assert np.array_equal(exact.true, scenario_payload(quick()))
+    assert np.array_equal(exact.true, exact.stated)
     assert not exact.std.any()
 
 
@@ -168,7 +174,7 @@ def test_an_experiment_states_the_load_and_keeps_the_drawn_one_in_its_truth(scen
     vague, exact = scenario.with_overrides(short), scenario.with_overrides(short | {"payload.mass_std_kg": 0.0})
 
     def run(one, seed=0, payload=True):
-        return excitation_run(one, rss6(), sensor, trajectory(0), seed, payload=payload)
+        return excitation_run(build_plant(one, rss6()), sensor, trajectory(0), seed, payload=payload)
 
     heavy, known = run(vague), run(exact)
     assert heavy.record.attrs["payload_mass"] == known.record.attrs["payload_mass"] == 8.0
@@ -191,10 +197,11 @@ def test_gains_miss_the_truth_as_often_as_they_say_where_the_load_is_drawn(scena
     sensor, count = DrawnSensor(np.diag(SIGMA**2)), 10
     weighed = scenario.with_overrides({"payload.mass_std_kg": 0.08, "identification.scale_anchor": "payload"})
 
+    plant = build_plant(weighed, rss6())
+
     def identified(seed, **attributes):
         bare, heavy = (
-            excitation_run(weighed, rss6(), sensor, trajectory(0), seed, payload=payload).record
-            for payload in (False, True)
+            excitation_run(plant, sensor, trajectory(0), seed, payload=payload).record for payload in (False, True)
         )
         return identify([bare, heavy.assign_attrs(attributes)], rss6(), weighed)
 

@@ -16,9 +16,9 @@ from identify.estimation.explanation import SUSPICIOUS
 from identify.estimation.identification import identify
 from identify.experiment import run as experiment
 from identify.experiment.joint_instruments import JointInstruments, measure_joints
-from identify.experiment.plant import check_plant, plant_robot, simulate_plant
+from identify.experiment.plant import build_plant
 from identify.experiment.truth import check_truth, true_poses
-from identify.record.loop_setup import frame_times, model_settings, plant_settings, reference_motion
+from identify.loop_parameters import model_settings
 from identify.scenario import scenario_from_toml
 from identify.validation.validation import unseen_errors
 from tests.identify.synthetic import quick, rss6, run_plant, trajectory, truth
@@ -48,10 +48,11 @@ def _short(**overrides):
 
 def test_without_a_switch_the_plant_is_the_nominal_robot_bit_by_bit():
     scenario = _short()
-    assert plant_robot(scenario, rss6()) is rss6()
-    reference = reference_motion(trajectory(0), frame_times(scenario, 0.5))
-    ours = simulate_plant(scenario, rss6(), truth(), reference)
-    plain = simulate(rss6(), truth(), reference, plant_settings(scenario))
+    plant = build_plant(scenario, rss6())
+    assert plant.robot is rss6()
+    reference = trajectory(0).reference(scenario.timing.frame_times(0.5))
+    ours = plant.run(reference)
+    plain = simulate(rss6(), truth(), reference, plant.settings)
     np.testing.assert_array_equal(ours.pose, plain.pose)
     np.testing.assert_array_equal(ours.command, plain.command)
 
@@ -59,7 +60,7 @@ def test_without_a_switch_the_plant_is_the_nominal_robot_bit_by_bit():
 def test_the_model_knows_of_none_of_the_switches():
     switched = quick(**ELASTIC, **MISPLACED, **STRIBECK)
     assert model_settings(switched) == model_settings(quick())
-    assert plant_settings(switched).elasticity.stiffness == 1000.0
+    assert build_plant(switched).settings.elasticity.stiffness == 1000.0
 
 
 def test_the_switches_stand_in_the_resolved_scenario_with_their_units():
@@ -89,13 +90,13 @@ def test_impossible_plants_are_refused_in_the_scenario(override, evidence):
 
 def test_motors_heavier_than_their_cranks_are_refused_before_a_run():
     with pytest.raises(SimulationError, match="of crank 2 about its axis"):
-        check_plant(quick(**ELASTIC, **{"plant.motor_inertia_kg_m2": 1e-3}), rss6(), truth())
+        build_plant(quick(**ELASTIC, **{"plant.motor_inertia_kg_m2": 1e-3}), rss6()).check()
 
 
 def test_the_truth_holds_true_poses_motors_and_switches_and_the_encoders_read_the_motors():
     """Crank angles are those of the poses that the sensor was shown; motors are ahead by torque over stiffness."""
     scenario, sensor = _short(**ELASTIC), PerfectSensor()
-    run = experiment.run_plant(scenario, rss6(), sensor, trajectory(3), frame_times(scenario, 0.5), 0, 0)
+    run = experiment.run_plant(build_plant(scenario, rss6()), sensor, trajectory(3), 0.5, 0, 0)
     np.testing.assert_array_equal(true_poses(run.truth), sensor.poses)
     cranks, motors = run.truth["joint_angle"].values, run.truth["motor_angle"].values
     np.testing.assert_allclose(cranks, rss6().inverse_kinematics(np.array(sensor.poses)), atol=1e-15)
@@ -122,15 +123,15 @@ def test_unseen_trajectories_are_run_by_the_elastic_plant():
 def test_the_truth_holds_the_joint_errors_of_the_plant():
     scenario = _short(**MISPLACED)
     sensor = PerfectSensor()
-    run = experiment.run_plant(scenario, rss6(), sensor, trajectory(3), frame_times(scenario, 0.5), 0, 0)
-    plant = plant_robot(scenario, rss6())
+    run = experiment.run_plant(build_plant(scenario, rss6()), sensor, trajectory(3), 0.5, 0, 0)
+    plant = build_plant(scenario, rss6()).robot
     errors = plant.geometry.base_joints - rss6().geometry.base_joints
     np.testing.assert_array_equal(run.truth["base_joint_error"].values, errors)
     assert 0.5e-4 < errors.std() < 2e-4
     np.testing.assert_array_equal(run.truth["joint_angle"].values, plant.inverse_kinematics(np.array(sensor.poses)))
-    assert plant_robot(scenario, rss6()).geometry == plant.geometry
+    assert build_plant(scenario, rss6()).robot.geometry == plant.geometry
     other = scenario.with_overrides({"plant.geometry_seed": 1})
-    assert plant_robot(other, rss6()).geometry != plant.geometry
+    assert build_plant(other, rss6()).robot.geometry != plant.geometry
 
 
 def _identified(**switch):

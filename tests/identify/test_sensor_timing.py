@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from cmmsim.files.sensor_file import read_sensor_file
+from identify.experiment.plant import build_plant
 from identify.experiment.run import run_plant, taught_sensor
-from identify.experiment.sensor_in_loop import SensorInLoop, frame_latencies, make_sensor
+from identify.experiment.sensor_in_loop import SensorInLoop, make_sensor
 from identify.experiment.truth import true_poses
+from identify.loop_parameters import model_settings
 from identify.progress import SilentProgress
-from identify.record.loop_setup import frame_times, model_settings
 from identify.record.recording import poses
 from identify.trajectory import random_trajectory
 from tests.identify.synthetic import quick, rss6, trajectory
@@ -28,8 +29,7 @@ def record_of(taught):
     def make(seed=0, path=None, **timing):
         scenario = quick(**ANALYTIC, **{f"timing.{key}": value for key, value in timing.items()})
         sensor = make_sensor(scenario, rss6(), 0, taught)
-        times = frame_times(scenario, 0.5)
-        return run_plant(scenario, rss6(), sensor, path or trajectory(3), times, seed, 0)
+        return run_plant(build_plant(scenario, rss6()), sensor, path or trajectory(3), 0.5, seed, 0)
 
     return make
 
@@ -53,10 +53,10 @@ def test_jitter_changes_the_run_and_follows_the_seed(record_of):
 
 def test_latencies_are_drawn_only_where_there_is_jitter_and_the_model_knows_the_mean():
     scenario = quick(**{"timing.latency_s": 0.01, "timing.latency_jitter_s": 0.002})
-    drawn = frame_latencies(scenario, 400, np.random.default_rng(0))
+    drawn = scenario.timing.drawn_latencies(400, np.random.default_rng(0))
     assert drawn.std() == pytest.approx(0.002, rel=0.15)
     assert model_settings(scenario).timing.latency_s == 0.01
-    assert frame_latencies(quick(**{"timing.latency_s": 0.01}), 400, np.random.default_rng(0)) is None
+    assert quick(**{"timing.latency_s": 0.01}).timing.drawn_latencies(400, np.random.default_rng(0)) is None
 
 
 def test_dropped_frames_are_lost_by_name_and_the_loop_goes_on(record_of):

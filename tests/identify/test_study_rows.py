@@ -11,7 +11,7 @@ from cmmsim.teaching import exactly_taught
 from dynamics import load_robot
 from dynamics.closed_loop import Reference
 from identify.errors import EstimationError, ScenarioError
-from identify.experiment.run import true_parameters
+from identify.experiment.plant import build_plant
 from identify.scenario import load_scenario
 from identify.studies.rows import kinds as rows
 from identify.studies.rows import sensor as row_sensor
@@ -208,7 +208,7 @@ def test_covariance_of_one_known_error_states_what_that_error_makes_of_the_predi
     poses = np.tile(robot.home_pose, (60, 1))
     poses[:, :3] += 0.002 * np.sin(np.arange(60)[:, None] / np.array([5.0, 7.0, 9.0]))
     references = [Reference(poses, np.gradient(poses, settings.timing.frame_period_s, axis=0))]
-    truth = true_parameters(robot, settings)
+    truth = build_plant(settings, robot).parameters
     error = 1e-4 * truth * np.random.default_rng(0).normal(size=len(truth))
     estimated = truth + error, np.outer(error, error)
     found = prediction_figures(robot, settings, estimated, truth, references)

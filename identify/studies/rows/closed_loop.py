@@ -13,12 +13,12 @@ from cmmsim.teaching import exactly_taught
 from dynamics import load_robot
 from identify.errors import EstimationError
 from identify.excitation.design import admissible_trajectories, motion_check
+from identify.experiment.plant import build_plant
 from identify.experiment.run import run_plant
-from identify.experiment.sensor_in_loop import make_sensor
+from identify.experiment.sensor_in_loop import make_sensor, sensor_file
 from identify.experiment.truth import true_poses
 from identify.random_streams import stream_seed
 from identify.record import recording
-from identify.record.loop_setup import frame_times
 from identify.scenario import Scenario
 from identify.studies.rows.columns import (
     NOISE_OFF,
@@ -33,7 +33,7 @@ from identify.studies.rows.columns import (
     pose_figures,
     rms_um,
 )
-from identify.studies.rows.sensor import Teaching, sensor_file
+from identify.studies.rows.sensor import Teaching
 
 EXPERIMENT, TRAJECTORY = 0, 1
 
@@ -96,7 +96,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoo
     drawn = np.random.SeedSequence(stream_seed(seed, TRAJECTORY))
     check = motion_check(robot, scenario)
     trajectory = admissible_trajectories(robot, scenario.excitation, duration, 1, drawn, check)[0]
-    run = run_plant(scenario, robot, sensor, trajectory, frame_times(scenario, duration), number, 1)
+    run = run_plant(build_plant(scenario, robot), sensor, trajectory, duration, number, 1)
     ok = run.record["measured_ok"].values.astype(bool)
     if not ok.any():
         raise EstimationError(f"no frame of {len(ok)} was measured, the first: {run.record.attrs['lost_frames']}")

@@ -13,7 +13,7 @@ from identify.arrays import Array
 from identify.errors import ScenarioError
 from identify.scenario import Scenario
 from identify.scenario.settings_file import one_line
-from identify.scenario.timing import NAMES
+from identify.scenario.timing import IN_FILE
 
 # What a kind of row reads of a scenario and of its sensor's file: all that a study can vary, beside its options.
 
@@ -57,7 +57,7 @@ def among(path: str, keys: tuple[str, ...]) -> bool:
 
 def timing(*names: str) -> tuple[str, ...]:
     """Both paths of keys of a scenario's ``[timing]``: there, and in the sensor's file."""
-    return tuple(path for name in names for path in (f"scenario.timing.{name}", f"sensor.timing.{NAMES[name]}"))
+    return tuple(path for name in names for path in (f"scenario.timing.{name}", f"sensor.timing.{IN_FILE[name]}"))
 
 
 SENSOR = (

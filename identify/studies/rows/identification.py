@@ -22,11 +22,12 @@ from identify.arrays import Array
 from identify.estimation.identification import IdentificationResult
 from identify.estimation.identification import identify as identify_record
 from identify.excitation import design_trajectories
-from identify.experiment.run import Experiment, excitation_run, run_plant, taught_sensor, true_parameters
+from identify.experiment.plant import build_plant
+from identify.experiment.run import Experiment, excitation_run, run_plant, taught_sensor
 from identify.experiment.truth import true_poses
+from identify.loop_parameters import model_settings
 from identify.progress import SilentProgress
 from identify.random_streams import stream_seed
-from identify.record.loop_setup import frame_times, model_settings
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, scenario_from_toml
 from identify.studies.rows.columns import (
@@ -124,21 +125,20 @@ READS = Reads(
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: IdentificationOptions) -> Row:
     """One row. Raises EstimationError and what experiment and sensor raise."""
     number = stream_seed(seed, EXPERIMENT)
-    robot = _robot(scenario.robot)
+    plant = build_plant(scenario, _robot(scenario.robot))
+    robot, truth = plant.nominal, plant.parameters
     trajectories = _trajectories(scenario.to_toml(), options.trajectory_seed)
     sensor = _drawn(scenario) if options.sensor == "drawn" else taught_sensor(scenario, robot, number, SilentProgress())
-    experiment = excitation_run(scenario, robot, sensor, trajectories.excitation, number)
+    experiment = excitation_run(plant, sensor, trajectories.excitation, number)
     records = [experiment.record]
     if scenario.identification.scale_anchor == "payload":
-        records.append(excitation_run(scenario, robot, sensor, trajectories.excitation, number, payload=True).record)
+        records.append(excitation_run(plant, sensor, trajectories.excitation, number, payload=True).record)
     result = identify_record(records, robot, scenario)
-    times = frame_times(scenario, scenario.validation.duration_s)
     unseen = [
-        run_plant(scenario, robot, sensor, trajectory, times, number, run)
+        run_plant(plant, sensor, trajectory, scenario.validation.duration_s, number, run)
         for run, trajectory in enumerate(trajectories.validation, start=1)
     ]
     errors = np.concatenate([_model_errors(robot, scenario, result.estimate, one) for one in unseen])
-    truth = true_parameters(robot, scenario)
     return (
         _record_figures(experiment)
         | _parameter_figures(result, truth)

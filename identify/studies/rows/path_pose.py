@@ -14,7 +14,6 @@ from pydantic import Field
 import cmmsim
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.experiment.sensor_in_loop import frame_latencies
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.studies.rows.columns import (
@@ -90,7 +89,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
     if ok.sum() < 2:
         raise EstimationError(f"{ok.sum()} of {frames} frames along the path gave a pose, 2 are needed")
     errors = (poses - path.pose(times))[ok]
-    latencies = frame_latencies(scenario, len(times), np.random.default_rng(stream_seed(seed, LATENCY)))
+    latencies = scenario.timing.drawn_latencies(len(times), np.random.default_rng(stream_seed(seed, LATENCY)))
     arrivals: Array = times + (scenario.timing.latency_s if latencies is None else latencies)
     used = _used_errors(path, poses[ok], arrivals[ok], scenario.timing.frame_period_s)
     return {

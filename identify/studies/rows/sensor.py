@@ -16,13 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import cmmsim
-from cmmsim.files.schema import SensorFile
-from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.files import SensorFile
 from cmmsim.pose_estimation.estimator import lost_measurement
 from cmmsim.teaching import exactly_taught
 from identify.arrays import Array
+from identify.experiment.sensor_in_loop import sensor_file
 from identify.scenario import Scenario
-from identify.scenario.timing import sensor_timing
 
 SENSORS_KEPT = 16
 """Sensors a process keeps; one of them takes about a megabyte."""
@@ -52,12 +51,6 @@ def row_sensor(scenario: Scenario, teaching: Teaching, seed: int) -> RowSensor:
         built = _built(file, scenario.pose_method, scenario.renderer, None, seed)
     built.sensor.start_run(seed)
     return built
-
-
-def sensor_file(scenario: Scenario) -> SensorFile:
-    """The sensor's file with the scenario's changes and timing."""
-    file = read_sensor_file(scenario.sensor, scenario.sensor_changes)
-    return file.model_copy(update={"timing": sensor_timing(scenario.timing.model_dump())})
 
 
 @lru_cache(maxsize=SENSORS_KEPT)
