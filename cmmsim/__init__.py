@@ -24,6 +24,9 @@ from cmmsim.pose_estimation.taught import Taught
 from cmmsim.radiometry.images import StereoFrame
 from cmmsim.sensor import Sensor, load_sensor
 from cmmsim.tracker import Tracker
+from cmmsim_command import warn_of_foreign_identify
+
+warn_of_foreign_identify()
 
 __all__ = [
     "CmmError",

@@ -1,56 +1,66 @@
 """Identification of parallel robots from images: excitation, experiment, estimation, validation, reports.
 
-The one place where robots (`dynamics`) and the optical sensor (`cmmsim`) meet. Names are imported on first use: CasADi
-and OpenGL take seconds to load, and `cmmsim --help` must not wait for them.
+The one place where robots (`dynamics`) and the optical sensor (`cmmsim`) meet.
+
+Experiment
+    load_scenario(name_or_path) -> Scenario     built in (`scenario_names() -> list[str]`), or a TOML file
+    run_experiment(scenario, seed) -> Dataset   the record of a plant moved with images in the loop
+
+A record of your own
+    build_record(*, time, ...) -> Dataset       from arrays over the frames
+    store_anchor(record, anchor)                what fixes the scale, a ScaleAnchor(name, value, std)
+    store_payload(record, payload, std)         a known load, `payload_vector(mass_kg, inertia_kg_m2)`
+
+Identification
+    identify(record, robot, scenario) -> IdentificationResult
+    unseen_errors(parameters, robot, scenario, seed) -> ndarray   model against plant on trajectories it never saw
+
+Every error that a user can cause is an IdentifyError, a `cmmsim.CmmError` or a `dynamics.DynamicsError`. Names are
+imported on first use: CasADi and OpenGL take seconds to load, and `cmmsim --help` must not wait for them.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from identify.errors import IdentifyError
+from identify.errors import IdentifyError as IdentifyError
 
 if TYPE_CHECKING:
-    from identify.estimation.identification import IdentificationResult, identify
-    from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
-    from identify.experiment.run import run_experiment
-    from identify.record.payload import payload_vector, store_payload
-    from identify.record.recording import build_record
-    from identify.scenario import Scenario, load_scenario, scenario_names
-    from identify.validation.validation import unseen_errors
+    from identify.estimation.identification import IdentificationResult as IdentificationResult
+    from identify.estimation.identification import identify as identify
+    from identify.estimation.scale_anchor import ScaleAnchor as ScaleAnchor
+    from identify.estimation.scale_anchor import store_anchor as store_anchor
+    from identify.experiment.run import run_experiment as run_experiment
+    from identify.record.payload import payload_vector as payload_vector
+    from identify.record.payload import store_payload as store_payload
+    from identify.record.recording import build_record as build_record
+    from identify.scenario import Scenario as Scenario
+    from identify.scenario import load_scenario as load_scenario
+    from identify.scenario import scenario_names as scenario_names
+    from identify.validation.validation import unseen_errors as unseen_errors
 
 _HOME = {
-    "IdentificationResult": "identify.estimation.identification",
-    "identify": "identify.estimation.identification",
-    "ScaleAnchor": "identify.estimation.scale_anchor",
-    "store_anchor": "identify.estimation.scale_anchor",
-    "build_record": "identify.record.recording",
-    "payload_vector": "identify.record.payload",
-    "store_payload": "identify.record.payload",
-    "run_experiment": "identify.experiment.run",
     "Scenario": "identify.scenario",
     "load_scenario": "identify.scenario",
     "scenario_names": "identify.scenario",
+    "run_experiment": "identify.experiment.run",
+    "build_record": "identify.record.recording",
+    "ScaleAnchor": "identify.estimation.scale_anchor",
+    "store_anchor": "identify.estimation.scale_anchor",
+    "payload_vector": "identify.record.payload",
+    "store_payload": "identify.record.payload",
+    "IdentificationResult": "identify.estimation.identification",
+    "identify": "identify.estimation.identification",
     "unseen_errors": "identify.validation.validation",
 }
 
-__all__ = [
-    "IdentificationResult",
-    "IdentifyError",
-    "ScaleAnchor",
-    "Scenario",
-    "build_record",
-    "identify",
-    "load_scenario",
-    "payload_vector",
-    "run_experiment",
-    "scenario_names",
-    "store_anchor",
-    "store_payload",
-    "unseen_errors",
-]
+__all__ = ["IdentifyError", *_HOME]
 
+if not TYPE_CHECKING:  # a type checker would take every name for one that this knows
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
-    return getattr(import_module(_HOME[name]), name)
+    def __getattr__(name: str) -> Any:
+        if name not in _HOME:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+        return getattr(import_module(_HOME[name]), name)
+
+    def __dir__() -> list[str]:
+        return [*__all__, *(name for name in globals() if name.startswith("__"))]

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
-from typing import ParamSpec
+from typing import ParamSpec, TypeVar, cast
 
 import typer
 from threadpoolctl import OpenBLASController, register, threadpool_limits
@@ -22,10 +22,18 @@ class _CasadiBlas(OpenBLASController):
 
 register(_CasadiBlas)
 
-one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
-"""Decorator: every BLAS that is loaded by now uses one thread. The many small matrices of a search lose by a second one
-(a fifth of the time on free cores, half on busy ones), and with one the rounding does not depend on the machine's
-cores or on its environment."""
+P = ParamSpec("P")
+R = TypeVar("R")
+_one_thread = threadpool_limits.wrap(limits=1, user_api="blas")
+
+
+def one_thread(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator: every BLAS that is loaded by now uses one thread.
+
+    The many small matrices of a search lose by a second one (a fifth of the time on free cores, half on busy ones), and
+    with one the rounding does not depend on the machine's cores or on its environment.
+    """
+    return cast(Callable[P, R], _one_thread(function))
 
 
 def cores() -> int:
@@ -127,9 +135,6 @@ def _is_ours() -> bool:
 
 
 # Ctrl-C ends a command that keeps what it has done in one line, at whatever moment it comes.
-
-
-P = ParamSpec("P")
 
 
 def stoppable(command: Callable[P, None]) -> Callable[P, None]:

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import pytest
 
-import identify
-
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("cmmsim", "dynamics", "identify")
 ESTIMATOR = ("identify/estimation", "identify/estimators")
@@ -77,13 +75,6 @@ def test_contracts_name_the_rooms_that_these_tests_read():
     config = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     sources = {m for c in config["tool"]["importlinter"]["contracts"] for m in c.get("source_modules", [])}
     assert {room.replace("/", ".") for room in ESTIMATOR} <= sources
-
-
-def test_every_name_that_identify_offers_can_be_had():
-    """They are imported on first use: a wrong home would show to the user only."""
-    assert all(getattr(identify, name).__name__ == name for name in identify.__all__)
-    with pytest.raises(AttributeError, match="no attribute 'estimate'; it has IdentificationResult, "):
-        _ = identify.estimate
 
 
 def test_no_file_is_longer_than_a_reader_can_hold():

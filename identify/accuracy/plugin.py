@@ -179,6 +179,7 @@ def _node_id(item: pytest.Item) -> str:
 
 
 def ratio(text: str) -> float:
+    """Value of --accuracy-fail; the parser names this function where it is no number."""
     value = float(text)
     if not 0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"RATIO is {text}, must be 0 or more, such as 0.1 for 10 %")
@@ -186,6 +187,7 @@ def ratio(text: str) -> float:
 
 
 def seed(text: str) -> int:
+    """Value of --accuracy-seed."""
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"the seed is {text}, must be 0 or more")

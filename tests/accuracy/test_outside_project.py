@@ -13,7 +13,7 @@ import pytest
 pytestmark = [pytest.mark.slow, pytest.mark.rendering]
 
 ROOT = Path(__file__).parents[2]
-SOURCES = ("pyproject.toml", "README.md", "LICENSE", "cmmsim", "dynamics", "identify")
+SOURCES = ("pyproject.toml", "README.md", "LICENSE", "cmmsim_command.py", "cmmsim", "dynamics", "identify")
 PROJECT = """
 import cmmsim
 import numpy as np

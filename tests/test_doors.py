@@ -1,0 +1,87 @@
+"""What a stranger meets first: the public names, their help and types, and what starts; each as one finds it."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import identify
+
+ROOT = Path(__file__).parents[1]
+HEAVY = ("casadi", "cv2", "numba", "numpy", "pyrender", "scipy", "xarray")
+
+SCRIPT = """
+import cmmsim
+import dynamics
+import identify
+
+scenario = identify.load_scenario("quick")
+robot = dynamics.load_robot(scenario.robot)
+result = identify.identify(identify.run_experiment(scenario), robot, scenario)
+reveal_type(result)
+reveal_type(robot)
+reveal_type(cmmsim.load_sensor("ctrack780"))
+identify.estimate
+"""
+
+
+def python(*arguments, cwd, path=()):
+    """A process that finds the packages where they are installed, and before them what lies in a path."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, path))}
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=cwd, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def test_help_begins_with_everything_that_identify_offers():
+    assert [name for name in identify.__all__ if not re.search(rf"\b{name}\b", identify.__doc__)] == []
+    assert len(identify.__all__) <= 15
+
+
+def test_every_name_that_identify_offers_can_be_had():
+    """They are imported on first use: a wrong home would show to the user only."""
+    assert all(getattr(identify, name).__name__ == name for name in identify.__all__)
+    assert set(identify.__all__) < set(dir(identify))
+    with pytest.raises(AttributeError, match="no attribute 'estimate'; it has IdentifyError, Scenario, "):
+        _ = identify.estimate
+
+
+@pytest.mark.parametrize("start", ["import identify", "import cmmsim_command", "import identify.__main__"])
+def test_nothing_heavy_is_imported_before_it_is_wanted(start, tmp_path):
+    text = f"import sys; {start}; print([name for name in {HEAVY} if name in sys.modules])"
+    assert python("-c", text, cwd=tmp_path, path=[ROOT]).stdout == "[]\n"
+
+
+@pytest.mark.slow
+def test_a_type_checker_follows_the_installed_packages(tmp_path):
+    """In the environment of this test, from a folder that knows nothing of the checkout."""
+    (tmp_path / "mine.py").write_text(SCRIPT)
+    said = python("-m", "mypy", "--cache-dir", tmp_path / "cache", "mine.py", cwd=tmp_path).stdout
+    assert re.findall(r'Revealed type is "([\w.]+)"', said) == [
+        "identify.estimation.identification.IdentificationResult",
+        "dynamics.robot.Robot",
+        "cmmsim.sensor.Sensor",
+    ], f"{said}\nan installation before 0.1.0's `package-dir`: run `sh .ci/setup`"
+    assert '"estimate"  [attr-defined]' in said
+    assert said.count("error:") == 1
+
+
+@pytest.mark.parametrize(("package", "rooms"), [("cmmsim", []), ("dynamics", ["errors.py", "scenario"])])
+def test_a_foreign_package_of_the_name_identify_is_named(tmp_path, package, rooms):
+    """PyPI's, whose `__init__.py` is empty, lies in a folder before ours, or was installed over ours."""
+    foreign = tmp_path / "identify"
+    foreign.mkdir()
+    (foreign / "__init__.py").touch()
+    for room in rooms:
+        (foreign / room).symlink_to(ROOT / "identify" / room)
+    said = f"another package stands in the place of cmmsim's `identify`: {foreign}; install cmmsim alone"
+    warned = python("-c", f"import {package}", cwd=tmp_path, path=[tmp_path, ROOT])
+    assert warned.returncode == 0
+    assert f"UserWarning: {said}" in warned.stderr
+    command = python("-c", "import cmmsim_command as c; c.main()", cwd=tmp_path, path=[tmp_path, ROOT])
+    assert command.returncode == 1
+    assert command.stderr.startswith(f"error: {said}")
+    assert command.stderr.count("\n") == 1
