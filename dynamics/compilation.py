@@ -23,7 +23,7 @@ import casadi as ca
 import platformdirs
 
 from dynamics.errors import DynamicsError
-from dynamics.kinematics.geometry import Rss6Geometry
+from dynamics.legs.rss_geometry import Rss6Geometry
 
 # CasADi exports its own `sq`: without -fno-semantic-interposition every square of a variable is a call. -O3 takes a
 # fifth longer to compile, for 2 % of speed in plain runs and a loss in sensitivities.

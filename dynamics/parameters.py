@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from dynamics.checks import floats
 from dynamics.errors import ParameterError
-from dynamics.kinematics.geometry import LEGS
+from dynamics.legs.rss_geometry import LEGS
 
 INERTIAL = ("mass", "Ixx", "Iyy", "Izz")
 

@@ -1,26 +1,46 @@
-"""A robot as its users call it: kinematics and dynamics on NumPy arrays, one pose or a batch of them."""
+"""A robot as its users call it: kinematics and dynamics on NumPy arrays, one pose or a batch of them.
 
+Also a robot whose joints do not sit where the drawing says, and forward dynamics for inner loops.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dynamics.checks import check_type, floats, row_text, rows
+from dynamics.checks import check_type, floats, real, row_text, rows, shown
 from dynamics.compilation import load_library, open_library
-from dynamics.errors import ParameterError, RobotFileError, ShapeError, SingularPoseError, UnreachablePoseError
+from dynamics.errors import (
+    DynamicsError,
+    ParameterError,
+    RobotFileError,
+    ShapeError,
+    SingularPoseError,
+    UnreachablePoseError,
+)
+from dynamics.expressions import evaluate
 from dynamics.kinematics import forward_kinematics
-from dynamics.kinematics.geometry import LEGS, Rss6Geometry
-from dynamics.parameters import PARAMETER_NAMES, check_ranges
-from dynamics.rigid_body import functions as model
+from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
+from dynamics.legs.rss_kinematics import home_angles
+from dynamics.parameters import PARAMETER_NAMES, check_parameters, check_ranges
+from dynamics.rigid_body.functions import FUNCTION_NAMES, robot_functions
 from dynamics.robot_file import ParameterSet, RobotDescription, read_robot_file
 
 # Below this the solution of M a = f loses all digits; a healthy robot is near 1e2 (poses in m and rad).
 CONDITION_LIMIT = 1e10
 
 
-def load_robot(name_or_path: str | Path) -> "Robot":
+StateToAcceleration = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+def load_robot(name_or_path: str | Path) -> Robot:
     """A built-in robot by name, or the one in a TOML robot file. Raises RobotFileError (see `read_robot_file`)."""
     return Robot(read_robot_file(name_or_path))
 
@@ -42,6 +62,9 @@ class Robot:
         self.parameter_sets: dict[str, ParameterSet] = description.parameter_sets
         self.parameter_names = PARAMETER_NAMES
         self.nominal_parameters = description.parameter_sets["initial"].dynamic
+
+    def __repr__(self) -> str:
+        return f"Robot({self.name!r}, {len(self.parameter_names)} parameters, sets: {', '.join(self.parameter_sets)})"
 
     @property
     def home_pose(self) -> np.ndarray:
@@ -190,26 +213,94 @@ class Robot:
         if len(set(batched) - {1}) > 1:
             shapes = ", ".join(str(argument.shape) for argument in arguments)
             raise ShapeError(f"{name}: batch lengths differ, shapes {shapes}")
-        function = self.functions[name]
-        if 0 in batched:
-            return np.zeros((0, *function.size_out(output)))
-        values = function(*[argument.T for argument in arguments])
-        values = np.asarray(values[output] if isinstance(values, tuple) else values, dtype=float)
+        values = evaluate(self.functions[name], *[np.atleast_2d(argument) for argument in arguments])[output]
         if output == 0 and not np.isfinite(values).all():
-            raise SingularPoseError(f"{name} is not finite for {_shown(arguments)}: singular pose or mass matrix")
-        stacked = values.reshape(values.shape[0], max(batched, default=1), -1).transpose(1, 0, 2)
-        return stacked if batched else stacked[0]
+            said = ", ".join(row_text(argument) for argument in arguments)
+            raise SingularPoseError(f"{name} is not finite for {said}: singular pose or mass matrix")
+        return values if batched else values[0]
 
 
 @lru_cache(maxsize=16)
 def _functions(geometry: Rss6Geometry) -> dict[str, ca.Function]:
     """One set for all robots of a geometry; not kept in the robot, so that robots can be pickled."""
-    library = load_library("functions", geometry, model.robot_functions)
+    library = load_library("functions", geometry, robot_functions)
     if library is None:
-        return {function.name(): function for function in model.robot_functions(geometry)}
+        return {function.name(): function for function in robot_functions(geometry)}
     open_library(library)
-    return {name: ca.external(name, str(library)) for name in model.FUNCTION_NAMES}
+    return {name: ca.external(name, str(library)) for name in FUNCTION_NAMES}
 
 
-def _shown(arguments: tuple[np.ndarray, ...]) -> str:
-    return ", ".join(row_text(argument) for argument in arguments)
+def with_geometry_error(robot: Robot, std: float, rng: np.random.Generator) -> Robot:
+    """The robot with every coordinate of its base joints B and platform joints A off by a normal error of `std`, m.
+
+    Crank and link lengths and the crank axes stay. The cranks are set to zero at the home pose as those of a real
+    robot are, so home keeps its crank angles. An error of zero gives the robot itself; the same state of `rng` gives
+    the same robot. Raises RobotFileError for a negative error, and where a leg does not reach the home pose any more.
+    """
+    check_type("robot", robot, Robot, RobotFileError)
+    if real("geometry error", std, RobotFileError, least=0, unit=" m") == 0:
+        return robot
+    base, platform = std * rng.standard_normal((2, LEGS, 3))
+    nominal = robot.geometry
+    moved = replace(nominal, base_joints=nominal.base_joints + base, platform_joints=nominal.platform_joints + platform)
+    try:
+        angles = home_angles(moved)
+    except RobotFileError as error:
+        raise RobotFileError(f"with joints off by {std:g} m: {error}") from error
+    geometry = replace(moved, crank_zero_directions=moved.crank_frames(angles)[:, :, 0])
+    return Robot(RobotDescription(robot.name, geometry, robot.parameter_sets))
+
+
+def fast_forward_dynamics(robot: Robot, parameters: np.ndarray | None = None) -> StateToAcceleration:
+    """A function of pose (6,), twist (6,), torque (6,) that returns twist_dot (6,), as `Robot.forward_dynamics`.
+
+    Parameters (64,) are fixed and checked once; None means the robot's nominal ones. Some 80 times faster than the
+    robot's own method, which checks shapes, reach and conditioning on every call. The array returned is the function's
+    own and is overwritten by the next call (copy it to keep it); so the function is not thread safe.
+    It raises ShapeError unless its inputs are float64 arrays of shape (6,), and SingularPoseError where the
+    result is not finite: a leg out of reach, a singular mass matrix, or NaN in the input.
+
+    Where J_a2 alone is singular (the platform moves with all cranks locked) eq. 40 still holds, since M is regular:
+    the result is the acceleration. `Robot.forward_dynamics` refuses such poses, since a controller cannot hold them;
+    `workspace.check_motion` says how near they are.
+    """
+    check_type("robot", robot, Robot, DynamicsError)
+    pose, twist, torque, result = np.zeros((4, 6))
+    fixed = check_parameters(robot.nominal_parameters if parameters is None else parameters).copy()
+    # Assigning to a memoryview costs half of assigning to an array, and refuses other shapes and types. The stubs of
+    # NumPy and CasADi do not know of that.
+    views: list[Any] = [memoryview(array.data) for array in (pose, twist, torque, fixed)]
+    values = memoryview(result.data)
+    buffer: Any
+    buffer, call = robot.functions["forward_dynamics"].buffer()
+    for index, view in enumerate(views):
+        buffer.set_arg(index, view)
+    buffer.set_res(0, values)
+    pose_in, twist_in, torque_in, _ = views
+
+    def forward_dynamics(at_pose: np.ndarray, at_twist: np.ndarray, at_torque: np.ndarray) -> np.ndarray:
+        try:
+            pose_in[:] = at_pose
+            twist_in[:] = at_twist
+            torque_in[:] = at_torque
+        except (TypeError, ValueError):
+            raise _refusal(pose=at_pose, twist=at_twist, torque=at_torque) from None
+        call()
+        first = values[0]  # the mass matrix couples all entries: one that is not finite makes all of them so
+        if not first - first == 0.0:
+            raise SingularPoseError(
+                f"forward dynamics is not finite at pose {at_pose}, twist {at_twist}, torque {at_torque}"
+            )
+        return result
+
+    # The buffer must live as long as the function that evaluates it.
+    forward_dynamics.buffer = buffer  # type: ignore[attr-defined]
+    return forward_dynamics
+
+
+def _refusal(**inputs: Any) -> ShapeError:
+    """The error for inputs of which one is no float64 array (6,)."""
+    for name, value in inputs.items():
+        if floats(name, value, (6,), finite=False) is not value:
+            return ShapeError(f"{name} must be a float64 array of shape (6,), got {shown(value)}")
+    return ShapeError(f"{', '.join(inputs)} must be float64 arrays of shape (6,)")

@@ -12,8 +12,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from dynamics.checks import shown
 from dynamics.errors import DynamicsError, RobotFileError
-from dynamics.kinematics.geometry import LEGS, Rss6Geometry
-from dynamics.kinematics.inverse_kinematics import check_home
+from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
+from dynamics.legs.rss_kinematics import check_home
 from dynamics.parameters import check_parameters
 
 _PerLeg = float | list[float]

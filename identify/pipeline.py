@@ -9,7 +9,6 @@ import xarray as xr
 
 import cmmsim
 from dynamics import Robot, load_robot
-from dynamics.analysis.workspace import check_motion
 from dynamics.closed_loop import prepare
 from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
@@ -41,7 +40,7 @@ from identify.reporting.run_result import (
 )
 from identify.scenario import Scenario, load_scenario
 from identify.scenario.scenario import estimator_settings, with_estimator_settings
-from identify.trajectory import TrajectorySet, load_trajectories, save_trajectories
+from identify.trajectory import TrajectorySet, check_travel, load_trajectories, save_trajectories
 from identify.validation.validation import model_run, predicted_runs, run_unseen
 
 
@@ -225,11 +224,10 @@ def _write_plan(folder: Path, scenario: Scenario, trajectories: TrajectorySet) -
 
 
 def _check_singularities(robot: Robot, scenario: Scenario, trajectories: TrajectorySet) -> None:
-    """Raise SingularPoseError, with time and leg, where a trajectory comes near a singularity (section 3.3)."""
+    """Raise TrajectoryError, with time and leg, where a trajectory comes near a singularity (section 3.3)."""
     durations = [scenario.excitation.duration_s] + [scenario.validation.duration_s] * len(trajectories.validation)
     for trajectory, duration in zip((trajectories.excitation, *trajectories.validation), durations, strict=True):
-        times = scenario.timing.frame_times(duration)
-        check_motion(robot, trajectory.pose(times), times)
+        check_travel(robot, trajectory, scenario.timing.frame_times(duration))
 
 
 def _identified_models(run_folder: RunFolder, result: dict[str, Any]) -> list[Array]:

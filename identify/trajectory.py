@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from dynamics import Robot
 from dynamics.closed_loop import Reference
 from dynamics.errors import DynamicsError
+from dynamics.workspace import check_motion
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.files.atomic import write_text
@@ -112,36 +113,17 @@ def from_home(home: Array, fundamental_hz: float, sine: Array, cosine: Array) ->
 
 
 def check_travel(robot: Robot, trajectory: FourierTrajectory, t: ArrayLike, margin_rad: float = 0.0) -> float:
-    """Largest crank angle [rad] of a trajectory sampled at times ``t`` (N,) [s].
+    """Largest crank angle [rad] of a trajectory that the robot may follow, sampled at times ``t`` (N,) [s].
 
     Raises:
-        TrajectoryError: a pose out of reach, or an angle beyond the travel limit less the margin; the message
-            names time, leg, angle and limit.
+        TrajectoryError: out of reach, beyond the travel limit less the margin, or near a singularity; the message
+            names time, leg, value and limit (`dynamics.workspace.check_motion`).
     """
     times = np.asarray(t, dtype=float)
-    angles = np.abs(_joint_angles(robot, trajectory, times))
-    row, leg = np.unravel_index(np.argmax(angles), angles.shape)
-    worst, limit = float(angles[row, leg]), robot.travel_limit - margin_rad
-    if worst > limit:
-        raise TrajectoryError(
-            f"trajectory turns crank {leg + 1} of {robot.name} to {worst:.4f} rad at t = {times[row]:.3f} s, beyond "
-            f"{limit:.4f} rad (travel limit {robot.travel_limit:.4f} rad less margin {margin_rad:.4f} rad)"
-        )
-    return worst
-
-
-def _joint_angles(robot: Robot, trajectory: FourierTrajectory, times: Array) -> Array:
-    poses = trajectory.pose(times)
     try:
-        angles = np.asarray(robot.inverse_kinematics(poses), dtype=float)
+        return check_motion(robot, trajectory.pose(times), times, travel_margin=margin_rad).travel.value
     except DynamicsError as error:
-        raise TrajectoryError(f"trajectory leaves the reach of {robot.name}: {error}") from error
-    if not np.isfinite(angles).all():
-        row, leg = np.argwhere(~np.isfinite(angles))[0]
-        raise TrajectoryError(
-            f"trajectory leaves the reach of {robot.name}: leg {leg + 1} at t = {times[row]:.3f} s, pose {poses[row]}"
-        )
-    return angles
+        raise TrajectoryError(f"the robot may not follow the trajectory: {error}") from error
 
 
 def _without(rows: Array, direction: Array) -> Array:

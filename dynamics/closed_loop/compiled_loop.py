@@ -21,9 +21,9 @@ from dynamics.closed_loop.run import ClosedLoopRun, empty_run, failure
 from dynamics.closed_loop.servo import CommandSchedule, command_schedule
 from dynamics.compilation import load_library, open_library
 from dynamics.errors import SimulationError
-from dynamics.kinematics.geometry import Rss6Geometry
+from dynamics.legs.rss_geometry import Rss6Geometry
 from dynamics.parameters import split_parameters
-from dynamics.rigid_body import functions as model
+from dynamics.rigid_body.equation_of_motion import motion_functions
 
 FAILURES = {
     1: LEFT_REACH,
@@ -99,7 +99,7 @@ def _library_at(path: Path) -> ctypes.CDLL:
 
 def library(geometry: Rss6Geometry) -> ctypes.CDLL | None:
     """The compiled loop of a robot, compiled on first use; None without a C compiler."""
-    path = load_library("closed_loop", geometry, model.motion_functions, SOURCES)
+    path = load_library("closed_loop", geometry, motion_functions, SOURCES)
     return _library_at(path) if path else None
 
 

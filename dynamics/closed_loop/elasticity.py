@@ -17,7 +17,7 @@ import numpy as np
 from dynamics.checks import real
 from dynamics.closed_loop.friction import FrictionLaw
 from dynamics.errors import SimulationError
-from dynamics.kinematics.geometry import LEGS
+from dynamics.legs.rss_geometry import LEGS
 from dynamics.parameters import BODY_NAMES, INERTIAL, RIGID_BODY, RIGID_BODY_NAMES, split_parameters
 from dynamics.robot import Robot
 

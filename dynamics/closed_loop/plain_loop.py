@@ -20,8 +20,9 @@ from dynamics.closed_loop.problem import (
 from dynamics.closed_loop.run import ClosedLoopRun, empty_run, failure
 from dynamics.closed_loop.servo import CommandSchedule, VisualServo, command_schedule
 from dynamics.closed_loop.stick_slip import Command, MotionStopped, State, StickSlipMotion
-from dynamics.kinematics.geometry import Rss6Geometry
-from dynamics.rigid_body import functions as model
+from dynamics.legs.rss_geometry import Rss6Geometry
+from dynamics.rigid_body.equation_of_motion import motion_functions
+from dynamics.rigid_body.functions import kinematic_functions
 from dynamics.robot import Robot
 
 Issued = tuple[np.ndarray, np.ndarray]
@@ -29,7 +30,7 @@ Issued = tuple[np.ndarray, np.ndarray]
 
 @lru_cache(maxsize=16)
 def _functions(geometry: Rss6Geometry) -> dict[str, ca.Function]:
-    built = model.motion_functions(geometry) + model.kinematic_functions(geometry)
+    built = motion_functions(geometry) + kinematic_functions(geometry)
     return {function.name(): function for function in built}
 
 

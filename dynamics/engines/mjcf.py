@@ -9,6 +9,8 @@ as long as Ixx = Iyy: it stays zero. Damping it away would damp the other two ax
 adds none.
 """
 
+from __future__ import annotations
+
 import re
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -18,11 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from dynamics.analysis.body_frames import BodyFrames, body_frames, crank_rotations
-from dynamics.analysis.inertia import BodyInertias, grouped, physical_inertias
 from dynamics.checks import check_choice, check_type, flag, real
 from dynamics.errors import DynamicsError
-from dynamics.kinematics.geometry import LEGS, Rss6Geometry
+from dynamics.inertia import BodyInertias, grouped, physical_inertias
+from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
 from dynamics.parameters import COULOMB, VISCOUS, check_parameters
 from dynamics.robot import Robot
 
@@ -235,7 +236,7 @@ def _add_leg(
     friction: tuple[float, float],
 ) -> None:
     geometry, number = robot.geometry, leg + 1
-    at_zero = crank_rotations(robot, np.zeros(LEGS))[leg]
+    at_zero = geometry.crank_frames(np.zeros(LEGS))[leg]
     place = {"pos": _numbers(geometry.base_joints[leg]), "quat": _numbers(quaternion(at_zero))}
     crank = Xml.SubElement(world, "body", name=f"crank{number}", attrib=place)
     rubbing = {"frictionloss": _numbers(friction[0]), "damping": _numbers(friction[1])}
@@ -279,3 +280,37 @@ def _add_comment(parent: Xml.Element, text: str) -> None:
 def _numbers(values: ArrayLike) -> str:
     """Numbers as MJCF writes them, with all their digits."""
     return " ".join(repr(float(value)) for value in np.atleast_1d(np.asarray(values, dtype=float)))
+
+
+@dataclass(frozen=True)
+class BodyFrames:
+    """Crank angles (6,), crank tips T and platform joints A (6, 3) in m, and base-from-body rotations of the platform
+    (3, 3), the cranks (6, 3, 3) and the links (6, 3, 3)."""
+
+    angle: np.ndarray
+    tip: np.ndarray
+    joint: np.ndarray
+    platform: np.ndarray
+    crank: np.ndarray
+    link: np.ndarray
+
+
+def body_frames(robot: Robot, pose: np.ndarray) -> BodyFrames:
+    """Frames of all bodies with the platform at a pose (6,)."""
+    geometry, angle = robot.geometry, robot.inverse_kinematics(pose)
+    platform = Rotation.from_euler("XYZ", pose[3:6]).as_matrix()
+    tip, joint = geometry.crank_tips(angle), pose[:3] + geometry.platform_joints @ platform.T
+    z = (joint - tip) / np.linalg.norm(joint - tip, axis=1, keepdims=True)
+    across = np.cross(geometry.crank_axes, z)
+    x = across / np.linalg.norm(across, axis=1, keepdims=True)
+    link = np.stack([x, np.cross(z, x), z], axis=-1)
+    return BodyFrames(angle, tip, joint, platform, geometry.crank_frames(angle), link)
+
+
+def link_angular_velocities(robot: Robot, frames: BodyFrames, pose: np.ndarray, twist: np.ndarray) -> np.ndarray:
+    """Angular velocities (6, 3) of the links in rad/s, base axes, without spin about their own axes (eq. 12)."""
+    axis, rate = robot.geometry.crank_axes, robot.joint_jacobian(pose) @ twist
+    link = frames.joint - frames.tip
+    tip_rate = rate[:, None] * np.cross(axis, robot.geometry.crank_length * frames.crank[:, :, 0])
+    link_rate = twist[:3] + np.cross(twist[3:], frames.joint - pose[:3]) - tip_rate
+    return np.cross(link, link_rate) / np.sum(link**2, axis=1, keepdims=True)

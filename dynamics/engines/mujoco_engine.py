@@ -5,11 +5,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dynamics.analysis.body_frames import body_frames, link_angular_velocities
 from dynamics.checks import check_type, floats, real
-from dynamics.engines.mjcf import quaternion
+from dynamics.engines.mjcf import body_frames, link_angular_velocities, quaternion
 from dynamics.errors import DynamicsError
-from dynamics.kinematics.geometry import LEGS
+from dynamics.legs.rss_geometry import LEGS
 from dynamics.robot import Robot
 
 

@@ -1,1 +1,1 @@
-"""Kinematics of a 6-RSS robot in CasADi: rotations, geometry, inverse and forward, Jacobians."""
+"""Kinematics of the platform: its coordinates and their rates, the motion of its joints, forward kinematics."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from dynamics.checks import row_text
 from dynamics.errors import ConvergenceError, ShapeError
-from dynamics.kinematics.rotation import evaluate
+from dynamics.expressions import evaluate
 
 # Steps smaller than the first end the iteration; the second is what counts as solved, in rad.
 STEP_TOLERANCE = 1e-12

@@ -1,1 +1,1 @@
-"""Virtual-work dynamics in CasADi: legs, equation of motion, and the functions of one robot."""
+"""Virtual-work dynamics in CasADi: sums over platform and legs, equation of motion, and the functions of one robot."""

@@ -12,62 +12,20 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from dynamics.kinematics.geometry import LEGS, Rss6Geometry
-from dynamics.kinematics.inverse_kinematics import leg_to
-from dynamics.kinematics.rotation import function, pose_rate_to_twist, rotation_matrix, symmetric_from_lower, twist_bias
+from dynamics.expressions import function, symmetric_from_lower
+from dynamics.kinematics.platform import PlatformJointMotion, pose_rate_to_twist, rotation_matrix, twist_bias
+from dynamics.legs.rss_dynamics import leg_columns, leg_force, leg_mass, leg_motion
+from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
+from dynamics.legs.rss_kinematics import angle_gradient, leg_to
 from dynamics.parameters import RIGID_BODY
-from dynamics.rigid_body.leg_dynamics import leg_columns, leg_force, leg_mass, leg_motion, torque_to_force
 from dynamics.rigid_body.virtual_work import crank_parameters, link_parameters, platform_columns
-
-# Motion of the six platform joints A = h + R a in pose coordinates, with the derivatives the legs chain through.
-
-
-class PlatformJointMotion:
-    """Symbolic motion of the joints A for a pose q (6,), rate and acceleration (6,); base axes, SI.
-
-    Lists over the legs: position, velocity, acceleration (3,); gradient dA/dq = d(velocity)/d(rate) (3, 6);
-    gradient_rate d(velocity)/dq (3, 6); acceleration_by_pose d(acceleration)/dq (3, 6).
-    d(acceleration)/d(rate) is twice gradient_rate.
-    """
-
-    def __init__(self, geometry: Rss6Geometry, pose: ca.SX, rate: ca.SX, acceleration: ca.SX) -> None:
-        angles, spin, spin_rate = pose[3:6], rate[3:6], acceleration[3:6]
-        rotation = rotation_matrix(angles)
-        first = _by_angles(rotation, angles)
-        self._second = [_by_angles(matrix, angles) for matrix in first]
-        first_rate = [_combine(row, spin) for row in self._second]
-        rotation_second_rate = _combine(first, spin_rate) + _combine(first_rate, spin)
-        third = _by_angles(rotation_second_rate, angles)
-        arms = [geometry.platform_joints[leg] for leg in range(LEGS)]
-        self._arms = arms
-        self.position = [pose[0:3] + rotation @ arm for arm in arms]
-        self.velocity = [rate[0:3] + _combine(first, spin) @ arm for arm in arms]
-        self.acceleration = [acceleration[0:3] + rotation_second_rate @ arm for arm in arms]
-        self.gradient = [ca.horzcat(ca.SX.eye(3), *[matrix @ arm for matrix in first]) for arm in arms]
-        self.gradient_rate = [ca.horzcat(ca.SX.zeros(3, 3), *[m @ arm for m in first_rate]) for arm in arms]
-        self.acceleration_by_pose = [ca.horzcat(ca.SX.zeros(3, 3), *[m @ arm for m in third]) for arm in arms]
-
-    def curvature(self, leg: int, force: ca.SX) -> ca.SX:
-        """d(gradient^T force)/dq (6, 6) for a force (3,) held constant at the joint of one leg."""
-        arm = self._arms[leg]
-        rows = [ca.horzcat(*[ca.dot(force, matrix @ arm) for matrix in row]) for row in self._second]
-        return ca.diagcat(ca.SX.zeros(3, 3), ca.vertcat(*rows))
-
-
-def _by_angles(matrix: ca.SX, angles: ca.SX) -> list[ca.SX]:
-    columns = ca.jacobian(ca.vec(matrix), angles)
-    return [ca.reshape(columns[:, axis], 3, 3) for axis in range(3)]
-
-
-def _combine(matrices: list[ca.SX], weights: ca.SX) -> ca.SX:
-    return matrices[0] * weights[0] + matrices[1] * weights[1] + matrices[2] * weights[2]
 
 
 def equation_of_motion(geometry: Rss6Geometry) -> ca.Function:
     """(pose, rate, rigid) -> M (6, 6), b (6,), J_theta (6, 6), J_theta_dot rate (6,), theta (6,)."""
     pose, rate, rigid = ca.SX.sym("pose", 6), ca.SX.sym("rate", 6), ca.SX.sym("rigid", RIGID_BODY.stop)
     rest = ca.SX.zeros(6)
-    joints = PlatformJointMotion(geometry, pose, rate, rest)
+    joints = PlatformJointMotion(geometry.platform_joints, pose, rate, rest)
     mass = _platform_mass(pose, rigid[0:4])
     bias = _platform_columns(geometry, pose, rate, rest) @ rigid[0:4]
     rows, crank_accelerations, angles = [], [], []
@@ -78,7 +36,7 @@ def equation_of_motion(geometry: Rss6Geometry) -> ca.Function:
         gradient = joints.gradient[leg]
         mass += gradient.T @ leg_mass(vectors, crank, link) @ gradient
         bias += gradient.T @ leg_force(vectors, motion, crank, link, ca.DM(geometry.gravity))
-        rows.append(torque_to_force(vectors).T @ gradient)
+        rows.append(angle_gradient(vectors).T @ gradient)
         crank_accelerations.append(motion.crank_acceleration)
         angles.append(vectors.angle)
     mass = symmetric_from_lower(mass)
@@ -95,7 +53,7 @@ def motion_derivatives(geometry: Rss6Geometry) -> ca.Function:
     """
     pose, rate, acceleration = (ca.SX.sym(name, 6) for name in ("pose", "rate", "acceleration"))
     torque, rigid = ca.SX.sym("torque", 6), ca.SX.sym("rigid", RIGID_BODY.stop)
-    joints = PlatformJointMotion(geometry, pose, rate, acceleration)
+    joints = PlatformJointMotion(geometry.platform_joints, pose, rate, acceleration)
     platform = _platform_columns(geometry, pose, rate, acceleration)
     by_pose = ca.jacobian(platform @ rigid[0:4], pose)
     by_rate = ca.jacobian(platform @ rigid[0:4], rate)
@@ -133,7 +91,7 @@ def _leg_derivatives(
     columns = leg_columns(vectors, motion, ca.DM(geometry.gravity))
     own = ca.vertcat(crank_parameters(rigid, leg), link_parameters(rigid, leg))
     moving = leg_force(vectors, motion, own[0:4], own[4:8], ca.DM(geometry.gravity))
-    force = moving - torque_to_force(vectors) * torque
+    force = moving - angle_gradient(vectors) * torque
     by_acceleration = leg_mass(vectors, own[0:4], own[4:8])
     crank = motion.crank_acceleration
     expressions = [
@@ -144,7 +102,7 @@ def _leg_derivatives(
         by_acceleration,
         ca.jacobian(crank, inputs[0]),
         ca.jacobian(crank, inputs[1]),
-        torque_to_force(vectors).T,
+        angle_gradient(vectors).T,
     ]
     values = [joints.position[leg], joints.velocity[leg], joints.acceleration[leg]]
     columns, force, *rows = ca.substitute(ca.cse(expressions), inputs, values)
@@ -168,11 +126,11 @@ def _by_rate(rows: tuple[ca.SX, ca.SX, ca.SX], joints: PlatformJointMotion, leg:
 def rate_map_derivative(geometry: Rss6Geometry) -> ca.Function:
     """(pose, g) -> d(J_theta g)/d(pose) (6, 6) for a constant pose rate g (6,)."""
     pose, rate = ca.SX.sym("pose", 6), ca.SX.sym("rate", 6)
-    joints = PlatformJointMotion(geometry, pose, rate, ca.SX.zeros(6))
+    joints = PlatformJointMotion(geometry.platform_joints, pose, rate, ca.SX.zeros(6))
     rows = []
     for leg in range(LEGS):
         position = ca.SX.sym("position", 3)
-        gradient = torque_to_force(leg_to(geometry, leg, position))
+        gradient = angle_gradient(leg_to(geometry, leg, position))
         curvature = ca.substitute(ca.jacobian(gradient, position), position, joints.position[leg])
         at_joint = ca.substitute(gradient, position, joints.position[leg])
         along = joints.velocity[leg].T @ curvature @ joints.gradient[leg]
@@ -191,3 +149,8 @@ def _platform_mass(pose: ca.SX, platform: ca.SX) -> ca.SX:
     to_twist = pose_rate_to_twist(pose)
     at_origin = ca.diagcat(platform[0] * ca.SX.eye(3), frame @ ca.diag(platform[1:4]) @ frame.T)
     return to_twist.T @ at_origin @ to_twist
+
+
+def motion_functions(geometry: Rss6Geometry) -> list[ca.Function]:
+    """What the closed loop integrates."""
+    return [equation_of_motion(geometry), motion_derivatives(geometry), rate_map_derivative(geometry)]

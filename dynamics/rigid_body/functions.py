@@ -1,13 +1,19 @@
-"""The CasADi functions of one robot: what `Robot` evaluates and what the closed loop integrates."""
+"""The CasADi functions of one robot that `Robot` evaluates."""
 
 import casadi as ca
 
-from dynamics.kinematics.geometry import Rss6Geometry
-from dynamics.kinematics.inverse_kinematics import leg_vectors, loop_closure, reach_margin
-from dynamics.kinematics.jacobians import joint_jacobian, loop_jacobians, pose_jacobian
-from dynamics.kinematics.rotation import function, pose_rate_to_twist, twist_bias
+from dynamics.expressions import function
+from dynamics.kinematics.platform import pose_rate_to_twist, twist_bias
+from dynamics.legs.rss_geometry import Rss6Geometry
+from dynamics.legs.rss_kinematics import (
+    joint_angles,
+    joint_jacobian,
+    loop_closure,
+    pose_jacobian,
+    reach_margin,
+    singularity_measures,
+)
 from dynamics.parameters import COULOMB, PARAMETER_NAMES, RIGID_BODY, VISCOUS
-from dynamics.rigid_body.equation_of_motion import equation_of_motion, motion_derivatives, rate_map_derivative
 from dynamics.rigid_body.virtual_work import (
     coriolis_matrix,
     friction_regressor,
@@ -20,7 +26,7 @@ from dynamics.rigid_body.virtual_work import (
 FUNCTION_NAMES = (
     "inverse_kinematics",
     "loop_closure",
-    "loop_jacobians",
+    "singularity_measures",
     "joint_jacobian",
     "pose_jacobian",
     "twist",
@@ -40,13 +46,11 @@ def kinematic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
     """Functions of pose and its rates alone: angles, reach, Jacobians, twist conversions."""
     pose, rate, acceleration = ca.SX.sym("pose", 6), ca.SX.sym("pose_rate", 6), ca.SX.sym("pose_acceleration", 6)
     twist, theta = ca.SX.sym("twist", 6), ca.SX.sym("theta", 6)
-    legs = leg_vectors(geometry, pose)
     to_twist = pose_rate_to_twist(pose)
-    angles = ca.vertcat(*[leg.angle for leg in legs])
     return [
-        function("inverse_kinematics", [pose], [angles, reach_margin(geometry, pose)]),
+        function("inverse_kinematics", [pose], [joint_angles(geometry, pose), reach_margin(geometry, pose)]),
         function("loop_closure", [pose, theta], list(loop_closure(geometry, pose, theta))),
-        function("loop_jacobians", [pose], list(loop_jacobians(geometry, pose))),
+        function("singularity_measures", [pose], list(singularity_measures(geometry, pose))),
         function("joint_jacobian", [pose], [joint_jacobian(geometry, pose)]),
         function("pose_jacobian", [pose], [pose_jacobian(geometry, pose)]),
         function("twist", [pose, rate], [to_twist @ rate]),
@@ -84,11 +88,6 @@ def dynamic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
 def robot_functions(geometry: Rss6Geometry) -> list[ca.Function]:
     """All that `Robot` evaluates; their names are FUNCTION_NAMES."""
     return kinematic_functions(geometry) + dynamic_functions(geometry)
-
-
-def motion_functions(geometry: Rss6Geometry) -> list[ca.Function]:
-    """What the closed-loop integrator evaluates (see `pose_space_motion`)."""
-    return [equation_of_motion(geometry), motion_derivatives(geometry), rate_map_derivative(geometry)]
 
 
 def _ldl_solve(matrix: ca.SX, right: ca.SX) -> ca.SX:

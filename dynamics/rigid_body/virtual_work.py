@@ -6,17 +6,11 @@ positive definite, G the wrench that holds the robot up, and tau_g = M twist_dot
 
 import casadi as ca
 
-from dynamics.kinematics.geometry import LEGS, Rss6Geometry
-from dynamics.kinematics.inverse_kinematics import LegVectors, leg_vectors, platform_arms
-from dynamics.kinematics.jacobians import (
-    crank_jacobian,
-    crank_jacobian_rate,
-    link_jacobian,
-    link_jacobian_rate,
-    moving_leg,
-)
-from dynamics.kinematics.rotation import rotation_matrix, symmetric_from_lower
-from dynamics.rigid_body.leg_dynamics import leg_columns, leg_force, leg_mass, leg_motion, link_axes
+from dynamics.expressions import symmetric_from_lower
+from dynamics.kinematics.platform import joint_motion, rotation_matrix
+from dynamics.legs.rss_dynamics import leg_columns, leg_coriolis, leg_force, leg_mass, leg_motion
+from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
+from dynamics.legs.rss_kinematics import leg_to, leg_vectors, platform_arms
 
 
 def rigid_body_regressor(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> ca.SX:
@@ -59,16 +53,10 @@ def inertial_wrench(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twist_dot
     return total
 
 
-def joint_motion(arm: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Velocity and acceleration (3,) of a platform joint at `arm` (3,) from the platform origin."""
-    omega, omega_dot = twist[3:6], twist_dot[3:6]
-    velocity = twist[0:3] + ca.cross(omega, arm)
-    return velocity, twist_dot[0:3] + ca.cross(omega_dot, arm) + ca.cross(omega, ca.cross(omega, arm))
-
-
 def mass_matrix(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
     """M (6, 6) of eq. 23, symmetric positive definite for positive parameters."""
-    total = _body_mass(rotation_matrix(pose[3:6]), rigid[0:4])
+    frame = rotation_matrix(pose[3:6])
+    total = ca.diagcat(rigid[0] * ca.SX.eye(3), frame @ ca.diag(rigid[1:4]) @ frame.T)
     for index, (leg, arm) in enumerate(zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True)):
         at_joint = leg_mass(leg, crank_parameters(rigid, index), link_parameters(rigid, index))
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
@@ -77,27 +65,25 @@ def mass_matrix(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
 
 
 def coriolis_matrix(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, rigid: ca.SX) -> ca.SX:
-    """C (6, 6) of eq. 23: C twist is the Coriolis and centrifugal wrench. Jacobian rates in closed form (eq. A1-A6)."""
-    total = _body_coriolis(rotation_matrix(pose[3:6]), rigid[0:4], twist[3:6])
-    for index, (leg, arm) in enumerate(zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True)):
-        moving = moving_leg(leg, arm, twist)
-        for jacobian, rate, frame, parameters in (
-            (crank_jacobian(leg, arm), crank_jacobian_rate(moving), _crank_frame(leg), crank_parameters(rigid, index)),
-            (link_jacobian(leg, arm), link_jacobian_rate(moving), _link_frame(leg), link_parameters(rigid, index)),
-        ):
-            coriolis = _body_coriolis(frame, parameters, jacobian[3:6, :] @ twist)
-            total += jacobian.T @ (coriolis @ jacobian + _body_mass(frame, parameters) @ rate)
+    """C (6, 6) of eq. 23: C twist is the Coriolis and centrifugal wrench."""
+    frame, omega = rotation_matrix(pose[3:6]), twist[3:6]
+    total = ca.diagcat(ca.SX.zeros(3, 3), ca.skew(omega) @ frame @ ca.diag(rigid[1:4]) @ frame.T)
+    at, moving = ca.SX.sym("position", 3), ca.SX.sym("velocity", 3)
+    for index, arm in enumerate(platform_arms(geometry, pose)):
+        own = crank_parameters(rigid, index), link_parameters(rigid, index)
+        here = [pose[0:3] + arm, twist[0:3] + ca.cross(omega, arm)]
+        coriolis, mass = ca.substitute(
+            ca.cse([*leg_coriolis(leg_to(geometry, index, at), *own, at, moving)]), [at, moving], here
+        )
+        to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
+        to_joint_rate = ca.horzcat(ca.SX.zeros(3, 3), -ca.skew(ca.cross(omega, arm)))
+        total += to_joint.T @ (coriolis @ to_joint + mass @ to_joint_rate)
     return total
 
 
 def gravity_wrench(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
     """G (6,) of eq. 23, N and N m: the wrench that holds the robot against gravity."""
-    gravity = ca.DM(geometry.gravity)
-    total = ca.vertcat(-rigid[0] * gravity, ca.SX.zeros(3))
-    for index, (leg, arm) in enumerate(zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True)):
-        total -= crank_parameters(rigid, index)[0] * crank_jacobian(leg, arm)[0:3, :].T @ gravity
-        total -= link_parameters(rigid, index)[0] * link_jacobian(leg, arm)[0:3, :].T @ gravity
-    return total
+    return inertial_wrench(geometry, pose, ca.SX(6, 1), ca.SX(6, 1), rigid)
 
 
 def crank_parameters(rigid: ca.SX, index: int) -> ca.SX:
@@ -108,21 +94,3 @@ def crank_parameters(rigid: ca.SX, index: int) -> ca.SX:
 def link_parameters(rigid: ca.SX, index: int) -> ca.SX:
     """Mass, Ixx, Iyy, Izz (4,) of one link, index 0..5."""
     return crank_parameters(rigid, LEGS + index)
-
-
-def _crank_frame(leg: LegVectors) -> ca.SX:
-    """Base-from-crank rotation (3, 3): x from B to T, z along the joint axis."""
-    x = leg.crank / ca.norm_2(leg.crank)
-    return ca.horzcat(x, ca.cross(leg.axis, x), leg.axis)
-
-
-def _link_frame(leg: LegVectors) -> ca.SX:
-    return ca.horzcat(*link_axes(leg), leg.link / ca.norm_2(leg.link))
-
-
-def _body_mass(frame: ca.SX, parameters: ca.SX) -> ca.SX:
-    return ca.diagcat(parameters[0] * ca.SX.eye(3), frame @ ca.diag(parameters[1:4]) @ frame.T)
-
-
-def _body_coriolis(frame: ca.SX, parameters: ca.SX, omega: ca.SX) -> ca.SX:
-    return ca.diagcat(ca.SX.zeros(3, 3), ca.skew(omega) @ frame @ ca.diag(parameters[1:4]) @ frame.T)

@@ -75,7 +75,7 @@ def mjcf(
 
 def _changes(robot: "Robot", parameters: "Array") -> list[str]:
     """Lines: the inertias that the export changed, and by how much that changes the robot's accelerations."""
-    from dynamics.analysis.inertia import acceleration_changes, grouped, physical_inertias
+    from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 
     inertias = physical_inertias(parameters, allow_changes=True)
     if not inertias.changes:

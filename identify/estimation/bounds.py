@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from dynamics.analysis.inertia import MOMENTS, SMALLEST, physical_inertias
+from dynamics.inertia import MOMENTS, SMALLEST, physical_inertias
 from dynamics.parameters import BODY_NAMES
 from identify.arrays import Array
 from identify.estimation.bounded_least_squares import Problem

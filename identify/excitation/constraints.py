@@ -26,10 +26,9 @@ from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.pose_estimation.observation import GRAZING
 from cmmsim.visibility import EDGE_PX, SightLines, sight_lines
 from dynamics import Robot
-from dynamics.analysis.workspace import LEAST_LEVERAGE, MOST_CONDITION, characteristic_length
-from dynamics.kinematics.inverse_kinematics import leg_vectors
-from dynamics.kinematics.jacobians import crank_leverage, loop_jacobians, pose_jacobian
-from dynamics.kinematics.rotation import rotation_matrix
+from dynamics.kinematics.platform import rotation_matrix
+from dynamics.legs.rss_kinematics import joint_angles, pose_jacobian, singularity_measures
+from dynamics.workspace import LEAST_LEVERAGE, MOST_CONDITION
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.excitation.motion import is_whole_periods
@@ -193,15 +192,11 @@ class MotionConstraints:
     def _rows(self, pose: ca.SX, rate: ca.SX) -> dict[str, ca.SX]:
         geometry, settings = self._robot.geometry, self._settings
         travel = self._robot.travel_limit - settings.travel_margin_rad
-        legs = leg_vectors(geometry, pose)
-        size = geometry.crank_length * geometry.link_length
-        leverage = ca.vertcat(*[ca.fabs(crank_leverage(leg)) / size for leg in legs])
-        scale = np.repeat([1.0, characteristic_length(geometry)], 3) * geometry.link_length
-        link_rows = loop_jacobians(geometry, pose)[1] @ ca.diag(1 / scale)
+        leverage, link_rows = singularity_measures(geometry, pose)
         condition = ca.norm_fro(link_rows) * ca.norm_fro(ca.solve(link_rows, ca.SX.eye(6)))
         rows = {
             "box": (pose - geometry.home_pose) / self.box,
-            "travel": ca.vertcat(*[leg.angle for leg in legs]) / travel,
+            "travel": joint_angles(geometry, pose) / travel,
             "velocity": pose_jacobian(geometry, pose) @ rate / settings.max_joint_velocity_rad_s,
             "leverage": LEAST_LEVERAGE / leverage,
             "conditioning": condition / MOST_CONDITION,

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import null_space
 
 from dynamics import Robot
-from dynamics.kinematics.jacobians import joint_jacobian
-from dynamics.kinematics.rotation import pose_rate_to_twist, twist_bias
+from dynamics.kinematics.platform import pose_rate_to_twist, twist_bias
+from dynamics.legs.rss_kinematics import joint_jacobian
 from dynamics.rigid_body.virtual_work import rigid_body_regressor
 from identify.arrays import Array
 from identify.scenario import Excitation

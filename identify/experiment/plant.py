@@ -7,7 +7,6 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from dynamics import Robot, load_robot
-from dynamics.analysis.geometry_error import with_geometry_error
 from dynamics.closed_loop import (
     ClosedLoopRun,
     JointElasticity,
@@ -17,6 +16,7 @@ from dynamics.closed_loop import (
     Reference,
     simulate,
 )
+from dynamics.robot import with_geometry_error
 from identify.arrays import Array
 from identify.experiment.truth import build_truth
 from identify.loop_parameters import NAMES, loop_settings, starting_guess

@@ -11,7 +11,6 @@ import cmmsim
 from cmmsim.files import SensorFile, read_sensor_file
 from cmmsim.imaging.renderer import choose_renderer
 from dynamics import Robot
-from dynamics.analysis.body_frames import crank_rotations, crank_tips
 from identify.arrays import Array
 from identify.progress import Advance
 from identify.scenario import Scenario
@@ -36,7 +35,7 @@ def robot_transforms(robot: Robot, pose: Array) -> dict[str, Array]:
     geometry = robot.geometry
     base_from_platform = cmmsim.pose_to_transform(pose)
     ends = geometry.platform_joints @ base_from_platform[:3, :3].T + base_from_platform[:3, 3]
-    tips = crank_tips(robot, crank_rotations(robot, robot.inverse_kinematics(pose)))
+    tips = geometry.crank_tips(robot.inverse_kinematics(pose))
     transforms = {}
     for leg in range(6):
         transforms[f"crank{leg + 1}"] = cmmsim.rod_transform(geometry.base_joints[leg], tips[leg])

@@ -16,9 +16,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dynamics import Robot, closed_loop
-from dynamics.analysis.inertia import grouped, physical_inertias
 from dynamics.engines.mjcf import MjcfSolver, mjcf_text
 from dynamics.engines.mujoco_engine import MujocoRobot, import_mujoco
+from dynamics.inertia import grouped, physical_inertias
 from dynamics.parameters import COULOMB, VISCOUS
 from identify.arrays import Array
 from identify.errors import TrajectoryError

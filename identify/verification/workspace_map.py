@@ -9,8 +9,7 @@ from matplotlib.collections import QuadMesh
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from dynamics import Robot
-from dynamics.analysis import workspace
+from dynamics import Robot, workspace
 from dynamics.kinematics import forward_kinematics
 from identify.arrays import Array
 from identify.progress import Progress, SilentProgress
@@ -86,7 +85,7 @@ def map_workspace(robot: Robot, progress: Progress | None = None, points: int = 
     The sides reach a crank's length from home, or 1.3 of it over the characteristic length in rotation.
     """
     progress = progress or SilentProgress()
-    length = workspace.characteristic_length(robot.geometry)
+    length = robot.geometry.characteristic_length
     step, turn = robot.geometry.crank_length, 1.3 * robot.geometry.crank_length / length
     layout = [(0, 1, 2, step, offset * step) for offset in (-0.4, 0.0, 0.4)]
     layout += [(3, 4, 5, turn, offset * turn) for offset in (-0.4, 0.0, 0.4)]

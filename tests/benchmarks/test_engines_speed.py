@@ -9,10 +9,10 @@ import itertools
 
 import numpy as np
 import pytest
+from dynamics.robot import fast_forward_dynamics
 
 import dynamics
 from dynamics import compilation
-from dynamics.analysis.fast_forward_dynamics import fast_forward_dynamics
 from dynamics.engines.mjcf import mjcf_text
 from dynamics.engines.mujoco_engine import MujocoRobot
 from tests.benchmarks.timing import OtherLoad, fastest, judge

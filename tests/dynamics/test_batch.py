@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from dynamics.robot import fast_forward_dynamics
 
-from dynamics.analysis.fast_forward_dynamics import fast_forward_dynamics
 from dynamics.closed_loop import simulate
 from dynamics.closed_loop.batch import simulate_batch
 from dynamics.errors import SimulationError, SingularPoseError

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from dynamics.robot import with_geometry_error
 from scipy.optimize import fsolve
 from scipy.stats import chi2
 
 from dynamics import closed_loop
-from dynamics.analysis.geometry_error import with_geometry_error
 from dynamics.errors import RobotFileError, SimulationError
 
 ERROR = 1e-4

@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dynamics.analysis.inertia import UnphysicalInertiaError, acceleration_changes, physical_inertias, travel_states
 from dynamics.engines.mjcf import MjcfSolver, mjcf_text
 from dynamics.engines.mujoco_engine import MujocoMissingError, MujocoRobot
 from dynamics.errors import DynamicsError, ParameterError
-from dynamics.kinematics.geometry import Rss6Geometry
+from dynamics.inertia import UnphysicalInertiaError, acceleration_changes, physical_inertias, travel_states
+from dynamics.legs.rss_geometry import Rss6Geometry
 from dynamics.parameters import BODY_NAMES, COULOMB, PARAMETER_NAMES, RIGID_BODY, VISCOUS
 from dynamics.robot import Robot
 from dynamics.robot_file import RobotDescription

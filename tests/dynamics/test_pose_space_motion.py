@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dynamics.rigid_body import functions as model
+from dynamics.rigid_body import equation_of_motion as model
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from dynamics import closed_loop
 from dynamics.closed_loop.motion import Command, State
 from dynamics.closed_loop.problem import LENGTH, FrictionLaw
 from dynamics.closed_loop.stick_slip import StickSlipMotion
-from dynamics.rigid_body import functions as model
+from dynamics.rigid_body import equation_of_motion as model
 
 MASS, STIFFNESS, COULOMB = 0.8, 20.0, 1.0
 FREQUENCY = np.sqrt(STIFFNESS / MASS)

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import dynamics
-from dynamics.analysis import workspace
+from dynamics import workspace
 from dynamics.errors import DynamicsError, ShapeError, SingularPoseError, TravelError, UnreachablePoseError
 
 
@@ -27,7 +27,7 @@ def test_leverage_is_the_sine_between_crank_plane_and_link(robot, states, legs_a
 
 def test_condition_of_the_platform_side_from_forces(robot, states, legs_at):
     """The wrench of unit forces along the links, torques over 0.2 m, has that condition number (virtual work)."""
-    assert workspace.characteristic_length(robot.geometry) == pytest.approx(0.2, abs=1e-12)
+    assert robot.geometry.characteristic_length == pytest.approx(0.2, abs=1e-12)
     measures = workspace.measure(robot, states.pose)
     for row, pose in enumerate(states.pose[:20]):
         legs = legs_at(pose)

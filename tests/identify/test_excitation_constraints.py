@@ -7,7 +7,7 @@ import pytest
 
 from cmmsim.visibility import sight_lines
 from dynamics import load_robot
-from dynamics.analysis.workspace import measure
+from dynamics.workspace import measure
 from identify.errors import TrajectoryError
 from identify.excitation import design_trajectories
 from identify.excitation.constraints import MotionConstraints, check_periods, required_stickers, within_sight
@@ -75,8 +75,8 @@ def test_run_that_cannot_end_at_rest_is_refused(duration_s):
     ("overrides", "reason"),
     [
         ({"excitation.max_joint_velocity_rad_s": 0.01}, r"velocity of leg \d"),
-        ({"excitation.position_amplitude_m": 0.06}, r"crank \d|reach"),
-        ({"excitation.travel_margin_rad": 0.99}, r"crank \d .*limit 0\.0048|beyond 0\.0048"),
+        ({"excitation.position_amplitude_m": 0.06}, r"leg \d"),
+        ({"excitation.travel_margin_rad": 0.99}, r"leg \d .*limit 0\.0048"),
     ],
 )
 def test_no_feasible_start_is_one_line_with_the_reason(robot, method, overrides, reason):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from dynamics.analysis.inertia import UnphysicalInertiaError, physical_inertias
+from dynamics.inertia import UnphysicalInertiaError, physical_inertias
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.bounds import InCoordinates, parameter_bounds
 from identify.estimation.identification import identify

@@ -1,4 +1,4 @@
-"""How far poses are from the limits of the robot: travel, reach, and its two kinds of singularity.
+"""May the robot move so? How far poses are from its limits: travel, reach, and its two kinds of singularity.
 
 - Travel: |theta| against the travel limit.
 - Reach: the reach margin of a leg is sin^2 of the angle between its crank and the direction to its platform joint in
@@ -9,19 +9,22 @@
   columns by the characteristic length, so that all entries are plain numbers. At infinity the platform moves with all
   cranks locked.
 
-The characteristic length is the RMS distance of the platform joints from the platform origin (0.2 m for rss6).
+The characteristic length is the RMS distance of the platform joints from the platform origin (0.2 m for rss6). The
+measures as CasADi expressions, for a search that keeps their limits, are `legs.rss_kinematics.singularity_measures`.
 """
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dynamics.checks import check_type, floats, real, row_text, rows
 from dynamics.errors import DynamicsError, ShapeError, SingularPoseError, TravelError, UnreachablePoseError
-from dynamics.kinematics.geometry import Rss6Geometry
-from dynamics.kinematics.rotation import evaluate
+from dynamics.expressions import evaluate
 from dynamics.robot import Robot
 
 LEAST_LEVERAGE = 0.05
@@ -35,16 +38,30 @@ MOST_CONDITION = 20.0
 class WorkspaceMeasures:
     """Measures of N poses; NaN where and only where a leg cannot reach, except for the reach margins.
 
-    theta (N, 6), rad; reach_margin (N, 6), negative out of reach; leverage (N, 6), of J_a1; platform_condition (N,),
-    of J_a2; joint_condition (N,), of J_ad = J_a1^-1 J_a2; travel_limit, rad.
+    theta (N, 6), rad; reach_margin (N, 6), negative out of reach; leverage (N, 6), of J_a1; platform_rows (N, 6, 6),
+    J_a2 without unit; travel_limit, rad.
     """
 
     theta: np.ndarray
     reach_margin: np.ndarray
     leverage: np.ndarray
-    platform_condition: np.ndarray
-    joint_condition: np.ndarray
+    platform_rows: np.ndarray
     travel_limit: float
+
+    @cached_property
+    def platform_condition(self) -> np.ndarray:
+        """Condition number of J_a2 (N,)."""
+        return self._condition(self.platform_rows)
+
+    @cached_property
+    def joint_condition(self) -> np.ndarray:
+        """Condition number of J_ad = J_a1^-1 J_a2 (N,)."""
+        return self._condition(self.platform_rows / self.leverage[..., None])
+
+    def _condition(self, matrices: np.ndarray) -> np.ndarray:
+        result = np.full(len(matrices), np.nan)
+        result[self.reachable] = np.linalg.cond(matrices[self.reachable])
+        return result
 
     @property
     def reachable(self) -> np.ndarray:
@@ -79,11 +96,6 @@ class MotionExtremes:
     condition: Extreme
 
 
-def characteristic_length(geometry: Rss6Geometry) -> float:
-    """Length in m that makes rotations comparable to translations: RMS distance of the joints A from the origin."""
-    return float(np.sqrt(np.mean(np.sum(geometry.platform_joints**2, axis=1))))
-
-
 def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
     """Measures of poses (N, 6), or of one (6,) as N = 1. Poses out of reach give NaN and a negative reach margin.
 
@@ -91,18 +103,13 @@ def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
     """
     check_type("robot", robot, Robot, DynamicsError)
     poses = np.atleast_2d(rows("pose", pose, 6))
-    geometry = robot.geometry
     theta, margin = (part[..., 0] for part in evaluate(robot.functions["inverse_kinematics"], poses))
-    leverages, link_rows = evaluate(robot.functions["loop_jacobians"], poses)
+    leverage, platform_rows = evaluate(robot.functions["singularity_measures"], poses)
     margin[np.isnan(margin)] = -np.inf  # squares have overflowed
-    reachable = (margin > 0).all(axis=1)
-    theta[~reachable] = np.nan
-    leverage, platform, joint = (np.full(shape, np.nan) for shape in (theta.shape, len(poses), len(poses)))
-    leverage[reachable] = np.abs(leverages[reachable, :, 0]) / (geometry.crank_length * geometry.link_length)
-    scaled = link_rows[reachable] / (geometry.link_length * np.repeat([1.0, characteristic_length(geometry)], 3))
-    platform[reachable] = np.linalg.cond(scaled)
-    joint[reachable] = np.linalg.cond(scaled / leverage[reachable, :, None])
-    return WorkspaceMeasures(theta, margin, leverage, platform, joint, robot.travel_limit)
+    unreachable = ~(margin > 0).all(axis=1)
+    for values in (theta, leverage, platform_rows):
+        values[unreachable] = np.nan
+    return WorkspaceMeasures(theta, margin, leverage[..., 0], platform_rows, robot.travel_limit)
 
 
 def check_motion(

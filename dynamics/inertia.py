@@ -16,11 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dynamics.analysis.workspace import measure
 from dynamics.errors import ParameterError
-from dynamics.kinematics.geometry import LEGS
+from dynamics.legs.rss_geometry import LEGS
 from dynamics.parameters import BODY_NAMES, RIGID_BODY, check_parameters
 from dynamics.robot import Robot
+from dynamics.workspace import measure
 
 MOMENTS = ("Ixx", "Iyy", "Izz")
 

@@ -1,18 +1,18 @@
-"""One leg as its platform joint A feels it: a function of the motion of A alone, in CasADi.
+"""Dynamics of one RSS leg as its platform joint A feels it: a function of the motion of A alone, in CasADi.
 
 Crank and link move as A makes them move (eq. 5-16), so each leg adds a force at A, and the robot's wrench is the sum
 of the platform's own and [F; a x F] over the legs. It is the virtual-work model of eq. 23 with the Jacobians taken
-with respect to the velocity of A (3 columns) in place of the twist (6 columns), at a fraction of the operations.
-All vectors in base axes; SI units.
+with respect to the velocity of A (3 columns) in place of the twist (6 columns), at a fraction of the operations; their
+rates, Appendix A of the paper, are automatic derivatives (eq. A5 and A6 as printed are not). Crank and link parameters
+are mass, Ixx, Iyy, Izz (4,) each, centres of mass at mid-length. All vectors in base axes; SI units.
 """
 
 from dataclasses import dataclass
 
 import casadi as ca
 
-from dynamics.kinematics.inverse_kinematics import LegVectors
-from dynamics.kinematics.jacobians import crank_leverage
-from dynamics.kinematics.rotation import symmetric_from_lower
+from dynamics.expressions import symmetric_from_lower
+from dynamics.legs.rss_kinematics import LegVectors, angle_gradient, crank_leverage
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,9 @@ class LegMotion:
     angular_acceleration: ca.SX
 
 
-def torque_to_force(leg: LegVectors) -> ca.SX:
-    """l / m (3,): force at A of a unit crank torque, and gradient of the crank angle with respect to A (eq. 8)."""
-    return leg.link * (1 / crank_leverage(leg))
-
-
 def leg_motion(leg: LegVectors, velocity: ca.SX, acceleration: ca.SX) -> LegMotion:
     """Motion of crank and link for a velocity (3,) and an acceleration (3,) of A."""
-    gradient, tangent = torque_to_force(leg), ca.cross(leg.axis, leg.crank)
+    gradient, tangent = angle_gradient(leg), ca.cross(leg.axis, leg.crank)
     rate = ca.dot(gradient, velocity)
     link_rate = velocity - rate * tangent
     # l . A_ddot + |l_dot|^2 = l . w_ddot: the link keeps its length.
@@ -63,7 +58,7 @@ def leg_columns(leg: LegVectors, motion: LegMotion, gravity: ca.DM) -> ca.SX:
 
 def leg_force(leg: LegVectors, motion: LegMotion, crank: ca.SX, link: ca.SX, gravity: ca.DM) -> ca.SX:
     """Force at A (3,), N, that moves crank and link, for their parameters (mass, Ixx, Iyy, Izz) each (4,)."""
-    gradient, tangent = torque_to_force(leg), ca.cross(leg.axis, leg.crank)
+    gradient, tangent = angle_gradient(leg), ca.cross(leg.axis, leg.crank)
     # The crank turns about its own z alone, and a link without spin about l does no work against Izz.
     lever = ca.dot(tangent / 2, motion.tip_acceleration / 2 - gravity)
     torque = crank[0] * lever + crank[3] * motion.crank_acceleration
@@ -79,7 +74,7 @@ def leg_force(leg: LegVectors, motion: LegMotion, crank: ca.SX, link: ca.SX, gra
 
 def leg_mass(leg: LegVectors, crank: ca.SX, link: ca.SX) -> ca.SX:
     """Mass (3, 3) the leg adds at A, for crank and link parameters (mass, Ixx, Iyy, Izz) each (4,)."""
-    gradient, tangent = torque_to_force(leg), ca.cross(leg.axis, leg.crank)
+    gradient, tangent = angle_gradient(leg), ca.cross(leg.axis, leg.crank)
     reflected = crank[3] + (crank[0] + link[0]) * (leg.crank_length**2 / 4)
     half = gradient @ (link[0] / 4 * tangent).T
     total = reflected * (gradient @ gradient.T) + link[0] / 4 * ca.SX.eye(3) + half + half.T
@@ -89,6 +84,25 @@ def leg_mass(leg: LegVectors, crank: ca.SX, link: ca.SX) -> ca.SX:
         row = direction - gradient * ca.dot(tangent, direction)
         total += (inertia * (1 / leg.link_length**2)) * (row @ row.T)
     return symmetric_from_lower(total)
+
+
+def leg_coriolis(leg: LegVectors, crank: ca.SX, link: ca.SX, position: ca.SX, velocity: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """C (3, 3) of one leg for the position and velocity symbols (3,) of A: C velocity is the Coriolis and centrifugal
+    force at A; and the mass (3, 3) that goes with it. Eq. 21 and 22: sums of J^T (M_body J_dot + C_body J)."""
+    gradient, tangent = angle_gradient(leg), ca.cross(leg.axis, leg.crank)
+    to_tip = tangent @ gradient.T
+    to_centre = (ca.SX.eye(3) + to_tip) / 2
+    to_spin = ca.skew(leg.link) @ (ca.SX.eye(3) - to_tip) / leg.link_length**2
+    gradient_rate, centre_rate, spin_rate = (
+        ca.reshape(ca.jtimes(ca.vec(matrix), position, velocity), matrix.shape)
+        for matrix in (gradient, to_centre, to_spin)
+    )
+    x, y = link_axes(leg)
+    inertia = link[1] * (x @ x.T) + link[2] * (y @ y.T)
+    reflected = crank[3] + crank[0] * (leg.crank_length**2 / 4)
+    coriolis = reflected * (gradient @ gradient_rate.T) + link[0] * (to_centre.T @ centre_rate)
+    coriolis += to_spin.T @ (inertia @ spin_rate + ca.skew(to_spin @ velocity) @ inertia @ to_spin)
+    return coriolis, leg_mass(leg, crank, link)
 
 
 def link_axes(leg: LegVectors) -> tuple[ca.SX, ca.SX]:

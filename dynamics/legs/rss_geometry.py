@@ -59,6 +59,21 @@ class Rss6Geometry:
     def __hash__(self) -> int:
         return hash(self.digest)
 
+    @property
+    def characteristic_length(self) -> float:
+        """Length in m that makes rotations comparable to translations: RMS distance of the joints A from the origin."""
+        return float(np.sqrt(np.mean(np.sum(self.platform_joints**2, axis=1))))
+
+    def crank_frames(self, angle: np.ndarray) -> np.ndarray:
+        """Base-from-crank rotations (6, 3, 3) at crank angles (6,), rad: x from B to T, z along the joint axis."""
+        axis, zero = self.crank_axes, self.crank_zero_directions
+        x = np.cos(angle)[:, None] * zero + np.sin(angle)[:, None] * np.cross(axis, zero)
+        return np.stack([x, np.cross(axis, x), axis], axis=-1)
+
+    def crank_tips(self, angle: np.ndarray) -> np.ndarray:
+        """Crank tips T (6, 3), m, at crank angles (6,), rad."""
+        return np.asarray(self.base_joints + self.crank_length * self.crank_frames(angle)[:, :, 0])
+
     def _check_directions(self) -> None:
         for leg in range(LEGS):
             axis, zero = self.crank_axes[leg], self.crank_zero_directions[leg]

@@ -1,4 +1,9 @@
-"""Closed-form inverse kinematics and leg vectors of the 6-RSS robot (eq. 3 and 4), in CasADi."""
+"""Closed-form inverse kinematics of RSS legs (eq. 3 and 4), their Jacobians (eq. 7, 8, 29) and singularities (CasADi).
+
+J_a1 and J_a2 (eq. 7): diag(J_a1) theta_dot = J_a2 twist; J_ad = J_a1^-1 J_a2 (eq. 8); J_theta = J_ad T maps pose rates
+(eq. 29). The vector a from the platform origin to joint A is in base axes throughout (eq. 3 and 5 need R a, though the
+text defines a in platform axes).
+"""
 
 from dataclasses import dataclass
 
@@ -6,8 +11,8 @@ import casadi as ca
 import numpy as np
 
 from dynamics.errors import RobotFileError
-from dynamics.kinematics.geometry import LEGS, Rss6Geometry
-from dynamics.kinematics.rotation import rotation_matrix
+from dynamics.kinematics.platform import pose_rate_to_twist, rotation_matrix
+from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,47 @@ def leg_to(geometry: Rss6Geometry, leg: int, joint_position: ca.SX) -> LegVector
     crank = geometry.crank_length * (cosine * zero + sine * np.cross(axis, zero))
     link = joint_position - geometry.base_joints[leg] - crank
     return LegVectors(ca.atan2(sine, cosine), ca.SX(axis), crank, link, geometry.crank_length, geometry.link_length)
+
+
+def joint_angles(geometry: Rss6Geometry, pose: ca.SX) -> ca.SX:
+    """Crank angles (6,), rad, at a pose (6,)."""
+    return ca.vertcat(*[leg.angle for leg in leg_vectors(geometry, pose)])
+
+
+def crank_leverage(leg: LegVectors) -> ca.SX:
+    """Diagonal entry of J_a1, m^2: (w x l) . s (eq. 7). Zero where the leg is singular."""
+    return ca.dot(ca.cross(leg.crank, leg.link), leg.axis)
+
+
+def angle_gradient(leg: LegVectors) -> ca.SX:
+    """l / J_a1 (3,), 1/m: gradient of the crank angle with respect to A, and force at A of a unit torque (eq. 8)."""
+    return leg.link * (1 / crank_leverage(leg))
+
+
+def loop_jacobians(geometry: Rss6Geometry, pose: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Diagonal of J_a1 (6,), m^2, and J_a2 (6, 6), rows [l^T, (a x l)^T], m and m^2 (eq. 7)."""
+    legs, arms = leg_vectors(geometry, pose), platform_arms(geometry, pose)
+    rows = [ca.horzcat(leg.link.T, ca.cross(arm, leg.link).T) for leg, arm in zip(legs, arms, strict=True)]
+    return ca.vertcat(*[crank_leverage(leg) for leg in legs]), ca.vertcat(*rows)
+
+
+def joint_jacobian(geometry: Rss6Geometry, pose: ca.SX) -> ca.SX:
+    """J_ad (6, 6): theta_dot = J_ad twist (eq. 8)."""
+    leverage, rows = loop_jacobians(geometry, pose)
+    return ca.vertcat(*[rows[leg, :] / leverage[leg] for leg in range(LEGS)])
+
+
+def pose_jacobian(geometry: Rss6Geometry, pose: ca.SX) -> ca.SX:
+    """J_theta (6, 6): theta_dot = J_theta pose_dot (eq. 29)."""
+    return joint_jacobian(geometry, pose) @ pose_rate_to_twist(pose)
+
+
+def singularity_measures(geometry: Rss6Geometry, pose: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Leverage of each crank on its link, |J_a1| / (|w| |l|) (6,), in 0..1; and J_a2 (6, 6) without unit, its rows
+    over the link length and its last three columns over the characteristic length."""
+    leverage, rows = loop_jacobians(geometry, pose)
+    scale = np.repeat([1.0, geometry.characteristic_length], 3) * geometry.link_length
+    return ca.fabs(leverage) / (geometry.crank_length * geometry.link_length), rows @ ca.diag(1 / scale)
 
 
 def loop_closure(geometry: Rss6Geometry, pose: ca.SX, angles: ca.SX) -> tuple[ca.SX, ca.SX]:

@@ -1,0 +1,97 @@
+"""The platform's coordinates and what moves with them, in CasADi: rotation, twist, and the joints A of the legs.
+
+The coordinates are the pose [x y z alpha beta gamma] with R = Rx(alpha) Ry(beta) Rz(gamma) (eq. 1); eq. 2, 29 and 38
+turn their rates into a twist [h_dot, omega]. A platform with fewer freedoms would have its chart here. Base axes; SI.
+"""
+
+import casadi as ca
+import numpy as np
+
+
+def rotation_matrix(angles: ca.SX) -> ca.SX:
+    """Base-from-platform rotation (3, 3) of the Euler angles [alpha, beta, gamma] in rad (eq. 1)."""
+    ca_, cb, cg = ca.cos(angles[0]), ca.cos(angles[1]), ca.cos(angles[2])
+    sa, sb, sg = ca.sin(angles[0]), ca.sin(angles[1]), ca.sin(angles[2])
+    return ca.vertcat(
+        ca.horzcat(cb * cg, -cb * sg, sb),
+        ca.horzcat(ca_ * sg + cg * sb * sa, ca_ * cg - sb * sa * sg, -cb * sa),
+        ca.horzcat(sa * sg - ca_ * cg * sb, ca_ * sb * sg + cg * sa, cb * ca_),
+    )
+
+
+def euler_rate_jacobian(angles: ca.SX) -> ca.SX:
+    """J_e (3, 3): angular velocity in base axes from Euler angle rates, omega = J_e phi_dot (eq. 2)."""
+    alpha, beta = angles[0], angles[1]
+    return ca.vertcat(
+        ca.horzcat(1, 0, ca.sin(beta)),
+        ca.horzcat(0, ca.cos(alpha), -ca.cos(beta) * ca.sin(alpha)),
+        ca.horzcat(0, ca.sin(alpha), ca.cos(beta) * ca.cos(alpha)),
+    )
+
+
+def euler_bias_acceleration(angles: ca.SX, rates: ca.SX) -> ca.SX:
+    """J_e_dot phi_dot (3,): the angular acceleration left when the Euler accelerations are zero (eq. 38)."""
+    ca_, cb, sa, sb = ca.cos(angles[0]), ca.cos(angles[1]), ca.sin(angles[0]), ca.sin(angles[1])
+    da, db, dg = rates[0], rates[1], rates[2]
+    return ca.vertcat(
+        db * dg * cb,
+        -ca_ * da * dg * cb + sa * (db * dg * sb - db * da),
+        -sa * da * dg * cb + ca_ * (db * da - db * dg * sb),
+    )
+
+
+def pose_rate_to_twist(pose: ca.SX) -> ca.SX:
+    """T (6, 6): twist [h_dot, omega] = T pose_dot; the block-diagonal matrix of eq. 29."""
+    return ca.diagcat(ca.SX.eye(3), euler_rate_jacobian(pose[3:6]))
+
+
+def twist_bias(pose: ca.SX, pose_rate: ca.SX) -> ca.SX:
+    """T_dot pose_dot (6,): what twist_dot holds when the pose acceleration is zero."""
+    return ca.vertcat(ca.SX.zeros(3), euler_bias_acceleration(pose[3:6], pose_rate[3:6]))
+
+
+def joint_motion(arm: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Velocity and acceleration (3,) of a platform joint A at `arm` (3,) from the platform origin."""
+    omega, omega_dot = twist[3:6], twist_dot[3:6]
+    velocity = twist[0:3] + ca.cross(omega, arm)
+    return velocity, twist_dot[0:3] + ca.cross(omega_dot, arm) + ca.cross(omega, ca.cross(omega, arm))
+
+
+class PlatformJointMotion:
+    """Motion of the joints A (N, 3), m, platform axes, for a pose q (6,), rate and acceleration (6,).
+
+    Lists over the legs: position, velocity, acceleration (3,); gradient dA/dq = d(velocity)/d(rate) (3, 6);
+    gradient_rate d(velocity)/dq (3, 6); acceleration_by_pose d(acceleration)/dq (3, 6).
+    d(acceleration)/d(rate) is twice gradient_rate.
+    """
+
+    def __init__(self, joints: np.ndarray, pose: ca.SX, rate: ca.SX, acceleration: ca.SX) -> None:
+        angles, spin, spin_rate = pose[3:6], rate[3:6], acceleration[3:6]
+        rotation = rotation_matrix(angles)
+        first = _by_angles(rotation, angles)
+        self._second = [_by_angles(matrix, angles) for matrix in first]
+        first_rate = [_combine(row, spin) for row in self._second]
+        rotation_second_rate = _combine(first, spin_rate) + _combine(first_rate, spin)
+        third = _by_angles(rotation_second_rate, angles)
+        self._arms = arms = list(joints)
+        self.position = [pose[0:3] + rotation @ arm for arm in arms]
+        self.velocity = [rate[0:3] + _combine(first, spin) @ arm for arm in arms]
+        self.acceleration = [acceleration[0:3] + rotation_second_rate @ arm for arm in arms]
+        self.gradient = [ca.horzcat(ca.SX.eye(3), *[matrix @ arm for matrix in first]) for arm in arms]
+        self.gradient_rate = [ca.horzcat(ca.SX.zeros(3, 3), *[m @ arm for m in first_rate]) for arm in arms]
+        self.acceleration_by_pose = [ca.horzcat(ca.SX.zeros(3, 3), *[m @ arm for m in third]) for arm in arms]
+
+    def curvature(self, leg: int, force: ca.SX) -> ca.SX:
+        """d(gradient^T force)/dq (6, 6) for a force (3,) held constant at the joint of one leg."""
+        arm = self._arms[leg]
+        rows = [ca.horzcat(*[ca.dot(force, matrix @ arm) for matrix in row]) for row in self._second]
+        return ca.diagcat(ca.SX.zeros(3, 3), ca.vertcat(*rows))
+
+
+def _by_angles(matrix: ca.SX, angles: ca.SX) -> list[ca.SX]:
+    columns = ca.jacobian(ca.vec(matrix), angles)
+    return [ca.reshape(columns[:, axis], 3, 3) for axis in range(3)]
+
+
+def _combine(matrices: list[ca.SX], weights: ca.SX) -> ca.SX:
+    return matrices[0] * weights[0] + matrices[1] * weights[1] + matrices[2] * weights[2]
