@@ -151,7 +151,7 @@ def _read_text(name_or_path: str | Path) -> tuple[str, str]:
     if not isinstance(name_or_path, str | PathLike):
         raise RobotFileError(f"a robot is given by its name or the path of its file, got {shown(name_or_path)}")
     path = Path(name_or_path)
-    if path.suffix == ".toml" or path.is_file():
+    if path.suffix == ".toml" or (path.is_file() and str(name_or_path) not in built_in_robots()):
         try:
             return str(path), path.read_text(encoding="utf-8")
         except (OSError, ValueError) as error:

@@ -1,6 +1,6 @@
 """Scenarios: everything that decides a synthetic experiment, read from TOML and checked as a whole."""
 
-from identify.scenario.scenario import Scenario, load_scenario, scenario_from_dict, scenario_from_toml, scenario_names
+from identify.scenario.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
 from identify.scenario.sections import Excitation, Filter, Model, Plant, PriorValue
 from identify.scenario.timing import Timing
 
@@ -13,7 +13,6 @@ __all__ = [
     "Scenario",
     "Timing",
     "load_scenario",
-    "scenario_from_dict",
     "scenario_from_toml",
     "scenario_names",
 ]

@@ -3,12 +3,11 @@
 Each field states its unit; an error names the key, the value, the unit and, for a wrong name, the valid names.
 """
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from identify.errors import ScenarioError
 from identify.filtering import padding_samples
@@ -23,10 +22,8 @@ from identify.scenario.sections import (
     Servo,
     Validation,
 )
-from identify.scenario.settings_file import built_in_names, named_text, one_line, to_toml
-from identify.scenario.timing import IN_FILE, Timing, by_dotted_key, completed
-
-BUILT_IN = Path(__file__).parent / "built_in"
+from identify.scenario.settings_file import SettingsFiles, to_toml
+from identify.scenario.timing import IN_FILE, Timing, by_dotted_key, completed, sensor_names
 
 
 class Scenario(Section):
@@ -34,8 +31,8 @@ class Scenario(Section):
 
     name: str = Field(description="short name, used for folders", pattern=r"^[\w.-]+$")
     description: str = ""
-    robot: str = Field("rss6", description="built-in robot or path of a robot file")
-    sensor: str = Field("ctrack780", description="built-in sensor or path of a sensor file")
+    robot: str = Field("rss6", description="built-in robot, or path of a robot file from this file on")
+    sensor: str = Field("ctrack780", description="built-in sensor, or path of a sensor file from this file on")
     sensor_note: str = Field("", description="what the sensor's file says about its own figures")
     sensor_changes: dict[str, Any] = Field({}, description="entries that hold instead of the sensor file's")
     renderer: Literal["pyrender", "analytic", "auto"] = Field(
@@ -115,7 +112,8 @@ class Scenario(Section):
     def with_overrides(self, overrides: Mapping[str, Any]) -> "Scenario":
         """Copy with values replaced by dotted path, such as ``{"timing.frame_rate_hz": 30.0}``; None takes one back.
 
-        What this scenario took from its sensor is taken again, from the copy's.
+        A path among them starts from the current folder, and the copy holds it absolute, as files leave it. What this
+        scenario took from its sensor is taken again, from the copy's.
 
         Raises:
             ScenarioError: a path that does not exist (with the valid names) or a value that does not fit.
@@ -123,51 +121,49 @@ class Scenario(Section):
         data = self.model_dump(exclude_none=True, exclude_unset=True)
         for path, value in overrides.items():
             _replace(data, path, value)
-        return scenario_from_dict(data, source=f"scenario {self.name!r}")
+        return SCENARIOS.from_dict(data, f"scenario {self.name!r}")
 
     def to_toml(self) -> str:
         """Fully resolved TOML text, every default written out with its unit; reading it gives an equal scenario."""
         return to_toml(self)
 
 
+def _robot_names() -> list[str]:
+    from dynamics.robot_file import built_in_robots
+
+    return built_in_robots()
+
+
+SCENARIOS = SettingsFiles(
+    "scenario",
+    Path(__file__).parent / "built_in",
+    Scenario,
+    ScenarioError,
+    {"robot": _robot_names, "sensor": sensor_names},
+)
+
+
 def scenario_names() -> list[str]:
     """Names of the built-in scenarios."""
-    return built_in_names(BUILT_IN)
+    return SCENARIOS.names()
 
 
 def load_scenario(name_or_path: str | Path) -> Scenario:
-    """Load a built-in scenario by name, or one from a TOML file.
+    """Load a built-in scenario by name, or one from a TOML file, from whose folder its paths start.
 
     Raises:
         ScenarioError: no such scenario (with the built-in names), no TOML, or wrong content.
     """
-    text, source = named_text(name_or_path, BUILT_IN, "scenario", ScenarioError)
-    return scenario_from_toml(text, source)
+    return SCENARIOS.load(name_or_path)
 
 
 def scenario_from_toml(text: str, source: str = "scenario") -> Scenario:
-    """Scenario from TOML text; ``source`` names it in error messages.
+    """Scenario from TOML text; ``source`` names it in error messages, and its paths start from the current folder.
 
     Raises:
         ScenarioError: no TOML, or wrong content.
     """
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ScenarioError(f"{source} is not valid TOML: {error}") from error
-    return scenario_from_dict(data, source)
-
-
-def scenario_from_dict(data: Mapping[str, Any], source: str = "scenario") -> Scenario:
-    """Scenario from nested mappings, all wrong entries named in one line.
-
-    Raises:
-        ScenarioError: unknown keys, wrong types or values, or settings that contradict each other.
-    """
-    try:
-        return Scenario.model_validate(dict(data))
-    except ValidationError as error:
-        raise ScenarioError(f"{source}: {one_line(error, Scenario)}") from error
+    return SCENARIOS.from_toml(text, source)
 
 
 def _replace(data: dict[str, Any], path: str, value: Any) -> None:

@@ -1,8 +1,12 @@
-"""Files of settings (TOML): names that there are, how one becomes a text, and why one is refused, in a line."""
+"""Files of settings (TOML), such as scenarios and studies: which there are, how one is read, written and refused."""
 
+import dataclasses
 import json
+import tomllib
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any, Generic, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -10,33 +14,72 @@ from pydantic_core import ErrorDetails
 
 from identify.errors import IdentifyError
 
-# Files that come with the package, or a user's own: which names there are, and how a name becomes a text.
+Settings = TypeVar("Settings", bound=BaseModel)
 
 
-def built_in_names(folder: Path) -> list[str]:
-    """Names of the TOML files in a folder of the package."""
-    return sorted(path.stem for path in folder.glob("*.toml"))
+@dataclass(frozen=True)
+class SettingsFiles(Generic[Settings]):
+    """The files of one kind, as ``scenario``: those of a folder of the package, by name, and a user's own, by path.
 
-
-def named_text(name_or_path: str | Path, folder: Path, kind: str, error_class: type[IdentifyError]) -> tuple[str, str]:
-    """Text of a built-in file by name, or of a user's by path, and how messages call it; `kind`: as ``scenario``.
-
-    Raises:
-        IdentifyError: of `error_class`, with the built-in names, where it is neither or cannot be read.
+    model: what they hold; error: what a refusal raises, with the reason in one line; files: keys that name files of
+    another kind, each with the names that are built in. Such a path starts from the file that states it.
     """
-    name = str(name_or_path)
-    built_in = built_in_names(folder)
-    path, source = Path(name), f"{kind} file {name}"
-    if name in built_in:
-        path, source = folder / f"{name}.toml", f"{kind} {name!r}"
-    try:
-        return path.read_text(encoding="utf-8"), source
-    except (OSError, UnicodeDecodeError) as error:
-        reason = f", and {error}" if path.exists() else " nor a file"
-        raise error_class(f"{kind} {name!r} is neither built in ({', '.join(built_in)}){reason}") from error
+
+    kind: str
+    folder: Path
+    model: type[Settings]
+    error: type[IdentifyError]
+    files: Mapping[str, Callable[[], Collection[str]]] = dataclasses.field(default_factory=dict)
+
+    def names(self) -> list[str]:
+        """Names of the built-in files."""
+        return sorted(path.stem for path in self.folder.glob("*.toml"))
+
+    def load(self, name_or_path: str | Path) -> Settings:
+        """Read a built-in file by name, or a user's own by path.
+
+        Raises:
+            IdentifyError: of this kind: neither a built-in name nor a file (with the names), no TOML, wrong content.
+        """
+        name, built_in = str(name_or_path), self.names()
+        path, source = Path(name), f"{self.kind} file {name}"
+        if name in built_in:
+            path, source = self.folder / f"{name}.toml", f"{self.kind} {name!r}"
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = f", and {error}" if path.exists() else " nor a file"
+            raise self.error(f"{self.kind} {name!r} is neither built in ({', '.join(built_in)}){reason}") from error
+        return self.from_toml(text, source, path.parent)
+
+    def from_toml(self, text: str, source: str, folder: Path = Path()) -> Settings:
+        """Settings from TOML text; `source` names it in messages, its paths start from `folder`. Raises as `load`."""
+        try:
+            content = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise self.error(f"{source} is not valid TOML: {error}") from error
+        return self.from_dict(content, source, folder)
+
+    def from_dict(self, content: Mapping[str, Any], source: str, folder: Path = Path()) -> Settings:
+        """Settings from nested mappings, all wrong entries named in one line. Raises as `load`."""
+        paths = {
+            key: file_path(name, folder, built_in())
+            for key, built_in in self.files.items()
+            if isinstance(name := content.get(key), str)
+        }
+        try:
+            return self.model.model_validate({**content, **paths})
+        except ValidationError as error:
+            raise self.error(f"{source}: {one_line(error, self.model)}") from error
 
 
-# Scenarios as text: TOML with units, and the reasons for a refusal in one line.
+def file_path(name: str, folder: Path, built_in: Collection[str]) -> str:
+    """The absolute path of a file that is named relative to a folder; a built-in name stays one.
+
+    So does what is neither: it is left for whoever reads the file to refuse, with the valid names.
+    """
+    path = folder / name
+    return name if name in built_in or not (path.suffix == ".toml" or path.is_file()) else str(path.resolve())
 
 
 def to_toml(model: BaseModel) -> str:

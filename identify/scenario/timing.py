@@ -117,6 +117,13 @@ def completed(stated: Timing, sensor: str, changes: Mapping[str, Any]) -> tuple[
     return Timing.model_construct(_fields_set=set(own), **whole.model_dump()), file.note
 
 
+def sensor_names() -> list[str]:
+    """Names of the built-in sensors."""
+    from cmmsim.files import built_in_names
+
+    return built_in_names()
+
+
 def by_dotted_key(changes: Mapping[str, Any]) -> dict[str, Any]:
     """A scenario's ``[sensor_changes]``, also as tables in tables, by dotted key of the sensor's file."""
     from cmmsim.files import dotted

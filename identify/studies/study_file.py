@@ -26,7 +26,6 @@ an option of the kind.
 """
 
 import math
-import tomllib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -34,7 +33,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError, field_validator, model_validator
 
 from identify.errors import StudyError
-from identify.scenario.settings_file import built_in_names, named_text, one_line
+from identify.scenario.settings_file import SettingsFiles, one_line
 
 # A law that a study's rows should follow, as a study file states it.
 
@@ -73,9 +72,6 @@ class Law(BaseModel):
     def quantity(self) -> str:
         """The figure, divided by the other where there is one."""
         return self.figure if self.per is None else f"{self.figure} / {self.per}"
-
-
-BUILT_IN = Path(__file__).parent / "built_in"
 
 
 class _Table(BaseModel):
@@ -158,9 +154,12 @@ class Study(_Table):
         return self.points * self.repeats
 
 
+STUDIES = SettingsFiles("study", Path(__file__).parent / "built_in", Study, StudyError)
+
+
 def study_names() -> list[str]:
     """Names of the built-in studies."""
-    return built_in_names(BUILT_IN)
+    return STUDIES.names()
 
 
 def load_study(name_or_path: str | Path) -> Study:
@@ -170,8 +169,7 @@ def load_study(name_or_path: str | Path) -> Study:
         StudyError: no such study (with the built-in names), no TOML, or wrong content; the keys of factors and changes
             are checked by :mod:`identify.studies.design`.
     """
-    text, source = named_text(name_or_path, BUILT_IN, "study", StudyError)
-    return study_from_toml(text, source)
+    return STUDIES.load(name_or_path)
 
 
 def study_from_toml(text: str, source: str = "study") -> Study:
@@ -180,12 +178,7 @@ def study_from_toml(text: str, source: str = "study") -> Study:
     Raises:
         StudyError: no TOML, or wrong content.
     """
-    try:
-        return Study.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise StudyError(f"{source} is not valid TOML: {error}") from error
-    except ValidationError as error:
-        raise StudyError(f"{source}: {one_line(error, Study)}") from error
+    return STUDIES.from_toml(text, source)
 
 
 def _factor(path: str, value: Any) -> Any:

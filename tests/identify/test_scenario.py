@@ -1,7 +1,10 @@
 import tomllib
+from importlib import resources
+from pathlib import Path
 
 import pytest
 
+from dynamics import load_robot
 from identify.errors import ScenarioError
 from identify.loop_parameters import NAMES
 from identify.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
@@ -108,6 +111,54 @@ def test_scenario_from_a_file(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('name = "mine"\n[timing]\nframe_rate_hz = 120\n', encoding="utf-8")
     assert load_scenario(path).timing.frames(0.5) == 60
+
+
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch):
+    """A folder with a scenario and the robot and sensor that it names, called from one with files of the same names."""
+    folder = tmp_path / "project"
+    here = tmp_path / "here"
+    for place, cranks, rate in ((folder / "files", 0.062, 50), (here / "files", 0.065, 40)):
+        place.mkdir(parents=True)
+        text = resources.files("dynamics").joinpath("robots", "rss6.toml").read_text(encoding="utf-8")
+        (place / "robot.toml").write_text(text.replace("crank_length = 0.06\n", f"crank_length = {cranks}\n"))
+        (place / "sensor.toml").write_text(f'name = "s"\nbased_on = "ctrack780"\n[timing]\nframe_rate = {rate}\n')
+    (folder / "mine.toml").write_text('name = "mine"\nrobot = "files/robot.toml"\nsensor = "files/sensor.toml"\n')
+    monkeypatch.chdir(here)
+    return folder
+
+
+def test_paths_in_a_scenario_start_from_its_own_file_and_hold_from_anywhere(elsewhere, monkeypatch):
+    scenario = load_scenario("../project/mine.toml")
+    assert load_robot(scenario.robot).geometry.crank_length == 0.062
+    assert scenario.timing.frame_rate_hz == 50
+    (elsewhere / "left").mkdir()
+    resolved = elsewhere / "left" / "scenario.toml"
+    resolved.write_text(scenario.to_toml(), encoding="utf-8")
+    monkeypatch.chdir("/")
+    assert load_scenario(resolved) == scenario
+    again = load_scenario(resolved).with_overrides({"timing.frame_rate_hz": None})
+    assert again.timing.frame_rate_hz == 50, "the sensor's file is found again"
+
+
+def test_a_path_on_the_command_line_starts_from_where_it_is_typed(elsewhere):
+    scenario = load_scenario("../project/mine.toml").with_overrides({"robot": "files/robot.toml"})
+    assert load_robot(scenario.robot).geometry.crank_length == 0.065
+    assert Path(scenario.robot).is_absolute()
+    assert scenario.timing.frame_rate_hz == 50
+
+
+def test_a_built_in_name_wins_over_a_file_and_one_that_is_nothing_is_left_as_it_stands(elsewhere):
+    (elsewhere / "rss6").write_text("no robot")
+    (elsewhere / "ctrack780").write_text("no sensor")
+    (elsewhere / "mine.toml").write_text('name = "mine"\nrobot = "rss6"\nsensor = "ctrack780"\n')
+    scenario = load_scenario(elsewhere / "mine.toml")
+    assert (scenario.robot, scenario.sensor) == ("rss6", "ctrack780")
+    (elsewhere / "mine.toml").write_text('name = "mine"\nrobot = "rss7"\n')
+    assert load_scenario(elsewhere / "mine.toml").robot == "rss7"
+    (elsewhere / "mine.toml").write_text('name = "mine"\nsensor = "none.toml"\n')
+    with pytest.raises(ScenarioError, match=str(elsewhere / "none.toml")):
+        load_scenario(elsewhere / "mine.toml")
 
 
 def test_unknown_scenario_lists_the_built_in_names():
