@@ -15,16 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.detection.cramer_rao import cramer_rao_bound, light_shares
-from cmmsim.detection.detected_centres import DetectedCentres
-from cmmsim.detection.detectors import DETECTORS, Detector
-from cmmsim.detection.ellipse_fit import FitLimits
+from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, find_detector
 from cmmsim.errors import CmmError
-from cmmsim.files.marked_body import marked_body
-from cmmsim.files.rig import rig_from_file
 from cmmsim.files.schema import NARROWEST_PSF, SensorFile
+from cmmsim.files.setup import marked_body, rig_from_file
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.disc_image import project_discs
 from cmmsim.geometry.pose import Array, apply, pose_to_transform
+from cmmsim.plugins import DETECTORS
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.sensor import Sensor
 
@@ -217,7 +215,7 @@ def compete(
         raise CmmError(f"a leaderboard needs at least 2 draws, got {draws}")
     scenes = [scene.with_noise(condition.noise) for condition in conditions]  # refused before any work is done
     scores: list[Score] = []
-    chosen = detectors or [*DETECTORS.values(), *PEERS]
+    chosen = detectors or [*map(find_detector, DETECTORS), *PEERS]
     for k, (lit, condition) in enumerate(zip(scenes, conditions, strict=True)):
         scores += _round(lit, condition, draws, rng, chosen)
         report(k + 1, len(conditions))

@@ -23,10 +23,11 @@ class SensorFileError(CmmError):
 
 
 class UnknownOptionError(CmmError):
-    """An option has a value that is not on its list."""
+    """An option has a value that is not on its list; ``own``: where ``module:name`` of a user's own would do, too."""
 
-    def __init__(self, option: str, value: object, valid_names: Iterable[str]) -> None:
-        super().__init__(f"unknown {option} {value!r}: valid are {', '.join(sorted(valid_names))}")
+    def __init__(self, option: str, value: object, valid_names: Iterable[str], own: bool = False) -> None:
+        names = ", ".join(sorted(valid_names)) + (", or module:name of your own" if own else "")
+        super().__init__(f"unknown {option} {value!r}: valid are {names}")
 
 
 class UnknownBodyError(CmmError):
@@ -59,14 +60,8 @@ class OpenGLMissingError(RuntimeError):
         )
 
 
-# Errors of calibration.
-
-
 class CalibrationError(CmmError):
     """Images, board or poses from which no calibration can be made; the message says which and how to go on."""
-
-
-# What an acceptance test refuses.
 
 
 class AcceptanceError(CmmError):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.checks import require_kind
-from cmmsim.geometry.coverage import covered_area
+from cmmsim.geometry.disc_image import covered_area
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.images import StereoFrame, StereoImages, Windows, readable
 from cmmsim.radiometry.noise import CameraNoise

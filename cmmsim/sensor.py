@@ -14,25 +14,24 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from cmmsim.checks import finite_array, require_kind
-from cmmsim.detection.blob_search import SMALLEST_STEP
-from cmmsim.detection.ellipse_fit import FitLimits
+from cmmsim.detection.detector import FitLimits, find_detector
 from cmmsim.errors import CmmError, UnknownBodyError, UnknownOptionError
-from cmmsim.files.marked_body import marked_body, require_corner
-from cmmsim.files.rig import rig_from_file
 from cmmsim.files.schema import SensorFile, Timing
 from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.files.setup import marked_body, require_corner, rig_from_file
+from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.pose import Array, checked_pose, checked_transform, pose_to_transform
 from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
 from cmmsim.imaging.formation import ImageFormation
-from cmmsim.imaging.renderer import RENDERER_NAMES, Renderer, choose_renderer
+from cmmsim.imaging.renderer import Drawable, Renderer, choose_renderer
 from cmmsim.imaging.scene import Mesh, scene_body, solid_mesh
-from cmmsim.imaging.views import Drawable
+from cmmsim.plugins import is_own, require_renderer
 from cmmsim.pose_estimation.estimator import METHODS, Measurement, PoseEstimator, lost_measurement
-from cmmsim.pose_estimation.observation import DetectionSettings
+from cmmsim.pose_estimation.observation import DetectionSettings, Observer
+from cmmsim.pose_estimation.search import SMALLEST_STEP
 from cmmsim.pose_estimation.taught import Taught, require_taught_for, setup_of
 from cmmsim.radiometry.images import StereoFrame, StereoImages
 from cmmsim.radiometry.noise import CameraNoise
-from cmmsim.radiometry.optics import Optics
 from cmmsim.teaching import Progress, Teacher, WindowSizes, largest_radius, radius_at, window_sizes
 from cmmsim.tracker import Tracker
 
@@ -58,8 +57,10 @@ class Sensor:
         require_kind(file, SensorFile, "a sensor is made of a SensorFile; load_sensor takes a name or a path")
         if method not in METHODS:
             raise UnknownOptionError("method", method, METHODS)
-        if renderer is not None and renderer not in RENDERER_NAMES:
-            raise UnknownOptionError("renderer", renderer, RENDERER_NAMES)
+        find_detector(file.detection.detector)
+        self._asked_renderer = require_renderer(file.renderer if renderer is None else renderer)
+        if is_own(self._asked_renderer):
+            choose_renderer(self._asked_renderer)
         if progress is not None and not callable(progress):
             raise CmmError(f"progress must be a function of the steps done and their number, got {progress!r}")
         self._file, self._seed, self._progress = file, _checked_seed(seed), progress
@@ -78,7 +79,6 @@ class Sensor:
             for stream, (body, section) in enumerate(((self.platform, file.platform), (self.base, file.base)))
         ]
         self._obstacles: dict[str, Mesh] = {}
-        self._asked_renderer = renderer or file.renderer
         self._taught = taught
         self._tracker: Tracker | None = None
         self.start_run(seed)
@@ -146,14 +146,17 @@ class Sensor:
         """The part that turns images into poses; also for images from elsewhere, see measure_frame."""
         return PoseEstimator(self.rig, self.noise, self.settings, self.platform, self.taught, self.method)
 
+    @property
+    def observer(self) -> Observer:
+        """The part that finds stickers in images, which needs no teaching."""
+        return Observer(self.rig, self.noise, self.settings)
+
     def teach(self, progress: Progress | None = None) -> Taught:
         """Teach the frames of base and platform if that has not been done; ``progress(done, total)`` is called."""
         if self._taught is None:
             for body in (self.platform, self.base):
                 require_corner(body)
-            teacher = Teacher(
-                self._camera, self.rig, self.noise, self.settings, self.platform, self.base, self._window_sizes.plan()
-            )
+            teacher = Teacher(self._camera, self.observer, self.platform, self.base, self._window_sizes.plan())
             rng = np.random.default_rng([self._seed, TEACHING_STREAM])
             found = teacher.teach(self.name, self.home, rng, progress or self._progress)
             self._taught = replace(found, setup=setup_of(self._file))
@@ -221,14 +224,11 @@ class Sensor:
         """
         images = self.look(pose, obstacles, pose_rate)
         if self._tracker is None:
-            self._tracker = self._new_tracker(self.taught)
+            self._tracker = Tracker(self.estimator)
         if self._dropout_rng.random() < self.timing.dropout:
             self._tracker.miss()
             return lost_measurement(f"dropped frame (a share of {self.timing.dropout:.3g} drops out)")
         return self._tracker.measure(images)
-
-    def _new_tracker(self, taught: Taught) -> Tracker:
-        return Tracker(PoseEstimator(self.rig, self.noise, self.settings, self.platform, taught, self.method))
 
     @cached_property
     def _renderer(self) -> Renderer:

@@ -21,22 +21,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.detection.detectors import DEFAULT_DETECTOR
 from cmmsim.errors import LostError, TeachingError
-from cmmsim.files.marked_body import MarkedBody, marked_body
-from cmmsim.files.rig import rig_from_file
 from cmmsim.files.schema import SensorFile
+from cmmsim.files.setup import MarkedBody, marked_body, rig_from_file
 from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, compose_covariance, invert
 from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
 from cmmsim.imaging.scene import placed_stickers
-from cmmsim.pose_estimation.estimator import FEWEST_NOMINAL, NOMINAL_TOLERANCE, by_planes, points_in_frame
-from cmmsim.pose_estimation.labelling import find_layout
-from cmmsim.pose_estimation.observation import DetectionSettings, StickerObservation, faces_camera, observe
+from cmmsim.plugins import DEFAULT_DETECTOR
+from cmmsim.pose_estimation.estimator import FEWEST_NOMINAL, NOMINAL_TOLERANCE, by_planes
+from cmmsim.pose_estimation.observation import Observer, StickerObservation, faces_camera
+from cmmsim.pose_estimation.search import bright_ellipses, candidate_points, find_layout
 from cmmsim.pose_estimation.taught import Taught, setup_of
-from cmmsim.radiometry.noise import CameraNoise
 
 Progress = Callable[[int, int], None]
 SHIFT, TURN = 0.008, 0.03  # m, rad: reach of the teaching path about home
@@ -62,9 +60,7 @@ class Teacher:
     """The instruments of teaching."""
 
     camera: VirtualStereoCamera
-    rig: StereoRig
-    noise: CameraNoise
-    settings: DetectionSettings
+    observer: Observer
     platform: MarkedBody
     base: MarkedBody
     plan: TeachingPlan = field(default_factory=TeachingPlan)
@@ -78,7 +74,8 @@ class Teacher:
         report(0, steps)
         try:
             path = teaching_path(home, self.plan.poses)
-            points = points_in_frame(self.camera.look(path[0], rng).full(), self.rig, self.noise, self.settings)
+            ellipses = bright_ellipses(self.camera.look(path[0], rng).full(), self.observer)
+            points = candidate_points(ellipses, self.observer, self.observer.settings.limits)
             start = [
                 find_layout(body.nominal, points, NOMINAL_TOLERANCE, FEWEST_NOMINAL, body.name)[0]
                 for body in (self.base, self.platform)
@@ -115,25 +112,18 @@ class Teacher:
         window_size: int,
     ) -> StickerObservation:
         """All stickers of a body from averaged exposures. Raises LostError when one is missing."""
-        limits = replace(self.settings.limits, largest_misfit=np.inf)
-        noise = replace(self.noise, frames=quality.exposures)
+        usual = self.observer.settings
         settings = replace(
-            self.settings,
+            usual,
             window_size=window_size,
-            limits=limits,
+            limits=replace(usual.limits, largest_misfit=np.inf),
             largest_ray_gap=np.inf,
             detector=DEFAULT_DETECTOR,
             centre_error_px=self.camera.centre_error_px(quality),
         )
-        seen = observe(
-            self.camera.look(pose, rng, quality=quality),
-            self.rig,
-            noise,
-            settings,
-            expected,
-            places,
-            body.sticker_normals,
-        )
+        noise = replace(self.observer.noise, frames=quality.exposures)
+        observer = replace(self.observer, noise=noise, settings=settings)
+        seen = observer.observe(self.camera.look(pose, rng, quality=quality), expected, places, body.sticker_normals)
         if len(seen.index) < len(places):
             missing = np.setdiff1d(np.arange(len(places)), seen.index)
             raise LostError(
@@ -144,7 +134,7 @@ class Teacher:
 
     def _outside(self, body: MarkedBody, missing: NDArray[np.int_], points: Array) -> str:
         """Which of the missing stickers no window could have found, for they lie beside an image."""
-        outside = missing[~np.all(self.rig.project(points[missing])[1], axis=0)]
+        outside = missing[~np.all(self.observer.rig.project(points[missing])[1], axis=0)]
         return f"; {', '.join(body.sticker_ids[outside])} lie outside of an image" if len(outside) else ""
 
     def _platform_views(

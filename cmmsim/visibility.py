@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmmsim.errors import LostError
-from cmmsim.files.marked_body import MarkedBody, marked_body
-from cmmsim.files.rig import rig_from_file
 from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.files.setup import MarkedBody, marked_body, rig_from_file
 from cmmsim.geometry.pose import Array, apply, compose_covariance, invert, pose_covariance, pose_to_transform
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.pose_estimation.estimator import by_planes, by_registration
-from cmmsim.pose_estimation.observation import DetectionSettings, faces_camera, observe
+from cmmsim.pose_estimation.observation import DetectionSettings, faces_camera
 from cmmsim.sensor import load_sensor
 
 EDGE_PX = DetectionSettings().window_size
@@ -79,15 +78,7 @@ def expected_covariance(
     sensor, sight = load_sensor(name, seed, method, renderer="analytic", changes=changes), sight_lines(name, changes)
     base_from_platform = pose_to_transform(pose)
     expected = sight.camera_from_base @ base_from_platform
-    seen = observe(
-        sensor.look(pose),
-        sight.rig,
-        sensor.noise,
-        sensor.settings,
-        expected,
-        sight.platform.nominal,
-        sight.platform.sticker_normals,
-    )
+    seen = sensor.observer.observe(sensor.look(pose), expected, sight.platform.nominal, sight.platform.sticker_normals)
     if method == "planes":
         covariance = by_planes(seen, sight.platform, sight.platform.normals @ expected[:3, :3].T)[1]
     else:

@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmmsim.errors import AcceptanceError, LostError
-from cmmsim.files.marked_body import MarkedBody
-from cmmsim.files.rig import rig_from_file
 from cmmsim.files.schema import Body, HalfSpace, Planes, Platform, Rig, SensorFile, StickerPlane
+from cmmsim.files.setup import MarkedBody, rig_from_file
 from cmmsim.geometry.pose import Array, invert, pose_to_transform, transform_to_pose
 from cmmsim.imaging.pyrender_renderer import require_opengl
-from cmmsim.imaging.renderer import PYRENDER, choose_renderer
+from cmmsim.imaging.renderer import choose_renderer
 from cmmsim.pose_estimation.estimator import PoseEstimator
-from cmmsim.pose_estimation.observation import StickerObservation, observe
+from cmmsim.pose_estimation.observation import StickerObservation
 from cmmsim.pose_estimation.taught import Taught
 from cmmsim.radiometry.images import StereoImages
 from cmmsim.sensor import Sensor
@@ -137,7 +136,7 @@ class SensorUnderTest:
     def renderer_name(self) -> str:
         """The renderer that will draw. Raises UnknownOptionError, or OpenGLMissingError where it cannot."""
         name = choose_renderer(self.renderer or self.file.renderer).name
-        if name == PYRENDER.name:
+        if name == "pyrender":
             require_opengl()
         return name
 
@@ -189,9 +188,7 @@ def locate(estimator: PoseEstimator, images: StereoImages) -> Array:
 def observe_stickers(estimator: PoseEstimator, images: StereoImages, expected: Array) -> StickerObservation:
     """Points of the stickers near an expected camera_from_body (4,4): nothing of the layout enters the points."""
     body = estimator.platform
-    return observe(
-        images, estimator.rig, estimator.noise, estimator.settings, expected, body.nominal, body.sticker_normals
-    )
+    return estimator.observe(images, expected, body.nominal, body.sticker_normals)
 
 
 def pose_in_base(base_from_volume: Array, rotation: Array, position: Array) -> Array:

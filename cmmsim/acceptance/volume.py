@@ -18,8 +18,8 @@ from itertools import product
 import numpy as np
 
 from cmmsim.errors import AcceptanceError
-from cmmsim.files.rig import rig_from_file
 from cmmsim.files.schema import Rig
+from cmmsim.files.setup import rig_from_file
 from cmmsim.geometry.pose import Array, apply, invert
 from cmmsim.geometry.stereo_rig import StereoRig
 

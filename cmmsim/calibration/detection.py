@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.calibration.board import Board
-from cmmsim.detection.ellipse_fit import FitLimits, fit_ellipses
+from cmmsim.detection.detector import FitLimits
+from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.images import FrameImages, StereoFrame
 from cmmsim.radiometry.noise import CameraNoise

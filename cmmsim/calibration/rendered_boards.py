@@ -10,16 +10,14 @@ from numpy.typing import NDArray
 
 from cmmsim.calibration.board import Board
 from cmmsim.errors import CalibrationError
-from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.camera import Optics, PinholeCamera
 from cmmsim.geometry.pose import Array, apply, invert, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.formation import ImageFormation, Side
-from cmmsim.imaging.renderer import Renderer
+from cmmsim.imaging.renderer import Drawable, Renderer
 from cmmsim.imaging.scene import SUNK, Disc, DiscStack, Mesh, Patch, solid_mesh
-from cmmsim.imaging.views import Drawable
 from cmmsim.radiometry.images import StereoFrame
 from cmmsim.radiometry.noise import CameraNoise
-from cmmsim.radiometry.optics import Optics
 
 # The drawn board: a bright plate with dark dots or squares, as both renderers or pyrender take it.
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from cmmsim.errors import CmmError
-from cmmsim.geometry.coverage import blurred_coverage, coverage, covered_area
+from cmmsim.geometry.disc_image import blurred_coverage, coverage, covered_area
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
 

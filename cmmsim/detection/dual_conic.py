@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from cmmsim.detection.detected_centres import DetectedCentres, no_centres
-from cmmsim.detection.ellipse_fit import FitLimits
+from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, no_centres
 from cmmsim.detection.grey_centroid import BrightSpots, bright_spots, whole_inside
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
@@ -64,6 +63,9 @@ def detect_by_dual_conic(
     good = (spots.contrast >= limits.smallest_contrast) & determined & (np.linalg.eigvalsh(squared)[:, 0] > 0.0)
     good &= whole_inside(centres, 0.25 * squared, fit_size, EDGE_PX + psf_px)
     return DetectedCentres(centres + spots.corners, covariances, good)
+
+
+DUAL_CONIC = Detector("dual_conic", detect_by_dual_conic, 0.004, EDGE_PX)
 
 
 class _EdgeLines:

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.geometry.coverage import require_psf
+from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits
+from cmmsim.geometry.disc_image import require_psf
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
 
@@ -35,8 +36,8 @@ class EllipseFits:
     """Result for n windows, in full-image px.
 
     centres (n,2); covariances (n,2,2) of the centres, px²; shapes (n,2,2) the ellipses' matrices A;
-    shape_covariances (n,3,3) of A_xx, A_xy, A_yy, px²; contrast (n,) grey values; misfit (n,) the reduced chi-square of
-    the grey values; good (n,) whether the window holds one ellipse.
+    shape_covariances (n,3,3) of A_xx, A_xy, A_yy, px²; contrast and ground (n,) grey values; misfit (n,) the reduced
+    chi-square of the grey values; good (n,) whether the window holds one ellipse.
     """
 
     centres: Array
@@ -44,19 +45,41 @@ class EllipseFits:
     shapes: Array
     shape_covariances: Array
     contrast: Array
+    ground: Array
     misfit: Array
     good: NDArray[np.bool_]
 
+    def within(self, limits: FitLimits, noise: CameraNoise) -> EllipseFits:
+        """The same fits, of which only those are still good that keep within limits."""
+        good = self.good & (self.contrast >= limits.smallest_contrast)
+        return replace(self, good=good & (self.misfit <= largest_misfits(limits, noise, self.contrast, self.ground)))
 
-@dataclass(frozen=True)
-class FitLimits:
-    """When a window counts as one whole sticker.
+    def selected(self, keep: NDArray[np.bool_]) -> EllipseFits:
+        """Those of only some windows."""
+        return EllipseFits(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 
-    smallest_contrast in grey values; largest_misfit of the reduced chi-square, for noise of a grey value and more.
-    """
+    @property
+    def detected(self) -> DetectedCentres:
+        """What these fits are as the result of a detector."""
+        return DetectedCentres(
+            self.centres, self.covariances, self.good, self.shapes, self.shape_covariances, self.misfit
+        )
 
-    smallest_contrast: float = 40.0
-    largest_misfit: float = 1.8
+
+def detect_by_maximum_likelihood(
+    windows: NDArray,
+    corners: NDArray[np.integer],
+    noise: CameraNoise,
+    fit_size: int,
+    limits: FitLimits | None = None,
+    psf_px: float = 0.0,
+    smears: Array | None = None,
+) -> DetectedCentres:
+    """Centres of the maximum-likelihood fit of a blurred ellipse. Parameters as of ``DetectWindows``."""
+    return fit_ellipses(windows, corners, noise, fit_size, limits, psf_px=psf_px, smears=smears).detected
+
+
+MAXIMUM_LIKELIHOOD = Detector("maximum_likelihood", detect_by_maximum_likelihood)
 
 
 def fit_ellipses(
@@ -77,7 +100,6 @@ def fit_ellipses(
     exposure, whose middle the centre is for. Raises CmmError for one too narrow to be followed.
     """
     require_psf(psf_px)
-    limits = limits or FitLimits()
     from cmmsim.detection.fit_kernels import UNKNOWNS, FitSettings, fit_windows
 
     n = len(windows)
@@ -118,18 +140,17 @@ def fit_ellipses(
         )
 
     _in_two_threads(fit, n)
-    good = parameters[:, 5] >= limits.smallest_contrast
-    good &= misfit <= largest_misfits(limits, noise, parameters[:, 5], parameters[:, 6])
-    good &= _inside(parameters[:, :2], shapes, fit_size)
-    return EllipseFits(
+    fits = EllipseFits(
         parameters[:, :2] + inner + corners,
         covariances[:, :2, :2],
         shapes,
         covariances[:, 2:, 2:],
         parameters[:, 5],
+        parameters[:, 6],
         misfit,
-        good,
+        _inside(parameters[:, :2], shapes, fit_size),
     )
+    return fits.within(limits or FitLimits(), noise)
 
 
 def _in_two_threads(fit: Callable[[slice], None], count: int) -> None:

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.detection.detected_centres import DetectedCentres, no_centres
-from cmmsim.detection.ellipse_fit import RING_REACH, FitLimits
+from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, no_centres
+from cmmsim.detection.ellipse_fit import RING_REACH
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
 
@@ -64,6 +64,9 @@ def detect_by_centroid(
     covariances = np.einsum("niyx,njyx,nyx->nij", jacobian, jacobian, variance)
     good = (spots.contrast >= limits.smallest_contrast) & whole_inside(spots.centroids, spots.spreads, fit_size)
     return DetectedCentres(spots.centroids + spots.corners, covariances, good)
+
+
+GREY_CENTROID = Detector("grey_centroid", detect_by_centroid, 0.009)
 
 
 def bright_spots(windows: NDArray, corners: NDArray[np.integer], size: int) -> BrightSpots:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from cmmsim.errors import SensorFileError
 from cmmsim.geometry.pose import Array
+from cmmsim.plugins import AUTO, DEFAULT_DETECTOR, require_detector, require_renderer
 
 Vector3 = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -154,12 +155,12 @@ class Lens(_Section):
 
 
 class Detection(_Section):
-    """detector: which one finds the centres of stickers in windows when poses are measured.
+    """detector: which one finds the centres of stickers in windows when poses are measured, see :mod:`cmmsim.plugins`.
 
     Teaching always takes the maximum-likelihood one, whichever is named here; see :mod:`cmmsim.teaching`.
     """
 
-    detector: Literal["maximum_likelihood", "dual_conic", "grey_centroid"] = "maximum_likelihood"
+    detector: Annotated[str, AfterValidator(require_detector)] = DEFAULT_DETECTOR
 
 
 class Stickers(_Section):
@@ -237,14 +238,14 @@ class SensorFile(_Section):
     """A whole sensor file.
 
     based_on: a built-in sensor, or a file beside this one, whose entries hold where this file has none; note: what a
-    user must know of the figures, such as that they are assumed; renderer: which one draws, "auto" takes pyrender where
-    OpenGL works, else analytic.
+    user must know of the figures, such as that they are assumed; renderer: which one draws, see
+    :mod:`cmmsim.plugins`; "auto" takes pyrender where OpenGL works, else analytic.
     """
 
     name: str
     based_on: str | None = None
     note: str = ""
-    renderer: Literal["auto", "pyrender", "analytic"] = "auto"
+    renderer: Annotated[str, AfterValidator(require_renderer)] = AUTO
     timing: Timing
     rig: Rig
     camera: Camera

@@ -1,34 +1,36 @@
-"""Pinhole camera with the lens distortion of Brown and Conrady.
+"""A pinhole camera with its lens: the distortion of Brown and Conrady, point spread and vignetting.
 
-Lens distortion of Brown and Conrady, in OpenCV's order and meaning of the five coefficients.
-Acts on normalised image coordinates (x, y) = (X/Z, Y/Z) of a camera. With s = x² + y²:
+Pixel (0, 0) is the centre of the top-left pixel; camera axes are x right, y down, z forward. Ideal pixels are those of
+the same camera with a perfect lens: lines are straight there, and epipolar geometry and triangulation hold.
+
+Distortion has OpenCV's order and meaning of the five coefficients. It acts on normalised image coordinates
+(x, y) = (X/Z, Y/Z); with s = x² + y²:
 
     x_d = x (1 + k1 s + k2 s² + k3 s³) + 2 p1 x y + p2 (s + 2 x²)
     y_d = y (1 + k1 s + k2 s² + k3 s³) + p1 (s + 2 y²) + 2 p2 x y
 
 The model holds up to the radius where the radial part stops growing: beyond it the image folds back onto itself.
 Source: D. C. Brown, Close-range camera calibration, Photogrammetric Engineering 37 (1971).
-
-Pinhole camera with lens distortion.
-Pixel (0, 0) is the centre of the top-left pixel; camera axes are x right, y down, z forward. Ideal pixels are those of
-the same camera with a perfect lens: lines are straight there, and epipolar geometry and triangulation hold.
 """
 
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass, field, replace
 from functools import cached_property
+from math import ceil
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cmmsim.checks import finite_array
 from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array
 
-NDArrayBool = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+NDArrayBool = NDArray[np.bool_]
 CONVERGED = 1e-12  # largest distance, in normalised coordinates, between a point and the image of its inverse
 MOST_STEPS = 60
 FARTHEST_FOLD = 1e3  # focal lengths: a fold beyond is none
+PSF_REACH = 5.0  # standard deviations after which the point spread is cut off
 
 
 @dataclass(frozen=True)
@@ -211,3 +213,37 @@ def _constant(*values: float) -> Array:
     array = np.array(values)
     array.setflags(write=False)
     return array
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What a lens does to light beside distortion: it spreads each point, and darkens towards the corners.
+
+    psf_px: standard deviation of the Gaussian point spread, px of the image; vignetting: share of the light that is
+    missing in the corner farthest from the principal point; the loss grows with the square of the distance from there.
+    Both zero: the image of a pinhole.
+    """
+
+    psf_px: float = 0.0
+    vignetting: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (self.psf_px >= 0.0 and 0.0 <= self.vignetting < 1.0):
+            raise CmmError(f"optics need psf_px >= 0 and vignetting from 0 to below 1, got {self}")
+
+    @property
+    def margin_px(self) -> int:
+        """How far, in whole px, light from outside of a window reaches into it."""
+        return ceil(PSF_REACH * self.psf_px)
+
+    def illumination(self, camera: PinholeCamera, pixels: Array) -> Array:
+        """Relative illumination (...) of pixels (..., 2) of the image, 1 at the principal point, 0 at the least."""
+        corners = np.array([[x, y] for x in (-0.5, camera.width - 0.5) for y in (-0.5, camera.height - 0.5)])
+        farthest = np.sum((corners - camera.centre) ** 2, axis=1).max()
+        return np.maximum(1.0 - self.vignetting / farthest * np.sum((pixels - camera.centre) ** 2, axis=-1), 0.0)
+
+    def window_illumination(self, camera: PinholeCamera, corners: NDArray[np.int_], size: int) -> Array:
+        """Relative illumination (k, size, size) of windows with first pixels ``corners`` (k, 2)."""
+        ticks = np.arange(size)
+        x, y = corners[:, 0, None, None] + ticks, corners[:, 1, None, None] + ticks[:, None]
+        return self.illumination(camera, np.stack(np.broadcast_arrays(x, y), axis=-1))

@@ -1,31 +1,55 @@
-"""The image of a disc: its ellipse, exact in perspective, and the eccentricity of the ellipse's centre.
+"""The image of a disc: its ellipse, where the ellipse's centre lies, and how much of each pixel it covers.
 
-The ellipse in which a camera sees a disc, exact in perspective.
-With C the centre, n the unit normal and R the radius in camera axes, C C' - R² (I - n n') is the dual conic of the
-rim; carried to pixels by the camera matrix it gives the ellipse's centre and, in its upper left, its shape.
+**Ellipse.** Exact in perspective: with C the centre, n the unit normal and R the radius in camera axes, D = C C' -
+R² (I - n n') is the dual conic of the rim; carried to pixels by the camera matrix it gives the ellipse's centre and, in
+its upper left, its shape: a matrix A (2,2), symmetric, that carries the unit disc onto the ellipse.
 
-The centre of a circle's image is not the image of the circle's centre.
-Through a perfect lens the image is an ellipse. With C the centre, n the unit normal and R the radius in camera axes,
-D = C C' - R² (I - n n') is the dual conic of the image, whose centre is f (D13/D33, D23/D33); the centre itself
-projects to f (X/Z, Y/Z).
-
-Distortion bends this ellipse c + A u, |u| = 1, into a curve, and what is fitted to it is an ellipse again. With J the
-Jacobian of the distortion d at c, the curve is d(c) + J A (u + w) with small w(u). A fit to grey values minimises the
-squared distance between curve and ellipse along its length, which is the integral over the angle of u of
-(u'w - u'a)² / |J A t|, where t is the tangent of the unit circle and a the shift of the ellipse's centre. So
+**Eccentricity.** The centre of a circle's image is not the image of the circle's centre. Through a perfect lens the
+ellipse's centre is f (D13/D33, D23/D33), while the circle's centre projects to f (X/Z, Y/Z). Distortion bends the
+ellipse c + A u, |u| = 1, into a curve, and what is fitted to it is an ellipse again. With J the Jacobian of the
+distortion d at c, the curve is d(c) + J A (u + w) with small w(u). A fit to grey values minimises the squared distance
+between curve and ellipse along its length, which is the integral over the angle of u of (u'w - u'a)² / |J A t|, where t
+is the tangent of the unit circle and a the shift of the ellipse's centre. So
 
     a = (∫ u u' / |J A t|)^-1 ∫ u (u'w) / |J A t|,    and the fitted centre is d(c) + J A a.
 
 For a round J A and a quadratic w_i = ½ H_ijk u_j u_k this is a_i = (H_ijj + 2 H_jij) / 8.
+
+**Coverage.** Seen from the disc, a pixel is a small parallelogram; the area they share is a sum over the
+parallelogram's sides (Green's theorem), each side giving two circle sectors and the triangle over its part inside the
+disc. A change of c or A moves the boundary with a velocity v(x) = dc + dA A^-1 (x - c), and by the transport theorem
+
+    d|disc and pixel| = integral of div v over the shared area - flux of v through the pixel's sides inside the disc,
+
+where v is linear along a side, so that its value at the middle of the part inside is exact.
+
+**Blurred coverage.** With a Gaussian point spread the share of light in a pixel is the integral over the ellipse of
+g_i(x) g_j(y), where g_i(x) is what the point spread carries from a point x into pixel i. By the divergence theorem it
+is an integral along the rim x(t) = c + A (cos t, sin t),
+
+    share = integral of P_i(x) g_j(y) n_x ds,   P_i' = g_i,
+
+and a change of the ellipse, which moves the rim by v = dc + dA (cos t, sin t), changes it by
+
+    d share = integral of g_i(x) g_j(y) v . n ds.
+
+Both are smooth and periodic in t, so the trapezoidal rule converges exponentially once its points lie closer than the
+point spread is wide.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from cmmsim.errors import CmmError
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array, apply
 from cmmsim.geometry.stereo_rig import StereoRig
+
+RIM_POINTS = 24  # of a bent ellipse, over which its fit is integrated
+NARROWEST_PX = 0.05  # standard deviation of a point spread that can be followed
+SHAPE_BASIS = np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
+SHAPE_BASIS.setflags(write=False)
 
 
 def project_discs(camera: PinholeCamera, centres: Array, normals: Array, radii: Array) -> tuple[Array, Array]:
@@ -49,13 +73,10 @@ def project_discs(camera: PinholeCamera, centres: Array, normals: Array, radii: 
     return pixels, shapes
 
 
-# The ellipses in which both cameras see the stickers of a body, in the images as they are.
-
-
 def sticker_outlines(
     rig: StereoRig, camera_from_body: Array, places: Array, normals: Array, radius: float
 ) -> tuple[Array, Array]:
-    """Centres (2, n, 2) px and shapes A (2, n, 2, 2) px of the ellipses of n stickers before both cameras.
+    """Centres (2, n, 2) px and shapes A (2, n, 2, 2) px of the ellipses of n stickers in the images as they are.
 
     Parameters: camera_from_body (4,4); places (n,3) m and normals (n,3) in body axes; radius m. Distortion is taken as
     linear across a sticker.
@@ -79,9 +100,6 @@ def symmetric_root(matrices: Array) -> Array:
     d = np.sqrt(np.linalg.det(matrices))[..., None, None]
     trace = np.trace(matrices, axis1=-2, axis2=-1)[..., None, None]
     return (matrices + d * np.eye(2)) / np.sqrt(trace + 2.0 * d)
-
-
-RIM_POINTS = 24
 
 
 def centre_offset(camera: PinholeCamera, centres: Array, normals: Array, radius: float) -> Array:
@@ -119,3 +137,46 @@ def bending(camera: PinholeCamera, middles: Array, shapes: Array) -> Array:
     normal = np.einsum("np,ip,jp->nij", weight, u, u)
     shift = np.linalg.solve(normal, np.einsum("np,np,ip->ni", weight, bulge, u)[..., None])
     return (local @ shift)[..., 0]
+
+
+def coverage(centres: Array, shapes: Array, size: int) -> tuple[Array, Array]:
+    """Coverage (n, size, size), 0 to 1, and its derivatives (n, size, size, 5) by [c_x, c_y, A_xx, A_xy, A_yy].
+
+    Parameters: centres (n, 2) px, where (0, 0) is the middle of the window's first pixel; shapes (n, 2, 2) px,
+    symmetric and positive definite; size: window side in px.
+    """
+    from cmmsim.geometry.disc_kernels import cover_windows  # compiles, so it is loaded where it is first needed
+
+    shares, derivatives = np.empty((len(centres), size, size)), np.empty((len(centres), size, size, 5))
+    cover_windows(
+        np.ascontiguousarray(centres, dtype=float), np.ascontiguousarray(shapes, dtype=float), shares, derivatives
+    )
+    return shares, derivatives
+
+
+def covered_area(centres: Array, shapes: Array, size: int) -> Array:
+    """Coverage (n, size, size) as ``coverage`` gives it, without derivatives."""
+    return coverage(centres, shapes, size)[0]
+
+
+def blurred_coverage(centres: Array, shapes: Array, size: int, psf_px: float) -> tuple[Array, Array]:
+    """Shares of light of an ellipse blurred by a point spread of sigma ``psf_px``, and their derivatives, as
+    ``coverage`` gives them without one. Raises CmmError for one narrower than NARROWEST_PX."""
+    from cmmsim.geometry.disc_kernels import blur_windows  # compiles, so it is loaded where it is first needed
+
+    require_psf(psf_px)
+    shares, derivatives = np.empty((len(centres), size, size)), np.empty((len(centres), size, size, 5))
+    blur_windows(
+        np.ascontiguousarray(centres, dtype=float),
+        np.ascontiguousarray(shapes, dtype=float),
+        float(psf_px),
+        shares,
+        derivatives,
+    )
+    return shares, derivatives
+
+
+def require_psf(psf_px: float) -> None:
+    """Raise CmmError for a point spread that is neither 0 nor wide enough to be followed."""
+    if not (psf_px == 0.0 or NARROWEST_PX <= psf_px < np.inf):
+        raise CmmError(f"a point spread of {psf_px:g} px cannot be fitted, only 0 or at least {NARROWEST_PX:g} px")

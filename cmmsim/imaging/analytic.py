@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from cmmsim.geometry.disc_image import project_discs
 from cmmsim.geometry.pose import Array
+from cmmsim.imaging.renderer import NEAR, Drawable, Renderer, View, same_exposure
 from cmmsim.imaging.scene import ConvexSolid, DiscStack, Mesh
-from cmmsim.imaging.views import NEAR, Drawable, View, same_exposure
 
-# Discs of a scene as one camera sees them.
-
+if TYPE_CHECKING:
+    from cmmsim.imaging.kernels import Solids
 
 PROBES = 8  # points on a disc's rim, asked with its middle whether a solid hides them
 
@@ -77,10 +77,6 @@ class DiscTable:
         )
 
 
-if TYPE_CHECKING:
-    from cmmsim.imaging.kernels import Solids
-
-
 def draw_windows(
     drawable: Drawable, views: Sequence[View], supersampling: int, background: float = 0.0
 ) -> NDArray[np.float32]:
@@ -93,6 +89,9 @@ def draw_windows(
     for group in same_exposure(views):
         scene.draw(images, views, group, supersampling)
     return images
+
+
+ANALYTIC = Renderer("analytic", draw_windows)
 
 
 class _AnalyticScene:

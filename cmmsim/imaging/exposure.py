@@ -19,8 +19,8 @@ from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array, apply, pose_to_transform
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.formation import ImageFormation, Side
+from cmmsim.imaging.renderer import View
 from cmmsim.imaging.scene import DiscStack
-from cmmsim.imaging.views import View
 from cmmsim.radiometry.images import StereoFrame, Windows
 from cmmsim.radiometry.noise import CameraNoise, FixedPattern, draw_pattern
 

@@ -21,11 +21,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.camera import Optics, PinholeCamera
 from cmmsim.geometry.pose import Array
-from cmmsim.imaging.renderer import Renderer
-from cmmsim.imaging.views import Drawable, View
-from cmmsim.radiometry.optics import Optics, pixel_response
+from cmmsim.imaging.renderer import Drawable, Renderer, View
 
 _QUADRATIC = np.array([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])  # from values at -1, 0, 1
 _QUADRATIC.setflags(write=False)
@@ -190,3 +188,21 @@ def _finer(camera: PinholeCamera, sub_pixels: int) -> PinholeCamera:
         width=camera.width * sub_pixels,
         height=camera.height * sub_pixels,
     )
+
+
+@lru_cache(maxsize=32)
+def pixel_response(psf_px: float, size: int, margin: int, sub_pixels: int) -> NDArray[np.float32]:
+    """Weights (size, (size + 2 margin) sub_pixels) float32 with which drawn sub-pixels count in each pixel of a row.
+
+    The mean over a pixel of a Gaussian of ``psf_px``: the drawn sub-pixels, means over their own width, make up the
+    exact mean over a pixel wherever the Gaussian puts it.
+    """
+    total = (size + 2 * margin) * sub_pixels
+    into_pixels = np.kron(np.eye(size, size + 2 * margin, margin), np.full(sub_pixels, 1.0 / sub_pixels))
+    if psf_px > 0.0:
+        gap = np.subtract.outer(np.arange(total), np.arange(total))
+        spread = np.exp(-0.5 * (gap / (psf_px * sub_pixels)) ** 2) * (np.abs(gap) <= margin * sub_pixels)
+        into_pixels = into_pixels @ (spread / spread[total // 2].sum())
+    weights = into_pixels.astype(np.float32)
+    weights.setflags(write=False)
+    return weights

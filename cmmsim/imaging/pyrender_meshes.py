@@ -21,8 +21,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from cmmsim.geometry.pose import Array
+from cmmsim.imaging.renderer import FAR, NEAR, Drawable, View, window_bounds
 from cmmsim.imaging.scene import ConvexSolid, Disc, DiscStack, Mesh
-from cmmsim.imaging.views import FAR, NEAR, Drawable, View, window_bounds
 
 RIM_SAMPLES = 1.8
 LARGEST_SAG = 0.08  # samples by which a side of the polygon may fall short of the rim

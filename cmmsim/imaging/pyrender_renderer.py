@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from cmmsim.errors import CmmError, OpenGLMissingError
 from cmmsim.imaging.pyrender_meshes import LaidSolids, disc_mesh
+from cmmsim.imaging.renderer import Drawable, Renderer, View, projections, same_exposure
 from cmmsim.imaging.scene import DiscStack, Mesh
-from cmmsim.imaging.views import Drawable, View, projections, same_exposure
 
 ATLAS_SIDE_PX = 2048
 KEPT_FRAME_BUFFERS = 12
@@ -52,6 +52,9 @@ def render_windows(
         atlas = _shared_atlas().draw(drawable, part, (cell_w, cell_h), columns, -(-len(part) // columns), background)
         mean_of_cells(atlas, columns, supersampling, windows[first : first + per_pass])
     return windows
+
+
+PYRENDER = Renderer("pyrender", render_windows, 0.00058)
 
 
 def require_opengl() -> None:

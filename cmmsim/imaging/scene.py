@@ -12,8 +12,8 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
 from cmmsim.checks import finite_array
 from cmmsim.errors import CmmError, SensorFileError
-from cmmsim.files.marked_body import MarkedBody
 from cmmsim.files.schema import Body, Stickers, unit
+from cmmsim.files.setup import MarkedBody
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.plane_frame import PLANE_NAMES
 from cmmsim.geometry.pose import Array, apply, invert

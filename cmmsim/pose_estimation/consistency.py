@@ -24,12 +24,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from cmmsim.errors import LostError
-from cmmsim.files.marked_body import MarkedBody
+from cmmsim.files.setup import MarkedBody
 from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, skew
 from cmmsim.geometry.registration import Registration, register
-from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.pose_estimation.observation import StickerObservation
+from cmmsim.pose_estimation.observation import Observer, StickerObservation
 
 CHANCE = 1e-4  # of a good sticker to be left out, for its place and for each of its two ellipses
 EXCESS_CHANCE = 1e-4  # of a good frame's residuals to be taken for larger than noise
@@ -63,11 +62,11 @@ class StickerChecks:
 
 
 def consistent(
-    observation: StickerObservation, rig: StereoRig, body: MarkedBody, places: Array, radius: float
+    observation: StickerObservation, observer: Observer, body: MarkedBody, places: Array
 ) -> tuple[StickerObservation, Registration]:
-    """The stickers that agree with each other, and their registration.
+    """The stickers of a body, taught at ``places`` (n,3), that agree with each other, and their registration.
 
-    Parameters: places (n,3) taught ones and radius m of all stickers. Raises LostError when too few agree.
+    Raises LostError when too few agree.
     """
     seen = len(observation.index)
     left_out: list[str] = []
@@ -75,7 +74,7 @@ def consistent(
         if len(observation.index) < FEWEST or len(observation.index) <= len(left_out):
             raise LostError(_too_few(len(observation.index), seen, left_out))
         result = register(places[observation.index], observation.points, observation.covariances)
-        checks = _checks(observation, result, rig, body, places, radius)
+        checks = _checks(observation, result, observer, body, places)
         excess = residual_excess(float(result.misfit.sum()), 3 * len(result.misfit) - 6)
         worst = checks.worst
         if checks.passed(worst) and excess <= LARGEST_EXCESS:
@@ -113,18 +112,14 @@ def outline_misfits(observation: StickerObservation, shapes: Array) -> Array:
 
 
 def _checks(
-    observation: StickerObservation,
-    result: Registration,
-    rig: StereoRig,
-    body: MarkedBody,
-    places: Array,
-    radius: float,
+    observation: StickerObservation, result: Registration, observer: Observer, body: MarkedBody, places: Array
 ) -> StickerChecks:
     index = observation.index
     place = place_misfits(result, observation.points, places[index], observation.covariances)
     total, freedom = float(result.misfit.sum()), 3 * len(index) - 9  # without a sticker, its place misfit is missing
     place = place / [residual_excess(total - own, freedom) for own in place]
-    shapes = sticker_outlines(rig, result.transform, places[index], body.sticker_normals[index], radius)[1]
+    normals, radius = body.sticker_normals[index], observer.settings.radius
+    shapes = sticker_outlines(observer.rig, result.transform, places[index], normals, radius)[1]
     return StickerChecks(place, outline_misfits(observation, shapes).max(axis=0))
 
 

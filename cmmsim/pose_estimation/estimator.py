@@ -8,28 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.checks import finite_array, require_kind
-from cmmsim.detection.blob_search import find_ellipses
+from cmmsim.detection.detector import FitLimits
+from cmmsim.detection.ellipse_fit import EllipseFits
 from cmmsim.errors import LostError, ShapeError, UnknownOptionError
-from cmmsim.files.marked_body import MarkedBody
+from cmmsim.files.setup import MarkedBody
 from cmmsim.geometry.plane_frame import frame_of_points
 from cmmsim.geometry.pose import Array, compose_covariance, invert, pose_covariance, skew, transform_to_pose
 from cmmsim.geometry.registration import register
-from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.pose_estimation.consistency import consistent
-from cmmsim.pose_estimation.labelling import ENOUGH, candidate_pairs, find_layout
-from cmmsim.pose_estimation.observation import (
-    DetectionSettings,
-    StickerObservation,
-    observe,
-    observe_windows,
-    read_windows,
-)
+from cmmsim.pose_estimation.observation import Observer, StickerObservation
+from cmmsim.pose_estimation.search import ENOUGH, FEWEST_TAUGHT, bright_ellipses, candidate_points, find_layout
 from cmmsim.pose_estimation.streaks import drawn_out, find_streaks
 from cmmsim.pose_estimation.taught import Taught
 from cmmsim.radiometry.images import FrameImages, StereoFrame, StereoImages
-from cmmsim.radiometry.noise import CameraNoise
 
-# The result of measuring one stereo frame.
+Solution = tuple[Array, Array, StickerObservation]
 
 
 @dataclass(frozen=True)
@@ -78,12 +71,6 @@ def lost_measurement(reason: str) -> Measurement:
     )
 
 
-# The two ways from observed stickers to the pose of the body in the camera frame.
-
-
-Solution = tuple[Array, Array, StickerObservation]
-
-
 def by_registration(observation: StickerObservation, places: Array) -> Solution:
     """camera_from_body (4,4), its covariance (6,6) and the stickers used, by a rigid fit of taught ``places`` (n,3).
 
@@ -113,22 +100,15 @@ def move_origin(frame: Array, covariance: Array, origin: Array) -> Array:
 
 
 METHODS: tuple[str, ...] = ("registration", "planes")
-
-
 NOMINAL_TOLERANCE = 0.003  # m: nominal places are known to about a millimetre
 TAUGHT_TOLERANCE = 0.0005  # m: taught places are known to microns, points in a whole image to tenths of a millimetre
-FEWEST_NOMINAL, FEWEST_TAUGHT = 6, 4
-SEARCH_WINDOW_PX = 24  # at least
-SEARCH_ROOM_PX = 8  # a bright spot's rough centre differs from a prediction of it
+FEWEST_NOMINAL = 6  # stickers by whose nominal places a body is found
 
 
 @dataclass(frozen=True)
-class PoseEstimator:
-    """Everything that turns images into poses: the known rig, noise, sticker bodies and what was taught."""
+class PoseEstimator(Observer):
+    """Everything that turns images into poses: an observer, the platform, and what was taught of it."""
 
-    rig: StereoRig
-    noise: CameraNoise
-    settings: DetectionSettings
     platform: MarkedBody
     taught: Taught
     method: str = "registration"
@@ -142,17 +122,17 @@ class PoseEstimator:
 
         Where the cameras are exposed for some time and many stickers are missing, streaks are looked for as well.
         """
-        frame, usual = images.full(), self.settings
-        if usual.exposed_share == 0.0:
-            return self._found(frame, usual)[0]
-        streaks = replace(usual, limits=replace(usual.limits, largest_misfit=np.inf))
+        ellipses, limits = bright_ellipses(images.full(), self), self.settings.limits
+        if self.settings.exposed_share == 0.0:
+            return self._found(ellipses, limits)[0]
+        streaks = replace(limits, largest_misfit=np.inf)
         try:
-            found, count = self._found(frame, usual)
+            found, count = self._found(ellipses, limits)
         except LostError:
-            return self._found(frame, streaks)[0]
+            return self._found(ellipses, streaks)[0]
         if count < ENOUGH * len(self.taught.platform_places):
             try:
-                longer, more = self._found(frame, streaks)
+                longer, more = self._found(ellipses, streaks)
             except LostError:
                 return found
             return longer if more > count else found
@@ -166,18 +146,7 @@ class PoseEstimator:
         ``swept``: expected ones at the beginning and the end of the exposure. Where stickers are smeared over more than
         half a pixel and it is not told, a pose without point spread is worse than its covariance: ``measure_anew``.
         """
-        return self._measured(
-            observe(
-                images,
-                self.rig,
-                self.noise,
-                self.settings,
-                expected,
-                self.taught.platform_places,
-                self.platform.sticker_normals,
-                swept,
-            )
-        )
+        return self._measured(self.observe(images, expected, *self._stickers, swept))
 
     def measure_anew(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
         """As ``measure`` where nothing is known of the movement: it is told from the streaks of the stickers.
@@ -186,20 +155,23 @@ class PoseEstimator:
         """
         if self.settings.exposed_share == 0.0:
             return self.measure(images, expected)
-        places, normals = self.taught.platform_places, self.platform.sticker_normals
-        read = read_windows(images, self.rig, self.noise, self.settings, expected, places, normals)
-        streaks = find_streaks(read, self.rig, self.noise, self.settings, places, normals)
-        swept = None if streaks is None else streaks.swept
+        read = self.read(images, expected, *self._stickers)
+        streaks = find_streaks(read)
         try:
-            return self._measured(observe_windows(read, self.rig, self.noise, self.settings, places, swept))
+            return self._measured(read.observed(None if streaks is None else streaks.swept))
         except LostError as error:
             if streaks is None:
                 raise
             raise LostError(f"{error}; {drawn_out(streaks.longest_px)}") from error
 
-    def _found(self, frame: StereoFrame, settings: DetectionSettings) -> tuple[Array, int]:
+    @property
+    def _stickers(self) -> tuple[Array, Array]:
+        """Taught places (n,3), m, and normals (n,3) of the platform's stickers, in its axes."""
+        return self.taught.platform_places, self.platform.sticker_normals
+
+    def _found(self, ellipses: tuple[EllipseFits, EllipseFits], limits: FitLimits) -> tuple[Array, int]:
         """Rough camera_from_platform (4,4) and the number of stickers that were recognised. Raises LostError."""
-        points = points_in_frame(frame, self.rig, self.noise, settings)
+        points = candidate_points(ellipses, self, limits)
         place, stickers, _ = find_layout(
             self.taught.platform_places, points, TAUGHT_TOLERANCE, FEWEST_TAUGHT, "platform"
         )
@@ -223,7 +195,7 @@ class PoseEstimator:
         return measurement, camera_from_platform
 
     def _solve(self, seen: StickerObservation) -> Solution:
-        used, result = consistent(seen, self.rig, self.platform, self.taught.platform_places, self.settings.radius)
+        used, result = consistent(seen, self, self.platform, self.taught.platform_places)
         if self.method == "planes":
             return by_planes(used, self.platform, self.platform.normals @ result.transform[:3, :3].T)
         return result.transform, result.covariance, used
@@ -261,21 +233,3 @@ def require_fitting(frame: StereoFrame, estimator: PoseEstimator) -> None:
                 f"the {name} image is {image.dtype}, but the camera's bit_depth "
                 f"{estimator.noise.bit_depth} makes {estimator.noise.image_type}"
             )
-
-
-def points_in_frame(frame: StereoFrame, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings) -> Array:
-    """Points (m,3) in the camera frame that may be stickers; true and false pairings together."""
-    window_size = max(SEARCH_WINDOW_PX, settings.window_size + SEARCH_ROOM_PX)
-    left, right = find_ellipses(frame, noise, window_size, settings.fit_size, settings.limits, settings.optics.psf_px)
-    if not len(left.centres) or not len(right.centres):
-        raise LostError(
-            f"{len(left.centres)} bright spots in the left image and {len(right.centres)} in the right, "
-            f"at least {FEWEST_TAUGHT} in each needed"
-        )
-    ideal = [
-        pixels[found]
-        for pixels, found in (
-            camera.undistort(side.centres) for camera, side in zip(rig.cameras, (left, right), strict=True)
-        )
-    ]
-    return candidate_pairs(rig.ideal, *ideal)[1]

@@ -1,21 +1,22 @@
-"""Stickers of one body, observed near where they are expected: windows, fits, triangulation."""
+"""Stickers of one body, observed near where they are expected: windows, detected centres, triangulation."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.detection.detected_centres import DetectedCentres
-from cmmsim.detection.detectors import DEFAULT_DETECTOR, find_detector
-from cmmsim.detection.ellipse_fit import SMEAR_STEP_PX, FitLimits
+from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, find_detector
+from cmmsim.detection.ellipse_fit import MAXIMUM_LIKELIHOOD, SMEAR_STEP_PX, EllipseFits, fit_ellipses
+from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import Array, apply
 from cmmsim.geometry.stereo_rig import StereoRig, triangulate
+from cmmsim.plugins import DEFAULT_DETECTOR
 from cmmsim.radiometry.images import StereoImages, Windows
 from cmmsim.radiometry.noise import CameraNoise
-from cmmsim.radiometry.optics import Optics
 
 LONGEST_SMEAR_PX = 8.0  # about the size of a sticker
 SHORTEST_SMEAR = 1.5  # standard deviations of the point spread: shorter ones do not change what the fit finds
@@ -84,117 +85,153 @@ class StickerObservation:
 
 
 @dataclass(frozen=True)
-class StickerWindows:
-    """Grey values around the k stickers of a body that both cameras should see.
+class Observer:
+    """What looks for stickers: the stereo rig and its cameras' noise as they are known, and how it looks."""
 
-    index (k,) into the body's stickers; camera_from_body (4,4) near which they are expected; corners (2,k,2) px of the
-    first pixels of windows (2,k,h,h), evenly lit; offsets (2,k,2) px of the ellipses' centres from those of the
-    stickers (eccentricity).
+    rig: StereoRig
+    noise: CameraNoise
+    settings: DetectionSettings
+
+    @property
+    def detector(self) -> Detector:
+        """What finds the centres of stickers in windows."""
+        return find_detector(self.settings.detector)
+
+    def observe(
+        self,
+        images: StereoImages,
+        camera_from_body: Array,
+        places: Array,
+        normals: Array,
+        swept: tuple[Array, Array] | None = None,
+    ) -> StickerObservation:
+        """Observe stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose of the body.
+
+        ``swept``: camera_from_body at the beginning and at the end of the exposure, where they are thought to be known.
+        """
+        return self.read(images, camera_from_body, places, normals).observed(swept)
+
+    def read(self, images: StereoImages, camera_from_body: Array, places: Array, normals: Array) -> StickerWindows:
+        """Read the windows of stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose."""
+        centres = [apply(move @ camera_from_body, places) for move in self.rig.from_camera]
+        turned = [normals @ (move @ camera_from_body)[:3, :3].T for move in self.rig.from_camera]
+        pixels, valid = self.rig.project(apply(camera_from_body, places))
+        facing = np.stack([faces_camera(c, t) for c, t in zip(centres, turned, strict=True)])
+        index = np.flatnonzero(np.all(valid & facing, axis=0))
+        size = self.settings.window_size + 2 * self.detector.margin_px
+        corners = np.rint(pixels[:, index] - 0.5 * (size - 1)).astype(int)
+        if len(index) == 0:
+            windows: Windows = np.zeros((2, 0, size, size))
+            offsets = np.zeros((2, 0, 2))
+        else:
+            windows = self.evenly_lit(images.windows(corners, size), corners)
+            offsets = np.stack(
+                [
+                    centre_offset(camera, c[index], t[index], self.settings.radius)
+                    for camera, c, t in zip(self.rig.cameras, centres, turned, strict=True)
+                ]
+            )
+        return StickerWindows(self, index, camera_from_body, places[index], normals[index], corners, windows, offsets)
+
+    def evenly_lit(self, windows: Windows, corners: NDArray[np.int_]) -> Windows:
+        """Windows (2, n, size, size) with the light within each made even: that of its middle.
+
+        Only the slope of the light across a sticker would move its centre; the noise stays what it is to a few per
+        mille.
+        """
+        optics, black = self.settings.optics, self.noise.black_level
+        if optics.vignetting == 0.0:
+            return windows
+        size, middle = windows.shape[-1], corners + 0.5 * (windows.shape[-1] - 1)
+        share = np.stack(
+            [
+                optics.window_illumination(camera, at, size) / optics.illumination(camera, centre)[:, None, None]
+                for camera, at, centre in zip(self.rig.cameras, corners, middle, strict=True)
+            ]
+        )
+        return black + (windows - black) / share
+
+
+@dataclass(frozen=True)
+class StickerWindows:
+    """Grey values around the k stickers of a body that both cameras of an observer should see.
+
+    index (k,) into the body's stickers; camera_from_body (4,4) near which they are expected; places (k,3) m and normals
+    (k,3) in body axes; corners (2,k,2) px of the first pixels of windows (2,k,h,h), evenly lit; offsets (2,k,2) px of
+    the ellipses' centres from those of the stickers (eccentricity).
     """
 
+    observer: Observer
     index: NDArray[np.int_]
     camera_from_body: Array
+    places: Array
+    normals: Array
     corners: NDArray[np.int_]
     windows: Windows
     offsets: Array
 
-
-def observe(
-    images: StereoImages,
-    rig: StereoRig,
-    noise: CameraNoise,
-    settings: DetectionSettings,
-    camera_from_body: Array,
-    places: Array,
-    normals: Array,
-    swept: tuple[Array, Array] | None = None,
-) -> StickerObservation:
-    """Observe stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose of the body.
-
-    ``swept``: camera_from_body at the beginning and at the end of the exposure, where they are thought to be known.
-    """
-    read = read_windows(images, rig, noise, settings, camera_from_body, places, normals)
-    return observe_windows(read, rig, noise, settings, places, swept)
-
-
-def read_windows(
-    images: StereoImages,
-    rig: StereoRig,
-    noise: CameraNoise,
-    settings: DetectionSettings,
-    camera_from_body: Array,
-    places: Array,
-    normals: Array,
-) -> StickerWindows:
-    """Read the windows of stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose."""
-    centres = [apply(move @ camera_from_body, places) for move in rig.from_camera]
-    turned = [normals @ (move @ camera_from_body)[:3, :3].T for move in rig.from_camera]
-    pixels, valid = rig.project(apply(camera_from_body, places))
-    facing = np.stack([faces_camera(c, t) for c, t in zip(centres, turned, strict=True)])
-    index = np.flatnonzero(np.all(valid & facing, axis=0))
-    window_size = settings.window_size + 2 * find_detector(settings.detector).margin_px
-    corners = np.rint(pixels[:, index] - 0.5 * (window_size - 1)).astype(int)
-    if len(index) == 0:
-        none = np.zeros((2, 0, window_size, window_size))
-        return StickerWindows(index, camera_from_body, corners, none, np.zeros((2, 0, 2)))
-    windows = _evenly_lit(images.windows(corners, window_size), corners, rig, noise, settings)
-    offsets = np.stack(
-        [
-            centre_offset(camera, c[index], t[index], settings.radius)
-            for camera, c, t in zip(rig.cameras, centres, turned, strict=True)
-        ]
-    )
-    return StickerWindows(index, camera_from_body, corners, windows, offsets)
-
-
-def observe_windows(
-    read: StickerWindows,
-    rig: StereoRig,
-    noise: CameraNoise,
-    settings: DetectionSettings,
-    places: Array,
-    swept: tuple[Array, Array] | None = None,
-) -> StickerObservation:
-    """Observe the stickers in windows that have been read; ``places`` and ``swept`` as of ``observe``."""
-    if len(read.index) == 0:
-        return StickerObservation(read.index, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    detector = find_detector(settings.detector)
-    fit_size = settings.fit_size + 2 * detector.margin_px
-    windows, corners = read.windows.reshape(-1, *read.windows.shape[2:]), read.corners.reshape(-1, 2)
-
-    def detect(smears: Array | None) -> DetectedCentres:
-        return detector.detect(
-            windows, corners, noise, fit_size, settings.limits, psf_px=settings.optics.psf_px, smears=smears
+    def observed(self, swept: tuple[Array, Array] | None = None) -> StickerObservation:
+        """The stickers in these windows; ``swept`` as of ``Observer.observe``."""
+        if len(self.index) == 0:
+            none = np.zeros((0, 3))
+            return StickerObservation(self.index, none[:, :2], none[:, :2], none, np.zeros((0, 3, 3)))
+        rig, settings = self.observer.rig, self.observer.settings
+        smears = None if swept is None else self._smears(swept)
+        fits = self._detected() if smears is None else _likelier(self._detected(), self._detected(smears))
+        seen_at = fits.centres.reshape(2, -1, 2) - self.offsets
+        systematic = settings.centre_error_px**2 + self.observer.detector.bias_px**2
+        spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
+        ideal, ideal_spread, found = rig.undistort(seen_at, spread)
+        good = np.all(fits.good.reshape(2, -1) & found, axis=0)
+        seen = triangulate(rig.ideal, *ideal, *ideal_spread)
+        outlines = _outlines(fits, settings.centre_error_px**2)
+        return StickerObservation(self.index, seen_at[0], seen_at[1], seen.points, seen.covariances, outlines).selected(
+            good & (seen.ray_gap < settings.largest_ray_gap)
         )
 
-    smears = None if swept is None else _smears(rig, swept, places[read.index], settings.optics.psf_px)
-    fits = detect(None) if smears is None else _likelier(detect(None), detect(smears))
-    seen_at = fits.centres.reshape(2, -1, 2) - read.offsets
-    systematic = settings.centre_error_px**2 + detector.bias_px**2
-    spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
-    ideal, ideal_spread, found = rig.undistort(seen_at, spread)
-    good = np.all(fits.good.reshape(2, -1) & found, axis=0)
-    seen = triangulate(rig.ideal, *ideal, *ideal_spread)
-    outlines = _outlines(fits, settings.centre_error_px**2)
-    return StickerObservation(read.index, seen_at[0], seen_at[1], seen.points, seen.covariances, outlines).selected(
-        good & (seen.ray_gap < settings.largest_ray_gap)
-    )
+    def ellipses(self, smears: Array | None = None) -> EllipseFits:
+        """Ellipses fitted to all 2k windows, good ones of any misfit; ``smears`` (2k,2) as of ``DetectWindows``."""
+        settings = self.observer.settings
+        limits = replace(settings.limits, largest_misfit=np.inf)
+        return fit_ellipses(
+            *self._flat, self.observer.noise, settings.fit_size, limits, psf_px=settings.optics.psf_px, smears=smears
+        )
+
+    @cached_property
+    def ellipses_at_rest(self) -> EllipseFits:
+        """``ellipses`` if nothing moved: streaks are told from them, and what stands still is measured by them."""
+        return self.ellipses()
+
+    def _detected(self, smears: Array | None = None) -> DetectedCentres:
+        """What the detector finds in the windows."""
+        detector, noise, settings = self.observer.detector, self.observer.noise, self.observer.settings
+        if detector is MAXIMUM_LIKELIHOOD:
+            fits = self.ellipses_at_rest if smears is None else self.ellipses(smears)
+            return fits.within(settings.limits, noise).detected
+        fit_size = settings.fit_size + 2 * detector.margin_px
+        return detector.detect(
+            *self._flat, noise, fit_size, settings.limits, psf_px=settings.optics.psf_px, smears=smears
+        )
+
+    @property
+    def _flat(self) -> tuple[Windows, NDArray[np.int_]]:
+        """Windows (2k,h,h) and corners (2k,2) of both images together."""
+        return self.windows.reshape(-1, *self.windows.shape[2:]), self.corners.reshape(-1, 2)
+
+    def _smears(self, swept: tuple[Array, Array]) -> Array | None:
+        """Movement (2k, 2) px of the stickers in both images during the exposure.
+
+        None where it is too short to show beside the point spread, or so long that it cannot be told.
+        """
+        first, last = (self.observer.rig.project(apply(pose, self.places))[0] for pose in swept)
+        shortest = max(SMEAR_STEP_PX, SHORTEST_SMEAR * self.observer.settings.optics.psf_px)
+        longest = float(np.linalg.norm(last - first, axis=-1).max())
+        return (last - first).reshape(-1, 2) if shortest < longest < LONGEST_SMEAR_PX else None
 
 
 def faces_camera(centres: Array, normals: Array) -> NDArray[np.bool_]:
     """Whether a camera sees stickers with centres (n,3) m and normals (n,3), camera axes, not at grazing incidence."""
     return np.asarray(-np.einsum("ni,ni->n", centres, normals) > GRAZING * np.linalg.norm(centres, axis=1))
-
-
-def _smears(rig: StereoRig, swept: tuple[Array, Array], places: Array, psf_px: float) -> Array | None:
-    """Movement (2k, 2) px of k stickers in both images during the exposure.
-
-    None where it is too short to show beside the point spread, or so long that it cannot be told.
-    """
-    first, last = (rig.project(apply(pose, places))[0] for pose in swept)
-    shortest = max(SMEAR_STEP_PX, SHORTEST_SMEAR * psf_px)
-    longest = float(np.linalg.norm(last - first, axis=-1).max())
-    return (last - first).reshape(-1, 2) if shortest < longest < LONGEST_SMEAR_PX else None
 
 
 def _likelier(still: DetectedCentres, moving: DetectedCentres) -> DetectedCentres:
@@ -210,23 +247,3 @@ def _outlines(fits: DetectedCentres, systematic: float) -> Outlines | None:
         return None
     spread = fits.shape_covariances.reshape(2, -1, 3, 3) + systematic * np.eye(3)
     return Outlines(fits.shapes.reshape(2, -1, 2, 2), spread)
-
-
-def _evenly_lit(
-    windows: Windows, corners: NDArray[np.int_], rig: StereoRig, noise: CameraNoise, settings: DetectionSettings
-) -> Windows:
-    """Windows (2, n, size, size) with the light within each made even: that of its middle.
-
-    Only the slope of the light across a sticker would move its centre; the noise stays what it is to a few per mille.
-    """
-    if settings.optics.vignetting == 0.0:
-        return windows
-    size, middle = windows.shape[-1], corners + 0.5 * (windows.shape[-1] - 1)
-    share = np.stack(
-        [
-            settings.optics.window_illumination(camera, at, size)
-            / settings.optics.illumination(camera, centre)[:, None, None]
-            for camera, at, centre in zip(rig.cameras, corners, middle, strict=True)
-        ]
-    )
-    return noise.black_level + (windows - noise.black_level) / share

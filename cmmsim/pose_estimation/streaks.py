@@ -15,20 +15,19 @@ the middle of the exposure, for which a pose stands, is the same for both.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from cmmsim.detection.ellipse_fit import EllipseFits, fit_ellipses
+from cmmsim.detection.ellipse_fit import EllipseFits
 from cmmsim.errors import LostError
 from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.pose_estimation.observation import LONGEST_SMEAR_PX, DetectionSettings, StickerWindows
-from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.pose_estimation.observation import LONGEST_SMEAR_PX, StickerWindows
 
 CHANCE = 1e-4  # of stickers at rest to be taken for streaks
 FEWEST = 8  # ellipses in both images together: four stickers
@@ -88,33 +87,30 @@ class _Ellipses:
         return float(np.linalg.norm(self.smears, axis=1).max())
 
 
-def find_streaks(
-    read: StickerWindows, rig: StereoRig, noise: CameraNoise, settings: DetectionSettings, places: Array, normals: Array
-) -> Streaks | None:
+def find_streaks(read: StickerWindows) -> Streaks | None:
     """The movement during the exposure of the body whose stickers were read; None where none shows.
 
-    Parameters: places (n,3) m and normals (n,3) of all stickers, body axes. Raises LostError where the streaks are
-    longer than can be measured.
+    Raises LostError where the streaks are longer than can be measured.
     """
-    at_rest = sticker_outlines(rig, read.camera_from_body, places[read.index], normals[read.index], settings.radius)[1]
-    windows, corners = read.windows.reshape(-1, *read.windows.shape[2:]), read.corners.reshape(-1, 2)
-    limits = replace(settings.limits, largest_misfit=np.inf)  # a streak is no ellipse
+    observer, places = read.observer, read.places
+    rig, settings = observer.rig, observer.settings
+    at_rest = sticker_outlines(rig, read.camera_from_body, places, read.normals, settings.radius)[1]
 
-    def fit(smears: Array) -> _Ellipses:
-        fits = fit_ellipses(
-            windows, corners, noise, settings.fit_size, limits, psf_px=settings.optics.psf_px, smears=smears
-        )
+    def compared(smears: Array, fits: EllipseFits) -> _Ellipses:
         squares, whiten = _squares(fits, settings.centre_error_px**2)
         added = _entries(_outer(smears)) / 3.0
         excess = squares - _entries(_square(at_rest.reshape(-1, 2, 2))) + added
-        return _Ellipses(smears, excess, whiten, fits.contrast >= limits.smallest_contrast, fits.good)
+        return _Ellipses(smears, excess, whiten, fits.contrast >= settings.limits.smallest_contrast, fits.good)
 
-    still = fit(np.zeros((len(windows), 2)))
+    def fit(smears: Array) -> _Ellipses:
+        return compared(smears, read.ellipses(smears))
+
+    still = compared(np.zeros((2 * len(places), 2)), read.ellipses_at_rest)
     if np.count_nonzero(still.good) < FEWEST:
         _require_short(still)
         return None
-    middle = places[read.index].mean(axis=0)
-    by_movement = _pixels_by_movement(rig, read.camera_from_body, places[read.index], middle)
+    middle = places.mean(axis=0)
+    by_movement = _pixels_by_movement(rig, read.camera_from_body, places, middle)
     found = _movement_and_ellipses(still, fit, by_movement)
     if found is None:
         _require_short(still)

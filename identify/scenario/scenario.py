@@ -35,8 +35,9 @@ class Scenario(Section):
     sensor: str = Field("ctrack780", description="built-in sensor, or path of a sensor file from this file on")
     sensor_note: str = Field("", description="what the sensor's file says about its own figures")
     sensor_changes: dict[str, Any] = Field({}, description="entries that hold instead of the sensor file's")
-    renderer: Literal["pyrender", "analytic", "auto"] = Field(
-        "auto", description="what draws the images: pyrender, analytic, or auto: pyrender where OpenGL works"
+    renderer: str = Field(
+        "auto",
+        description="what draws the images: pyrender, analytic, auto: pyrender where OpenGL works, or module:name",
     )
     pose_method: Literal["registration", "planes"] = "registration"
     timing: Timing = Timing()
@@ -48,6 +49,13 @@ class Scenario(Section):
     identification: Identification = Identification()
     payload: Payload = Payload()
     validation: Validation = Validation()
+
+    @field_validator("renderer")
+    @classmethod
+    def _known_renderer(cls, name: str) -> str:
+        from cmmsim.plugins import require_renderer  # the command line's help must not wait for the sensor
+
+        return require_renderer(name)
 
     @field_validator("sensor_changes")
     @classmethod

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import identify
-from cmmsim.detection.detectors import DEFAULT_DETECTOR, DETECTORS
+from cmmsim.detection.detector import find_detector
 from cmmsim.detector_leaderboard import compete, scene_of, working_point
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import apply, pose_to_transform
+from cmmsim.plugins import DEFAULT_DETECTOR
 from identify.experiment.sensor_in_loop import make_sensor
 from tests.dynamics.conftest import random_states
 
@@ -67,7 +68,7 @@ def test_poses(accuracy, cmmsim_sensor, cmmsim_seed, method):
 
 def test_detector_against_the_cramer_rao_bound(accuracy, cmmsim_seed):
     """At the working point of the sensor: 16 times the rms of 100 drawn stickers."""
-    file, detectors = read_sensor_file("ctrack780"), [DETECTORS[DEFAULT_DETECTOR]]
+    file, detectors = read_sensor_file("ctrack780"), [find_detector(DEFAULT_DETECTOR)]
     rng = np.random.default_rng(cmmsim_seed)
     scores = compete(scene_of(file), 16 * [working_point(file)], 100, rng, detectors)
     accuracy.sample("detector's rms over the Cramér-Rao bound", [score.ratio for score in scores], limit=DETECTOR_GOAL)

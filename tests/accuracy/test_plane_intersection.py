@@ -8,11 +8,12 @@ product's.
 import numpy as np
 import pytest
 
-from cmmsim.detection.detectors import DEFAULT_DETECTOR, DETECTORS
+from cmmsim.detection.detector import find_detector
 from cmmsim.detector_leaderboard import compete, scene_of, working_point
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.plane_frame import frame_from_planes
 from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
+from cmmsim.plugins import DEFAULT_DETECTOR
 from cmmsim.visibility import sight_lines
 from tests.accuracy.test_own_figures import DETECTOR_GOAL, PLANES_GOAL, TRAVEL
 
@@ -56,7 +57,7 @@ def test_goal_of_plane_intersection():
     """
     file, sight = read_sensor_file("ctrack780"), sight_lines("ctrack780")
     rng = np.random.default_rng(0)
-    bound = compete(scene_of(file), [working_point(file)], 200, rng, [DETECTORS[DEFAULT_DETECTOR]])[0].bound_px
+    bound = compete(scene_of(file), [working_point(file)], 200, rng, [find_detector(DEFAULT_DETECTOR)])[0].bound_px
     poses = np.array(file.platform.home) + TRAVEL * rng.uniform(-1, 1, (1000, 6))
     errors = 1e6 * np.array([error_by_planes(sight, pose, DETECTOR_GOAL * bound, rng) for pose in poses])
     rms = np.sqrt(np.mean(errors**2, axis=0))

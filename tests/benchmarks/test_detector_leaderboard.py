@@ -5,10 +5,11 @@ import sys
 import numpy as np
 import pytest
 
-from cmmsim.detection.detectors import DEFAULT_DETECTOR, DETECTORS
+from cmmsim.detection.detector import find_detector
 from cmmsim.detector_leaderboard import PEERS, Condition, compete, scene_of, working_point
 from cmmsim.errors import CmmError
 from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.plugins import DEFAULT_DETECTOR, DETECTORS
 
 FILE = read_sensor_file("ctrack780")
 SCENE = scene_of(FILE)
@@ -57,7 +58,7 @@ def test_unbiased_detector_does_not_beat_the_bound(at_work):
 @pytest.mark.slow
 def test_interval_holds_the_ratio_in_95_of_100_repetitions():
     """Against the ratio of many draws; 60 repetitions of 100 draws make 95 % uncertain by 3 %."""
-    best = [DETECTORS["dual_conic"]]
+    best = [find_detector("dual_conic")]
     true = compete(SCENE, [working_point(FILE)], 4000, np.random.default_rng(1), best)[0].ratio
     rng = np.random.default_rng(2)
     held = [s.ratio_low <= true <= s.ratio_high for s in compete(SCENE, [working_point(FILE)] * 60, 100, rng, best)]

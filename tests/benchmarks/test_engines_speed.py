@@ -9,12 +9,12 @@ import itertools
 
 import numpy as np
 import pytest
-from dynamics.robot import fast_forward_dynamics
 
 import dynamics
 from dynamics import compilation
 from dynamics.engines.mjcf import mjcf_text
 from dynamics.engines.mujoco_engine import MujocoRobot
+from dynamics.robot import fast_forward_dynamics
 from tests.benchmarks.timing import OtherLoad, fastest, judge
 
 pytestmark = pytest.mark.slow

@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import (
     CORE_SHARE,
     RING_REACH,
     SMALLEST_RADIUS_PX,
     EllipseFits,
-    FitLimits,
     largest_misfits,
 )
 from tests.cmmsim.numpy_coverage import coverage
@@ -45,6 +45,7 @@ def fit_ellipses(windows, corners, noise, fit_size, limits=None, iterations=3):
         _shape(parameters),
         covariances[:, 2:5, 2:5],
         parameters[:, 5],
+        parameters[:, 6],
         misfit,
         good,
     )

@@ -11,9 +11,8 @@ from cmmsim.acceptance.latency_test import require_room
 from cmmsim.acceptance.length_test import length_artefact
 from cmmsim.acceptance.moving_bar import SECONDS
 from cmmsim.acceptance.volume import CORNERS, MARGIN_PX, MeasuringLine
-from cmmsim.files.marked_body import marked_body
-from cmmsim.files.rig import rig_from_file
 from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.files.setup import marked_body, rig_from_file
 from cmmsim.geometry.pose import apply, pose_to_transform
 
 RIG = read_sensor_file("ctrack780").rig

@@ -7,12 +7,12 @@ import pytest
 import trimesh
 
 import cmmsim
-from cmmsim.detection.ellipse_fit import FitLimits, fit_ellipses
+from cmmsim.detection.detector import FitLimits
+from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.disc_image import eccentricity, project_discs
 from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.imaging import pyrender_renderer as render
-from cmmsim.imaging import renderer as renderers
 from cmmsim.imaging.analytic import draw_windows
 from cmmsim.imaging.exposure import SUPERSAMPLING
 from cmmsim.imaging.kernels import Discs, Solids, cover_by_polygon, lay_layers, polygon_holds
@@ -201,7 +201,7 @@ def test_auto_falls_back_with_one_line(monkeypatch, taught):
     def missing():
         raise cmmsim.OpenGLMissingError(ImportError("x")) from ImportError("no\nEGL")
 
-    monkeypatch.setattr(renderers.render, "require_opengl", missing)
+    monkeypatch.setattr(render, "_shared_atlas", missing)
     sensor = cmmsim.load_sensor("ctrack780", taught=taught)  # says nothing before something is to be drawn
     with pytest.warns(UserWarning, match=r"^images are drawn by the analytic renderer, [^\n]*no EGL[^\n]*$") as caught:
         assert sensor.measure(sensor.home).ok

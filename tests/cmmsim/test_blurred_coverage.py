@@ -6,7 +6,7 @@ from scipy.special import ndtr
 
 import cmmsim
 from cmmsim.detection.ellipse_fit import fit_ellipses
-from cmmsim.geometry.coverage import SHAPE_BASIS, blurred_coverage
+from cmmsim.geometry.disc_image import SHAPE_BASIS, blurred_coverage
 from tests.cmmsim.ellipses import NOISE, random_ellipses
 
 SIZE = 20

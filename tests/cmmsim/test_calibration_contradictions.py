@@ -7,7 +7,7 @@ import pytest
 
 from cmmsim.calibration import Board, CalibrationError, PairView, calibrate, find_board
 from cmmsim.calibration.detection import covered_radius
-from cmmsim.radiometry.optics import Optics
+from cmmsim.geometry.camera import Optics
 from tests.cmmsim.test_calibration_adjustment import BOARD, SHIFT, SIZE, board_poses, seen_pairs
 from tests.cmmsim.test_calibration_images import ASYMMETRIC, BENT, DOTS, PERFECT, rendered, views_of
 

@@ -20,13 +20,13 @@ from cmmsim.calibration import (
     sensor_template,
 )
 from cmmsim.files.sensor_file import sensor_text
-from cmmsim.geometry.camera import Distortion, PinholeCamera
+from cmmsim.geometry.camera import Distortion, Optics, PinholeCamera
 from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import apply, rotation_log
 from cmmsim.geometry.stereo_rig import StereoRig, toed_in_rig
-from cmmsim.imaging.renderer import ANALYTIC, PYRENDER
+from cmmsim.imaging.analytic import ANALYTIC
+from cmmsim.imaging.pyrender_renderer import PYRENDER
 from cmmsim.radiometry.noise import CameraNoise
-from cmmsim.radiometry.optics import Optics
 
 NOISE = CameraNoise(1600.0, 0.13, 26.0, 1800.0, 16.0)
 DOTS = Board(kind="dots", columns=9, rows=7, spacing=0.05, radius=0.0125)

@@ -10,11 +10,13 @@ from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import triangulate
 from cmmsim.pose_estimation.consistency import FEWEST, LARGEST_MISFIT, consistent, outline_misfits, place_misfits
-from cmmsim.pose_estimation.observation import Outlines, StickerObservation
+from cmmsim.pose_estimation.observation import DetectionSettings, Observer, Outlines, StickerObservation
+from tests.cmmsim.ellipses import NOISE
 from tests.cmmsim.test_covariance import BODY, CAMERA_FROM_BASE, FILE, RIG, pixel_covariances
 
 RADIUS = 0.003
 CAMERA_FROM_BODY = CAMERA_FROM_BASE @ pose_to_transform(FILE.platform.home)
+OBSERVER = Observer(RIG, NOISE, DetectionSettings(radius=RADIUS))
 PIXELS = RIG.project(apply(CAMERA_FROM_BODY, BODY.nominal))[0]
 SHAPES = sticker_outlines(RIG, CAMERA_FROM_BODY, BODY.nominal, BODY.sticker_normals, RADIUS)[1]
 
@@ -50,29 +52,29 @@ def test_place_misfits_are_chi_square(stickers):
 
 def test_displaced_sticker_is_left_out():
     seen = observed(np.random.default_rng(2), range(18), shift_px=0.5)
-    used, _ = consistent(seen, RIG, BODY, BODY.nominal, RADIUS)
+    used, _ = consistent(seen, OBSERVER, BODY, BODY.nominal)
     np.testing.assert_array_equal(used.index, range(1, 18))
 
 
 def test_misshapen_sticker_is_left_out():
     seen = observed(np.random.default_rng(3), range(18), shrink_px=0.1)
-    used, _ = consistent(seen, RIG, BODY, BODY.nominal, RADIUS)
+    used, _ = consistent(seen, OBSERVER, BODY, BODY.nominal)
     np.testing.assert_array_equal(used.index, range(1, 18))
 
 
 def test_four_stickers_of_which_one_is_wrong_are_refused():
     with pytest.raises(LostError, match=r"4 visible stickers contradict each other, 3 are left .* squared misfit"):
-        consistent(observed(np.random.default_rng(4), [0, 5, 7, 12], shift_px=1.0), RIG, BODY, BODY.nominal, RADIUS)
+        consistent(observed(np.random.default_rng(4), [0, 5, 7, 12], shift_px=1.0), OBSERVER, BODY, BODY.nominal)
 
 
 def test_three_stickers_are_refused():
     with pytest.raises(LostError, match=f"3 visible stickers, at least {FEWEST} are needed"):
-        consistent(observed(np.random.default_rng(5), [0, 7, 12]), RIG, BODY, BODY.nominal, RADIUS)
+        consistent(observed(np.random.default_rng(5), [0, 7, 12]), OBSERVER, BODY, BODY.nominal)
 
 
 def test_good_stickers_are_kept():
     rng = np.random.default_rng(6)
-    left = [len(consistent(observed(rng, range(18)), RIG, BODY, BODY.nominal, RADIUS)[0].index) for _ in range(500)]
+    left = [len(consistent(observed(rng, range(18)), OBSERVER, BODY, BODY.nominal)[0].index) for _ in range(500)]
     assert np.mean(left) > 18.0 * (1.0 - 5e-4)
 
 
@@ -99,7 +101,7 @@ def test_drifted_camera_enlarges_the_covariance():
     doubled = StickerObservation(
         seen.index, seen.left_pixels, seen.right_pixels, seen.points, seen.covariances / 4.0, seen.outlines
     )
-    plain, scaled = (consistent(s, RIG, BODY, BODY.nominal, RADIUS) for s in (seen, doubled))
+    plain, scaled = (consistent(s, OBSERVER, BODY, BODY.nominal) for s in (seen, doubled))
     assert len(scaled[0].index) == 18
     freedom = 3 * 18 - 6
     factor = plain[1].misfit.sum() / freedom

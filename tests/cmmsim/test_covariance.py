@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cmmsim.files.marked_body import marked_body
 from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.files.setup import marked_body
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import apply, compose_covariance, pose_covariance, pose_to_transform, transform_to_pose
 from cmmsim.geometry.stereo_rig import toed_in_rig, triangulate

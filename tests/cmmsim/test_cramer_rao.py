@@ -10,7 +10,7 @@ from scipy.stats import norm
 from cmmsim.detection import cramer_rao
 from cmmsim.detection.cramer_rao import cramer_rao_bound, grey_value_information, light_shares
 from cmmsim.errors import CmmError
-from cmmsim.geometry.coverage import SHAPE_BASIS
+from cmmsim.geometry.disc_image import SHAPE_BASIS
 from cmmsim.radiometry.noise import CameraNoise
 
 NOISE = CameraNoise(electrons_at_white=1600.0, gain=0.13, dark_noise=26.0, full_well=1800.0, black_level=16.0)

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import cmmsim
-from cmmsim.files.rig import rig_from_file
 from cmmsim.files.schema import RightFromLeft
 from cmmsim.files.sensor_file import read_sensor_file, sensor_text
+from cmmsim.files.setup import rig_from_file
 from cmmsim.geometry.camera import Distortion, PinholeCamera
 from cmmsim.geometry.pose import apply, rotation_exp
 from tests.cmmsim.lenses import CAMERAS

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from cmmsim.detection.ellipse_fit import FitLimits, fit_ellipses
+from cmmsim.detection.detector import FitLimits
+from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.geometry.camera import Distortion, PinholeCamera
 from cmmsim.geometry.disc_image import bending, centre_offset, eccentricity
 from cmmsim.radiometry.noise import CameraNoise

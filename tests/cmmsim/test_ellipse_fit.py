@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cmmsim.detection.ellipse_fit import fit_ellipses
-from cmmsim.geometry.coverage import SHAPE_BASIS, coverage
+from cmmsim.geometry.disc_image import SHAPE_BASIS, coverage
 from tests.cmmsim.ellipses import NOISE, random_ellipses
 
 SIZE = 18

@@ -9,12 +9,10 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 import cmmsim
 from cmmsim.detection.ellipse_fit import fit_ellipses
-from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.camera import Optics, PinholeCamera
 from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.imaging.exposure import SUPERSAMPLING
-from cmmsim.imaging.views import View
-from cmmsim.pose_estimation.observation import _evenly_lit
-from cmmsim.radiometry.optics import Optics
+from cmmsim.imaging.renderer import View
 from tests.cmmsim.lenses import LENSES, expected_centres, lens_sensor, placed_at, pose_errors, poses_about_home
 
 FINE = 16
@@ -26,7 +24,7 @@ def centre_errors(sensor, pose, supersampling=SUPERSAMPLING):
     corners = np.rint(expected - 7.5).astype(int)
     noise = replace(sensor.noise, enabled=False)
     grey = noise.mean_grey(sensor._camera.radiance(placed_at(sensor, pose), corners, 16, supersampling))
-    grey = _evenly_lit(grey, corners, sensor.rig, noise, sensor.settings)
+    grey = replace(sensor.observer, noise=noise).evenly_lit(grey, corners)
     fits = fit_ellipses(grey.reshape(-1, 16, 16), corners.reshape(-1, 2), noise, 14, psf_px=sensor.optics.psf_px)
     assert fits.good.all()
     return fits.centres - expected.reshape(-1, 2)

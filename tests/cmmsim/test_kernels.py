@@ -15,7 +15,7 @@ from cmmsim.detection import fit_kernels as fit_kernel
 from cmmsim.geometry import disc_kernels as blur_kernel
 from cmmsim.geometry import disc_kernels as coverage_kernel
 from cmmsim.geometry import point_kernels as cholesky_kernel
-from cmmsim.geometry.coverage import blurred_coverage, coverage
+from cmmsim.geometry.disc_image import blurred_coverage, coverage
 from tests.cmmsim import numpy_blurred_coverage, numpy_coverage, numpy_fit
 from tests.cmmsim.ellipses import NOISE, random_ellipses
 
@@ -146,7 +146,7 @@ def test_selection_and_bounded_radii():
 
 
 PROBE = (
-    "import numpy as np; from cmmsim.geometry.coverage import covered_area as c;"
+    "import numpy as np; from cmmsim.geometry.disc_image import covered_area as c;"
     "print(c(np.full((1, 2), 5.2), np.eye(2)[None] * 3.0, 12).sum())"
 )
 

@@ -5,7 +5,7 @@ import pytest
 
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import apply, pose_to_transform
-from cmmsim.pose_estimation.labelling import find_layout
+from cmmsim.pose_estimation.search import find_layout
 
 LAYOUT = np.random.default_rng(5).uniform(-0.08, 0.08, (18, 3))
 PLACE = pose_to_transform([0.1, -0.05, 1.6, 2.0, 0.4, -0.7])

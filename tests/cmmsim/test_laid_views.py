@@ -11,8 +11,8 @@ from cmmsim.imaging import pyrender_renderer as render
 from cmmsim.imaging.exposure import SUPERSAMPLING
 from cmmsim.imaging.kernels import mean_of_cells
 from cmmsim.imaging.pyrender_meshes import Laid, LaidSolids
+from cmmsim.imaging.renderer import NEAR, Drawable, View, same_exposure
 from cmmsim.imaging.scene import Disc, DiscStack, rod, rod_transform, solid_mesh
-from cmmsim.imaging.views import NEAR, Drawable, View, same_exposure
 from cmmsim.sensor import load_sensor
 
 CAMERA = PinholeCamera(1000.0, 500.0, 400.0, 1001, 801)

@@ -9,7 +9,7 @@ import pytest
 from cmmsim.files.schema import SensorFile
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.geometry.pose import apply, pose_to_transform
-from cmmsim.pose_estimation.observation import DetectionSettings, observe
+from cmmsim.pose_estimation.observation import DetectionSettings, Observer
 from cmmsim.sensor import Sensor
 
 PLACES = {
@@ -49,15 +49,8 @@ def test_correction_takes_the_predicted_bias_away(radius):
     settings = DetectionSettings(window_size=size + 2, fit_size=size, radius=radius)
     errors = {}
     for name, taken in (("on", radius), ("off", 0.0)):
-        seen = observe(
-            sensor.look(sensor.home),
-            sensor.rig,
-            sensor.noise,
-            replace(settings, radius=taken),
-            camera_from_body,
-            places,
-            normals,
-        )
+        observer = Observer(sensor.rig, sensor.noise, replace(settings, radius=taken))
+        seen = observer.observe(sensor.look(sensor.home), camera_from_body, places, normals)
         assert seen.index.tolist() == [0, 1, 2]
         errors[name] = np.stack([seen.left_pixels, seen.right_pixels]) - expected
     predicted, tilts = np.empty((2, 3, 2)), np.empty((2, 3))

@@ -11,7 +11,6 @@ from cmmsim.geometry.disc_image import eccentricity
 from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.imaging import pyrender_renderer as render
 from cmmsim.imaging.exposure import SUPERSAMPLING
-from cmmsim.imaging.renderer import PYRENDER
 from cmmsim.radiometry.noise import CameraNoise
 
 pytestmark = pytest.mark.rendering
@@ -52,7 +51,7 @@ def test_sticker_centres_agree_with_their_projection(sensor, supersampling, limi
     rms, mean = np.sqrt((errors**2).mean(axis=0)), errors.mean(axis=0)
     assert np.all(rms < limit), rms
     assert np.all(np.abs(mean) < 0.0002), mean
-    assert 0.85 < np.sqrt((errors**2).mean()) / PYRENDER.centre_error_px(supersampling) < 1.15
+    assert 0.85 < np.sqrt((errors**2).mean()) / render.PYRENDER.centre_error_px(supersampling) < 1.15
 
 
 def test_whole_image_shows_the_windows(sensor):

@@ -9,7 +9,7 @@ from scipy.stats import chi2, kstest
 import cmmsim
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import apply, pose_to_transform
-from cmmsim.pose_estimation.observation import LONGEST_SMEAR_PX, read_windows
+from cmmsim.pose_estimation.observation import LONGEST_SMEAR_PX
 from cmmsim.pose_estimation.streaks import find_streaks
 from tests.cmmsim.lenses import lens_sensor, poses_about_home
 
@@ -38,8 +38,7 @@ def camera_from(sensor, pose):
 
 def streaks_of(sensor, images, pose):
     body = sensor.taught.platform_places, sensor.platform.sticker_normals
-    read = read_windows(images, sensor.rig, sensor.noise, sensor.settings, camera_from(sensor, pose), *body)
-    return find_streaks(read, sensor.rig, sensor.noise, sensor.settings, *body)
+    return find_streaks(sensor.observer.read(images, camera_from(sensor, pose), *body))
 
 
 def movements(sensor, first, last):

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from dynamics.robot import fast_forward_dynamics
 
 from dynamics.closed_loop import simulate
 from dynamics.closed_loop.batch import simulate_batch
 from dynamics.errors import SimulationError, SingularPoseError
+from dynamics.robot import fast_forward_dynamics
 
 
 @pytest.mark.parametrize("workers", [1, 3])

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from dynamics.robot import with_geometry_error
 from scipy.optimize import fsolve
 from scipy.stats import chi2
 
 from dynamics import closed_loop
 from dynamics.errors import RobotFileError, SimulationError
+from dynamics.robot import with_geometry_error
 
 ERROR = 1e-4
 THETA = np.array([0.21, -0.14, 0.3, 0.05, -0.22, 0.11])

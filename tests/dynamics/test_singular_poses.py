@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from dynamics.robot import fast_forward_dynamics
 
 from dynamics.errors import SingularPoseError
+from dynamics.robot import fast_forward_dynamics
 
 
 @pytest.fixture

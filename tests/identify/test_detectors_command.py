@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cmmsim.detection.detectors import DEFAULT_DETECTOR
+from cmmsim.detection.detector import DEFAULT_DETECTOR
 from cmmsim.detector_leaderboard import Condition, compete, scene_of, working_point
 from cmmsim.errors import CmmError
 from cmmsim.files.sensor_file import read_sensor_file

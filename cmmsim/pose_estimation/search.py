@@ -1,29 +1,92 @@
-"""Which spots are one sticker in both images, and which measured point is which sticker.
+"""Search of whole images with no prior pose: bright spots, their pairs in both images, and which is which sticker.
 
-Which measured point is which sticker: search for the rigid layout in a cloud of points, with no prior pose.
-Three stickers far from each other are looked for by their three mutual distances; each find proposes a pose, which is
-judged by how many stickers of the layout then have a measured point close by.
+Bright spots that a window holds are fitted with ellipses. Spots of both images that lie on each other's epipolar lines
+are pairs, true and false ones together, and each pair is a point in space. In this cloud of points the known layout of
+the stickers is looked for: three stickers far from each other by their three mutual distances; each find proposes a
+pose, which is judged by how many stickers of the layout then have a point close by.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import combinations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from cmmsim.detection.detector import FitLimits
+from cmmsim.detection.ellipse_fit import EllipseFits, fit_ellipses
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import Array, apply
 from cmmsim.geometry.registration import rigid_starts
 from cmmsim.geometry.stereo_rig import StereoRig, linear_triangulation
+from cmmsim.pose_estimation.observation import Observer
+from cmmsim.radiometry.images import FrameImages, StereoFrame
+from cmmsim.radiometry.noise import GreyImage
 
-# Which spot of the left image may be the same sticker as which spot of the right image.
-
-
+SMALLEST_AREA_PX = 8
+LARGEST_SHARE = 25 / 36  # of a square with the largest side
+BRIGHT_SHARE = 1e-4  # share of the image's pixels that are taken as the brightest
+SMALLEST_STEP = 40.0 / 255.0  # of the largest grey value: between the ground and the brightest pixels
+SMALLEST_WINDOW_PX = 24
+ROOM_PX = 8  # a bright spot's rough centre differs from a prediction of it
+FEWEST_TAUGHT = 4  # stickers by whose taught places a platform is found
 LINE_TOLERANCE_PX = 0.5
 NEAREST, FURTHEST = 0.3, 6.0  # m
+SMALLEST_TRIANGLE = 0.002  # m² area
+MOST_TOGETHER = 64  # triangles judged together
+ENOUGH = 0.8  # share of the layout that ends the search
+
+
+def bright_ellipses(frame: StereoFrame, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
+    """Ellipses of any misfit fitted to all bright spots of the left and of the right image that a window holds."""
+    noise, settings = observer.noise, observer.settings
+    size = max(SMALLEST_WINDOW_PX, settings.window_size + ROOM_PX)
+    limits, found = replace(settings.limits, largest_misfit=np.inf), []
+    for image in (frame.left, frame.right):
+        corners = np.rint(find_blobs(image, noise.white_level, size) - 0.5 * (size - 1)).astype(int)
+        windows = FrameImages(StereoFrame(image, image)).windows(np.stack([corners, corners]), size)[0]
+        found.append(fit_ellipses(windows, corners, noise, settings.fit_size, limits, psf_px=settings.optics.psf_px))
+    return found[0], found[1]
+
+
+def candidate_points(ellipses: tuple[EllipseFits, EllipseFits], observer: Observer, limits: FitLimits) -> Array:
+    """Points (m,3) in the camera frame that may be stickers, of ellipses that keep within ``limits``; true and false
+    pairings together. Raises LostError where there are too few bright spots."""
+    left, right = (fits.centres[fits.within(limits, observer.noise).good] for fits in ellipses)
+    if not len(left) or not len(right):
+        raise LostError(
+            f"{len(left)} bright spots in the left image and {len(right)} in the right, "
+            f"at least {FEWEST_TAUGHT} in each needed"
+        )
+    ideal = []
+    for camera, centres in zip(observer.rig.cameras, (left, right), strict=True):
+        pixels, found = camera.undistort(centres)
+        ideal.append(pixels[found])
+    return candidate_pairs(observer.rig.ideal, *ideal)[1]
+
+
+def find_blobs(image: GreyImage, white_level: int, largest_side: int) -> Array:
+    """Rough centres (n, 2) px of compact bright spots of an image (height, width).
+
+    Parameters: white_level: largest grey value; largest_side of a spot's bounding box, px.
+    """
+    counts = np.bincount(image.ravel())
+    from_top = np.cumsum(counts[::-1])
+    bright = len(counts) - 1 - int(np.searchsorted(from_top, max(1.0, BRIGHT_SHARE * image.size)))
+    ground = int(np.searchsorted(np.cumsum(counts), 0.5 * image.size))
+    if bright - ground < SMALLEST_STEP * white_level:
+        return np.zeros((0, 2))
+    mask = (image > 0.5 * (bright + ground)).astype(np.uint8)
+    _, _, stats, centres = cv2.connectedComponentsWithStats(mask)
+    area, sides = stats[1:, cv2.CC_STAT_AREA], stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
+    keep = (area >= SMALLEST_AREA_PX) & (area <= round(LARGEST_SHARE * largest_side**2))
+    keep &= sides.max(axis=1) <= largest_side
+    keep &= area > 0.4 * sides.prod(axis=1)
+    return centres[1:][keep]
 
 
 def epipolar_distance(rig: StereoRig, left: Array, right: Array) -> Array:
@@ -43,11 +106,6 @@ def candidate_pairs(rig: StereoRig, left: Array, right: Array) -> tuple[NDArray[
     points = linear_triangulation(rig, left[pairs[:, 0]], right[pairs[:, 1]])
     near = (points[:, 2] > NEAREST) & (np.linalg.norm(points, axis=1) < FURTHEST)
     return pairs[near], points[near]
-
-
-SMALLEST_TRIANGLE = 0.002  # m² area
-MOST_TOGETHER = 64  # triangles judged together
-ENOUGH = 0.8  # share of the layout that ends the search
 
 
 def find_layout(

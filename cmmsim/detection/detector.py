@@ -1,0 +1,96 @@
+"""The contract of all detectors of sticker centres: what they are given, what they hand back, and which is taken."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.geometry.pose import Array
+from cmmsim.plugins import DETECTORS, find, require_callable
+from cmmsim.radiometry.noise import CameraNoise
+
+
+@dataclass(frozen=True)
+class FitLimits:
+    """When a window counts as one whole sticker.
+
+    smallest_contrast in grey values; largest_misfit of the reduced chi-square, for noise of a grey value and more.
+    """
+
+    smallest_contrast: float = 40.0
+    largest_misfit: float = 1.8
+
+
+@dataclass(frozen=True)
+class DetectedCentres:
+    """Ellipse centres in n windows, in full-image px.
+
+    centres (n,2); covariances (n,2,2) px², what the pixel noise does to the centres to first order; good (n,) whether
+    the window holds one whole bright spot. shapes (n,2,2) px and shape_covariances (n,3,3) px² of A_xx, A_xy, A_yy
+    where a detector states them, as misfits (n,), the reduced chi-square of the grey values. Values of windows that are
+    not good are finite but mean nothing.
+    """
+
+    centres: Array
+    covariances: Array
+    good: NDArray[np.bool_]
+    shapes: Array | None = None
+    shape_covariances: Array | None = None
+    misfits: Array | None = None
+
+
+def no_centres() -> DetectedCentres:
+    """The result for no windows."""
+    return DetectedCentres(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, dtype=bool))
+
+
+class DetectWindows(Protocol):
+    """Ellipse centres in n windows with one bright spot each."""
+
+    def __call__(
+        self,
+        windows: NDArray,
+        corners: NDArray[np.integer],
+        noise: CameraNoise,
+        fit_size: int,
+        limits: FitLimits | None = None,
+        psf_px: float = 0.0,
+        smears: Array | None = None,
+    ) -> DetectedCentres:
+        """Detect.
+
+        Parameters: windows (n, h, h) grey values; corners (n, 2) the full-image pixel (x, y) of each window's first
+        pixel; noise: the camera's noise; fit_size: side in px of the part around the bright spot that is looked at;
+        limits: when a window counts as one whole sticker; psf_px: sigma of the Gaussian point spread; smears
+        (n, 2) px: how far each spot moves during the exposure, for whose middle the centres are.
+        """
+
+
+@dataclass(frozen=True)
+class Detector:
+    """name; detect; bias_px: rms error of a centre without noise, at the built-in sensors' radius (3.8 px, 45 degrees,
+    sharp images). It differs from place to place within a pixel, so it acts like noise that detect does not state.
+    margin_px: how much wider than for the maximum-likelihood fit a window must be on each side."""
+
+    name: str
+    detect: DetectWindows
+    bias_px: float = 0.0
+    margin_px: int = 0
+
+
+@lru_cache
+def find_detector(name: str) -> Detector:
+    """The detector of a built-in name, or of ``module:name``: a Detector, or a function as ``DetectWindows`` describes.
+
+    A function may carry its own ``bias_px`` and ``margin_px``. Raises UnknownOptionError with the valid names, CmmError
+    for what cannot be imported or called.
+    """
+    found = find("detector", name, DETECTORS)
+    if isinstance(found, Detector):
+        return found
+    require_callable("detector", name, found)
+    return Detector(name, found, float(getattr(found, "bias_px", 0.0)), int(getattr(found, "margin_px", 0)))
