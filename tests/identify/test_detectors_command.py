@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cmmsim.detection.detector import DEFAULT_DETECTOR
 from cmmsim.detector_leaderboard import Condition, compete, scene_of, working_point
 from cmmsim.errors import CmmError
 from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.plugins import DEFAULT_DETECTOR
 from identify.commands.app import app, is_known
 
 OPTIONS = ["--radius", "3", "--noise", "1", "--noise", "5", "--tilt", "30", "--psf", "0", "--draws", "30"]
