@@ -9,15 +9,12 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from identify.commands.acceptance import acceptance
-from identify.commands.base_parameters import base_parameters
 from identify.commands.calibrate import CALIBRATE_HELP, calibrate
-from identify.commands.detectors import detectors
-from identify.commands.engines import export, verify_model
 from identify.commands.estimators import estimators
+from identify.commands.robot import base_parameters, export, verify_model, workspace
+from identify.commands.sensor import acceptance, detectors
 from identify.commands.study import STUDY_HELP, study
 from identify.commands.variation import variation
-from identify.commands.workspace import workspace
 from identify.errors import IdentifyError, ScenarioError
 from identify.files.run_folder import RunFolder, load_result, new_run_folder
 from identify.progress import print_warnings, terminal_progress

@@ -1,17 +1,16 @@
 """The command ``cmmsim calibrate``. Heavy imports are late."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from identify.errors import OutputFolderError, ScenarioError
+from identify.files.atomic import atomic_contents, atomic_path
+from identify.files.run_folder import new_run_folder, save_files
 from identify.progress import Progress, print_table, print_warnings, terminal_progress
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from cmmsim.calibration import Board, Calibration, CalibrationOptions, SensorTemplate
 
 CALIBRATE_HELP = """
@@ -100,7 +99,6 @@ def calibrate(
 ) -> None:
     """Calibrate a stereo camera from pictures of a board, or render such pictures."""
     from cmmsim.calibration import read_board, sensor_template
-    from identify.files.run_folder import new_run_folder
 
     folder = new_run_folder(out).path
     progress = terminal_progress(quiet)
@@ -117,7 +115,7 @@ def calibrate(
     if left is None or right is None or board is None:
         missing = ["LEFT"] * (left is None) + ["RIGHT"] * (right is None) + ["--board FILE"] * (board is None)
         raise ScenarioError(f"missing {', '.join(missing)}; cmmsim calibrate --help shows examples")
-    options = _options(distortion, fix_aspect, min_images)
+    options = _options(distortion=distortion, fix_aspect=fix_aspect, min_images=min_images)
     template = None if sensor is None else sensor_template(sensor, folder)
     found = _calibrate(left, right, read_board(board), options, template, progress)
     refused = _write(folder, found, template)
@@ -132,11 +130,11 @@ def _require_none(reason: str, **given: object) -> None:
         raise ScenarioError(f"{reason}: leave out {' and '.join(names)}")
 
 
-def _options(distortion: str | None, fix_aspect: bool, min_images: int | None) -> "CalibrationOptions":
+def _options(**given: Any) -> "CalibrationOptions":
+    """Options as given, the others (None) as they are without."""
     from cmmsim.calibration import CalibrationOptions
 
-    default = CalibrationOptions()
-    return CalibrationOptions(distortion or default.distortion, fix_aspect, min_images or default.min_images)
+    return CalibrationOptions(**{name: value for name, value in given.items() if value is not None})
 
 
 def _calibrate(
@@ -162,36 +160,23 @@ def _calibrate(
 
 
 def _write(folder: Path, found: "Calibration", template: "SensorTemplate | None") -> list[str]:
-    """All files, the texts made before the first is written; a line where no sensor can have these cameras."""
-    from cmmsim.calibration import as_dict, rig_tables
-    from identify.files.atomic import write_text
-    from identify.files.run_folder import save_result
-    from identify.reporting.figures import save_figure
+    """All files, made before the first is written; a line where no sensor can have these cameras."""
+    from cmmsim.calibration import as_dict, require_sensor, rig_tables
+    from cmmsim.errors import SensorFileError
     from identify.verification.sensor_figures import coverage_figure, distortion_figure, residual_figure
 
-    texts = {"rig.toml": rig_tables(found)}
     sensor = None if template is None else template.filled(found)
     figures = {"residuals": residual_figure, "coverage": coverage_figure, "distortion": distortion_figure}
-    for name, text in texts.items():
-        write_text(folder / name, text)
-    save_result(folder / "calibration.json", as_dict(found))
-    for name, draw in figures.items():
-        save_figure(draw(found), folder / f"{name}.png")
-    return [] if sensor is None else _write_sensor(folder / "sensor.toml", sensor)
-
-
-def _write_sensor(path: Path, text: str) -> list[str]:
-    """A sensor file that can be read back, or the line that says why there is none."""
-    from cmmsim.calibration import require_sensor
-    from cmmsim.errors import SensorFileError
-    from identify.files.atomic import atomic_path
-
+    drawn = {f"{name}.png": draw(found) for name, draw in figures.items()}
+    save_files(folder, {"rig.toml": rig_tables(found), "calibration.json": as_dict(found), **drawn})
+    if sensor is None:
+        return []
     try:
-        with atomic_path(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        with atomic_path(folder / "sensor.toml") as temporary:
+            temporary.write_text(sensor, encoding="utf-8")
             require_sensor(temporary)
     except SensorFileError as error:
-        return [f"{path.name} is not written, no sensor can have these cameras: {error}"]
+        return [f"sensor.toml is not written, no sensor can have these cameras: {error}"]
     return []
 
 
@@ -199,12 +184,12 @@ def _render(
     folder: Path, sensor: str, board: "Board | None", count: int, seed: int, progress: Progress, quiet: bool
 ) -> None:
     """Pictures in left/ and right/, and board.toml beside them: all of them, or nothing."""
+    import cv2
     import numpy as np
 
     from cmmsim import load_sensor
     from cmmsim.calibration import board_poses, default_board, render_pairs
     from cmmsim.imaging.renderer import choose_renderer
-    from identify.files.atomic import atomic_contents
 
     source = load_sensor(sensor, seed)
     board = board or default_board(source.rig)
@@ -213,9 +198,13 @@ def _render(
     renderer = choose_renderer(source.renderer)
     frames = render_pairs(source.rig, board, poses, renderer, source.optics, source.noise, rng)
     with progress.stage("render", count) as advance, atomic_contents(folder) as made:
+        for side in ("left", "right"):
+            (made / side).mkdir()
         for k, frame in enumerate(frames):
             for side, image in (("left", frame.left), ("right", frame.right)):
-                _write_picture(made / side / f"{k:03d}.png", image)
+                path = made / side / f"{k:03d}.png"
+                if not cv2.imwrite(str(path), image):
+                    raise OutputFolderError(f"cannot write {path}")
             advance()
         (made / "board.toml").write_text(board.as_toml(), encoding="utf-8")
     if not quiet:
@@ -223,14 +212,6 @@ def _render(
             f"pictures: {folder}\ncalibrate with: cmmsim calibrate {folder}/left {folder}/right "
             f"--board {folder}/board.toml --sensor {sensor}"
         )
-
-
-def _write_picture(path: Path, image: "NDArray[np.unsignedinteger]") -> None:
-    import cv2
-
-    path.parent.mkdir(exist_ok=True)
-    if not cv2.imwrite(str(path), image):
-        raise OutputFolderError(f"cannot write {path}")
 
 
 def _print_summary(found: "Calibration", folder: Path) -> None:

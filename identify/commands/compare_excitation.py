@@ -21,15 +21,13 @@ def compare(scenario: Scenario, seed: int, folder: Path, progress: Progress, qui
 
     from dynamics import load_robot
     from identify.excitation.comparison import compare_methods, comparison_figure
-    from identify.files.run_folder import save_result
-    from identify.reporting.figures import save_figure
+    from identify.files.run_folder import save_files
 
     robot = load_robot(scenario.robot)
     found = compare_methods(robot, scenario, seed, progress)
-    folder.mkdir(parents=True, exist_ok=True)
     figures = {**asdict(found), "entries": [entry.figures() for entry in found.entries], "scenario": scenario.name}
-    save_result(folder / "comparison.json", figures)
-    save_figure(comparison_figure(robot, scenario, found), folder / "comparison.png")
+    figure = comparison_figure(robot, scenario, found)
+    save_files(folder, {"comparison.json": figures, "comparison.png": figure})
     if not quiet:
         print_comparison(found, folder)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from identify.files.run_folder import RunFolder
+from identify.files.run_folder import RunFolder, save_files
 from identify.progress import print_table, terminal_progress
 
 if TYPE_CHECKING:
@@ -37,9 +37,7 @@ def estimators(
     """
     from identify.estimators.registry import choose
     from identify.experiment.joint_instruments import JointInstruments
-    from identify.files.run_folder import save_result
     from identify.record.provenance import check_folder
-    from identify.reporting.figures import save_figure
     from identify.validation.estimator_comparison import estimators_figure
 
     folder = RunFolder(out)
@@ -49,8 +47,7 @@ def estimators(
     chosen = choose(only)
     scores = _scores(folder, instruments, chosen, seed, quiet)
     entry = {"seed": seed, "instruments": asdict(instruments), "estimators": {s.name: _entry(s) for s in scores}}
-    save_result(out / "estimators.json", entry)
-    save_figure(estimators_figure(scores), folder.figures / "estimators.png")
+    save_files(out, {"estimators.json": entry, "figures/estimators.png": estimators_figure(scores)})
     if not quiet:
         _print(scores, out)
 

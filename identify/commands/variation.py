@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from identify.files.run_folder import RunFolder
+from identify.files.run_folder import RunFolder, save_files
 from identify.progress import Progress, print_table, terminal_progress
 
 if TYPE_CHECKING:
@@ -85,14 +85,14 @@ def _record_designed(
 
 
 def _write(folder: RunFolder, found: "Variation", runs: str, table: "Table") -> None:
-    from identify.files.atomic import write_text
-    from identify.files.run_folder import save_result
-    from identify.reporting.figures import save_figure
     from identify.reporting.variation_tables import variation_entry, variation_figure
 
-    save_result(folder.path / "variation.json", variation_entry(found, runs))
-    write_text(folder.path / "variation.md", f"# {table.title}\n\n{table.markdown()}\n\n{table.note}\n")
-    save_figure(variation_figure(found), folder.figures / "variation.png")
+    files = {
+        "variation.json": variation_entry(found, runs),
+        "variation.md": f"# {table.title}\n\n{table.markdown()}\n\n{table.note}\n",
+        "figures/variation.png": variation_figure(found),
+    }
+    save_files(folder.path, files)
 
 
 def _print(table: "Table", name: str, worst: float, out: Path) -> None:

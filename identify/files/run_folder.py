@@ -3,6 +3,7 @@
 import json
 import math
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from identify.errors import OutputFolderError, RecordError
-from identify.files.atomic import write_text
+from identify.files.atomic import write_figure, write_text
 
 # The folder of a run: which stage writes what, and what is refused.
 
@@ -134,6 +135,17 @@ ENTRIES = {"identify": ("identification", "before", "after", "seconds"), "valida
 def save_result(path: Path | str, result: dict[str, Any]) -> None:
     """Write a result, whole or not at all; arrays become lists, and numbers that are not finite become null."""
     write_text(path, json.dumps(_plain(result), indent=2, allow_nan=False) + "\n")
+
+
+def save_files(folder: Path, files: Mapping[str, Any]) -> None:
+    """Write files by their names in a folder: a text as it is, figures of a run (dict) as JSON, a drawn one as PNG."""
+    for name, content in files.items():
+        if isinstance(content, str):
+            write_text(folder / name, content)
+        elif isinstance(content, dict):
+            save_result(folder / name, content)
+        else:
+            write_figure(folder / name, content)
 
 
 def load_result(path: Path | str) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """Figures like the paper's 11, 12 and 13 and those of the errors, for print (PNG), with units on every axis."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +8,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from identify.arrays import Array
-from identify.files.atomic import atomic_path
 from identify.files.run_folder import predicted_row, rms_figures, rms_row
 from identify.reporting.goals import VALIDATION_UM, VALIDATION_URAD, is_friction_or_pid
 
@@ -134,12 +132,6 @@ def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
     axes.set_title("Correlation of the identified parameters")
     figure.colorbar(image, ax=axes, label="correlation [1]", shrink=0.8)
     return figure
-
-
-def save_figure(figure: Figure, path: Path | str) -> None:
-    """Write a figure as PNG, whole or not at all."""
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=120)
 
 
 def _fit_panel(axes: Axes, time: Array, measured: Array, initial: Array | None, identified: Array, i: int) -> None:

@@ -13,7 +13,7 @@ from identify.arrays import Array
 from identify.errors import RecordError
 from identify.estimation.base_parameters import correlation_matrix
 from identify.experiment.truth import read_truth_runs, true_poses
-from identify.files.atomic import write_text
+from identify.files.atomic import write_figure, write_text
 from identify.files.dataset import read_covariance
 from identify.files.run_folder import RunFolder, check_entries, load_result
 from identify.loop_parameters import NAMES
@@ -66,7 +66,7 @@ def write_report(folder: Path | str, progress: Progress | None = None) -> Path:
     drawings = png_figures(data)
     with (progress or SilentProgress()).stage("report", len(drawings) + 1) as advance:
         for name, draw in drawings.items():
-            figures.save_figure(draw(), run.figures / f"{name}.png")
+            write_figure(run.figures / f"{name}.png", draw())
             advance()
         write_text(run.report, render(data))
         advance()

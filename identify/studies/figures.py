@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 
 from identify.arrays import Array
-from identify.reporting.figures import save_figure
+from identify.files.atomic import write_figure
 from identify.studies.study_file import Law, Study
 from identify.studies.table import factor_unit, figure_unit, labelled
 from identify.studies.theory import BAND_CONFIDENCE as BANDS
@@ -32,17 +32,17 @@ def draw(folder: Path, study: Study, done: pd.DataFrame, shown: list[str], verdi
     if not len(done) or not shown:
         return
     for path in study.factors:
-        save_figure(factor_figure(study, done, path, shown), folder / f"by_{path}.png")
+        write_figure(folder / f"by_{path}.png", factor_figure(study, done, path, shown))
     grid = [path for path, values in study.factors.items() if isinstance(values, list)]
     if study.sample is None and len(grid) >= 2:
-        save_figure(map_figure(study, done, (grid[0], grid[1]), shown[:2]), folder / "map.png")
+        write_figure(folder / "map.png", map_figure(study, done, (grid[0], grid[1]), shown[:2]))
     laws = [
         (law, verdict)
         for law, verdict in zip(study.theory, verdicts, strict=True)
         if law.exponent is not None and verdict.measured is not None
     ]
     if laws:
-        save_figure(laws_figure(study, done, laws), folder / "laws.png")
+        write_figure(folder / "laws.png", laws_figure(study, done, laws))
 
 
 def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str]) -> Figure:

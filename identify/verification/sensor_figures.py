@@ -1,4 +1,4 @@
-"""Figures of acceptance tests, of a calibration and of the detectors (PNG)."""
+"""Figures of a sensor's acceptance tests, of its calibration and of its detectors (PNG)."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,13 +13,32 @@ from cmmsim.acceptance.moving_bar import SECONDS
 from cmmsim.acceptance.statistics import published
 from cmmsim.acceptance.volume import CORNERS
 from cmmsim.calibration import Calibration
+from cmmsim.calibration.sightings import SIDES
 from cmmsim.detector_leaderboard import Condition, Score
 from cmmsim.geometry.pose import apply, invert
-
-# Figures of acceptance tests: the volume with its lines, length errors, errors of the bar, latency (PNG).
-
+from identify.verification.acceptance import AcceptanceRun
 
 EDGES = [(a, b) for a in range(8) for b in range(a) if np.sum(CORNERS[a] != CORNERS[b]) == 1]
+ARROW_SHARE = 0.06
+"""Of the image width: length of an arrow for a residual of three sigma."""
+GRID = 25
+"""Points along the width of the image at which distortion is drawn."""
+COLUMNS = 3
+"""Panels beside each other in the figure of the detectors."""
+
+
+def acceptance_figures(run: AcceptanceRun) -> dict[str, Figure]:
+    """Figures by name: two of the lengths, two of the bar, one of the latency; none of a test that was not done."""
+    figures = {}
+    if length := run.found.get("vdi"):
+        figures["measuring_lines"] = lines_figure(run.volume)
+        figures["length_errors"] = length_figure(length, run.limit_um)
+    if bar := run.found.get("e3064"):
+        figures["bar_paths"] = paths_figure(run.volume)
+        figures["bar_errors"] = bar_figure(bar)
+    if latency := run.found.get("e3124"):
+        figures["latency"] = latency_figure(latency)
+    return figures
 
 
 def lines_figure(volume: MeasuringVolume) -> Figure:
@@ -38,99 +57,14 @@ def paths_figure(volume: MeasuringVolume) -> Figure:
     return _in_volume(volume, "Paths of the bar's middle (ASTM E3064)", curves)
 
 
-def length_figure(test: LengthTest, limit_um: float) -> Figure:
-    """Length measurement error against length: single exposures as dots, the mean of each length as a line."""
-    figure = Figure(figsize=(9, 5.5), layout="constrained")
-    axes = figure.subplots()
-    for number, line in enumerate(test.lines):
-        lengths = test.of_line(line.name)
-        true = np.array([1e3 * length.true for length in lengths])
-        single = 1e6 * np.array([length.measured - length.true for length in lengths])
-        shown = axes.plot(true, [1e6 * length.error for length in lengths], "o-", label=line.name)
-        axes.plot(true[:, None] + 1.5 * (number - 3), single, ".", color=shown[0].get_color(), alpha=0.35, markersize=4)
-    for sign in (-1.0, 1.0):
-        axes.axhline(sign * limit_um, color="black", linestyle="--", linewidth=1)
-    axes.set_xlabel("certified length [mm]")
-    axes.set_ylabel("length measurement error [um]")
-    axes.set_title(
-        f"VDI/VDE 2634-1: largest error {1e6 * test.largest.error:+.1f} um, limit ± {limit_um:g} um (dashes)"
-        "\ndots: single exposures, lines: their mean"
-    )
-    axes.legend(fontsize="small", ncols=2)
-    axes.grid(alpha=0.3)
-    return figure
-
-
-def bar_figure(test: BarTest) -> Figure:
-    """Relative pose error of the bar over time, and its distribution beside the published limits."""
-    figure = Figure(figsize=(12, 8), layout="constrained")
-    panels = figure.subplots(2, 2, width_ratios=(3, 2))
-    for run in test.runs:
-        for row, columns, scale in ((0, slice(0, 3), 1e6), (1, slice(3, 6), 1e6)):
-            panels[row, 0].plot(
-                run.time, scale * np.linalg.norm(run.errors[:, columns], axis=1), linewidth=0.7, label=run.name
-            )
-    for row, (name, unit) in enumerate((("position", "um"), ("orientation", "urad"))):
-        panels[row, 0].set_ylabel(f"{name} error [{unit}]")
-        panels[row, 0].axvline(0.0, color="black", linestyle="--", linewidth=1)
-        panels[row, 0].grid(alpha=0.3)
-        _distribution(panels[row, 1], test, row, name, unit)
-    panels[0, 0].set_title("error of the second end relative to the first (dashes: the bar starts to move)")
-    panels[0, 0].legend(fontsize="x-small", ncols=2)
-    panels[1, 0].set_xlabel("time [s]")
-    figure.suptitle("Rigid bar in the style of ASTM E3064-16")
-    return figure
-
-
-def latency_figure(test: LatencyTest) -> Figure:
-    """Delay of each report, their mean with its interval, and what the sensor file states."""
-    figure = Figure(figsize=(9, 4.5), layout="constrained")
-    series, spread = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
-    found = test.latency
-    series.plot(test.reported, 1e3 * found.delays, ".", markersize=4, label="one report")
-    low, high = (1e3 * bound for bound in found.interval)
-    series.axhspan(low, high, color="tab:orange", alpha=0.4, label="95 % interval of the mean")
-    series.axhline(1e3 * test.stated, color="black", linestyle="--", linewidth=1, label="stated in the sensor file")
-    spread.hist(1e3 * found.delays, bins=30, orientation="horizontal")
-    series.set_xlabel("time of the report [s]")
-    series.set_ylabel("latency [ms]")
-    spread.set_xlabel("reports")
-    series.set_title(f"ASTM E3124: mean {1e3 * found.mean:.4f} ms, standard deviation {1e3 * found.std:.4f} ms")
-    series.legend(fontsize="small")
-    series.grid(alpha=0.3)
-    return figure
-
-
-def _distribution(axes: Axes, test: BarTest, row: int, name: str, unit: str) -> None:
-    """Share of frames below an error, standing and moving, with published figures as vertical lines."""
-    for moving, word in ((False, "standing"), (True, "moving")):
-        magnitudes = np.sort(1e6 * np.linalg.norm(test.errors(moving)[:, 3 * row : 3 * row + 3], axis=1))
-        axes.plot(magnitudes, np.arange(1, len(magnitudes) + 1) / len(magnitudes), label=f"this sensor, {word}")
-    figures = [*published(f"{name}, static"), *published(f"{name}, moving")]
-    for number, figure in enumerate(figures):
-        value = 1e3 * figure.value if figure.unit == "mm" else 1e6 * np.deg2rad(figure.value)
-        style = ":" if figure.quantity.endswith("static") else "-."
-        axes.axvline(
-            value,
-            color=f"C{number + 2}",
-            linestyle=style,
-            label=f"{figure.instrument}, {figure.quantity.split(', ')[1]}",
-        )
-    axes.set_xscale("log")
-    axes.set_xlabel(f"{name} error [{unit}]")
-    axes.set_ylabel("share of frames")
-    axes.legend(fontsize="x-small")
-    axes.grid(alpha=0.3)
-
-
 def _in_volume(volume: MeasuringVolume, title: str, curves: dict[str, np.ndarray]) -> Figure:
     """Curves (n,3) m in the volume, drawn as a reader sees it: x to the right, depth away, up."""
     figure = Figure(figsize=(8, 6.5), layout="constrained")
     axes: Any = figure.add_subplot(projection="3d")
     for a, b in EDGES:
-        axes.plot(*_shown(CORNERS[[a, b]] * volume.size), color="grey", linewidth=0.8)
+        axes.plot(*_as_seen(CORNERS[[a, b]] * volume.size), color="grey", linewidth=0.8)
     for name, curve in curves.items():
-        axes.plot(*_shown(curve), label=name)
+        axes.plot(*_as_seen(curve), label=name)
     near, far = volume.depth_range
     axes.set(
         xlabel="x [mm]",
@@ -144,24 +78,89 @@ def _in_volume(volume: MeasuringVolume, title: str, curves: dict[str, np.ndarray
     return figure
 
 
-def _shown(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """x, z and -y (n,) mm of points (n,3) m."""
-    return 1e3 * points[:, 0], 1e3 * points[:, 2], -1e3 * points[:, 1]
+def _as_seen(points: np.ndarray) -> np.ndarray:
+    """x, z and -y (3,n) mm of points (n,3) m."""
+    return 1e3 * (points * [1.0, -1.0, 1.0]).T[[0, 2, 1]]
 
 
-# Figures of a calibration: residuals over the image, where board points were seen, and what the lenses bend.
+def length_figure(test: LengthTest, limit_um: float) -> Figure:
+    """Length measurement error against length: single exposures as dots, the mean of each length as a line."""
+    figure = Figure(figsize=(9, 5.5), layout="constrained")
+    axes = figure.subplots()
+    for number, line in enumerate(test.lines):
+        lengths = test.of_line(line.name)
+        true = np.array([1e3 * length.true for length in lengths])
+        single = 1e6 * np.array([length.measured - length.true for length in lengths])
+        shown = axes.plot(true, [1e6 * length.error for length in lengths], "o-", label=line.name)
+        axes.plot(true[:, None] + 1.5 * (number - 3), single, ".", color=shown[0].get_color(), alpha=0.35, markersize=4)
+    for sign in (-1.0, 1.0):
+        axes.axhline(sign * limit_um, color="black", linestyle="--", linewidth=1)
+    axes.set(xlabel="certified length [mm]", ylabel="length measurement error [um]")
+    axes.set_title(
+        f"VDI/VDE 2634-1: largest error {1e6 * test.largest.error:+.1f} um, limit ± {limit_um:g} um (dashes)"
+        "\ndots: single exposures, lines: their mean"
+    )
+    axes.legend(fontsize="small", ncols=2)
+    axes.grid(alpha=0.3)
+    return figure
 
 
-SIDES = ("left", "right")
-ARROW_SHARE = 0.06
-"""Of the image width: length of an arrow for a residual of three sigma."""
-GRID = 25
-"""Points along the width of the image at which distortion is drawn."""
+def bar_figure(test: BarTest) -> Figure:
+    """Relative pose error of the bar over time, and its distribution beside the published limits."""
+    figure = Figure(figsize=(12, 8), layout="constrained")
+    panels = figure.subplots(2, 2, width_ratios=(3, 2))
+    for (series, spread), name, unit, columns in zip(
+        panels, ("position", "orientation"), ("um", "urad"), (slice(0, 3), slice(3, 6)), strict=True
+    ):
+        for run in test.runs:
+            series.plot(run.time, 1e6 * np.linalg.norm(run.errors[:, columns], axis=1), linewidth=0.7, label=run.name)
+        series.set_ylabel(f"{name} error [{unit}]")
+        series.axvline(0.0, color="black", linestyle="--", linewidth=1)
+        series.grid(alpha=0.3)
+        _distribution(spread, test, columns, name, unit)
+    panels[0, 0].set_title("error of the second end relative to the first (dashes: the bar starts to move)")
+    panels[0, 0].legend(fontsize="x-small", ncols=2)
+    panels[1, 0].set_xlabel("time [s]")
+    figure.suptitle("Rigid bar in the style of ASTM E3064-16")
+    return figure
+
+
+def _distribution(axes: Axes, test: BarTest, columns: slice, name: str, unit: str) -> None:
+    """Share of frames below an error, standing and moving, with published figures as vertical lines."""
+    for moving, word in ((False, "standing"), (True, "moving")):
+        magnitudes = np.sort(1e6 * np.linalg.norm(test.errors(moving)[:, columns], axis=1))
+        axes.plot(magnitudes, np.arange(1, len(magnitudes) + 1) / len(magnitudes), label=f"this sensor, {word}")
+    for number, figure in enumerate([*published(f"{name}, static"), *published(f"{name}, moving")]):
+        value = 1e3 * figure.value if figure.unit == "mm" else 1e6 * np.deg2rad(figure.value)
+        state = figure.quantity.split(", ")[1]
+        style = ":" if state == "static" else "-."
+        axes.axvline(value, color=f"C{number + 2}", linestyle=style, label=f"{figure.instrument}, {state}")
+    axes.set(xscale="log", xlabel=f"{name} error [{unit}]", ylabel="share of frames")
+    axes.legend(fontsize="x-small")
+    axes.grid(alpha=0.3)
+
+
+def latency_figure(test: LatencyTest) -> Figure:
+    """Delay of each report, their mean with its interval, and what the sensor file states."""
+    figure = Figure(figsize=(9, 4.5), layout="constrained")
+    series, spread = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
+    found = test.latency
+    series.plot(test.reported, 1e3 * found.delays, ".", markersize=4, label="one report")
+    low, high = (1e3 * bound for bound in found.interval)
+    series.axhspan(low, high, color="tab:orange", alpha=0.4, label="95 % interval of the mean")
+    series.axhline(1e3 * test.stated, color="black", linestyle="--", linewidth=1, label="stated in the sensor file")
+    spread.hist(1e3 * found.delays, bins=30, orientation="horizontal")
+    series.set(xlabel="time of the report [s]", ylabel="latency [ms]")
+    spread.set_xlabel("reports")
+    series.set_title(f"ASTM E3124: mean {1e3 * found.mean:.4f} ms, standard deviation {1e3 * found.std:.4f} ms")
+    series.legend(fontsize="small")
+    series.grid(alpha=0.3)
+    return figure
 
 
 def residual_figure(found: Calibration) -> Figure:
     """Residuals, measured minus computed, as arrows where they were seen."""
-    figure, panels = _panels(found, f"residuals, sigma {found.adjustment.sigma_px:.3g} px")
+    figure, panels = _image_panels(found, f"residuals, sigma {found.adjustment.sigma_px:.3g} px")
     for k, axes in enumerate(panels):
         pixels, residuals = found.sightings[k].pixels, found.adjustment.residuals[k]
         three_sigma = 3.0 * max(found.adjustment.sigma_px, 1e-9)
@@ -181,7 +180,7 @@ def residual_figure(found: Calibration) -> Figure:
 
 def coverage_figure(found: Calibration) -> Figure:
     """All board points of all images: where none were seen, distortion is extrapolated."""
-    figure, panels = _panels(found, "board points of all used images")
+    figure, panels = _image_panels(found, "board points of all used images")
     for k, axes in enumerate(panels):
         seen = found.sightings[k]
         axes.scatter(seen.pixels[:, 0], seen.pixels[:, 1], s=3, c=seen.view, cmap="turbo")
@@ -191,7 +190,7 @@ def coverage_figure(found: Calibration) -> Figure:
 
 def distortion_figure(found: Calibration) -> Figure:
     """How far the lenses move each point of the image, in px; white crosses: principal points."""
-    figure, panels = _panels(found, "lens distortion")
+    figure, panels = _image_panels(found, "lens distortion")
     for axes, camera, name in zip(panels, found.rig.cameras, SIDES, strict=True):
         step = camera.width / GRID
         x, y = np.meshgrid(np.arange(0.0, camera.width, step), np.arange(0.0, camera.height, step))
@@ -206,23 +205,14 @@ def distortion_figure(found: Calibration) -> Figure:
     return figure
 
 
-def _panels(found: Calibration, title: str) -> tuple[Figure, list[Axes]]:
+def _image_panels(found: Calibration, title: str) -> tuple[Figure, list[Axes]]:
     figure = Figure(figsize=(12, 5), layout="constrained")
     panels = list(figure.subplots(1, 2).flat)
     for axes in panels:
-        axes.set_xlim(-0.5, found.rig.left.width - 0.5)
-        axes.set_ylim(found.rig.left.height - 0.5, -0.5)
-        axes.set_aspect("equal")
-        axes.set_xlabel("x [px]")
-        axes.set_ylabel("y [px]")
+        axes.set(xlim=(-0.5, found.rig.left.width - 0.5), ylim=(found.rig.left.height - 0.5, -0.5), aspect="equal")
+        axes.set(xlabel="x [px]", ylabel="y [px]")
     figure.suptitle(title)
     return figure, panels
-
-
-# Figure of the detectors: error over noise beside the Cramer-Rao bound, one panel for each way a disc is seen.
-
-
-COLUMNS = 3
 
 
 def detectors_figure(scores: Sequence[Score], at_work: Condition) -> Figure:
@@ -233,7 +223,7 @@ def detectors_figure(scores: Sequence[Score], at_work: Condition) -> Figure:
     figure = Figure(figsize=(4.5 * columns, 0.8 + 3.2 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False, sharey=True).flat
     for view, axes in zip(views, panels, strict=False):
-        _panel(axes, [score for score in scores if _view(score.condition) == view])
+        _condition_panel(axes, [score for score in scores if _view(score.condition) == view])
         radius, tilt, psf = view
         work = "working point: " if view == _view(at_work) else ""
         seen = f"radius {radius:.3g} px, tilt {np.degrees(tilt):.0f}°, σ_psf {psf:.2g} px"
@@ -250,7 +240,7 @@ def _view(condition: Condition) -> tuple[float, float, float]:
     return condition.radius_px, condition.tilt, condition.psf_px
 
 
-def _panel(axes: Axes, scores: Sequence[Score]) -> None:
+def _condition_panel(axes: Axes, scores: Sequence[Score]) -> None:
     noise = sorted({score.condition.noise for score in scores})
     bound = {score.condition.noise: score.bound_px for score in scores}
     axes.plot(100.0 * np.array(noise), [bound[n] for n in noise], "k--", marker="_", label="Cramer-Rao bound")

@@ -13,15 +13,16 @@ from dynamics import Robot, workspace
 from dynamics.kinematics import forward_kinematics
 from identify.arrays import Array
 from identify.progress import Progress, SilentProgress
-
-# Maps of a robot's workspace: planes of poses around home, with travel, reach and conditioning at every point.
-
+from identify.reporting.figures import COMPONENTS
 
 POINTS = 101
 """Grid points along each side of a map."""
 
 JOINT_SAMPLES = 20_000
 """Joint vectors within travel from which the extremes of the whole travel range are taken."""
+
+COLUMNS = 3
+"""Maps beside each other in a figure."""
 
 AXES = ("x_m", "y_m", "z_m", "alpha_rad", "beta_rad", "gamma_rad")
 
@@ -159,13 +160,6 @@ def _plane_summary(plane: WorkspacePlane) -> dict[str, Any]:
     }
 
 
-# Figures of workspace maps: colour is travel used or conditioning, lines are the travel limit and the reach.
-
-
-NAMES = ("x", "y", "z", "α", "β", "γ")
-COLUMNS = 3
-
-
 def travel_figure(workspace: WorkspaceMap) -> Figure:
     """Largest crank angle as a share of the travel limit."""
     title = f"{workspace.robot}: travel used, largest |θ| / {workspace.home.travel_limit:.4f} rad"
@@ -180,6 +174,7 @@ def conditioning_figure(workspace: WorkspaceMap) -> Figure:
 
 
 def _maps(workspace: WorkspaceMap, quantity: str, title: str, label: str, norm: Normalize) -> Figure:
+    """One panel a plane: colour is the quantity, lines are the travel limit and the reach."""
     figure = Figure(figsize=(12, 8), layout="constrained")
     panels = figure.subplots(-(-len(workspace.planes) // COLUMNS), COLUMNS, squeeze=False)
     for axes, plane in zip(panels.flat, workspace.planes, strict=False):
@@ -196,10 +191,12 @@ def _panel(axes: Axes, plane: WorkspacePlane, values: np.ndarray, norm: Normaliz
         finite = field[np.isfinite(field)]
         if finite.size and finite.min() < level < finite.max():
             axes.contour(across, up, field, [level], linestyles=style, colors=colour, linewidths=1.5)
-    axes.set_xlabel(f"{NAMES[plane.across]} [{_unit(plane.across)}]")
-    axes.set_ylabel(f"{NAMES[plane.up]} [{_unit(plane.up)}]")
-    axes.set_title(f"{NAMES[plane.fixed]} = {1e3 * plane.value:.4g} {_unit(plane.fixed)}")
-    axes.set_aspect("equal")
+    axes.set(
+        xlabel=f"{COMPONENTS[plane.across]} [{_unit(plane.across)}]",
+        ylabel=f"{COMPONENTS[plane.up]} [{_unit(plane.up)}]",
+        title=f"{COMPONENTS[plane.fixed]} = {1e3 * plane.value:.4g} {_unit(plane.fixed)}",
+        aspect="equal",
+    )
     return shown
 
 

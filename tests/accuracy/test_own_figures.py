@@ -99,7 +99,7 @@ def test_dynamics_against_pinocchio(accuracy, cmmsim_robot, cmmsim_seed):
 @pytest.mark.slow
 def test_papers_loop_against_mujoco(accuracy, cmmsim_robot):
     pytest.importorskip("mujoco")
-    from identify.verification.figure7 import judge, verify
+    from identify.verification.against_mujoco import judge, verify
 
     verdict = judge(verify(cmmsim_robot))
     accuracy.record("the paper's loop against MuJoCo, position", verdict.position_steady_um, unit="um", limit=10)

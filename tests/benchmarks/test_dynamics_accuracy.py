@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
 def test_papers_loop_on_both_engines(quote):
     """Figure 7 for ten seconds: within a thousandth of the goals of 10 um and 20 urad."""
     pytest.importorskip("mujoco")
-    from identify.verification.figure7 import judge, verify
+    from identify.verification.against_mujoco import judge, verify
 
     verdict = judge(verify(dynamics.load_robot("rss6")))
     quote(mujoco_position_steady_um=verdict.position_steady_um, mujoco_angle_steady_urad=verdict.angle_steady_urad)

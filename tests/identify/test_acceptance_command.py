@@ -4,7 +4,6 @@ import json
 
 import pytest
 
-from identify.verification import acceptance_procedure as acceptance
 from identify.verification.acceptance_report import acceptance_markdown
 from tests.identify.commands import command
 
@@ -14,7 +13,7 @@ def nothing_is_drawn(monkeypatch):
     def drawn(*_):
         raise AssertionError("the tests have begun")
 
-    monkeypatch.setattr(acceptance, "do", drawn)
+    monkeypatch.setattr("identify.verification.acceptance.do", drawn)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from identify.errors import RecordError, ScenarioError, TrajectoryError
 from identify.files.run_folder import load_result, save_result
 from identify.loop_parameters import choose_parameters
 from identify.trajectory import check_travel
-from identify.verification.figure7 import EngineRuns, compare_engines, exciting_trajectory, figure_8, judge
+from identify.verification.against_mujoco import EngineRuns, compare_engines, exciting_trajectory, figure_8, judge
 from tests.identify.commands import command
 
 
@@ -92,7 +92,7 @@ def test_exciting_trajectory_starts_at_home_at_rest_and_stays_inside_the_travel(
 
 
 def test_robot_without_room_for_the_trajectory_is_refused_with_evidence(robot, monkeypatch):
-    monkeypatch.setattr("identify.verification.figure7.TRAVEL_MARGIN_RAD", 0.8)
+    monkeypatch.setattr("identify.verification.against_mujoco.TRAVEL_MARGIN_RAD", 0.8)
     with pytest.raises(TrajectoryError, match=r"none of 200 exciting .*travel limit 0\.9948 rad less margin 0\.8000"):
         exciting_trajectory(robot)
 
@@ -122,7 +122,7 @@ def test_command_verifies_the_reference_robot(capfd, tmp_path):
 
 
 def test_command_fails_in_one_line_where_a_goal_is_missed(made_runs, monkeypatch, capfd, tmp_path):
-    from identify.verification import figure7 as model_verification
+    from identify.verification import against_mujoco as model_verification
 
     off = replace(made_runs, mujoco_pose=made_runs.mujoco_pose + 1e-4)
     monkeypatch.setattr(model_verification, "verify", lambda *_: off)
@@ -241,7 +241,7 @@ def test_folder_that_cannot_be_made_is_refused_before_anything_is_computed(
     def compute(*_):
         raise AssertionError("computed first")
 
-    monkeypatch.setattr("identify.verification.figure7.verify", compute)
+    monkeypatch.setattr("identify.verification.against_mujoco.verify", compute)
     monkeypatch.setattr("identify.verification.workspace_map.map_workspace", compute)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()

@@ -7,7 +7,7 @@ import pytest
 
 import dynamics
 from dynamics.errors import UnreachablePoseError
-from identify.commands import workspace as workspace_command
+from identify.commands.robot import workspace
 from identify.errors import OutputFolderError
 from identify.verification import workspace_map
 
@@ -57,7 +57,7 @@ def test_command_writes_numbers_and_figures(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(workspace_map, "POINTS", 21)
     monkeypatch.setattr(workspace_map, "JOINT_SAMPLES", 500)
     monkeypatch.setattr(workspace_map.map_workspace, "__defaults__", (None, 21))
-    workspace_command.workspace("rss6", tmp_path / "map")
+    workspace("rss6", tmp_path / "map")
     numbers = json.loads((tmp_path / "map" / "workspace.json").read_text())
     assert numbers["whole_travel"]["without_pose"] == 0
     assert numbers["whole_travel"]["largest_condition_J_ad"] < 10
@@ -66,4 +66,4 @@ def test_command_writes_numbers_and_figures(tmp_path, monkeypatch, capsys):
         assert (tmp_path / "map" / name).read_bytes().startswith(b"\x89PNG")
     assert "from home within travel" in capsys.readouterr().out
     with pytest.raises(OutputFolderError, match="not empty"):
-        workspace_command.workspace("rss6", tmp_path / "map")
+        workspace("rss6", tmp_path / "map")

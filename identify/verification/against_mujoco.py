@@ -1,8 +1,8 @@
-"""The paper's model validation (section 4.1): this model against MuJoCo in figure 7's loop, and its figure 8.
+"""The paper's model validation (section 4.1): this model against MuJoCo in the loop of its figure 7, and its figure 8.
 
-Figure 7 of the paper: the same joint PID on this model and on MuJoCo, following the same exciting trajectory.
-The PID (eq. 31) follows crank angles of a trajectory of eq. 37; torques come from each engine's own motion. This model
-goes through the closed loop of the experiments, driven by commands; MuJoCo through `mj_step` on the exported MJCF.
+The same joint PID (eq. 31) on both engines follows the crank angles of the same exciting trajectory (eq. 37); torques
+come from each engine's own motion. This model goes through the closed loop of the experiments, driven by commands;
+MuJoCo through `mj_step` on the exported MJCF.
 
 MuJoCo runs with RK4 and with the PID's stiffness and damping inside its integrator, so that its discretisation stays
 far below what is to be seen; only the integral part is held over a step of 0.25 ms, at its value in mid-step.
@@ -23,10 +23,12 @@ from dynamics.parameters import COULOMB, VISCOUS
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.progress import Progress, SilentProgress
+from identify.reporting.figures import COMPONENTS
 from identify.trajectory import FourierTrajectory, check_travel, random_trajectory
 
-COMMAND_RATE_HZ = 200.0
-STEPS_PER_COMMAND = 4
+PARAMETER_SET = "initial"
+DURATION_S, STEADY_FROM_S = 10.0, 2.0
+COMMAND_RATE_HZ, STEPS_PER_COMMAND = 200.0, 4
 SOLVER = MjcfSolver(timestep_s=2.5e-4, integrator="RK4")
 
 # The paper's excitation (section 4.2) in the box of the reference experiment.
@@ -34,6 +36,9 @@ FUNDAMENTAL_HZ, HARMONICS = 0.1, 5
 AMPLITUDE_M, AMPLITUDE_RAD = 0.010, 0.040
 TRAVEL_MARGIN_RAD = 0.1
 ATTEMPTS = 200
+
+GOAL_UM, GOAL_URAD = 10.0, 20.0
+PAPER = {"position_max_um": 1250.0, "angle_max_urad": 3250.0, "position_steady_um": 100.0, "angle_steady_urad": 250.0}
 
 
 @dataclass(frozen=True)
@@ -55,6 +60,17 @@ class EngineRuns:
     def difference(self) -> Array:
         """MuJoCo's pose less this model's, (N, 6) [m, rad]."""
         return self.mujoco_pose - self.model_pose
+
+
+def verify(robot: Robot, progress: Progress | None = None) -> EngineRuns:
+    """Run both engines with the set `initial` less its friction (the paper's Table 1 has none).
+
+    Raises:
+        DynamicsError, TrajectoryError: see `compare_engines`.
+    """
+    values = robot.parameter_sets[PARAMETER_SET].vector.copy()
+    values[COULOMB], values[VISCOUS] = 0.0, 0.0
+    return compare_engines(robot, values, values, DURATION_S, progress)
 
 
 def compare_engines(
@@ -82,22 +98,16 @@ def compare_engines(
         commands = robot.inverse_kinematics(reference.poses)
         model = _run_model(robot, model_parameters, reference, commands)
         advance()
-    engine = _engine(robot, mujoco_parameters, solver)
-    rows = np.empty((len(time), 14))
+    # Table 1's inertias break the triangle inequality in ways that the motion does not feel
+    mjcf = mjcf_text(robot, mujoco_parameters[:64], allow_unphysical_inertia=True, solver=solver)
+    engine, rows = MujocoRobot(robot, mjcf), np.empty((len(time), 14))
     with progress.stage("MuJoCo", len(time)) as advance:
         for frame, row in enumerate(_mujoco_rows(robot, engine, mujoco_parameters, reference, commands)):
             rows[frame] = row
             advance()
+    pose, torque, closure, spin = rows[:, :6], rows[:, 6:12], rows[:, 12], rows[:, 13]
     return EngineRuns(
-        time,
-        reference.poses,
-        model.pose,
-        rows[:, :6],
-        model.torque,
-        rows[:, 6:12],
-        rows[:, 12],
-        rows[:, 13],
-        engine.version,
+        time, reference.poses, model.pose, pose, model.torque, torque, closure, spin, mujoco_version=engine.version
     )
 
 
@@ -129,11 +139,6 @@ def _run_model(
     return closed_loop.simulate(robot, parameters, reference, settings, commands=commands)
 
 
-def _engine(robot: Robot, parameters: Array, solver: MjcfSolver) -> MujocoRobot:
-    """The exported model. Table 1's inertias break the triangle inequality in ways that the motion does not feel."""
-    return MujocoRobot(robot, mjcf_text(robot, parameters[:64], allow_unphysical_inertia=True, solver=solver))
-
-
 def _mujoco_rows(
     robot: Robot, engine: MujocoRobot, parameters: Array, reference: closed_loop.Reference, commands: Array
 ) -> Iterator[Array]:
@@ -158,17 +163,6 @@ def _mujoco_rows(
         before = command
 
 
-# The paper's model validation (section 4.1): this model against MuJoCo in figure 7's loop, with its goals.
-
-
-DURATION_S = 10.0
-STEADY_FROM_S = 2.0
-PARAMETER_SET = "initial"
-
-GOAL_UM, GOAL_URAD = 10.0, 20.0
-PAPER = {"position_max_um": 1250.0, "angle_max_urad": 3250.0, "position_steady_um": 100.0, "angle_steady_urad": 250.0}
-
-
 @dataclass(frozen=True)
 class Verdict:
     """Largest differences between the engines, of the whole run and from STEADY_FROM_S on: distances of the platform
@@ -191,17 +185,6 @@ class Verdict:
         return self.position_steady_um <= GOAL_UM and self.angle_steady_urad <= GOAL_URAD
 
 
-def verify(robot: Robot, progress: Progress | None = None) -> EngineRuns:
-    """Run both engines with the set `initial` less its friction (the paper's Table 1 has none).
-
-    Raises:
-        DynamicsError, TrajectoryError: see `compare_engines`.
-    """
-    values = robot.parameter_sets[PARAMETER_SET].vector.copy()
-    values[COULOMB], values[VISCOUS] = 0.0, 0.0
-    return compare_engines(robot, values, values, DURATION_S, progress)
-
-
 def judge(runs: EngineRuns) -> Verdict:
     """Figures of a comparison."""
     position, angle = _lengths(runs.difference)
@@ -220,15 +203,18 @@ def judge(runs: EngineRuns) -> Verdict:
     )
 
 
+def _lengths(difference: Array) -> tuple[Array, Array]:
+    """Lengths (N,) of the position part and of the angle part of pose differences (N, 6)."""
+    return np.linalg.norm(difference[:, :3], axis=1), np.linalg.norm(difference[:, 3:], axis=1)
+
+
 def verification_entry(robot: Robot, runs: EngineRuns) -> dict[str, Any]:
     """What `verification.json` holds."""
-    verdict = judge(runs)
-    chosen = robot.parameter_sets[PARAMETER_SET]
-    gains = dict(zip(("lp", "li", "ld"), chosen.joint_pid.tolist(), strict=True))
+    verdict, chosen = judge(runs), robot.parameter_sets[PARAMETER_SET]
     return {
         "robot": robot.name,
         "parameters": f"{PARAMETER_SET}, friction zero",
-        "joint_pid": gains,
+        "joint_pid": dict(zip(("lp", "li", "ld"), chosen.joint_pid.tolist(), strict=True)),
         "duration_s": float(runs.time[-1]),
         "steady_from_s": STEADY_FROM_S,
         "mujoco": {
@@ -241,17 +227,6 @@ def verification_entry(robot: Robot, runs: EngineRuns) -> dict[str, Any]:
         "met": verdict.met,
         "paper": PAPER,
     }
-
-
-def _lengths(difference: Array) -> tuple[Array, Array]:
-    """Lengths (N,) of the position part and of the angle part of pose differences (N, 6)."""
-    return np.linalg.norm(difference[:, :3], axis=1), np.linalg.norm(difference[:, 3:], axis=1)
-
-
-# The paper's figure 8: position and angle differences of two engines over time, with MuJoCo's own closure error.
-
-
-COMPONENTS = ("x", "y", "z", "α", "β", "γ")
 
 
 def figure_8(runs: EngineRuns) -> Figure:

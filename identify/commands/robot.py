@@ -1,0 +1,228 @@
+"""Commands about a robot alone: what its motion can show, where it can go, its model in other engines.
+
+Heavy imports are late.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from identify.errors import OutputFolderError, VerificationError
+from identify.files.atomic import write_text
+from identify.files.run_folder import new_run_folder, save_files, save_result
+from identify.progress import print_table, terminal_progress
+
+if TYPE_CHECKING:
+    from dynamics import Robot
+    from identify.arrays import Array
+    from identify.estimation.base_parameters import BaseParameters
+
+RobotArgument = Annotated[str, typer.Argument(help="Built-in robot (rss6) or path of a TOML file.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary.")]
+
+THRESHOLD = 1e-3
+"""Entries of R below it count as zero in the paper (section 4.2)."""
+
+DECADES = (0, 3, 6)
+"""Units in which the paper's threshold is tried: the regressor in N, kN, MN."""
+
+
+def base_parameters(
+    robot: RobotArgument = "rss6",
+    out: Annotated[Path | None, typer.Option("--out", help="Also write the groups to this JSON file.")] = None,
+) -> None:
+    """Which combinations of its dynamic parameters a robot's motion can show at all.
+
+    A parameter that stands alone can be identified by itself, one in a sum only as part of it, and the unseen ones by
+    no motion. All of it up to one common factor where only poses are measured.
+    """
+    from dynamics import load_robot
+    from identify.estimation import base_parameters as base
+
+    matrix = base.structural_regressor(load_robot(robot))
+    found = base.base_parameters(matrix)
+    singular, angle = base.rank_by_singular_values(matrix), base.angle_to_singular_vectors(matrix, found)
+    counts = {10**d: base.rank_by_threshold(matrix / 10**d, THRESHOLD) for d in DECADES}
+    if out is not None:
+        save_result(out, _groups(found, singular, angle))
+    for expression in found.expressions():
+        typer.echo(expression)
+    typer.echo(f"unseen: {', '.join(found.unseen) or 'none'}")
+    typer.echo(
+        f"{found.rank} base parameters of {len(found.names)} by pivoted QR, {singular} by singular values; columns of "
+        f"length one leave {found.gap[1]:.1e} outside the others where independent, {found.gap[0]:.1e} where not"
+    )
+    typer.echo(f"the same groups from singular vectors: largest angle between what both span {angle:.1e} rad")
+    tried = ", ".join(f"{count} in units of {unit:g} N" for unit, count in counts.items())
+    left = len(found.names) - len(found.unseen)
+    typer.echo(
+        f"the paper's rule (|R_ii| > {THRESHOLD:g}, unscaled): {tried}: it depends on the units. Deleting only the "
+        f"unseen ones leaves {left}, {left + 3} with the joint PID's gains (the paper's table lists 49)"
+    )
+
+
+def _groups(found: "BaseParameters", singular: int, angle: float) -> dict[str, Any]:
+    groups = [
+        {"name": name, "expression": text, "coefficients": {found.names[k]: row[k] for k in row.nonzero()[0]}}
+        for name, text, row in zip(found.group_names(), found.expressions(), found.combinations, strict=True)
+    ]
+    return {
+        "rank": found.rank,
+        "rank_by_singular_values": singular,
+        "angle_to_singular_vectors_rad": angle,
+        "unseen": list(found.unseen),
+        "groups": groups,
+    }
+
+
+def workspace(
+    robot: RobotArgument = "rss6",
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Output folder, new or empty.", show_default="runs/workspace-ROBOT")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Map travel, reach and conditioning around home: writes workspace.json, travel.png and conditioning.png."""
+    from dynamics import load_robot
+    from identify.verification.workspace_map import conditioning_figure, map_workspace, travel_figure
+
+    chosen = load_robot(robot)
+    folder = new_run_folder(out or Path("runs") / f"workspace-{chosen.name}").path
+    found = map_workspace(chosen, terminal_progress(quiet))
+    summary = found.summary()
+    figures = {"travel.png": travel_figure(found), "conditioning.png": conditioning_figure(found)}
+    save_files(folder, {**figures, "workspace.json": summary})
+    if quiet:
+        return
+    for axis, (low, high) in summary["range_from_home"].items():
+        name, unit = axis.rsplit("_", 1)
+        typer.echo(f"{name}: {1e3 * low:+.1f} to {1e3 * high:+.1f} m{unit} from home within travel")
+    worst = summary["whole_travel"]
+    typer.echo(
+        f"whole travel: leverage (J_a1) at least {worst['least_leverage_J_a1']:.3f}, condition of J_a2 at most "
+        f"{worst['largest_condition_J_a2']:.2f}, of J_ad {worst['largest_condition_J_ad']:.2f}"
+    )
+    typer.echo(f"maps: {folder}")
+
+
+EXPORT_HELP = """
+Write a robot for another engine.
+
+\b
+Examples:
+  cmmsim export mjcf rss6 --parameters runs/paper-0/result.json --allow-unphysical-inertia
+  cmmsim export mjcf mine.toml --parameters identified --out mine.xml
+"""
+
+export = typer.Typer(name="export", help=EXPORT_HELP, no_args_is_help=True, rich_markup_mode=None)
+
+
+@export.callback()
+def _export() -> None:
+    pass
+
+
+@export.command()
+def mjcf(
+    robot: RobotArgument,
+    parameters: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SET|FILE",
+            help="Parameter set of the robot, or result.json of a run: its estimates.",
+            show_default="initial",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="File to write; replaced if there.", show_default="ROBOT.xml")
+    ] = None,
+    allow_unphysical_inertia: Annotated[
+        bool,
+        typer.Option(
+            "--allow-unphysical-inertia",
+            help="Where a body breaks Ix + Iy >= Iz, write the nearest inertia that MuJoCo accepts.",
+        ),
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write the robot as MJCF, a closed chain that MuJoCo loads."""
+    from dynamics import load_robot
+    from dynamics.engines.mjcf import mjcf_text
+    from identify.loop_parameters import choose_parameters
+
+    with terminal_progress(quiet).stage("export", 1) as advance:
+        chosen_robot = load_robot(robot)
+        chosen = choose_parameters(chosen_robot, parameters)
+        allowed = allow_unphysical_inertia
+        text = mjcf_text(chosen_robot, chosen.values, allow_unphysical_inertia=allowed, source=chosen.source)
+        path = out or Path(f"{chosen_robot.name}.xml")
+        try:
+            write_text(path, text)
+        except (OSError, ValueError) as error:  # ValueError: a robot's name that no file can have
+            reason = (error.strerror if isinstance(error, OSError) else None) or error
+            raise OutputFolderError(f"cannot write {path}: {reason}; name another file with --out") from None
+        advance()
+    if not quiet:
+        for line in [*_changes(chosen_robot, chosen.values), f"model: {path}"]:
+            typer.echo(line)
+
+
+def _changes(robot: "Robot", parameters: "Array") -> list[str]:
+    """Lines: the inertias that the export changed, and by how much that changes the robot's accelerations."""
+    from dynamics.inertia import acceleration_changes, grouped, physical_inertias
+
+    inertias = physical_inertias(parameters, allow_changes=True)
+    if not inertias.changes:
+        return []
+    effects = acceleration_changes(robot, parameters, inertias.values)
+    said = {body: f"{change}; {_effect(effects[body])}" for body, change in inertias.changes.items()}
+    return [f"changed {line}" for line in grouped(said)]
+
+
+def _effect(change: float) -> str:
+    return f"accelerations differ by up to {100 * change:.2g} %" if change > 1e-9 else "the motion does not feel it"
+
+
+def verify_model(
+    robot: RobotArgument = "rss6",
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Output folder, new or empty.", show_default="runs/verify-ROBOT")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Compare the model with MuJoCo in the paper's loop (figure 7): writes verification.json and figure8.png."""
+    from dynamics import load_robot
+    from identify.verification.against_mujoco import figure_8, verification_entry, verify
+
+    chosen = load_robot(robot)
+    folder = new_run_folder(out or Path("runs") / f"verify-{chosen.name}").path
+    runs = verify(chosen, terminal_progress(quiet))
+    entry = verification_entry(chosen, runs)
+    save_files(folder, {"verification.json": entry, "figure8.png": figure_8(runs)})
+    if not quiet:
+        _print_verdict(entry, folder)
+    if not entry["met"]:
+        found, goal = entry["difference"], entry["goal"]
+        raise VerificationError(
+            f"model and MuJoCo differ by {found['position_steady_um']:.3g} um and {found['angle_steady_urad']:.3g} urad"
+            f", more than {goal['position_steady_um']:g} um and {goal['angle_steady_urad']:g} urad; see {folder}"
+        )
+
+
+def _print_verdict(entry: dict[str, Any], folder: Path) -> None:
+    found, goal, paper = entry["difference"], entry["goal"], entry["paper"]
+    title = f"{entry['robot']}: MuJoCo {entry['mujoco']['version']} against this model"
+    rows = []
+    for label, key in (
+        ("position, whole run", "position_max_um"),
+        ("position, steady", "position_steady_um"),
+        ("angle, whole run", "angle_max_urad"),
+        ("angle, steady", "angle_steady_urad"),
+    ):
+        limit = f"{goal[key]:g}" if key in goal else ""
+        rows.append((label, key.rpartition("_")[2], f"{found[key]:.2g}", limit, f"{paper[key]:g}"))
+    rows.append(("torque, whole run", "N m", f"{found['torque_max_nm']:.2g}", "", ""))
+    rows.append(("MuJoCo's loop closure", "um", f"{found['closure_max_um']:.2g}", "", ""))
+    print_table(("largest difference", "unit", "value", "goal", "paper"), rows, ("largest difference", "unit"), title)
+    typer.echo(f"figure: {folder / 'figure8.png'}")

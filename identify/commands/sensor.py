@@ -1,0 +1,218 @@
+"""Commands about a sensor alone: tested like a real instrument, and its detectors beside their bound.
+
+Heavy imports are late.
+"""
+
+import csv
+import io
+import math
+from dataclasses import asdict
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from identify.errors import VerificationError
+from identify.files.run_folder import new_run_folder, save_files
+from identify.progress import print_table, terminal_progress
+
+if TYPE_CHECKING:
+    from cmmsim.detector_leaderboard import Condition, Score
+
+SensorArgument = Annotated[str, typer.Argument(help="Built-in sensor or path of a TOML file.")]
+
+DEFAULT_LIMIT_UM = 50.0  # published static limit of the C-Track 780
+
+
+def acceptance(
+    sensor: SensorArgument = "ctrack780",
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Output folder, new or empty.", show_default="runs/acceptance-SENSOR-SEED"),
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of all sensor noise.")] = 0,
+    renderer: Annotated[
+        str | None,
+        typer.Option(help="pyrender, analytic or auto.", show_default="what the sensor file says"),
+    ] = None,
+    standard: Annotated[str, typer.Option(help="vdi (lengths), e3064 (moving bar), e3124 (latency) or all.")] = "all",
+    volume: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SIDE|WxHxD",
+            help="Measuring volume in m around the rig's target: 0.6 is a cube.",
+            show_default="the largest cube that both cameras see",
+        ),
+    ] = None,
+    limit_um: Annotated[
+        float, typer.Option("--limit-um", help="Largest length error in um that is accepted.")
+    ] = DEFAULT_LIMIT_UM,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary.")] = False,
+) -> None:
+    """Test a sensor like a real one: writes acceptance.md, acceptance.json and figures/*.png.
+
+    The sensor's own cameras take noisy pictures of artefacts in its measuring volume, its own detection and
+    triangulation measure them, and what is true of the artefacts judges the result.
+
+    \b
+    vdi    seven lines through the volume, five lengths each: length error
+           and its limit (in the style of VDI/VDE 2634-1)
+    e3064  a rigid bar with markers at both ends, standing and moved through
+           the volume: relative pose error of its ends (ASTM E3064-16)
+    e3124  a body on a circle: latency of the reported poses (ASTM E3124)
+
+    \b
+    Examples:
+      cmmsim acceptance                          all tests of ctrack780
+      cmmsim acceptance mine.toml --standard vdi --limit-um 30
+      cmmsim acceptance --volume 0.6 --renderer analytic --seed 3
+    """
+    from identify.verification.acceptance import acceptance_entry, do, prepare
+    from identify.verification.acceptance_report import acceptance_markdown
+    from identify.verification.sensor_figures import acceptance_figures
+
+    run = prepare(sensor, seed, renderer, volume, standard, limit_um)
+    folder = new_run_folder(out or Path("runs") / f"acceptance-{run.under_test.file.name}-{seed}").path
+    do(run, terminal_progress(quiet))
+    entry = acceptance_entry(run)
+    figures = {f"figures/{name}.png": figure for name, figure in acceptance_figures(run).items()}
+    save_files(folder, {"acceptance.json": entry, "acceptance.md": acceptance_markdown(entry), **figures})
+    if not quiet:
+        _print_acceptance(entry, folder)
+    lengths = entry.get("vdi_2634_1")
+    if lengths and not lengths["met"]:
+        raise VerificationError(
+            f"the largest length error is {abs(lengths['largest_error_um']):.1f} um on line "
+            f"{lengths['largest_error_at']['line']}, more than {limit_um:g} um; see {folder}"
+        )
+
+
+def _print_acceptance(entry: dict[str, Any], folder: Path) -> None:
+    """One line a test, and where the report is."""
+    if (test := entry.get("vdi_2634_1")) is not None:
+        typer.echo(
+            f"length error: largest {test['largest_error_um']:+.1f} um, limit ± {test['limit_um']:g} um: "
+            f"{'met' if test['met'] else 'MISSED'}"
+        )
+    if (test := entry.get("astm_e3064")) is not None:
+        for state in ("standing", "moving"):
+            position, orientation = test[state]["position_um"], test[state]["orientation_urad"]
+            typer.echo(
+                f"{state} bar: position {position['rms']:.1f} um RMS, {position['maximum']:.0f} largest; "
+                f"orientation {orientation['rms']:.0f} urad RMS, {orientation['maximum']:.0f} largest"
+            )
+    if (test := entry.get("astm_e3124")) is not None:
+        low, high = test["mean_interval_ms"]
+        typer.echo(f"latency: {test['mean_ms']:.4f} ms ({low:.4f} to {high:.4f}), largest {test['max_ms']:.4f} ms")
+    typer.echo(f"report: {folder / 'acceptance.md'}")
+
+
+RADII_PX, NOISES_PERCENT, TILTS_DEG = (2.5, 5.0, 10.0), (0.2, 1.0, 5.0), (0.0, 30.0, 60.0)
+
+
+def detectors(
+    sensor: Annotated[str, typer.Argument(help="Built-in sensor (ctrack780) or path of a TOML file.")] = "ctrack780",
+    radius: Annotated[
+        list[float] | None,
+        typer.Option(help="Long half axis of the disc, 1 to 50 px; repeatable.", show_default="2.5, 5, 10"),
+    ] = None,
+    noise: Annotated[
+        list[float] | None,
+        typer.Option(help="Noise half-way up the edge, % of the contrast; repeatable.", show_default="0.2, 1, 5"),
+    ] = None,
+    tilt: Annotated[
+        list[float] | None, typer.Option(help="Tilt of the disc, degrees; repeatable.", show_default="0, 30, 60")
+    ] = None,
+    psf: Annotated[
+        list[float] | None,
+        typer.Option(help="Sigma of the point spread, px; repeatable.", show_default="the sensor's"),
+    ] = None,
+    draws: Annotated[int, typer.Option(min=2, help="Discs drawn for each row of the table.")] = 400,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of places, directions and noise.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Output folder, new or empty.", show_default="runs/detectors-SENSOR")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no table.")] = False,
+) -> None:
+    """Compare the detectors of sticker centres with the Cramer-Rao bound: writes detectors.csv, .json and .png.
+
+    The first row is what the sensor sees of the platform at home; the others are all combinations of the options.
+    """
+    import numpy as np
+
+    from cmmsim.detector_leaderboard import CONFIDENCE, Condition, compete, scene_of, working_point
+    from cmmsim.files.sensor_file import read_sensor_file
+    from identify.verification.sensor_figures import detectors_figure
+
+    file = read_sensor_file(sensor)
+    at_work = working_point(file)
+    grid = product(radius or RADII_PX, tilt or TILTS_DEG, noise or NOISES_PERCENT, psf or [at_work.psf_px])
+    swept = [Condition(r, np.radians(t), n / 100.0, p) for r, t, n, p in grid]
+    folder = new_run_folder(out or Path("runs") / f"detectors-{file.name}").path
+    with terminal_progress(quiet).stage("detectors", 1 + len(swept)) as advance:
+        rng = np.random.default_rng(seed)
+        scores = compete(scene_of(file), [at_work, *swept], draws, rng, report=lambda done, total: advance())
+    rows = [_row(score) for score in scores]
+    said = {"sensor": file.name, "seed": seed, "draws": draws, "confidence": CONFIDENCE}
+    entry = {**said, "working_point": _columns(at_work), "scores": rows}
+    figure = detectors_figure(scores, at_work)
+    save_files(folder, {"detectors.csv": _as_csv(rows), "detectors.json": entry, "detectors.png": figure})
+    if not quiet:
+        _print_scores(scores, file.name, folder)
+
+
+def _columns(condition: "Condition") -> dict[str, float]:
+    return {
+        "radius_px": condition.radius_px,
+        "tilt_deg": math.degrees(condition.tilt),
+        "noise_percent": 100.0 * condition.noise,
+        "psf_px": condition.psf_px,
+    }
+
+
+def _row(score: "Score") -> dict[str, Any]:
+    """A score as a flat row; the first of each file is the working point's."""
+    figures = asdict(score)
+    del figures["condition"]
+    return {"detector": figures.pop("detector"), **_columns(score.condition), **figures}
+
+
+def _as_csv(rows: list[dict[str, Any]]) -> str:
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]))
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _print_scores(scores: list["Score"], sensor: str, folder: Path) -> None:
+    """One row a condition: the bound, then the rms error of each detector; the working point's row in words below."""
+    names = list(dict.fromkeys(score.detector for score in scores))
+    together = [scores[k : k + len(names)] for k in range(0, len(scores), len(names))]
+    print_table(
+        ("radius\npx", "tilt\n°", "noise\n%", "psf\npx", "bound", *(name.replace("_", " ") for name in names)),
+        map(_cells, together),
+        (),
+        f"rms error of a sticker's centre, px; first row: working point of {sensor}",
+        "* without the windows it lost" if any(score.lost for score in scores) else None,
+    )
+    for s in together[0]:
+        typer.echo(
+            f"{s.detector}: {s.ratio:.3f} times the bound at the working point, 95 % interval {s.ratio_low:.3f} to "
+            f"{s.ratio_high:.3f}; {s.bias_px:.5f} px without noise"
+        )
+    typer.echo(f"files: {folder}")
+
+
+def _cells(scores: list["Score"]) -> tuple[str, ...]:
+    """A row of the table: the scores of all detectors under one condition."""
+    seen = _columns(scores[0].condition)
+    return (
+        f"{seen['radius_px']:.3g}",
+        f"{seen['tilt_deg']:.0f}",
+        f"{seen['noise_percent']:.2g}",
+        f"{seen['psf_px']:.2g}",
+        f"{scores[0].bound_px:.5f}",
+        *(f"{score.rms_px:.5f}{'*' if score.lost else ''}" for score in scores),
+    )

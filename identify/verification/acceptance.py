@@ -1,0 +1,239 @@
+"""The acceptance tests of one sensor, one after the other, and their figures as ``acceptance.json`` holds them."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cmmsim import UnknownOptionError
+from cmmsim.acceptance import (
+    PUBLISHED,
+    AcceptanceError,
+    BarTest,
+    LatencyTest,
+    LengthTest,
+    MeasuringVolume,
+    SensorUnderTest,
+    bar_paths,
+    bar_test,
+    common_volume,
+    interval_of_mean,
+    latency_test,
+    length_test,
+    seven_lines,
+    summarise,
+    volume_of_size,
+)
+from cmmsim.acceptance.artefacts import LENGTH
+from cmmsim.acceptance.latency_test import FRAMES, require_room
+from cmmsim.files.sensor_file import read_sensor_file
+from identify.files.versions import versions
+from identify.progress import Progress
+from identify.random_streams import RESAMPLING, mixed_generator
+
+BLOCK = 10
+"""Neighbouring frames of the bar are resampled together."""
+
+
+@dataclass
+class AcceptanceRun:
+    """What is tested, with the limit of the length error, and what came out, by the name of the test; its seconds."""
+
+    under_test: SensorUnderTest
+    renderer: str
+    volume: MeasuringVolume
+    standards: tuple[str, ...]
+    limit_um: float
+    found: dict[str, Any] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Standard:
+    """A test: its name in progress bars and in ``acceptance.json``; its steps in a volume, which it refuses where there
+    is no room; the test itself; its figures for ``acceptance.json``."""
+
+    title: str
+    key: str
+    steps: Callable[[MeasuringVolume], int]
+    test: Callable[..., Any]
+    figures: Callable[[Any, AcceptanceRun], dict[str, Any]]
+
+
+def prepare(
+    sensor: str | Path, seed: int, renderer: str | None, volume: str | None, standard: str, limit_um: float
+) -> AcceptanceRun:
+    """A run in which nothing is done yet; everything that can be wrong is checked before anything is drawn.
+
+    standard: the name of a test or ``all``; volume: its sides, see `parse_volume`, or the largest that is seen.
+
+    Raises:
+        CmmError: an unknown sensor, renderer or standard, a limit that is no positive number, or a volume that is not
+            seen, breaks a rule or lacks room for the bar.
+    """
+    if not (math.isfinite(limit_um) and limit_um > 0.0):
+        raise AcceptanceError(f"the limit of the length error must be a positive number of um, got {limit_um:g}")
+    if standard != "all" and standard not in STANDARDS:
+        raise UnknownOptionError("standard", standard, (*STANDARDS, "all"))
+    standards = tuple(STANDARDS) if standard == "all" else (standard,)
+    file = read_sensor_file(sensor)
+    under_test = SensorUnderTest(file, seed, renderer)
+    found = common_volume(file.rig) if volume is None else volume_of_size(file.rig, parse_volume(volume))
+    for name in standards:
+        STANDARDS[name].steps(found)
+    return AcceptanceRun(under_test, under_test.renderer_name(), found, standards, limit_um)
+
+
+def parse_volume(text: str) -> np.ndarray:
+    """Sides (3,) [m] of a volume written as ``0.6`` (a cube) or ``0.7x0.6x0.6``.
+
+    Raises:
+        AcceptanceError: anything else.
+    """
+    try:
+        sides = np.array([float(part) for part in text.lower().split("x")])
+    except ValueError:
+        sides = np.zeros(0)
+    if len(sides) not in (1, 3) or not np.all(np.isfinite(sides)):
+        raise AcceptanceError(f"volume {text!r} is neither one side of a cube nor WIDTHxHEIGHTxDEPTH in m, such as 0.6")
+    return np.broadcast_to(sides, 3).copy()
+
+
+def do(run: AcceptanceRun, progress: Progress) -> None:
+    """Do the tests of a prepared run."""
+    for name in run.standards:
+        standard, start = STANDARDS[name], time.perf_counter()
+        with progress.stage(standard.title, standard.steps(run.volume)) as advance:
+            run.found[name] = standard.test(run.under_test, run.volume, advance=advance)
+        run.seconds[name] = time.perf_counter() - start
+
+
+def acceptance_entry(run: AcceptanceRun) -> dict[str, Any]:
+    """All figures of a run; a test that was not done is absent."""
+    volume = run.volume
+    return {
+        "sensor": run.under_test.file.name,
+        "note": run.under_test.file.note,
+        "renderer": run.renderer,
+        "seed": run.under_test.seed,
+        "versions": versions(),
+        "seconds": run.seconds,
+        "volume": {
+            "size_mm": (1e3 * volume.size).tolist(),
+            "diagonal_mm": 1e3 * volume.diagonal,
+            "cubic_metres": float(np.prod(volume.size)),
+            "depth_from_baseline_mm": [1e3 * depth for depth in volume.depth_range],
+            "base_from_volume": volume.base_from_volume,
+        },
+        **{STANDARDS[name].key: STANDARDS[name].figures(test, run) for name, test in run.found.items()},
+        "published": [asdict(figure) for figure in PUBLISHED],
+    }
+
+
+def _length(test: LengthTest, run: AcceptanceRun) -> dict[str, Any]:
+    largest, errors, single = test.largest, 1e6 * test.errors, 1e6 * test.single_errors
+    # the lengths of a line share its first sticker: only the lines are independent
+    line_means = 1e6 * np.array([np.mean([length.error for length in test.of_line(line.name)]) for line in test.lines])
+    return {
+        "limit_um": run.limit_um,
+        "met": bool(np.abs(errors).max() <= run.limit_um),
+        "largest_error_um": 1e6 * largest.error,
+        "largest_error_at": {"line": largest.line, "length_mm": 1e3 * largest.true},
+        "mean_error_um": float(errors.mean()),
+        "mean_error_interval_um": interval_of_mean(line_means),
+        "rms_error_um": float(np.sqrt(np.mean(errors**2))),
+        "exposures_a_length": single.shape[1],
+        "single_exposure_rms_um": float(np.sqrt(np.mean(single**2))),
+        "variance_ratio": test.variance_ratio,
+        "lines": [
+            {
+                "name": line.name,
+                "start_mm": 1e3 * line.start,
+                "end_mm": 1e3 * line.end,
+                "longest_share_of_diagonal": float(line.lengths.max()) / test.volume.diagonal,
+                "lengths": [
+                    {
+                        "certified_mm": 1e3 * length.true,
+                        "measured_mm": 1e3 * float(length.measured.mean()),
+                        "error_um": 1e6 * length.error,
+                        "single_exposure_std_um": 1e6 * length.std,
+                    }
+                    for length in test.of_line(line.name)
+                ],
+            }
+            for line in test.lines
+        ],
+    }
+
+
+def _bar(test: BarTest, run: AcceptanceRun) -> dict[str, Any]:
+    rng = mixed_generator(RESAMPLING, run.under_test.seed)
+    return {
+        "bar_length_mm": 1e3 * LENGTH,
+        "frames": test.frames,
+        "lost_frames": test.lost,
+        "largest_speed_mm_s": 1e3 * test.largest_speed,
+        "exposure_ms": 1e3 * test.exposure,
+        "variance_ratio": test.variance_ratio,
+        "standing": _relative_errors(test, False, rng),
+        "moving": _relative_errors(test, True, rng),
+        "runs": [
+            {
+                "name": bar.name,
+                "frames": len(bar.time),
+                "lost_frames": bar.lost,
+                "given_up": bar.given_up,
+                "position_rms_um": _rms_norm(bar.errors[:, :3]),
+                "orientation_rms_urad": _rms_norm(bar.errors[:, 3:]),
+                "distance_rms_um": _rms_norm(bar.distance_errors[:, None]),
+            }
+            for bar in test.runs
+        ],
+    }
+
+
+def _relative_errors(test: BarTest, moving: bool, rng: np.random.Generator) -> dict[str, Any]:
+    errors = test.errors(moving)
+    magnitudes = {
+        "position_um": np.linalg.norm(errors[:, :3], axis=1),
+        "orientation_urad": np.linalg.norm(errors[:, 3:], axis=1),
+        "distance_um": np.abs(test.distance_errors(moving)),
+    }
+    return {name: asdict(summarise(1e6 * values, rng, BLOCK)) for name, values in magnitudes.items()}
+
+
+def _rms_norm(errors: np.ndarray) -> float:
+    return float(1e6 * np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+
+
+def _latency(test: LatencyTest, run: AcceptanceRun) -> dict[str, Any]:
+    found = test.latency
+    return {
+        "reports": len(test.reported),
+        "lost_frames": test.lost,
+        "mean_ms": 1e3 * found.mean,
+        "mean_interval_ms": [1e3 * bound for bound in found.interval],
+        "std_ms": 1e3 * found.std,
+        "max_ms": 1e3 * found.maximum,
+        "single_report_noise_ms": 1e3 * found.resolution,
+        "sensor_file_ms": 1e3 * test.stated,
+        "oldest_pose_ms": 1e3 * (found.maximum + test.frame_period),
+    }
+
+
+def _circle_steps(volume: MeasuringVolume) -> int:
+    require_room(volume)
+    return FRAMES
+
+
+STANDARDS = {
+    "vdi": Standard(
+        "lengths (VDI/VDE 2634-1)", "vdi_2634_1", lambda volume: len(seven_lines(volume)), length_test, _length
+    ),
+    "e3064": Standard("moving bar (ASTM E3064)", "astm_e3064", lambda volume: len(bar_paths(volume)), bar_test, _bar),
+    "e3124": Standard("latency (ASTM E3124)", "astm_e3124", _circle_steps, latency_test, _latency),
+}
