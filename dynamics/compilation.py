@@ -133,7 +133,7 @@ def _source(functions: list[ca.Function], drivers: tuple[str, ...]) -> str:
     generator = ca.CodeGenerator("robot.c")
     for function in functions:
         generator.add(function)
-    own = [(resources.files("dynamics.closed_loop") / driver).read_text(encoding="utf-8") for driver in drivers]
+    own = [(resources.files("dynamics.closed_loop") / "c" / driver).read_text(encoding="utf-8") for driver in drivers]
     return "".join([generator.dump(), *own])
 
 

@@ -1,6 +1,6 @@
 """Inertias that a rigid body can have, and what changed inertias do to the motion.
 
-Principal inertias that a rigid body can have: positive mass, and no moment larger than the sum of the other two.
+A rigid body has a positive mass, and no principal moment larger than the sum of the other two (`moments_fault`).
 Published tables break this (the cranks and links of the paper's Table 1 do), and multibody engines refuse such bodies.
 `physical_inertias` names them, or changes as little as possible, and where it can what the motion does not feel:
 
@@ -8,10 +8,10 @@ Published tables break this (the cranks and links of the paper's Table 1 do), an
 - a link without spin does no work against Izz, so Izz gives way and Ixx and Iyy stay;
 - the platform feels all three, so they share the change equally (the nearest moments in the least-squares sense).
 
-What changed inertias do to the motion: accelerations of the robot with its own parameters and with changed ones.
-Measured at random states over the travel, so that an export that has to change inertias can say what that means.
+`acceleration_changes` measures at random states over the travel what that means for the robot's motion.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,6 +65,17 @@ def physical_inertias(parameters: np.ndarray, allow_changes: bool = False) -> Bo
     return BodyInertias(values, changes)
 
 
+def moments_fault(moments: Mapping[str, float], rounding: float = 0.0) -> str:
+    """Which of three principal moments of inertia, by name, exceeds the sum of the others by more than its share
+    `rounding`, with values; empty where a rigid body can have them."""
+    largest = max(moments, key=moments.__getitem__)
+    others = [name for name in moments if name != largest]
+    halves = sum(moments[name] / 2 for name in others)  # sums of two of the largest floats overflow
+    if moments[largest] / 2 <= (1 + rounding) * halves:
+        return ""
+    return f"{largest} {moments[largest]:g} > {' + '.join(f'{name} {moments[name]:g}' for name in others)}"
+
+
 def grouped(texts: dict[str, str]) -> list[str]:
     """Texts by body as lines `body, body: text`, one for all bodies that share a text, in the order of the bodies."""
     bodies: dict[str, list[str]] = {}
@@ -78,13 +89,7 @@ def _fault(row: np.ndarray) -> str:
     for name, value in zip(("mass", *MOMENTS), row, strict=True):
         if value < SMALLEST:
             return f"{name} = {value:g} is below {SMALLEST:g}"
-    largest = int(np.argmax(row[1:]))
-    others = [index for index in range(3) if index != largest]
-    half = row[1:] / 2  # sums of two of the largest floats overflow
-    if half[largest] <= half[others[0]] + half[others[1]]:
-        return ""
-    total = " + ".join(f"{MOMENTS[index]} {row[1 + index]:g}" for index in others)
-    return f"{MOMENTS[largest]} {row[1 + largest]:g} > {total}"
+    return moments_fault(dict(zip(MOMENTS, row[1:].tolist(), strict=True)))
 
 
 def _repaired(body: str, row: np.ndarray) -> np.ndarray:

@@ -88,7 +88,7 @@ class Robot:
         """
         theta = rows("theta", theta, LEGS)
         start = self.home_pose if initial_pose is None else rows("initial_pose", initial_pose, 6)
-        return forward_kinematics.solve(self, theta, start)
+        return forward_kinematics.solve(self.functions, theta, start)
 
     def joint_jacobian(self, pose: ArrayLike) -> np.ndarray:
         """J_ad (6, 6): theta_dot = J_ad twist (eq. 8)."""

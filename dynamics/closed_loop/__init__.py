@@ -4,24 +4,24 @@ Every frame the pose is measured, by the sensor that the caller passes or by an 
 command after the latency, and the command is held until the next. Unless a start is given the run starts at rest at the
 first reference pose, in equilibrium: integrators hold what keeps the robot there. One function serves plant and model.
 
-Two implementations, tested to be equal: compiled C (see `closed_loop.h`) and plain Python (`plain_closed_loop.py`).
+Two implementations, tested to be equal: compiled C (`compiled_loop`, folder `c`) and plain Python
+(`plain_loop`, with `servo`, `motion`, `stick_slip` and `sensitivity`).
 """
 
-from dynamics.closed_loop.elasticity import JointElasticity
-from dynamics.closed_loop.preparation import equilibrium
+from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
 from dynamics.closed_loop.problem import (
     Controller,
     FrameTiming,
-    FrictionLaw,
     LoopSettings,
     PoseSensor,
     RateSensor,
     Reference,
     ServoGains,
     StartState,
+    equilibrium,
 )
 from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
-from dynamics.closed_loop.simulate import prepare, simulate
+from dynamics.closed_loop.simulate import prepare, simulate, simulate_batch
 
 __all__ = [
     "ClosedLoopRun",
@@ -39,4 +39,5 @@ __all__ = [
     "equilibrium",
     "prepare",
     "simulate",
+    "simulate_batch",
 ]

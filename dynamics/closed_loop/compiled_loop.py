@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dynamics.closed_loop.command_schedule import CommandSchedule, command_schedule
 from dynamics.closed_loop.problem import (
     LEFT_REACH,
     MEASURED_OUT_OF_REACH,
@@ -18,7 +19,6 @@ from dynamics.closed_loop.problem import (
     measurement,
 )
 from dynamics.closed_loop.run import ClosedLoopRun, empty_run, failure
-from dynamics.closed_loop.servo import CommandSchedule, command_schedule
 from dynamics.compilation import load_library, open_library
 from dynamics.errors import SimulationError
 from dynamics.legs.rss_geometry import Rss6Geometry

@@ -6,7 +6,9 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
-from dynamics.closed_loop.motion import MotionFunctions, elastic_functions, with_motors
+from dynamics.closed_loop.command_schedule import CommandSchedule, command_schedule
+from dynamics.closed_loop.joints import MotionFunctions, elastic_functions
+from dynamics.closed_loop.motion import Command, State
 from dynamics.closed_loop.problem import (
     LENGTH,
     MEASURED_OUT_OF_REACH,
@@ -18,8 +20,8 @@ from dynamics.closed_loop.problem import (
     own_command,
 )
 from dynamics.closed_loop.run import ClosedLoopRun, empty_run, failure
-from dynamics.closed_loop.servo import CommandSchedule, VisualServo, command_schedule
-from dynamics.closed_loop.stick_slip import Command, MotionStopped, State, StickSlipMotion
+from dynamics.closed_loop.servo import VisualServo
+from dynamics.closed_loop.stick_slip import MotionStopped, StickSlipMotion
 from dynamics.legs.rss_geometry import Rss6Geometry
 from dynamics.rigid_body.equation_of_motion import motion_functions
 from dynamics.rigid_body.functions import kinematic_functions
@@ -40,7 +42,10 @@ def run(robot: Robot, problem: LoopProblem) -> ClosedLoopRun:
     reference, settings, period, start = problem.reference, problem.settings, problem.period, problem.start
     state = State(start.pose, start.pose_rate, start.joint_integral)
     if settings.elasticity is not None:
-        state, functions = with_motors(state, start), elastic_functions(functions, settings.elasticity)
+        assert start.motor_angle is not None
+        assert start.motor_rate is not None
+        pose, rate = np.append(state.pose, start.motor_angle), np.append(state.rate, start.motor_rate)
+        state, functions = State(pose, rate, state.integral), elastic_functions(functions, settings.elasticity)
     tangent, d_servo_integral = _start_tangent(problem)
     rest = np.zeros_like(d_servo_integral)
     motion = StickSlipMotion(
@@ -157,7 +162,7 @@ def _command(issued: list[Issued], number: int, ramp: float, problem: LoopProble
 
 
 def _start_tangent(problem: LoopProblem) -> tuple[State, np.ndarray]:
-    """Derivatives of the first state, and of the servo integral, with the columns of `step_sensitivity`."""
+    """Derivatives of the first state, and of the servo integral, with the columns of `sensitivity`."""
     columns = LENGTH + 1 + (START_COUNT if problem.start_sensitivities else 0)
     pose, rate, integral, servo_integral = np.zeros((4, 6, columns))
     integral[:, :PARAMETER_COUNT] = problem.start.joint_integral_sensitivity

@@ -1,17 +1,15 @@
-"""What goes into a closed-loop run: settings, reference, start state."""
+"""What goes into a closed-loop run: settings, reference, parameters, and the state it starts from, by default rest."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, get_args
-from weakref import WeakSet
 
 import numpy as np
 
 from dynamics.checks import Shape, check_choice, check_type, floats, real, whole
-from dynamics.closed_loop.elasticity import JointElasticity
-from dynamics.closed_loop.friction import FrictionLaw
+from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
 from dynamics.errors import SimulationError
-from dynamics.parameters import PARAMETER_NAMES
+from dynamics.parameters import JOINT_PID_NAMES, PARAMETER_NAMES, check_parameters
 from dynamics.robot import Robot
 
 PARAMETER_COUNT = len(PARAMETER_NAMES) + 3
@@ -95,13 +93,12 @@ class LoopSettings:
         object.__setattr__(self, "steps_per_frame", steps)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Reference:
     """Desired motion at the frame times: poses (frames, 6) and pose rates (frames, 6), copied and frozen."""
 
     poses: np.ndarray
     rates: np.ndarray
-    _reached_by: WeakSet[Robot] = field(default_factory=WeakSet, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("poses", "rates"):
@@ -114,14 +111,8 @@ class Reference:
         if self.poses.shape != self.rates.shape:
             raise SimulationError(f"reference poses {self.poses.shape} and rates {self.rates.shape} differ in shape")
 
-    def __reduce__(self) -> tuple[type["Reference"], tuple[np.ndarray, np.ndarray]]:
-        return Reference, (self.poses, self.rates)
-
-    def check_reach(self, robot: Robot) -> None:
-        """Raise UnreachablePoseError, naming frame and leg, for a pose out of a robot's reach; asked once a robot."""
-        if robot not in self._reached_by:
-            robot.check_reach(self.poses, "reference pose", "frame")
-            self._reached_by.add(robot)
+    def __repr__(self) -> str:
+        return f"Reference({len(self.poses)} frames)"
 
 
 @dataclass(frozen=True)
@@ -207,14 +198,50 @@ def own_command(controller: Controller, problem: LoopProblem, frame: int, measur
     return np.array(floats(f"what the controller returned at frame {frame}", command, (6,), error=SimulationError))
 
 
-def checked_latencies(latencies: object, frames: int, timing: FrameTiming) -> np.ndarray:
-    """Latency (frames,), s, of each frame's command. Raises SimulationError for one that no `FrameTiming` may have."""
-    values = floats("latencies", latencies, (frames,), error=SimulationError)
-    in_frames = values * timing.frame_rate_hz
-    wrong = np.flatnonzero((in_frames < 0) | (in_frames > MAX_DELAY_FRAMES))
-    if len(wrong):
-        raise SimulationError(
-            f"latency of frame {wrong[0]} is {values[wrong[0]]:g} s, must be >= 0 and at most "
-            f"{MAX_DELAY_FRAMES} frames ({MAX_DELAY_FRAMES / timing.frame_rate_hz:.3g} s)"
-        )
+def checked_loop_parameters(parameters: object) -> np.ndarray:
+    """The 64 dynamic parameters and lp, li, ld (67,). Raises SimulationError, or ParameterError for a dynamic one."""
+    values = floats("loop parameters", parameters, (PARAMETER_COUNT,), error=SimulationError, finite=False)
+    check_parameters(values[:64])
+    lp, li, ld = JOINT_PID_NAMES
+    for name, value in ((lp, values[64]), (ld, values[66])):
+        real(name, value, SimulationError, least=0)
+    real(li, values[65], SimulationError, above=0)
     return values
+
+
+def check_start_pose(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> None:
+    """Raise UnreachablePoseError or SingularPoseError for a pose (6,) from which no run can start."""
+    robot.static_torque(pose, parameters[:64])  # refuses a pose out of reach or singular, with the evidence
+    robot.pose_rate(pose, np.zeros(6))  # refuses Euler angles at their singularity
+
+
+def equilibrium(
+    robot: Robot,
+    parameters: np.ndarray,
+    pose: np.ndarray,
+    servo: ServoGains,
+    servo_robot: Robot | None = None,
+    elasticity: JointElasticity | None = None,
+) -> StartState:
+    """State of rest at a pose (6,), friction unloaded, for parameters (67,); servo_robot as in `closed_loop.simulate`.
+
+    The holding torque is linear in the dynamic parameters. Raises what that raises before a run.
+    """
+    check_type("robot", robot, Robot, SimulationError)
+    check_type("servo", servo, ServoGains, SimulationError)
+    parameters, pose = checked_loop_parameters(parameters), floats("pose", pose, (6,))
+    li, rest = parameters[65], np.zeros(6)
+    check_start_pose(robot, parameters, pose)
+    angles = robot.inverse_kinematics(pose)
+    torque_map = np.linalg.solve(robot.joint_jacobian(pose).T, robot.regressor(pose, rest, rest))
+    integral = torque_map @ parameters[:64] / li
+    sensitivity = np.zeros((6, PARAMETER_COUNT))
+    sensitivity[:, :64] = torque_map / li
+    sensitivity[:, 65] = -integral / li
+    motors = {}
+    if elasticity is not None:
+        angles = angles + li * integral / elasticity.stiffness
+        motors = {"motor_angle": angles, "motor_rate": rest}
+    known = servo_robot or robot
+    servo_integral = np.linalg.solve(known.pose_jacobian(pose), angles) / servo.ki if servo.ki else np.zeros(6)
+    return StartState(pose, rest, integral, servo_integral, angles[None], pose, sensitivity, **motors)

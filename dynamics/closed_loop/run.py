@@ -44,6 +44,10 @@ class ClosedLoopRun:
     events: int
     start: StartState
 
+    def __repr__(self) -> str:
+        lost = len(self.time) - int(self.measured_ok.sum())
+        return f"ClosedLoopRun({len(self.time)} frames to {self.time[-1]:.4g} s, {lost} lost, {self.events} events)"
+
     def state_at(self, frame: int) -> StartState:
         """The state at a frame: a run that starts from it repeats the rest of this one, if its latency is constant.
 

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from dynamics.closed_loop.friction import FrictionLaw
-from dynamics.closed_loop.motion import Command, Evaluation, MotionFunctions, State, compliance
+from dynamics.closed_loop.joints import FrictionLaw, MotionFunctions
+from dynamics.closed_loop.motion import Command, Evaluation, State, compliance
 from dynamics.closed_loop.problem import LENGTH
 from dynamics.parameters import COULOMB, RIGID_BODY, VISCOUS, split_parameters
 

@@ -1,33 +1,37 @@
-"""One closed-loop run: what is asked is checked and prepared, run compiled or plain, and handed back."""
+"""Closed-loop runs, one or many: what is asked is checked and prepared, run compiled or plain, and handed back."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import TypeVar, cast
 
 import numpy as np
 
-from dynamics.checks import check_type, flag
-from dynamics.closed_loop import compiled_loop as compiled_closed_loop
-from dynamics.closed_loop import plain_loop as plain_closed_loop
-from dynamics.closed_loop.preparation import (
-    check_elasticity,
-    check_kinds,
-    check_start_pose,
-    check_together,
-    checked_loop_parameters,
-    checked_lost,
-    checked_rows,
-    equilibrium,
-)
+from dynamics.checks import Shape, check_type, flag, floats, mask, shown, whole
+from dynamics.closed_loop import compiled_loop, plain_loop
 from dynamics.closed_loop.problem import (
+    MAX_DELAY_FRAMES,
+    PARAMETER_COUNT,
     Controller,
+    FrameTiming,
     LoopProblem,
     LoopSettings,
     PoseSensor,
     RateSensor,
     Reference,
     StartState,
-    checked_latencies,
+    check_start_pose,
+    checked_loop_parameters,
+    equilibrium,
 )
 from dynamics.closed_loop.run import ClosedLoopRun
 from dynamics.errors import SimulationError
 from dynamics.robot import Robot
+
+Item = TypeVar("Item", Reference, StartState)
 
 
 def simulate(
@@ -65,11 +69,11 @@ def simulate(
     Raises LoopFailure when the robot leaves the reachable set (an unstable loop); and before the run
     UnreachablePoseError where reference or start do, ParameterError, SimulationError, SingularPoseError.
     """
-    check_kinds(robot, reference, settings, sensor, servo_robot, controller)
+    _check_kinds(robot, reference, settings, sensor, servo_robot, controller)
     start_sensitivities = flag("start_sensitivities", start_sensitivities, SimulationError)
     sensitivities = flag("sensitivities", sensitivities, SimulationError) or start_sensitivities
     compiled = None if compiled is None else flag("compiled", compiled, SimulationError)
-    reference.check_reach(robot)
+    _check_reach(robot, reference)
     frames, parameters = len(reference.poses), checked_loop_parameters(parameters)
     problem = LoopProblem(
         robot,
@@ -80,16 +84,64 @@ def simulate(
         sensor,
         sensitivities,
         start_sensitivities,
-        commands=checked_rows("commands", commands, frames),
-        lost=checked_lost(lost, frames),
-        noise=checked_rows("noise", noise, frames),
-        latencies=None if latencies is None else checked_latencies(latencies, frames, settings.timing),
+        commands=_checked_rows("commands", commands, frames),
+        lost=_checked_lost(lost, frames),
+        noise=_checked_rows("noise", noise, frames),
+        latencies=None if latencies is None else _checked_latencies(latencies, frames, settings.timing),
         servo_robot=servo_robot or robot,
         controller=controller,
     )
-    check_together(problem, servo_robot, compiled)
-    check_elasticity(problem)
+    _check_together(problem, servo_robot, compiled)
+    _check_elasticity(problem)
     return _run(problem, compiled)
+
+
+def simulate_batch(
+    robot: Robot,
+    parameters: np.ndarray,
+    references: Reference | Sequence[Reference],
+    settings: LoopSettings,
+    *,
+    starts: StartState | Sequence[StartState] | None = None,
+    sensitivities: bool = False,
+    start_sensitivities: bool = False,
+    workers: int | None = None,
+) -> list[ClosedLoopRun]:
+    """Run the closed loop with the ideal sensor for N parameter vectors (N, 67), references, starts, or them in pairs.
+
+    A single vector (67,), reference or start serves all runs. Results are those of `simulate`, in order, and do not
+    depend on `workers` (default: one a core). Raises what `simulate` raises, for the first run that fails.
+    """
+    threads = len(os.sched_getaffinity(0)) if workers is None else whole("workers", workers, SimulationError, least=1)
+    shapes: tuple[Shape, Shape] = (PARAMETER_COUNT,), ("N", PARAMETER_COUNT)
+    vectors = np.atleast_2d(floats("loop parameters", parameters, *shapes, error=SimulationError, finite=False))
+    given = _listed("references", references, Reference)
+    begins: Sequence[StartState | None] = [None] if starts is None else _listed("starts", starts, StartState)
+    lengths = (len(vectors), len(given), len(begins))
+    count = max(lengths)
+    if not set(lengths) <= {1, count}:
+        of_starts = "" if starts is None else f" and {len(begins)} start states"
+        raise SimulationError(f"{len(vectors)} parameter vectors and {len(given)} references{of_starts} do not pair up")
+
+    def one(index: int) -> ClosedLoopRun:
+        return simulate(
+            robot,
+            vectors[index % len(vectors)],
+            given[index % len(given)],
+            settings,
+            start=begins[index % len(begins)],
+            sensitivities=sensitivities,
+            start_sensitivities=start_sensitivities,
+        )
+
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(one, range(count)))
+
+
+def prepare(robot: Robot) -> bool:
+    """Compile the loop of a robot if that has not been done; False where no C compiler is at hand."""
+    check_type("robot", robot, Robot, SimulationError)
+    return compiled_loop.library(robot.geometry) is not None
 
 
 def _start(
@@ -111,15 +163,103 @@ def _start(
 def _run(problem: LoopProblem, compiled: bool | None) -> ClosedLoopRun:
     """Take the compiled path or the plain one; a user's controller is called on the plain one."""
     wanted = compiled is not False and problem.controller is None
-    library = compiled_closed_loop.library(problem.robot.geometry) if wanted else None
+    library = compiled_loop.library(problem.robot.geometry) if wanted else None
     if library is not None:
-        return compiled_closed_loop.run(library, problem)
+        return compiled_loop.run(library, problem)
     if compiled:
         raise SimulationError("compiled=True, but no C compiler was found")
-    return plain_closed_loop.run(problem.robot, problem)
+    return plain_loop.run(problem.robot, problem)
 
 
-def prepare(robot: Robot) -> bool:
-    """Compile the loop of a robot if that has not been done; False where no C compiler is at hand."""
+def _listed(name: str, given: Item | Sequence[Item], kind: type[Item]) -> list[Item]:
+    if isinstance(given, kind):
+        return [given]
+    check_type(name, given, Sequence, SimulationError)
+    items = list(cast(Sequence[Item], given))
+    for index, item in enumerate(items):
+        check_type(f"{name}[{index}]", item, kind, SimulationError)
+    return items
+
+
+def _check_kinds(
+    robot: Robot,
+    reference: Reference,
+    settings: LoopSettings,
+    sensor: object,
+    servo_robot: Robot | None,
+    controller: object,
+) -> None:
+    """Raise SimulationError for parts of a run that are not what they are called."""
     check_type("robot", robot, Robot, SimulationError)
-    return compiled_closed_loop.library(robot.geometry) is not None
+    check_type("reference", reference, Reference, SimulationError)
+    check_type("settings", settings, LoopSettings, SimulationError)
+    if sensor is not None and not callable(sensor) and not isinstance(sensor, RateSensor):
+        raise SimulationError(f"sensor must be a function of frame, time and pose, or None, got {shown(sensor)}")
+    if servo_robot is not None:
+        check_type("servo_robot", servo_robot, Robot, SimulationError)
+    if controller is not None and not callable(controller):
+        raise SimulationError(f"controller must be a function, or None for the servo, got {shown(controller)}")
+
+
+@lru_cache(maxsize=64)
+def _check_reach(robot: Robot, reference: Reference) -> None:
+    """Raise UnreachablePoseError, naming frame and leg, for a pose out of a robot's reach; asked once for both."""
+    robot.check_reach(reference.poses, "reference pose", "frame")
+
+
+def _checked_rows(name: str, rows: object, frames: int) -> np.ndarray | None:
+    """Rows (frames, 6) as C doubles; None stays None. Raises SimulationError."""
+    return None if rows is None else np.ascontiguousarray(floats(name, rows, (frames, 6), error=SimulationError))
+
+
+def _checked_lost(lost: object, frames: int) -> np.ndarray | None:
+    """Lost frames (frames,) as C bytes; None stays None. Raises SimulationError."""
+    return None if lost is None else mask("lost", lost, frames, SimulationError).astype(np.int8)
+
+
+def _checked_latencies(latencies: object, frames: int, timing: FrameTiming) -> np.ndarray:
+    """Latency (frames,), s, of each frame's command. Raises SimulationError for one that no `FrameTiming` may have."""
+    values = floats("latencies", latencies, (frames,), error=SimulationError)
+    in_frames = values * timing.frame_rate_hz
+    wrong = np.flatnonzero((in_frames < 0) | (in_frames > MAX_DELAY_FRAMES))
+    if len(wrong):
+        raise SimulationError(
+            f"latency of frame {wrong[0]} is {values[wrong[0]]:g} s, must be >= 0 and at most "
+            f"{MAX_DELAY_FRAMES} frames ({MAX_DELAY_FRAMES / timing.frame_rate_hz:.3g} s)"
+        )
+    return values
+
+
+def _check_together(problem: LoopProblem, servo_robot: Robot | None, compiled: bool | None) -> None:
+    """Raise SimulationError for options of a run that exclude each other; servo_robot as the caller gave it."""
+    sensed, controlled, derived = problem.sensor is not None, problem.controller is not None, problem.sensitivities
+    refusals = {
+        "sensitivities need the ideal sensor: pass sensor=None": sensed and derived,
+        "lost is for the ideal sensor: a sensor returns None at the frames that it loses": sensed
+        and problem.lost is not None,
+        "noise is for the ideal sensor: a sensor that is given adds its own": sensed and problem.noise is not None,
+        "sensitivities need a servo that knows the robot: pass servo_robot=None": derived and servo_robot is not None,
+        "sensitivities are those of rigid joints: pass settings with elasticity=None": derived
+        and problem.settings.elasticity is not None,
+        "sensitivities are those of the servo: pass controller=None": controlled and derived,
+        "commands take the place of any controller: pass controller=None": controlled and problem.commands is not None,
+        "a controller runs on the plain path: pass compiled=None or False": controlled and compiled,
+    }
+    for words, excluded in refusals.items():
+        if excluded:
+            raise SimulationError(words)
+
+
+def _check_elasticity(problem: LoopProblem) -> None:
+    """Raise SimulationError where elastic joints have no start of their motors, or steps too long to follow them."""
+    elasticity, start, settings = problem.settings.elasticity, problem.start, problem.settings
+    if elasticity is None:
+        return
+    if start.motor_angle is None or start.motor_rate is None:
+        raise SimulationError("a start with elastic joints needs motor_angle and motor_rate")
+    steps = elasticity.steps_needed(problem.robot, problem.parameters, start.pose, problem.period, settings.friction)
+    if settings.steps_per_frame < steps:
+        raise SimulationError(
+            f"steps_per_frame is {settings.steps_per_frame}, must be >= {steps} to follow joints with "
+            f"a stiffness of {elasticity.stiffness:g} N m/rad"
+        )

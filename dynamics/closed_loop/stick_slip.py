@@ -4,15 +4,15 @@ Each joint either slips one way (mode +1 or -1) or is stuck (mode 0) and then ca
 acceleration zero. Between mode changes the motion is smooth and classical Runge-Kutta integrates it. A mode ends where
 a slipping joint comes to rest or a stuck joint reaches its breakaway torque (eq. 24); the step is cut there, to
 rounding. At rest, which joints stick is a box-constrained problem in the friction torques. Sensitivities follow every
-step: see `step_sensitivity`.
+step: see `sensitivity`.
 """
 
 from dataclasses import replace
 
 import numpy as np
 
-from dynamics.closed_loop.friction import FrictionLaw
-from dynamics.closed_loop.motion import Command, Evaluation, MotionFunctions, State, compliance
+from dynamics.closed_loop.joints import FrictionLaw, MotionFunctions
+from dynamics.closed_loop.motion import Command, Evaluation, State, compliance
 from dynamics.closed_loop.problem import LEFT_REACH, SINGULAR_MASS
 from dynamics.closed_loop.sensitivity import FRACTION, WEIGHT, StepSensitivity
 from dynamics.parameters import split_parameters
@@ -32,7 +32,7 @@ class MotionStopped(Exception):
 class StickSlipMotion:
     """Integrates one robot with parameters (67,) under a friction law; keeps modes and sensitivities.
 
-    tangent: derivatives of the first state (see `step_sensitivity`), or None where no sensitivities are wanted.
+    tangent: derivatives of the first state (see `sensitivity`), or None where no sensitivities are wanted.
     """
 
     def __init__(

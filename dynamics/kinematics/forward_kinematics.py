@@ -5,7 +5,7 @@ pose found this way may have a crank on the far side of its dead point; the clos
 word.
 """
 
-from typing import Protocol
+from collections.abc import Mapping
 
 import casadi as ca
 import numpy as np
@@ -21,16 +21,11 @@ MAX_ITERATIONS = 50
 HALVINGS = 20
 
 
-class LoopClosure(Protocol):
-    """What Newton's method needs of a robot."""
-
-    @property
-    def functions(self) -> dict[str, ca.Function]:
-        """CasADi functions `loop_closure` and `inverse_kinematics`."""
-        ...
+Functions = Mapping[str, ca.Function]
+"""CasADi functions of a robot, of which `loop_closure` and `inverse_kinematics` are asked for."""
 
 
-def solve(robot: LoopClosure, theta: np.ndarray, start: np.ndarray) -> np.ndarray:
+def solve(functions: Functions, theta: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Pose (6,) or (N, 6) whose crank angles are theta, searched from start (6,) or (N, 6).
 
     Raises ConvergenceError with row, leg and residual where no pose near the start has these angles.
@@ -39,28 +34,28 @@ def solve(robot: LoopClosure, theta: np.ndarray, start: np.ndarray) -> np.ndarra
     if (start.ndim == 2 and start.shape[0] not in (1, len(angles))) or start.ndim > theta.ndim:
         raise ShapeError(f"initial_pose has shape {start.shape}, must be (6,) or that of theta {theta.shape}")
     poses = np.array(np.broadcast_to(start, angles.shape))
-    poses, residual = search(robot, angles, poses)
-    _check(robot, angles, poses, residual)
+    poses, residual = search(functions, angles, poses)
+    _check(functions, angles, poses, residual)
     return poses.reshape(theta.shape)
 
 
-def search(robot: LoopClosure, theta: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def search(functions: Functions, theta: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Best poses (N, 6) for crank angles (N, 6) from starts (N, 6), and what the angles there lack of those, (N, 6).
 
     A row is solved where all its residuals are below ANGLE_TOLERANCE; they are NaN where a leg cannot reach.
     """
-    poses = _newton(robot, theta, np.array(start))
-    found = evaluate(robot.functions["inverse_kinematics"], poses)[0][..., 0]
+    poses = _newton(functions, theta, np.array(start))
+    found = evaluate(functions["inverse_kinematics"], poses)[0][..., 0]
     return poses, np.abs(theta - found)
 
 
-def _newton(robot: LoopClosure, theta: np.ndarray, poses: np.ndarray) -> np.ndarray:
+def _newton(functions: Functions, theta: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """Newton's iteration with step halving; rows leave it when their step or what it gains is nil."""
     active = np.arange(len(theta))
-    gaps, jacobians = evaluate(robot.functions["loop_closure"], poses, theta)
+    gaps, jacobians = evaluate(functions["loop_closure"], poses, theta)
     for _ in range(MAX_ITERATIONS):
         steps = -_solve_each(jacobians, gaps)[..., 0]
-        trials, gaps, jacobians, better = _damped(robot, theta[active], poses[active], steps, gaps)
+        trials, gaps, jacobians, better = _damped(functions, theta[active], poses[active], steps, gaps)
         poses[active] = trials
         going = better & (np.abs(steps).max(axis=1) > STEP_TOLERANCE)
         active, gaps, jacobians = active[going], gaps[going], jacobians[going]
@@ -70,7 +65,7 @@ def _newton(robot: LoopClosure, theta: np.ndarray, poses: np.ndarray) -> np.ndar
 
 
 def _damped(
-    robot: LoopClosure, theta: np.ndarray, poses: np.ndarray, steps: np.ndarray, gaps: np.ndarray
+    functions: Functions, theta: np.ndarray, poses: np.ndarray, steps: np.ndarray, gaps: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Poses, gaps and Jacobians after the first of the full step and its halves that narrows the gaps, and for which
     rows one does; a last full step that rounding keeps from gaining is taken."""
@@ -79,7 +74,7 @@ def _damped(
     small = np.abs(steps).max(axis=1) <= STEP_TOLERANCE
     for _ in range(HALVINGS):
         trials = poses + scale[:, None] * steps
-        new_gaps, jacobians = evaluate(robot.functions["loop_closure"], trials, theta)
+        new_gaps, jacobians = evaluate(functions["loop_closure"], trials, theta)
         better = (np.linalg.norm(new_gaps[..., 0], axis=1) < before) | small
         if better.all():
             break
@@ -98,11 +93,11 @@ def _solve_each(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
         return solutions
 
 
-def _check(robot: LoopClosure, theta: np.ndarray, poses: np.ndarray, residual: np.ndarray) -> None:
+def _check(functions: Functions, theta: np.ndarray, poses: np.ndarray, residual: np.ndarray) -> None:
     if (residual < ANGLE_TOLERANCE).all():
         return
     row, leg = (int(value) for value in np.argwhere(~(residual < ANGLE_TOLERANCE))[0])
-    gap = np.abs(evaluate(robot.functions["loop_closure"], poses[row : row + 1], theta[row : row + 1])[0]).max()
+    gap = np.abs(evaluate(functions["loop_closure"], poses[row : row + 1], theta[row : row + 1])[0]).max()
     closed = gap < 1e-14
     why = "closes the legs with a crank beyond its dead point" if closed else f"leaves a gap of {gap:.3g} m^2"
     raise ConvergenceError(

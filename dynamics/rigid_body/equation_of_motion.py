@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import casadi as ca
 
 from dynamics.expressions import function, symmetric_from_lower
-from dynamics.kinematics.platform import PlatformJointMotion, pose_rate_to_twist, rotation_matrix, twist_bias
+from dynamics.kinematics.platform import PlatformJointMotion, pose_rate_to_twist, twist_bias
 from dynamics.legs.rss_dynamics import leg_columns, leg_force, leg_mass, leg_motion
 from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
 from dynamics.legs.rss_kinematics import angle_gradient, leg_to
 from dynamics.parameters import RIGID_BODY
-from dynamics.rigid_body.virtual_work import crank_parameters, link_parameters, platform_columns
+from dynamics.rigid_body.virtual_work import leg_parameters, platform_columns, platform_mass
 
 
 def equation_of_motion(geometry: Rss6Geometry) -> ca.Function:
@@ -26,13 +26,14 @@ def equation_of_motion(geometry: Rss6Geometry) -> ca.Function:
     pose, rate, rigid = ca.SX.sym("pose", 6), ca.SX.sym("rate", 6), ca.SX.sym("rigid", RIGID_BODY.stop)
     rest = ca.SX.zeros(6)
     joints = PlatformJointMotion(geometry.platform_joints, pose, rate, rest)
-    mass = _platform_mass(pose, rigid[0:4])
+    to_twist = pose_rate_to_twist(pose)
+    mass = to_twist.T @ platform_mass(pose, rigid[0:4]) @ to_twist
     bias = _platform_columns(geometry, pose, rate, rest) @ rigid[0:4]
     rows, crank_accelerations, angles = [], [], []
     for leg in range(LEGS):
         vectors = leg_to(geometry, leg, joints.position[leg])
         motion = leg_motion(vectors, joints.velocity[leg], joints.acceleration[leg])
-        crank, link = crank_parameters(rigid, leg), link_parameters(rigid, leg)
+        crank, link = leg_parameters(rigid, leg)
         gradient = joints.gradient[leg]
         mass += gradient.T @ leg_mass(vectors, crank, link) @ gradient
         bias += gradient.T @ leg_force(vectors, motion, crank, link, ca.DM(geometry.gravity))
@@ -89,10 +90,10 @@ def _leg_derivatives(
     vectors = leg_to(geometry, leg, inputs[0])
     motion = leg_motion(vectors, inputs[1], inputs[2])
     columns = leg_columns(vectors, motion, ca.DM(geometry.gravity))
-    own = ca.vertcat(crank_parameters(rigid, leg), link_parameters(rigid, leg))
-    moving = leg_force(vectors, motion, own[0:4], own[4:8], ca.DM(geometry.gravity))
+    own = leg_parameters(rigid, leg)
+    moving = leg_force(vectors, motion, *own, ca.DM(geometry.gravity))
     force = moving - angle_gradient(vectors) * torque
-    by_acceleration = leg_mass(vectors, own[0:4], own[4:8])
+    by_acceleration = leg_mass(vectors, *own)
     crank = motion.crank_acceleration
     expressions = [
         columns,
@@ -142,13 +143,6 @@ def _platform_columns(geometry: Rss6Geometry, pose: ca.SX, rate: ca.SX, accelera
     to_twist = pose_rate_to_twist(pose)
     twist_dot = to_twist @ acceleration + twist_bias(pose, rate)
     return to_twist.T @ platform_columns(pose, to_twist @ rate, twist_dot, ca.DM(geometry.gravity))
-
-
-def _platform_mass(pose: ca.SX, platform: ca.SX) -> ca.SX:
-    frame = rotation_matrix(pose[3:6])
-    to_twist = pose_rate_to_twist(pose)
-    at_origin = ca.diagcat(platform[0] * ca.SX.eye(3), frame @ ca.diag(platform[1:4]) @ frame.T)
-    return to_twist.T @ at_origin @ to_twist
 
 
 def motion_functions(geometry: Rss6Geometry) -> list[ca.Function]:

@@ -48,17 +48,16 @@ def inertial_wrench(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twist_dot
     total = platform_columns(pose, twist, twist_dot, gravity) @ rigid[0:4]
     for index, (leg, arm) in enumerate(zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True)):
         motion = leg_motion(leg, *joint_motion(arm, twist, twist_dot))
-        force = leg_force(leg, motion, crank_parameters(rigid, index), link_parameters(rigid, index), gravity)
+        force = leg_force(leg, motion, *leg_parameters(rigid, index), gravity)
         total += ca.vertcat(force, ca.cross(arm, force))
     return total
 
 
 def mass_matrix(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
     """M (6, 6) of eq. 23, symmetric positive definite for positive parameters."""
-    frame = rotation_matrix(pose[3:6])
-    total = ca.diagcat(rigid[0] * ca.SX.eye(3), frame @ ca.diag(rigid[1:4]) @ frame.T)
+    total = platform_mass(pose, rigid[0:4])
     for index, (leg, arm) in enumerate(zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True)):
-        at_joint = leg_mass(leg, crank_parameters(rigid, index), link_parameters(rigid, index))
+        at_joint = leg_mass(leg, *leg_parameters(rigid, index))
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
         total += to_joint.T @ at_joint @ to_joint
     return symmetric_from_lower(total)
@@ -70,7 +69,7 @@ def coriolis_matrix(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, rigid: ca
     total = ca.diagcat(ca.SX.zeros(3, 3), ca.skew(omega) @ frame @ ca.diag(rigid[1:4]) @ frame.T)
     at, moving = ca.SX.sym("position", 3), ca.SX.sym("velocity", 3)
     for index, arm in enumerate(platform_arms(geometry, pose)):
-        own = crank_parameters(rigid, index), link_parameters(rigid, index)
+        own = leg_parameters(rigid, index)
         here = [pose[0:3] + arm, twist[0:3] + ca.cross(omega, arm)]
         coriolis, mass = ca.substitute(
             ca.cse([*leg_coriolis(leg_to(geometry, index, at), *own, at, moving)]), [at, moving], here
@@ -86,11 +85,13 @@ def gravity_wrench(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
     return inertial_wrench(geometry, pose, ca.SX(6, 1), ca.SX(6, 1), rigid)
 
 
-def crank_parameters(rigid: ca.SX, index: int) -> ca.SX:
-    """Mass, Ixx, Iyy, Izz (4,) of one crank, index 0..5."""
-    return rigid[4 + 4 * index : 8 + 4 * index]
+def platform_mass(pose: ca.SX, platform: ca.SX) -> ca.SX:
+    """Mass matrix (6, 6) of the platform alone for its mass, Ixx, Iyy, Izz (4,)."""
+    frame = rotation_matrix(pose[3:6])
+    return ca.diagcat(platform[0] * ca.SX.eye(3), frame @ ca.diag(platform[1:4]) @ frame.T)
 
 
-def link_parameters(rigid: ca.SX, index: int) -> ca.SX:
-    """Mass, Ixx, Iyy, Izz (4,) of one link, index 0..5."""
-    return crank_parameters(rigid, LEGS + index)
+def leg_parameters(rigid: ca.SX, leg: int) -> tuple[ca.SX, ca.SX]:
+    """Mass, Ixx, Iyy, Izz (4,) of crank and link of a leg, 0..5, from the 52 inertial parameters."""
+    crank, link = 4 + 4 * leg, 4 + 4 * (LEGS + leg)
+    return rigid[crank : crank + 4], rigid[link : link + 4]

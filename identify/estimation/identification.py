@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from dynamics import DynamicsError, Robot
-from dynamics.closed_loop.preparation import checked_loop_parameters
+from dynamics.closed_loop.problem import checked_loop_parameters
 from identify.arrays import Array
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation import warm_start

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from dynamics import DynamicsError
-from dynamics.closed_loop.preparation import checked_loop_parameters
+from dynamics.closed_loop.problem import checked_loop_parameters
 from dynamics.parameters import unit_of
 from identify.arrays import Array
 from identify.errors import RecordError

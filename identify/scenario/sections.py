@@ -39,11 +39,11 @@ def check_moments(moments: Mapping[str, float]) -> None:
 
     Raises ValueError where one exceeds the sum of the other two, which no distribution of mass has.
     """
-    largest = max(moments, key=lambda name: moments[name])
-    others = {name: value for name, value in moments.items() if name != largest}
-    if moments[largest] > (1 + ROUNDING) * sum(others.values()):
-        parts = " + ".join(f"{name} {value:g}" for name, value in others.items())
-        raise ValueError(f"{largest} = {moments[largest]:g} kg m2 exceeds {parts} kg m2, as in no rigid body")
+    from dynamics.inertia import moments_fault
+
+    fault = moments_fault(moments, ROUNDING)
+    if fault:
+        raise ValueError(f"{fault} kg m2, as in no rigid body")
 
 
 def check_load_std(name: str, std: float, load_name: str, load: float, unit: str) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 import cmmsim
 from dynamics import Robot
 from dynamics.closed_loop import LoopFailure, Reference, simulate
-from dynamics.closed_loop.preparation import checked_loop_parameters
+from dynamics.closed_loop.problem import checked_loop_parameters
 from identify.arrays import Array
 from identify.estimation.covariance import PosePrediction, predict_poses
 from identify.excitation.design import unseen_trajectories

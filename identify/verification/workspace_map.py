@@ -99,7 +99,8 @@ def map_workspace(robot: Robot, progress: Progress | None = None, points: int = 
         advance()
         limit = robot.travel_limit
         theta = np.random.default_rng(0).uniform(-limit, limit, (JOINT_SAMPLES, 6))
-        poses, residual = forward_kinematics.search(robot, theta, np.tile(robot.home_pose, (JOINT_SAMPLES, 1)))
+        start = np.tile(robot.home_pose, (JOINT_SAMPLES, 1))
+        poses, residual = forward_kinematics.search(robot.functions, theta, start)
         solved = (residual < forward_kinematics.ANGLE_TOLERANCE).all(axis=1)
         travel = workspace.measure(robot, poses[solved])
         advance()

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import dynamics
-from dynamics import closed_loop, compilation
-from dynamics.closed_loop.batch import simulate_batch
+from dynamics import closed_loop, compilation, simulate_batch
 from tests.benchmarks.timing import (
     FREE,
     WHOLE_SECOND_CORE,

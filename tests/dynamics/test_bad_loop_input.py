@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from dynamics import closed_loop
+from dynamics import closed_loop, simulate_batch
 from dynamics import robot as forward_dynamics
 from dynamics.closed_loop import FrameTiming, FrictionLaw, LoopSettings, Reference, ServoGains
-from dynamics.closed_loop.batch import simulate_batch
 from dynamics.engines import mjcf
 from dynamics.errors import DynamicsError, ParameterError, ShapeError, SimulationError, UnreachablePoseError
 

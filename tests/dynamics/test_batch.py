@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from dynamics import simulate_batch
 from dynamics.closed_loop import simulate
-from dynamics.closed_loop.batch import simulate_batch
 from dynamics.errors import SimulationError, SingularPoseError
 from dynamics.robot import fast_forward_dynamics
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dynamics import closed_loop, compilation
-from dynamics.closed_loop.servo import command_schedule
+from dynamics.closed_loop.command_schedule import command_schedule
 from dynamics.errors import SimulationError
 
 PERIOD = 1 / 60

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from dynamics.closed_loop.friction import FrictionLaw
+from dynamics.closed_loop.joints import FrictionLaw
 from dynamics.closed_loop.stick_slip import StickSlipMotion
 from dynamics.errors import SimulationError
 from tests.dynamics.test_stick_slip import COULOMB, MASS, STIFFNESS, _command, _displaced, _one_joint_functions

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dynamics import closed_loop
-from dynamics.closed_loop.friction import FrictionLaw
+from dynamics.closed_loop.joints import FrictionLaw
 
 STRIBECK = FrictionLaw("stribeck", static_ratio=1.3, stribeck_velocity=0.1)
 CASES = {

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynamics import closed_loop
-from dynamics.closed_loop.batch import simulate_batch
+from dynamics import closed_loop, simulate_batch
 from dynamics.errors import SimulationError, UnreachablePoseError
 
 FRAME = 20  # of the reference: there four joints move and two stick

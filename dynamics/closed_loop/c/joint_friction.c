@@ -1,4 +1,4 @@
-/* The friction law of a joint: see friction.py. */
+/* The friction law of a joint: see joints.py. */
 
 static int stuck_joints(const int *mode, int *list) {
     int count = 0;
@@ -9,7 +9,7 @@ static int stuck_joints(const int *mode, int *list) {
 
 static int needs_event(const problem *p, int i) { return p->law != SMOOTHED && p->coulomb[i] > 0; }
 
-/* Dry friction over Coulomb torque of a joint that slips towards `mode`, and its derivative: see friction.py. */
+/* Dry friction over Coulomb torque of a joint that slips towards `mode`, and its derivative: see joints.py. */
 static double dry_level(const problem *p, double velocity, int mode) {
     if (p->law == SMOOTHED) return tanh(velocity / p->smoothing_velocity);
     if (p->law == STRIBECK) {

@@ -1,4 +1,4 @@
-/* Elastic joints, seen from the motors, where encoders, joint PID and friction are: see joint_elasticity.py. */
+/* Elastic joints, seen from the motors, where encoders, joint PID and friction are: see joints.py. */
 
 static int elastic(const problem *p) { return p->stiffness > 0; }
 

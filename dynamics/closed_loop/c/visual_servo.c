@@ -1,4 +1,4 @@
-/* The visual servo (eq. 30) and the commands on their way to the joints: see visual_servo.py. */
+/* The visual servo (eq. 30) and the commands on their way to the joints: see servo.py and plain_loop.py. */
 
 typedef struct {
     vec previous_measured, integral, last_command;

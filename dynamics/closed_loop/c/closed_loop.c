@@ -1,4 +1,4 @@
-/* The frame loop: see plain_closed_loop.py. */
+/* The frame loop: see plain_loop.py. */
 
 static int frame_command(context *c, servo *v, int k, const state *s, measure_fn measure, trajectory *out) {
     const problem *p = c->p;

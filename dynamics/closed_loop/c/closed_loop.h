@@ -1,5 +1,5 @@
-/* Constants and types of the compiled closed loop: the twin of plain_closed_loop.py, stick_slip.py, step_sensitivity.py
- * and visual_servo.py, which explain the method and are tested to be equal. After this file come, in one unit with the C
+/* Constants and types of the compiled closed loop: the twin of plain_loop.py, stick_slip.py, sensitivity.py
+ * and servo.py, which explain the method and are tested to be equal. After this file come, in one unit with the C
  * code that CasADi generates for equation_of_motion, motion_derivatives and rate_map_derivative (column-major matrices):
  * linear_algebra.c, joint_friction.c, elastic_joints.c, joint_modes.c, step_sensitivity.c, stick_slip.c, visual_servo.c,
  * closed_loop.c.

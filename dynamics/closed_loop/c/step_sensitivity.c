@@ -1,4 +1,4 @@
-/* Sensitivities over the steps of the integrator, the exact derivative of what it computes: see step_sensitivity.py.
+/* Sensitivities over the steps of the integrator, the exact derivative of what it computes: see sensitivity.py.
  * One row per state entry, one column for each of the 67 parameters, one for the length of the present step, and 24 for
  * the start state if wanted.
  */
