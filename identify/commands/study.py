@@ -203,14 +203,16 @@ def _list() -> None:
 
 
 def _list_kinds() -> None:
-    from identify.studies.rows.kinds import KINDS
+    from identify.studies.design import valid_keys
+    from identify.studies.rows import KINDS
     from identify.studies.table import factor_unit
 
     for kind in KINDS.values():
         typer.echo(f"{kind.name}: {kind.what}\n\nIt reads {kind.reads}, and its options; no other factor is taken.\n")
         options = [
-            (f"options.{name}", str(field.default), factor_unit(f"options.{name}"), str(field.description))
-            for name, field in kind.options.model_fields.items()
+            (path, str(field.default), factor_unit(path), str(field.description))
+            for path, field in valid_keys(kind.options).items()
+            if path.startswith("options.")
         ]
         print_table(("option", "default", "unit", "what it is"), options, ("option", "default", "unit", "what it is"))
         figures = [

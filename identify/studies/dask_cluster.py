@@ -1,8 +1,11 @@
-"""A study on Dask: a local cluster, one process a core, or one that is running already.
+"""The batches of a study on Dask: on a local cluster, one process a core, or on one that is running already.
 
-The batches of a study on the workers of a Dask cluster.
 A worker that dies loses nothing but the batches it had, which are computed elsewhere. Batches whose workers died are
 taken apart, and each of their rows is tried alone; a row that then kills its worker again is an error of this row.
+
+Finished batches come by a callback into a queue, which is waited for with a limit: that of ``distributed.as_completed``
+holds for all of a study, and it looks ten times a second. ``Client.get_versions(check=True)`` compares Dask's own
+packages, also those of the scheduler, which computes nothing; here those count with which rows are computed.
 """
 
 import asyncio
@@ -11,7 +14,7 @@ import math
 import queue
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from multiprocessing import active_children, resource_tracker
@@ -24,9 +27,10 @@ from distributed.comm.registry import get_backend
 from tornado.ioloop import PeriodicCallback
 
 from identify.errors import StudyError
-from identify.files.versions import check_workers, product_version, require_product, versions
+from identify.files.versions import product_version, require_product, same_versions, versions
 from identify.runtime import deaf_offspring, held
-from identify.studies.design import Batches, Case, Finished, Setup, compute
+from identify.studies.design import Case, Finished, Setup
+from identify.studies.runner import Batches, compute
 
 WORKERLESS_SECONDS = 180
 """How long a cluster may be without any worker; one that starts again needs its time on a busy machine."""
@@ -37,6 +41,8 @@ ANSWER_SECONDS = 30
 GONE = "the Dask scheduler is gone; the same command goes on from here with another"
 
 KILLED = "KilledWorker: the process that computed this row died, and died again when it computed this row alone"
+
+REMEDY = "install the same on all machines"
 
 BATCHES_A_WORKER = 3
 """Batches on their way for each worker: one in work, and the next ones at hand."""
@@ -148,7 +154,7 @@ def _compute_alike(version: str, setup: Setup, cases: list[Case]) -> list[Finish
     Raises:
         StudyError: it has another version of cmmsim than the study's.
     """
-    require_product(get_worker().address, product_version(), version)
+    require_product(f"worker {get_worker().address}", product_version(), version, REMEDY)
     return compute(setup, cases)
 
 
@@ -259,6 +265,20 @@ def running_cluster(address: str) -> Iterator[DaskExecutor]:
         except OSError as error:
             raise gone(error) from error
         yield DaskExecutor(client)
+
+
+def check_workers(there: Mapping[str, dict[str, str] | Exception]) -> None:
+    """Compare with the versions here those that workers answered, by address.
+
+    A worker that answered with an error cannot run cmmsim, but one that did not answer (OSError) is gone.
+
+    Raises:
+        StudyError: a worker has another cmmsim, or none.
+    """
+    for worker, answer in there.items():
+        if isinstance(answer, Exception) and not isinstance(answer, OSError):
+            raise StudyError(f"worker {worker} cannot run cmmsim {product_version()}: {' '.join(str(answer).split())}")
+    same_versions({f"worker {one}": answer for one, answer in there.items() if isinstance(answer, dict)}, REMEDY)
 
 
 async def _identity(address: str) -> object:

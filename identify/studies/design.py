@@ -1,37 +1,44 @@
-"""The rows of a study, one by one, and their computation in batches; a large grid takes no memory.
+"""What a study varies: its keys, values and laws, checked before any row is computed, and what holds in each row.
 
-The rows of a study, one by one: what holds in each. None is kept, so that a large grid takes no memory.
 Rows are numbered repeat by repeat, and within a repeat point by point, the last factor fastest. The seed of row n is
 the n-th child that ``numpy.random.SeedSequence(seed).spawn`` gives. So neither the machines, nor the order of work, nor
-further repeats change the numbers of a row; nor do further points of a sample, as long as there are no repeats.
+further repeats change the numbers of a row; nor do further points of a sample, as long as there are no repeats. No row
+is kept, so that a large grid takes no memory.
 """
 
-import math
-import time
-from collections.abc import Iterator, Mapping
+import difflib
+import json
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import islice
-from typing import Any
+from functools import cached_property, lru_cache
+from typing import Annotated, Any, ClassVar, get_args
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.fields import FieldInfo
 
+from cmmsim.files import SensorFile
 from identify.errors import ScenarioError, StudyError
 from identify.experiment.sensor_in_loop import with_renderer
 from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
-from identify.runtime import raise_noted
 from identify.scenario import Scenario, load_scenario
-from identify.studies.keys import (
-    check,
-    check_ever_read,
-    check_law_names,
-    check_read_here,
-    is_integer,
-    options_in,
-    overrides,
-)
-from identify.studies.rows.kinds import check_kind, kind_reads, options_model, row_function
-from identify.studies.study_file import Range, Study
+from identify.studies.rows import find_kind
+from identify.studies.rows.kind import Kind, check_read
+from identify.studies.study_file import Law, Range, Study
+
+ROOTS = ("scenario.", "sensor.", "options.")
+"""How factors begin, and figures do not."""
+
+SENSOR_CHANGES = "sensor_changes"
+"""The table of a scenario into which the keys ``sensor.`` go."""
+
+NEAREST = 4
+"""Valid names that a refusal gives."""
+
+STRICT = ConfigDict(strict=True, allow_inf_nan=False)
+
+
+# Rows.
 
 
 @dataclass(frozen=True)
@@ -41,6 +48,18 @@ class Case:
     number: int
     repeat: int
     factors: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A row that is done: its figures, or in one line why there are none; the seconds it took."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = STRICT | ConfigDict(extra="forbid")
+
+    number: Annotated[int, Field(ge=0)]
+    figures: dict[str, float]
+    seconds: float
+    error: str = ""
 
 
 @dataclass(frozen=True)
@@ -58,7 +77,8 @@ class Setup:
 
     def row_options(self, case: Case) -> dict[str, Any]:
         """The options of a row."""
-        return self.options | options_in(case.factors)
+        varied = {path: value for path, value in case.factors.items() if path.startswith("options.")}
+        return self.options | {path.partition(".")[2]: value for path, value in varied.items()}
 
     def row_seed(self, number: int) -> np.random.SeedSequence:
         """The seed of a row."""
@@ -70,7 +90,6 @@ class Design:
 
     def __init__(self, study: Study) -> None:
         self._study = study
-        self._lists = {path: values for path, values in study.factors.items() if isinstance(values, list)}
 
     def __len__(self) -> int:
         return self._study.rows
@@ -81,14 +100,13 @@ class Design:
         return Case(number, repeat, self._drawn(point) if self._study.sample else self._on_grid(point))
 
     def _on_grid(self, point: int) -> dict[str, Any]:
-        places = {}
-        for path, values in reversed(self._lists.items()):
-            point, places[path] = divmod(point, len(values))
-        return {path: values[places[path]] for path, values in self._lists.items()}
+        lists = {path: values for path, values in self._study.factors.items() if isinstance(values, list)}
+        places = np.unravel_index(point, [len(values) for values in lists.values()])
+        return {path: values[place] for (path, values), place in zip(lists.items(), places, strict=True)}
 
     def _drawn(self, point: int) -> dict[str, Any]:
-        shares = dict(zip(self._study.factors, self._shares[point], strict=True))
-        return {path: self._value(path, share) for path, share in shares.items()}
+        shares = zip(self._study.factors, self._shares[point], strict=True)
+        return {path: self._value(path, share) for path, share in shares}
 
     @cached_property
     def _shares(self) -> np.ndarray:
@@ -100,11 +118,27 @@ class Design:
         values = self._study.factors[path]
         if isinstance(values, list):
             return values[int(share * len(values))]
-        if is_integer(path, options_model(self._study.kind)):
+        field = valid_keys(find_kind(self._study.kind).options).get(path)
+        if field is not None and field.annotation is int:
             return int(values.low) + int(share * (values.high - values.low + 1))
         if values.scale == "log":
             return float(values.low * (values.high / values.low) ** share)
         return float(values.low + (values.high - values.low) * share)
+
+
+def overrides(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of ``scenario.`` and ``sensor.`` as overrides of a scenario."""
+    found = {}
+    for path, value in settings.items():
+        root, _, key = path.partition(".")
+        if root == "scenario":
+            found[key] = value
+        elif root == "sensor":
+            found[f"{SENSOR_CHANGES}.{key}"] = value
+    return found
+
+
+# A study as a whole, before its first row.
 
 
 def prepare(study: Study) -> Setup:
@@ -117,128 +151,115 @@ def prepare(study: Study) -> Setup:
             key that the kind's rows do not read.
         ScenarioError: no such scenario, or changes that contradict it.
     """
-    check_kind(study.kind, study.options)
-    model = options_model(study.kind)
-    for path, value in study.changes.items():
-        if path.startswith("options."):
-            raise StudyError(f"changes.{path}: what holds in every row stands in [options]")
-        check(path, [value], model)
-    for path in study.factors:
-        if path.startswith("options.") and path.partition(".")[2] in study.options:
-            raise StudyError(f"{path} is both a factor and among the options")
-    for path, values in study.factors.items():
-        check(path, [values.low, values.high] if isinstance(values, Range) else values, model)
-        _check_factor(path, values)
-    reads = kind_reads(study.kind)
-    if reads is not None:
-        check_ever_read(study, reads)
-    setup = Setup(study.kind, _scenario(study.scenario, overrides(study.changes)), study.options, study.seed)
+    kind = find_kind(study.kind)
+    kind.checked(study.options)
+    _check_keys(study, kind)
+    try:  # what draws the images is decided here, once for all machines
+        scenario = with_renderer(load_scenario(study.scenario).with_overrides(overrides(study.changes)))
+    except ScenarioError as error:
+        raise StudyError(f"scenario of the study: {error}") from error
+    setup = Setup(study.kind, scenario, study.options, study.seed)
     first = Design(study).case(0)
-    scenario, options = setup.row_scenario(first), setup.row_options(first)
-    check_kind(study.kind, options)
-    if reads is not None and model is not None:
-        check_read_here(study, reads, scenario, model.model_validate(options))
-    check_law_names(study)
+    row_scenario, row_options = setup.row_scenario(first), kind.checked(setup.row_options(first))
+    if kind.reads is not None:
+        check_read(study, kind.reads, row_scenario, row_options)
+    for place, law in enumerate(study.theory, start=1):
+        try:
+            _check_law(law, study, list(kind.columns))
+        except StudyError as error:
+            raise StudyError(f"[[theory]] {place}: {error}") from error
     return setup
 
 
-def _scenario(name: str, changes: Mapping[str, Any]) -> Scenario:
-    """What draws the images is decided here, once for all machines."""
-    try:
-        return with_renderer(load_scenario(name).with_overrides(changes))
-    except ScenarioError as error:
-        raise StudyError(f"scenario of the study: {error}") from error
+def _check_keys(study: Study, kind: Kind) -> None:
+    """Refuse keys that do not exist or are given twice, and values that do not fit them."""
+    for path, value in study.changes.items():
+        if path.startswith("options."):
+            raise StudyError(f"changes.{path}: what holds in every row stands in [options]")
+        _check_values(path, [value], kind)
+    for path, values in study.factors.items():
+        if path.startswith("options.") and path.partition(".")[2] in study.options:
+            raise StudyError(f"{path} is both a factor and among the options")
+        _check_values(path, values.ends if isinstance(values, Range) else values, kind)
+        if not isinstance(values, list):
+            continue
+        types = {"number" if type(value) in (int, float) else type(value).__name__ for value in values}
+        if len(types) > 1:
+            raise StudyError(f"factors.{path} = {values} has values of several kinds: {', '.join(sorted(types))}")
+        if len({repr(value) for value in values}) < len(values):
+            raise StudyError(f"factors.{path} = {values} has a value twice; repeats = N computes every point N times")
 
 
-def _check_factor(path: str, values: list[Any] | Range) -> None:
-    if not isinstance(values, list):
+def _check_values(path: str, values: list[Any], kind: Kind) -> None:
+    """Refuse a path that does not exist and values that are not of its type; options of one's own kind may be any."""
+    if kind.options is None and path.startswith("options."):
         return
-    kinds = {"number" if type(value) in (int, float) else type(value).__name__ for value in values}
-    if len(kinds) > 1:
-        raise StudyError(f"factors.{path} = {values} has values of several kinds: {', '.join(sorted(kinds))}")
-    if len({repr(value) for value in values}) < len(values):
-        raise StudyError(f"factors.{path} = {values} has a value twice; repeats = N computes every point N times")
+    known = valid_keys(kind.options)
+    if path not in known:
+        own = [key for key in known if path.startswith("options.") and key.startswith("options.")]
+        valid = f"the kind has {', '.join(own)}" if own else _nearest(path, known)
+        raise StudyError(f"unknown key {path!r}; {valid}")
+    # As in JSON, so that a list is a tuple's spelling but a text or a truth value is no number.
+    annotation: Any = Annotated[known[path].annotation, known[path]]
+    adapter: TypeAdapter[Any] = TypeAdapter(annotation, config=ConfigDict(allow_inf_nan=False))
+    for value in values:
+        try:
+            adapter.validate_json(json.dumps(value), strict=True)
+        except ValidationError as error:
+            message = error.errors()[0]["msg"]
+            raise StudyError(f"{path} = {value!r}: {message[0].lower()}{message[1:]}") from error
 
 
-# Computing rows: the only part of a study that runs on other processes and machines.
+@lru_cache(maxsize=8)
+def valid_keys(options: type[BaseModel] | None) -> dict[str, FieldInfo]:
+    """Every dotted path that a study may vary, with its field; `options`: the model of a kind's options, if it has one.
+
+    A path is one of a scenario, of a sensor file, or of the options.
+    """
+    found = _leaves(Scenario, "scenario.") | _leaves(SensorFile, "sensor.")
+    for path in (f"scenario.{SENSOR_CHANGES}", "sensor.based_on"):
+        del found[path]
+    return found | (_leaves(options, "options.") if options is not None else {})
 
 
-FIRST = ("row", "repeat", "seed_entropy", "seed_spawn_key")
-LAST = ("seconds", "error")
-"""Columns of a study's table before its factors and behind its figures."""
+def _leaves(model: type[BaseModel], prefix: str) -> dict[str, FieldInfo]:
+    """Fields that are no sections, by dotted path."""
+    found: dict[str, FieldInfo] = {}
+    for name, field in model.model_fields.items():
+        inner = next((a for a in (field.annotation, *get_args(field.annotation)) if _is_model(a)), None)
+        listed = getattr(field.annotation, "__origin__", None) is list
+        found |= {f"{prefix}{name}": field} if inner is None or listed else _leaves(inner, f"{prefix}{name}.")
+    return found
 
 
-@dataclass(frozen=True)
-class Finished:
-    """A row that is done: its figures, or in one line why there are none; the seconds it took."""
-
-    number: int
-    figures: dict[str, float]
-    seconds: float
-    error: str = ""
+def _is_model(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
-def compute(setup: Setup, cases: list[Case]) -> list[Finished]:
-    """Compute rows one after the other; what goes wrong in one is noted there, and the others go on."""
-    return [_compute(setup, case) for case in cases]
+def _nearest(name: str, known: Collection[str]) -> str:
+    """The valid names with the same last part or spelled alike, else the first of the same root or of all, in words."""
+    last = [key for key in known if key.rpartition(".")[2] == name.rpartition(".")[2]]
+    alike = difflib.get_close_matches(name, known, n=NEAREST, cutoff=0.5)
+    root = [key for key in known if key.startswith(name.partition(".")[0] + ".")]
+    near = list(dict.fromkeys([*last, *alike])) or root or list(known)
+    return f"the nearest are {', '.join(near[:NEAREST])}" if near else "it has no factors"
 
 
-def _compute(setup: Setup, case: Case) -> Finished:
-    start = time.perf_counter()
-    try:
-        figures = _checked(
-            row_function(setup.kind)(setup.row_scenario(case), setup.row_seed(case.number), setup.row_options(case)),
-            {*FIRST, *case.factors, *LAST},
-        )
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # also sys.exit() ends the row and not the study
-        raise_noted()
-        text = " ".join(f"{type(error).__name__}: {error}".split())
-        return Finished(case.number, {}, time.perf_counter() - start, text)
-    return Finished(case.number, figures, time.perf_counter() - start)
+def _check_law(law: Law, study: Study, figures: list[str]) -> None:
+    """Refuse a law of figures that rows do not have, or of factors and values that the study does not vary.
 
-
-def _checked(figures: Mapping[str, float], taken: set[str]) -> dict[str, float]:
-    """Figures as plain numbers; one that is none is an error of the row, so that no average hides it, and so is one
-    that no column of the table is left for."""
-    if hidden := sorted(taken & set(figures)):
-        raise ValueError(f"a figure must not be called {hidden[0]!r}: the table has a column of this name")
-    plain = {name: float(value) for name, value in figures.items()}
-    for name, value in plain.items():
-        if not math.isfinite(value):
-            raise ArithmeticError(f"{name} is {value}")
-    return plain
-
-
-# Rows in batches: as many a task as keep a worker busy for a while, so that sending them costs little.
-
-
-BATCH_SECONDS = 0.25
-"""Work in a batch; what is lost at most with each worker when everything is killed at once."""
-
-LARGEST_BATCH = 500
-
-
-class Batches:
-    """Hands out the rows that are still to be done, in batches sized by how long the last ones took."""
-
-    def __init__(self, cases: Iterator[Case], count: int) -> None:
-        self._cases, self._left = cases, count
-        self._row_seconds = BATCH_SECONDS
-
-    def take(self, workers: int) -> list[Case]:
-        """The next batch for one of so many workers; empty when all rows are handed out.
-
-        Towards the end batches become smaller, so that all workers end together.
-        """
-        fair = max(1, self._left // (4 * workers))
-        size = max(1, min(int(BATCH_SECONDS / self._row_seconds), LARGEST_BATCH, fair, self._left))
-        batch = list(islice(self._cases, size))
-        self._left -= len(batch)
-        return batch
-
-    def learn(self, finished: list[Finished]) -> None:
-        """Take from a finished batch how long rows take."""
-        mean = sum(row.seconds for row in finished) / len(finished)
-        self._row_seconds = max(0.5 * (self._row_seconds + mean), 1e-6)
+    The figures of a kind of one's own are not known before its rows are; there are none, and they are not checked.
+    """
+    for key in ("figure", "per", "equals"):
+        name = getattr(law, key)
+        if figures and name is not None and name not in figures:
+            raise StudyError(f"{key} = {name!r} is no figure of {study.kind}; {_nearest(name, figures)}")
+    if law.factor is None:
+        return
+    known = [*study.factors, *figures]
+    if law.factor not in known and (figures or law.factor.startswith(ROOTS)):
+        raise StudyError(f"factor = {law.factor!r} is not varied by the study; {_nearest(law.factor, known)}")
+    values = study.factors.get(law.factor)
+    unknown = [value for value in law.order or [] if isinstance(values, list) and value not in values]
+    if unknown:
+        raise StudyError(f"order has {unknown[0]!r}, and {law.factor} has the values {values}")

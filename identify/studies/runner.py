@@ -1,8 +1,11 @@
 """A study from its first to its last row: what is not done yet is computed, kept at once, and tabulated at the end."""
 
-from collections.abc import Callable, Iterator
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import pandas as pd
@@ -10,16 +13,11 @@ import pandas as pd
 from identify.errors import StudyInterrupted
 from identify.progress import Progress
 from identify.runtime import honoured, raise_noted
-from identify.studies.design import Batches, Design, Finished, Setup, compute, prepare
+from identify.studies.design import Case, Design, Finished, Setup, prepare
+from identify.studies.rows import find_kind
 from identify.studies.store import TABLE, VIEW, Journal, open_folder, resolved
 from identify.studies.study_file import Study
-from identify.studies.table import tidy_table, write_table, write_view
-
-Executor = Callable[[Setup, Batches], Iterator[list[Finished]]]
-"""Computes batches until there are none left, and yields them as they are done, in any order."""
-
-Workers = Callable[[], AbstractContextManager[Executor]]
-"""Starts what computes, for as long as the context lasts."""
+from identify.studies.table import FIRST, LAST, tidy_table, write_table, write_view
 
 
 @dataclass(frozen=True)
@@ -42,13 +40,20 @@ class Outcome:
         return f"row {bad['row'].iloc[0]}: {bad['error'].iloc[0]}" if len(bad) else ""
 
 
+Executor = Callable[[Setup, "Batches"], Iterator[list[Finished]]]
+"""Computes batches until there are none left, and yields them as they are done, in any order."""
+
+Workers = Callable[[], AbstractContextManager[Executor]]
+"""Starts what computes, for as long as the context lasts."""
+
+
 @contextmanager
 def in_this_process() -> Iterator[Executor]:
     """Workers: none but this process, one row after the other."""
     yield _serial
 
 
-def _serial(setup: Setup, batches: Batches) -> Iterator[list[Finished]]:
+def _serial(setup: Setup, batches: "Batches") -> Iterator[list[Finished]]:
     while cases := batches.take(workers=1):
         finished = compute(setup, cases)
         batches.learn(finished)
@@ -91,3 +96,71 @@ def _compute_pending(
         for finished in execute(setup, batches):
             journal.append(finished)
             advance(len(finished))
+
+
+# Rows in batches: as many a task as keep a worker busy for a while, so that sending them costs little.
+
+
+BATCH_SECONDS = 0.25
+"""Work in a batch; what is lost at most with each worker when everything is killed at once."""
+
+LARGEST_BATCH = 500
+
+
+class Batches:
+    """Hands out the rows that are still to be done, in batches sized by how long the last ones took."""
+
+    def __init__(self, cases: Iterator[Case], count: int) -> None:
+        self._cases, self._left = cases, count
+        self._row_seconds = BATCH_SECONDS
+
+    def take(self, workers: int) -> list[Case]:
+        """The next batch for one of so many workers; empty when all rows are handed out.
+
+        Towards the end batches become smaller, so that all workers end together.
+        """
+        fair = max(1, self._left // (4 * workers))
+        size = max(1, min(int(BATCH_SECONDS / self._row_seconds), LARGEST_BATCH, fair, self._left))
+        batch = list(islice(self._cases, size))
+        self._left -= len(batch)
+        return batch
+
+    def learn(self, finished: list[Finished]) -> None:
+        """Take from a finished batch how long rows take."""
+        mean = sum(row.seconds for row in finished) / len(finished)
+        self._row_seconds = max(0.5 * (self._row_seconds + mean), 1e-6)
+
+
+def compute(setup: Setup, cases: list[Case]) -> list[Finished]:
+    """Compute rows one after the other; what goes wrong in one is noted there, and the others go on.
+
+    The only part of a study that runs on other processes and machines.
+    """
+    return [_compute(setup, case) for case in cases]
+
+
+def _compute(setup: Setup, case: Case) -> Finished:
+    start = time.perf_counter()
+    try:
+        kind = find_kind(setup.kind)
+        row = kind.row(setup.row_scenario(case), setup.row_seed(case.number), setup.row_options(case))
+        figures = _plain(row, {*FIRST, *case.factors, *LAST})
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # also sys.exit() ends the row and not the study
+        raise_noted()
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        return Finished(case.number, {}, time.perf_counter() - start, text)
+    return Finished(case.number, figures, time.perf_counter() - start)
+
+
+def _plain(figures: Mapping[str, float], taken: set[str]) -> dict[str, float]:
+    """Figures as plain numbers; one that is none is an error of the row, so that no average hides it, and so is one
+    that no column of the table is left for."""
+    if hidden := sorted(taken & set(figures)):
+        raise ValueError(f"a figure must not be called {hidden[0]!r}: the table has a column of this name")
+    plain = {name: float(value) for name, value in figures.items()}
+    for name, value in plain.items():
+        if not math.isfinite(value):
+            raise ArithmeticError(f"{name} is {value}")
+    return plain

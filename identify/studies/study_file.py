@@ -1,6 +1,5 @@
-"""A study: which scenario is varied how, and the laws its rows should follow, read from TOML and checked.
+"""What a user writes: which scenario is varied how, and the laws that its rows should follow, read from TOML.
 
-A study: which scenario is varied how, read from TOML and checked before anything is computed.
     name = "pixel_noise"
     title = "Pose error against pixel noise"
     kind = "static_pose"                          # what a row is: a built-in kind, or module:function
@@ -16,7 +15,7 @@ A study: which scenario is varied how, read from TOML and checked before anythin
     options.captures = [1, 4, 16]
     # sensor.rig.baseline = { low = 0.5, high = 2.0, scale = "log" }   # only in a sample
 
-    [[theory]]                                    # a law that the summary checks; see identify.studies.law
+    [[theory]]                                    # a law that the summary checks; see Law below
     figure = "mean_position_rms_um"
     factor = "options.captures"
     exponent = -0.5
@@ -28,25 +27,25 @@ an option of the kind.
 import math
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from identify.errors import StudyError
 from identify.scenario.settings_file import SettingsFiles, one_line
 
-# A law that a study's rows should follow, as a study file states it.
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-class Law(BaseModel):
-    """One of three statements about the rms of a figure over rows; all other factors are held where they are.
+class Law(_Table):
+    """A law: one of three statements about the rms of a figure over rows, with all other factors held where they are.
 
     exponent: it grows with a numeric factor as ``factor ** exponent``; equals: it is that of another figure;
     order: it grows along these values of a factor. Valid to ``tolerance``, an amount that the statement itself is known
     to be off by: of the exponent, or of the logarithm of a ratio.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     figure: str = Field(description="figure of the rows, its rms over rows is meant")
     per: str | None = Field(None, description="figure that it is divided by, row by row")
@@ -74,25 +73,11 @@ class Law(BaseModel):
         return self.figure if self.per is None else f"{self.figure} / {self.per}"
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-
-def _finite(value: Any) -> int | float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise ValueError(f"{value!r} is no finite number")
-    return value
-
-
-# Not a union that pydantic resolves: it would complain once a member.
-Bound = Annotated[int | float, PlainValidator(_finite)]
-
-
 class Range(_Table):
     """A factor of a random sample, drawn evenly between two bounds or evenly between their logarithms."""
 
-    low: Bound
-    high: Bound
+    low: float
+    high: float
     scale: Literal["linear", "log"] = "linear"
 
     @model_validator(mode="after")
@@ -102,6 +87,11 @@ class Range(_Table):
         if self.scale == "log" and self.low <= 0:
             raise ValueError(f"low = {self.low:g} must be positive on a logarithmic scale")
         return self
+
+    @property
+    def ends(self) -> list[float]:
+        """Both bounds, as integers where they are whole."""
+        return [int(bound) if bound.is_integer() else bound for bound in (self.low, self.high)]
 
 
 class Study(_Table):

@@ -10,13 +10,12 @@ from typing import Any
 
 import pandas as pd
 
-from identify.errors import ScenarioError
 from identify.files.atomic import write_text
 from identify.files.run_folder import save_result
 from identify.files.versions import versions
 from identify.studies import theory
 from identify.studies.figures import draw
-from identify.studies.rows.kinds import find_kind
+from identify.studies.rows import KINDS
 from identify.studies.study_file import Study
 from identify.studies.table import factor_unit, figure_names, figure_unit, labelled, unit_of
 from identify.studies.theory import Statistics, Verdict, check_laws
@@ -69,11 +68,9 @@ def write(folder: Path, study: Study, frame: pd.DataFrame) -> dict[str, Any]:
 
 def main_figures(kind: str, names: list[str]) -> list[str]:
     """The figures that are shown first: a built-in kind's own choice, or the first six of one's own kind."""
-    try:
-        chosen = find_kind(kind).main
-    except ScenarioError:
+    if kind not in KINDS:
         return names[:6]
-    return [name for name in chosen if name in names]
+    return [name for name, column in KINDS[kind].columns.items() if column.main and name in names]
 
 
 def _points(study: Study, done: pd.DataFrame, names: list[str]) -> list[tuple[dict[str, Any], dict[str, Statistics]]]:

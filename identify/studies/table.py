@@ -1,6 +1,5 @@
 """Finished rows as one tidy table with units: Parquet with the study in its metadata, and a view by factors.
 
-Finished rows as one tidy table: Parquet with the study in its metadata, and a view by factors.
 Columns: ``row``, ``repeat``, the seed as ``seed_entropy`` and ``seed_spawn_key`` (what ``numpy.random.SeedSequence``
 takes), one a factor under its dotted path, one a figure with its unit in the name, ``seconds`` and ``error``. A row
 that failed has NaN figures and says why in ``error``; a figure that rows of one's own do not all have is NaN in others.
@@ -18,17 +17,20 @@ import pyarrow.parquet as pq
 import xarray as xr
 
 from identify.arrays import Array
-from identify.errors import ScenarioError, StudyError
+from identify.errors import StudyError
 from identify.files.atomic import atomic_path
 from identify.files.dataset import write_groups
 from identify.files.versions import versions
 from identify.scenario import Scenario
-from identify.studies.design import FIRST, LAST, Design, Finished
-from identify.studies.rows.kinds import columns
+from identify.studies.design import Design, Finished
+from identify.studies.rows import KINDS
 from identify.studies.study_file import Study
 
-# Units of what a study varies and of what its rows say, for tables and axes.
+FIRST = ("row", "repeat", "seed_entropy", "seed_spawn_key")
+LAST = ("seconds", "error")
+"""Columns of a study's table before its factors and behind its figures."""
 
+STUDY_KEY, VERSIONS_KEY = b"cmmsim.study", b"cmmsim.versions"
 
 SENSOR_UNITS = {
     "rig.baseline": "m",
@@ -78,11 +80,8 @@ def factor_unit(path: str) -> str:
 
 def figure_unit(kind: str, figure: str) -> str:
     """Unit of a figure of a built-in kind; empty where it has none, or where the kind is one's own."""
-    try:
-        known = columns(kind)
-    except ScenarioError:
-        return ""
-    unit = known[figure].unit if figure in known else ""
+    columns = KINDS[kind].columns if kind in KINDS else {}
+    unit = columns[figure].unit if figure in columns else ""
     return "" if unit == "1" else unit
 
 
@@ -96,9 +95,6 @@ def unit_of(name: str, study: Study) -> str:
 def labelled(name: str, unit: str) -> str:
     """A name with its unit in brackets."""
     return f"{name} [{unit}]" if unit else name
-
-
-STUDY_KEY, VERSIONS_KEY = b"cmmsim.study", b"cmmsim.versions"
 
 
 def tidy_table(study: Study, finished: Iterable[Finished]) -> pd.DataFrame:

@@ -3,8 +3,9 @@
 import pytest
 
 from identify.studies import summary
-from identify.studies.design import Design, compute, prepare
-from identify.studies.rows import kinds as rows
+from identify.studies.design import Design, prepare
+from identify.studies.rows import find_kind
+from identify.studies.runner import compute
 from identify.studies.study_file import load_study, study_names
 from identify.studies.table import tidy_table
 from identify.studies.theory import check_laws
@@ -45,7 +46,7 @@ def test_study_states_laws_about_figures_and_factors_that_it_has(name):
     prepare(study)
     assert study.title
     assert study.theory
-    figures = rows.columns(study.kind)
+    figures = find_kind(study.kind).columns
     for law in study.theory:
         assert {law.figure, law.per or law.figure, law.equals or law.figure} <= set(figures)
         assert law.factor is None or law.factor in {*study.factors, *figures}

@@ -216,7 +216,9 @@ def test_other_versions_of_other_packages_are_one_warning(tmp_path, serial):
         outcome = run_study(study(), tmp_path / "a", SilentProgress(), partial(running_cluster, address))
     assert len(caught) == 1
     text = str(caught[0].message)
-    assert re.search(rf"numpy 1.2.3 \(tcp://\S+( and 1 more)?\), here {np.__version__}; casadi 0.1 \(tcp://", text)
+    assert re.search(
+        rf"numpy 1.2.3 \(worker tcp://\S+( and 1 more)?\), here {np.__version__}; casadi 0.1 \(worker tcp://", text
+    )
     assert "scipy" not in text
     same_numbers(outcome.frame, serial)
 

@@ -12,7 +12,7 @@ from identify.commands import study as study_command
 from identify.errors import StudyInterrupted
 from identify.studies import dask_cluster as dask_runner
 from identify.studies import runner, summary
-from identify.studies.rows import kinds as rows
+from identify.studies.rows import KINDS
 from identify.studies.study_file import study_names
 from identify.studies.table import read_table
 from tests.identify.commands import command, one_line
@@ -141,11 +141,11 @@ def test_list_names_every_built_in_study_with_its_rows(capsys):
 def test_kinds_are_listed_with_their_options_and_figures(capsys):
     assert command("study", "--kinds") == 0
     shown = capsys.readouterr().out
-    assert all(f"{name}: {kind.what}" in shown for name, kind in rows.KINDS.items())
+    assert all(f"{name}: {kind.what}" in shown for name, kind in KINDS.items())
     assert "\nIt reads scenario.sensor, scenario.renderer, " in shown
     assert "\nIt reads scenario.*, sensor.rig.*, " in shown
     lines = [line.split() for line in shown.splitlines() if line]
-    for kind in rows.KINDS.values():
+    for kind in KINDS.values():
         assert all(
             [name, column.unit] == [line[0], line[1]]
             for name, column in kind.columns.items()

@@ -9,7 +9,8 @@ from distributed import KilledWorker
 from identify.errors import StudyError
 from identify.studies import dask_cluster as dask_executor
 from identify.studies.dask_cluster import DaskExecutor
-from identify.studies.design import Batches, Case, Finished
+from identify.studies.design import Case, Finished
+from identify.studies.runner import Batches
 
 LOST = TimeoutError("its worker died with the result")
 DIED = KilledWorker("task", SimpleNamespace(address="tcp://a:1"), 0)

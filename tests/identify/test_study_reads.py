@@ -9,9 +9,8 @@ import pytest
 from cmmsim.files.sensor_file import read_sensor_file
 from identify.errors import IdentifyError, StudyError
 from identify.scenario import load_scenario
-from identify.studies.design import prepare
-from identify.studies.keys import overrides, valid_keys
-from identify.studies.rows import kinds as rows
+from identify.studies.design import overrides, prepare, valid_keys
+from identify.studies.rows import find_kind
 from identify.studies.study_file import Study
 from tests.identify.study_rows import KIND
 
@@ -82,12 +81,12 @@ def test_what_a_kind_does_not_read_changes_nothing_in_its_rows(kind, options):
         "validation.count": 1,
         "identification.method": "command_driven",
     }
-    scenario, reads = load_scenario("quick").with_overrides(given), rows.find_kind(kind).reads
+    scenario, reads = load_scenario("quick").with_overrides(given), find_kind(kind).reads
     unread = [path for path in valid_keys(None) if not reads.covers(path) and "prior." not in path]
     other, left = with_others(scenario, unread)
     shared = {"sensor.timing.latency", "sensor.timing.latency_jitter"}  # which the scenario states
     assert left <= ALONE | shared | {"sensor.renderer"}
-    one, two = (rows.run(kind, settings, np.random.SeedSequence(3), options) for settings in (scenario, other))
+    one, two = (find_kind(kind).row(settings, np.random.SeedSequence(3), options) for settings in (scenario, other))
     assert one == two
 
 
@@ -101,12 +100,14 @@ def test_what_a_kind_does_not_read_changes_nothing_in_its_rows(kind, options):
 def test_what_a_held_pose_reads_acts_on_its_rows(path, value):
     scenario = load_scenario("quick").with_overrides({"renderer": "analytic"})
     options = {"hold_s": 0.1}
-    one = rows.run("static_pose", scenario, np.random.SeedSequence(3), options)
-    assert rows.find_kind("static_pose").reads.covers(path)
+    one = find_kind("static_pose").row(scenario, np.random.SeedSequence(3), options)
+    assert find_kind("static_pose").reads.covers(path)
     if path.startswith("options."):
         options |= {path.partition(".")[2]: value}
     assert (
-        rows.run("static_pose", scenario.with_overrides(overrides({path: value})), np.random.SeedSequence(3), options)
+        find_kind("static_pose").row(
+            scenario.with_overrides(overrides({path: value})), np.random.SeedSequence(3), options
+        )
         != one
     )
 

@@ -10,10 +10,10 @@ from cmmsim.geometry.pose import invert, rotation_log
 from cmmsim.teaching import exactly_taught
 from dynamics import load_robot
 from dynamics.closed_loop import Reference
-from identify.errors import EstimationError, ScenarioError
+from identify.errors import EstimationError, StudyError
 from identify.experiment.plant import build_plant
 from identify.scenario import load_scenario
-from identify.studies.rows import kinds as rows
+from identify.studies.rows import KINDS, find_kind
 from identify.studies.rows import sensor as row_sensor
 from identify.studies.rows.identification import prediction_figures
 from identify.studies.rows.sensor import DrawnSensor
@@ -35,37 +35,37 @@ def seed(number=0):
 
 
 def static(number=0, settings=None, **options):
-    return rows.run("static_pose", settings or scenario(), seed(number), options)
+    return find_kind("static_pose").row(settings or scenario(), seed(number), options)
 
 
 def test_same_seed_gives_the_same_row_and_another_one_another():
     first, again, other = static(0), static(0), static(1)
     assert first == again
     assert first["position_rms_um"] != other["position_rms_um"]
-    assert list(first) == list(rows.columns("static_pose"))
+    assert list(first) == list(find_kind("static_pose").columns)
 
 
 def test_row_does_not_depend_on_what_the_process_has_kept():
-    row_sensor._exact_sensor.cache_clear()
+    row_sensor.exact_sensor.cache_clear()
     alone = static(0)
     for dark_noise in (10.0, 40.0, 80.0):
         static(1, scenario(**{"sensor_changes.camera.dark_noise": dark_noise}))
-    kept = row_sensor._exact_sensor.cache_info()
+    kept = row_sensor.exact_sensor.cache_info()
     assert static(0) == alone
-    assert row_sensor._exact_sensor.cache_info().hits == kept.hits + 1
-    rows.run("path_pose", scenario(), seed(3), {"stretch_s": 0.1})
+    assert row_sensor.exact_sensor.cache_info().hits == kept.hits + 1
+    find_kind("path_pose").row(scenario(), seed(3), {"stretch_s": 0.1})
     assert static(0) == alone
 
 
 def test_sensors_that_a_process_keeps_are_bounded():
-    assert row_sensor._exact_sensor.cache_info().maxsize == row_sensor.SENSORS_KEPT
+    assert row_sensor.exact_sensor.cache_info().maxsize == row_sensor.SENSORS_KEPT
 
 
 def test_seed_of_a_row_is_not_used_up():
     given = seed()
-    static_row = rows.run("static_pose", scenario(), given, {})
+    static_row = find_kind("static_pose").row(scenario(), given, {})
     assert given.n_children_spawned == 0
-    assert rows.run("static_pose", scenario(), given, {}) == static_row
+    assert find_kind("static_pose").row(scenario(), given, {}) == static_row
 
 
 @pytest.mark.slow
@@ -135,7 +135,7 @@ def test_pose_in_use_lags_by_what_its_age_says(latency_frames, expected):
     """A pose that is L old when it arrives and held for T is off by v sqrt(L^2 + L T + T^2 / 3) in the mean."""
     rate = 30.0
     settings = scenario(**NOISELESS | {"timing.frame_rate_hz": rate, "timing.latency_s": latency_frames / rate})
-    row = rows.run("path_pose", settings, seed(2), {"stretch_s": 1.0})
+    row = find_kind("path_pose").row(settings, seed(2), {"stretch_s": 1.0})
     assert row["frames"] == 30
     ratio = 1e-3 * row["used_position_rms_um"] / row["speed_rms_mm_s"] * rate
     assert ratio == pytest.approx(expected, rel=0.06)
@@ -144,7 +144,7 @@ def test_pose_in_use_lags_by_what_its_age_says(latency_frames, expected):
 
 def test_dropped_frames_of_a_path_are_counted():
     settings = scenario(**{"timing.dropout": 0.4})
-    row = rows.run("path_pose", settings, seed(1), {"stretch_s": 0.5})
+    row = find_kind("path_pose").row(settings, seed(1), {"stretch_s": 0.5})
     assert 3 <= row["lost_frames"] <= 22
 
 
@@ -171,18 +171,18 @@ def test_drawn_sensor_loses_its_share_of_frames_without_changing_the_noise_of_ot
 
 
 def test_unknown_kinds_and_options_name_the_valid_ones():
-    with pytest.raises(ScenarioError, match="static_pose, path_pose, identification, closed_loop"):
-        rows.run("pose", scenario(), seed(), {})
-    with pytest.raises(ScenarioError, match=r"unknown key 'capture'; valid names: poses, captures, hold_s, teaching"):
-        rows.check_options("static_pose", {"capture": 3})
-    with pytest.raises(ScenarioError, match=r"options of static_pose: captures = 0"):
-        rows.check_options("static_pose", {"captures": 0})
+    with pytest.raises(StudyError, match="static_pose, path_pose, identification, closed_loop"):
+        find_kind("pose").row(scenario(), seed(), {})
+    with pytest.raises(StudyError, match=r"unknown key 'capture'; valid names: poses, captures, hold_s, teaching"):
+        find_kind("static_pose").checked({"capture": 3})
+    with pytest.raises(StudyError, match=r"options of static_pose: captures = 0"):
+        find_kind("static_pose").checked({"captures": 0})
 
 
-@pytest.mark.parametrize("kind", rows.KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_each_kind_says_unit_and_meaning_of_its_columns_and_which_are_drawn(kind):
-    columns = rows.columns(kind)
-    assert set(rows.find_kind(kind).main) <= set(columns)
+    columns = find_kind(kind).columns
+    assert any(column.main for column in columns.values())
     suffixes = {"um": "_um", "urad": "_urad", "px": "_px", "%": "_percent", "mm/s": "_mm_s", "m": "_m", "N m": "_N_m"}
     for name, column in columns.items():
         assert column.meaning
@@ -192,13 +192,13 @@ def test_each_kind_says_unit_and_meaning_of_its_columns_and_which_are_drawn(kind
 @pytest.mark.slow
 def test_closed_loop_follows_its_reference_with_the_images_in_the_loop():
     settings = scenario(**{"validation.duration_s": 1.0})
-    row = rows.run("closed_loop", settings, seed(0), {"teaching": "exact"})
-    assert list(row) == list(rows.columns("closed_loop"))
+    row = find_kind("closed_loop").row(settings, seed(0), {"teaching": "exact"})
+    assert list(row) == list(find_kind("closed_loop").columns)
     assert row["frames"] == 60
     assert row["lost_frames"] == 0
     assert row["position_rms_um"] < 2.0 * row["stated_position_rms_um"]
     assert 10.0 < row["tracking_position_rms_um"] < 1e4
-    assert row == rows.run("closed_loop", settings, seed(0), {"teaching": "exact"})
+    assert row == find_kind("closed_loop").row(settings, seed(0), {"teaching": "exact"})
 
 
 def test_covariance_of_one_known_error_states_what_that_error_makes_of_the_prediction():
@@ -219,9 +219,9 @@ def test_covariance_of_one_known_error_states_what_that_error_makes_of_the_predi
 @pytest.mark.slow
 def test_identification_finds_the_parameters_to_what_it_states():
     settings = scenario(**{"identification.method": "command_driven", "validation.count": 1})
-    found = [rows.run("identification", settings, seed(number), {}) for number in range(3)]
-    assert list(found[0]) == list(rows.columns("identification"))
-    assert found[0] == rows.run("identification", settings, seed(0), {})
+    found = [find_kind("identification").row(settings, seed(number), {}) for number in range(3)]
+    assert list(found[0]) == list(find_kind("identification").columns)
+    assert found[0] == find_kind("identification").row(settings, seed(0), {})
     assert all(row["unseen_position_rms_um"] < row["pose_noise_um"] for row in found)
     assert np.sqrt(np.mean([row["normalised_error"] ** 2 for row in found])) < 1.5
 
@@ -229,6 +229,8 @@ def test_identification_finds_the_parameters_to_what_it_states():
 @pytest.mark.slow
 def test_identification_from_images_is_as_good_as_from_drawn_noise():
     settings = scenario(**{"identification.method": "command_driven", "validation.count": 1})
-    drawn, images = (rows.run("identification", settings, seed(5), {"sensor": kind}) for kind in ("drawn", "images"))
+    drawn, images = (
+        find_kind("identification").row(settings, seed(5), {"sensor": kind}) for kind in ("drawn", "images")
+    )
     assert images["pose_noise_um"] == pytest.approx(drawn["pose_noise_um"], rel=0.1)
     assert images["viscous_std_percent"] == pytest.approx(drawn["viscous_std_percent"], rel=0.1)

@@ -9,8 +9,9 @@ import warnings
 import pytest
 
 from identify.errors import StudyError
-from identify.files.versions import OtherVersionsWarning, check_workers, versions
+from identify.files.versions import OtherVersionsWarning, versions
 from identify.progress import SilentProgress
+from identify.studies.dask_cluster import check_workers
 from identify.studies.runner import run_study
 from identify.studies.store import JOURNAL, STUDY
 from identify.studies.study_file import Study
@@ -48,8 +49,8 @@ def test_one_warning_names_each_version_once_with_how_many_workers_have_it():
         check_workers(there)
     here = versions()
     assert [str(one.message) for one in caught] == [
-        f"figures may differ a little where versions do: numpy 1.2.3 (tcp://a:1 and 2 more), here {here['numpy']}; "
-        f"casadi 3.0 (tcp://d:1), here {here['casadi']}"
+        "figures may differ a little where versions do: numpy 1.2.3 (worker tcp://a:1 and 2 more), here "
+        f"{here['numpy']}; casadi 3.0 (worker tcp://d:1), here {here['casadi']}"
     ]
 
 
@@ -72,7 +73,7 @@ def test_no_rows_are_added_to_those_of_another_version(tmp_path):
     run(tmp_path, 2)
     begun_by(tmp_path, cmmsim="9.8.7")
     kept = (tmp_path / JOURNAL).read_bytes()
-    with pytest.raises(StudyError, match=r"has rows of cmmsim 9\.8\.7, here is \S+; go on with that version"):
+    with pytest.raises(StudyError, match=r"has cmmsim 9\.8\.7, here is \S+; go on with that version"):
         run(tmp_path, 3)
     assert (tmp_path / JOURNAL).read_bytes() == kept
     with warnings.catch_warnings():

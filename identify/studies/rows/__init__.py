@@ -1,1 +1,54 @@
-"""The kinds of row a study can have, one file each."""
+"""The kinds of row a study can have: one file each, and a line in ``KINDS``; or ``module:function`` of a user's own.
+
+A function of one's own is ``run(scenario, seed)`` or ``run(scenario, seed, options)``: it takes the scenario, the row's
+``numpy.random.SeedSequence`` and, where the study has any, the options by name, and returns the row's figures by name,
+units in the names. Workers import it, so it must be in a module that they find.
+"""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from identify.errors import StudyError
+from identify.plugins import is_own, own_function
+from identify.studies.rows.closed_loop import CLOSED_LOOP
+from identify.studies.rows.identification import IDENTIFICATION
+from identify.studies.rows.kind import Kind
+from identify.studies.rows.path_pose import PATH_POSE
+from identify.studies.rows.static_pose import STATIC_POSE
+
+KINDS: dict[str, Kind] = {kind.name: kind for kind in (STATIC_POSE, PATH_POSE, IDENTIFICATION, CLOSED_LOOP)}
+
+
+def find_kind(name: str) -> Kind:
+    """The kind of that name, built in or of one's own.
+
+    Raises:
+        StudyError: no such kind, with the built-in ones; no such module or function, or one that takes other arguments.
+    """
+    if is_own(name):
+        return _own(name, own_function(name, "kind", StudyError))
+    if name not in KINDS:
+        raise StudyError(f"unknown kind of row {name!r}, valid are {', '.join(KINDS)}, or module:function")
+    return KINDS[name]
+
+
+def _own(name: str, function: Callable[..., Any]) -> Kind:
+    """The kind of a function that takes three arguments, or two and no options."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # written in C: it does not say
+        return Kind(name, function)
+    for count in (3, 2):
+        try:
+            signature.bind(*range(count))
+        except TypeError:
+            continue
+        return Kind(name, function) if count == 3 else Kind(name, _without_options(function), takes_options=False)
+    raise StudyError(
+        f"kind {name!r} takes {signature}; a row's function takes (scenario, seed) or (scenario, seed, options)"
+    )
+
+
+def _without_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda scenario, seed, _: function(scenario, seed)

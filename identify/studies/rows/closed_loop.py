@@ -4,8 +4,6 @@ Each row draws a trajectory in the scenario's box and runs it for `validation.du
 plant are the scenario's. The sensor teaches itself, seeded by the row, unless exact teaching is asked for.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from pydantic import Field
 
@@ -20,7 +18,7 @@ from identify.experiment.truth import true_poses
 from identify.random_streams import stream_seed
 from identify.record import recording
 from identify.scenario import Scenario
-from identify.studies.rows.columns import (
+from identify.studies.rows.kind import (
     NOISE_OFF,
     PICTURES,
     PLANT,
@@ -39,20 +37,16 @@ EXPERIMENT, TRAJECTORY = 0, 1
 
 COLUMNS = {
     "frames": Column("1", "frames of the run"),
-    "lost_frames": Column("1", "frames without a pose; they do not count in the sensor's error"),
-    "tracking_position_rms_um": Column("um", "true position against the desired one, rms over frames and axes"),
-    "tracking_orientation_rms_urad": Column("urad", "true orientation against the desired one, rms likewise"),
+    "lost_frames": Column("1", "frames without a pose; they do not count in the sensor's error", main=True),
+    "tracking_position_rms_um": Column(
+        "um", "true position against the desired one, rms over frames and axes", main=True
+    ),
+    "tracking_orientation_rms_urad": Column(
+        "urad", "true orientation against the desired one, rms likewise", main=True
+    ),
     **POSE_COLUMNS,
-    "torque_rms_N_m": Column("N m", "torque of the joint controllers, rms over frames and joints"),
+    "torque_rms_N_m": Column("N m", "torque of the joint controllers, rms over frames and joints", main=True),
 }
-MAIN = (
-    "tracking_position_rms_um",
-    "tracking_orientation_rms_urad",
-    "position_rms_um",
-    "orientation_rms_urad",
-    "lost_frames",
-    "torque_rms_N_m",
-)
 
 
 class ClosedLoopOptions(RowOptions):
@@ -113,5 +107,11 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: ClosedLoo
     }
 
 
-WHAT = "the robot follows an unseen trajectory with the images in the loop"
-CLOSED_LOOP = Kind("closed_loop", WHAT, COLUMNS, MAIN, ClosedLoopOptions, READS, compute)
+CLOSED_LOOP = Kind(
+    "closed_loop",
+    compute,
+    "the robot follows an unseen trajectory with the images in the loop",
+    COLUMNS,
+    ClosedLoopOptions,
+    READS,
+)

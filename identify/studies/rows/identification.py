@@ -6,8 +6,6 @@ the home pose, so that the sensor's entries act on it. The exciting and the unse
 itself, seeded by the row.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Literal
 
@@ -30,7 +28,7 @@ from identify.progress import SilentProgress
 from identify.random_streams import stream_seed
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, scenario_from_toml
-from identify.studies.rows.columns import (
+from identify.studies.rows.kind import (
     NOISE_OFF,
     PLANT,
     SENSOR,
@@ -49,7 +47,11 @@ from identify.trajectory import TrajectorySet
 from identify.validation.validation import model_run
 
 EXPERIMENT = 0
-CHOSEN = {"coulomb": COULOMB_NAMES, "viscous": VISCOUS_NAMES, "gains": JOINT_PID_NAMES}
+CHOSEN = {
+    "coulomb": ("Coulomb friction", COULOMB_NAMES),
+    "viscous": ("viscous friction", VISCOUS_NAMES),
+    "gains": ("joint gains", JOINT_PID_NAMES),
+}
 """Parameters that a record always shows, so that their spread follows the noise; rms over each set."""
 
 COLUMNS = {
@@ -58,15 +60,12 @@ COLUMNS = {
     "pose_noise_um": Column("um", "stated standard deviation of a measured position, rms over frames and axes"),
     "pose_noise_urad": Column("urad", "stated standard deviation of a measured orientation, rms over frames and axes"),
     **{
-        f"{name}_std_percent": Column("%", f"stated standard deviation of {what}, rms relative to the truth")
-        for name, what in (("coulomb", "Coulomb friction"), ("viscous", "viscous friction"), ("gains", "joint gains"))
-    },
-    **{
-        f"{name}_error_percent": Column("%", f"error of {what}, rms relative to the truth")
-        for name, what in (("coulomb", "Coulomb friction"), ("viscous", "viscous friction"), ("gains", "joint gains"))
+        f"{name}_{figure}_percent": Column("%", f"{words} of {what}, rms relative to the truth", main=figure == "std")
+        for figure, words in (("std", "stated standard deviation"), ("error", "error"))
+        for name, (what, _) in CHOSEN.items()
     },
     "identified_groups": Column("1", "base parameters that the record identifies"),
-    "group_std_percent": Column("%", "stated standard deviation of those, relative to the truth, median"),
+    "group_std_percent": Column("%", "stated standard deviation of those, relative to the truth, median", main=True),
     "normalised_error": Column("1", "error of those over its stated standard deviation, rms; 1 where stated well"),
     "noise_ratio": Column("1", "mean squared whitened residual; 1 where noise is all that is left"),
     "iterations": Column("1", "iterations of all searches"),
@@ -75,17 +74,11 @@ COLUMNS = {
         "identified model against the true one on unseen trajectories, neither with noise: position, rms over axes",
     ),
     "stated_prediction_rms_um": Column("um", "the same, as the covariance of the parameters states it"),
-    "unseen_position_rms_um": Column("um", "model against true plant on unseen trajectories, rms over axes"),
-    "unseen_orientation_rms_urad": Column("urad", "model against true plant on unseen trajectories, rms over axes"),
+    "unseen_position_rms_um": Column("um", "model against true plant on unseen trajectories, rms over axes", main=True),
+    "unseen_orientation_rms_urad": Column(
+        "urad", "model against true plant on unseen trajectories, rms over axes", main=True
+    ),
 }
-MAIN = (
-    "coulomb_std_percent",
-    "viscous_std_percent",
-    "gains_std_percent",
-    "group_std_percent",
-    "unseen_position_rms_um",
-    "unseen_orientation_rms_urad",
-)
 
 
 class IdentificationOptions(RowOptions):
@@ -167,7 +160,7 @@ def _record_figures(experiment: Experiment) -> Row:
 def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
     row: Row = {}
     for figure, values in (("std", result.std), ("error", result.estimate - truth)):
-        for name, members in CHOSEN.items():
+        for name, (_, members) in CHOSEN.items():
             index = [result.names.index(member) for member in members]
             row[f"{name}_{figure}_percent"] = 100.0 * float(np.sqrt(np.mean((values[index] / truth[index]) ** 2)))
     groups = result.groups
@@ -226,5 +219,11 @@ def _trajectories(scenario_toml: str, seed: int) -> TrajectorySet:
     return design_trajectories(_robot(scenario.robot), scenario, seed)
 
 
-WHAT = "a record of the exciting trajectory, the parameters identified from it, and their errors"
-IDENTIFICATION = Kind("identification", WHAT, COLUMNS, MAIN, IdentificationOptions, READS, compute)
+IDENTIFICATION = Kind(
+    "identification",
+    compute,
+    "a record of the exciting trajectory, the parameters identified from it, and their errors",
+    COLUMNS,
+    IdentificationOptions,
+    READS,
+)

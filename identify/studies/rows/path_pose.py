@@ -6,8 +6,6 @@ of its exposure. Beside its error a row gives that of the pose in use: the last 
 next one arrives. Teaching is exact unless asked for otherwise.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from pydantic import Field
 
@@ -16,7 +14,7 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
-from identify.studies.rows.columns import (
+from identify.studies.rows.kind import (
     NOISE_OFF,
     PICTURES,
     POSE_COLUMNS,
@@ -41,10 +39,11 @@ COLUMNS = {
     "lost_frames": Column("1", "frames without a pose; they count in no other figure but the pose in use"),
     "speed_rms_mm_s": Column("mm/s", "speed of the platform along each axis, rms over the frames"),
     **POSE_COLUMNS,
-    "used_position_rms_um": Column("um", "last position that had arrived against the true one at all times"),
-    "used_orientation_rms_urad": Column("urad", "last orientation that had arrived against the true one at all times"),
+    "used_position_rms_um": Column("um", "last position that had arrived against the true one at all times", main=True),
+    "used_orientation_rms_urad": Column(
+        "urad", "last orientation that had arrived against the true one at all times", main=True
+    ),
 }
-MAIN = ("position_rms_um", "orientation_rms_urad", "used_position_rms_um", "used_orientation_rms_urad")
 
 
 class PathPoseOptions(RowOptions):
@@ -120,5 +119,11 @@ def _used_errors(path: FourierTrajectory, poses: Array, arrivals: Array, period_
     return np.asarray(poses[in_use] - path.pose(instants), dtype=float)
 
 
-WHAT = "the sensor alone follows a platform along a random path, with the scenario's timing"
-PATH_POSE = Kind("path_pose", WHAT, COLUMNS, MAIN, PathPoseOptions, READS, compute)
+PATH_POSE = Kind(
+    "path_pose",
+    compute,
+    "the sensor alone follows a platform along a random path, with the scenario's timing",
+    COLUMNS,
+    PathPoseOptions,
+    READS,
+)

@@ -1,11 +1,9 @@
-"""The sensor of a row: taught exactly or by itself, built once a process, or a sensor without images.
+"""The sensor of a row: taught exactly or by itself, or one without images, whose noise is drawn.
 
-The sensor of a row: built once a process for each content of a sensor file, taught exactly or by itself.
-A row that is taught exactly depends on nothing that another row left behind: every picture has a noise stream of its
-own, begun by `start_run`. So a sensor from the cache gives the same numbers as a new one.
+It is built once a process for each content of a sensor file. A row that is taught exactly depends on nothing that
+another row left behind: every picture has a noise stream of its own, begun by `start_run`. So a sensor from the cache
+gives the same numbers as a new one.
 """
-
-from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -46,7 +44,7 @@ def row_sensor(scenario: Scenario, teaching: Teaching, seed: int) -> RowSensor:
     """The sensor of a scenario without the robot's links in its view, at the beginning of a run of its own."""
     file = sensor_file(scenario)
     if teaching == "exact":
-        built = _exact_sensor(file.model_dump_json(), scenario.pose_method, scenario.renderer)
+        built = exact_sensor(file.model_dump_json(), scenario.pose_method, scenario.renderer)
     else:
         built = _built(file, scenario.pose_method, scenario.renderer, None, seed)
     built.sensor.start_run(seed)
@@ -54,7 +52,8 @@ def row_sensor(scenario: Scenario, teaching: Teaching, seed: int) -> RowSensor:
 
 
 @lru_cache(maxsize=SENSORS_KEPT)
-def _exact_sensor(file_json: str, method: str, renderer: str) -> RowSensor:
+def exact_sensor(file_json: str, method: str, renderer: str) -> RowSensor:
+    """The sensor of a file's content, taught exactly; a process keeps the last ones."""
     file = SensorFile.model_validate_json(file_json)
     return _built(file, method, renderer, exactly_taught(file), 0)
 
@@ -65,11 +64,11 @@ def _built(file: SensorFile, method: str, renderer: str, taught: cmmsim.Taught |
     return RowSensor(sensor, taught or exactly_taught(file), np.array(file.rig.position), rim)
 
 
-# A sensor without images: the true pose with noise of a covariance, drawn. Fast, and with known statistics.
-
-
 class DrawnSensor:
-    """Measures as a `cmmsim.Sensor` does, with Gaussian noise of one covariance (6, 6) [m, rad] and with dropout."""
+    """Measures as a `cmmsim.Sensor` does, without images: Gaussian noise of a covariance (6, 6) [m, rad], and dropout.
+
+    Fast, and with known statistics.
+    """
 
     sees_bodies = False
 

@@ -6,8 +6,6 @@ no picture is searched as a whole. The timing's dropout loses pictures, and chan
 exact unless asked for otherwise: the rows show observation noise alone.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from pydantic import Field
 
@@ -18,7 +16,7 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
-from identify.studies.rows.columns import (
+from identify.studies.rows.kind import (
     NOISE_OFF,
     PICTURES,
     POSE_COLUMNS,
@@ -44,22 +42,18 @@ COLUMNS = {
     "stickers": Column("1", "stickers used, mean over the pictures"),
     "pixel_noise_grey": Column("grey values", "rms noise of a grey value half-way between sticker and ring"),
     **POSE_COLUMNS,
-    "mean_position_rms_um": Column("um", "error of the position averaged over the pictures of a pose"),
-    "mean_orientation_rms_urad": Column("urad", "error of the orientation averaged over the pictures of a pose"),
+    "mean_position_rms_um": Column("um", "error of the position averaged over the pictures of a pose", main=True),
+    "mean_orientation_rms_urad": Column(
+        "urad", "error of the orientation averaged over the pictures of a pose", main=True
+    ),
     "sight_m": Column("m", "distance of the stickers from the middle of the baseline, mean"),
-    "point_depth_rms_um": Column("um", "error of single stickers along the line from there to the sticker"),
+    "point_depth_rms_um": Column("um", "error of single stickers along the line from there to the sticker", main=True),
     "point_lateral_rms_um": Column("um", "error of single stickers across that line, rms over both axes"),
-    "centre_rms_px": Column("px", "error of sticker centres in the images, rms over stickers, cameras and axes"),
+    "centre_rms_px": Column(
+        "px", "error of sticker centres in the images, rms over stickers, cameras and axes", main=True
+    ),
     "disparity_rms_px": Column("px", "error of the difference of a sticker's x in both images, rms over stickers"),
 }
-MAIN = (
-    "position_rms_um",
-    "orientation_rms_urad",
-    "mean_position_rms_um",
-    "mean_orientation_rms_urad",
-    "point_depth_rms_um",
-    "centre_rms_px",
-)
 
 
 class StaticPoseOptions(RowOptions):
@@ -189,5 +183,11 @@ def _row(eye: RowSensor, looks: list[_Look], captures: int) -> Row:
     }
 
 
-WHAT = "the sensor alone looks at a platform that stands still, at a pose drawn in the box"
-STATIC_POSE = Kind("static_pose", WHAT, COLUMNS, MAIN, StaticPoseOptions, READS, compute)
+STATIC_POSE = Kind(
+    "static_pose",
+    compute,
+    "the sensor alone looks at a platform that stands still, at a pose drawn in the box",
+    COLUMNS,
+    StaticPoseOptions,
+    READS,
+)
