@@ -11,20 +11,15 @@ from dynamics import Robot
 from dynamics.closed_loop import prepare
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import Worst
-from identify.excitation.design import admissible_trajectories, motion_check, prepare_search
+from identify.excitation.criteria import log_observability, observability_index
+from identify.excitation.design import motion_check, random_candidates, search_problem
 from identify.excitation.information import knowledge, log_information
 from identify.excitation.motion import sample_times
-from identify.excitation.observability import log_observability, observability_index
-from identify.excitation.search import FEWEST_MEMBERS
+from identify.excitation.search import FEWEST_MEMBERS, SEARCHES
 from identify.progress import Progress
-from identify.random_streams import EXCITATION, SEARCH, child
+from identify.random_streams import SEARCH, child
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
-
-# The three methods side by side: same criterion, same seed, same random candidates.
-
-
-METHODS = ("random", "evolutionary", "gradient")
 
 COMPARISON_REFINEMENT = 10
 """How much finer the margins are reported than constraints are seen by a search."""
@@ -79,18 +74,17 @@ def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progr
     scenario = scenario.with_overrides({"excitation.method": "gradient", "excitation.candidates": count})
     check = motion_check(robot, scenario)
     with progress.stage("random candidates", 1) as advance:
-        drawn = child(seed, EXCITATION)
-        candidates = admissible_trajectories(robot, settings, settings.duration_s, count, drawn, check)
-        search = prepare_search(robot, scenario, candidates)
-        index = log_observability(robot, search.problem.unknowns, settings.duration_s, search.candidates[0])
+        candidates = random_candidates(robot, scenario, count, seed, check)
+        problem = search_problem(robot, scenario, candidates)
+        index = log_observability(robot, problem.unknowns, settings.duration_s, problem.candidates[0])
         advance()
     known, prepared = knowledge(robot, scenario), time.perf_counter() - began
     times = sample_times(settings.fundamental_hz, settings.harmonics, COMPARISON_REFINEMENT)
     entries = []
-    for method in METHODS:
+    for method, search in SEARCHES.items():
         began = time.perf_counter()
-        found = search.run(method, child(seed, SEARCH), progress)
-        seconds, trajectory = time.perf_counter() - began, found.trajectory(search.problem)
+        found = search(problem, child(seed, SEARCH), progress)
+        seconds, trajectory = time.perf_counter() - began, found.trajectory(problem)
         try:
             information = float(np.exp(log_information(robot, scenario, known, trajectory)))
         except TrajectoryError:
@@ -107,13 +101,10 @@ def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progr
                 found.gradients,
                 found.iterations,
                 found.reason,
-                tuple(search.problem.constraints.worst(trajectory, times)),
+                tuple(problem.constraints.worst(trajectory, times)),
             )
         )
     return Comparison(settings.criterion, seed, count, prepared, tuple(entries))
-
-
-# The trajectories of all methods: paths of the pose and crank angles with their limits.
 
 
 COMPONENTS = ("x", "y", "z", "α", "β", "γ")

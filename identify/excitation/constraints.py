@@ -35,9 +35,6 @@ from identify.excitation.motion import is_whole_periods
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
-# How near stickers come to being out of the sight of a camera, as CasADi expressions of the pose.
-
-
 STICKERS_A_PLANE = 4
 """Stickers of each plane that both cameras must be able to look for at every pose; all where it has fewer."""
 

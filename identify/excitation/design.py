@@ -1,12 +1,6 @@
-"""The trajectories of a run: the exciting one by the scenario's method and criterion, and unseen random ones.
-
-Methods: the best of `candidates` random trajectories; differential evolution that begins with them; IPOPT from the
-best few of them. Criteria: the observability index (eq. 39), or the D-criterion in the linearised loop, by which the
-searches go; what IPOPT found from several starts is then ranked by the D-criterion of the simulated loop.
-"""
+"""The trajectories of a run: the exciting one by the scenario's method and criterion, and unseen random ones."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,18 +8,13 @@ from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import MotionConstraints, check_periods
-from identify.excitation.gradient_search import climb
-from identify.excitation.information import Knowledge, knowledge, log_information, log_linear_information
+from identify.excitation.criteria import criterion_of, log_observability, observability_index
 from identify.excitation.motion import SAMPLES_PER_HARMONIC, unknowns
-from identify.excitation.observability import SMOOTHING_RAD_S, log_observability, observability_index
-from identify.excitation.search import FEWEST_MEMBERS, SearchProblem, SearchResult, evolve
-from identify.progress import Progress, SilentProgress
+from identify.excitation.search import SEARCHES, SearchProblem
+from identify.progress import Advance, Progress, SilentProgress
 from identify.random_streams import EXCITATION, SEARCH, UNSEEN, child
 from identify.scenario import Excitation, Scenario
 from identify.trajectory import FourierTrajectory, TrajectorySet, check_travel, random_trajectory
-
-# Random trajectories that a robot can be given: inside its travel and the other limits.
-
 
 ATTEMPTS = 50
 """Random trajectories tried, on the average, for each one that has to be admissible."""
@@ -76,9 +65,6 @@ def admissible_trajectories(
     )
 
 
-STARTS = 3
-"""Random trajectories from which IPOPT climbs."""
-
 RANDOM_TOLERANCE = 1e-3
 """Share by which random trajectories may go over a limit: they fill the box as closely as they were sampled for it."""
 
@@ -87,24 +73,25 @@ def design_trajectories(robot: Robot, scenario: Scenario, seed: int, progress: P
     """Exciting trajectory and validation trajectories of a scenario, each kind from its own stream of the seed.
 
     Raises:
+        ScenarioError: no such criterion.
         TrajectoryError: no random trajectory of this amplitude keeps the limits; no whole number of periods where a
             search needs it; a search that finds nothing.
     """
-    progress = progress or SilentProgress()
-    settings = scenario.excitation
+    progress, settings = progress or SilentProgress(), scenario.excitation
     check = motion_check(robot, scenario)
-    if (settings.method, settings.criterion) == ("random", "observability"):
-        excitation, indices = _best_random(robot, scenario, seed, check, progress)
-    else:
-        excitation, indices = _searched(robot, scenario, seed, check, progress)
-    unseen = _unseen(robot, scenario, seed, check)
+    with progress.stage("excitation", settings.candidates) as advance:
+        candidates = random_candidates(robot, scenario, settings.candidates, seed, check)
+        problem = search_problem(robot, scenario, candidates, advance)
+    found = SEARCHES[settings.method](problem, child(seed, SEARCH), progress)
+    index = log_observability(robot, problem.unknowns, settings.duration_s, problem.candidates[0])
+    indices = [observability_index(index, problem.unknowns.of(trajectory)) for trajectory in candidates]
     return TrajectorySet(
         seed=seed,
-        excitation=excitation,
-        validation=unseen,
-        observability_index=float(indices[0]),
-        first_index=float(indices[1]),
-        median_index=float(np.median(indices[1:])),
+        excitation=found.trajectory(problem),
+        validation=_unseen(robot, scenario, seed, check),
+        observability_index=observability_index(index, found.z),
+        first_index=indices[0],
+        median_index=float(np.median(indices)),
     )
 
 
@@ -119,98 +106,34 @@ def motion_check(robot: Robot, scenario: Scenario) -> Check:
     return lambda trajectory, times: constraints.check(trajectory, times, RANDOM_TOLERANCE)
 
 
-@dataclass(frozen=True)
-class Search:
-    """A scenario's search: the problem, its random candidates (z) in the order of their value, best first, and what is
-    known before the run (None where the criterion does not ask)."""
-
-    robot: Robot
-    scenario: Scenario
-    problem: SearchProblem
-    candidates: list[Array]
-    known: Knowledge | None
-
-    def run(self, method: str, seed: np.random.SeedSequence, progress: Progress) -> SearchResult:
-        """What one method finds."""
-        if method == "random":
-            best = self.candidates[0]
-            count = len(self.candidates)
-            return SearchResult(best, float(self.problem.value(best)), count, 0, 0, f"best of {count}")
-        if method == "evolutionary":
-            generations = self.scenario.excitation.generations
-            with progress.stage("evolutionary search", generations) as advance:
-                return evolve(self.problem, self.candidates, generations, np.random.default_rng(seed), advance)
-        starts = self.candidates[:STARTS]
-        with progress.stage("gradient search", len(starts)) as advance:
-            return self._best(climb(self.problem, starts, advance))
-
-    def _best(self, results: list[SearchResult]) -> SearchResult:
-        if self.known is None:
-            return results[0]
-        trajectories = [result.trajectory(self.problem) for result in results]
-        true = [log_information(self.robot, self.scenario, self.known, t) for t in trajectories]
-        return results[int(np.argmax(true))]
+def random_candidates(robot: Robot, scenario: Scenario, count: int, seed: int, check: Check) -> list[FourierTrajectory]:
+    """The random trajectories among which, or from which, a search goes."""
+    settings = scenario.excitation
+    return admissible_trajectories(robot, settings, settings.duration_s, count, child(seed, EXCITATION), check)
 
 
-def prepare_search(robot: Robot, scenario: Scenario, candidates: list[FourierTrajectory]) -> Search:
-    """The search of a scenario among and from admissible random trajectories."""
-    if scenario.excitation.method == "evolutionary" and len(candidates) < FEWEST_MEMBERS:
-        raise TrajectoryError(
-            f"excitation.candidates = {len(candidates)}: the evolutionary method needs at least {FEWEST_MEMBERS}"
-        )
-    if scenario.excitation.method != "random":
+def search_problem(
+    robot: Robot, scenario: Scenario, candidates: list[FourierTrajectory], advance: Advance = lambda n=1: None
+) -> SearchProblem:
+    """The search of a scenario among, or from, admissible random trajectories.
+
+    Raises:
+        ScenarioError: no such criterion.
+        TrajectoryError: no whole number of periods for a method that needs it.
+    """
+    settings = scenario.excitation
+    if settings.method != "random":
         check_periods(scenario)
-    free = unknowns(robot.home_pose, scenario.excitation)
+    free = unknowns(robot.home_pose, settings)
     pool = [free.of(trajectory) for trajectory in candidates]
-    if scenario.excitation.criterion == "observability":
-        known = None
-        duration_s = scenario.excitation.duration_s
-        value, smooth = (log_observability(robot, free, duration_s, pool[0], v) for v in (None, SMOOTHING_RAD_S))
-    else:
-        known = knowledge(robot, scenario)
-        value, smooth = (log_linear_information(robot, free, scenario, known, v) for v in (None, SMOOTHING_RAD_S))
-    problem = SearchProblem(free, MotionConstraints(robot, scenario), value, smooth)
-    order = np.argsort([-float(value(z)) for z in pool], kind="stable")
-    return Search(robot, scenario, problem, [pool[k] for k in order], known)
+    criterion, values = criterion_of(robot, scenario, free, pool[0]), []
+    for z in pool:
+        values.append(-float(criterion.value(z)))
+        advance()
+    best_first = [pool[k] for k in np.argsort(values, kind="stable")]
+    return SearchProblem(settings, free, MotionConstraints(robot, scenario), criterion, best_first)
 
 
 def _unseen(robot: Robot, scenario: Scenario, seed: int, check: Check) -> tuple[FourierTrajectory, ...]:
     count, duration_s = scenario.validation.count, scenario.validation.duration_s
     return tuple(admissible_trajectories(robot, scenario.excitation, duration_s, count, child(seed, UNSEEN), check))
-
-
-def _candidates(robot: Robot, scenario: Scenario, seed: int, check: Check) -> list[FourierTrajectory]:
-    settings = scenario.excitation
-    drawn = child(seed, EXCITATION)
-    return admissible_trajectories(robot, settings, settings.duration_s, settings.candidates, drawn, check)
-
-
-def _best_random(
-    robot: Robot, scenario: Scenario, seed: int, check: Check, progress: Progress
-) -> tuple[FourierTrajectory, Array]:
-    """The best candidate, and the indices (eq. 39) of it and of all."""
-    settings = scenario.excitation
-    with progress.stage("excitation", settings.candidates) as advance:
-        candidates = _candidates(robot, scenario, seed, check)
-        free = unknowns(robot.home_pose, settings)
-        pool = [free.of(trajectory) for trajectory in candidates]
-        index = log_observability(robot, free, settings.duration_s, pool[0])
-        indices = []
-        for z in pool:
-            indices.append(observability_index(index, z))
-            advance()
-    best = int(np.argmax(indices))
-    return candidates[best], np.array([indices[best], *indices])
-
-
-def _searched(
-    robot: Robot, scenario: Scenario, seed: int, check: Check, progress: Progress
-) -> tuple[FourierTrajectory, Array]:
-    """What the scenario's method finds, and the indices (eq. 39) of it and of all candidates."""
-    settings = scenario.excitation
-    candidates = _candidates(robot, scenario, seed, check)
-    search = prepare_search(robot, scenario, candidates)
-    found = search.run(settings.method, child(seed, SEARCH), progress)
-    index = log_observability(robot, search.problem.unknowns, settings.duration_s, search.candidates[0])
-    pool = [search.problem.unknowns.of(trajectory) for trajectory in candidates]
-    return found.trajectory(search.problem), np.array([observability_index(index, z) for z in (found.z, *pool)])

@@ -1,28 +1,23 @@
-"""D-optimality of the output error's information: through the closed loop, and with the loop linearised about home.
+"""D-optimality of the output error's information: in the simulated closed loop, and in the loop linearised at home.
 
-D-optimality of the output error's information, through the closed loop and with the sensor's covariance.
-With J = d(poses)/d(67 parameters) of the simulated closed loop at the starting guess, Sigma the covariance that the
-sensor states, and what is known before (starting guess, the scenario's prior of single parameters, scale anchor),
+With J = d(poses)/d(67 parameters) of the closed loop at the starting guess, Sigma the covariance that the sensor
+states, and what is known before (starting guess, the scenario's prior of single parameters, scale anchor),
 
     W = sum over frames J^T Sigma^-1 J + prior,      D = (det(S W S))^(1 / (2 67)),      S = diag(prior deviations).
 
 D is the factor by which the experiment narrows the prior, the geometric mean over all directions of the parameter
 space; it has no unit. That the sensor's noise also moves the plant (through the servo) is left out.
 
-The closed loop, linearised about rest at home: how it follows a reference, and how missing torque moves it.
-With s = i omega, C = kp + kd s + ki / s the servo, L = lp + ld s + li / s the joint PID and t_d the latency plus half
-a frame of hold, the pose x follows a torque error d (Nm, joints) as
+The simulation gives D of a trajectory, but no exact derivative by it. Searches go by D in the loop linearised about
+rest at home. With s = i omega, C = kp + kd s + ki / s the servo, L = lp + ld s + li / s the joint PID and t_d the
+latency plus half a frame of hold, the pose x follows a torque error d (Nm, joints) as
 
     x = -S d,   S = (J_ad^-T M E s^2 + F_v J_theta s + d(holding torque)/dx + L J_theta (1 + C exp(-s t_d)))^-1,
 
 E from pose rates to twists, and follows a reference x_d as x = T x_d with T = S L J_theta C exp(-s t_d). Friction
-counts with its viscous part only.
-
-The D-criterion with the loop linearised about home: a function of the unknowns with exact derivatives.
-The information of `criterion_information` comes from a simulation and has no exact derivative by the trajectory. In
-the linearised loop the robot follows each harmonic of the trajectory with a known lag, and the sensitivities are
-filtered columns of the torque regressor along that motion: with Y its Fourier coefficients at a harmonic, tau = Y Xi
-the torques and e = tau / L the joint error that the PID needs for them,
+counts with its viscous part only. So the robot follows each harmonic of the trajectory with a known lag, and the
+sensitivities are filtered columns of the torque regressor along that motion: with Y its Fourier coefficients at a
+harmonic, tau = Y Xi the torques and e = tau / L the joint error that the PID needs for them,
 
     d(pose)/d(Xi) = -S Y,    d(pose)/d(lp, li, ld) = S (e, e / s, e s).
 
@@ -30,6 +25,7 @@ One period in the steady state counts for all, so the start of the run is left o
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -42,10 +38,18 @@ from dynamics.parameters import VISCOUS
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.estimation.scale_anchor import DEFAULT_STD, MEASURED_PARAMETER
+from identify.excitation.criteria import SMOOTHING_RAD_S, Criterion
 from identify.excitation.motion import Unknowns, log_determinant, sample_times, torque_regressor, tracked_motion
 from identify.loop_parameters import NAMES, StartingGuess, index_of, model_settings, starting_guess
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
+
+
+def information(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array) -> Criterion:
+    """D in the linearised loop, by which searches go; what they end in is judged by that of the simulated loop."""
+    known = knowledge(robot, scenario)
+    value, smooth = (log_linear_information(robot, unknowns, scenario, known, v) for v in (None, SMOOTHING_RAD_S))
+    return Criterion(value, smooth, judge=partial(log_information, robot, scenario, known))
 
 
 @dataclass(frozen=True)
@@ -146,7 +150,7 @@ HARMONICS_SEEN = 8
 def log_linear_information(
     robot: Robot, unknowns: Unknowns, scenario: Scenario, known: Knowledge, smoothing_rad_s: float | None = None
 ) -> ca.Function:
-    """z -> ln D in the linearised loop; `smoothing_rad_s` as in `criterion_observability`."""
+    """z -> ln D in the linearised loop; `smoothing_rad_s` as in `log_observability`."""
     z = ca.MX.sym("z", unknowns.size)
     rows = sensitivity_spectrum(robot, unknowns, scenario, known.guess.values, z, smoothing_rad_s)
     whitener = np.linalg.inv(np.linalg.cholesky(known.covariance))

@@ -1,6 +1,5 @@
-"""The unknowns of a smooth-start trajectory (eq. 37), and its motion as CasADi expressions of them.
+"""The unknowns of a smooth-start trajectory (eq. 37), and motion and regressors as CasADi expressions of them.
 
-The unknowns of a smooth-start trajectory (eq. 37), and the motion as a linear function of them.
 The conditions of a smooth start leave 2 (n - 1) free directions a pose component: n - 1 combinations of the sines with
 sum_l s_l = 0, and n - 1 of the cosines with sum_l l c_l = 0. With Z (6, 2 (n - 1)), without unit, and a box (6,)
 
@@ -24,17 +23,6 @@ from dynamics.rigid_body.virtual_work import rigid_body_regressor
 from identify.arrays import Array
 from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory, from_home
-
-# Logarithm of the determinant of a symmetric positive definite matrix as a CasADi function.
-
-
-@lru_cache(maxsize=4)
-def log_determinant(size: int) -> ca.Function:
-    """Matrix (size, size), of which the upper triangle is read -> ln det, by LDL^T; NaN where it is not positive."""
-    matrix = ca.SX.sym("matrix", size, size)
-    upper = ca.triu(matrix)
-    diagonal, _, _ = ca.ldl(upper + ca.triu(matrix, False).T, False)
-    return ca.Function("log_determinant", [matrix], [ca.sum1(ca.log(diagonal))])
 
 
 @dataclass(frozen=True)
@@ -93,9 +81,6 @@ def unknowns(home_pose: ArrayLike, settings: Excitation) -> Unknowns:
     """The unknowns of a scenario's excitation; the box is what its amplitudes allow."""
     box = np.repeat([settings.position_amplitude_m, settings.orientation_amplitude_rad], 3)
     return Unknowns(np.asarray(home_pose, dtype=float), box, settings.fundamental_hz, settings.harmonics)
-
-
-# The motion of a trajectory as CasADi expressions of its unknowns.
 
 
 SAMPLES_PER_HARMONIC = 20
@@ -179,3 +164,12 @@ def _regressor(robot: Robot, smoothing_rad_s: float | None, torque: bool) -> ca.
     else:
         whole = ca.horzcat(rigid, jacobian.T @ friction)
     return ca.Function("regressor", [pose, rate, acceleration], ca.cse([ca.densify(whole.T)]))
+
+
+@lru_cache(maxsize=4)
+def log_determinant(size: int) -> ca.Function:
+    """Matrix (size, size), of which the upper triangle is read -> ln det, by LDL^T; NaN where it is not positive."""
+    matrix = ca.SX.sym("matrix", size, size)
+    upper = ca.triu(matrix)
+    diagonal, _, _ = ca.ldl(upper + ca.triu(matrix, False).T, False)
+    return ca.Function("log_determinant", [matrix], [ca.sum1(ca.log(diagonal))])

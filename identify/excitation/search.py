@@ -1,12 +1,12 @@
-"""What the searches share, and the search by differential evolution, in the place of the paper's genetic algorithm.
+"""Searches for the trajectory that excites most: the best of random ones, differential evolution, and IPOPT.
 
-Exciting trajectory by differential evolution, in the place of the paper's genetic algorithm.
-A member of the population is scaled, a pose component at a time, until it fills the box, as a random trajectory is:
-its size is then no unknown any more, and no limit on the amplitude has to be found by chance. Among two members the
-admissible one wins, among two that are not the one that breaks its limits less.
+All maximise a criterion within the constraints of the motion, and begin with the same random candidates. To add one,
+write a function of the form `Search` and name it in `SEARCHES`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -15,12 +15,12 @@ from scipy.optimize import differential_evolution
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import MotionConstraints, Worst
-from identify.excitation.motion import SAMPLES_PER_HARMONIC, Unknowns, sample_times
-from identify.progress import Advance
+from identify.excitation.criteria import Criterion
+from identify.excitation.motion import SAMPLES_PER_HARMONIC, Unknowns, motion, sample_times
+from identify.progress import Progress
+from identify.runtime import honoured, one_thread, raise_noted
+from identify.scenario import Excitation
 from identify.trajectory import FourierTrajectory
-
-# What both searches share: the problem, its admissible candidates, and what a search found.
-
 
 CHECK_REFINEMENT = 8
 """How much finer constraints are checked in the end than while a search runs."""
@@ -31,12 +31,17 @@ CLEARANCE = (np.pi / (SAMPLES_PER_HARMONIC * CHECK_REFINEMENT)) ** 2 / 2
 
 @dataclass(frozen=True)
 class SearchProblem:
-    """Maximise `value` (z -> logarithm of a criterion) under `constraints`; `smooth` is `value` with derivatives."""
+    """Maximise a criterion of the unknowns z under constraints; candidates: z of random trajectories, best first."""
 
+    settings: Excitation
     unknowns: Unknowns
     constraints: MotionConstraints
-    value: ca.Function
-    smooth: ca.Function
+    criterion: Criterion
+    candidates: list[Array]
+
+    def value(self, z: Array) -> float:
+        """Logarithm of the criterion."""
+        return float(self.criterion.value(z))
 
     @property
     def times(self) -> Array:
@@ -90,6 +95,17 @@ class SearchResult:
         return problem.unknowns.trajectory(self.z)
 
 
+Search = Callable[[SearchProblem, np.random.SeedSequence, Progress], SearchResult]
+
+
+def best_of(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progress) -> SearchResult:
+    """The best random trajectory."""
+    best, count = problem.candidates[0], len(problem.candidates)
+    return SearchResult(best, problem.value(best), count, 0, 0, f"best of {count}")
+
+
+# Differential evolution, in the place of the paper's genetic algorithm.
+
 STALLED = 1e-10
 """The paper's stop criterion: spread of the population's values, relative."""
 
@@ -103,33 +119,36 @@ NOT_ADMISSIBLE = 1e6
 """Added to the cost of a member that breaks a limit, beyond any value of a criterion."""
 
 
-def evolve(
-    problem: SearchProblem,
-    population: list[Array],
-    generations: int,
-    rng: np.random.Generator,
-    advance: Advance = lambda n=1: None,
-) -> SearchResult:
-    """The best of `generations` generations that begin with the first of `population` (z); `advance` per generation.
+def evolve(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progress) -> SearchResult:
+    """What the generations of differential evolution find that begin with the best of the candidates.
 
-    `population` has at least FEWEST_MEMBERS; no more than MOST_MEMBERS take part.
+    A member of the population is scaled, a pose component at a time, until it fills the box, as a random trajectory is:
+    its size is then no unknown any more, and no limit on the amplitude has to be found by chance. Among two members the
+    admissible one wins, among two that are not the one that breaks its limits less.
+
+    Raises TrajectoryError where the candidates are too few.
     """
+    generations, candidates = problem.settings.generations, problem.candidates
+    if len(candidates) < FEWEST_MEMBERS:
+        raise TrajectoryError(
+            f"excitation.candidates = {len(candidates)}: the evolutionary method needs at least {FEWEST_MEMBERS}"
+        )
     filling = _Filling(problem)
-    start = np.array([_normalised(z, problem.unknowns.columns) for z in population[:MOST_MEMBERS]])
-    found = differential_evolution(
-        filling.cost,
-        bounds=[(-1.0, 1.0)] * problem.unknowns.size,
-        init=start,
-        maxiter=generations,
-        tol=STALLED,
-        polish=False,
-        recombination=RECOMBINATION,
-        rng=rng,
-        callback=lambda intermediate_result: advance(),
-    )
+    with progress.stage("evolutionary search", generations) as advance:
+        found = differential_evolution(
+            filling.cost,
+            bounds=[(-1.0, 1.0)] * problem.unknowns.size,
+            init=np.array([filling.member(z) for z in candidates[:MOST_MEMBERS]]),
+            maxiter=generations,
+            tol=STALLED,
+            polish=False,
+            recombination=RECOMBINATION,
+            rng=np.random.default_rng(seed),
+            callback=lambda intermediate_result: advance(),
+        )
     z = problem.drawn_in(filling.fill(found.x))
     reason = "values no longer spread" if found.success else f"{found.nit} generations"
-    return SearchResult(z, float(problem.value(z)), found.nfev, 0, found.nit, reason)
+    return SearchResult(z, problem.value(z), found.nfev, 0, found.nit, reason)
 
 
 class _Filling:
@@ -139,6 +158,11 @@ class _Filling:
         self._problem = problem
         self._offset, self._rate, _ = problem.unknowns.basis(problem.times)
         self._shares = problem.constraints.shares.map(len(problem.times))
+
+    def member(self, z: Array) -> Array:
+        """The member that z is, within -1 and 1."""
+        matrix = z.reshape(6, -1)
+        return np.asarray((matrix / np.abs(matrix).max(axis=1, keepdims=True)).ravel())
 
     def fill(self, member: Array) -> Array:
         """z of a member: each pose component scaled to fill the box."""
@@ -155,10 +179,109 @@ class _Filling:
         worst = float(np.abs(shares).max())
         if not worst <= 1:
             return NOT_ADMISSIBLE * (2 if np.isnan(worst) else 2 - 1 / worst)
-        value = float(self._problem.value(z))
+        value = self._problem.value(z)
         return -value if np.isfinite(value) else NOT_ADMISSIBLE
 
 
-def _normalised(z: Array, columns: int) -> Array:
-    matrix = z.reshape(6, columns)
-    return np.asarray((matrix / np.abs(matrix).max(axis=1, keepdims=True)).ravel())
+# IPOPT.
+
+MOST_ITERATIONS = 150
+
+TOLERANCE = 1e-4
+"""IPOPT's, relative: further digits of an optimum do not excite more."""
+
+INTERIOR = 0.98
+"""A start is drawn in to this share of the limits, where the interior-point method can move."""
+
+FAR = 0.5
+"""A limit of which a start uses less than this share is left out at first."""
+
+ALWAYS = "box"
+"""The limit that always counts: without it a criterion grows without end."""
+
+
+STARTS = 3
+"""Candidates from which IPOPT climbs."""
+
+
+@honoured()
+def climb(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progress) -> SearchResult:
+    """The best of what IPOPT finds from the best candidates, with exact derivatives of criterion and constraints.
+
+    The Hessian is approximated from gradients (limited memory): a criterion with 48 unknowns converges with it in some
+    tens of iterations, and an exact Hessian of a regressor costs more than it saves. Several starts, because the
+    criterion has many local optima. Limits that a start is far from are left out at first; those that the result breaks
+    are put in, and IPOPT climbs on. What goes over a limit between the instants of the constraints is drawn in towards
+    home until it is admissible at the finer instants of the check.
+
+    Raises TrajectoryError where no start is admissible, or IPOPT finds nothing from any of them, with its reasons.
+    """
+    starts, found, reasons = problem.candidates[:STARTS], [], []
+    with progress.stage("gradient search", len(starts)) as advance:
+        for start in starts:
+            result = _climb_from(problem, INTERIOR * problem.drawn_in(start))
+            reasons.append(result.reason)
+            if np.isfinite(result.log_value):
+                found.append(result)
+            advance()
+    if not found:
+        raise TrajectoryError(f"IPOPT found no trajectory from any of {len(starts)} starts: {', '.join(reasons)}")
+    judge = problem.criterion.judge
+    return max(found, key=lambda one: judge(one.trajectory(problem)) if judge else one.log_value)
+
+
+def _climb_from(problem: SearchProblem, z: Array) -> SearchResult:
+    """One climb; its value is -inf where IPOPT came to nothing."""
+    counted = {ALWAYS} | _used(problem, z, FAR)
+    values = gradients = iterations = 0
+    while True:
+        solver = _solver(problem, counted)
+        done, stats = _solve(solver, z)
+        values, gradients = values + int(stats["n_call_nlp_f"]), gradients + int(stats["n_call_nlp_grad_f"])
+        iterations, reason = iterations + int(stats["iter_count"]), str(stats["return_status"])
+        found = np.array(done["x"]).ravel()
+        if not np.isfinite(found).all() or not np.isfinite(float(done["f"])):
+            return SearchResult(z, -np.inf, values, gradients, iterations, reason)
+        broken = _used(problem, found, 1.0) - counted
+        admissible = problem.drawn_in(found)
+        if not broken:
+            return SearchResult(admissible, problem.value(admissible), values, gradients, iterations, reason)
+        counted, z = counted | broken, INTERIOR * admissible
+
+
+@one_thread
+def _solve(solver: ca.Function, z: Array) -> tuple[dict[str, ca.DM], dict[str, Any]]:
+    """What IPOPT finds from z, and its statistics."""
+    done = solver(x0=z, lbg=-1.0, ubg=1.0)
+    raise_noted()  # IPOPT takes Ctrl-C for an evaluation that failed
+    return done, solver.stats()
+
+
+def _used(problem: SearchProblem, z: Array, share: float) -> set[str]:
+    """Names of the limits of which z uses more than a share."""
+    return {worst.name for worst in problem.worst(z) if not worst.share <= share}
+
+
+def _solver(problem: SearchProblem, counted: set[str]) -> ca.Function:
+    """IPOPT for the problem with the limits `counted`, whose shares stay within -1 and 1."""
+    z = ca.MX.sym("z", problem.unknowns.size)
+    poses, rates, _ = motion(problem.unknowns, z, problem.times)
+    shares = problem.constraints.shares_of(counted).map(len(problem.times))(poses, rates)
+    options: dict[str, Any] = {
+        "print_time": False,
+        "ipopt": {
+            "print_level": 0,
+            "sb": "yes",
+            "hessian_approximation": "limited-memory",
+            "max_iter": MOST_ITERATIONS,
+            "tol": TOLERANCE,
+            "acceptable_tol": 10 * TOLERANCE,
+            "acceptable_iter": 5,
+        },
+    }
+    nlp: dict[str, Any] = {"x": z, "f": -problem.criterion.smooth(z), "g": ca.vec(shares)}
+    return ca.nlpsol("excitation", "ipopt", nlp, options)
+
+
+SEARCHES: dict[str, Search] = {"random": best_of, "evolutionary": evolve, "gradient": climb}
+"""The methods of a scenario, see `excitation.method`."""

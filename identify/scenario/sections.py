@@ -5,6 +5,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from identify.plugins import CRITERIA, check_choice
+
 # What a scenario may not claim of parameters and bodies: names that do not exist, and bodies that cannot.
 
 
@@ -148,11 +150,18 @@ class Excitation(Section):
     method: Literal["random", "evolutionary", "gradient"] = Field(
         "random", description="best random trajectory, differential evolution (the paper's kind), or IPOPT"
     )
-    criterion: Literal["observability", "information"] = Field(
-        "observability", description="eq. 39, or D-optimality of the output error's information"
+    criterion: str = Field(
+        "observability",
+        description="observability: eq. 39; information: D-optimality of the output error's; or module:function",
     )
     max_joint_velocity_rad_s: float = quantity(2.0, "rad/s", "largest velocity of a crank", gt=0)
     generations: int = quantity(324, "1", "generations of the evolutionary method (the paper: 324)", ge=1, le=100_000)
+
+    @field_validator("criterion")
+    @classmethod
+    def _can_be_found(cls, criterion: str) -> str:
+        check_choice(criterion, "criterion", CRITERIA, ValueError)
+        return criterion
 
 
 class Filter(Section):

@@ -1,5 +1,6 @@
 """Records of the reference robot with drawn measurement noise instead of images: fast, and with known statistics."""
 
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 
@@ -65,3 +66,16 @@ def run_plant(scenario, seed, sigma=SIGMA, lost=(), parameters=None, duration_s=
 
 def quick(**overrides):
     return load_scenario("quick").with_overrides(overrides)
+
+
+class Stages:
+    """Progress that keeps each stage's name, total and steps, one entry a call of its `advance`."""
+
+    def __init__(self):
+        self.seen = []
+
+    @contextmanager
+    def stage(self, name, total):
+        steps = []
+        self.seen.append((name, total, steps))
+        yield lambda n=1: steps.append(n)

@@ -1,38 +1,48 @@
+"""The trajectories of a run: what is chosen, and what it has to keep by the figures of robot and sensor themselves."""
+
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from dynamics import load_robot
-from identify.errors import TrajectoryError
+from cmmsim.visibility import sight_lines
+from dynamics.workspace import measure
+from identify.errors import ScenarioError, TrajectoryError
 from identify.excitation import design_trajectories
+from identify.excitation.constraints import MotionConstraints, check_periods, required_stickers, within_sight
 from identify.excitation.design import unseen_trajectories
 from identify.scenario import load_scenario
-from identify.trajectory import load_trajectories, save_trajectories
+from identify.trajectory import load_trajectories, random_trajectory, save_trajectories
+from tests.identify.synthetic import Stages, rss6
 
 QUICK = load_scenario("quick").with_overrides({"excitation.candidates": 4})
 
 
 @pytest.fixture(scope="module")
 def robot():
-    return load_robot("rss6")
+    return rss6()
+
+
+def quick(**overrides):
+    return QUICK.with_overrides({f"excitation.{key}": value for key, value in overrides.items()})
 
 
 @cache
-def designed(robot, seed=3, **overrides):
+def designed(seed=3, **overrides):
     """What is designed for `quick` with four candidates; a smaller number draws the first of them."""
-    return design_trajectories(robot, QUICK.with_overrides({f"excitation.{k}": v for k, v in overrides.items()}), seed)
+    return design_trajectories(rss6(), quick(**overrides), seed)
 
 
-def test_best_candidate_is_chosen(robot):
-    chosen, alone = designed(robot), designed(robot, candidates=1)
+def test_best_candidate_is_chosen():
+    chosen, alone = designed(), designed(candidates=1)
     assert chosen.observability_index >= chosen.median_index
     assert alone.observability_index == alone.first_index == pytest.approx(chosen.first_index, rel=1e-9)
     assert chosen.observability_index > alone.observability_index
 
 
-def test_seed_decides_everything_and_unseen_trajectories_are_others(robot):
-    a, b, c = designed(robot), designed.__wrapped__(robot), designed(robot, seed=4)
+def test_seed_decides_everything_and_unseen_trajectories_are_others():
+    a, b, c = designed(), designed.__wrapped__(), designed(seed=4)
     np.testing.assert_array_equal(a.excitation.sine, b.excitation.sine)
     np.testing.assert_array_equal(a.validation[1].sine, b.validation[1].sine)
     assert not np.allclose(a.excitation.sine, c.excitation.sine)
@@ -40,71 +50,131 @@ def test_seed_decides_everything_and_unseen_trajectories_are_others(robot):
     assert not any(np.allclose(a.excitation.sine, v.sine) for v in a.validation)
 
 
-def test_unseen_trajectories_do_not_depend_on_the_number_of_candidates(robot):
-    few, many = designed(robot, candidates=1), designed(robot)
-    np.testing.assert_array_equal(few.validation[0].sine, many.validation[0].sine)
+def test_unseen_trajectories_depend_neither_on_the_search_nor_on_its_candidates(robot):
+    for others in (designed(candidates=1).validation, unseen_trajectories(robot, QUICK, 3)):
+        for one, other in zip(designed().validation, others, strict=True):
+            np.testing.assert_array_equal(one.sine, other.sine)
+            np.testing.assert_array_equal(one.cosine, other.cosine)
 
 
-def test_unseen_trajectories_are_had_without_the_search(robot):
-    whole, alone = designed(robot), unseen_trajectories(robot, QUICK, 3)
-    assert len(alone) == 2
-    for one, other in zip(whole.validation, alone, strict=True):
-        np.testing.assert_array_equal(one.sine, other.sine)
-        np.testing.assert_array_equal(one.cosine, other.cosine)
-
-
-def test_run_too_short_to_show_every_parameter_has_no_index(robot):
+def test_run_too_short_to_show_every_parameter_has_no_index():
     """Six poses give 36 equations for the 37 base parameters, seven give enough."""
-    assert designed(robot, duration_s=0.6).observability_index == 0.0
-    assert designed(robot, duration_s=0.7).observability_index > 0.0
-
-
-def test_amplitude_beyond_the_travel_is_refused_with_the_reason(robot):
-    with pytest.raises(TrajectoryError, match=r"only 0 of 100 .*±0\.1 m.*(crank|leg) \d"):
-        designed(robot, seed=0, position_amplitude_m=0.1, candidates=2)
+    assert designed(duration_s=0.6).observability_index == 0.0
+    assert designed(duration_s=0.7).observability_index > 0.0
 
 
 def test_progress_reaches_its_total(robot):
-    from contextlib import contextmanager
-
-    seen = {}
-
-    class Counting:
-        @contextmanager
-        def stage(self, name, total):
-            seen[name] = [0, total]
-
-            def advance(n=1):
-                seen[name][0] += n
-
-            yield advance
-
-    design_trajectories(robot, QUICK, seed=0, progress=Counting())
-    assert seen == {"excitation": [4, 4]}
+    progress = Stages()
+    design_trajectories(robot, QUICK, 0, progress)
+    assert progress.seen == [("excitation", 4, [1] * 4)]
 
 
-def test_file_reads_back_equal(tmp_path, robot):
-    chosen = designed(robot)
-    save_trajectories(tmp_path / "trajectories.json", chosen)
-    again = load_trajectories(tmp_path / "trajectories.json")
-    t = np.linspace(0, 5, 20)
+def test_file_reads_back_equal_and_a_damaged_one_is_named(tmp_path):
+    chosen, path = designed(), tmp_path / "trajectories.json"
+    save_trajectories(path, chosen)
+    again, t = load_trajectories(path), np.linspace(0, 5, 20)
     np.testing.assert_array_equal(again.excitation.pose(t), chosen.excitation.pose(t))
     np.testing.assert_array_equal(again.validation[1].pose(t), chosen.validation[1].pose(t))
     assert (again.seed, again.observability_index) == (3, chosen.observability_index)
     assert [p.name for p in tmp_path.iterdir()] == ["trajectories.json"]
+    whole = path.read_text()
+    for damaged in (whole[: len(whole) // 2], whole.replace("offset", "offfset"), "[]"):
+        path.write_text(damaged)
+        with pytest.raises(TrajectoryError, match=r"trajectories\.json"):
+            load_trajectories(path)
+    with pytest.raises(TrajectoryError, match=r"nothing\.json"):
+        load_trajectories(tmp_path / "nothing.json")
+
+
+def trajectory_of(robot, seed=0, amplitudes=(0.01, 0.04)):
+    return random_trajectory(np.random.default_rng(seed), robot.home_pose, 0.1, 5, *amplitudes)
+
+
+def narrowed(sight, factor):
+    """The same rig with longer focal lengths."""
+    left, right = (replace(c, focal_px=factor * c.focal_px) for c in sight.rig.cameras)
+    return replace(sight, rig=replace(sight.rig, left=left, right=right))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_worst_is_what_the_robot_says(robot, seed):
+    trajectory, t = trajectory_of(robot, seed), np.arange(400) / 40
+    worst = {w.name: w for w in MotionConstraints(robot, QUICK).worst(trajectory, t)}
+    seen = measure(robot, trajectory.pose(t))
+    fine = 1e-4
+    rates = robot.inverse_kinematics(trajectory.pose(t + fine)) - robot.inverse_kinematics(trajectory.pose(t - fine))
+    assert worst["travel"].value == pytest.approx(np.abs(seen.theta).max(), rel=1e-9)
+    assert worst["travel"].limit == pytest.approx(robot.travel_limit - 0.1)
+    assert worst["leverage"].value == pytest.approx(seen.leverage.min(), rel=1e-9)
+    assert worst["velocity"].value == pytest.approx(np.abs(rates).max() / (2 * fine), rel=1e-5)
+    assert worst["conditioning"].value >= seen.platform_condition.max()
+    row, leg = np.unravel_index(np.abs(seen.theta).argmax(), seen.theta.shape)
+    assert (worst["travel"].who, worst["travel"].time_s) == (f"leg {leg + 1}", t[row])
 
 
 @pytest.mark.parametrize(
-    "damage", [lambda s: s[: len(s) // 2], lambda s: s.replace("offset", "offfset"), lambda s: "[]"]
+    ("key", "value", "message"),
+    [
+        ("travel_margin_rad", 0.8, r"travel of leg \d is 0\.\d+ rad at t = \d+\.\d+ s, limit 0\.1948 rad"),
+        ("max_joint_velocity_rad_s", 0.1, r"velocity of leg \d is 0\.\d+ rad/s at t = \d+\.\d+ s, limit 0\.1 rad/s"),
+        ("position_amplitude_m", 0.005, r"box of [xyz] is 0\.01 m at t = \d+\.\d+ s, limit 0\.005 m"),
+    ],
 )
-def test_damaged_file_is_named(tmp_path, robot, damage):
-    path = tmp_path / "trajectories.json"
-    save_trajectories(path, designed(robot))
-    path.write_text(damage(path.read_text()))
-    with pytest.raises(TrajectoryError, match=r"trajectories\.json"):
-        load_trajectories(path)
+def test_broken_limit_is_named_with_leg_value_limit_and_time(robot, key, value, message):
+    with pytest.raises(TrajectoryError, match=message):
+        MotionConstraints(robot, quick(**{key: value})).check(trajectory_of(robot), np.arange(400) / 40, 1e-3)
 
 
-def test_missing_file_is_named(tmp_path):
-    with pytest.raises(TrajectoryError, match=r"nothing\.json"):
-        load_trajectories(tmp_path / "nothing.json")
+@pytest.mark.parametrize(
+    ("overrides", "reason"),
+    [
+        ({"max_joint_velocity_rad_s": 0.01}, r"only 0 of 50 .*velocity of leg \d"),
+        ({"position_amplitude_m": 0.06}, r"only 0 of 50 .*±0\.06 m.*leg \d"),
+        ({"travel_margin_rad": 0.99, "method": "gradient"}, r"leg \d .*limit 0\.0048"),
+        ({"travel_margin_rad": 1.0}, r"travel_margin_rad = 1 rad leaves nothing of the travel limit 0\.9948"),
+    ],
+)
+def test_no_feasible_start_is_one_line_with_the_reason(overrides, reason):
+    with pytest.raises(TrajectoryError, match=reason) as error:
+        designed(seed=0, candidates=1, **overrides)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("duration_s", [5.0, 13.0])
+def test_run_that_cannot_end_at_rest_is_refused(duration_s):
+    with pytest.raises(TrajectoryError, match=rf"end at rest: excitation\.duration_s = .* is {duration_s / 10:g} per"):
+        check_periods(quick(duration_s=duration_s, method="gradient"))
+
+
+def test_a_criterion_that_does_not_exist_is_refused_with_the_valid_names():
+    with pytest.raises(ScenarioError, match="unknown criterion 'beauty'; valid: observability, information, or module"):
+        quick(criterion="beauty")
+
+
+def test_box_that_is_said_to_be_in_sight_is(robot):
+    sight, box = sight_lines("ctrack780"), np.repeat([0.01, 0.04], 3)
+    chosen = required_stickers(sight, robot.home_pose)
+    assert len(chosen) == 12
+    assert within_sight(sight, chosen, robot.home_pose, box)
+    for signs in np.random.default_rng(0).choice([-1.0, 1.0], (40, 6)):
+        assert sight.visible(robot.home_pose + signs * box)[chosen].all()
+
+
+def test_sight_counts_where_the_box_is_not_proved_to_be_in_it(robot):
+    """A narrow image: the shares that are within one are those of stickers that the cameras can look for."""
+    sight = narrowed(sight_lines("ctrack780"), 1.5)
+    constraints = MotionConstraints(robot, quick(position_amplitude_m=0.1), sight)
+    assert not constraints.always_in_sight
+    chosen = required_stickers(sight, robot.home_pose)
+    function, rng, lost = constraints.shares_of(["visibility"]), np.random.default_rng(1), 0
+    for offset in rng.uniform(-1, 1, (100, 6)) * np.repeat([0.1, 0.5], 3):
+        pose = robot.home_pose + offset
+        shares = np.array(function(pose, np.zeros(6))).reshape(len(chosen), -1)
+        np.testing.assert_array_equal((np.abs(shares) <= 1).all(axis=1), sight.visible(pose)[chosen])
+        lost += not sight.visible(pose)[chosen].all()
+    assert 10 < lost < 90
+
+
+def test_sensor_that_does_not_see_the_platform_is_named(robot):
+    with pytest.raises(TrajectoryError, match=r"visibility: both cameras can look for \d stickers of plane [ABC]"):
+        MotionConstraints(robot, QUICK, narrowed(sight_lines("ctrack780"), 12.0))

@@ -1,6 +1,5 @@
 """Multiple shooting: the segments of the right model make up its run, and a model that does not run is brought to."""
 
-from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 
@@ -14,7 +13,7 @@ from identify.estimation.multiple_shooting import STATES, MultipleShooting, end_
 from identify.estimation.output_error_search import output_error_searches, runnable_start, search, shoot
 from identify.loop_parameters import StartingGuess
 from identify.progress import SilentProgress
-from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
+from tests.identify.synthetic import SIGMA, Stages, quick, rss6, run_plant, truth
 
 SMOOTHED = {
     f"{side}.{key}": value
@@ -146,19 +145,6 @@ def test_a_model_that_no_segment_bears_is_named():
     hopeless = replace(problem, guess=replace(problem.guess, values=wild))
     with pytest.raises(EstimationError, match=r"nor does multiple shooting.*frame"):
         shoot(hopeless, scenario, wild, SilentProgress())
-
-
-class Stages:
-    """Progress that keeps each stage's name, total and steps, one entry a call of its `advance`."""
-
-    def __init__(self):
-        self.seen = []
-
-    @contextmanager
-    def stage(self, name, total):
-        steps = []
-        self.seen.append((name, total, steps))
-        yield lambda n=1: steps.append(n)
 
 
 def test_the_bar_moves_with_every_iteration_and_ends_full():

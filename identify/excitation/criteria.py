@@ -1,8 +1,12 @@
-"""The paper's observability index (eq. 39) as a function of the unknowns of a trajectory, with exact derivatives.
+"""Criteria of exciting trajectories: what one is, and the paper's, the observability index (eq. 39).
 
-The index is the geometric mean of the singular values of H over sqrt(m). Of the 64 columns of H only those of the base
-parameters are independent: H = H_1 C with H_1 the pivot columns and C the base combinations (rank, 64), so the product
-of the singular values that are not zero is sqrt(det(H_1^T H_1) det(C C^T)), whichever pivots were chosen:
+A criterion is a function (robot, scenario, unknowns, typical) -> Criterion, named in `identify.plugins` or given as
+``module:function``. `typical` is the z of a trajectory that excites everything, from which it may take its scale.
+
+The observability index is the geometric mean of the singular values of H over sqrt(m). Of the 64 columns of H only
+those of the base parameters are independent: H = H_1 C with H_1 the pivot columns and C the base combinations
+(rank, 64), so the product of the singular values that are not zero is sqrt(det(H_1^T H_1) det(C C^T)), whichever
+pivots were chosen:
 
     ln O_in = (ln det(H_1^T H_1) + ln det(C C^T)) / (2 rank) - ln(m) / 2.
 
@@ -15,6 +19,9 @@ H_1^T H_1 well conditioned. One period is sampled where a run plays whole ones: 
 number. Another run is sampled from its start to its end.
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import casadi as ca
 import numpy as np
 from scipy.linalg import qr, solve_triangular
@@ -23,9 +30,40 @@ from dynamics import Robot
 from identify.arrays import Array
 from identify.estimation.base_parameters import base_parameters, structural_regressor
 from identify.excitation.motion import Unknowns, log_determinant, motion, played_times, wrench_regressor
+from identify.plugins import CRITERIA, chosen
+from identify.scenario import Scenario
+from identify.trajectory import FourierTrajectory
 
 SMOOTHING_RAD_S = 0.02
 """v_s in tanh(theta_dot / v_s) where derivatives are asked for: as much as a velocity changes between two samples."""
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """What searches maximise: value, z -> its logarithm; smooth, as value, but with derivatives everywhere.
+
+    judge: what ranks the few trajectories that a gradient search ends in, where there is something better than value;
+    larger is better, and TrajectoryError where a trajectory cannot be judged.
+    """
+
+    value: ca.Function
+    smooth: ca.Function
+    judge: Callable[[FourierTrajectory], float] | None = None
+
+
+def criterion_of(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array) -> Criterion:
+    """The scenario's criterion. Raises ScenarioError, with the valid names, where there is none of its name."""
+    made: Criterion = chosen(scenario.excitation.criterion, "excitation.criterion", CRITERIA)(
+        robot, scenario, unknowns, typical
+    )
+    return made
+
+
+def observability(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array) -> Criterion:
+    """The observability index (eq. 39) of the run that the scenario plays."""
+    duration_s = scenario.excitation.duration_s
+    value, smooth = (log_observability(robot, unknowns, duration_s, typical, v) for v in (None, SMOOTHING_RAD_S))
+    return Criterion(value, smooth)
 
 
 def log_observability(
