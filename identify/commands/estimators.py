@@ -20,7 +20,12 @@ HEADER = ("estimator", "groups\n%", "median\n%", "gains\n%", "pos.\num", "ori.\n
 def estimators(
     out: Annotated[Path, typer.Option("--out", help="Folder of a whole run: cmmsim run.")],
     only: Annotated[
-        list[str] | None, typer.Option(help="Name of an estimator; repeatable.", show_default="all")
+        list[str] | None,
+        typer.Option(help="Name of an estimator, or module:function of one's own; repeatable.", show_default="all"),
+    ] = None,
+    add: Annotated[
+        list[str] | None,
+        typer.Option(help="Estimator of one's own beside these, as module:function; repeatable.", show_default="none"),
     ] = None,
     torque_noise: Annotated[float, typer.Option(min=0, help="Standard deviation of a measured torque, N m.")] = 0.02,
     encoder_noise: Annotated[float, typer.Option(min=0, help="Standard deviation of a joint angle, rad.")] = 1e-5,
@@ -33,9 +38,10 @@ def estimators(
     The paper's output error beside its variants and beside what the literature does with measured joint torques and
     encoders (inverse dynamics; poses from the camera, or by forward kinematics). The run has no such instruments: they
     are simulated from its truth, with the noise given here. Where the PID is known it has the true gains. All are
-    judged by the truth of the record and of the unseen trajectories.
+    judged by the truth of the record and of the unseen trajectories. An estimator of one's own is a function of the
+    evidence, see identify.estimators.estimator.
     """
-    from identify.estimators.registry import choose
+    from identify.estimators.estimator import find_estimators
     from identify.experiment.joint_instruments import JointInstruments
     from identify.record.provenance import check_folder
     from identify.validation.estimator_comparison import estimators_figure
@@ -44,7 +50,7 @@ def estimators(
     folder.require("scenario.toml", "experiment.nc", "validation.nc")
     check_folder(folder, "experiment.nc", "validation.nc")
     instruments = JointInstruments(torque_noise, encoder_noise, 2 * math.pi / 2**encoder_bits)
-    chosen = choose(only)
+    chosen = find_estimators(only) | (find_estimators(add) if add else {})
     scores = _scores(folder, instruments, chosen, seed, quiet)
     entry = {"seed": seed, "instruments": asdict(instruments), "estimators": {s.name: _entry(s) for s in scores}}
     save_files(out, {"estimators.json": entry, "figures/estimators.png": estimators_figure(scores)})
@@ -59,7 +65,7 @@ def _scores(
 
     from dynamics import load_robot
     from identify.estimation.identification import output_error_problem
-    from identify.estimators.evidence import Evidence, joint_channels
+    from identify.estimators.estimator import Evidence, joint_channels
     from identify.experiment.joint_instruments import measure_joints, read_channels, write_channels
     from identify.experiment.truth import read_truth, read_truth_runs, true_parameters
     from identify.loop_parameters import NAMES

@@ -75,6 +75,11 @@ class Uncertainty:
     misfit: Misfit
     unstable: int = 0
 
+    @property
+    def std(self) -> Array:
+        """Standard deviations (67,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)), dtype=float)
+
     def warnings(self) -> tuple[str, ...]:
         """A misfit that the sensor's noise does not explain, and a model whose loop is close to unstable."""
         if not self.unstable:

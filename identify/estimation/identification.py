@@ -16,7 +16,6 @@ from dynamics import DynamicsError, Robot
 from dynamics.closed_loop.problem import checked_loop_parameters
 from identify.arrays import Array
 from identify.errors import EstimationError, ScenarioError
-from identify.estimation import warm_start
 from identify.estimation.base_parameters import Conditioning
 from identify.estimation.bounded_least_squares import Solution
 from identify.estimation.covariance import DRAWS, Uncertainty, estimate_uncertainty
@@ -25,6 +24,7 @@ from identify.estimation.identifiability import GroupEstimates, Judgement, judge
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor
+from identify.estimation.warm_start import linear_warm_start
 from identify.loop_parameters import NAMES, StartingGuess, starting_guess
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
@@ -99,7 +99,7 @@ def identify(
     problem = output_error_problem(records, robot, scenario)
     rng = mixed_generator(UNCERTAINTY, recorded_seed(records[0]))
     began = time.perf_counter()
-    warm = warm_start.linear_warm_start(problem.runs, scenario.timing, scenario.filter, problem.guess, problem.anchor)
+    warm = linear_warm_start(problem, scenario)
     warmed = time.perf_counter()
     searches = output_error_searches(problem, scenario, warm, progress)
     searched = time.perf_counter()

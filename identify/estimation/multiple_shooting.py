@@ -1,12 +1,9 @@
 """Multiple shooting: the record in short segments, for models that do not run through the whole of it.
 
-A record cut into short segments, through each of which the model runs from a state of its own.
-The model is driven by the logged commands. Its state is what it then starts from: pose, pose rate and joint PID
-integral.
-
-A model that is unstable, or that leaves the reachable set, has no output error over a record. Over half a second it has
-one, where each segment starts from its own state. These states are unknowns beside the parameters, and each segment
-must end where the next starts, up to what the sensor can see, so that in the optimum the segments make up one run.
+A model that is unstable, or that leaves the reachable set, has no output error over a record. Driven by the logged
+commands it has one over half a second, where each segment starts from a state of its own: pose, pose rate and joint PID
+integral. These states are unknowns beside the parameters, and each segment must end where the next starts, up to what
+the sensor can see, so that in the optimum the segments make up one run.
 
 In the linearised problem the states form a chain. They are eliminated one after the other by QR, which leaves a problem
 in the parameters alone (condensing; Bock and Plitt, "A multiple shooting algorithm for direct solution of optimal
@@ -26,7 +23,7 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.warm_start import effective_command, running_integral
 from identify.filtering import filtered_derivatives
 from identify.record.recorded_run import RecordedRun
-from identify.scenario import Filter, Timing
+from identify.scenario import Scenario
 
 SEGMENT_S = 0.5
 """Length of a segment: a few periods of the joint loop, in which an unstable one does not leave the reachable set."""
@@ -101,13 +98,13 @@ def segments(run: RecordedRun) -> list[Segment]:
     ]
 
 
-def measured_states(chain: list[Segment], parameters: Array, timing: Timing, filtering: Filter) -> Array:
+def measured_states(chain: list[Segment], parameters: Array, scenario: Scenario) -> Array:
     """States (segments, 18) at the starts of a run's segments: filtered poses and rates, and what the joint PID has
     integrated since the start, where it held the model of parameters (67,) at rest."""
-    run = chain[0].run
-    pose, rate, _ = filtered_derivatives(run.without_gaps(), timing.frame_rate_hz, filtering.cutoff_hz, filtering.order)
-    _, _, command_integral = effective_command(run.logged, timing, filtering)
-    angle_integral = running_integral(run.robot.inverse_kinematics(pose), timing.frame_rate_hz)
+    run, rate_hz, filtering = chain[0].run, scenario.timing.frame_rate_hz, scenario.filter
+    pose, rate, _ = filtered_derivatives(run.without_gaps(), rate_hz, filtering.cutoff_hz, filtering.order)
+    _, _, command_integral = effective_command(run.logged, scenario)
+    angle_integral = running_integral(run.robot.inverse_kinematics(pose), rate_hz)
     rest = equilibrium(run.robot, parameters + run.payload, run.reference.poses[0], run.settings.servo)
     states = np.hstack([pose, rate, rest.joint_integral + command_integral - angle_integral])
     return np.asarray(states[[part.first for part in chain]], dtype=float)

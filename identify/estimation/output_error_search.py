@@ -66,7 +66,7 @@ def shoot(problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress
     criteria = StopCriteria(CLOSE_ENOUGH, settings.parameter_tolerance, settings.max_iterations)
     chains = [segments(run) for run in problem.runs]
     for start in _candidates(problem, scenario, warm):
-        states = [measured_states(chain, start, scenario.timing, scenario.filter) for chain in chains]
+        states = [measured_states(chain, start, scenario) for chain in chains]
         shooting = MultipleShooting(problem, chains, states)
         if not np.isfinite(shooting.cost(start)):
             continue

@@ -18,11 +18,12 @@ from scipy.optimize import lsq_linear
 
 from dynamics import Robot
 from identify.arrays import Array
+from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.filtering import filtered_derivatives, zero_phase_filter
 from identify.loop_parameters import NAMES, StartingGuess
 from identify.record.recorded_run import RecordedRun
-from identify.scenario import Filter, Timing
+from identify.scenario import Scenario
 
 EDGE_FRACTION = 0.02
 """Share of the record left out at either end, where filtered derivatives are poor."""
@@ -34,28 +35,26 @@ REWEIGHTINGS = 3
 """Solutions of the fit: each takes the size of the residual from the one before."""
 
 
-def linear_warm_start(
-    runs: Sequence[RecordedRun], timing: Timing, filtering: Filter, guess: StartingGuess, anchor: ScaleAnchor
-) -> Array:
-    """Parameters (67,) fitted to the measured poses and commands of one or several runs.
+def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
+    """Parameters (67,) fitted to the measured poses and commands of the problem's runs.
 
     Each run has its own starting torques; what a known payload adds stands on the right side. The residual's size is
     estimated from the fit itself, so that the starting guess counts as much as it should.
     """
-    matrix, right = _stacked(runs, timing, filtering)
+    matrix, right = _stacked(problem.runs, scenario)
     lower = np.concatenate([np.zeros(len(NAMES)), np.full(matrix.shape[1] - len(NAMES), -np.inf)])
     noise = 0.1
     for _ in range(REWEIGHTINGS):
-        solution = bounded_fit(matrix / noise, right / noise, guess, anchor, lower)
+        solution = bounded_fit(matrix / noise, right / noise, problem.guess, problem.anchor, lower)
         noise = max(float(np.sqrt(np.mean((matrix @ solution - right) ** 2))), 1e-9)
     return np.maximum(solution[: len(NAMES)], 0.0)
 
 
-def _stacked(runs: Sequence[RecordedRun], timing: Timing, filtering: Filter) -> tuple[Array, Array]:
+def _stacked(runs: Sequence[RecordedRun], scenario: Scenario) -> tuple[Array, Array]:
     """Equations of all runs: matrix (rows, 67 + 6 runs) and right side (rows,), N m."""
     matrices, right = [], []
     for place, run in enumerate(runs):
-        columns = regression_columns(run.robot, run.without_gaps(), run.logged, timing, filtering)
+        columns = regression_columns(run.robot, run.without_gaps(), run.logged, scenario)
         matrix = np.zeros((len(columns), len(NAMES) + 6 * len(runs)))
         matrix[:, : len(NAMES)] = columns[:, : len(NAMES)]
         matrix[:, len(NAMES) + 6 * place :][:, :6] = columns[:, len(NAMES) :]
@@ -64,28 +63,28 @@ def _stacked(runs: Sequence[RecordedRun], timing: Timing, filtering: Filter) -> 
     return np.concatenate(matrices), np.concatenate(right)
 
 
-def regression_columns(robot: Robot, measured: Array, commands: Array, timing: Timing, filtering: Filter) -> Array:
+def regression_columns(robot: Robot, measured: Array, commands: Array, scenario: Scenario) -> Array:
     """Homogeneous regression (rows, 73) of the joints that slip, see `joint_balance`; N m."""
-    columns, slipping = joint_balance(robot, measured, commands, timing, filtering)
+    columns, slipping = joint_balance(robot, measured, commands, scenario)
     return columns[slipping]
 
 
 def joint_balance(
-    robot: Robot, measured: Array, commands: Array, timing: Timing, filtering: Filter
+    robot: Robot, measured: Array, commands: Array, scenario: Scenario
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Torque balance of every joint (N, 6, 73) of poses (N, 6) and commands (N, 6), and where it slips (N, 6).
 
     Columns: 64 dynamic parameters, which give the joint's torque, then lp, li, ld and the six starting torques, which
     give the controller's with the opposite sign; N m per unit of each.
     """
-    rate_hz = timing.frame_rate_hz
-    pose, pose_rate, acceleration = filtered_derivatives(measured, rate_hz, filtering.cutoff_hz, filtering.order)
+    rate_hz, cutoff_hz, order = scenario.timing.frame_rate_hz, scenario.filter.cutoff_hz, scenario.filter.order
+    pose, pose_rate, acceleration = filtered_derivatives(measured, rate_hz, cutoff_hz, order)
     twist, twist_dot = robot.twist(pose, pose_rate), robot.twist_dot(pose, pose_rate, acceleration)
     regressor = robot.regressor(pose, twist, twist_dot)
     torque_map = np.linalg.inv(robot.joint_jacobian(pose)).transpose(0, 2, 1)
     angle = robot.inverse_kinematics(pose)
     velocity = np.einsum("nij,nj->ni", robot.joint_jacobian(pose), twist)
-    command, command_rate, integral = effective_command(commands, timing, filtering)
+    command, command_rate, integral = effective_command(commands, scenario)
     angle_integral = running_integral(angle, rate_hz)
     count = len(measured)
     start = np.broadcast_to(-np.eye(6), (count, 6, 6))
@@ -97,11 +96,12 @@ def joint_balance(
     return columns, slipping
 
 
-def effective_command(commands: Array, timing: Timing, filtering: Filter) -> tuple[Array, Array, Array]:
+def effective_command(commands: Array, scenario: Scenario) -> tuple[Array, Array, Array]:
     """Filtered command as the joints feel it, its rate as the joint PID sees it, and its integral, at the frames.
 
     A held command lags by half a frame, a ramped one by a whole frame; U_dot is the difference of two commands, held.
     """
+    timing, filtering = scenario.timing, scenario.filter
     rate_hz, period = timing.frame_rate_hz, timing.frame_period_s
     smooth = zero_phase_filter(commands, rate_hz, filtering.cutoff_hz, filtering.order)
     times = np.arange(len(commands)) * period

@@ -1,6 +1,5 @@
 """Inverse dynamics by least squares: measured torque, ordinary and weighted; or crank angles from encoders.
 
-Equations of a run with measured joint torques: linear in the dynamic parameters, and in the joint PID's.
 With tau the filtered torque of a slipping joint, at every instant (eq. 17 and 25; eq. 31)
 
     (J_ad^-T Gamma(chi, v, v_dot) Xi)_j = tau_j
@@ -9,13 +8,9 @@ With tau the filtered torque of a slipping joint, at every instant (eq. 17 and 2
 Both stand in one system with the unknowns Xi, lp, li, ld and the starting torques z (6,). The measured torque gives
 the scale: no anchor is needed. What the motion does not show is left to the starting guess with its deviations.
 
-Inverse dynamics with measured torque by least squares: ordinary, and weighted by what each joint leaves unexplained.
 Noise in the poses gets into the regression matrix through both derivatives, which draws the estimates towards zero: no
-number of samples removes that bias. Weights: Gautier, "Dynamic identification of robots with power model", ICRA 1997.
-
-The conventional route: crank angles from encoders, poses from forward kinematics, then inverse dynamics.
-Forward kinematics of a parallel robot has no closed form: Newton's method solves all instants at once, each from the
-desired pose there, which the robot is never far from. Knows nothing of the camera.
+number of samples removes that bias. Weights, from what each joint leaves unexplained: Gautier, "Dynamic identification
+of robots with power model", ICRA 1997.
 """
 
 import time
@@ -30,11 +25,11 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.estimation.warm_start import REWEIGHTINGS, bounded_fit, joint_balance
-from identify.estimators.evidence import Estimate, Evidence
+from identify.estimators.estimator import Estimate, Evidence, estimator
 from identify.filtering import zero_phase_filter
 from identify.loop_parameters import NAMES, StartingGuess
 from identify.record.recorded_run import RecordedRun
-from identify.scenario import Filter, Timing
+from identify.scenario import Scenario
 
 DYNAMIC, UNKNOWNS = 64, len(NAMES) + 6
 
@@ -66,16 +61,12 @@ class TorqueEquations:
 
 
 def torque_equations(
-    run: RecordedRun,
-    poses: Array,
-    torque: Array,
-    timing: Timing,
-    filtering: Filter,
-    slipping: NDArray[np.bool_] | None = None,
+    run: RecordedRun, poses: Array, torque: Array, scenario: Scenario, slipping: NDArray[np.bool_] | None = None
 ) -> TorqueEquations:
     """Equations of poses (N, 6) and torques (N, 6) of a run with its logged commands; those of the joints that slip, or
     of the ones given (N, 6)."""
-    balance, found = joint_balance(run.robot, poses, run.logged, timing, filtering)
+    timing, filtering = scenario.timing, scenario.filter
+    balance, found = joint_balance(run.robot, poses, run.logged, scenario)
     rows = found if slipping is None else slipping
     columns = balance[rows]
     smooth = zero_phase_filter(torque, timing.frame_rate_hz, filtering.cutoff_hz, filtering.order)[rows]
@@ -88,38 +79,72 @@ def torque_equations(
     return TorqueEquations(matrix, right, np.concatenate([joint, joint + 6]), correlation, rows)
 
 
+LOWER = np.concatenate([np.zeros(len(NAMES)), np.full(6, -np.inf)])
+"""Bounds (73,): parameters and gains are not negative, starting torques are free."""
+
+
 def prior_of(guess: StartingGuess) -> tuple[Array, Array]:
     """Values (73,) and standard deviations (73,) of the unknowns before the experiment."""
-    values = np.concatenate([guess.values, np.zeros(6)])
-    return values, np.concatenate([guess.std, np.full(6, FREE_TORQUE_N_M)])
-
-
-def lower_bounds() -> Array:
-    """Lower bounds (73,): parameters and gains are not negative, starting torques are free."""
-    return np.concatenate([np.zeros(len(NAMES)), np.full(6, -np.inf)])
+    return np.append(guess.values, np.zeros(6)), np.append(guess.std, np.full(6, FREE_TORQUE_N_M))
 
 
 def nearest_admissible(unknowns: Array, information: Array, scale: Array) -> Array:
     """Unknowns (73,) within their bounds that are nearest in the metric of the information matrix (73, 73)."""
-    lower = lower_bounds()
-    if (unknowns >= lower).all():
+    if (unknowns >= LOWER).all():
         return unknowns
     factor = np.linalg.cholesky(information * np.outer(scale, scale)).T
-    solved = lsq_linear(factor, factor @ (unknowns / scale), bounds=(lower / scale, np.inf), method="bvls")
-    return np.maximum(solved.x * scale, lower)
+    solved = lsq_linear(factor, factor @ (unknowns / scale), bounds=(LOWER / scale, np.inf), method="bvls")
+    return np.maximum(solved.x * scale, LOWER)
 
 
 SMALLEST_NOISE_N_M = 1e-9
 
 
+@estimator("torque, LS", uses="poses, torque")
 def least_squares(evidence: Evidence) -> Estimate:
     """Ordinary least squares: all joints count alike."""
-    return _from_poses(evidence, weighted=False)
+    return _solved(evidence, time.perf_counter(), weighted=False)
 
 
+@estimator("torque, weighted LS", uses="poses, torque")
 def weighted_least_squares(evidence: Evidence) -> Estimate:
     """Least squares weighted by the residual of each joint."""
-    return _from_poses(evidence, weighted=True)
+    return _solved(evidence, time.perf_counter(), weighted=True)
+
+
+@estimator("encoders, weighted LS", uses="encoders, torque")
+def encoder_route(evidence: Evidence) -> Estimate:
+    """Weighted least squares on the poses that the encoders give, by forward kinematics: the conventional route.
+
+    Forward kinematics of a parallel robot has no closed form: Newton's method solves all instants at once, each from
+    the desired pose there, which the robot is never far from. Knows nothing of the camera. The note says what it took.
+    Raises EstimationError where the angles belong to no pose near the desired one.
+    """
+    began, run = time.perf_counter(), evidence.run
+    try:
+        poses = run.robot.forward_kinematics(evidence.joint_channels().angle, run.reference.poses)
+    except DynamicsError as error:
+        raise EstimationError(f"the encoders' angles give no poses: {error}") from None
+    note = f"forward kinematics of {len(poses)} frames: {time.perf_counter() - began:.3f} s"
+    return replace(_solved(evidence, began, weighted=True, poses=poses), note=note)
+
+
+def _solved(evidence: Evidence, began: float, weighted: bool, poses: Array | None = None) -> Estimate:
+    """The estimate of a fit that began at `began` (`time.perf_counter`), from the measured poses or others (N, 6)."""
+    equations, guess = measured_equations(evidence, poses), evidence.problem.guess
+    unknowns, noise = fit_equations(equations, guess, weighted)
+    seconds = time.perf_counter() - began
+    covariance = np.asarray(np.linalg.inv(information(equations.whitened(noise), guess)), dtype=float)
+    return Estimate(unknowns[: len(NAMES)], standard_deviations(covariance), seconds, REWEIGHTINGS)
+
+
+def measured_equations(evidence: Evidence, poses: Array | None = None) -> TorqueEquations:
+    """Equations of the measured torque and poses, or of other poses (N, 6).
+
+    Raises EstimationError where the record has no torque.
+    """
+    run, torque = evidence.run, evidence.joint_channels().torque
+    return torque_equations(run, run.without_gaps() if poses is None else poses, torque, evidence.scenario)
 
 
 def fit_equations(equations: TorqueEquations, guess: StartingGuess, weighted: bool) -> tuple[Array, Array]:
@@ -131,7 +156,7 @@ def fit_equations(equations: TorqueEquations, guess: StartingGuess, weighted: bo
     noise = np.full(len(equations.right), 0.1)
     for _ in range(REWEIGHTINGS):
         rows = equations.whitened(noise)
-        unknowns = bounded_fit(rows.matrix, rows.right, guess, ScaleAnchor("prior"), lower_bounds())
+        unknowns = bounded_fit(rows.matrix, rows.right, guess, ScaleAnchor("prior"), LOWER)
         noise = row_noise(equations, unknowns, groups)
     return unknowns, noise
 
@@ -152,38 +177,3 @@ def information(rows: TorqueEquations, guess: StartingGuess) -> Array:
 def standard_deviations(covariance: Array) -> Array:
     """Standard deviations (67,) of the parameters from a covariance (73, 73) of the unknowns."""
     return np.asarray(np.sqrt(np.diag(covariance))[: len(NAMES)], dtype=float)
-
-
-def solved(equations: TorqueEquations, guess: StartingGuess, weighted: bool, began: float) -> Estimate:
-    """The estimate of a least-squares fit that began at `began` (`time.perf_counter`)."""
-    unknowns, noise = fit_equations(equations, guess, weighted)
-    seconds = time.perf_counter() - began
-    covariance = np.asarray(np.linalg.inv(information(equations.whitened(noise), guess)), dtype=float)
-    std = standard_deviations(covariance)
-    return Estimate(unknowns[: len(NAMES)], std, seconds, REWEIGHTINGS, 0)
-
-
-def _from_poses(evidence: Evidence, weighted: bool) -> Estimate:
-    began = time.perf_counter()
-    run, scenario = evidence.run, evidence.scenario
-    torque = evidence.joint_channels().torque
-    equations = torque_equations(run, run.without_gaps(), torque, scenario.timing, scenario.filter)
-    return solved(equations, evidence.problem.guess, weighted, began)
-
-
-def encoder_route(evidence: Evidence) -> Estimate:
-    """Weighted least squares on the poses that the encoders give; the note says what forward kinematics took.
-
-    Raises EstimationError where the angles belong to no pose near the desired one.
-    """
-    began = time.perf_counter()
-    run, scenario, channels = evidence.run, evidence.scenario, evidence.joint_channels()
-    try:
-        poses = run.robot.forward_kinematics(channels.angle, run.reference.poses)
-    except DynamicsError as error:
-        raise EstimationError(f"the encoders' angles give no poses: {error}") from None
-    took = time.perf_counter() - began
-    equations = torque_equations(run, poses, channels.torque, scenario.timing, scenario.filter)
-    estimate = solved(equations, evidence.problem.guess, True, began)
-    note = f"forward kinematics of {len(poses)} frames: {took:.3f} s"
-    return replace(estimate, note=note)

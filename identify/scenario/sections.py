@@ -152,7 +152,7 @@ class Excitation(Section):
     )
     criterion: str = Field(
         "observability",
-        description="observability: eq. 39; information: D-optimality of the output error's; or module:function",
+        description="eq. 39, D-optimality of the output error's information, or module:function",
     )
     max_joint_velocity_rad_s: float = quantity(2.0, "rad/s", "largest velocity of a crank", gt=0)
     generations: int = quantity(324, "1", "generations of the evolutionary method (the paper: 324)", ge=1, le=100_000)

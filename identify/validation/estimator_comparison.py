@@ -25,8 +25,7 @@ from identify.errors import EstimationError
 from identify.estimation.base_parameters import base_parameters, structural_regressor
 from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identifiability import IDENTIFIABLE_SHARE, group_estimates, identifiability
-from identify.estimators.evidence import Evidence
-from identify.estimators.registry import Estimator
+from identify.estimators.estimator import Estimate, Estimator, Evidence
 from identify.experiment.truth import true_poses
 from identify.files.run_folder import rms_figures, rms_row
 from identify.progress import Progress
@@ -117,46 +116,42 @@ def compare(
 ) -> list[Score]:
     """One score for the starting guess and each estimator; one that fails has its reason in the note."""
     guess = evidence.problem.guess
-    scores = [_score(START, START, "", asked, guess.values, guess.std, 0.0, 0, 0, "")]
+    scores = [_score(START, Estimator(START, "", lambda given: Estimate(guess.values, guess.std)), evidence, asked)]
     with progress.stage("estimators", len(estimators)) as advance:
         for name, estimator in estimators.items():
-            scores.append(_examined(name, estimator, evidence, asked))
+            scores.append(_score(name, estimator, evidence, asked))
             advance()
     return scores
 
 
-def _examined(name: str, estimator: Estimator, evidence: Evidence, asked: Examination) -> Score:
+def _score(name: str, estimator: Estimator, evidence: Evidence, asked: Examination) -> Score:
     try:
-        found = estimator.estimate(evidence)
+        found = estimator(evidence)
     except (EstimationError, DynamicsError) as error:
         nothing = (np.nan, np.nan, np.nan, np.nan, np.nan, np.nan)
         return Score(name, estimator.title, estimator.uses, *nothing, 0, 0, f"failed: {error}")
-    counts = (found.seconds, found.iterations, found.evaluations)
-    return _score(name, estimator.title, estimator.uses, asked, found.parameters, found.std, *counts, found.note)
-
-
-def _score(
-    name: str,
-    title: str,
-    uses: str,
-    asked: Examination,
-    parameters: Array,
-    std: Array | None,
-    seconds: float,
-    iterations: int,
-    evaluations: int,
-    note: str,
-) -> Score:
-    groups, gains = asked.group_errors(parameters), asked.gain_errors(parameters)
-    distances = (_rms(groups), float(np.median(np.abs(groups))), _rms(gains), *asked.pose_distance(parameters))
-    return Score(name, title, uses, *distances, seconds, iterations, evaluations, note, parameters, std)
+    groups, gains = asked.group_errors(found.parameters), asked.gain_errors(found.parameters)
+    position_um, orientation_urad = asked.pose_distance(found.parameters)
+    return Score(
+        name=name,
+        title=estimator.title,
+        uses=estimator.uses,
+        group_distance=_rms(groups),
+        group_median=float(np.median(np.abs(groups))),
+        gain_distance=_rms(gains),
+        position_um=position_um,
+        orientation_urad=orientation_urad,
+        seconds=found.seconds,
+        iterations=found.iterations,
+        evaluations=found.evaluations,
+        note=found.note,
+        parameters=found.parameters,
+        std=found.std,
+    )
 
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-# Figure of the estimators: distances of parameters and poses, and time, one point each.
 
 
 PANELS = (

@@ -65,7 +65,7 @@ def problem(record, scenario):
 @pytest.fixture(scope="module")
 def start(problem, scenario):
     """The linear warm start, a little inside the bounds, where scipy's solver can move."""
-    warm = linear_warm_start(problem.runs, scenario.timing, scenario.filter, problem.guess, problem.anchor)
+    warm = linear_warm_start(problem, scenario)
     return np.maximum(warm, lower_bounds(problem) + INSIDE * problem.guess.std)
 
 

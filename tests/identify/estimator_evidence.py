@@ -3,7 +3,7 @@
 import numpy as np
 
 from identify.estimation.identification import output_error_problem
-from identify.estimators.evidence import Evidence, joint_channels
+from identify.estimators.estimator import Evidence, joint_channels
 from identify.experiment.joint_instruments import JointInstruments, measure_joints
 from identify.experiment.truth import build_truth
 from identify.loop_parameters import NAMES

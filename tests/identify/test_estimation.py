@@ -7,10 +7,10 @@ from dynamics.closed_loop import equilibrium, simulate
 from identify.errors import EstimationError, RecordError
 from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identification import identify, output_error_problem
-from identify.estimation.scale_anchor import ScaleAnchor, read_anchor, store_anchor
+from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.estimation.warm_start import linear_warm_start, regression_columns
 from identify.experiment.plant import build_plant, drawn_load
-from identify.loop_parameters import NAMES, model_settings, starting_guess
+from identify.loop_parameters import NAMES, model_settings
 from identify.record.payload import store_payload
 from identify.record.recorded_run import recorded_run
 from identify.scenario import load_scenario
@@ -42,7 +42,7 @@ def test_warm_start_equation_holds_for_the_true_parameters(scenario):
     parameters = truth()
     parameters[52:58] = 0
     _, run = run_plant(scenario, 0, np.zeros(6), parameters=parameters)
-    columns = regression_columns(rss6(), run.pose, run.command, scenario.timing, scenario.filter)
+    columns = regression_columns(rss6(), run.pose, run.command, scenario)
     start = equilibrium(rss6(), parameters, run.pose[0], build_plant(scenario, rss6()).settings.servo)
     unknowns = np.concatenate([parameters, start.joint_integral * parameters[65]])
     balance = columns @ unknowns
@@ -51,10 +51,9 @@ def test_warm_start_equation_holds_for_the_true_parameters(scenario):
 
 def test_warm_start_is_ten_times_closer_than_the_starting_guess(scenario):
     record, _ = run_plant(scenario, seed=1)
-    guess = starting_guess(rss6(), "initial", 1.0)
-    runs = [recorded_run(record, rss6(), scenario)]
-    warm = linear_warm_start(runs, scenario.timing, scenario.filter, guess, read_anchor(record))
-    before, after = unseen_error(scenario, guess.values), unseen_error(scenario, warm)
+    problem = output_error_problem([record], rss6(), scenario)
+    warm = linear_warm_start(problem, scenario)
+    before, after = unseen_error(scenario, problem.guess.values), unseen_error(scenario, warm)
     assert np.all(after < before / 10), (before, after)
 
 

@@ -6,19 +6,18 @@ import numpy as np
 import pytest
 
 from identify.errors import EstimationError, RecordError, ScenarioError
-from identify.estimators.evidence import Evidence, joint_channels
-from identify.estimators.instrumental_variables import instrumental_variables, iv_fit
+from identify.estimators.errors_in_variables import instrumental_variables, iv_fit, total_least_squares, truncated_tls
+from identify.estimators.estimator import joint_channels
 from identify.estimators.least_squares import (
+    LOWER,
     UNKNOWNS,
     TorqueEquations,
     encoder_route,
     least_squares,
-    lower_bounds,
     nearest_admissible,
     torque_equations,
     weighted_least_squares,
 )
-from identify.estimators.total_least_squares import total_least_squares, truncated_tls
 from identify.experiment.joint_instruments import (
     JointInstruments,
     frame_mean,
@@ -35,6 +34,17 @@ from tests.identify.synthetic import quick, rss6, run_plant, truth
 LD = NAMES.index("joint_pid.ld")
 
 
+@pytest.fixture(scope="module")
+def short():
+    """Record of two seconds, run of the plant, and what joint instruments read of it."""
+    record, run = run_plant(quick(), 0, duration_s=2.0)
+
+    def measured(instruments, seed=0):
+        return measure_joints(record, truth_of(run), quick().timing, instruments, np.random.default_rng(seed))
+
+    return record, run, measured
+
+
 @pytest.mark.parametrize(
     "timing",
     [{}, {"timing.latency_s": 1 / 60}, {"timing.latency_s": 0.25 / 60}, {"timing.hold": "linear"}],
@@ -44,12 +54,12 @@ def test_the_mean_torque_of_a_frame_is_that_of_the_motion(timing):
     """The true parameters explain the mean torque of the smooth motion; single samples sit on the sawtooth's tooth."""
     scenario = quick(**timing)
     record, run = run_plant(scenario, 0, np.zeros(6), duration_s=5.0)
-    problem = evidence_run(record, scenario)
+    problem = recorded_run(record, rss6(), scenario)
     latencies = np.full(len(run.torque), scenario.timing.latency_s)
     mean = frame_mean(run.torque, run.command, run.start.commands[-1], truth()[[64, 66]], scenario.timing, latencies)
     left = {}
     for name, torque in (("mean", mean), ("sample", run.torque)):
-        equations = torque_equations(problem, run.pose, torque, scenario.timing, scenario.filter)
+        equations = torque_equations(problem, run.pose, torque, scenario)
         dynamics = equations.kind < 6
         left[name] = np.sqrt(np.mean(equations.residual(np.append(truth(), np.zeros(6)))[dynamics] ** 2))
     assert left["mean"] < 1.5e-3
@@ -73,10 +83,6 @@ def test_jumps_are_averaged_whenever_they_come():
     mean = np.array([np.mean([torque(k + s) for s in fine]) for k in range(2, 48)])
     found = frame_mean(samples, command, np.zeros(6), np.array([2.0, 0.0]), quick().timing, latencies)
     assert np.abs(found[2:48, 0] - mean).max() < 5e-3
-
-
-def evidence_run(record, scenario):
-    return recorded_run(record, rss6(), scenario)
 
 
 def test_without_noise_torque_gives_gains_and_coulomb_friction():
@@ -167,7 +173,7 @@ def test_the_nearest_admissible_unknowns_have_no_negative_parameter():
     outside = inside.copy()
     outside[5] = -0.3
     found = nearest_admissible(outside, root.T @ root, np.ones(UNKNOWNS))
-    assert np.all(found >= lower_bounds())
+    assert np.all(found >= LOWER)
     assert found[5] == 0
     gradient = root.T @ root @ (found - outside)
     free = found > 1e-9
@@ -185,71 +191,49 @@ def test_total_least_squares_and_the_encoder_route_agree_with_least_squares_wher
         assert np.all(estimate.std > 0)
 
 
-def test_encoders_give_the_true_poses_through_forward_kinematics():
-    record, run = run_plant(quick(), 0, duration_s=2.0)
-    channels = measure_joints(record, truth_of(run), quick().timing, PERFECT, np.random.default_rng(0))
-    problem = evidence_run(record, quick())
-    poses = rss6().forward_kinematics(channels["joint_angle"].values, problem.reference.poses)
+def test_encoders_give_the_true_poses_through_forward_kinematics(short):
+    record, run, measured = short
+    reference = recorded_run(record, rss6(), quick()).reference.poses
+    poses = rss6().forward_kinematics(measured(PERFECT)["joint_angle"].values, reference)
     assert np.abs(poses - run.pose).max() < 1e-10
 
 
-def test_the_encoder_rounds_and_the_channels_are_seeded():
-    record, run = run_plant(quick(), 0, duration_s=2.0)
-    instruments = JointInstruments(0.05, 1e-4, 1e-3)
-    one, same, other = (
-        measure_joints(record, truth_of(run), quick().timing, instruments, np.random.default_rng(seed))
-        for seed in (1, 1, 2)
-    )
+def test_the_encoder_rounds_and_the_channels_are_seeded(short):
+    _, _, measured = short
+    one, same, other = (measured(JointInstruments(0.05, 1e-4, 1e-3), seed) for seed in (1, 1, 2))
     assert one.equals(same)
     assert not np.array_equal(one["joint_torque"], other["joint_torque"])
     steps = one["joint_angle"].values / 1e-3
     assert np.abs(steps - np.round(steps)).max() < 1e-9
-    clean = measure_joints(record, truth_of(run), quick().timing, PERFECT, np.random.default_rng(0))
-    spread = (one["joint_torque"] - clean["joint_torque"]).values.std()
+    spread = (one["joint_torque"] - measured(PERFECT)["joint_torque"]).values.std()
     assert spread == pytest.approx(0.05, rel=0.1)
 
 
-def test_channels_survive_the_file_and_bad_ones_are_named(tmp_path):
-    record, run = run_plant(quick(), 0, duration_s=2.0)
-    channels = measure_joints(record, truth_of(run), quick().timing, JointInstruments(), np.random.default_rng(0))
-    path = tmp_path / "instruments.nc"
+def test_channels_survive_the_file_and_bad_ones_are_named(short, tmp_path):
+    record, _, measured = short
+    channels, path = measured(JointInstruments()), tmp_path / "instruments.nc"
     write_channels(path, channels)
     assert read_channels(path).equals(channels)
     assert joint_channels(read_channels(path), record).torque_std == 0.02
     with pytest.raises(RecordError, match=r"120 frames up to .* the record 60"):
         joint_channels(channels, record.isel(time=slice(0, 60)))
-    write_groups(path, {"": channels.drop_vars("joint_torque")})
-    with pytest.raises(RecordError, match="lacks joint_torque"):
-        read_channels(path)
-    write_groups(path, {"": channels.assign_attrs(channels.attrs).drop_attrs()})
-    with pytest.raises(RecordError, match="attributes torque_noise_N_m"):
-        read_channels(path)
-    write_groups(path, {"": channels.where(channels["time"] > 0.5)})
-    with pytest.raises(RecordError, match=r"values of joint_torque are not finite"):
-        read_channels(path)
-
-
-@pytest.mark.parametrize("bad", [-1.0, np.nan, np.inf])
-def test_impossible_instruments_are_refused(bad):
+    for bad, says in (
+        (channels.drop_vars("joint_torque"), "lacks joint_torque"),
+        (channels.drop_attrs(), "attributes torque_noise_N_m"),
+        (channels.where(channels["time"] > 0.5), "values of joint_torque are not finite"),
+    ):
+        write_groups(path, {"": bad})
+        with pytest.raises(RecordError, match=says):
+            read_channels(path)
     with pytest.raises(ScenarioError, match=r"encoder_noise_rad is .*finite number >= 0"):
-        JointInstruments(encoder_noise_rad=bad)
+        JointInstruments(encoder_noise_rad=np.nan)
 
 
 def test_angles_that_no_pose_has_are_said():
     seen = evidence(1)
-    broken = joint_channels_like(seen, angle=np.full_like(seen.channels.angle, 2.0))
+    broken = replace(seen.channels, angle=np.full_like(seen.channels.angle, 2.0))
     with pytest.raises(EstimationError, match="angles give no poses"):
-        encoder_route(broken)
-
-
-def joint_channels_like(seen, **changes):
-    return replace(seen, channels=replace(seen.channels, **changes))
-
-
-def test_an_estimator_says_that_it_needs_torques():
-    seen = evidence(1)
-    with pytest.raises(EstimationError, match="needs a measured torque"):
-        least_squares(Evidence(seen.problem, seen.scenario))
+        encoder_route(replace(seen, channels=broken))
 
 
 @pytest.mark.slow

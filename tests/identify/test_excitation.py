@@ -11,8 +11,9 @@ from dynamics.workspace import measure
 from identify.errors import ScenarioError, TrajectoryError
 from identify.excitation import design_trajectories
 from identify.excitation.constraints import MotionConstraints, check_periods, required_stickers, within_sight
-from identify.excitation.design import unseen_trajectories
-from identify.scenario import load_scenario
+from identify.excitation.design import motion_check, random_candidates, unseen_trajectories
+from identify.excitation.motion import unknowns
+from identify.scenario import load_scenario, scenario_from_toml
 from identify.trajectory import load_trajectories, random_trajectory, save_trajectories
 from tests.identify.synthetic import Stages, rss6
 
@@ -149,6 +150,29 @@ def test_run_that_cannot_end_at_rest_is_refused(duration_s):
 def test_a_criterion_that_does_not_exist_is_refused_with_the_valid_names():
     with pytest.raises(ScenarioError, match="unknown criterion 'beauty'; valid: observability, information, or module"):
         quick(criterion="beauty")
+
+
+def test_a_criterion_of_ones_own_is_given_as_module_function(tmp_path, monkeypatch, robot):
+    """Of all candidates the smallest is chosen by a function of the user's that is named nowhere else."""
+    (tmp_path / "mine.py").write_text(
+        "import casadi as ca\n"
+        "from identify.excitation.criteria import Criterion\n"
+        "def smallness(robot, scenario, unknowns, typical):\n"
+        "    z = ca.MX.sym('z', unknowns.size)\n"
+        "    value = ca.Function('smallness', [z], [-ca.log(ca.sumsqr(z))])\n"
+        "    return Criterion(value, smooth=value)\n",
+        encoding="utf-8",
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    scenario = quick(criterion="mine:smallness")
+    free = unknowns(robot.home_pose, scenario.excitation)
+    chosen = design_trajectories(robot, scenario, 3).excitation
+    drawn = random_candidates(robot, scenario, 4, 3, motion_check(robot, scenario))
+    sizes = [np.linalg.norm(free.of(trajectory)) for trajectory in drawn]
+    assert np.linalg.norm(free.of(chosen)) == pytest.approx(min(sizes))
+    assert scenario_from_toml(scenario.to_toml()) == scenario
+    with pytest.raises(ScenarioError, match="excitation.criterion 'mine:beauty' is no importable module:function"):
+        design_trajectories(robot, quick(criterion="mine:beauty"), 3)
 
 
 def test_box_that_is_said_to_be_in_sight_is(robot):

@@ -34,7 +34,7 @@ def recorded(duration_s, changes=None, **how):
 
 def started(scenario, problem, parameters):
     chain = segments(problem.runs[0])
-    return MultipleShooting(problem, [chain], [measured_states(chain, parameters, scenario.timing, scenario.filter)])
+    return MultipleShooting(problem, [chain], [measured_states(chain, parameters, scenario)])
 
 
 def test_segments_from_the_true_states_make_up_the_run():
@@ -54,7 +54,7 @@ def test_states_are_measured_to_what_the_filter_leaves():
     """Poses to the sensor's noise, and the integral of the joint PID to 2 mrad s of the 0.2 that hold the robot."""
     scenario, problem, run = recorded(5.0)
     chain = segments(problem.runs[0])
-    states = measured_states(chain, truth(), scenario.timing, scenario.filter)
+    states = measured_states(chain, truth(), scenario)
     true = np.hstack([run.pose, run.pose_rate, run.joint_integral])[[part.first for part in chain]]
     error = np.abs(states - true)[1:]
     assert np.all(error[:, :6] < 5 * SIGMA)

@@ -74,7 +74,7 @@ def test_the_optimum_does_not_depend_on_the_starting_guess(recorded, spread):
     excess, apart = [], []
     for seed in range(STARTS):
         problem = replace(stated, guess=drawn_guess(spread, seed))
-        warm = linear_warm_start(problem.runs, scenario.timing, scenario.filter, problem.guess, problem.anchor)
+        warm = linear_warm_start(problem, scenario)
         found = output_error_searches(problem, scenario, warm, SilentProgress())["closed_loop"]
         assert "max_iterations" not in found.stop_reason
         from_truth = search(problem, truth(), scenario, silent)

@@ -1,5 +1,11 @@
-"""What an estimator is given, and what it gives back."""
+"""What an estimator is: what it is given, what it gives back, and all of them by name.
 
+An estimator is a function (evidence) -> Estimate, named in `identify.plugins` or given as ``module:function``; the
+decorator `estimator` says in words what it is.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +14,7 @@ import xarray as xr
 from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
 from identify.estimation.output_error import OutputErrorProblem
+from identify.plugins import ESTIMATORS, check_choice, chosen, is_own
 from identify.record.recorded_run import RecordedRun
 from identify.scenario import Scenario
 
@@ -51,10 +58,45 @@ class Estimate:
 
     parameters: Array
     std: Array | None
-    seconds: float
-    iterations: int
-    evaluations: int
+    seconds: float = 0.0
+    iterations: int = 0
+    evaluations: int = 0
     note: str = ""
+
+
+@dataclass(eq=False)
+class Estimator:
+    """An estimator: what it is in words, what it uses beside the commands, and the function, as which it is called."""
+
+    title: str
+    uses: str
+    estimate: Callable[[Evidence], Estimate]
+
+    def __post_init__(self) -> None:
+        functools.update_wrapper(self, self.estimate)
+
+    def __call__(self, evidence: Evidence) -> Estimate:
+        """The function's estimate. Raises EstimationError, or dynamics.DynamicsError, where there is none."""
+        return self.estimate(evidence)
+
+
+def estimator(title: str, uses: str) -> Callable[[Callable[[Evidence], Estimate]], Estimator]:
+    """Decorator that makes an estimator of a function."""
+    return functools.partial(Estimator, title, uses)
+
+
+def find_estimators(names: Sequence[str] | None = None) -> dict[str, Estimator]:
+    """The built-in estimators of these names, or all, in the order of their table; then those of a user's own.
+
+    Raises ScenarioError for one that does not exist, with the valid names, or cannot be imported.
+    """
+    for name in names or ():
+        check_choice(name, "estimator", ESTIMATORS)
+    wanted = [name for name in ESTIMATORS if not names or name in names] + [
+        name for name in names or () if is_own(name)
+    ]
+    found = {name: chosen(name, "estimator", ESTIMATORS) for name in wanted}
+    return {name: one if isinstance(one, Estimator) else Estimator(name, "", one) for name, one in found.items()}
 
 
 def joint_channels(channels: xr.Dataset, record: xr.Dataset) -> JointChannels:
