@@ -171,7 +171,7 @@ def test_a_criterion_of_ones_own_is_given_as_module_function(tmp_path, monkeypat
     sizes = [np.linalg.norm(free.of(trajectory)) for trajectory in drawn]
     assert np.linalg.norm(free.of(chosen)) == pytest.approx(min(sizes))
     assert scenario_from_toml(scenario.to_toml()) == scenario
-    with pytest.raises(ScenarioError, match="excitation.criterion 'mine:beauty' is no importable module:function"):
+    with pytest.raises(ScenarioError, match="criterion 'mine:beauty' is no importable module:function"):
         design_trajectories(robot, quick(criterion="mine:beauty"), 3)
 
 
