@@ -16,8 +16,8 @@ from identify.accuracy.saved import read_saved
 from identify.accuracy.session import markdown_table
 from identify.commands import app as command_line
 from identify.commands.app import app
-from identify.estimators.registry import ESTIMATORS
 from identify.files.run_folder import load_result
+from identify.plugins import ESTIMATORS
 from identify.reporting.goals import check_goals
 from identify.reporting.tables import excitation_error_table, goals_table
 from tests.identify.synthetic import SIGMA, quick, run_plant, truth
