@@ -1,7 +1,11 @@
-"""Figures like the paper's 11, 12 and 13 and those of the errors, for print (PNG), with units on every axis."""
+"""What the figures of a run show, and the figures themselves for print (PNG): the paper's 11, 12, 13 and the errors.
+
+The report draws the same with plotly (`report_plots`).
+"""
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,10 +17,88 @@ from identify.reporting.goals import VALIDATION_UM, VALIDATION_URAD, is_friction
 
 COMPONENTS = ("x", "y", "z", "α", "β", "γ")
 LETTERS = ("(a)", "(b)", "(c)", "(d)", "(e)", "(f)")
+BLACK, GREEN, BLUE, RED = "black", "#2ca02c", "#1f77b4", "#d62728"
+
 BAND = 2.0
 """Predicted standard deviations drawn around an error of zero: 95 % of true errors lie within."""
 
-MEASURED, INITIAL, IDENTIFIED, TRUE = "black", "tab:green", "tab:blue", "tab:red"
+BAND_NAME = f"predicted ± {BAND:g} std"
+
+
+class Curve(NamedTuple):
+    """Values (N,) over time in the unit of their panel, as dots or as a line."""
+
+    name: str
+    values: Array
+    colour: str
+    dots: bool = False
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What was measured of a run over its time (N,) [s], and what models do: poses (N, 6) [m, rad].
+
+    NaN where a measurement was lost or a model has diverged. initial: of the starting model; std: predicted deviation
+    of the truth from the identified model.
+    """
+
+    time: Array
+    measured: Array
+    identified: Array
+    initial: Array | None = None
+    truth: Array | None = None
+    std: Array | None = None
+
+    def pose_curves(self, i: int) -> list[Curve]:
+        """Component i, in mm or mrad: measurement and models."""
+        curves = [("measured", self.measured, BLACK, True), ("identified model", self.identified, BLUE, False)]
+        if self.initial is not None:
+            curves.insert(1, ("starting model", self.initial, GREEN, False))
+        return [Curve(name, 1e3 * poses[:, i], colour, dots) for name, poses, colour, dots in curves]
+
+    def error_curves(self, i: int) -> list[Curve]:
+        """Errors of the identified model in component i, in um or urad, against measurement and truth."""
+        curves = [Curve("measured − identified", 1e6 * (self.measured - self.identified)[:, i], BLACK, dots=True)]
+        if self.truth is not None:
+            curves.append(Curve("true − identified", 1e6 * (self.truth - self.identified)[:, i], RED))
+        return curves
+
+    def pose_range(self, i: int) -> tuple[float, float]:
+        """Range of the measurement, widened for the models by half at most: an unstable one must not hide the rest."""
+        measured, *models = (curve.values[np.isfinite(curve.values)] for curve in self.pose_curves(i))
+        low, high = measured.min(), measured.max()
+        reach, every = (high - low) / 2 or 1.0, np.concatenate([measured, *models])
+        low, high = max(low - reach, every.min()), min(high + reach, every.max())
+        margin = 0.05 * (high - low) or 1.0
+        return low - margin, high + margin
+
+    def rms_text(self, i: int) -> str:
+        """RMS of the models against the measurement in component i."""
+        counted = np.isfinite(self.measured).all(axis=1)
+        models = [model for model in (self.initial, self.identified) if model is not None]
+        values = [rms_row(rms_figures(self.measured - model, counted))[i] for model in models]
+        unit = "um" if i < 3 else "urad"
+        return "RMS " + " → ".join(f"{value:.3g} {unit}" if np.isfinite(value) else "diverged" for value in values)
+
+
+class RelativeErrors(NamedTuple):
+    """Names, and in per cent of the truth: error and reach of the 95 % interval below and above the estimate, (n,)."""
+
+    names: list[str]
+    error: Array
+    below: Array
+    above: Array
+
+
+def relative_errors(parameters: dict[str, dict[str, Any]]) -> RelativeErrors:
+    """Of the identifiable parameters of a result whose truth is known; no reach where there is no interval."""
+    shown = {n: p for n, p in parameters.items() if p["identifiable"] and p["true"] and p["estimate"] is not None}
+    rows = [(p["true"], p["estimate"], *(p.get("interval") or 2 * [p["estimate"]])) for p in shown.values()]
+    true, estimate, low, high = np.array(rows, dtype=float).reshape(-1, 4).T
+    percent = 100 / np.abs(true)
+    return RelativeErrors(
+        list(shown), percent * (estimate - true), percent * (estimate - low), percent * (high - estimate)
+    )
 
 
 def excitation_figure(time: Array, poses: Array, title: str = "Exciting trajectory") -> Figure:
@@ -36,31 +118,37 @@ def excitation_figure(time: Array, poses: Array, title: str = "Exciting trajecto
     return figure
 
 
-def fit_figure(
-    time: Array,
-    measured: Array,
-    initial: Array | None,
-    identified: Array,
-    title: str,
-    truth: Array | None = None,
-    std: Array | None = None,
-) -> Figure:
-    """Measured (black dots), starting (green) and identified (blue) model, with the errors below; like figure 12, 13.
-
-    Poses are (N, 6) [m, rad]; NaN where a measurement was lost or a model has diverged. Where the ``truth`` is given,
-    the model's error against it is drawn in red, and where ``std`` (N, 6) is, the band of ± 2 predicted deviations.
-    """
+def fit_figure(fit: Fit, title: str) -> Figure:
+    """Measured (black dots), starting (green) and identified (blue) model, errors below; like figure 12, 13."""
     figure = Figure(figsize=(13, 12), layout="constrained")
     axes = figure.subplots(4, 3, sharex=True)
     for i in range(6):
-        _fit_panel(axes[i // 3, i % 3], time, measured, initial, identified, i)
-        _error_panel(axes[2 + i // 3, i % 3], time, measured, initial, identified, truth, std, i)
-    for column in range(3):
-        axes[3, column].set_xlabel("time [s]")
-    axes[0, 0].legend(loc="upper right", fontsize="small")
-    axes[2, 0].legend(loc="upper right", fontsize="small")
+        above, below = axes[i // 3, i % 3], axes[2 + i // 3, i % 3]
+        _draw(above, fit.time, fit.pose_curves(i))
+        above.set_ylim(*fit.pose_range(i))
+        above.set_title(f"{LETTERS[i]} {COMPONENTS[i]}")
+        above.set_ylabel(f"{COMPONENTS[i]} [{'mm' if i < 3 else 'mrad'}]")
+        _draw(below, fit.time, fit.error_curves(i))
+        if fit.std is not None:
+            band = BAND * 1e6 * fit.std[:, i]
+            below.fill_between(fit.time, -band, band, color=RED, alpha=0.15, linewidth=0, label=BAND_NAME)
+        below.set_title(f"error, {fit.rms_text(i)}", fontsize="small")
+        below.set_ylabel(f"error of {COMPONENTS[i]} [{'um' if i < 3 else 'urad'}]")
+    for panel in axes[3]:
+        panel.set_xlabel("time [s]")
+    for panel in axes[::2, 0]:
+        panel.legend(loc="upper right", fontsize="small")
     figure.suptitle(title)
     return figure
+
+
+SIZES: dict[str, Any] = {"markersize": 2.5, "linewidth": 1}
+
+
+def _draw(axes: Axes, time: Array, curves: Sequence[Curve]) -> None:
+    for curve in curves:
+        axes.plot(time, curve.values, "." if curve.dots else "-", color=curve.colour, label=curve.name, **SIZES)
+    axes.grid(alpha=0.3)
 
 
 def validation_figure(validation: list[dict[str, Any]]) -> Figure:
@@ -89,32 +177,24 @@ def validation_figure(validation: list[dict[str, Any]]) -> Figure:
 
 def parameter_figure(parameters: dict[str, dict[str, Any]]) -> Figure:
     """Relative error of every identifiable parameter with its 95 % interval, friction and gains apart."""
-    shown = {name: p for name, p in parameters.items() if p["identifiable"] and p["true"] and p["estimate"] is not None}
-    groups = (
-        ("friction and joint controller", [n for n in shown if is_friction_or_pid(n)]),
-        ("mass and inertia", [n for n in shown if not is_friction_or_pid(n)]),
-    )
-    figure = Figure(figsize=(11, max(5.0, 0.28 * max(len(names) for _, names in groups))), layout="constrained")
-    for axes, (title, names) in zip(figure.subplots(1, 2), groups, strict=True):
-        true = np.array([abs(shown[n]["true"]) for n in names])
-        error = np.array([shown[n]["estimate"] - shown[n]["true"] for n in names])
-        bars = np.array([interval_bars(shown[n]) for n in names]).reshape(-1, 2).T
-        rows = np.arange(len(names))
-        axes.axvspan(-5, 5, color="tab:green", alpha=0.1)
+    groups = {
+        "friction and joint controller": {n: p for n, p in parameters.items() if is_friction_or_pid(n)},
+        "mass and inertia": {n: p for n, p in parameters.items() if not is_friction_or_pid(n)},
+    }
+    shown = {title: relative_errors(group) for title, group in groups.items()}
+    height = max(5.0, 0.28 * max(len(found.names) for found in shown.values()))
+    figure = Figure(figsize=(11, height), layout="constrained")
+    for axes, (title, found) in zip(figure.subplots(1, 2), shown.items(), strict=True):
+        rows = np.arange(len(found.names))
+        axes.axvspan(-5, 5, color=GREEN, alpha=0.1)
         axes.axvline(0, color="black", linewidth=1)
-        axes.errorbar(100 * error / true, rows, xerr=100 * bars / true, fmt="o", color=IDENTIFIED, capsize=3)
-        axes.set_yticks(rows, names, fontsize="small")
+        axes.errorbar(found.error, rows, xerr=(found.below, found.above), fmt="o", color=BLUE, capsize=3)
+        axes.set_yticks(rows, found.names, fontsize="small")
         axes.invert_yaxis()
         axes.set_xlabel("estimate − truth, bars: 95 % interval [%]")
         axes.set_title(title)
         axes.grid(alpha=0.3, axis="x")
     return figure
-
-
-def interval_bars(parameter: dict[str, Any]) -> tuple[float, float]:
-    """How far an entry's interval goes below and above its estimate; zeros where it has none."""
-    low, high = parameter.get("interval") or (parameter["estimate"], parameter["estimate"])
-    return parameter["estimate"] - low, high - parameter["estimate"]
 
 
 def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
@@ -132,50 +212,3 @@ def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
     axes.set_title("Correlation of the identified parameters")
     figure.colorbar(image, ax=axes, label="correlation [1]", shrink=0.8)
     return figure
-
-
-def _fit_panel(axes: Axes, time: Array, measured: Array, initial: Array | None, identified: Array, i: int) -> None:
-    unit = "mm" if i < 3 else "mrad"
-    axes.plot(time, 1e3 * measured[:, i], ".", color=MEASURED, markersize=2.5, label="measured")
-    bottom, top = axes.get_ylim()
-    if initial is not None:
-        axes.plot(time, 1e3 * initial[:, i], color=INITIAL, linewidth=1, label="starting model")
-        half = (top - bottom) / 2  # an unstable starting model must not hide the rest
-        low, high = axes.get_ylim()
-        axes.set_ylim(max(low, bottom - half), min(high, top + half))
-    axes.plot(time, 1e3 * identified[:, i], color=IDENTIFIED, linewidth=1, label="identified model")
-    axes.set_title(f"{LETTERS[i]} {COMPONENTS[i]}")
-    axes.set_ylabel(f"{COMPONENTS[i]} [{unit}]")
-    axes.grid(alpha=0.3)
-
-
-def _error_panel(
-    axes: Axes,
-    time: Array,
-    measured: Array,
-    initial: Array | None,
-    identified: Array,
-    truth: Array | None,
-    std: Array | None,
-    i: int,
-) -> None:
-    unit = "um" if i < 3 else "urad"
-    error = 1e6 * (measured - identified)[:, i]
-    axes.plot(time, error, ".", color=MEASURED, markersize=2, label="measured − identified")
-    if truth is not None:
-        axes.plot(time, 1e6 * (truth - identified)[:, i], color=TRUE, linewidth=1, label="true − identified")
-    if std is not None:
-        band = BAND * 1e6 * std[:, i]
-        axes.fill_between(time, -band, band, color=TRUE, alpha=0.15, linewidth=0, label=f"predicted ± {BAND:g} std")
-    axes.set_title(f"error, {_rms_text(measured, initial, identified, i)}", fontsize="small")
-    axes.set_ylabel(f"error of {COMPONENTS[i]} [{unit}]")
-    axes.grid(alpha=0.3)
-
-
-def _rms_text(measured: Array, initial: Array | None, identified: Array, i: int) -> str:
-    def rms(model: Array) -> str:
-        value = rms_row(rms_figures(measured - model, np.isfinite(measured).all(axis=1)))[i]
-        return f"{value:.3g} {'um' if i < 3 else 'urad'}" if np.isfinite(value) else "diverged"
-
-    before = "" if initial is None else f"{rms(initial)} → "
-    return f"RMS {before}{rms(identified)}"

@@ -1,7 +1,7 @@
 """The report of a run: PNG figures and one HTML file, built from sections, that opens without a network."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from identify.progress import Progress, SilentProgress
 from identify.record.provenance import RECORDS, check_made_of
 from identify.record.recording import EXCITATION, poses, read, read_model_runs, read_runs, run_name
 from identify.reporting import figures, report_plots, tables
+from identify.reporting.figures import Fit
 from identify.reporting.goals import check_goals
 from identify.reporting.run_result import check_intervals
 from identify.reporting.tables import INDEX_BEST, INDEX_FIRST, Table
@@ -41,6 +42,35 @@ class ReportData:
     models: Mapping[str, xr.Dataset]
     covariance: Array
     trajectories: TrajectorySet | None = None
+
+    @property
+    def excitation_fit(self) -> Fit:
+        """Measurement and models on the exciting trajectory."""
+        return _fit(self.experiment, self.models[EXCITATION])
+
+    @property
+    def validation_fit(self) -> Fit:
+        """Measurement, models and truth on the first unseen trajectory."""
+        fit, model = _fit(self.validation[0], self.models[run_name(1)]), self.models[run_name(1)]
+        std = poses(model, "std") if "std_position" in model else None
+        return replace(fit, truth=true_poses(self.validation_truth[0]), std=std)
+
+    @property
+    def correlations(self) -> tuple[Array, list[str]]:
+        """Correlations (n, n) of the identified parameters, and their names."""
+        parameters = self.result["identification"]["parameters"]
+        chosen = [k for k, name in enumerate(NAMES) if parameters.get(name, {}).get("identifiable")]
+        return correlation_matrix(self.covariance[np.ix_(chosen, chosen)]), [NAMES[k] for k in chosen]
+
+
+def _fit(record: xr.Dataset, model: xr.Dataset) -> Fit:
+    initial = poses(model, "initial")
+    return Fit(
+        time=record["time"].values,
+        measured=poses(record, "measured"),
+        identified=poses(model, "identified"),
+        initial=initial if np.isfinite(initial).any() else None,
+    )
 
 
 @dataclass(frozen=True)
@@ -110,27 +140,15 @@ def _checked_result(run: RunFolder) -> dict[str, Any]:
 
 def png_figures(data: ReportData) -> dict[str, Callable[[], Any]]:
     """The figures of a run by file name, each as a function that draws it."""
-    time = data.experiment["time"].values
-    first = run_name(1)
+    time, reference = data.experiment["time"].values, poses(data.experiment, "reference")
+    models = "measurement, starting and identified model"
     return {
-        "excitation": lambda: figures.excitation_figure(time, poses(data.experiment, "reference")),
-        "fit_excitation": lambda: figures.fit_figure(
-            time,
-            poses(data.experiment, "measured"),
-            *_model_poses(data, EXCITATION),
-            title="Exciting trajectory: measurement, starting and identified model",
-        ),
-        "fit_validation": lambda: figures.fit_figure(
-            data.validation[0]["time"].values,
-            poses(data.validation[0], "measured"),
-            *_model_poses(data, first),
-            title="First unseen trajectory: measurement, starting and identified model",
-            truth=true_poses(data.validation_truth[0]),
-            std=_predicted_std(data, first),
-        ),
+        "excitation": lambda: figures.excitation_figure(time, reference),
+        "fit_excitation": lambda: figures.fit_figure(data.excitation_fit, f"Exciting trajectory: {models}"),
+        "fit_validation": lambda: figures.fit_figure(data.validation_fit, f"First unseen trajectory: {models}"),
         "validation_errors": lambda: figures.validation_figure(data.result["validation"]),
         "parameters": lambda: figures.parameter_figure(data.result["identification"]["parameters"]),
-        "correlation": lambda: figures.correlation_figure(*_correlations(data)),
+        "correlation": lambda: figures.correlation_figure(*data.correlations),
     }
 
 
@@ -145,9 +163,6 @@ def render(data: ReportData) -> str:
         sections=[build(data) for build in SECTIONS],
         plotly=report_plots.plotly_javascript(),
     )
-
-
-# --- sections ----------------------------------------------------------------------------------------------
 
 
 def summary_section(data: ReportData) -> Section:
@@ -172,7 +187,7 @@ def excitation_section(data: ReportData) -> Section:
         (tables.excitation_error_table(data.result),),
         (
             report_plots.trajectory_plot(time, poses(data.experiment, "reference")),
-            report_plots.fit_plot(time, poses(data.experiment, "measured"), *_model_poses(data, EXCITATION)),
+            report_plots.fit_plot(data.excitation_fit),
         ),
     )
 
@@ -194,25 +209,17 @@ def identification_section(data: ReportData) -> Section:
         "Parameters",
         text,
         (tables.parameter_table(data.result), tables.group_table(data.result), tables.correlation_table(data.result)),
-        (report_plots.parameter_plot(parameters), report_plots.correlation_plot(*_correlations(data))),
+        (report_plots.parameter_plot(parameters), report_plots.correlation_plot(*data.correlations)),
     )
 
 
 def validation_section(data: ReportData) -> Section:
     """Unseen trajectories."""
-    record = data.validation[0]
-    fit = report_plots.fit_plot(
-        record["time"].values,
-        poses(record, "measured"),
-        *_model_poses(data, run_name(1)),
-        truth=true_poses(data.validation_truth[0]),
-        std=_predicted_std(data, run_name(1)),
-    )
     return Section(
         "Validation on unseen trajectories",
         "The plots below the bars show the first unseen trajectory.",
         (tables.validation_table(data.result), tables.prediction_table(data.result)),
-        (report_plots.validation_plot(data.result["validation"]), fit),
+        (report_plots.validation_plot(data.result["validation"]), report_plots.fit_plot(data.validation_fit)),
     )
 
 
@@ -241,24 +248,6 @@ SECTIONS: tuple[Callable[[ReportData], Section], ...] = (
     validation_section,
     provenance_section,
 )
-
-
-def _model_poses(data: ReportData, name: str) -> tuple[Array | None, Array]:
-    run = data.models[name]
-    initial = poses(run, "initial")
-    return (initial if np.isfinite(initial).any() else None), poses(run, "identified")
-
-
-def _predicted_std(data: ReportData, name: str) -> Array | None:
-    """Predicted deviations (N, 6) of an unseen run, where they were predicted."""
-    return poses(data.models[name], "std") if "std_position" in data.models[name] else None
-
-
-def _correlations(data: ReportData) -> tuple[Array, list[str]]:
-    """Correlations of the identified parameters, and their names."""
-    parameters = data.result["identification"]["parameters"]
-    chosen = [k for k, name in enumerate(NAMES) if parameters.get(name, {}).get("identifiable")]
-    return correlation_matrix(data.covariance[np.ix_(chosen, chosen)]), [NAMES[k] for k in chosen]
 
 
 def _on_guess(parameters: dict[str, Any]) -> str:

@@ -9,11 +9,21 @@ from plotly.subplots import make_subplots
 
 from identify.arrays import Array
 from identify.files.run_folder import rms_row
-from identify.reporting.figures import BAND, COMPONENTS, LETTERS, interval_bars
+from identify.reporting.figures import (
+    BAND,
+    BAND_NAME,
+    BLUE,
+    COMPONENTS,
+    GREEN,
+    LETTERS,
+    RED,
+    Curve,
+    Fit,
+    relative_errors,
+)
 from identify.reporting.goals import VALIDATION_UM, VALIDATION_URAD
 
-BLACK, GREEN, BLUE, RED = "black", "#2ca02c", "#1f77b4", "#d62728"
-AXIS_COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c")
+AXIS_COLOURS = (BLUE, "#ff7f0e", GREEN)
 
 
 def plotly_javascript() -> str:
@@ -26,49 +36,32 @@ def trajectory_plot(time: Array, poses: Array) -> str:
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, subplot_titles=("(a) position", "(b) orientation"))
     for i in range(6):
         values = 1e3 * (poses[:, i] - poses[0, i])
-        figure.add_trace(_line(time, values, COMPONENTS[i], AXIS_COLOURS[i % 3]), row=1 + i // 3, col=1)
+        trace = _trace(time, Curve(COMPONENTS[i], values, AXIS_COLOURS[i % 3]))
+        figure.add_trace(trace, row=1 + i // 3, col=1)
     figure.update_yaxes(title_text="from start [mm]", row=1)
     figure.update_yaxes(title_text="from start [mrad]", row=2)
     figure.update_xaxes(title_text="time [s]", row=2)
     return _html(figure, 550)
 
 
-def fit_plot(
-    time: Array,
-    measured: Array,
-    initial: Array | None,
-    identified: Array,
-    truth: Array | None = None,
-    std: Array | None = None,
-) -> str:
-    """Six panels of poses and six of errors, like figures 12 and 13; poses (N, 6) [m, rad], NaN where there is none.
-
-    std (N, 6): predicted standard deviation of the true error, drawn as a band.
-    """
+def fit_plot(fit: Fit) -> str:
+    """Six panels of poses and six of errors, like figures 12 and 13."""
     titles = [f"{letter} {name}" for letter, name in zip(LETTERS, COMPONENTS, strict=True)]
     errors = [f"error of {name}" for name in COMPONENTS]
     figure = make_subplots(rows=4, cols=3, shared_xaxes=True, subplot_titles=titles + errors, vertical_spacing=0.05)
     for i in range(6):
-        row, column, first = 1 + i // 3, 1 + i % 3, i == 0
-        models = [("identified model", identified, BLUE)]
-        if initial is not None:
-            models.insert(0, ("starting model", initial, GREEN))
-        traces = [
-            _dots(time, 1e3 * measured[:, i], "measured"),
-            *(_line(time, 1e3 * poses[:, i], name, colour) for name, poses, colour in models),
-        ]
-        for trace in traces:
-            figure.add_trace(trace.update(showlegend=first), row=row, col=column)
-        rest = [_dots(time, 1e6 * (measured - identified)[:, i], "measured − identified")]
-        if truth is not None:
-            rest.append(_line(time, 1e6 * (truth - identified)[:, i], "true − identified", RED))
-        if std is not None:
-            rest += _band(time, BAND * 1e6 * std[:, i])
-        for trace in rest:
-            figure.add_trace(trace.update(showlegend=first and trace.showlegend is not False), row=row + 2, col=column)
-        figure.update_yaxes(title_text="[mm]" if i < 3 else "[mrad]", row=row, col=column)
+        row, column = 1 + i // 3, 1 + i % 3
+        above = [_trace(fit.time, curve) for curve in fit.pose_curves(i)]
+        below = [_trace(fit.time, curve) for curve in fit.error_curves(i)]
+        if fit.std is not None:
+            below += _band(fit.time, BAND * 1e6 * fit.std[:, i])
+        for traces, place in ((above, row), (below, row + 2)):
+            for trace in traces:
+                figure.add_trace(
+                    trace.update(showlegend=i == 0 and trace.showlegend is not False), row=place, col=column
+                )
+        figure.update_yaxes(title_text="[mm]" if i < 3 else "[mrad]", range=fit.pose_range(i), row=row, col=column)
         figure.update_yaxes(title_text="[um]" if i < 3 else "[urad]", row=row + 2, col=column)
-        figure.update_yaxes(range=_range(1e3 * measured[:, i]), row=row, col=column)
     figure.update_xaxes(title_text="time [s]", row=4)
     return _html(figure, 1000)
 
@@ -90,66 +83,36 @@ def validation_plot(validation: list[dict[str, Any]]) -> str:
 
 def parameter_plot(parameters: dict[str, dict[str, Any]]) -> str:
     """Relative error of every identifiable parameter with its 95 % interval."""
-    shown = {n: p for n, p in parameters.items() if p["identifiable"] and p["true"] and p["estimate"] is not None}
-    error = [100 * (p["estimate"] - p["true"]) / abs(p["true"]) for p in shown.values()]
-    bars = [[100 * one / abs(p["true"]) for one in interval_bars(p)] for p in shown.values()]
-    below, above = [one[0] for one in bars], [one[1] for one in bars]
-    trace = go.Scatter(
-        x=list(shown),
-        y=error,
-        error_y={"type": "data", "array": above, "arrayminus": below},
-        mode="markers",
-        marker_color=BLUE,
-        showlegend=False,
-    )
-    figure = go.Figure(trace)
+    names, error, below, above = relative_errors(parameters)
+    bars = {"type": "data", "array": above, "arrayminus": below}
+    figure = go.Figure(go.Scatter(x=names, y=error, error_y=bars, mode="markers", marker_color=BLUE, showlegend=False))
     figure.add_hrect(y0=-5, y1=5, fillcolor=GREEN, opacity=0.1, line_width=0)
     figure.update_yaxes(title_text="estimate − truth, bars: 95 % interval [%]")
     return _html(figure, 450)
 
 
-def _line(time: Array, values: Array, name: str, colour: str) -> Any:
-    return go.Scatter(x=time, y=values, name=name, mode="lines", line={"color": colour, "width": 1.3}, legendgroup=name)
-
-
-def _band(time: Array, half: Array) -> list[Any]:
-    """Lower and upper edge of the predicted band, the space between them filled."""
-    name = f"predicted ± {BAND:g} std"
-    edge = {"color": RED, "width": 0.3}
-    shared = {"x": time, "mode": "lines", "line": edge, "legendgroup": name, "hoverinfo": "skip"}
-    return [
-        go.Scatter(y=-half, showlegend=False, name=f"−{name}", **shared),
-        go.Scatter(y=half, name=name, fill="tonexty", fillcolor="rgba(214, 39, 40, 0.15)", **shared),
-    ]
-
-
 def correlation_plot(correlations: Array, names: Sequence[str]) -> str:
     """Correlations (n, n) of estimates as a coloured matrix."""
-    labels = list(names)
-    shown = go.Heatmap(
-        x=labels,
-        y=labels,
-        z=correlations,
-        zmin=-1,
-        zmax=1,
-        colorscale="RdBu",
-        reversescale=True,
-        colorbar={"title": "correlation"},
-    )
-    figure = go.Figure(shown)
+    labels, scale = list(names), {"zmin": -1, "zmax": 1, "colorscale": "RdBu", "reversescale": True}
+    figure = go.Figure(go.Heatmap(x=labels, y=labels, z=correlations, colorbar={"title": "correlation"}, **scale))
     figure.update_yaxes(autorange="reversed")
     return _html(figure, 200 + 20 * len(labels))
 
 
-def _dots(time: Array, values: Array, name: str) -> Any:
-    return go.Scatter(x=time, y=values, name=name, mode="markers", marker={"color": BLACK, "size": 3}, legendgroup=name)
+def _trace(time: Array, curve: Curve) -> Any:
+    style = {"marker": {"size": 3}, "mode": "markers"} if curve.dots else {"line": {"width": 1.3}, "mode": "lines"}
+    trace = go.Scatter(x=time, y=curve.values, name=curve.name, legendgroup=curve.name, **style)
+    return trace.update(marker_color=curve.colour, line_color=curve.colour)
 
 
-def _range(values: Array) -> list[float]:
-    """Range of the measurement with half as much around it: an unstable starting model must not hide the rest."""
-    low, high = float(min(values[values == values])), float(max(values[values == values]))
-    reach = (high - low) / 2 or 1.0
-    return [low - reach, high + reach]
+def _band(time: Array, half: Array) -> list[Any]:
+    """Lower and upper edge of the predicted band, the space between them filled."""
+    edge = {"color": RED, "width": 0.3}
+    shared = {"x": time, "mode": "lines", "line": edge, "legendgroup": BAND_NAME, "hoverinfo": "skip"}
+    return [
+        go.Scatter(y=-half, showlegend=False, name=f"−{BAND_NAME}", **shared),
+        go.Scatter(y=half, name=BAND_NAME, fill="tonexty", fillcolor="rgba(214, 39, 40, 0.15)", **shared),
+    ]
 
 
 def _html(figure: Any, height: int) -> str:

@@ -1,5 +1,7 @@
 """A small run with known errors."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -112,14 +114,13 @@ def parameter(initial, true, estimate, std, identifiable=True):
     }
 
 
-@pytest.fixture
-def run_folder(tmp_path):
-    """A finished run up to the report; the starting model diverges on the first unseen trajectory."""
-    run = RunFolder(tmp_path / "run")
+@pytest.fixture(scope="session")
+def finished_run(tmp_path_factory):
+    """A finished run up to the report, not to be changed; the starting model diverges on the first unseen trajectory."""
+    run = RunFolder(tmp_path_factory.mktemp("finished") / "run")
     run.path.mkdir()
     record, truth = make_record(), make_truth()
-    pose = make_truth()
-    identified = np.hstack([pose["position"].values, pose["orientation"].values]) + 1e-6
+    identified = np.hstack([truth["position"].values, truth["orientation"].values]) + 1e-6
     initial = identified + 1e-4
     diverging = initial.copy()
     diverging[40:] = np.inf
@@ -134,6 +135,12 @@ def run_folder(tmp_path):
     save_result(run.result, make_result())
     run.scenario.write_text(load_scenario("quick").to_toml(), encoding="utf-8")
     return run
+
+
+@pytest.fixture
+def run_folder(finished_run, tmp_path):
+    """A copy of the finished run."""
+    return RunFolder(shutil.copytree(finished_run.path, tmp_path / "run"))
 
 
 @pytest.fixture(name="make_record")
