@@ -1,8 +1,7 @@
 """One least-squares adjustment of both cameras, their relative pose and all board poses to all measured pixels.
 
-The numbers that describe one camera, and which of them a calibration sets free.
-Order: focal lengths fx, fy and principal point cx, cy in px, then k1, k2, p1, p2, k3 of Brown and Conrady as OpenCV
-orders them.
+Nine intrinsics describe a camera: focal lengths fx, fy and principal point cx, cy in px, then k1, k2, p1, p2, k3 of
+Brown and Conrady as OpenCV orders them. Those that a calibration does not set free stay where the adjustment starts.
 
 Levenberg and Marquardt's method on the normal equations. A board pose is seen by its own view only, so that the poses
 are eliminated view by view (Schur complement) and what remains is the reduced normal matrix N of the free intrinsics
@@ -18,6 +17,7 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
+from scipy.linalg import block_diag
 
 from cmmsim.calibration.shared_errors import SharedErrors, shared_errors
 from cmmsim.calibration.sightings import Sightings
@@ -28,6 +28,10 @@ from cmmsim.geometry.pose import Array, apply, rotation_exp, skew
 INTRINSIC_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 DISTORTIONS = {"none": (), "radial2": ("k1", "k2"), "brown5": ("k1", "k2", "p1", "p2", "k3")}
 DEFAULT_DISTORTION = "brown5"
+MOST_STEPS = 60
+SMALLEST_GAIN = 1e-11  # relative decrease of the sum of squares that ends the iteration
+SINGULAR = 1e-14  # smallest eigenvalue of N, scaled to a unit diagonal, below which nothing is determined
+POSE = 6
 
 
 def free_directions(distortion: str, fix_aspect: bool) -> Array:
@@ -52,16 +56,17 @@ def camera_from(values: Array, width: int, height: int) -> PinholeCamera:
     return PinholeCamera(fx, cx, cy, width, height, aspect=fy / fx, distortion=Distortion(*terms))
 
 
+def camera_matrix(values: Array) -> Array:
+    """OpenCV's matrix (3,3) of a camera's intrinsics (9,)."""
+    return np.array([[values[0], 0.0, values[2]], [0.0, values[1], values[3]], [0.0, 0.0, 1.0]])
+
+
 def project(values: Array, points: Array) -> tuple[Array, Array, Array]:
     """Pixels (n, 2) of points (n, 3) in camera axes, and their derivatives by the intrinsics (n, 2, 9) and by the
     points (n, 2, 3), px/m. The points must lie before the camera."""
-    matrix = np.array([[values[0], 0.0, values[2]], [0.0, values[1], values[3]], [0.0, 0.0, 1.0]])
-    pixels, jacobian = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, values[4:])
+    pixels, jacobian = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera_matrix(values), values[4:])
     by_all = np.asarray(jacobian, dtype=float).reshape(len(points), 2, -1)  # turn 3, shift 3, f 2, c 2, distortion 5
     return np.asarray(pixels, dtype=float).reshape(-1, 2), by_all[:, :, 6:15], by_all[:, :, 3:6]
-
-
-# What the adjustment estimates.
 
 
 @dataclass(frozen=True)
@@ -93,12 +98,6 @@ def _moved(transform: Array, change: Array) -> Array:
     moved[:3, 3] += change[:3]
     moved[:3, :3] = rotation_exp(change[3:]) @ transform[:3, :3]
     return moved
-
-
-MOST_STEPS = 60
-SMALLEST_GAIN = 1e-11  # relative decrease of the sum of squares that ends the iteration
-SINGULAR = 1e-14  # smallest eigenvalue of N, scaled to a unit diagonal, below which nothing is determined
-POSE = 6
 
 
 @dataclass(frozen=True)
@@ -164,7 +163,7 @@ def adjust(points: Array, sightings: tuple[Sightings, Sightings], start: RigStat
         )
     sigma2 = normal.cost / freedom
     shared = shared_errors(scores, information, sigma2)
-    spread = _spread(free)
+    spread = block_diag(free, free, np.eye(POSE))  # (24,c), from the free unknowns to all
     return Adjustment(
         state,
         normal.residuals,
@@ -185,7 +184,7 @@ def _minimise(build: Callable[[RigState], _Normal], state: RigState, free: Array
     k = free.shape[1]
     for step in range(1, MOST_STEPS + 1):
         common, boards = _solve(normal, damping)
-        trial = state.moved((free @ common[: 2 * k].reshape(2, k).T).T, common[2 * k :], boards)
+        trial = state.moved(common[: 2 * k].reshape(2, k) @ free.T, common[2 * k :], boards)
         attempt = build(trial)
         if attempt.cost < normal.cost:
             gain = (normal.cost - attempt.cost) / normal.cost
@@ -283,12 +282,3 @@ def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
     boards = normal.boards + damping * normal.boards * np.eye(POSE)
     rest = normal.board_side - np.einsum("vci,c->vi", normal.mixed, common)
     return common, np.linalg.solve(boards, rest[..., None])[..., 0]
-
-
-def _spread(free: Array) -> Array:
-    """Matrix (24,c) from the free unknowns to all intrinsics and the small error of right_from_left."""
-    rows, k = free.shape
-    spread = np.zeros((2 * rows + POSE, 2 * k + POSE))
-    spread[:rows, :k] = spread[rows : 2 * rows, k : 2 * k] = free
-    spread[2 * rows :, 2 * k :] = np.eye(POSE)
-    return spread

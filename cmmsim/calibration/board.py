@@ -56,9 +56,14 @@ class Board(BaseModel):
         return self
 
     @property
+    def dot_radius(self) -> float:
+        """Radius of the dots, m; 0 of a chessboard, which has none."""
+        return self.radius or 0.0
+
+    @property
     def nearest(self) -> float:
         """Distance between nearest points, m."""
-        return self.spacing * (np.sqrt(2.0) if self.kind == "asymmetric_dots" else 1.0)
+        return self.spacing * (float(np.sqrt(2.0)) if self.kind == "asymmetric_dots" else 1.0)
 
     @property
     def points(self) -> Array:

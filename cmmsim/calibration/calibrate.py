@@ -18,7 +18,7 @@ from cmmsim.calibration.adjustment import (
 )
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.result import Calibration, UsedView
-from cmmsim.calibration.sightings import SIDES, PairView, Sightings, sightings_of, some
+from cmmsim.calibration.sightings import SIDES, PairView, Sightings, sightings_of, some, views_of
 from cmmsim.calibration.start_values import start_values
 from cmmsim.calibration.warnings import contradictions, weaknesses
 from cmmsim.errors import CalibrationError
@@ -60,14 +60,12 @@ def calibrate(
     options = options or CalibrationOptions()
     _require_pairs(pairs, options)
     free = free_directions(options.distortion, options.fix_aspect)
-    bend = bool(DISTORTIONS[options.distortion])
-    state, read = start_values(board, pairs, size, bend, options.fix_aspect)
-    judged, kept, solved, sightings = _without_misfits(board, read, state, free, options)
-    if board.kind != "chessboard" and options.correct_dots:
+    start, read = start_values(board, pairs, size, bool(DISTORTIONS[options.distortion]), options.fix_aspect)
+    judged, kept, solved, sightings = _without_misfits(board, read, start, free, options)
+    if board.dot_radius and options.correct_dots:
         solved, sightings = _with_true_centres(board, sightings, solved, free, size)
-    rejected = {pair.name: pair.reasons for pair in judged if pair.reasons}
-    rig = _rig(solved.state, size)
-    warnings = contradictions(board, solved.state, judged) + weaknesses(solved, sightings, rig)
+    left, right = (camera_from(values, *size) for values in solved.state.intrinsics)
+    rig = StereoRig(left, right, solved.state.right_from_left.copy())
     return Calibration(
         rig,
         board,
@@ -75,9 +73,9 @@ def calibrate(
         options.fix_aspect,
         solved,
         sightings,
-        _used(kept, solved, sightings),
-        rejected,
-        warnings,
+        used=_used(kept, solved, sightings),
+        rejected={pair.name: pair.reasons for pair in judged if pair.reasons},
+        warnings=contradictions(board, solved.state, judged) + weaknesses(solved, sightings, rig),
     )
 
 
@@ -99,7 +97,7 @@ def _without_misfits(
     boards = start.left_from_boards.copy()
     for _ in range(ROUNDS):
         _require_pairs(judged, options)
-        seen = [k for k, pair in enumerate(judged) if any(not isinstance(side, str) for side in pair.sides)]
+        seen = sorted(views_of(judged, 0).keys() | views_of(judged, 1).keys())
         sightings = sightings_of([judged[k] for k in seen])
         solved = adjust(board.points, sightings, RigState(start.intrinsics, start.right_from_left, boards[seen]), free)
         rms = _image_rms(solved, sightings)
@@ -145,12 +143,7 @@ def _offsets(board: Board, seen: Sightings, state: RigState, side: int, size: tu
     moves = state.left_from_boards if side == 0 else state.right_from_left @ state.left_from_boards
     places = np.einsum("mij,mj->mi", moves[seen.view, :3, :3], board.points[seen.point]) + moves[seen.view, :3, 3]
     normals = -moves[seen.view, :3, 2]
-    return centre_offset(camera_from(state.intrinsics[side], *size), places, normals, float(board.radius or 0.0))
-
-
-def _rig(state: RigState, size: tuple[int, int]) -> StereoRig:
-    left, right = (camera_from(values, *size) for values in state.intrinsics)
-    return StereoRig(left, right, state.right_from_left.copy())
+    return centre_offset(camera_from(state.intrinsics[side], *size), places, normals, board.dot_radius)
 
 
 def _used(kept: Sequence[PairView], solved: Adjustment, sightings: tuple[Sightings, Sightings]) -> list[UsedView]:

@@ -1,7 +1,8 @@
 """A board in a picture: which of its points are seen, and where.
 
-Centres of a dot grid: OpenCV finds and orders the dots, a fit of a bright ellipse to each makes them exact.
-The centre is that of the dot's ellipse in the image, not the image of the dot's centre: see dot_eccentricity.
+Corners of a chessboard are those that OpenCV finds. Dots OpenCV finds and orders, and a fit of a bright ellipse to each
+makes their centres exact: the centre is that of the dot's ellipse in the image, not the image of the dot's centre, see
+cmmsim.geometry.disc_image. The fits also tell the dots' radius, whatever the board file says.
 """
 
 from __future__ import annotations
@@ -20,42 +21,84 @@ from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.images import FrameImages, StereoFrame
 from cmmsim.radiometry.noise import CameraNoise
 
-# Radius of a board's dots as a picture shows it, whatever the board file says.
-
-
-CELL_SIDE = 41  # samples along each side of the square around a dot
-EXTREMES = (2.0, 98.0)  # percentiles of a cell whose middle parts ground from dot
-LARGEST_GAP = 0.1  # of the board's radius, by which the measured one may differ: more costs the dots' correction 20 %
-
-
-def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> float:
-    """Median radius of bright dots in units of the reach of the cells: half the distance to the nearest neighbour.
-
-    Parameters: image; centres (n,2) px; steps (n,2,2) px that carry the unit disc to each dot's cell. In each cell the
-    grey values' share of the step from ground to dot adds up to the dot's area. Dots that blur leaves without a level
-    top seem larger: of 2.5 px radius, blurred by 1 px, by a quarter.
-    """
-    ticks = np.linspace(-1.0, 1.0, CELL_SIDE)
-    within = np.hypot(*np.meshgrid(ticks, ticks)) <= 1.0
-    cell = np.stack(np.meshgrid(ticks, ticks), axis=-1)[within]
-    places = (centres[:, None] + cell @ steps.swapaxes(1, 2)).astype(np.float32)
-    values = cv2.remap(bright, places[..., 0], places[..., 1], cv2.INTER_LINEAR).astype(float)
-    middle = np.percentile(values, EXTREMES, axis=1).mean(axis=0)[:, None]
-    ground = np.nanmedian(np.where(values <= middle, values, np.nan), axis=1)
-    dot = np.nanmedian(np.where(values >= middle, values, np.nan), axis=1)
-    area = (values.mean(axis=1) - ground) / np.maximum(dot - ground, 1.0)
-    return float(np.sqrt(max(np.median(area), 0.0)))
-
-
-def differs(measured: float | None, given: float | None) -> bool:
-    """Whether a measured radius contradicts a given one; not where either is missing."""
-    return measured is not None and given is not None and bool(abs(measured - given) > LARGEST_GAP * given)
-
-
-# Inner corners of a chessboard by OpenCV.
-
-
+FEWEST_SHARE = 0.7  # of the board's points that must be measured
+LARGEST_POINT_GAP = 0.25  # of the distance of neighbours, by which a point may leave the plane's perspective
+LARGEST_RADIUS_GAP = 0.1  # of a dot's radius, by which the measured one may differ: more costs its correction 20 %
 FINE_WINDOW_SHARE = 0.3  # half window of cornerSubPix over the distance of neighbouring corners
+
+SMALLEST_AREA_PX = 20.0
+FIND_SIDE_PX = 1600  # dots are first looked for in an image of at most this size: faster, and less noise
+FIT_ITERATIONS = 5
+WINDOW_REACH = 2.2  # dot radii around the centre that are looked at
+GROUND_FROM = 1.2  # dot radii from which the ground is taken
+SPREADS_PX = (0.0, 0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.0)  # blurs that are tried, sigma
+PROBED = 12  # dots on which they are tried
+LARGEST_MOVE = 0.3  # a fit that ends farther from OpenCV's centre, in dot radii, has caught something else
+FITTED_SHARE = 0.5  # of the dots whose fits tell their radius; where fewer succeed, the area they cover tells it
+CELL_SIDE = 41  # samples along each side of the square around a dot, whose area is measured
+EXTREMES = (2.0, 98.0)  # percentiles of a cell whose middle parts ground from dot
+# A photograph's noise is not known and its edges are blurred: all grey values count alike, and the limit only refuses
+# what is no ellipse at all (residuals of 25 grey values rms).
+PLAIN_NOISE = CameraNoise(electrons_at_white=255e4, gain=1e-4, dark_noise=5e4, full_well=1e9, black_level=0.0)
+LIMITS = FitLimits(smallest_contrast=25.0, largest_misfit=25.0)
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """What one camera sees of a board: index (n,) of the points, their pixels (n, 2), the radius of its dots, m."""
+
+    index: NDArray[np.int_]
+    pixels: Array
+    radius: float | None = None
+
+    def read_as(self, order: NDArray[np.int_]) -> BoardView:
+        """The same view with its points renamed by one of the board's symmetries."""
+        renamed = order[self.index]
+        by_index = np.argsort(renamed)
+        return replace(self, index=renamed[by_index], pixels=self.pixels[by_index])
+
+
+def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
+    """The board in one grey image, or in words why not."""
+    radius: float | None = None
+    if board.kind == "chessboard":
+        found = find_chessboard(grey, board.columns, board.rows)
+    else:
+        found, radius = find_dots(grey, board) or (None, None)
+    if found is None:
+        return f"no {board.kind} of {board.columns} x {board.rows} found"
+    measured = np.isfinite(found).all(axis=1)
+    if measured.sum() < FEWEST_SHARE * len(found):
+        other = radius_differs(radius, board.radius)
+        why = f", its dots measure {radius:.3g} m in radius, not {board.radius:g}" if other else ""
+        return f"only {measured.sum()} of {len(found)} points are sharp and whole{why}"
+    return _as_seen_from_the_front(board, BoardView(np.flatnonzero(measured), found[measured], radius))
+
+
+def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:
+    """The view with its rows turned round if it was read mirrored: a board is seen from its front only."""
+    grid = np.arange(len(board.points)).reshape(board.rows, board.columns)
+    plane = board.points[view.index, :2]
+    flat, _ = cv2.findHomography(plane, view.pixels)
+    if flat is None:
+        return "its points lie on one line"
+    if np.linalg.det(flat) * (np.append(plane.mean(axis=0), 1.0) @ flat[2]) < 0.0:
+        if board.kind == "asymmetric_dots":
+            return "the dots were found in mirrored order"
+        view = view.read_as(grid[:, ::-1].ravel())
+        plane = board.points[view.index, :2]
+        flat, _ = cv2.findHomography(plane, view.pixels)
+    expected = cv2.perspectiveTransform(plane[None], flat)[0]
+    step = np.linalg.norm(np.diff(cv2.perspectiveTransform(board.points[None, :2, :2], flat)[0], axis=0))
+    gap = np.linalg.norm(expected - view.pixels, axis=1).max()
+    if gap > LARGEST_POINT_GAP * step:
+        return f"points leave the plane by up to {gap:.1f} px: not in the board's order"
+    return view
+
+
+def radius_differs(measured: float | None, given: float | None) -> bool:
+    """Whether a measured radius contradicts a given one; not where either is missing."""
+    return measured is not None and given is not None and bool(abs(measured - given) > LARGEST_RADIUS_GAP * given)
 
 
 def find_chessboard(grey: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
@@ -77,21 +120,6 @@ def find_chessboard(grey: NDArray[np.uint8], columns: int, rows: int) -> Array |
     return np.asarray(fine, dtype=float).reshape(-1, 2)
 
 
-SMALLEST_AREA_PX = 20.0
-FIND_SIDE_PX = 1600  # dots are first looked for in an image of at most this size: faster, and less noise
-FIT_ITERATIONS = 5
-WINDOW_REACH = 2.2  # dot radii around the centre that are looked at
-GROUND_FROM = 1.2  # dot radii from which the ground is taken
-SPREADS_PX = (0.0, 0.4, 0.6, 0.8, 1.0, 1.25, 1.6, 2.0)  # blurs that are tried, sigma
-PROBED = 12  # dots on which they are tried
-FITTED_SHARE = 0.5  # of the dots whose fits tell their radius; where fewer succeed, the area they cover tells it
-LARGEST_MOVE = 0.3  # a fit that ends farther from OpenCV's centre, in dot radii, has caught something else
-# A photograph's noise is not known and its edges are blurred: all grey values count alike, and the limit only refuses
-# what is no ellipse at all (residuals of 25 grey values rms).
-PLAIN_NOISE = CameraNoise(electrons_at_white=255e4, gain=1e-4, dark_noise=5e4, full_well=1e9, black_level=0.0)
-LIMITS = FitLimits(smallest_contrast=25.0, largest_misfit=25.0)
-
-
 def find_dots(grey: NDArray[np.uint8], board: Board) -> tuple[Array, float] | None:
     """Dot centres (rows * columns, 2) px in the board's order, NaN where a dot is no clean ellipse, and the dots'
     measured radius, m; None: no board."""
@@ -99,18 +127,18 @@ def find_dots(grey: NDArray[np.uint8], board: Board) -> tuple[Array, float] | No
     rough = None
     for side in (FIND_SIDE_PX, max(grey.shape)):
         if rough is None:
-            rough = _find_grid(bright, board, min(1.0, side / max(grey.shape)))
+            rough = _found_by_opencv(bright, board, min(1.0, side / max(grey.shape)))
     if rough is None:
         return None
     shapes = _dot_shapes(rough, board)
     centres, ratios = _refine(bright, rough, shapes, board)
-    given, reach = float(board.radius or 1.0), 0.5 * float(board.nearest)
     if np.isfinite(ratios).mean() > FITTED_SHARE:
-        return centres, given * float(np.nanmedian(ratios))
-    return centres, reach * covered_radius(bright, rough, shapes * (reach / given))
+        return centres, board.dot_radius * float(np.nanmedian(ratios))
+    reach = 0.5 * board.nearest
+    return centres, reach * covered_radius(bright, rough, shapes * (reach / board.dot_radius))
 
 
-def _find_grid(bright: NDArray[np.uint8], board: Board, scale: float) -> Array | None:
+def _found_by_opencv(bright: NDArray[np.uint8], board: Board, scale: float) -> Array | None:
     """OpenCV's centres (n, 2) px; it returns (n, 1, 2) up to version 4 and (n, 2) from version 5 on."""
     small = bright if scale == 1.0 else cv2.resize(bright, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (3, 3), 0.0)
@@ -143,7 +171,7 @@ def _refine(bright: NDArray[np.uint8], rough: Array, shapes: Array, board: Board
     """Fitted centres (n, 2), and fitted over expected radii (n,); dots that need windows of one size are fitted
     together."""
     largest = np.linalg.norm(shapes, axis=2).max(axis=1)
-    reach = min(WINDOW_REACH, board.nearest / float(board.radius or 1.0) - 1.15)  # neighbours stay outside
+    reach = min(WINDOW_REACH, board.nearest / board.dot_radius - 1.15)  # neighbours stay outside
     sizes = 2 * np.ceil(reach * largest + 1.0).astype(int)
     images = FrameImages(StereoFrame(bright, bright))
     fine, ratios, spread = np.full_like(rough, np.nan), np.full(len(rough), np.nan), None
@@ -175,8 +203,7 @@ def _dot_shapes(rough: Array, board: Board) -> Array:
     """Matrices (n,2,2) px that carry the unit disc to each dot, by the perspective of the whole board."""
     plane = board.points[:, :2]
     flat, _ = cv2.findHomography(plane, rough)
-    radius = float(board.radius or 0.0)
-    moved = [cv2.perspectiveTransform((plane + step)[None], flat)[0] for step in radius * np.eye(2)]
+    moved = [cv2.perspectiveTransform((plane + step)[None], flat)[0] for step in board.dot_radius * np.eye(2)]
     middle = cv2.perspectiveTransform(plane[None], flat)[0]
     return np.stack([m - middle for m in moved], axis=2)
 
@@ -187,67 +214,26 @@ def _without_neighbours(windows: Array, centres: Array, shapes: Array, reach: fl
     x, y = ticks[None, None, :] - centres[:, 0, None, None], ticks[None, :, None] - centres[:, 1, None, None]
     inverse = np.linalg.inv(shapes)[..., None, None]
     distance = np.hypot(inverse[:, 0, 0] * x + inverse[:, 0, 1] * y, inverse[:, 1, 0] * x + inverse[:, 1, 1] * y)
-    around = np.where((distance > GROUND_FROM) & (distance <= reach), windows, np.nan)
-    around = around.reshape(len(windows), -1)
+    around = np.where((distance > GROUND_FROM) & (distance <= reach), windows, np.nan).reshape(len(windows), -1)
     known, ground = np.isfinite(around).any(axis=1), np.zeros(len(windows))
     ground[known] = np.nanmedian(around[known], axis=1)
     return np.where(distance <= reach, windows, ground[:, None, None])
 
 
-FEWEST_SHARE = 0.7  # of the board's points that must be measured
-LARGEST_POINT_GAP = 0.25  # of the distance of neighbours, by which a point may leave the plane's perspective
+def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> float:
+    """Median radius of bright dots in units of the reach of the cells: half the distance to the nearest neighbour.
 
-
-@dataclass(frozen=True)
-class BoardView:
-    """What one camera sees of a board: index (n,) of the points, their pixels (n, 2), the radius of its dots, m."""
-
-    index: NDArray[np.int_]
-    pixels: Array
-    radius: float | None = None
-
-    def read_as(self, order: NDArray[np.int_]) -> BoardView:
-        """The same view with its points renamed by one of the board's symmetries."""
-        renamed = order[self.index]
-        by_index = np.argsort(renamed)
-        return replace(self, index=renamed[by_index], pixels=self.pixels[by_index])
-
-
-def find_board(grey: NDArray[np.uint8], board: Board) -> BoardView | str:
-    """The board in one grey image, or in words why not."""
-    found, radius = _points(grey, board)
-    if found is None:
-        return f"no {board.kind} of {board.columns} x {board.rows} found"
-    measured = np.isfinite(found).all(axis=1)
-    if measured.sum() < FEWEST_SHARE * len(found):
-        size = f", its dots measure {radius:.3g} m in radius, not {board.radius:g}" * differs(radius, board.radius)
-        return f"only {measured.sum()} of {len(found)} points are sharp and whole{size}"
-    return _as_seen_from_the_front(board, BoardView(np.flatnonzero(measured), found[measured], radius))
-
-
-def _points(grey: NDArray[np.uint8], board: Board) -> tuple[Array | None, float | None]:
-    """Points (rows * columns, 2) px, NaN where one is not measured, and the radius of dots, m; None where not found."""
-    if board.kind == "chessboard":
-        return find_chessboard(grey, board.columns, board.rows), None
-    return find_dots(grey, board) or (None, None)
-
-
-def _as_seen_from_the_front(board: Board, view: BoardView) -> BoardView | str:
-    """The view with its rows turned round if it was read mirrored: a board is seen from its front only."""
-    grid = np.arange(len(board.points)).reshape(board.rows, board.columns)
-    plane = board.points[view.index, :2]
-    flat, _ = cv2.findHomography(plane, view.pixels)
-    if flat is None:
-        return "its points lie on one line"
-    if np.linalg.det(flat) * (np.append(plane.mean(axis=0), 1.0) @ flat[2]) < 0.0:
-        if board.kind == "asymmetric_dots":
-            return "the dots were found in mirrored order"
-        view = view.read_as(grid[:, ::-1].ravel())
-        plane = board.points[view.index, :2]
-        flat, _ = cv2.findHomography(plane, view.pixels)
-    expected = cv2.perspectiveTransform(plane[None], flat)[0]
-    step = np.linalg.norm(np.diff(cv2.perspectiveTransform(board.points[None, :2, :2], flat)[0], axis=0))
-    gap = np.linalg.norm(expected - view.pixels, axis=1).max()
-    if gap > LARGEST_POINT_GAP * step:
-        return f"points leave the plane by up to {gap:.1f} px: not in the board's order"
-    return view
+    Parameters: image; centres (n,2) px; steps (n,2,2) px that carry the unit disc to each dot's cell. In each cell the
+    grey values' share of the step from ground to dot adds up to the dot's area. Dots that blur leaves without a level
+    top seem larger: of 2.5 px radius, blurred by 1 px, by a quarter.
+    """
+    ticks = np.linspace(-1.0, 1.0, CELL_SIDE)
+    within = np.hypot(*np.meshgrid(ticks, ticks)) <= 1.0
+    cell = np.stack(np.meshgrid(ticks, ticks), axis=-1)[within]
+    places = (centres[:, None] + cell @ steps.swapaxes(1, 2)).astype(np.float32)
+    values = cv2.remap(bright, places[..., 0], places[..., 1], cv2.INTER_LINEAR).astype(float)
+    middle = np.percentile(values, EXTREMES, axis=1).mean(axis=0)[:, None]
+    ground = np.nanmedian(np.where(values <= middle, values, np.nan), axis=1)
+    dot = np.nanmedian(np.where(values >= middle, values, np.nan), axis=1)
+    area = (values.mean(axis=1) - ground) / np.maximum(dot - ground, 1.0)
+    return float(np.sqrt(max(np.median(area), 0.0)))

@@ -19,15 +19,23 @@ from cmmsim.imaging.scene import SUNK, Disc, DiscStack, Mesh, Patch, solid_mesh
 from cmmsim.radiometry.images import StereoFrame
 from cmmsim.radiometry.noise import CameraNoise
 
-# The drawn board: a bright plate with dark dots or squares, as both renderers or pyrender take it.
-
-
+# The drawn board
 MARGIN = 1.0  # of the spacing: rim of the plate beyond its outermost points; a chessboard's outer squares reach there
 RIM = 0.35  # of the spacing: bright rim beyond the outer squares of a chessboard
 THICKNESS = 0.008  # m
 BRIGHT, DARK = 0.86, 0.06  # share of white light sent back
 FRONT = np.array([0.0, 0.0, -1.0])  # the front looks against the board's z axis
 FRONT.setflags(write=False)
+# Its poses
+LARGEST_TILT = 0.75  # rad between the board's normal and the view from the middle of the baseline
+DEPTH_RANGE = (0.8, 1.2)  # of the depth at which the optical axes come nearest
+CELLS = 3  # each image is divided into 3 x 3 cells that the board visits in turn
+GRAZING = 0.35  # cosine between the board's normal and the view of either camera, at the least
+TRIES = 4000  # poses drawn for one image before giving up
+# Its images
+TILE_PX = 64
+SUPERSAMPLING = 12
+OUTLINE_POINTS = 15  # along each side of the plate, to know where a bent one reaches
 
 
 def board_drawable(board: Board, distance: float) -> Drawable:
@@ -68,16 +76,6 @@ def _squares(board: Board, level: float) -> list[Mesh]:
         if (row + column) % 2 == 0
     ]
     return [Mesh(corners + place, np.array([[0, 1, 2], [0, 2, 3]]), np.full(4, level)) for place in places]
-
-
-# Seeded poses in which both cameras see a whole board, all over their images and tilted to all sides.
-
-
-LARGEST_TILT = 0.75  # rad between the board's normal and the view from the middle of the baseline
-DEPTH_RANGE = (0.8, 1.2)  # of the depth at which the optical axes come nearest
-CELLS = 3  # each image is divided into 3 x 3 cells that the board visits in turn
-GRAZING = 0.35  # cosine between the board's normal and the view of either camera, at the least
-TRIES = 4000  # poses drawn for one image before giving up
 
 
 def default_board(rig: StereoRig) -> Board:
@@ -155,14 +153,6 @@ def _front_to_both(rig: StereoRig, pose: Array, middle: Array) -> bool:
     return all(
         float(pose[:3, 2] @ view) > GRAZING * float(np.linalg.norm(view)) for view in (place, place - _right_eye(rig))
     )
-
-
-# Rendered calibration images: what the cameras of a sensor see of a board.
-
-
-TILE_PX = 64
-SUPERSAMPLING = 12
-OUTLINE_POINTS = 15  # along each side of the plate, to know where a bent one reaches
 
 
 def render_pairs(

@@ -1,4 +1,4 @@
-"""The result of a calibration: its figures, its text, and a sensor file whose cameras it replaces."""
+"""The result of a calibration: its figures, its text (TOML, JSON), and the sensor file whose cameras it replaces."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ from cmmsim.files.setup import rig_from_file
 from cmmsim.geometry.pose import Array, skew, transform_to_pose
 from cmmsim.geometry.stereo_rig import StereoRig
 
-# The result of a calibration.
-
-
 PLACE_NAMES = ("tx_m", "ty_m", "tz_m", "rx_rad", "ry_rad", "rz_rad")
 PARAMETER_NAMES = (
     *(f"{side}.{name}" for side in ("left", "right") for name in INTRINSIC_NAMES),
     *(f"right_from_left.{name}" for name in PLACE_NAMES),
 )
+TABLES = ("rig.left", "rig.right", "rig.right_from_left")
+HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(#.*)?$")
+BASIS = re.compile(r"^\s*based_on\s*=.*$")
+LARGEST_RATIO = 1.5  # of the baselines of calibration and sensor file, one over the other
 
 
 @dataclass(frozen=True)
@@ -93,9 +94,6 @@ def _inverse_left_jacobian(vector: Array) -> Array:
     return np.eye(3) - 0.5 * k + (1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))) * k @ k
 
 
-# A calibration as text: the tables of a sensor file (TOML), and everything as one JSON object.
-
-
 def rig_tables(found: Calibration) -> str:
     """Tables [rig.left], [rig.right] and [rig.right_from_left] of a sensor file."""
     state, lines = found.adjustment.state, []
@@ -148,15 +146,6 @@ def as_dict(found: Calibration) -> dict[str, Any]:
 
 def _row(values: Sequence[float] | np.ndarray) -> str:
     return "[" + ", ".join(repr(float(value)) for value in values) + "]"
-
-
-# A sensor file whose cameras a calibration replaces.
-
-
-TABLES = ("rig.left", "rig.right", "rig.right_from_left")
-HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(#.*)?$")
-LARGEST_RATIO = 1.5  # of the baselines of calibration and sensor file, one over the other
-BASIS = re.compile(r"^\s*based_on\s*=.*$")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""All that both cameras saw of the board, as the adjustment takes it, and how pictures become it."""
+"""From pairs of image files to what both cameras saw of the board, as the adjustment takes it."""
 
 from __future__ import annotations
 
@@ -15,21 +15,7 @@ from cmmsim.calibration.detection import BoardView, find_board
 from cmmsim.errors import CalibrationError
 from cmmsim.geometry.pose import Array
 
-# Names in messages: a few, and how many there are besides.
-
-
-MOST = 3
-
-
-def some(names: Sequence[str]) -> str:
-    """The first three names and the number of the others; "none" where there is none."""
-    more = f" and {len(names) - MOST} more" if len(names) > MOST else ""
-    return ", ".join(names[:MOST]) + more if names else "none"
-
-
-# Pairs of image files in two folders, and their grey values.
-
-
+SIDES = ("left", "right")
 SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".tif", ".tiff", ".webp")
 WHITE_SHARE = 99.9  # percentile of an image of more than 8 bit that becomes 255: 12-bit cameras fill 1/16 of 16 bit
 HOW_PAIRED = "pairs are made in the order of the sorted file names"
@@ -110,12 +96,6 @@ def _image_files(folder: Path) -> list[Path]:
     return files
 
 
-# All that both cameras saw of the board, as the adjustment takes it.
-
-
-SIDES = ("left", "right")
-
-
 @dataclass(frozen=True)
 class PairView:
     """What one pair of images shows; a side is the board or the reason why there is none."""
@@ -148,6 +128,33 @@ class PairView:
         return replace(self, left=reason) if side == 0 else replace(self, right=reason)
 
 
+def view_pairs(
+    pairs: Sequence[ImagePair], board: Board, advance: Callable[[], None] = lambda: None
+) -> tuple[list[PairView], tuple[int, int]]:
+    """What each pair shows of the board, and the size (width, height) px that all images have.
+
+    advance is called after each pair. Raises CalibrationError for images that cannot be read or differ in size.
+    """
+    if not pairs:
+        raise CalibrationError("no pairs of images")
+    seen, size = [], (0, 0)
+    for pair in pairs:
+        sides = []
+        for path in (pair.left, pair.right):
+            grey = read_grey(path)
+            height, width = grey.shape
+            size = (width, height) if path is pairs[0].left else size
+            if (width, height) != size:
+                raise CalibrationError(
+                    f"{path} is {width} x {height} px, {pairs[0].left} {size[0]} x {size[1]}: all images must have one "
+                    "size, unturned and uncropped"
+                )
+            sides.append(find_board(grey, board))
+        seen.append(PairView(pair.name, *sides))
+        advance()
+    return seen, size
+
+
 @dataclass(frozen=True)
 class Sightings:
     """Points seen by one camera in all pairs: view (m,) ascending, point (m,) of the board, pixels (m, 2)."""
@@ -163,45 +170,24 @@ class Sightings:
 
 def sightings_of(pairs: Sequence[PairView]) -> tuple[Sightings, Sightings]:
     """Sightings of the left and of the right camera; a pair's place in the list is its view."""
-    both = []
-    for side in range(2):
-        seen = [(k, pair.sides[side]) for k, pair in enumerate(pairs)]
-        views = [(k, view) for k, view in seen if not isinstance(view, str)]
-        both.append(
-            Sightings(
-                np.concatenate([np.full(len(v.index), k) for k, v in views]),
-                np.concatenate([v.index for _, v in views]),
-                np.concatenate([v.pixels for _, v in views]),
-            )
-        )
-    return both[0], both[1]
+    left, right = (views_of(pairs, side) for side in range(2))
+    return _joined(left), _joined(right)
 
 
-# From image files to what they show of the board.
+def views_of(pairs: Sequence[PairView], side: int) -> dict[int, BoardView]:
+    """The views of one camera by the place of their pair in the list."""
+    return {k: view for k, view in enumerate(pair.sides[side] for pair in pairs) if not isinstance(view, str)}
 
 
-def view_pairs(
-    pairs: Sequence[ImagePair], board: Board, advance: Callable[[], None] = lambda: None
-) -> tuple[list[PairView], tuple[int, int]]:
-    """What each pair shows of the board, and the size (width, height) px that all images have.
+def _joined(views: dict[int, BoardView]) -> Sightings:
+    return Sightings(
+        np.concatenate([np.full(len(view.index), k) for k, view in views.items()]),
+        np.concatenate([view.index for view in views.values()]),
+        np.concatenate([view.pixels for view in views.values()]),
+    )
 
-    advance is called after each pair. Raises CalibrationError for images that cannot be read or differ in size.
-    """
-    seen, size, first = [], None, None
-    for pair in pairs:
-        sides = []
-        for path in (pair.left, pair.right):
-            grey = read_grey(path)
-            if size is None:
-                size, first = (grey.shape[1], grey.shape[0]), path
-            if (grey.shape[1], grey.shape[0]) != size:
-                raise CalibrationError(
-                    f"{path} is {grey.shape[1]} x {grey.shape[0]} px, {first} {size[0]} x "
-                    f"{size[1]}: all images must have one size, unturned and uncropped"
-                )
-            sides.append(find_board(grey, board))
-        seen.append(PairView(pair.name, *sides))
-        advance()
-    if size is None:
-        raise CalibrationError("no pairs of images")
-    return seen, size
+
+def some(names: Sequence[str]) -> str:
+    """The first three names and the number of the others; "none" where there is none."""
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(names[:3]) + more if names else "none"

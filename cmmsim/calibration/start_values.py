@@ -12,53 +12,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.calibration.adjustment import RigState
+from cmmsim.calibration.adjustment import RigState, camera_matrix
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.detection import BoardView
-from cmmsim.calibration.sightings import SIDES, PairView
+from cmmsim.calibration.sightings import SIDES, PairView, views_of
 from cmmsim.errors import CalibrationError
 from cmmsim.geometry.pose import Array, invert
 
-# How many different places of the board some pictures show: pictures alike tell no more than one of them.
-
-
-ALIKE_PX = 2.0  # rms distance of the points of two pictures that show the board in one place
-
-
-def require_variety(views: Sequence[BoardView], orders: Sequence[NDArray[np.int_]], camera: str, fewest: int) -> None:
-    """Raise CalibrationError where the views of a camera show fewer than ``fewest`` places of the board.
-
-    orders: the board's symmetries, in any of which a view may be read.
-    """
-    count = len(different_views(views, orders))
-    if count < fewest:
-        places = "one place" if count == 1 else f"{count} places"
-        raise CalibrationError(
-            f"the {len(views)} pictures of the {camera} camera are alike, they show the board in "
-            f"{places} only (within {ALIKE_PX:g} px), {fewest} at the least are needed: move and "
-            "tilt the board from picture to picture"
-        )
-
-
-def different_views(views: Sequence[BoardView], orders: Sequence[NDArray[np.int_]]) -> list[BoardView]:
-    """The views without those that show the board where an earlier one does."""
-    found: list[BoardView] = []
-    for view in views:
-        readings = [view.read_as(order) for order in orders]
-        if not any(_distance(reading, other) < ALIKE_PX for reading in readings for other in found):
-            found.append(view)
-    return found
-
-
-def _distance(a: BoardView, b: BoardView) -> float:
-    """Root mean square distance of the points that both show, px."""
-    _, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
-    gap: Array = a.pixels[in_a] - b.pixels[in_b]
-    return float(np.sqrt(np.mean(np.sum(gap**2, axis=1)))) if len(gap) else np.inf
-
-
-ALIKE_ANGLE, ALIKE_SHARE = 0.06, 0.12  # rad; of the baseline: places of the right camera that count as the same
 FEWEST_VIEWS = 3
+ALIKE_PX = 2.0  # rms distance of the points of two pictures that show the board in one place
+ALIKE_ANGLE, ALIKE_SHARE = 0.06, 0.12  # rad; of the baseline: places of the right camera that count as the same
 MISFIT = "the two places of the board fit no other pair: wrong partner, or moved between the exposures"
 
 
@@ -69,55 +32,81 @@ def start_values(
 
     bend: whether two radial terms of distortion are estimated; size: (width, height) px. Raises CalibrationError.
     """
-    cameras = [_single(board, pairs, side, size, bend, fix_aspect) for side in range(2)]
-    poses = [dict(camera[1]) for camera in cameras]
-    pairs, right_from_left = _read_alike(board, pairs, poses)
-    right_from_left = _stereo(board, pairs, [camera[0] for camera in cameras], size, right_from_left)
-    boards = np.stack(
-        [
-            poses[0][k] if k in poses[0] else invert(right_from_left) @ poses[1].get(k, np.eye(4))
-            for k in range(len(pairs))
-        ]
-    )
-    return RigState(np.stack([camera[0] for camera in cameras]), right_from_left, boards), pairs
+    left, from_left = _one_camera(board, pairs, 0, size, bend, fix_aspect)
+    right, from_right = _one_camera(board, pairs, 1, size, bend, fix_aspect)
+    read, from_right, right_from_left = _read_alike(board, pairs, from_left, from_right)
+    right_from_left = _stereo(board, read, (left, right), size, right_from_left)
+    boards = [
+        from_left[k] if k in from_left else invert(right_from_left) @ from_right.get(k, np.eye(4))
+        for k in range(len(pairs))
+    ]
+    return RigState(np.stack([left, right]), right_from_left, np.stack(boards)), read
 
 
-def _single(
+def _one_camera(
     board: Board, pairs: Sequence[PairView], side: int, size: tuple[int, int], bend: bool, fix_aspect: bool
-) -> tuple[Array, list[tuple[int, Array]]]:
+) -> tuple[Array, dict[int, Array]]:
     """Intrinsics (9,) of one camera, and camera_from_board (4,4) of each view by the pair's place."""
-    views = [(k, v) for k, v in ((k, p.sides[side]) for k, p in enumerate(pairs)) if not isinstance(v, str)]
+    views = views_of(pairs, side)
     if len(views) < FEWEST_VIEWS:
         raise CalibrationError(f"the {SIDES[side]} camera sees the board in {len(views)} images, {FEWEST_VIEWS} needed")
-    require_variety([view for _, view in views], board.symmetries, SIDES[side], FEWEST_VIEWS)
+    _require_variety(list(views.values()), board.symmetries, SIDES[side])
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     flags |= 0 if bend else cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
     flags |= cv2.CALIB_FIX_ASPECT_RATIO if fix_aspect else 0
-    points = [board.points[view.index].astype(np.float32) for _, view in views]
-    pixels = [view.pixels.astype(np.float32) for _, view in views]
+    points = [board.points[view.index].astype(np.float32) for view in views.values()]
+    pixels = [view.pixels.astype(np.float32) for view in views.values()]
     try:
         _, matrix, terms, turns, shifts = cv2.calibrateCamera(points, pixels, size, np.eye(3), np.zeros(5), flags=flags)
     except cv2.error as error:
         raise CalibrationError(
             f"OpenCV finds no {SIDES[side]} camera for these views: {error.err}; show the board tilted to several sides"
         ) from error
-    terms = np.asarray(terms, dtype=float).ravel()
-    values = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *terms[:5]])
-    places = [_transform(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
-    if not (np.isfinite(values).all() and values[:2].min() > 0.0 and all(np.isfinite(p).all() for p in places)):
+    values = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *np.ravel(terms)[:5]], dtype=float)
+    places = [_transform(cv2.Rodrigues(turn)[0], shift) for turn, shift in zip(turns, shifts, strict=True)]
+    if not (np.isfinite(values).all() and values[:2].min() > 0.0 and np.isfinite(places).all()):
         raise CalibrationError(
             f"OpenCV's {SIDES[side]} camera is not finite (focal lengths {values[:2]}): show the "
             "board tilted to several sides"
         )
-    return values, [(k, place) for (k, _), place in zip(views, places, strict=True)]
+    return values, dict(zip(views, places, strict=True))
 
 
-def _read_alike(board: Board, pairs: Sequence[PairView], poses: list[dict[int, Array]]) -> tuple[list[PairView], Array]:
-    """Pairs whose right images are read in the order that most pairs agree on, and right_from_left (4,4) of it."""
+def _require_variety(views: Sequence[BoardView], orders: Sequence[NDArray[np.int_]], camera: str) -> None:
+    """Raise CalibrationError where the views of a camera show the board in too few places.
+
+    orders: the board's symmetries, in any of which a view may be read.
+    """
+    different: list[BoardView] = []
+    for view in views:
+        readings = [view.read_as(order) for order in orders]
+        if not any(_distance(reading, other) < ALIKE_PX for reading in readings for other in different):
+            different.append(view)
+    if len(different) < FEWEST_VIEWS:
+        places = "one place" if len(different) == 1 else f"{len(different)} places"
+        raise CalibrationError(
+            f"the {len(views)} pictures of the {camera} camera are alike, they show the board in "
+            f"{places} only (within {ALIKE_PX:g} px), {FEWEST_VIEWS} at the least are needed: move and "
+            "tilt the board from picture to picture"
+        )
+
+
+def _distance(a: BoardView, b: BoardView) -> float:
+    """Root mean square distance of the points that both show, px."""
+    _, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
+    gap: Array = a.pixels[in_a] - b.pixels[in_b]
+    return float(np.sqrt(np.mean(np.sum(gap**2, axis=1)))) if len(gap) else np.inf
+
+
+def _read_alike(
+    board: Board, pairs: Sequence[PairView], from_left: dict[int, Array], from_right: dict[int, Array]
+) -> tuple[list[PairView], dict[int, Array], Array]:
+    """Pairs whose right images are read in the order that most pairs agree on; the places of the board that the right
+    camera then sees; right_from_left (4,4)."""
     orders = board.symmetries
     turned = [_renaming_move(board, order) for order in orders]
     names = [(k, j) for k, pair in enumerate(pairs) if pair.both for j in range(len(orders))]
-    places = np.stack([poses[1][k] @ turned[j] @ invert(poses[0][k]) for k, j in names])
+    places = np.stack([from_right[k] @ turned[j] @ invert(from_left[k]) for k, j in names])
     alike = _alike(places)
     pair_of = np.array([k for k, _ in names])
     support = np.array([len(set(pair_of[row])) for row in alike])
@@ -129,16 +118,14 @@ def _read_alike(board: Board, pairs: Sequence[PairView], poses: list[dict[int, A
             f"only {support[best]} of {count} pairs agree on where the right camera stands: the "
             "images of a pair were not taken together, or the folders are paired wrongly"
         )
-    chosen = {names[i][0]: orders[names[i][1]] for i in np.flatnonzero(alike[best])}
+    chosen = {names[i][0]: i for i in np.flatnonzero(alike[best])}
     read = list(pairs)
     for k, pair in enumerate(pairs):
-        if pair.both and k in chosen and not isinstance(pair.right, str):
-            read[k] = PairView(pair.name, pair.left, pair.right.read_as(chosen[k]))
-        elif pair.both:
+        if pair.both and k not in chosen:
             read[k] = PairView(pair.name, MISFIT, MISFIT)
-    for k, place in ((names[i][0], places[i]) for i in np.flatnonzero(alike[best])):
-        poses[1][k] = place @ poses[0][k]
-    return read, places[best]
+        elif pair.both and not isinstance(pair.right, str):
+            read[k] = PairView(pair.name, pair.left, pair.right.read_as(orders[names[chosen[k]][1]]))
+    return read, from_right | {k: places[i] @ from_left[k] for k, i in chosen.items()}, places[best]
 
 
 def _renaming_move(board: Board, order: NDArray[np.int_]) -> Array:
@@ -167,29 +154,27 @@ def _angles(places: Array, rotations: Array) -> Array:
 
 
 def _stereo(
-    board: Board, pairs: Sequence[PairView], cameras: list[Array], size: tuple[int, int], guess: Array
+    board: Board, pairs: Sequence[PairView], cameras: tuple[Array, Array], size: tuple[int, int], guess: Array
 ) -> Array:
     """right_from_left (4,4) by OpenCV with the cameras as they are, from the points that both see."""
     points, left, right = [], [], []
-    for pair in pairs:
-        a, b = pair.sides
-        if isinstance(a, BoardView) and isinstance(b, BoardView):
-            index, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
-            points.append(board.points[index].astype(np.float32))
-            left.append(a.pixels[in_a].astype(np.float32))
-            right.append(b.pixels[in_b].astype(np.float32))
-    lenses = [(np.array([[v[0], 0.0, v[2]], [0.0, v[1], v[3]], [0.0, 0.0, 1.0]]), v[4:]) for v in cameras]
+    left_views, right_views = views_of(pairs, 0), views_of(pairs, 1)
+    for k in sorted(left_views.keys() & right_views.keys()):
+        a, b = left_views[k], right_views[k]
+        index, in_a, in_b = np.intersect1d(a.index, b.index, return_indices=True)
+        points.append(board.points[index].astype(np.float32))
+        left.append(a.pixels[in_a].astype(np.float32))
+        right.append(b.pixels[in_b].astype(np.float32))
+    lenses = [(camera_matrix(values), values[4:]) for values in cameras]
     try:
         found = cv2.stereoCalibrate(points, left, right, *lenses[0], *lenses[1], size, flags=cv2.CALIB_FIX_INTRINSIC)
-        place = np.eye(4)
-        place[:3, :3], place[:3, 3] = found[5], np.ravel(found[6])
     except cv2.error:
         return guess
+    place = _transform(found[5], found[6])
     return place if np.isfinite(place).all() else guess
 
 
-def _transform(turn: Array, shift: Array) -> Array:
+def _transform(rotation: Array, shift: Array) -> Array:
     transform = np.eye(4)
-    transform[:3, :3] = cv2.Rodrigues(np.asarray(turn, dtype=float))[0]
-    transform[:3, 3] = np.ravel(shift)
+    transform[:3, :3], transform[:3, 3] = rotation, np.ravel(shift)
     return transform

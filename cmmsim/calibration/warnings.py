@@ -9,17 +9,19 @@ import numpy as np
 
 from cmmsim.calibration.adjustment import Adjustment, RigState
 from cmmsim.calibration.board import Board
-from cmmsim.calibration.detection import BoardView, differs
+from cmmsim.calibration.detection import BoardView, radius_differs
 from cmmsim.calibration.sightings import SIDES, PairView, Sightings
-from cmmsim.geometry.pose import Array, apply, invert
+from cmmsim.geometry.pose import apply, invert
 from cmmsim.geometry.stereo_rig import StereoRig
-
-# What the pictures say against the board file and the folders they were given with.
-
 
 BOARD_SIDES = 0.01, 5.0  # m, smallest and largest longer side of a board that is hardly a wrong unit
 LARGEST_UNUSED = 1.0 / 3.0  # of the pairs
 LEFTWARD = 0.5  # of the baseline, by which the right camera may stand on the left of the left one
+LARGEST_FOCAL_STD = 0.003  # of the focal length
+LARGEST_CENTRE_STD = 0.005  # of the image width
+SMALLEST_TILT = 0.26  # rad between the board normals that differ most: 15 degrees
+SMALLEST_COVER = 0.4  # of the image's area within the hull of all points
+FEW_VIEWS = 8
 
 
 def contradictions(board: Board, state: RigState, pairs: Sequence[PairView]) -> list[str]:
@@ -35,7 +37,7 @@ def _dot_radius(board: Board, pairs: Sequence[PairView]) -> list[str]:
         view.radius for pair in pairs for view in pair.sides if isinstance(view, BoardView) and view.radius is not None
     ]
     measured = float(np.median(radii)) if radii else None
-    if not differs(measured, board.radius):
+    if not radius_differs(measured, board.radius):
         return []
     return [
         f"the board file gives dots of radius {board.radius:g} m, in the pictures they measure {measured:.4g} m "
@@ -77,16 +79,6 @@ def _unused(board: Board, pairs: Sequence[PairView]) -> list[str]:
     ]
 
 
-# What the user should know before trusting a calibration.
-
-
-LARGEST_FOCAL_STD = 0.003  # of the focal length
-LARGEST_CENTRE_STD = 0.005  # of the image width
-SMALLEST_TILT = 0.26  # rad between the board normals that differ most: 15 degrees
-SMALLEST_COVER = 0.4  # of the image's area within the hull of all points
-FEW_VIEWS = 8
-
-
 def weaknesses(solved: Adjustment, sightings: tuple[Sightings, Sightings], rig: StereoRig) -> list[str]:
     """One line for each weakness of a calibration: errors shared within a view, uncertain cameras, boards alike, images
     not covered, few views."""
@@ -98,7 +90,6 @@ def weaknesses(solved: Adjustment, sightings: tuple[Sightings, Sightings], rig: 
             "sharp?"
         )
     spread = np.sqrt(np.diag(solved.covariance))
-    tilt = solved.state.largest_tilt
     for side, (camera, name) in enumerate(zip(rig.cameras, SIDES, strict=True)):
         focal, centre = spread[9 * side : 9 * side + 2].max(), spread[9 * side + 2 : 9 * side + 4].max()
         if focal > LARGEST_FOCAL_STD * camera.focal_px or centre > LARGEST_CENTRE_STD * camera.width:
@@ -107,13 +98,14 @@ def weaknesses(solved: Adjustment, sightings: tuple[Sightings, Sightings], rig: 
                 f"principal point ± {centre:.1f} px (condition {solved.condition:.0e}); show the board tilted "
                 "to all sides"
             )
-        cover = _cover(sightings[side].pixels, camera.width, camera.height)
+        hull = cv2.convexHull(sightings[side].pixels.astype(np.float32))
+        cover = cv2.contourArea(hull) / (camera.width * camera.height)
         if cover < SMALLEST_COVER:
             lines.append(
                 f"board points cover {cover:.0%} of the {name} image, distortion beyond them is extrapolated; "
                 "show the board in the corners too"
             )
-    if tilt < SMALLEST_TILT:
+    if (tilt := solved.state.largest_tilt) < SMALLEST_TILT:
         lines.append(
             f"the boards are nearly parallel: their normals differ by at most {np.degrees(tilt):.1f} degrees, "
             "so that focal length and distance can hardly be told apart; tilt the board by 30 "
@@ -122,9 +114,3 @@ def weaknesses(solved: Adjustment, sightings: tuple[Sightings, Sightings], rig: 
     if (count := len(solved.state.left_from_boards)) < FEW_VIEWS:
         lines.append(f"{count} views only; {FEW_VIEWS} and more make an estimate of the uncertainty reliable")
     return lines
-
-
-def _cover(pixels: Array, width: int, height: int) -> float:
-    """Share of the image's area within the convex hull of all points."""
-    hull = cv2.convexHull(pixels.astype(np.float32))
-    return float(cv2.contourArea(hull)) / (width * height)
