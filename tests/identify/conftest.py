@@ -116,7 +116,7 @@ def parameter(initial, true, estimate, std, identifiable=True):
 
 @pytest.fixture(scope="session")
 def finished_run(tmp_path_factory):
-    """A finished run up to the report, not to be changed; the starting model diverges on the first unseen trajectory."""
+    """A run up to the report, not to be changed; the starting model diverges on the first unseen trajectory."""
     run = RunFolder(tmp_path_factory.mktemp("finished") / "run")
     run.path.mkdir()
     record, truth = make_record(), make_truth()
