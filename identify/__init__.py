@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Any
 from identify.errors import IdentifyError as IdentifyError
 
 if TYPE_CHECKING:
-    from identify.estimation.identification import IdentificationResult as IdentificationResult
     from identify.estimation.identification import identify as identify
+    from identify.estimation.result import IdentificationResult as IdentificationResult
     from identify.estimation.scale_anchor import ScaleAnchor as ScaleAnchor
     from identify.estimation.scale_anchor import store_anchor as store_anchor
     from identify.experiment.run import run_experiment as run_experiment
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from identify.scenario import Scenario as Scenario
     from identify.scenario import load_scenario as load_scenario
     from identify.scenario import scenario_names as scenario_names
-    from identify.validation.validation import unseen_errors as unseen_errors
+    from identify.validation.unseen import unseen_errors as unseen_errors
 
 _HOME = {
     "Scenario": "identify.scenario",
@@ -48,9 +48,9 @@ _HOME = {
     "store_anchor": "identify.estimation.scale_anchor",
     "payload_vector": "identify.record.payload",
     "store_payload": "identify.record.payload",
-    "IdentificationResult": "identify.estimation.identification",
+    "IdentificationResult": "identify.estimation.result",
     "identify": "identify.estimation.identification",
-    "unseen_errors": "identify.validation.validation",
+    "unseen_errors": "identify.validation.unseen",
 }
 
 __all__ = ["IdentifyError", *_HOME]

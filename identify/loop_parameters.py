@@ -13,13 +13,7 @@ import numpy as np
 from dynamics import Robot
 from dynamics.closed_loop import FrameTiming, FrictionLaw, LoopSettings, ServoGains
 from dynamics.errors import ParameterError
-from dynamics.parameters import (
-    COULOMB_NAMES,
-    JOINT_PID_NAMES,
-    PARAMETER_NAMES,
-    VISCOUS_NAMES,
-    check_parameters,
-)
+from dynamics.parameters import COULOMB_NAMES, JOINT_PID_NAMES, PARAMETER_NAMES, VISCOUS_NAMES, check_parameters
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import load_result

@@ -32,7 +32,6 @@ from identify.record.recording import build_model_run, write_model_runs
 from identify.reporting.report import write_report
 from identify.reporting.run_result import (
     add_truth,
-    identification_entry,
     parameter_vector,
     prediction_entry,
     sensor_entry,
@@ -41,7 +40,7 @@ from identify.reporting.run_result import (
 from identify.scenario import Scenario, load_scenario
 from identify.scenario.scenario import estimator_settings, with_estimator_settings
 from identify.trajectory import TrajectorySet, check_travel, load_trajectories, save_trajectories
-from identify.validation.validation import model_run, predicted_runs, run_unseen
+from identify.validation.unseen import model_run, predicted_runs, run_unseen
 
 
 def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:
@@ -125,7 +124,7 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
                 "identify": time.perf_counter() - began,
                 **seconds,
             },
-            "identification": identification_entry(result),
+            "identification": result.to_dict(),
             "before": rms_figures(before - measured, ok),
             "after": rms_figures(after - measured, ok),
         },

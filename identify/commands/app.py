@@ -10,11 +10,10 @@ import typer
 from typer.core import TyperGroup
 
 from identify.commands.calibrate import CALIBRATE_HELP, calibrate
-from identify.commands.estimators import estimators
+from identify.commands.comparisons import compare_excitation, estimators, variation
 from identify.commands.robot import base_parameters, export, verify_model, workspace
 from identify.commands.sensor import acceptance, detectors
 from identify.commands.study import STUDY_HELP, study
-from identify.commands.variation import variation
 from identify.errors import IdentifyError, ScenarioError
 from identify.files.run_folder import RunFolder, load_result, new_run_folder
 from identify.progress import print_warnings, terminal_progress
@@ -222,9 +221,7 @@ def excite(
     name = f"excite-{chosen.name}-{seed}" if compare else f"{chosen.name}-{seed}"
     folder = new_run_folder(out or Path("runs") / name)
     if compare:
-        from identify.commands import compare_excitation
-
-        compare_excitation.compare(chosen, seed, folder.path, terminal_progress(quiet), quiet)
+        compare_excitation(chosen, seed, folder.path, terminal_progress(quiet), quiet)
         return
     _pipeline().excite(chosen, seed, folder.path, terminal_progress(quiet))
 

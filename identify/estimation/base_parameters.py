@@ -1,24 +1,16 @@
-"""Base parameters: the combinations of dynamic parameters that a motion can tell apart (section 4.2), and how well.
+"""Base parameters: the combinations of dynamic parameters that a motion can tell apart (section 4.2).
 
-Base parameters: the combinations of dynamic parameters that a motion can tell apart (section 4.2).
 The wrench is H Xi (eq. 26). Where columns of H depend on each other, only combinations of their parameters act:
 H = H_1 (1 | beta) P, so that H Xi = H_1 (xi_1 + beta xi_2), and the base parameters are xi_1 + beta xi_2, one for each
 pivot column. Columns are scaled to length one, so that the choice does not depend on units. Pivots are deterministic:
 of all columns that are long enough, the first in a stated order is taken (threshold pivoting), so that the groups are
 the same whatever motion shows them.
-
-Conditioning of an identification: how unevenly a record tells the parameters apart.
-The information is taken in units of the starting guess: an eigenvalue of one is a direction that the record shows as
-well as the guess knows it. With the guess the information is that of all parameters. Without it, most of them would
-have none: there the poses are asked for the base parameters and the gains, with their common factor held, which poses
-never show (`scale_anchor`).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import null_space, orth, qr, subspace_angles
+from scipy.linalg import orth, qr, subspace_angles
 
 from dynamics import Robot
 from dynamics.closed_loop import Reference
@@ -27,7 +19,6 @@ from dynamics.parameters import COULOMB_NAMES, PARAMETER_NAMES, VISCOUS_NAMES
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.filtering import spline_derivatives
-from identify.loop_parameters import StartingGuess
 
 DEPENDENT = 1e-8
 """A column of length one whose part outside the pivots is shorter than this depends on them."""
@@ -193,81 +184,3 @@ def _preference(name: str) -> int:
 
 def _coefficient(value: float) -> str:
     return "" if abs(value - 1.0) < 5e-7 else f"{value:.6g} "
-
-
-# Correlation of estimates: which of them a record ties together.
-
-
-@dataclass(frozen=True)
-class Pair:
-    """Two quantities and the correlation of their estimates."""
-
-    first: str
-    second: str
-    correlation: float
-
-
-def correlation_matrix(covariance: Array) -> Array:
-    """Correlations (n, n) of a covariance (n, n) with positive variances."""
-    std = np.sqrt(np.diag(covariance))
-    correlations = np.asarray(covariance / np.outer(std, std), dtype=float)
-    np.fill_diagonal(correlations, 1.0)
-    return correlations
-
-
-def strongest_pairs(correlations: Array, names: Sequence[str], count: int) -> list[Pair]:
-    """The `count` pairs with the largest correlations (n, n) in size, the largest first."""
-    rows, columns = np.triu_indices(len(names), 1)
-    order = np.argsort(-np.abs(correlations[rows, columns]), kind="stable")[:count]
-    return [Pair(names[rows[k]], names[columns[k]], float(correlations[rows[k], columns[k]])) for k in order]
-
-
-POOR = 1e13
-"""Condition number of the poses' information beyond which double precision (1.1e-16) leaves the variance of the least
-known direction fewer than three digits."""
-
-
-@dataclass(frozen=True)
-class Conditioning:
-    """Condition numbers (largest over smallest eigenvalue) of the scaled information, with the starting guess and of
-    the poses alone (infinite where rounding hides the smallest); of the `directions` of base parameters and gains,
-    `unshown` are those that the guess knows better than the poses show them."""
-
-    with_guess: float
-    poses_alone: float
-    directions: int
-    unshown: int
-
-    @property
-    def poor(self) -> bool:
-        """Whether rounding decides what the poses say of the least known direction."""
-        return self.poses_alone > POOR
-
-    def warnings(self) -> tuple[str, ...]:
-        """One line where the record is poorly conditioned."""
-        if not self.poor:
-            return ()
-        return (
-            f"the record is poorly conditioned: the condition number of the poses' information is "
-            f"{self.poses_alone:.1e}, more than {POOR:.0e}; {self.unshown} of {self.directions} directions of base "
-            "parameters and gains come from the starting guess: excite more, or longer",
-        )
-
-
-def conditioning(
-    information: Array, known: Array, base: BaseParameters, guess: StartingGuess, estimate: Array
-) -> Conditioning:
-    """Conditioning of an estimate (67,) from the information (67, 67) of the poses and of what is known beside them."""
-    everything = np.linalg.eigvalsh((information + known) * np.outer(guess.std, guess.std))
-    count = base.combinations.shape[1]
-    gains = np.arange(count, len(estimate))
-    seen = np.concatenate([base.pivots, gains])
-    size = np.concatenate([np.sqrt(base.combinations**2 @ guess.std[:count] ** 2), guess.std[gains]])
-    values = np.concatenate([base.combinations @ estimate[:count], estimate[gains]])
-    # A base parameter acts through its pivot alone, whose column is therefore its own.
-    scaled = information[np.ix_(seen, seen)] * np.outer(size, size)
-    free = null_space((values / size)[None])
-    shown = np.linalg.eigvalsh(free.T @ scaled @ free)
-    smallest = float(shown[0])
-    alone = float(shown[-1]) / smallest if smallest > 0 else np.inf
-    return Conditioning(float(everything[-1] / everything[0]), alone, len(shown), int(np.sum(shown < 1)))

@@ -1,15 +1,14 @@
-"""Where a search may go, and 95 % intervals of what is estimated within bounds.
+"""Bounds: where a search may go, and the 95 % intervals of what is estimated within them.
 
-Where a search may go: no negative parameter, and on demand only bodies that can exist.
-A rigid body has a positive mass, and none of its principal moments of inertia exceeds the sum of the other two. With
-the second moments of its mass along its axes, J_x = integral of x^2 dm and so on,
+No parameter is negative, and on demand bodies are such as can exist: a rigid body has a positive mass, and none of its
+principal moments of inertia exceeds the sum of the other two. With the second moments of its mass along its axes,
+J_x = integral of x^2 dm and so on,
 
     Ixx = J_y + J_z,    Iyy = J_x + J_z,    Izz = J_x + J_y,
 
 and the triangle inequality of the moments is nothing but J >= 0: a search in J instead of I needs bounds only, see
 Traversaro et al., "Identification of fully physical consistent inertial parameters" (IROS 2016).
 
-95 % intervals of what is estimated within bounds.
 The covariance of an estimate is that of the problem without bounds. Where bounds hold the estimate back, they pull all
 of it from where the record and the starting guess alone would have it. Linearised about the estimate, that is
 
@@ -33,8 +32,6 @@ from dynamics.parameters import BODY_NAMES
 from identify.arrays import Array
 from identify.estimation.bounded_least_squares import Problem
 from identify.loop_parameters import NAMES, StartingGuess, index_of
-
-# Linear propagation of uncertainty.
 
 
 def combined_std(rows: Array, covariance: Array) -> Array:

@@ -1,27 +1,17 @@
-"""Covariance of an output-error estimate, by propagating the sensor's noise, and of the poses that it predicts.
+"""Covariance of an output-error estimate, by propagating through the experiment what is not known exactly.
 
-What the error of a known load does to an estimate that takes the load at its stated figures.
-Under the load L the model has the parameters p + L: an error of the load moves the residuals of its records by J dL,
-with J their Jacobian by the parameters, and the scores by J^T J dL. With S the covariance of the load, the scores
-spread by H S H beside the noise, where H = J^T J sums over all records made under this load. The estimate follows the
-scores as it follows those of noise (`estimate_covariance`). Where the load shows the scale, a load that is a percent
-heavier than stated makes all parameters about a percent too small.
-
-Covariance of an output-error estimate, by propagating the sensor's noise through the experiment.
 Sensor noise enters twice: in the measured poses, and through the servo in the plant's motion, which a model that
 closes its own loop cannot follow (its residuals are coloured, and stick-slip makes the response nonlinear). So the
 experiment is repeated on the identified model with drawn noise: each draw gives residuals r, and their scores J^T r
 spread as those of the real record do. With W the information of data and prior, the covariance of the estimate is
 W^-1 (cov(J^T r) + prior information) W^-1. A model driven by the logged commands has white residuals, and W^-1 is all.
-Where either misses the record by more than noise explains, what its error does to the scores is added (`misfit`); and
-what the error of a load does that is not known exactly (`load_error`). It is all computed in units where W is one.
+Where either misses the record by more than noise explains, what its error does to the scores is added (`explanation`).
+It is all computed in units where W is one.
 
-How far the true plant may be from what the identified model predicts, on a motion that it was not identified from.
-Two things keep the plant away from the model. The parameters are uncertain: their covariance C comes through the exact
-sensitivities S of the model's poses as S C S^T. And the sensor's noise goes through the servo into the plant's motion,
-which no model can foretell: its covariance is sampled by repeated experiments on the identified model, and is taken to
-be the same all along the motion. What the sensor has wrong in every frame alike, such as the frames it was taught,
-moves the whole motion with it and is not predicted: no record of this sensor shows it.
+A known load errs, too. Under the load L the model has the parameters p + L: an error of the load moves the residuals of
+its records by J dL, with J their Jacobian by the parameters, and the scores by J^T J dL. With S the covariance of the
+load, the scores spread by H S H beside the noise, where H = J^T J sums over all records made under this load. Where the
+load shows the scale, one that is a percent heavier than stated makes all parameters about a percent too small.
 """
 
 from collections.abc import Sequence
@@ -39,22 +29,6 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.progress import Advance
 from identify.record.recorded_run import RecordedRun
 from identify.runtime import cores
-
-
-def load_score_covariance(runs: Sequence[RecordedRun], information: Sequence[Array], units: Array) -> Array:
-    """Covariance (p, p) of the scores T^T J^T r that the loads' standard deviations make, to first order.
-
-    information: J^T J (p, p) of each run's residuals; units: T (p, p). Runs that state the same load, equally well
-    known, share its error; different loads err independently.
-    """
-    size = len(units)
-    shown: dict[tuple[float, ...], Array] = {}
-    for run, one in zip(runs, information, strict=True):
-        load = (*run.payload, *run.payload_std)
-        shown[load] = shown.get(load, np.zeros((size, size))) + one
-    spread = [units.T @ total * np.array(load[size:]) for load, total in shown.items()]
-    return np.asarray(sum(one @ one.T for one in spread), dtype=float)
-
 
 DRAWS = 100
 """Repetitions: they know a standard deviation to 7 %."""
@@ -114,6 +88,21 @@ def estimate_uncertainty(
     prior = _information(known_rows @ units)
     covariance = units @ (scores + prior) @ units.T
     return Uncertainty((covariance + covariance.T) / 2, information, np.asarray(gradient), misfit, unstable)
+
+
+def load_score_covariance(runs: Sequence[RecordedRun], information: Sequence[Array], units: Array) -> Array:
+    """Covariance (p, p) of the scores T^T J^T r that the loads' standard deviations make, to first order.
+
+    information: J^T J (p, p) of each run's residuals; units: T (p, p). Runs that state the same load, equally well
+    known, share its error; different loads err independently.
+    """
+    size = len(units)
+    shown: dict[tuple[float, ...], Array] = {}
+    for run, one in zip(runs, information, strict=True):
+        load = (*run.payload, *run.payload_std)
+        shown[load] = shown.get(load, np.zeros((size, size))) + one
+    spread = [units.T @ total * np.array(load[size:]) for load, total in shown.items()]
+    return np.asarray(sum(one @ one.T for one in spread), dtype=float)
 
 
 def _units(rows: list[Array]) -> Array:
@@ -197,41 +186,25 @@ def repeated_experiment(run: RecordedRun, parameters: Array, rng: np.random.Gene
     return simulate(run.robot, parameters + run.payload, run.reference, run.settings, lost=~run.ok, noise=noise)
 
 
-REPETITIONS = 4
-"""Repeated experiments a motion: with hundreds of frames each they know the noise's share of a deviation to 5 %."""
-
-
 @dataclass(frozen=True)
-class PosePrediction:
-    """The model's poses (N, 6) [m, rad], and the covariance (N, 6, 6) of the plant's true ones about them."""
+class Pair:
+    """Two quantities and the correlation of their estimates."""
 
-    poses: Array
-    covariance: Array
-
-    @property
-    def std(self) -> Array:
-        """Standard deviations (N, 6) [m, rad]."""
-        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)), dtype=float)
-
-    def normalised_squared_error(self, true: Array) -> float:
-        """Mean over the frames of e^T P^-1 e / 6 with the error e of the true poses (N, 6): near one where P is right.
-
-        Errors of parameters last for the whole motion: of a single run the figure spreads widely about one.
-        """
-        errors = true - self.poses
-        weighted = np.linalg.solve(self.covariance, errors[..., None])[..., 0]
-        return float(np.mean(np.sum(errors * weighted, axis=1))) / 6
+    first: str
+    second: str
+    correlation: float
 
 
-def predict_poses(run: RecordedRun, parameters: Array, covariance: Array, rng: np.random.Generator) -> PosePrediction:
-    """Predict a run with estimated parameters (67,) of covariance (67, 67).
+def correlation_matrix(covariance: Array) -> Array:
+    """Correlations (n, n) of a covariance (n, n) with positive variances."""
+    std = np.sqrt(np.diag(covariance))
+    correlations = np.asarray(covariance / np.outer(std, std), dtype=float)
+    np.fill_diagonal(correlations, 1.0)
+    return correlations
 
-    Of the run only the reference, the sensor's covariance and the lost frames count, not what was measured.
-    Raises LoopFailure where the model, or its repetition with the sensor's noise, is unstable.
-    """
-    model = run.simulate(parameters, sensitivities=True)
-    assert model.pose_sensitivity is not None
-    drawn = [repeated_experiment(run, parameters, rng).pose - model.pose for _ in range(REPETITIONS)]
-    noise = np.concatenate(drawn)
-    from_parameters = model.pose_sensitivity @ covariance @ model.pose_sensitivity.transpose(0, 2, 1)
-    return PosePrediction(model.pose, from_parameters + noise.T @ noise / len(noise))
+
+def strongest_pairs(correlations: Array, names: Sequence[str], count: int) -> list[Pair]:
+    """The `count` pairs with the largest correlations (n, n) in size, the largest first."""
+    rows, columns = np.triu_indices(len(names), 1)
+    order = np.argsort(-np.abs(correlations[rows, columns]), kind="stable")[:count]
+    return [Pair(names[rows[k]], names[columns[k]], float(correlations[rows[k], columns[k]])) for k in order]

@@ -1,8 +1,7 @@
 """Whether the model explains its records: by the size of what it leaves, and by whether that is white.
 
-How far a model misses its record beyond what the sensor's noise explains, and what that does to the intervals.
 With the right model the mean squared whitened residual is what noise makes of it, but for chance. Where it is larger
-than chance allows, the rest is an error of the model. Unlike noise such an error lasts from frame to frame, and moves
+than chance allows, the rest, the misfit, is an error of the model. Unlike noise it lasts from frame to frame, and moves
 an estimate further than white residuals of the same size would: scaling the covariance by the residual (Birge's ratio)
 is not enough. The scores J^T r of stationary residuals with the autocorrelation R_k have the covariance
 
@@ -10,11 +9,9 @@ is not enough. The scores J^T r of stationary residuals with the autocorrelation
 
 (Morelli and Klein, "Accuracy of aerodynamic model parameters estimated from flight test data", J. Guidance, Control,
 and Dynamics 20(1), 1997), with R_k from the residuals themselves. The model's share is added to what the noise makes.
-
 No residual shows the part of an error that the parameters take up. Where the model's error makes most of the residual,
 no interval can be trusted, and nothing counts as identified.
 
-Whiteness of residuals: does anything systematic remain in what the model does not explain?
 A model driven by the logged commands feels everything the plant felt, so that with the right model its residuals are
 the sensor's noise, independent from frame to frame. The portmanteau test of Ljung and Box asks whether their
 autocorrelations could be chance: n (n + 2) sum_k r_k² / (n - k) over the lags k = 1 ... L is chi-square with L degrees
@@ -56,6 +53,9 @@ class Misfit:
     expected: float
     std: float
 
+    def __str__(self) -> str:
+        return f"{self.found:.3f} times the noise variance, noise alone gives {self.expected:.3f} ± {self.std:.3f}"
+
     @property
     def significant(self) -> bool:
         """Whether the model misses the record by more than chance explains."""
@@ -73,10 +73,7 @@ class Misfit:
 
     def warnings(self, model: str = "the model") -> tuple[str, ...]:
         """One line where noise does not explain the residual: a local minimum, or a model or covariance is wrong."""
-        says = (
-            f"{model} misses the record by {self.found:.3f} times the noise variance, noise alone gives "
-            f"{self.expected:.3f} ± {self.std:.3f}: "
-        )
+        says = f"{model} misses the record by {self}: "
         if self.decides:
             says += "the model or the stated covariance is wrong, its error decides, and nothing counts as identified"
         elif self.significant:

@@ -1,6 +1,5 @@
 """What the records decide of each parameter and group: whether it is identified, in what interval, and at what risk.
 
-Which quantities a record identifies: one criterion for parameters and for groups of them.
 A quantity counts as identified when the record
 
     at least halves the standard deviation that the starting guess leaves, and
@@ -13,33 +12,33 @@ size of a group is the root of the summed squares of what its members contribute
 large as they are, though the guess may have it vanish: known to a fraction of that, it is known to be small, while its
 own relative error may be anything.
 
-What an identification says about the base parameters: the combinations that a record can show.
-A group's estimate and standard deviation follow from those of its parameters by linear propagation; it is often known
-well where none of its members is.
+Groups are the base parameters, the combinations that a record can show: what is known of one follows from its members
+by linear propagation, and it is often known well where none of them is. Poses show the groups and the gains; the scale
+anchor adds what it measures. A parameter that is none of these, nor a combination of them, may be estimated with a
+small standard deviation all the same: where the guess knows the other members of a sum well enough for that, however
+vaguely in their own units. Such an estimate rests on the prior: it is as good as what the guess says of them, and its
+interval holds the truth where that does. A mass shown only in link4.Ixx - 0.0227 link4.mass is one: it rests on the
+guess of link4.Ixx. The common factor of all parameters counts as known by its anchor; where that is the prior, no
+parameter is on its own.
 
-Which parameters a record tells on their own, and which only with the help of the starting guess.
-Poses show the base parameters, sums of parameters, and the gains; the scale anchor adds what it measures. A parameter
-that is none of these, nor a combination of them, may be estimated with a small standard deviation all the same: where
-the guess knows the other members of a sum well enough for that, however vaguely in their own units. Such an estimate
-is as good as what the guess says of them, and its interval holds the truth where that does. A mass shown only in
-link4.Ixx - 0.0227 link4.mass is one: it rests on the guess of link4.Ixx.
-
-The common factor of all parameters counts as known by its anchor; where that is the prior, no parameter is on its own.
+Conditioning says how unevenly a record tells the parameters apart. The information is taken in units of the starting
+guess: an eigenvalue of one is a direction that the record shows as well as the guess knows it. With the guess the
+information is that of all parameters. Without it, most of them would have none: there the poses are asked for the base
+parameters and the gains, with their common factor held, which poses never show (`scale_anchor`).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import null_space
 
 from dynamics import Robot
 from dynamics.parameters import COULOMB_NAMES, JOINT_PID_NAMES, VISCOUS_NAMES
 from identify.arrays import Array
 from identify.estimation.base_parameters import (
     BaseParameters,
-    Conditioning,
     base_parameters,
-    conditioning,
     rank_by_threshold,
     reference_regressor,
     structural_regressor,
@@ -64,7 +63,7 @@ FRICTION_SHARE = 0.1
 @dataclass(frozen=True)
 class Identifiability:
     """What the starting guess leaves of each parameter, std (67,), and its size (67,), SI; model_holds: whether noise,
-    and not an error of the model, makes most of the residuals (`misfit`): with another model nothing is identified."""
+    and not an error of the model, makes most of the residuals: with another model nothing is identified."""
 
     std: Array
     sizes: Array
@@ -140,6 +139,57 @@ def rests_on_prior(base: BaseParameters, anchor: ScaleAnchor, estimate: Array, s
     span = directions[singular > ROUNDING * singular[0]]
     outside = np.eye(len(sizes)) - span.T @ span
     return np.asarray(np.linalg.norm(outside, axis=1) > ROUNDING)
+
+
+POOR = 1e13
+"""Condition number of the poses' information beyond which double precision (1.1e-16) leaves the variance of the least
+known direction fewer than three digits."""
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """Condition numbers (largest over smallest eigenvalue) of the scaled information, with the starting guess and of
+    the poses alone (infinite where rounding hides the smallest); of the `directions` of base parameters and gains,
+    `unshown` are those that the guess knows better than the poses show them."""
+
+    with_guess: float
+    poses_alone: float
+    directions: int
+    unshown: int
+
+    @property
+    def poor(self) -> bool:
+        """Whether rounding decides what the poses say of the least known direction."""
+        return self.poses_alone > POOR
+
+    def warnings(self) -> tuple[str, ...]:
+        """One line where the record is poorly conditioned."""
+        if not self.poor:
+            return ()
+        return (
+            f"the record is poorly conditioned: the condition number of the poses' information is "
+            f"{self.poses_alone:.1e}, more than {POOR:.0e}; {self.unshown} of {self.directions} directions of base "
+            "parameters and gains come from the starting guess: excite more, or longer",
+        )
+
+
+def conditioning(
+    information: Array, known: Array, base: BaseParameters, guess: StartingGuess, estimate: Array
+) -> Conditioning:
+    """Conditioning of an estimate (67,) from the information (67, 67) of the poses and of what is known beside them."""
+    everything = np.linalg.eigvalsh((information + known) * np.outer(guess.std, guess.std))
+    count = base.combinations.shape[1]
+    gains = np.arange(count, len(estimate))
+    seen = np.concatenate([base.pivots, gains])
+    size = np.concatenate([np.sqrt(base.combinations**2 @ guess.std[:count] ** 2), guess.std[gains]])
+    values = np.concatenate([base.combinations @ estimate[:count], estimate[gains]])
+    # A base parameter acts through its pivot alone, whose column is therefore its own.
+    scaled = information[np.ix_(seen, seen)] * np.outer(size, size)
+    free = null_space((values / size)[None])
+    shown = np.linalg.eigvalsh(free.T @ scaled @ free)
+    smallest = float(shown[0])
+    alone = float(shown[-1]) / smallest if smallest > 0 else np.inf
+    return Conditioning(float(everything[-1] / everything[0]), alone, len(shown), int(np.sum(shown < 1)))
 
 
 @dataclass(frozen=True)

@@ -6,24 +6,19 @@ settings or the truth.
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from dynamics import DynamicsError, Robot
 from dynamics.closed_loop.problem import checked_loop_parameters
-from identify.arrays import Array
 from identify.errors import EstimationError, ScenarioError
-from identify.estimation.base_parameters import Conditioning
-from identify.estimation.bounded_least_squares import Solution
-from identify.estimation.covariance import DRAWS, Uncertainty, estimate_uncertainty
-from identify.estimation.explanation import Explanation, Whiteness, explanation
-from identify.estimation.identifiability import GroupEstimates, Judgement, judge
+from identify.estimation.covariance import DRAWS, estimate_uncertainty
+from identify.estimation.explanation import explanation
+from identify.estimation.identifiability import judge
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
-from identify.estimation.scale_anchor import ScaleAnchor, read_anchor
+from identify.estimation.result import IdentificationResult
+from identify.estimation.scale_anchor import read_anchor
 from identify.estimation.warm_start import linear_warm_start
 from identify.loop_parameters import NAMES, StartingGuess, starting_guess
 from identify.progress import Progress, SilentProgress
@@ -32,49 +27,6 @@ from identify.record.provenance import recorded_seed
 from identify.record.recorded_run import recorded_run
 from identify.runtime import one_thread
 from identify.scenario import Scenario
-
-
-@dataclass(frozen=True)
-class IdentificationResult:
-    """What one record says about the 67 parameters, in the order of `names`; SI.
-
-    initial, warm_start, estimate, std (67,), covariance (67, 67), the last two as they were without bounds; intervals
-    (67, 2): 95 %, cut at the bounds; identifiable (67,) bool; rests_on_prior (67,) bool: identified, but only with what
-    the guess says of other parameters; groups, group_intervals: what the record says of the base parameters;
-    base_rank: independent groups that the trajectory excites by the paper's rule; iterations and evaluations: of all
-    searches; stop_reason: of the last; searches: their names in order, and costs: after each iteration, one tuple a
-    search; active_bounds: what holds the estimate back, as "platform.Izz <= Ixx + Iyy";
-    noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what the sensor's noise alone
-    would leave, give or take noise_ratio_std; whiteness: test of the residuals of the model driven by the logged
-    commands.
-    """
-
-    names: tuple[str, ...]
-    initial: Array
-    warm_start: Array
-    estimate: Array
-    std: Array
-    covariance: Array
-    intervals: Array
-    identifiable: NDArray[np.bool_]
-    rests_on_prior: NDArray[np.bool_]
-    groups: GroupEstimates
-    group_intervals: Array
-    conditioning: Conditioning
-    scale_anchor: ScaleAnchor
-    base_rank: int
-    iterations: int
-    evaluations: int
-    stop_reason: str
-    searches: tuple[str, ...]
-    costs: tuple[tuple[float, ...], ...]
-    active_bounds: tuple[str, ...]
-    noise_ratio: float
-    expected_noise_ratio: float
-    noise_ratio_std: float
-    whiteness: Whiteness
-    warnings: tuple[str, ...]
-    seconds: dict[str, float]
 
 
 @one_thread
@@ -104,14 +56,33 @@ def identify(
     searches = output_error_searches(problem, scenario, warm, progress)
     searched = time.perf_counter()
     method, driven = scenario.identification.method, problem.driven_by_commands()
+    solution = searches[method]
     with progress.stage("uncertainty", DRAWS) as advance:
         judged = problem if method == "closed_loop" else driven
-        uncertainty = estimate_uncertainty(judged, searches[method].parameters, rng, advance)
+        uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
     explained = explanation(driven, searches["command_driven"].parameters, uncertainty.misfit)
-    judgement = judge(problem, scenario, searches[method], uncertainty, explained)
+    judgement = judge(problem, scenario, solution, uncertainty, explained)
     ended = time.perf_counter()
-    seconds = {"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched}
-    return _result(problem, warm, searches, uncertainty, explained, judgement, seconds)
+    return IdentificationResult(
+        names=NAMES,
+        initial=problem.guess.values,
+        warm_start=warm,
+        estimate=solution.parameters,
+        std=uncertainty.std,
+        covariance=uncertainty.covariance,
+        scale_anchor=problem.anchor,
+        iterations=sum(one.iterations for one in searches.values()),
+        evaluations=sum(one.evaluations for one in searches.values()),
+        stop_reason=solution.stop_reason,
+        searches=tuple(searches),
+        costs=tuple(one.costs for one in searches.values()),
+        noise_ratio=explained.misfit.found,
+        expected_noise_ratio=explained.misfit.expected,
+        noise_ratio_std=explained.misfit.std,
+        whiteness=explained.whiteness,
+        seconds={"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched},
+        **vars(judgement),
+    )
 
 
 def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario) -> OutputErrorProblem:
@@ -150,44 +121,3 @@ def _guess(robot: Robot, scenario: Scenario) -> StartingGuess:
             f"{error}"
         ) from None
     return guess
-
-
-def _result(
-    problem: OutputErrorProblem,
-    warm: Array,
-    searches: dict[str, Solution],
-    uncertainty: Uncertainty,
-    explained: Explanation,
-    judgement: Judgement,
-    seconds: dict[str, float],
-) -> IdentificationResult:
-    """What each step found, as one result; the last search brings the estimate."""
-    solution = list(searches.values())[-1]
-    return IdentificationResult(
-        names=NAMES,
-        initial=problem.guess.values,
-        warm_start=warm,
-        estimate=solution.parameters,
-        std=np.sqrt(np.diag(uncertainty.covariance)),
-        covariance=uncertainty.covariance,
-        intervals=judgement.intervals,
-        identifiable=judgement.identifiable,
-        rests_on_prior=judgement.rests_on_prior,
-        groups=judgement.groups,
-        group_intervals=judgement.group_intervals,
-        conditioning=judgement.conditioning,
-        scale_anchor=problem.anchor,
-        base_rank=judgement.base_rank,
-        iterations=sum(one.iterations for one in searches.values()),
-        evaluations=sum(one.evaluations for one in searches.values()),
-        stop_reason=solution.stop_reason,
-        searches=tuple(searches),
-        costs=tuple(one.costs for one in searches.values()),
-        active_bounds=judgement.active_bounds,
-        noise_ratio=explained.misfit.found,
-        expected_noise_ratio=explained.misfit.expected,
-        noise_ratio_std=explained.misfit.std,
-        whiteness=explained.whiteness,
-        warnings=judgement.warnings,
-        seconds=seconds,
-    )

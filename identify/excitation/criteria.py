@@ -29,7 +29,7 @@ from scipy.linalg import qr, solve_triangular
 from dynamics import Robot
 from identify.arrays import Array
 from identify.estimation.base_parameters import base_parameters, structural_regressor
-from identify.excitation.motion import Unknowns, log_determinant, motion, played_times, wrench_regressor
+from identify.excitation.motion import Unknowns, log_determinant, motion, played_times, regressor
 from identify.plugins import CRITERIA, chosen
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
@@ -79,7 +79,7 @@ def log_observability(
     z = ca.MX.sym("z", unknowns.size)
     if 6 * len(times) < base.rank:
         return ca.Function("log_observability", [z], [ca.MX(-np.inf)], ["z"], ["value"])
-    sampled = wrench_regressor(robot, smoothing_rad_s).map(len(times))(*motion(unknowns, z, times))
+    sampled = regressor(robot, smoothing_rad_s, "wrench").map(len(times))(*motion(unknowns, z, times))
     columns = ca.Function("pivots", [z], [sampled[list(base.pivots), :]])
     index = log_index(columns(z), base.combinations, np.array(columns(typical)), len(times))
     return ca.Function("log_observability", [z], [index], ["z"], ["value"])

@@ -39,7 +39,7 @@ from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.estimation.scale_anchor import DEFAULT_STD, MEASURED_PARAMETER
 from identify.excitation.criteria import SMOOTHING_RAD_S, Criterion
-from identify.excitation.motion import Unknowns, log_determinant, sample_times, torque_regressor, tracked_motion
+from identify.excitation.motion import Unknowns, log_determinant, regressor, sample_times, tracked_motion
 from identify.loop_parameters import NAMES, StartingGuess, index_of, model_settings, starting_guess
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
@@ -183,7 +183,7 @@ def sensitivity_spectrum(
     response = torque_response(robot, parameters, scenario, s)
     tracking = tracking_response(robot, parameters, scenario, s[: unknowns.harmonics])
     moved = tracked_motion(unknowns, z, times, tracking)
-    sampled = torque_regressor(robot, smoothing_rad_s).map(len(times))(*moved)
+    sampled = regressor(robot, smoothing_rad_s, "torque").map(len(times))(*moved)
     waves = np.exp(-np.outer(times, s)) * 2 / len(times)
     transform = np.stack([waves.real, waves.imag], axis=-1).reshape(len(times), -1)
     spectrum = ca.reshape(ca.reshape(sampled, 64 * 6, len(times)) @ ca.DM(transform), 64, 12 * len(s))

@@ -10,6 +10,7 @@ so that every trajectory that starts smoothly at home is one vector z of 12 (n -
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Literal
 
 import casadi as ca
 import numpy as np
@@ -136,21 +137,12 @@ def tracked_motion(
     return ca.repmat(ca.DM(unknowns.home), 1, len(times)) + offset, rate, acceleration
 
 
-def torque_regressor(robot: Robot, smoothing_rad_s: float | None) -> ca.Function:
-    """(pose, rate, acceleration) (6,) -> regressor of the actuator torques, transposed, (64, 6).
+def regressor(robot: Robot, smoothing_rad_s: float | None, of: Literal["wrench", "torque"]) -> ca.Function:
+    """(pose, rate, acceleration) (6,) -> regressor of wrench (eq. 25) or actuator torques, transposed (64, 6).
 
-    The wrench regressor (eq. 25) is J_ad^T times it. The sign of Coulomb friction has no derivative:
-    `smoothing_rad_s` replaces it by tanh(theta_dot / v_s); None keeps it.
+    The former is J_ad^T times the latter. The sign of Coulomb friction has no derivative: `smoothing_rad_s` replaces it
+    by tanh(theta_dot / v_s); None keeps it.
     """
-    return _regressor(robot, smoothing_rad_s, torque=True)
-
-
-def wrench_regressor(robot: Robot, smoothing_rad_s: float | None) -> ca.Function:
-    """(pose, rate, acceleration) (6,) -> regressor of the wrench (eq. 25), transposed, (64, 6)."""
-    return _regressor(robot, smoothing_rad_s, torque=False)
-
-
-def _regressor(robot: Robot, smoothing_rad_s: float | None, torque: bool) -> ca.Function:
     pose, rate, acceleration = (ca.SX.sym(name, 6) for name in ("pose", "rate", "acceleration"))
     to_twist = pose_rate_to_twist(pose)
     twist, twist_dot = to_twist @ rate, to_twist @ acceleration + twist_bias(pose, rate)
@@ -159,7 +151,7 @@ def _regressor(robot: Robot, smoothing_rad_s: float | None, torque: bool) -> ca.
     sign = ca.sign(velocity) if smoothing_rad_s is None else ca.tanh(velocity / smoothing_rad_s)
     rigid = rigid_body_regressor(robot.geometry, pose, twist, twist_dot)
     friction = ca.horzcat(ca.diag(sign), ca.diag(velocity))
-    if torque:
+    if of == "torque":
         whole = ca.horzcat(ca.solve(jacobian.T, rigid), friction)
     else:
         whole = ca.horzcat(rigid, jacobian.T @ friction)

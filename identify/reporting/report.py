@@ -11,7 +11,7 @@ import xarray as xr
 
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.estimation.base_parameters import correlation_matrix
+from identify.estimation.covariance import correlation_matrix
 from identify.experiment.truth import read_truth_runs, true_poses
 from identify.files.atomic import write_figure, write_text
 from identify.files.dataset import read_covariance

@@ -1,7 +1,6 @@
 """Entries of `result.json` from what the stages computed and recorded."""
 
 import json
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -9,94 +8,13 @@ import xarray as xr
 
 from dynamics import DynamicsError
 from dynamics.closed_loop.problem import checked_loop_parameters
-from dynamics.parameters import unit_of
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.estimation.base_parameters import Pair, correlation_matrix, strongest_pairs
-from identify.estimation.covariance import PosePrediction
-from identify.estimation.identification import IdentificationResult
 from identify.experiment.truth import true_poses
-from identify.files.run_folder import AXES, rms_figures
+from identify.files.run_folder import rms_figures
 from identify.loop_parameters import NAMES
 from identify.record import recording
-
-STRONGEST = 10
-"""Correlations that a result lists."""
-
-
-def identification_entry(result: IdentificationResult) -> dict[str, Any]:
-    """Estimates with their uncertainty; the true values are added by validation."""
-    anchor = result.scale_anchor
-    return {
-        "scale_anchor": anchor.name,
-        "scale_anchor_value": anchor.value,
-        "scale_anchor_std": anchor.std,
-        "iterations": result.iterations,
-        "evaluations": result.evaluations,
-        "stop_reason": result.stop_reason,
-        "costs": [list(costs) for costs in result.costs],
-        "searches": list(result.searches),
-        "active_bounds": list(result.active_bounds),
-        "noise_ratio": result.noise_ratio,
-        "expected_noise_ratio": result.expected_noise_ratio,
-        "noise_ratio_std": result.noise_ratio_std,
-        "whiteness": {
-            "p_value": result.whiteness.p_value,
-            "p_values": dict(zip(AXES, result.whiteness.p_values, strict=True)),
-        },
-        "conditioning": {
-            "with_guess": result.conditioning.with_guess,
-            "poses_alone": result.conditioning.poses_alone,
-            "directions": result.conditioning.directions,
-            "unshown": result.conditioning.unshown,
-        },
-        "strongest_correlations": [asdict(pair) for pair in _strongest(result)],
-        "warnings": list(result.warnings),
-        "base_rank": result.base_rank,
-        "parameters": _parameter_entries(result),
-        "groups": _group_entries(result),
-    }
-
-
-def _parameter_entries(result: IdentificationResult) -> dict[str, dict[str, Any]]:
-    return {
-        name: {
-            "unit": unit_of(name),
-            "initial": result.initial[index],
-            "true": None,
-            "warm_start": result.warm_start[index],
-            "estimate": result.estimate[index],
-            "std": result.std[index],
-            "interval": result.intervals[index].tolist(),
-            "identifiable": bool(result.identifiable[index]),
-            "rests_on_prior": bool(result.rests_on_prior[index]),
-        }
-        for index, name in enumerate(result.names)
-    }
-
-
-def _group_entries(result: IdentificationResult) -> dict[str, dict[str, Any]]:
-    groups = result.groups
-    return {
-        name: {
-            "expression": groups.expressions[index],
-            "coefficients": _coefficients(groups.combinations[index], result.names),
-            "initial": groups.initial[index],
-            "true": None,
-            "estimate": groups.estimate[index],
-            "std": groups.std[index],
-            "interval": result.group_intervals[index].tolist(),
-            "identifiable": bool(groups.identifiable[index]),
-        }
-        for index, name in enumerate(groups.names)
-    }
-
-
-def _strongest(result: IdentificationResult) -> list[Pair]:
-    """The strongest correlations among the parameters that are identified."""
-    chosen = np.flatnonzero(result.identifiable)
-    correlations = correlation_matrix(result.covariance[np.ix_(chosen, chosen)])
-    return strongest_pairs(correlations, [result.names[k] for k in chosen], STRONGEST)
+from identify.validation.unseen import PosePrediction
 
 
 def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
@@ -105,10 +23,6 @@ def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
         identification["parameters"][name]["true"] = value
     for group in identification.get("groups", {}).values():
         group["true"] = sum(weight * truth[name] for name, weight in group["coefficients"].items())
-
-
-def _coefficients(row: Array, names: tuple[str, ...]) -> dict[str, float]:
-    return {names[k]: float(row[k]) for k in np.flatnonzero(row)}
 
 
 def parameter_vector(identification: dict[str, Any], column: str) -> Array:

@@ -18,20 +18,25 @@ import xarray as xr
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from dynamics import DynamicsError, Robot
+from dynamics import DynamicsError, Robot, load_robot
 from dynamics.errors import ParameterError, SimulationError
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.base_parameters import base_parameters, structural_regressor
 from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identifiability import IDENTIFIABLE_SHARE, group_estimates, identifiability
-from identify.estimators.estimator import Estimate, Estimator, Evidence
-from identify.experiment.truth import true_poses
-from identify.files.run_folder import rms_figures, rms_row
+from identify.estimation.identification import output_error_problem
+from identify.estimators.estimator import Estimate, Estimator, Evidence, joint_channels
+from identify.experiment.joint_instruments import JointInstruments, measure_joints, read_channels, write_channels
+from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
+from identify.files.run_folder import RunFolder, rms_figures, rms_row
+from identify.loop_parameters import NAMES
 from identify.progress import Progress
+from identify.random_streams import INSTRUMENTS, LATENCY, mixed_generator, stream_seed
+from identify.record import recording
 from identify.record.recorded_run import recorded_reference
-from identify.scenario import Scenario
-from identify.validation.validation import model_run
+from identify.scenario import Scenario, load_scenario
+from identify.validation.unseen import model_run
 
 START = "starting guess"
 
@@ -89,6 +94,31 @@ class Score:
     note: str
     parameters: Array | None = None
     std: Array | None = None
+
+
+def compare_on_run(
+    folder: RunFolder,
+    instruments: JointInstruments,
+    estimators: Mapping[str, Estimator],
+    seed: int,
+    progress: Progress,
+) -> list[Score]:
+    """Scores on the record of a run, with joint instruments simulated from its truth, which are kept as instruments.nc.
+
+    Where the PID is known it has the true gains. Raises RecordError for files that are damaged.
+    """
+    scenario = load_scenario(folder.scenario)
+    record, truth = recording.read(folder.experiment), read_truth(folder.experiment)
+    draws = np.random.default_rng(stream_seed(int(record.attrs["seed"]), LATENCY, 0))
+    latencies = scenario.timing.drawn_latencies(record.sizes["time"], draws)
+    rng, channels = mixed_generator(INSTRUMENTS, seed), folder.path / "instruments.nc"
+    write_channels(channels, measure_joints(record, truth, scenario.timing, instruments, rng, latencies))
+    known = true_parameters(truth)
+    true = np.array([known[name] for name in NAMES])
+    problem = output_error_problem([record], load_robot(scenario.robot), scenario)
+    evidence = Evidence(problem, scenario, joint_channels(read_channels(channels), record), true[64:])
+    unseen = zip(recording.read_runs(folder.validation), read_truth_runs(folder.validation), strict=True)
+    return compare(evidence, examination(evidence, true, list(unseen)), estimators, progress)
 
 
 def examination(evidence: Evidence, true: Array, unseen: Sequence[tuple[xr.Dataset, xr.Dataset]]) -> Examination:

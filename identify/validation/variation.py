@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -24,14 +25,18 @@ from numpy.typing import NDArray
 from dynamics import Robot, load_robot
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.estimation.identification import IdentificationResult, identify
+from identify.estimation.identification import identify
+from identify.estimation.result import IdentificationResult
 from identify.excitation import design_trajectories
 from identify.experiment.run import Experiment, taught_sensor
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import DESIGN, stream_seed
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
-from identify.validation.validation import run_unseen
+from identify.validation.unseen import run_unseen
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 FEWEST_RUNS = 3
 """Of fewer runs a standard deviation says nothing."""
@@ -48,6 +53,18 @@ class Variation:
     expected: Array
     identified: NDArray[np.bool_]
     runs: int
+
+    def __repr__(self) -> str:
+        return (
+            f"<Variation: {np.sum(self.identified)} of {len(self.names)} parameters identified in all {self.runs} runs>"
+        )
+
+    def to_dataframe(self) -> "pd.DataFrame":
+        """One row a parameter: mean, variation, expected, identified."""
+        import pandas as pd
+
+        columns = {name: getattr(self, name) for name in ("mean", "variation", "expected", "identified")}
+        return pd.DataFrame(columns, index=pd.Index(self.names, name="parameter"))
 
     @property
     def worst(self) -> tuple[str, float]:

@@ -3,13 +3,7 @@
 import numpy as np
 
 from cmmsim.detection.detector import FitLimits
-from cmmsim.detection.ellipse_fit import (
-    CORE_SHARE,
-    RING_REACH,
-    SMALLEST_RADIUS_PX,
-    EllipseFits,
-    largest_misfits,
-)
+from cmmsim.detection.ellipse_fit import CORE_SHARE, RING_REACH, SMALLEST_RADIUS_PX, EllipseFits, largest_misfits
 from tests.cmmsim.numpy_coverage import coverage
 
 

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from identify.estimation.base_parameters import POOR, BaseParameters, conditioning, correlation_matrix, strongest_pairs
+from identify.estimation.base_parameters import BaseParameters
+from identify.estimation.covariance import correlation_matrix, strongest_pairs
+from identify.estimation.identifiability import POOR, conditioning
 from identify.estimation.identification import identify
 from identify.loop_parameters import NAMES, StartingGuess
 from identify.scenario import load_scenario

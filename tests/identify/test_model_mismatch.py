@@ -20,7 +20,7 @@ from identify.experiment.plant import build_plant
 from identify.experiment.truth import check_truth, true_poses
 from identify.loop_parameters import model_settings
 from identify.scenario import scenario_from_toml
-from identify.validation.validation import unseen_errors
+from identify.validation.unseen import unseen_errors
 from tests.identify.synthetic import quick, rss6, run_plant, trajectory, truth
 
 ELASTIC = {"plant.joint_stiffness_N_m_rad": 1000.0}

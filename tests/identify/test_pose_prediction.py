@@ -6,12 +6,11 @@ import pytest
 from dynamics.closed_loop import LoopFailure
 from dynamics.errors import ParameterError
 from identify.errors import EstimationError
-from identify.estimation.covariance import PosePrediction, predict_poses
 from identify.estimation.identification import identify
 from identify.progress import SilentProgress
 from identify.record.recorded_run import recorded_run
 from identify.reporting.run_result import prediction_entry
-from identify.validation.validation import predicted_runs
+from identify.validation.unseen import PosePrediction, predict_poses, predicted_runs
 from tests.identify.estimator_evidence import truth_of
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
 

@@ -9,7 +9,6 @@ from identify.estimation.identification import identify
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.loop_parameters import NAMES, index_of, starting_guess
 from identify.record.recorded_run import recorded_run
-from identify.reporting.run_result import identification_entry
 from identify.reporting.tables import ON_GUESS, parameter_table
 from tests.identify.synthetic import quick, rss6, run_plant, truth
 
@@ -65,7 +64,7 @@ def test_a_result_names_what_rests_on_the_guess_among_what_is_identified():
     named = {name for name, rests in zip(NAMES, result.rests_on_prior, strict=True) if rests}
     assert {"platform.Ixx", "platform.Iyy"} <= named < resting(WEIGHED)
     assert not (result.rests_on_prior & ~result.identifiable).any()
-    entries = identification_entry(result)["parameters"]
+    entries = result.to_dict()["parameters"]
     assert {name for name, entry in entries.items() if entry["rests_on_prior"]} == named
-    rows = parameter_table({"identification": identification_entry(result)}).rows
+    rows = parameter_table({"identification": result.to_dict()}).rows
     assert {row[0] for row in rows if row[-1] == ON_GUESS} == named

@@ -56,6 +56,8 @@ def test_variation_is_the_standard_deviation_over_the_mean():
     assert np.isnan(found.variation[2]), "a mean of zero has no relative variation"
     assert list(found.identified) == [True, True, False], "in every run, not in some"
     assert found.worst == ("link1.mass", pytest.approx(0.1))
+    assert repr(found) == "<Variation: 2 of 3 parameters identified in all 3 runs>"
+    assert found.to_dataframe().loc["link1.mass", "variation"] == pytest.approx(0.1)
 
 
 def test_the_table_stands_beside_the_papers():

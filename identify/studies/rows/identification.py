@@ -17,8 +17,8 @@ from dynamics import Robot, load_robot
 from dynamics.closed_loop import Reference, simulate
 from dynamics.parameters import COULOMB_NAMES, JOINT_PID_NAMES, VISCOUS_NAMES
 from identify.arrays import Array
-from identify.estimation.identification import IdentificationResult
 from identify.estimation.identification import identify as identify_record
+from identify.estimation.result import IdentificationResult
 from identify.excitation import design_trajectories
 from identify.experiment.plant import build_plant
 from identify.experiment.run import Experiment, excitation_run, run_plant, taught_sensor
@@ -44,7 +44,7 @@ from identify.studies.rows.kind import (
 )
 from identify.studies.rows.sensor import DrawnSensor
 from identify.trajectory import TrajectorySet
-from identify.validation.validation import model_run
+from identify.validation.unseen import model_run
 
 EXPERIMENT = 0
 CHOSEN = {

@@ -1,0 +1,223 @@
+"""Commands that compare: estimators on one record, estimates from run to run, and methods of excitation.
+
+Heavy imports are late.
+"""
+
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from identify.files.run_folder import RunFolder, save_files
+from identify.progress import Progress, print_table, terminal_progress
+from identify.scenario import Scenario, load_scenario
+
+if TYPE_CHECKING:
+    from identify.excitation.comparison import Comparison, Entry
+    from identify.validation.estimator_comparison import Score
+
+ESTIMATORS_HEADER = (
+    "estimator",
+    "groups\n%",
+    "median\n%",
+    "gains\n%",
+    "pos.\num",
+    "ori.\nurad",
+    "time\ns",
+    "iter.",
+    "evals",
+)
+
+METHODS_HEADER = ("method", "value", "eq. 39", "D", "seconds", "values", "gradients", "stopped")
+
+PAPER = "the paper, with its own robot and geometry: index 0.38 at the start, 1.345 after 324 generations"
+
+
+def estimators(
+    out: Annotated[Path, typer.Option("--out", help="Folder of a whole run: cmmsim run.")],
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="Name of an estimator, or module:function of one's own; repeatable.", show_default="all"),
+    ] = None,
+    add: Annotated[
+        list[str] | None,
+        typer.Option(help="Estimator of one's own beside these, as module:function; repeatable.", show_default="none"),
+    ] = None,
+    torque_noise: Annotated[float, typer.Option(min=0, help="Standard deviation of a measured torque, N m.")] = 0.02,
+    encoder_noise: Annotated[float, typer.Option(min=0, help="Standard deviation of a joint angle, rad.")] = 1e-5,
+    encoder_bits: Annotated[int, typer.Option(min=4, max=40, help="Bits a turn of the joint encoders.")] = 17,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the joint instruments' noise.")] = 0,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no table.")] = False,
+) -> None:
+    """Compare estimators on the record of a run: writes instruments.nc, estimators.json and figures/estimators.png.
+
+    The paper's output error beside its variants and beside what the literature does with measured joint torques and
+    encoders (inverse dynamics; poses from the camera, or by forward kinematics). The run has no such instruments: they
+    are simulated from its truth, with the noise given here. Where the PID is known it has the true gains. All are
+    judged by the truth of the record and of the unseen trajectories. An estimator of one's own is a function of the
+    evidence, see identify.estimators.estimator.
+    """
+    from identify.estimators.estimator import find_estimators
+    from identify.experiment.joint_instruments import JointInstruments
+    from identify.record.provenance import check_folder
+    from identify.validation.estimator_comparison import compare_on_run, estimators_figure
+
+    folder = RunFolder(out)
+    folder.require("scenario.toml", "experiment.nc", "validation.nc")
+    check_folder(folder, "experiment.nc", "validation.nc")
+    instruments = JointInstruments(torque_noise, encoder_noise, 2 * math.pi / 2**encoder_bits)
+    chosen = find_estimators(only) | (find_estimators(add) if add else {})
+    scores = compare_on_run(folder, instruments, chosen, seed, terminal_progress(quiet))
+    entry = {"seed": seed, "instruments": asdict(instruments), "estimators": {s.name: _entry(s) for s in scores}}
+    save_files(folder.path, {"estimators.json": entry, "figures/estimators.png": estimators_figure(scores)})
+    if not quiet:
+        _print_scores(scores, out)
+
+
+def _entry(score: "Score") -> dict[str, Any]:
+    """A score with its parameters by name."""
+    from identify.loop_parameters import NAMES
+
+    entry = asdict(score)
+    estimate, std = entry.pop("parameters"), entry.pop("std")
+    if estimate is not None:
+        entry["parameters"] = {
+            name: {"estimate": estimate[k], "std": None if std is None else std[k]} for k, name in enumerate(NAMES)
+        }
+    return entry
+
+
+def _print_scores(scores: list["Score"], out: Path) -> None:
+    print_table(
+        ESTIMATORS_HEADER,
+        [(score.title, *_score_row(score)) for score in scores],
+        ("estimator",),
+        "estimators on one record, against one truth",
+        "groups: RMS and median relative error of the base parameters that the record shows; gains: RMS of "
+        "those of the joint PID; position, orientation: model against true plant on unseen trajectories, RMS of the "
+        "worst axis and run; evals: simulated runs of the model",
+    )
+    for score in scores:
+        if score.note:
+            typer.echo(f"{score.title}: {score.note}")
+    typer.echo(f"files: {out}")
+
+
+def _score_row(score: "Score") -> list[str]:
+    """A row of the table; a dash where there is nothing, such as the error of an unstable model."""
+    gains = "given" if "gains" in score.uses else _short(100 * score.gain_distance)
+    groups = [_short(100 * value) for value in (score.group_distance, score.group_median)]
+    poses = [_short(value) for value in (score.position_um, score.orientation_urad, score.seconds)]
+    return [*groups, gains, *poses, str(score.iterations), str(score.evaluations)]
+
+
+def _short(value: float) -> str:
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
+
+
+def variation(
+    out: Annotated[Path, typer.Option("--out", help="Folder of a whole run: cmmsim run.")],
+    designed: Annotated[
+        int | None,
+        typer.Option(
+            "--designed",
+            min=3,
+            metavar="COUNT",
+            help="Record this many new runs, each on an exciting trajectory designed for it by the scenario's method, "
+            "instead of taking the unseen runs.",
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", min=1, help="Processes that design and render.", show_default="one a core"),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no table.")] = False,
+) -> None:
+    """Identify from each of several runs alone, and see how the estimates vary (the paper's table 5).
+
+    As in the paper, from the unseen runs of validation.nc; or from newly recorded ones, which are kept as variation.nc.
+    Writes variation.json, variation.md and figures/variation.png.
+
+    The masses of the links vary most: only what accelerates shows them. Fast trajectories tell more of them than long
+    ones: cmmsim excite paper --set excitation.fundamental_hz=0.3 --out fast, then cmmsim variation --out fast
+    --designed 10.
+    """
+    from dynamics import load_robot
+    from identify.record import recording
+    from identify.record.provenance import check_folder
+    from identify.reporting import variation_tables as tables
+    from identify.trajectory import load_trajectories
+    from identify.validation.variation import designed_runs, identify_each
+    from identify.validation.variation import variation as variation_of
+
+    folder, progress = RunFolder(out), terminal_progress(quiet)
+    folder.require("scenario.toml", "trajectories.json" if designed else "validation.nc")
+    scenario = load_scenario(folder.scenario)
+    robot = load_robot(scenario.robot)
+    if designed:
+        seed = load_trajectories(folder.trajectories).seed
+        runs = designed_runs(scenario, robot, seed, designed, workers, progress)
+        recording.write_runs(out / "variation.nc", [(run.record, run.truth) for run in runs])
+        records, origin = [run.record for run in runs], f"designed: {scenario.excitation.method}"
+    else:
+        check_folder(folder, "validation.nc")
+        records, origin = recording.read_runs(folder.validation), "unseen"
+    found = variation_of(identify_each(records, robot, scenario, progress))
+    table = tables.variation_table(found)
+    files = {
+        "variation.json": tables.variation_entry(found, origin),
+        "variation.md": f"# {table.title}\n\n{table.markdown()}\n\n{table.note}\n",
+        "figures/variation.png": tables.variation_figure(found),
+    }
+    save_files(out, files)
+    if not quiet:
+        name, worst = found.worst
+        print_table(table.header, table.rows, ("parameter", "unit"), table.title, table.note)
+        typer.echo(f"largest: {100 * worst:.3g} % of {name}; files: {out}")
+
+
+def compare_excitation(scenario: Scenario, seed: int, folder: Path, progress: Progress, quiet: bool) -> None:
+    """Search with every method: writes comparison.json and comparison.png into `folder`."""
+    from dynamics import load_robot
+    from identify.excitation.comparison import compare_methods, comparison_figure
+
+    robot = load_robot(scenario.robot)
+    found = compare_methods(robot, scenario, seed, progress)
+    figures = {**asdict(found), "entries": [entry.figures() for entry in found.entries], "scenario": scenario.name}
+    figure = comparison_figure(robot, scenario, found)
+    save_files(folder, {"comparison.json": figures, "comparison.png": figure})
+    if not quiet:
+        _print_methods(found, folder)
+
+
+def _print_methods(found: "Comparison", folder: Path) -> None:
+    """One row a method, and what is nearest to its limit."""
+    title = f"criterion {found.criterion}, seed {found.seed}, {found.candidates} random candidates"
+    print_table(METHODS_HEADER, map(_method_row, found.entries), ("method", "stopped"), title, PAPER)
+    for entry in found.entries:
+        nearest = sorted(entry.worst, key=lambda worst: -worst.share)
+        used = ", ".join(f"{worst.name} {100 * worst.share:.2f} %" for worst in nearest)
+        typer.echo(f"{entry.method}: share of each limit used: {used}")
+    typer.echo(
+        f"value: what was maximised (information: D of the linearised loop). D: factor by which a run narrows the "
+        f"prior, simulated loop; - where it is unstable. Candidates and functions: {found.preparation_seconds:.1f} s. "
+        f"Files: {folder}"
+    )
+
+
+def _method_row(entry: "Entry") -> tuple[str, ...]:
+    information = "-" if entry.information is None else f"{entry.information:.3f}"
+    return (
+        entry.method,
+        f"{entry.value:.4f}",
+        f"{entry.observability:.4f}",
+        information,
+        f"{entry.seconds:.1f}",
+        str(entry.evaluations),
+        str(entry.gradients),
+        entry.reason.replace("_", " "),
+    )

@@ -1,0 +1,152 @@
+"""What an identification says: estimates with their uncertainty and judgement, as a table, as JSON, and in one line."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynamics.parameters import unit_of
+from identify.arrays import Array
+from identify.estimation.covariance import Pair, correlation_matrix, strongest_pairs
+from identify.estimation.explanation import Misfit, Whiteness
+from identify.estimation.identifiability import Conditioning, GroupEstimates
+from identify.estimation.scale_anchor import ScaleAnchor
+from identify.files.dataset import POSE
+from identify.files.run_folder import save_result
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+STRONGEST = 10
+"""Correlations that a result lists."""
+
+
+@dataclass(frozen=True)
+class IdentificationResult:
+    """What one record says about the 67 parameters, in the order of `names`; SI.
+
+    initial, warm_start, estimate, std (67,), covariance (67, 67), the last two as they were without bounds; intervals
+    (67, 2): 95 %, cut at the bounds; identifiable (67,) bool; rests_on_prior (67,) bool: identified, but only with what
+    the guess says of other parameters; groups, group_intervals: what the record says of the base parameters;
+    base_rank: independent groups that the trajectory excites by the paper's rule; iterations and evaluations: of all
+    searches; stop_reason: of the last; searches: their names in order, and costs: after each iteration, one tuple a
+    search; active_bounds: what holds the estimate back, as "platform.Izz <= Ixx + Iyy";
+    noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what the sensor's noise alone
+    would leave, give or take noise_ratio_std; whiteness: test of the residuals of the model driven by the logged
+    commands.
+    """
+
+    names: tuple[str, ...]
+    initial: Array
+    warm_start: Array
+    estimate: Array
+    std: Array
+    covariance: Array
+    intervals: Array
+    identifiable: NDArray[np.bool_]
+    rests_on_prior: NDArray[np.bool_]
+    groups: GroupEstimates
+    group_intervals: Array
+    conditioning: Conditioning
+    scale_anchor: ScaleAnchor
+    base_rank: int
+    iterations: int
+    evaluations: int
+    stop_reason: str
+    searches: tuple[str, ...]
+    costs: tuple[tuple[float, ...], ...]
+    active_bounds: tuple[str, ...]
+    noise_ratio: float
+    expected_noise_ratio: float
+    noise_ratio_std: float
+    whiteness: Whiteness
+    warnings: tuple[str, ...]
+    seconds: dict[str, float]
+
+    def __repr__(self) -> str:
+        misfit = Misfit(self.noise_ratio, self.expected_noise_ratio, self.noise_ratio_std)
+        return (
+            f"<IdentificationResult: {np.sum(self.identifiable)} of {len(self.names)} parameters and "
+            f"{np.sum(self.groups.identifiable)} of {len(self.groups.names)} groups identified in {self.iterations} "
+            f"iterations, {misfit}, {len(self.warnings)} warnings>"
+        )
+
+    def to_dataframe(self) -> "pd.DataFrame":
+        """One row a parameter: unit, initial, estimate, std, the interval from low to high, identifiable."""
+        import pandas as pd
+
+        columns = {
+            "unit": [unit_of(name) for name in self.names],
+            "initial": self.initial,
+            "estimate": self.estimate,
+            "std": self.std,
+            "low": self.intervals[:, 0],
+            "high": self.intervals[:, 1],
+            "identifiable": self.identifiable,
+        }
+        return pd.DataFrame(columns, index=pd.Index(self.names, name="parameter"))
+
+    def save(self, path: Path | str) -> None:
+        """Write a JSON file whose "identification" is that of a run's result.json; commands take its estimates."""
+        save_result(path, {"identification": self.to_dict()})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Estimates with their uncertainty, for a JSON file; the true values, where known, are for others to add."""
+        return {
+            "scale_anchor": self.scale_anchor.name,
+            "scale_anchor_value": self.scale_anchor.value,
+            "scale_anchor_std": self.scale_anchor.std,
+            "iterations": self.iterations,
+            "evaluations": self.evaluations,
+            "stop_reason": self.stop_reason,
+            "costs": [list(costs) for costs in self.costs],
+            "searches": list(self.searches),
+            "active_bounds": list(self.active_bounds),
+            "noise_ratio": self.noise_ratio,
+            "expected_noise_ratio": self.expected_noise_ratio,
+            "noise_ratio_std": self.noise_ratio_std,
+            "whiteness": {
+                "p_value": self.whiteness.p_value,
+                "p_values": dict(zip(POSE, self.whiteness.p_values, strict=True)),
+            },
+            "conditioning": asdict(self.conditioning),
+            "strongest_correlations": [asdict(pair) for pair in self._strongest_correlations()],
+            "warnings": list(self.warnings),
+            "base_rank": self.base_rank,
+            "parameters": {name: self._parameter(k) for k, name in enumerate(self.names)},
+            "groups": {name: self._group(k) for k, name in enumerate(self.groups.names)},
+        }
+
+    def _parameter(self, k: int) -> dict[str, Any]:
+        return {
+            "unit": unit_of(self.names[k]),
+            "initial": self.initial[k],
+            "true": None,
+            "warm_start": self.warm_start[k],
+            "estimate": self.estimate[k],
+            "std": self.std[k],
+            "interval": self.intervals[k].tolist(),
+            "identifiable": bool(self.identifiable[k]),
+            "rests_on_prior": bool(self.rests_on_prior[k]),
+        }
+
+    def _group(self, k: int) -> dict[str, Any]:
+        groups, row = self.groups, self.groups.combinations[k]
+        return {
+            "expression": groups.expressions[k],
+            "coefficients": {self.names[i]: float(row[i]) for i in np.flatnonzero(row)},
+            "initial": groups.initial[k],
+            "true": None,
+            "estimate": groups.estimate[k],
+            "std": groups.std[k],
+            "interval": self.group_intervals[k].tolist(),
+            "identifiable": bool(groups.identifiable[k]),
+        }
+
+    def _strongest_correlations(self) -> list[Pair]:
+        """The strongest among the parameters that are identified."""
+        identified = np.flatnonzero(self.identifiable)
+        correlations = correlation_matrix(self.covariance[np.ix_(identified, identified)])
+        return strongest_pairs(correlations, [self.names[k] for k in identified], STRONGEST)
