@@ -117,6 +117,7 @@ def study(
         raise typer.BadParameter("name a built-in study or a TOML file, or ask for --list", param_hint="STUDY")
     if scheduler is not None and workers is not None:
         raise typer.BadParameter("--workers is for this machine, not for a running cluster", param_hint="--workers")
+    from identify.studies.runner import run_study
     from identify.studies.study_file import load_study
 
     chosen = load_study(name)
@@ -126,21 +127,11 @@ def study(
         raise StudyError(f"study {chosen.name!r} has {chosen.rows:,} rows; to run more than {MANY_ROWS:,}, say --yes")
     folder = out or Path("runs") / f"study-{chosen.name}"
     try:
-        outcome = _run(chosen, folder, scheduler, workers, quiet)
+        outcome = run_study(chosen, folder, terminal_progress(quiet, rate="rows/s"), _workers(scheduler, workers))
     except StudyInterrupted as stopped:
         typer.echo(f"{stopped}; the same command goes on from there", err=True)
         raise typer.Exit(STOPPED) from None
-    laws = _summary(chosen, folder, outcome)
-    if not quiet:
-        _print_summary(folder, outcome, laws)
-    _exit(outcome, laws)
-
-
-def _run(study: "Study", folder: Path, scheduler: str | None, workers: int | None, quiet: bool) -> "Outcome":
-    from identify.studies.runner import run_study
-
-    progress = terminal_progress(quiet, rate="rows/s")
-    return run_study(study, folder, progress, _workers(scheduler, workers))
+    _say(folder, outcome, _summary(chosen, folder, outcome), quiet)
 
 
 def _workers(scheduler: str | None, workers: int | None) -> "Workers":
@@ -157,31 +148,25 @@ def _workers(scheduler: str | None, workers: int | None) -> "Workers":
 def _summary(study: "Study", folder: Path, outcome: "Outcome") -> list[dict[str, Any]]:
     """Write the summary; the laws with their verdicts."""
     from identify.studies import summary
+    from identify.studies.table import written
 
-    try:
+    with written(folder / summary.MARKDOWN, "; all rows are kept, and the same command writes it again"):
         return list(summary.write(folder, study, outcome.frame)["theory"])
-    except OSError as error:
-        raise StudyError(
-            f"the summary in {folder} cannot be written: {error.strerror or error}; all rows are kept, and the same "
-            "command writes it again"
-        ) from error
 
 
-def _print_summary(folder: Path, outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
-    for law in laws:
-        typer.echo(_law_line(law))
-    again = f", {outcome.found} of them from before" if outcome.found else ""
-    again += f" ({outcome.beyond} more, of further repeats, are kept)" if outcome.beyond else ""
-    typer.echo(f"{outcome.rows} rows{again}; summary.md, figures and study.parquet: {folder}")
-
-
-def _exit(outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
-    """An exit status of its own, and a line on standard error, where rows or laws failed."""
+def _say(folder: Path, outcome: "Outcome", laws: list[dict[str, Any]], quiet: bool) -> None:
+    """What came out; an exit status of its own, and a line on standard error, where rows or laws failed."""
+    if not quiet:
+        for law in laws:
+            typer.echo(_law_line(law))
+        again = f", {outcome.found} of them from before" if outcome.found else ""
+        again += f" ({outcome.beyond} more, of further repeats, are kept)" if outcome.beyond else ""
+        typer.echo(f"{outcome.rows} rows{again}; summary.md, figures and study.parquet: {folder}")
     broken = [law for law in laws if law["verdict"] == "failed"]
     if broken:
         typer.echo(f"{len(broken)} of {len(laws)} laws failed; {_law_line(broken[0])}", err=True)
-    if outcome.failed:
-        typer.echo(f"{outcome.failed} of {outcome.rows} rows failed; {outcome.first_error}", err=True)
+    if outcome.failures:
+        typer.echo(f"{len(outcome.failures)} of {outcome.rows} rows failed; {outcome.failures[0]}", err=True)
         raise typer.Exit(SOME_ROWS_FAILED)
     if broken:
         raise typer.Exit(A_LAW_FAILED)

@@ -14,7 +14,7 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 from identify.arrays import Array
 from identify.files.atomic import write_figure
 from identify.studies.study_file import Law, Study
-from identify.studies.table import factor_unit, figure_unit, labelled
+from identify.studies.table import labelled
 from identify.studies.theory import BAND_CONFIDENCE as BANDS
 from identify.studies.theory import CONFIDENCE as LAWS
 from identify.studies.theory import Verdict, law_data, point_statistics, with_data
@@ -60,8 +60,8 @@ def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str])
         if law is not None and law.exponent is not None:
             _theory_line(axes, have[path], have[name].to_numpy(dtype=float), law.exponent)
         _scale(axes, have[path], have[name])
-        axes.set_xlabel(labelled(path, factor_unit(path)))
-        axes.set_ylabel(labelled(name, figure_unit(study.kind, name)))
+        axes.set_xlabel(labelled(path, study))
+        axes.set_ylabel(labelled(name, study))
         if axes.get_legend_handles_labels()[1]:
             axes.legend(fontsize="small")
     what = f"rms over rows, {BANDS:.0%} band" if study.sample is None else "single rows"
@@ -83,9 +83,9 @@ def map_figure(study: Study, done: pd.DataFrame, paths: tuple[str, str], shown: 
             axes.text(column, row, f"{value:.3g}", ha="center", va="center", color=ink, fontsize="small")
         axes.set_xticks(range(table.shape[1]), [str(value) for value in table.columns])
         axes.set_yticks(range(table.shape[0]), [str(value) for value in table.index])
-        axes.set_xlabel(labelled(paths[1], factor_unit(paths[1])))
-        axes.set_ylabel(labelled(paths[0], factor_unit(paths[0])))
-        figure.colorbar(picture, ax=axes, label=labelled(name, figure_unit(study.kind, name)))
+        axes.set_xlabel(labelled(paths[1], study))
+        axes.set_ylabel(labelled(paths[0], study))
+        figure.colorbar(picture, ax=axes, label=labelled(name, study))
     _title(figure, f"{study.title or study.name}: rms over rows")
     return figure
 
@@ -104,9 +104,8 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
         axes.set_title(
             f"{verdict.verdict}: {verdict.measured:.4g} ({verdict.low:.4g} to {verdict.high:.4g})", fontsize="small"
         )
-        unit = factor_unit(factor) if factor in study.factors else figure_unit(study.kind, factor)
-        axes.set_xlabel(labelled(factor, unit))
-        axes.set_ylabel(labelled(law.quantity, figure_unit(study.kind, law.figure) if law.per is None else ""))
+        axes.set_xlabel(labelled(factor, study))
+        axes.set_ylabel(labelled(law.quantity, study))
         axes.legend(fontsize="small")
     _title(figure, f"{study.title or study.name}: measured exponent and its {LAWS:.0%} interval")
     return figure

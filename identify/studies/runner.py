@@ -22,22 +22,25 @@ from identify.studies.table import FIRST, LAST, tidy_table, write_table, write_v
 
 @dataclass(frozen=True)
 class Outcome:
-    """A study that is done: its table, how many rows it has, how many of them were found done, and how many failed.
+    """A study that is done: its table, and how many of its rows were found done.
 
     beyond: rows that its folder keeps of repeats which it no longer has.
     """
 
     frame: pd.DataFrame
-    rows: int
     found: int
-    failed: int
     beyond: int
 
     @property
-    def first_error(self) -> str:
-        """The first failure in words; empty where there is none."""
+    def rows(self) -> int:
+        """How many rows it has."""
+        return len(self.frame)
+
+    @property
+    def failures(self) -> list[str]:
+        """The rows that failed, each in words."""
         bad = self.frame[self.frame["error"] != ""]
-        return f"row {bad['row'].iloc[0]}: {bad['error'].iloc[0]}" if len(bad) else ""
+        return [f"row {row}: {error}" for row, error in zip(bad["row"], bad["error"], strict=True)]
 
 
 Executor = Callable[[Setup, "Batches"], Iterator[list[Finished]]]
@@ -81,7 +84,7 @@ def run_study(study: Study, folder: Path, progress: Progress, workers: Workers =
         frame = tidy_table(study, journal.rows())
         write_table(folder / TABLE, frame, entry)
         write_view(folder / VIEW, frame, study)
-    return Outcome(frame, len(design), found, int((frame["error"] != "").sum()), journal.beyond)
+    return Outcome(frame, found, journal.beyond)
 
 
 def _compute_pending(

@@ -28,7 +28,7 @@ from identify.files.atomic import write_text
 from identify.files.versions import same_versions, versions
 from identify.studies.design import Finished, Setup
 from identify.studies.study_file import Study
-from identify.studies.table import study_in
+from identify.studies.table import study_in, written
 
 STUDY, JOURNAL, TABLE, VIEW, LOCK = "study.json", "rows.jsonl", "study.parquet", "study.nc", ".lock"
 VERSIONS = "versions"
@@ -71,17 +71,16 @@ class Journal:
             StudyError: the disk is full or broken; the file is as it was before.
         """
         text = "".join(f"{json.dumps(asdict(row))}\n" for row in rows).encode()
-        try:
-            written = 0
-            while written < len(text):
-                written += os.pwrite(self._file, text[written:], self._end + written)
-            os.fsync(self._file)
-        except OSError as error:
-            os.ftruncate(self._file, self._end)
-            raise StudyError(
-                f"{self.path} cannot be written: {error.strerror}; {self.finished.sum()} rows are safe, and the same "
-                "command goes on from there"
-            ) from error
+        safe = f"; {self.finished.sum()} rows are safe, and the same command goes on from there"
+        with written(self.path, safe):
+            try:
+                done = 0
+                while done < len(text):
+                    done += os.pwrite(self._file, text[done:], self._end + done)
+                os.fsync(self._file)
+            except OSError:
+                os.ftruncate(self._file, self._end)
+                raise
         self._end += len(text)
         for row in rows:
             self._note(row)
@@ -188,10 +187,8 @@ def _claim(folder: Path, entry: dict[str, Any]) -> dict[str, str]:
                 f"{folder / name} is of another study, which differs in {', '.join(others[:4])}; name another folder "
                 "with --out"
             )
-    try:
+    with written(folder / STUDY):
         write_text(folder / STUDY, json.dumps(entry | {VERSIONS: begun}, indent=1) + "\n")
-    except OSError as error:
-        raise StudyError(f"{folder / STUDY} cannot be written: {error.strerror}") from error
     return begun
 
 

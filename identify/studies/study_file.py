@@ -72,6 +72,23 @@ class Law(_Table):
         """The figure, divided by the other where there is one."""
         return self.figure if self.per is None else f"{self.figure} / {self.per}"
 
+    @property
+    def statement(self) -> str:
+        """What the law says, in a line."""
+        if self.equals is not None:
+            return f"{self.quantity} = {self.equals}"
+        if self.order is not None:
+            return f"{self.quantity} grows along {self.factor} = {', '.join(map(str, self.order))}"
+        return f"{self.quantity} ~ {self.factor} ^ {self.exponent:g}"
+
+    @property
+    def expected(self) -> str:
+        """The exponent or ratio that is to be measured, in words."""
+        if self.order is not None:
+            return "ratio > 1"
+        value = "ratio 1" if self.exponent is None else f"{self.exponent:g}"
+        return f"{value} ± {self.tolerance:g}" if self.tolerance else value
+
 
 class Range(_Table):
     """A factor of a random sample, drawn evenly between two bounds or evenly between their logarithms."""

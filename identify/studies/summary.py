@@ -17,7 +17,7 @@ from identify.studies import theory
 from identify.studies.figures import draw
 from identify.studies.rows import KINDS
 from identify.studies.study_file import Study
-from identify.studies.table import factor_unit, figure_names, figure_unit, labelled, unit_of
+from identify.studies.table import figure_names, labelled, unit_of
 from identify.studies.theory import Statistics, Verdict, check_laws
 
 JSON, MARKDOWN = "summary.json", "summary.md"
@@ -52,7 +52,7 @@ def write(folder: Path, study: Study, frame: pd.DataFrame) -> dict[str, Any]:
         "failures": _failures(study, frame),
         "confidence": {"bands": theory.BAND_CONFIDENCE, "laws": theory.CONFIDENCE},
         "units": {name: unit for name in [*study.factors, *names] if (unit := unit_of(name, study))},
-        "theory": [theory.as_entry(verdict) for verdict in verdicts],
+        "theory": [verdict.entry for verdict in verdicts],
         "points": [
             {"factors": factors, "figures": {name: asdict(one) for name, one in figures.items()}}
             for factors, figures in points
@@ -135,12 +135,10 @@ def _markdown(
 
 
 def _law_row(verdict: Verdict) -> str:
-    if verdict.measured is None:
-        return f"| {verdict.statement} | {verdict.expected} | {verdict.reason} | | {verdict.verdict} |"
-    return (
-        f"| {verdict.statement} | {verdict.expected} | {verdict.measured:.4g} | "
-        f"{verdict.low:.4g} to {verdict.high:.4g} | {verdict.verdict} |"
-    )
+    law, measured, interval = verdict.law, verdict.reason, ""
+    if verdict.measured is not None:
+        measured, interval = f"{verdict.measured:.4g}", f"{verdict.low:.4g} to {verdict.high:.4g}"
+    return f"| {law.statement} | {law.expected} | {measured} | {interval} | {verdict.verdict} |"
 
 
 def _bands_text(points: list[tuple[dict[str, Any], dict[str, Statistics]]]) -> str:
@@ -151,8 +149,8 @@ def _bands_text(points: list[tuple[dict[str, Any], dict[str, Statistics]]]) -> s
 
 def _table(study: Study, points: list[tuple[dict[str, Any], dict[str, Statistics]]], shown: list[str]) -> list[str]:
     factors = list(points[0][0]) if points else []
-    heads = [labelled(path, factor_unit(path)) for path in factors]
-    heads += ["rows", *(labelled(name, figure_unit(study.kind, name)) for name in shown)]
+    heads = [labelled(path, study) for path in factors]
+    heads += ["rows", *(labelled(name, study) for name in shown)]
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for values, figures in points[:LONGEST]:
         count = max((one.rows for one in figures.values()), default=0)

@@ -6,7 +6,8 @@ that failed has NaN figures and says why in ``error``; a figure that rows of one
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -33,34 +34,18 @@ LAST = ("seconds", "error")
 STUDY_KEY, VERSIONS_KEY = b"cmmsim.study", b"cmmsim.versions"
 
 SENSOR_UNITS = {
-    "rig.baseline": "m",
-    "rig.distance": "m",
-    "rig.focal_px": "px",
-    "rig.width": "px",
-    "rig.height": "px",
-    "rig.position": "m",
-    "rig.target": "m",
-    "rig.left.focal_px": "px",
-    "rig.left.centre_px": "px",
-    "rig.right.focal_px": "px",
-    "rig.right.centre_px": "px",
+    **dict.fromkeys(("rig.baseline", "rig.distance", "rig.position", "rig.target"), "m"),
+    **dict.fromkeys(("rig.focal_px", "rig.width", "rig.height", "lens.psf_px"), "px"),
+    **{f"rig.{side}.{key}": "px" for side in ("left", "right") for key in ("focal_px", "centre_px")},
     "rig.right_from_left.translation": "m",
     "rig.right_from_left.rotation_vector": "rad",
-    "stickers.radius": "m",
-    "stickers.ring_radius": "m",
-    "stickers.placement": "m",
-    "camera.dark_noise": "electrons",
-    "camera.electrons_at_white": "electrons",
-    "camera.full_well": "electrons",
+    **dict.fromkeys(("stickers.radius", "stickers.ring_radius", "stickers.placement"), "m"),
+    **{f"camera.{key}": "electrons" for key in ("dark_noise", "electrons_at_white", "full_well", "dsnu")},
     "camera.gain": "grey values per electron",
     "camera.black_level": "grey values",
-    "camera.dsnu": "electrons",
     "camera.bit_depth": "bit",
-    "lens.psf_px": "px",
     "timing.frame_rate": "Hz",
-    "timing.exposure": "s",
-    "timing.latency": "s",
-    "timing.latency_jitter": "s",
+    **dict.fromkeys(("timing.exposure", "timing.latency", "timing.latency_jitter"), "s"),
 }
 """Units of the sensor file's keys that have one, but for the shapes of the bodies."""
 
@@ -78,23 +63,20 @@ def factor_unit(path: str) -> str:
     return "s" if key.endswith("_s") else ""
 
 
-def figure_unit(kind: str, figure: str) -> str:
-    """Unit of a figure of a built-in kind; empty where it has none, or where the kind is one's own."""
-    columns = KINDS[kind].columns if kind in KINDS else {}
-    unit = columns[figure].unit if figure in columns else ""
+def unit_of(name: str, study: Study) -> str:
+    """Unit of a column of a study's table, a factor or a figure; empty where it has none, or where nobody says it."""
+    if name == "seconds":
+        return "s"
+    if name in study.factors:
+        return factor_unit(name)
+    columns = KINDS[study.kind].columns if study.kind in KINDS else {}
+    unit = columns[name].unit if name in columns else ""
     return "" if unit == "1" else unit
 
 
-def unit_of(name: str, study: Study) -> str:
-    """Unit of a column of a study's table, a factor or a figure; empty where it has none."""
-    if name == "seconds":
-        return "s"
-    return factor_unit(name) if name in study.factors else figure_unit(study.kind, name)
-
-
-def labelled(name: str, unit: str) -> str:
-    """A name with its unit in brackets."""
-    return f"{name} [{unit}]" if unit else name
+def labelled(name: str, study: Study) -> str:
+    """A column's name with its unit in brackets."""
+    return f"{name} [{unit}]" if (unit := unit_of(name, study)) else name
 
 
 def tidy_table(study: Study, finished: Iterable[Finished]) -> pd.DataFrame:
@@ -130,6 +112,15 @@ def plain(value: Any) -> Any:
     return json.dumps(value) if isinstance(value, (list, dict)) else value
 
 
+@contextmanager
+def written(path: Path, more: str = "") -> Iterator[None]:
+    """What keeps the block from writing a file is an error of the study. Raises StudyError with the reason."""
+    try:
+        yield
+    except OSError as error:
+        raise StudyError(f"{path} cannot be written: {error.strerror or error}{more}") from error
+
+
 def write_table(path: Path, frame: pd.DataFrame, entry: dict[str, Any]) -> None:
     """Write a table as Parquet, whole or not at all; ``entry`` is the resolved study, kept with it.
 
@@ -138,11 +129,8 @@ def write_table(path: Path, frame: pd.DataFrame, entry: dict[str, Any]) -> None:
     """
     table = pa.Table.from_pandas(frame, preserve_index=False)
     own = {STUDY_KEY: json.dumps(entry).encode(), VERSIONS_KEY: json.dumps(versions()).encode()}
-    try:
-        with atomic_path(path) as temporary:
-            pq.write_table(table.replace_schema_metadata((table.schema.metadata or {}) | own), temporary)
-    except OSError as error:
-        raise StudyError(f"{path} cannot be written: {error.strerror or error}") from error
+    with written(path), atomic_path(path) as temporary:
+        pq.write_table(table.replace_schema_metadata((table.schema.metadata or {}) | own), temporary)
 
 
 def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
@@ -204,8 +192,6 @@ def write_view(path: Path, frame: pd.DataFrame, study: Study) -> None:
     Raises:
         StudyError: it cannot be written.
     """
-    try:
-        view = to_xarray(frame, study)
+    view = to_xarray(frame, study)
+    with written(path):
         write_groups(path, {"": view.rename({name: str(name).replace("/", "_per_") for name in view.data_vars})})
-    except OSError as error:
-        raise StudyError(f"{path} cannot be written: {error.strerror or error}") from error

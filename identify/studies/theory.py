@@ -1,16 +1,16 @@
 """Whether a study's rows follow the laws that it states: the measured exponent or ratio with its interval.
 
-How the mean square of a positive figure depends on other quantities: regression of its logarithm.
-The mean square of a row's figure is taken as exp(X beta). The estimate solves X^T (y^2 / mean - 1) = 0, the score of a
+How the mean square of a positive figure depends on other quantities is told by regression of its logarithm. The mean
+square of a row's figure is taken as exp(X beta). The estimate solves X^T (y^2 / mean - 1) = 0, the score of a
 gamma-distributed y^2 with logarithmic link (McCullagh and Nelder 1989, section 8.3); unlike a straight line through
 logarithms it says how the mean square itself scales, whatever the figure's distribution is and however it changes from
 row to row. Its covariance is the sandwich of that score, so rows need not be alike either.
 
-Mean, spread and rms of a figure over the rows of one point of a study, with bands that hold 95 % of the time.
-The band of the mean is Student's; that of the rms is Student's of the logarithm of the mean square. A chi-square band
-would need to know how many independent errors a row's figure is made of; this one takes their scatter from the rows.
-Counted, it holds the rms of three normal numbers or more in 95 to 97 % of cases from two rows on, and that of single
-normal numbers, the worst case, in 92 % at least. One row alone has no band.
+The figures of one point of a study have bands that hold 95 % of the time. That of the mean is Student's; that of the
+rms is Student's of the logarithm of the mean square. A chi-square band would need to know how many independent errors a
+row's figure is made of; this one takes their scatter from the rows. Counted, it holds the rms of three normal numbers
+or more in 95 to 97 % of cases from two rows on, and that of single normal numbers, the worst case, in 92 % at least.
+One row alone has no band.
 
 A law fails when the interval excludes what the law says, give or take its own tolerance. Else it passes, unless the
 rows are too few to say anything: it is undecided where the interval is wide. At 99 % one true law in a hundred fails by
@@ -44,8 +44,13 @@ class ScaleRegression:
 
     def interval(self, index: int, confidence: float) -> tuple[float, float]:
         """Student's interval of one coefficient."""
-        half = student.ppf(0.5 + 0.5 * confidence, self.freedom) * np.sqrt(self.covariance[index, index])
+        half = reach(confidence, self.freedom) * np.sqrt(self.covariance[index, index])
         return float(self.coefficients[index] - half), float(self.coefficients[index] + half)
+
+
+def reach(confidence: float, freedom: int) -> float:
+    """Half-width of Student's interval in standard deviations; scipy's own interval is NaN where these are zero."""
+    return float(student.ppf(0.5 + 0.5 * confidence, freedom))
 
 
 def scale_regression(squares: Array, design: Array) -> ScaleRegression:
@@ -102,17 +107,11 @@ def point_statistics(values: Array) -> Statistics:
     if count < 2:
         return Statistics(count, mean, None, rms, None, None)
     std = float(np.std(values, ddof=1))
-    half = float(student.ppf(0.5 + 0.5 * BAND_CONFIDENCE, count - 1)) * std / np.sqrt(count)
-    return Statistics(count, mean, std, rms, (mean - half, mean + half), _rms_band(values))
-
-
-def _rms_band(values: Array) -> tuple[float, float]:
-    if not np.any(values):
-        return 0.0, 0.0
-    count, square = len(values), float(np.mean(values**2))
-    spread = float(np.linalg.norm(values**2 / square - 1.0)) / (count - 1)
-    factor = float(np.exp(0.5 * student.ppf(0.5 + 0.5 * BAND_CONFIDENCE, count - 1) * spread))
-    return float(np.sqrt(square)) / factor, float(np.sqrt(square)) * factor
+    wide = reach(BAND_CONFIDENCE, count - 1)
+    half = wide * std / np.sqrt(count)
+    spread = float(np.linalg.norm(values**2 / np.mean(values**2) - 1.0)) / (count - 1) if rms else 0.0
+    factor = float(np.exp(0.5 * wide * spread))
+    return Statistics(count, mean, std, rms, (mean - half, mean + half), (rms / factor, rms * factor))
 
 
 CONFIDENCE = 0.99
@@ -124,14 +123,12 @@ RESOLUTION = 0.2
 class Verdict:
     """What the rows say about a law: verdict "passed", "failed" or "undecided".
 
-    statement in words; expected, as an exponent or a ratio, in words; measured with its interval low to high; rows that
-    counted; reason where nothing could be measured.
+    measured, an exponent or a ratio, with its interval low to high; rows that counted; reason where nothing could be
+    measured.
     """
 
-    statement: str
-    why: str
+    law: Law
     verdict: str
-    expected: str
     measured: float | None = None
     low: float | None = None
     high: float | None = None
@@ -142,9 +139,17 @@ class Verdict:
     def text(self) -> str:
         """One line with the numbers."""
         if self.measured is None:
-            return f"{self.verdict}: {self.statement}; {self.reason}"
+            return f"{self.verdict}: {self.law.statement}; {self.reason}"
         interval = f"{self.measured:.4g} ({self.low:.4g} to {self.high:.4g}, {CONFIDENCE:.0%})"
-        return f"{self.verdict}: {self.statement}; measured {interval}"
+        return f"{self.verdict}: {self.law.statement}; measured {interval}"
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """The verdict as `summary.json` holds it."""
+        law = {"statement": self.law.statement, "why": self.law.why, "verdict": self.verdict}
+        return (
+            law | {"expected": self.law.expected} | {k: v for k, v in vars(self).items() if k not in ("law", "verdict")}
+        )
 
 
 def check_laws(study: Study, frame: pd.DataFrame) -> list[Verdict]:
@@ -180,7 +185,7 @@ def _check(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     try:
         return check(law, study, with_data(law, frame))
     except StudyError as error:
-        return Verdict(_statement(law), law.why, "undecided", _expected(law), reason=str(error))
+        return Verdict(law, "undecided", reason=str(error))
 
 
 def _exponent(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
@@ -191,7 +196,7 @@ def _exponent(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     low, high = fit.interval(design.shape[1] - 1, CONFIDENCE)
     expected, half = float(law.exponent or 0.0), 0.5 * (high - low)
     verdict = _decided(low - law.tolerance <= expected <= high + law.tolerance, half)
-    return _verdict(law, verdict, float(fit.coefficients[-1]), low, high, len(frame))
+    return Verdict(law, verdict, float(fit.coefficients[-1]), low, high, len(frame))
 
 
 def _equality(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
@@ -201,7 +206,7 @@ def _equality(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     low, high = fit.interval(0, CONFIDENCE)
     verdict = _decided(low <= law.tolerance and high >= -law.tolerance, 0.5 * (high - low))
     measured, low, high = np.exp([fit.coefficients[0], low, high]).tolist()
-    return _verdict(law, verdict, measured, low, high, len(frame))
+    return Verdict(law, verdict, measured, low, high, len(frame))
 
 
 def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
@@ -216,7 +221,7 @@ def _order(law: Law, study: Study, frame: pd.DataFrame) -> Verdict:
     low, middle, high = _smallest_step(fit, len(values) - 1)
     verdict = "passed" if low > -law.tolerance else "failed" if high < -law.tolerance else "undecided"
     measured, low, high = np.exp([middle, low, high]).tolist()
-    return _verdict(law, verdict, measured, low, high, len(chosen))
+    return Verdict(law, verdict, measured, low, high, len(chosen))
 
 
 def _smallest_step(fit: ScaleRegression, steps: int) -> tuple[float, float, float]:
@@ -260,27 +265,3 @@ def _decided(holds: bool, half: float) -> str:
     if not holds:
         return "failed"
     return "passed" if half <= RESOLUTION else "undecided"
-
-
-def _verdict(law: Law, verdict: str, measured: float, low: float, high: float, rows: int) -> Verdict:
-    return Verdict(_statement(law), law.why, verdict, _expected(law), measured, low, high, rows)
-
-
-def _statement(law: Law) -> str:
-    if law.equals is not None:
-        return f"{law.quantity} = {law.equals}"
-    if law.order is not None:
-        return f"{law.quantity} grows along {law.factor} = {', '.join(map(str, law.order))}"
-    return f"{law.quantity} ~ {law.factor} ^ {law.exponent:g}"
-
-
-def _expected(law: Law) -> str:
-    if law.order is not None:
-        return "ratio > 1"
-    value = "ratio 1" if law.exponent is None else f"{law.exponent:g}"
-    return f"{value} ± {law.tolerance:g}" if law.tolerance else value
-
-
-def as_entry(verdict: Verdict) -> dict[str, Any]:
-    """A verdict as `summary.json` holds it."""
-    return dict(vars(verdict))

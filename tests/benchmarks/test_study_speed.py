@@ -79,7 +79,7 @@ class Runs:
         self._count += 1
         folder = self._folder / str(self._count)
         outcome = run_study(study, folder, progress or SilentProgress(), lambda: nullcontext(self._execute))
-        assert outcome.failed == 0, outcome.first_error
+        assert not outcome.failures
         return outcome
 
 

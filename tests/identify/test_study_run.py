@@ -230,8 +230,8 @@ def test_full_disk_leaves_whole_lines_and_the_study_goes_on_later(whole, tmp_pat
 def test_a_failing_row_says_why_and_the_others_go_on(whole, tmp_path):
     outcome = run(tmp_path, study(options={"fails": [2, 11], "odd": 5}))
     frame = outcome.frame
-    assert outcome.failed == 3
-    assert outcome.first_error == "row 2: ValueError: row 2 has no answer"
+    assert len(outcome.failures) == 3
+    assert outcome.failures[0] == "row 2: ValueError: row 2 has no answer"
     assert frame["error"][5] == "ArithmeticError: error_um is nan"
     failed = frame["row"].isin([2, 5, 11])
     assert frame.loc[failed, figure_names(frame, study())].isna().all(axis=None)

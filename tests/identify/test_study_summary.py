@@ -157,7 +157,7 @@ def test_long_title_stays_within_the_figure_of_a_single_law():
     study = made_study(title="How far the measured position is from the true one against the noise of the pixels")
     frame = made_table(study)
     figure = laws_figure(study, frame, [(study.theory[0], check_laws(study, frame)[0])])
-    figure.canvas.draw()
+    figure.draw_without_rendering()
     title = figure.texts[0].get_window_extent()
     assert title.x0 > 0.0
     assert title.x1 < figure.bbox.width

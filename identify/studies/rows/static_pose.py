@@ -6,12 +6,13 @@ no picture is searched as a whole. The timing's dropout loses pictures, and chan
 exact unless asked for otherwise: the rows show observation noise alone.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from pydantic import Field
 
 import cmmsim
 from cmmsim.geometry.pose import apply, invert
-from cmmsim.pose_estimation.estimator import PoseEstimator
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.random_streams import stream_seed
@@ -91,61 +92,58 @@ READS = Reads(
 )
 
 
+@dataclass(frozen=True)
+class _Seen:
+    """What a picture of a pose gave: error (6,) and covariance (6, 6) of the pose, and what `_sticker_errors` says."""
+
+    pose: int
+    error: Array
+    covariance: Array
+    points: Array
+    centres: Array
+
+
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPoseOptions) -> Row:
     """One row. Raises EstimationError, with a reason, where every picture was lost, and what the sensor raises."""
     eye = row_sensor(scenario, options.teaching, stream_seed(seed, SENSOR))
     rng = np.random.default_rng(stream_seed(seed, POSES))
-    amplitude = (scenario.excitation.position_amplitude_m, scenario.excitation.orientation_amplitude_rad)
-    box = np.repeat(amplitude, 3)
-    captures = options.captures if options.hold_s is None else max(1, scenario.timing.frames(options.hold_s))
     dropout = np.random.default_rng(stream_seed(seed, DROPOUT))
-    looks = [
-        _Look(eye, eye.sensor.home + box * rng.uniform(-1.0, 1.0, 6), captures, rng, dropout)
-        for _ in range(options.poses)
-    ]
-    return _row(eye, looks, captures)
+    box = np.repeat((scenario.excitation.position_amplitude_m, scenario.excitation.orientation_amplitude_rad), 3)
+    captures = options.captures if options.hold_s is None else max(1, scenario.timing.frames(options.hold_s))
+    seen: list[_Seen] = []
+    lost = ""
+    for number in range(options.poses):
+        pose = eye.sensor.home + box * rng.uniform(-1.0, 1.0, 6)
+        for _ in range(captures):
+            try:
+                measured = _measured(eye, pose, rng, dropout)
+            except cmmsim.LostError as error:
+                lost = str(error)
+                continue
+            errors = _sticker_errors(eye, measured, pose)
+            seen.append(_Seen(number, measured.pose - pose, measured.covariance, *errors))
+    if not seen:
+        raise EstimationError(f"no pose was found in any of {captures * options.poses} pictures: {lost}")
+    return _row(eye, seen, captures * options.poses)
 
 
-class _Look:
-    """What the pictures of one pose gave: errors and covariances of the pose (n, 6), (n, 6, 6), and what
-    `_sticker_errors` says of all stickers in them."""
-
-    def __init__(
-        self, eye: RowSensor, pose: Array, captures: int, rng: np.random.Generator, dropout: np.random.Generator
-    ) -> None:
-        estimator = eye.sensor.estimator
-        self._dropout = dropout
-        self.reasons: list[str] = []
-        seen = [self._measured(eye, estimator, pose, rng) for _ in range(captures)]
-        good = [one for one in seen if one is not None]
-        self.errors = np.array([one.pose - pose for one in good]).reshape(-1, 6)
-        self.covariances = np.array([one.covariance for one in good]).reshape(-1, 6, 6)
-        self.counts = [len(one.target_ids) for one in good]
-        pairs = [_sticker_errors(eye, estimator, one, pose) for one in good]
-        self.points = np.concatenate([points for points, _ in pairs]) if pairs else np.zeros((0, 3))
-        self.centres = np.concatenate([centres for _, centres in pairs], axis=1) if pairs else np.zeros((2, 0, 2))
-
-    def _measured(
-        self, eye: RowSensor, estimator: PoseEstimator, pose: Array, rng: np.random.Generator
-    ) -> cmmsim.Measurement | None:
-        predicted = pose + PREDICTION_ERROR * rng.standard_normal(6)
-        expected = invert(estimator.taught.base_from_camera) @ cmmsim.pose_to_transform(predicted)
-        images = eye.sensor.look(pose)  # also of one that drops out, so that the next have the noise they had
-        if self._dropout.random() < (share := eye.sensor.timing.dropout):
-            self.reasons.append(f"dropped frame (a share of {share:.3g} drops out)")
-            return None
-        try:
-            return estimator.measure(images, expected)[0]
-        except cmmsim.LostError as error:
-            self.reasons.append(str(error))
-            return None
+def _measured(
+    eye: RowSensor, pose: Array, rng: np.random.Generator, dropout: np.random.Generator
+) -> cmmsim.Measurement:
+    """What a picture of a pose (6,) gives. Raises LostError."""
+    estimator = eye.sensor.estimator
+    predicted = pose + PREDICTION_ERROR * rng.standard_normal(6)
+    expected = invert(estimator.taught.base_from_camera) @ cmmsim.pose_to_transform(predicted)
+    images = eye.sensor.look(pose)  # also of one that drops out, so that the next have the noise they had
+    if dropout.random() < (share := eye.sensor.timing.dropout):
+        raise cmmsim.LostError(f"dropped frame (a share of {share:.3g} drops out)")
+    return estimator.measure(images, expected)[0]
 
 
-def _sticker_errors(
-    eye: RowSensor, estimator: PoseEstimator, seen: cmmsim.Measurement, pose: Array
-) -> tuple[Array, Array]:
+def _sticker_errors(eye: RowSensor, seen: cmmsim.Measurement, pose: Array) -> tuple[Array, Array]:
     """Of the stickers seen: [distance, error along the line of sight, error across it] (k, 3), m, and the errors of
     their centres in both images (2, k, 2), px."""
+    estimator = eye.sensor.estimator
     index = np.flatnonzero(np.isin(estimator.platform.sticker_ids, seen.target_ids))
     places = apply(cmmsim.pose_to_transform(pose), eye.truth.platform_places[index])
     in_camera = apply(invert(eye.truth.base_from_camera), places)
@@ -158,21 +156,20 @@ def _sticker_errors(
     return np.column_stack([distance, along, across]), np.stack([seen.left_pixels, seen.right_pixels]) - pixels
 
 
-def _row(eye: RowSensor, looks: list[_Look], captures: int) -> Row:
-    errors = np.concatenate([look.errors for look in looks])
-    if not len(errors):
-        raise EstimationError(f"no pose was found in any of {captures * len(looks)} pictures: {looks[-1].reasons[-1]}")
-    means = np.array([look.errors.mean(axis=0) for look in looks if len(look.errors)])
-    points = np.concatenate([look.points for look in looks])
-    centres = np.concatenate([look.centres for look in looks], axis=1)
+def _row(eye: RowSensor, seen: list[_Seen], captures: int) -> Row:
+    errors = np.array([one.error for one in seen])
+    of_pose = np.array([one.pose for one in seen])
+    means = np.array([errors[of_pose == number].mean(axis=0) for number in np.unique(of_pose)])
+    points = np.concatenate([one.points for one in seen])
+    centres = np.concatenate([one.centres for one in seen], axis=1)
     noise = eye.sensor.noise
     rim_grey: Array = np.asarray(noise.mean_grey(np.array(eye.rim)), dtype=float)
     return {
-        "captures": captures * len(looks),
-        "lost_frames": captures * len(looks) - len(errors),
-        "stickers": float(np.mean([count for look in looks for count in look.counts])),
+        "captures": captures,
+        "lost_frames": captures - len(seen),
+        "stickers": float(np.mean([len(one.points) for one in seen])),
         "pixel_noise_grey": float(np.sqrt(noise.variance(rim_grey))),
-        **pose_figures(errors, np.concatenate([look.covariances for look in looks])),
+        **pose_figures(errors, np.array([one.covariance for one in seen])),
         "mean_position_rms_um": rms_um(means[:, :3]),
         "mean_orientation_rms_urad": rms_um(means[:, 3:]),
         "sight_m": float(points[:, 0].mean()),
