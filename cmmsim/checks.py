@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
 from copy import deepcopy
 from functools import lru_cache
-from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -49,22 +47,30 @@ class Section(BaseModel):
 M = TypeVar("M", bound=BaseModel)
 
 
-def read_text(path: str | PathLike, kind: str, error: type[CmmError]) -> str:
-    """Text of a file; ``kind`` says in messages what it is: "sensor file". Raises ``error`` where it is no text."""
+def read_text(path: str | Path, source: str, refusal: type[CmmError]) -> str:
+    """Text of a file. Raises ``refusal`` where it cannot be read; source: how messages call it, as "board file x"."""
     try:
         return Path(path).read_text(encoding="utf-8")
-    except OSError as reason:
-        raise error(f"cannot read {kind} {str(path)[:200]}: {reason.strerror or reason}") from reason
-    except UnicodeDecodeError as reason:
-        raise error(f"{kind} {path} is not text, so it cannot be TOML: {reason}") from reason
+    except OSError as error:
+        raise refusal(f"cannot read {source}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise refusal(f"{source} is not text, so it cannot be TOML: {error}") from error
 
 
-def toml_table(text: str, source: str, error: type[CmmError]) -> dict[str, Any]:
-    """What a TOML text holds; ``source`` says in messages where it is from. Raises ``error`` where it is no TOML."""
+def parsed(text: str, source: str, refusal: type[CmmError]) -> dict[str, Any]:
+    """Content of a text, the caller's to change. Raises ``refusal`` where it is not TOML."""
     try:
         return deepcopy(_parsed(text))
-    except tomllib.TOMLDecodeError as reason:
-        raise error(f"{source}: {reason}") from reason
+    except tomllib.TOMLDecodeError as error:
+        raise refusal(f"{source} is not TOML: {error}") from error
+
+
+def checked(model: type[M], content: dict[str, Any], source: str, refusal: type[CmmError]) -> M:
+    """Content as a model. Raises ``refusal`` with all that is wrong, and with the valid names of an unknown key."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise refusal(f"{source}: {'; '.join(_explain(details, model) for details in error.errors())}") from error
 
 
 @lru_cache(maxsize=8)
@@ -73,31 +79,24 @@ def _parsed(text: str) -> dict[str, Any]:
     return tomllib.loads(text)
 
 
-def validated(model: type[M], content: Mapping[str, Any], source: str, error: type[CmmError]) -> M:
-    """The content of a file as its model; raises ``error`` in one line with the valid names for an unknown key, and
-    with the value for a wrong one."""
-    try:
-        return model.model_validate(content)
-    except ValidationError as reason:
-        raise error(f"{source}: {'; '.join(_explained(model, e) for e in reason.errors())}") from reason
-
-
-def _explained(model: type[BaseModel], error: Any) -> str:
+def _explain(error: Any, model: type[BaseModel]) -> str:
     """One problem in words."""
     where = ".".join(str(part) for part in error["loc"])
     if error["type"] == "extra_forbidden":
-        return f"unknown key {where!r}, valid are {', '.join(_valid_keys(model, error['loc'][:-1]))}"
+        return f"unknown key {where!r}, valid are {', '.join(_valid_keys(error['loc'][:-1], model))}"
+    if error["type"] == "missing":
+        return f"{where}: {error['msg']}"  # what was got instead is the whole section
     if error["type"] == "value_error":
         return f"{where}: {error['ctx']['error']}" if where else str(error["ctx"]["error"])
-    # what was got instead of a missing key is the whole section
-    return f"{where}: {error['msg']}" + ("" if error["type"] == "missing" else f" (got {error['input']!r})")
+    return f"{where}: {error['msg']} (got {error['input']!r})"
 
 
-def _valid_keys(model: Any, section: tuple[Any, ...]) -> list[str]:
+def _valid_keys(section: tuple[Any, ...], model: Any) -> list[str]:
     for part in section:
-        if not isinstance(part, int):
-            annotation = model.model_fields[part].annotation
-            model = getattr(annotation, "__args__", (annotation,))[0]
+        if isinstance(part, int):
+            continue
+        annotation = model.model_fields[part].annotation
+        model = getattr(annotation, "__args__", (annotation,))[0]
     return sorted(model.model_fields)
 
 

@@ -12,11 +12,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+import numpy as np
 from numba import njit
 
 if TYPE_CHECKING:
     from numba.core.dispatcher import Dispatcher
 
+Array = np.ndarray  # of any type and shape, which each docstring states
 F = TypeVar("F", bound=Callable)
 
 

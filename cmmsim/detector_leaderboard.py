@@ -1,8 +1,7 @@
-"""Leaderboard of the detectors: errors on drawn images of tilted discs whose centres are known, beside the bound.
+"""Leaderboard of the detectors: their errors on drawn images of tilted discs, beside the Cramer-Rao bound.
 
-Leaderboard of the detectors: their errors on drawn images of tilted discs, beside the Cramer-Rao bound.
-The discs are drawn exactly, their centres lie anywhere within a pixel, and the camera adds its noise. Error means
-distance from the ellipse's centre; eccentricity is another matter. Two ways that OpenCV offers run along.
+The discs are drawn exactly, their centres lie anywhere within a pixel and are known, and the camera adds its noise.
+Error means distance from the ellipse's centre; eccentricity is another matter. Two ways that OpenCV offers run along.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.detection.cramer_rao import cramer_rao_bound, light_shares
-from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, find_detector
+from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, SpotWindows, find_detector
 from cmmsim.errors import CmmError
 from cmmsim.files.schema import NARROWEST_PSF, SensorFile
 from cmmsim.files.setup import marked_body, rig_from_file
@@ -26,12 +25,14 @@ from cmmsim.plugins import DETECTORS
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.sensor import Sensor
 
-# Drawn images of tilted discs whose centres are known: exact, with the camera's noise, anywhere within a pixel.
-
-
 TOGETHER = 100  # discs drawn at once
 SMALLEST_RADIUS_PX, LARGEST_RADIUS_PX = 1.0, 50.0
 LARGEST_TILT_DEG = 80.0
+FREE_PX = 3  # px between a disc's rim and the side of the part that is looked at
+RESAMPLES, CONFIDENCE = 1000, 0.95
+# The leaderboard is about accuracy. Where the noise is below half a grey value, the rounding of neighbours is not
+# independent, and a misfit that is judged as if it were would turn good windows away.
+LIMITS = FitLimits(largest_misfit=np.inf)
 
 
 @dataclass(frozen=True)
@@ -176,13 +177,6 @@ def draw_discs(scene: Scene, centres: Array, shapes: Array, size: int, psf_px: f
     return (scene.dark + (scene.bright - scene.dark) * np.concatenate(shares)).astype(np.float32)
 
 
-FREE_PX = 3  # px between a disc's rim and the side of the part that is looked at
-RESAMPLES, CONFIDENCE = 1000, 0.95
-# The leaderboard is about accuracy. Where the noise is below half a grey value, the rounding of neighbours is not
-# independent, and a misfit that is judged as if it were would turn good windows away.
-LIMITS = FitLimits(largest_misfit=np.inf)
-
-
 @dataclass(frozen=True)
 class Score:
     """One detector under one condition, px and per axis: Cramer-Rao bound; rms error of the windows it did not lose,
@@ -233,7 +227,9 @@ def _round(
     scores = []
     for detector in detectors:
         found, without_noise = (
-            detector.detect(w, np.zeros((draws, 2), dtype=int), scene.noise, fit_size, LIMITS, condition.psf_px)
+            detector.detect(
+                SpotWindows(w, np.zeros((draws, 2), dtype=int), scene.noise, fit_size, LIMITS, condition.psf_px)
+            )
             for w in (noisy, clean)
         )
         good = found.good
@@ -279,50 +275,30 @@ def _root_mean(squared: Array) -> float:
     return float(np.sqrt(squared.mean())) if squared.size else np.inf
 
 
-def _by_window(
-    find: Callable[[NDArray[np.uint8]], tuple[float, float] | None],
-    windows: NDArray,
-    corners: NDArray[np.integer],
-    white_level: int,
-) -> DetectedCentres:
+def _by_window(find: Callable[[NDArray[np.uint8]], tuple[float, float] | None], given: SpotWindows) -> DetectedCentres:
     """Centres that a function finds in each window alone, in 8 bit; OpenCV states no covariance, so it is zero."""
-    found = [find(window) for window in np.rint(windows * (255.0 / white_level)).astype(np.uint8)]
+    grey = np.rint(given.windows * (255.0 / given.noise.white_level)).astype(np.uint8)
+    found = [find(window) for window in grey]
     good = np.array([centre is not None for centre in found], dtype=bool)
     centres = np.array([centre or (0.0, 0.0) for centre in found]).reshape(-1, 2)
-    return DetectedCentres(centres + corners, np.zeros((len(found), 2, 2)), good)
+    return DetectedCentres(centres + given.corners, np.zeros((len(found), 2, 2)), good)
 
 
-def detect_by_blobs(
-    windows: NDArray,
-    corners: NDArray[np.integer],
-    noise: CameraNoise,
-    fit_size: int,
-    limits: FitLimits | None = None,
-    psf_px: float = 0.0,
-    smears: Array | None = None,
-) -> DetectedCentres:
+def detect_by_blobs(given: SpotWindows) -> DetectedCentres:
     """``cv2.SimpleBlobDetector`` with its filters of shape switched off: the largest bright blob."""
     settings = cv2.SimpleBlobDetector.Params()
     settings.filterByCircularity = settings.filterByConvexity = settings.filterByInertia = False
-    settings.blobColor, settings.minArea, settings.maxArea = 255, 4.0, float(fit_size**2)
+    settings.blobColor, settings.minArea, settings.maxArea = 255, 4.0, float(given.fit_size**2)
     blobs = cv2.SimpleBlobDetector.create(settings)
 
     def find(window: NDArray[np.uint8]) -> tuple[float, float] | None:
         points = blobs.detect(window)
         return max(points, key=lambda point: point.size).pt if points else None
 
-    return _by_window(find, windows, corners, noise.white_level)
+    return _by_window(find, given)
 
 
-def detect_by_contour(
-    windows: NDArray,
-    corners: NDArray[np.integer],
-    noise: CameraNoise,
-    fit_size: int,
-    limits: FitLimits | None = None,
-    psf_px: float = 0.0,
-    smears: Array | None = None,
-) -> DetectedCentres:
+def detect_by_contour(given: SpotWindows) -> DetectedCentres:
     """``cv2.fitEllipse`` on the longest contour of the window thresholded after Otsu."""
 
     def find(window: NDArray[np.uint8]) -> tuple[float, float] | None:
@@ -331,7 +307,7 @@ def detect_by_contour(
         longest = max(contours, key=len, default=())
         return cv2.fitEllipse(longest)[0] if len(longest) >= 5 else None
 
-    return _by_window(find, windows, corners, noise.white_level)
+    return _by_window(find, given)
 
 
 PEERS = (Detector("opencv_blob", detect_by_blobs, 0.01), Detector("opencv_fit_ellipse", detect_by_contour, 0.05))

@@ -1,8 +1,8 @@
-"""What spoils an image, and images with a fault laid over them.
+"""Images with a fault laid over them: marks painted into their grey values, or both images swapped.
 
-What spoils an image, painted into grey values: opaque discs and plates, added light, a whole image of one level.
-Marks are laid over grey values that already hold noise. A pixel of which a mark hides the share s keeps (1 - s) of
-what it showed, gets s of the mark's light, and as much noise as makes its variance that of its new mean.
+Marks are opaque discs and plates, added light, and whole images of one level. They are laid over grey values that
+already hold noise. A pixel of which a mark hides the share s keeps (1 - s) of what it showed, gets s of the mark's
+light, and as much noise as makes its variance that of its new mean.
 """
 
 from __future__ import annotations
@@ -49,8 +49,7 @@ class DiscMark:
 
     def box(self) -> tuple[float, float, float, float]:
         """See ``Mark``."""
-        x, y = np.linalg.norm(self.shape, axis=1) + 1.0
-        return self.centre[0] - x, self.centre[1] - y, self.centre[0] + x, self.centre[1] + y
+        return _box(self.centre, np.linalg.norm(self.shape, axis=1) + 1.0)
 
     def light(self, corner: NDArray[np.int_], shape: tuple[int, int]) -> tuple[Array, Array]:
         """See ``Mark``."""
@@ -70,19 +69,15 @@ class PlateMark:
 
     def box(self) -> tuple[float, float, float, float]:
         """See ``Mark``."""
-        reach = float(np.hypot(*self.half)) + 1.0
-        return self.centre[0] - reach, self.centre[1] - reach, self.centre[0] + reach, self.centre[1] + reach
+        return _box(self.centre, float(np.hypot(*self.half)) + 1.0)
 
     def light(self, corner: NDArray[np.int_], shape: tuple[int, int]) -> tuple[Array, Array]:
         """See ``Mark``."""
         x, y = _offsets(self.centre, corner, shape)
-        along, across = (
-            np.array([np.cos(self.angle), np.sin(self.angle)]),
-            np.array([-np.sin(self.angle), np.cos(self.angle)]),
-        )
+        cosine, sine = np.cos(self.angle), np.sin(self.angle)
         inside = [
-            np.clip(0.5 + half - np.abs(x * axis[0] + y * axis[1]), 0.0, 1.0)
-            for axis, half in zip((along, across), self.half, strict=True)
+            np.clip(0.5 + half - np.abs(x * along_x + y * along_y), 0.0, 1.0)
+            for (along_x, along_y), half in zip(((cosine, sine), (-sine, cosine)), self.half, strict=True)
         ]
         share = inside[0] * inside[1]
         return share, share * self.radiance
@@ -103,12 +98,8 @@ class GlintMark:
 
     def box(self) -> tuple[float, float, float, float]:
         """See ``Mark``."""
-        reach = (
-            self.core * np.sqrt(2.0 * np.log(max(self.peak, self.tail_peak) / FAINTEST))
-            + 1.0
-            + self.tail * np.log(max(self.tail_peak / FAINTEST, 1.0))
-        )
-        return self.centre[0] - reach, self.centre[1] - reach, self.centre[0] + reach, self.centre[1] + reach
+        core = self.core * np.sqrt(2.0 * np.log(max(self.peak, self.tail_peak) / FAINTEST))
+        return _box(self.centre, core + 1.0 + self.tail * np.log(max(self.tail_peak / FAINTEST, 1.0)))
 
     def light(self, corner: NDArray[np.int_], shape: tuple[int, int]) -> tuple[Array, Array]:
         """See ``Mark``."""
@@ -156,13 +147,15 @@ def paint(grey: Array, corner: NDArray[np.int_], mark: Mark, noise: CameraNoise,
     part[touched] = new
 
 
+def _box(centre: Array, reach: Array | float) -> tuple[float, float, float, float]:
+    """First x, y and last x, y, ``reach`` px around a centre (2,)."""
+    return (*(centre - reach), *(centre + reach))
+
+
 def _offsets(centre: Array, corner: NDArray[np.int_], shape: tuple[int, int]) -> tuple[Array, Array]:
     """Distances along x (1, w) and y (h, 1) of a part's pixels from a centre."""
     x, y = corner[0] + np.arange(shape[1]) - centre[0], corner[1] + np.arange(shape[0]) - centre[1]
     return x[None, :], y[:, None]
-
-
-# Images with a fault laid over them: marks in either image, or both images swapped.
 
 
 @dataclass(frozen=True)
@@ -174,6 +167,9 @@ class Fault:
     marks: tuple[Mark, ...] = ()
     swapped: bool = False
     obstacles: Mapping[str, Array] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"Fault({self.kind!r}, {len(self.marks)} marks, {len(self.obstacles)} obstacles)"
 
 
 class FaultyImages:

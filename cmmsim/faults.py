@@ -12,8 +12,6 @@ both cameras consistently have to be drawn with the scene: ``sensor.add_bodies(f
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +25,10 @@ from cmmsim.pose_estimation.estimator import PoseEstimator
 
 BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)  # m, sides of the boxes that hide stickers
 FEW = 4
+KINDS = (  # each is drawn by the method of its name
+    *("hidden", "half_hidden", "obstacles", "one_camera_dark", "one_camera_covered", "false_discs", "false_points"),
+    *("glint", "merging", "swapped", "black", "saturated", "several"),
+)
 STICKER_RADIANCE, DARK_RADIANCE, SATURATING = 228.0 / 255.0, 60.0 / 255.0, 1.5
 
 
@@ -44,21 +46,6 @@ class FaultGenerator:
         require_kind(estimator, PoseEstimator, "an estimator must be a PoseEstimator, such as sensor.estimator")
         self._rig, self._platform, self._taught = estimator.rig, estimator.platform, estimator.taught
         self._radius = estimator.settings.radius
-        self._drawn: dict[str, Callable[[Array, np.random.Generator], Fault]] = {
-            "hidden": self._hidden,
-            "half_hidden": self._half_hidden,
-            "obstacles": self._obstacles,
-            "one_camera_dark": self._one_camera_dark,
-            "one_camera_covered": self._one_camera_covered,
-            "false_discs": self._false_discs,
-            "false_points": self._false_points,
-            "glint": self._glint,
-            "merging": self._merging,
-            "swapped": self._swapped,
-            "black": self._black,
-            "saturated": self._saturated,
-            "several": self._several,
-        }
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -67,17 +54,18 @@ class FaultGenerator:
         false_points: discs in both images where one point in space would show; glint: saturated light with a tail on
         or beside stickers; merging: discs that touch stickers; swapped: left for right; black, saturated: whole frames;
         several: two or three of those at once that leave something to measure."""
-        return tuple(self._drawn)
+        return KINDS
 
     def draw(self, kind: str, pose: ArrayLike, rng: np.random.Generator) -> Fault:
         """A fault of that kind for the platform at a pose (6,).
 
         Raises UnknownOptionError with the valid kinds, ShapeError for what is no pose, CmmError for no generator.
         """
-        if kind not in self.kinds:
-            raise UnknownOptionError("fault", kind, self.kinds)
+        if kind not in KINDS:
+            raise UnknownOptionError("fault", kind, KINDS)
         require_kind(rng, np.random.Generator, "rng must be a generator, such as numpy.random.default_rng(1)")
-        return self._drawn[kind](checked_pose(pose), rng)
+        found: Fault = getattr(self, f"_{kind}")(checked_pose(pose), rng)
+        return found
 
     def _outlines(self, pose: Array) -> tuple[Array, Array]:
         """Ellipses of all stickers: centres (2, n, 2) and shapes (2, n, 2, 2), px."""
@@ -229,11 +217,6 @@ class FaultGenerator:
         parts = [self.draw(kind, pose, rng) for kind in rng.choice(kinds, rng.integers(2, 4), replace=False)]
         obstacles = {name: place for part in parts for name, place in part.obstacles.items()}
         return Fault("several", tuple(mark for part in parts for mark in part.marks), obstacles=obstacles)
-
-
-def jump(pose: Array, rng: np.random.Generator, shift: float = 0.01, turn: float = 0.04) -> Array:
-    """A pose (6,) up to ``shift`` m and ``turn`` rad off in each coordinate: the platform moved between two frames."""
-    return np.asarray(pose, dtype=float) + rng.uniform(-1.0, 1.0, 6) * ([shift] * 3 + [turn] * 3)
 
 
 def _one_or_both(rng: np.random.Generator) -> tuple[int, ...]:

@@ -32,7 +32,7 @@ from cmmsim.pose_estimation.search import SMALLEST_STEP
 from cmmsim.pose_estimation.taught import Taught, require_taught_for, setup_of
 from cmmsim.radiometry.images import StereoFrame, StereoImages
 from cmmsim.radiometry.noise import CameraNoise
-from cmmsim.teaching import Progress, Teacher, WindowSizes, largest_radius, radius_at, window_sizes
+from cmmsim.teaching import Progress, Teacher, WindowSizes, exactly_taught, largest_radius, radius_at, window_sizes
 from cmmsim.tracker import Tracker
 
 TEACHING_STREAM, RUN_STREAM, DROPOUT_STREAM = 0, 1, 2
@@ -83,6 +83,10 @@ class Sensor:
         self._tracker: Tracker | None = None
         self.start_run(seed)
 
+    def __repr__(self) -> str:
+        state = "not yet taught" if self._taught is None else "taught"
+        return f"Sensor({self.name!r}, method {self.method!r}, renderer {self._asked_renderer!r}, {state})"
+
     @property
     def name(self) -> str:
         """Name of the sensor file."""
@@ -105,7 +109,7 @@ class Sensor:
             detector=self._file.detection.detector,
             limits=limits,
             optics=self.optics,
-            centre_error_px=self._camera.centre_error_px(Quality()),
+            centre_error_px=self.camera.centre_error_px(Quality()),
             exposed_share=self.timing.exposure * self.timing.frame_rate,
         )
 
@@ -142,6 +146,12 @@ class Sensor:
         return self.teach()
 
     @property
+    def truth(self) -> Taught:
+        """What teaching would find without any error: the true places of rig and stickers, of which no part of the
+        chain knows; for studies of the observation noise alone."""
+        return exactly_taught(self._file)
+
+    @property
     def estimator(self) -> PoseEstimator:
         """The part that turns images into poses; also for images from elsewhere, see measure_frame."""
         return PoseEstimator(self.rig, self.noise, self.settings, self.platform, self.taught, self.method)
@@ -156,7 +166,7 @@ class Sensor:
         if self._taught is None:
             for body in (self.platform, self.base):
                 require_corner(body)
-            teacher = Teacher(self._camera, self.observer, self.platform, self.base, self._window_sizes.plan())
+            teacher = Teacher(self.camera, self.observer, self.platform, self.base, self._window_sizes.plan())
             rng = np.random.default_rng([self._seed, TEACHING_STREAM])
             found = teacher.teach(self.name, self.home, rng, progress or self._progress)
             self._taught = replace(found, setup=setup_of(self._file))
@@ -207,7 +217,7 @@ class Sensor:
         the sensor's exposure is not zero. Raises ShapeError, UnknownBodyError, and CmmError for too long a blur or for
         obstacles that are no transforms by name.
         """
-        return self._camera.look(*self._checked(pose, obstacles), pose_rate=_checked_rate(pose_rate))
+        return self.camera.look(*self._checked(pose, obstacles), pose_rate=_checked_rate(pose_rate))
 
     def capture(
         self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
@@ -236,11 +246,11 @@ class Sensor:
 
     def _build_again(self) -> None:
         """The camera is built anew before the next picture."""
-        self.__dict__.pop("_camera", None)
+        self.__dict__.pop("camera", None)
 
     @cached_property
-    def _camera(self) -> VirtualStereoCamera:
-        """Stickers are drawn first: what they hide need not be drawn."""
+    def camera(self) -> VirtualStereoCamera:
+        """The two cameras before the true scene. Stickers are drawn first: what they hide need not be drawn."""
         patches = [p for body in self._scene for p in body.stickers] + [body.solid for body in self._scene]
         owners = [k for k, body in enumerate(self._scene) for _ in body.stickers] + [0, 1]
         owners += range(2, 2 + len(self._obstacles))

@@ -8,9 +8,9 @@ the image formation's own error averages out as well.
 Whatever detector the sensor measures with, the centres are those of the maximum-likelihood fit, which is the one
 without a bias: the base is seen in one pose only, so that another detector's bias would stay in every pose.
 
-How large the windows are in which stickers are looked for: large enough for the largest image of a sticker.
-That is the image of a sticker in the nearest place of work, which is taken for a fifth nearer than the rig's target, or
-of one that both cameras see on base and platform at teaching.
+The windows in which stickers are looked for are large enough for the largest image of a sticker: that of one in the
+nearest place of work, which is taken for a fifth nearer than the rig's target, or of one that both cameras see on base
+and platform at teaching.
 """
 
 from __future__ import annotations
@@ -41,6 +41,11 @@ SHIFT, TURN = 0.008, 0.03  # m, rad: reach of the teaching path about home
 CYCLES = np.array([1, 2, 3, 3, 1, 2])
 LARGEST_GAP = 1e-4  # m: in averaged exposures a whole sticker is within a few microns of its place
 PHASES = np.array([0.0, 0.9, 1.7, 2.6, 0.4, 1.3])
+ROOM = 1.35  # half the side of what is fitted over a sticker's radius at the rig's target
+SMALLEST_ROOM_PX = 0.7  # on each side of the largest sticker at teaching: half a pixel goes into rounding
+SMALLEST_FIT, SMALLEST_BLURRED_FIT = 12, 14  # px
+BLUR_ROOM = 1.0  # px on each side, at least, for what point spread and exposure blur
+WINDOW_SHARE = 7 / 6  # side of a window over that of the part that is fitted
 
 
 @dataclass(frozen=True)
@@ -204,13 +209,6 @@ def _mean_constellation(reference: Array, seen: list[StickerObservation]) -> tup
         weighted += np.einsum("nij,nj->ni", weight, apply(to_reference, observation.points))
     covariances = np.asarray(np.linalg.inv(information), dtype=np.float64)
     return np.einsum("nij,nj->ni", covariances, weighted), covariances
-
-
-ROOM = 1.35  # half the side of what is fitted over a sticker's radius at the rig's target
-SMALLEST_ROOM_PX = 0.7  # on each side of the largest sticker at teaching: half a pixel goes into rounding
-SMALLEST_FIT, SMALLEST_BLURRED_FIT = 12, 14  # px
-BLUR_ROOM = 1.0  # px on each side, at least, for what point spread and exposure blur
-WINDOW_SHARE = 7 / 6  # side of a window over that of the part that is fitted
 
 
 @dataclass(frozen=True)

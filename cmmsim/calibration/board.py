@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from cmmsim.checks import checked, parsed, read_text
 from cmmsim.errors import CalibrationError
-from cmmsim.files.settings import checked, parsed, read_text
 from cmmsim.geometry.pose import Array
 
 Length = Annotated[float, Field(gt=0.0, le=100.0)]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,26 +48,27 @@ def no_centres() -> DetectedCentres:
     return DetectedCentres(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, dtype=bool))
 
 
-class DetectWindows(Protocol):
-    """Ellipse centres in n windows with one bright spot each."""
+@dataclass(frozen=True)
+class SpotWindows:
+    """n windows with one bright spot each, and what is known of them.
 
-    def __call__(
-        self,
-        windows: NDArray,
-        corners: NDArray[np.integer],
-        noise: CameraNoise,
-        fit_size: int,
-        limits: FitLimits | None = None,
-        psf_px: float = 0.0,
-        smears: Array | None = None,
-    ) -> DetectedCentres:
-        """Detect.
+    windows (n,h,h) grey values; corners (n,2) the full-image pixel (x, y) of each window's first pixel; noise: the
+    camera's noise; fit_size: side in px of the part around the bright spot that is looked at; limits: when a window
+    counts as one whole sticker; psf_px: sigma of the Gaussian point spread; smears (n,2) px: how far each spot moves
+    during the exposure, for whose middle the centres are.
+    """
 
-        Parameters: windows (n, h, h) grey values; corners (n, 2) the full-image pixel (x, y) of each window's first
-        pixel; noise: the camera's noise; fit_size: side in px of the part around the bright spot that is looked at;
-        limits: when a window counts as one whole sticker; psf_px: sigma of the Gaussian point spread; smears
-        (n, 2) px: how far each spot moves during the exposure, for whose middle the centres are.
-        """
+    windows: NDArray
+    corners: NDArray[np.integer]
+    noise: CameraNoise
+    fit_size: int
+    limits: FitLimits = field(default_factory=FitLimits)
+    psf_px: float = 0.0
+    smears: Array | None = None
+
+
+Detect = Callable[[SpotWindows], DetectedCentres]
+"""Ellipse centres in windows with one bright spot each."""
 
 
 @dataclass(frozen=True)
@@ -77,14 +78,14 @@ class Detector:
     margin_px: how much wider than for the maximum-likelihood fit a window must be on each side."""
 
     name: str
-    detect: DetectWindows
+    detect: Detect
     bias_px: float = 0.0
     margin_px: int = 0
 
 
 @lru_cache
 def find_detector(name: str) -> Detector:
-    """The detector of a built-in name, or of ``module:name``: a Detector, or a function as ``DetectWindows`` describes.
+    """The detector of a built-in name, or of ``module:name``: a Detector, or a ``Detect`` function.
 
     A function may carry its own ``bias_px`` and ``margin_px``. Raises UnknownOptionError with the valid names, CmmError
     for what cannot be imported or called.

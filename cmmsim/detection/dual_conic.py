@@ -23,10 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, no_centres
+from cmmsim.detection.detector import DetectedCentres, Detector, SpotWindows, no_centres
 from cmmsim.detection.grey_centroid import BrightSpots, bright_spots, whole_inside
 from cmmsim.geometry.pose import Array
-from cmmsim.radiometry.noise import CameraNoise
 
 SLOPE = (-0.5, 0.0, 0.5)
 SMOOTHING = (0.1875, 0.625, 0.1875)  # across the slope (Scharr): the most nearly isotropic of this size
@@ -34,21 +33,11 @@ EDGE_PX = 2  # from the rim to the window's side: a gradient reaches 1.5 px from
 SMALLEST_CONDITION = 1e-9  # reciprocal condition below which the lines do not determine an ellipse
 
 
-def detect_by_dual_conic(
-    windows: NDArray,
-    corners: NDArray[np.integer],
-    noise: CameraNoise,
-    fit_size: int,
-    limits: FitLimits | None = None,
-    psf_px: float = 0.0,
-    smears: Array | None = None,
-) -> DetectedCentres:
-    """Centres by the dual conic. Parameters as of ``DetectWindows``; the point spread only widens the rim, and smears
-    play no part."""
-    limits = limits or FitLimits()
-    if len(windows) == 0:
+def detect_by_dual_conic(given: SpotWindows) -> DetectedCentres:
+    """Centres by the dual conic; the point spread only widens the rim, and smears play no part."""
+    if len(given.windows) == 0:
         return no_centres()
-    spots = bright_spots(windows, corners, fit_size)
+    spots = bright_spots(given)
     lines = _edge_lines(spots)
     basis = np.stack([lines.a**2, lines.a * lines.b, lines.b**2, lines.a * lines.c, lines.b * lines.c])
     normal = np.einsum("inyx,jnyx->nij", basis, basis)
@@ -57,11 +46,11 @@ def detect_by_dual_conic(
     dual = np.linalg.solve(normal, -np.einsum("inyx,nyx->ni", basis, lines.c**2)[..., None])[..., 0]
     centres = 0.5 * dual[:, 3:] * lines.unit_px[:, None] + spots.centroids
     jacobian = _centre_by_pixels(spots, lines, basis, normal, dual)
-    variance = noise.variance(spots.windows)
+    variance = given.noise.variance(spots.windows)
     covariances = np.einsum("niyx,njyx,nyx->nij", jacobian, jacobian, variance)
     squared = _squared_shape(dual) * lines.unit_px[:, None, None] ** 2
-    good = (spots.contrast >= limits.smallest_contrast) & determined & (np.linalg.eigvalsh(squared)[:, 0] > 0.0)
-    good &= whole_inside(centres, 0.25 * squared, fit_size, EDGE_PX + psf_px)
+    good = (spots.contrast >= given.limits.smallest_contrast) & determined & (np.linalg.eigvalsh(squared)[:, 0] > 0.0)
+    good &= whole_inside(centres, 0.25 * squared, given.fit_size, EDGE_PX + given.psf_px)
     return DetectedCentres(centres + spots.corners, covariances, good)
 
 

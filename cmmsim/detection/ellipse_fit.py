@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits
+from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, SpotWindows
 from cmmsim.geometry.disc_image import require_psf
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
@@ -66,17 +66,17 @@ class EllipseFits:
         )
 
 
-def detect_by_maximum_likelihood(
-    windows: NDArray,
-    corners: NDArray[np.integer],
-    noise: CameraNoise,
-    fit_size: int,
-    limits: FitLimits | None = None,
-    psf_px: float = 0.0,
-    smears: Array | None = None,
-) -> DetectedCentres:
-    """Centres of the maximum-likelihood fit of a blurred ellipse. Parameters as of ``DetectWindows``."""
-    return fit_ellipses(windows, corners, noise, fit_size, limits, psf_px=psf_px, smears=smears).detected
+def detect_by_maximum_likelihood(spots: SpotWindows) -> DetectedCentres:
+    """Centres of the maximum-likelihood fit of a blurred ellipse."""
+    return fit_ellipses(
+        spots.windows,
+        spots.corners,
+        spots.noise,
+        spots.fit_size,
+        spots.limits,
+        psf_px=spots.psf_px,
+        smears=spots.smears,
+    ).detected
 
 
 MAXIMUM_LIKELIHOOD = Detector("maximum_likelihood", detect_by_maximum_likelihood)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cmmsim.compiled import compiled
+from cmmsim.compiled import Array, compiled
 from cmmsim.geometry.disc_kernels import blur_window, cover_window, inverse_of
 from cmmsim.geometry.point_kernels import factor, invert_factored, solve_factored
 
@@ -25,18 +25,18 @@ class FitSettings(NamedTuple):
     ring_reach: float
     smallest_start: float
     smallest: float
-    largest_step: np.ndarray
+    largest_step: Array
     iterations: int
     converged: float
     psf_px: float
     smear_step: float
-    variances: np.ndarray
+    variances: Array
     first_grey: float
     entries_a_grey: float
 
 
 @compiled
-def nth_smallest(values: np.ndarray, n: int) -> float:
+def nth_smallest(values: Array, n: int) -> float:
     """The value with ``n`` smaller ones (Hoare's selection); reorders ``values``."""
     first, last = 0, len(values) - 1
     while first < last:
@@ -57,7 +57,7 @@ def nth_smallest(values: np.ndarray, n: int) -> float:
 
 
 @compiled
-def moments(window: np.ndarray, core_share: float) -> tuple:
+def moments(window: Array, core_share: float) -> tuple:
     """Ground, contrast, centroid x, y and spread xx, xy, yy of the bright spot of a window (h, w) of floats."""
     flat = window.flatten()
     ground = nth_smallest(flat, len(flat) // 3)
@@ -102,15 +102,15 @@ def variance_at(mean: float, settings: FitSettings) -> float:
 
 @compiled
 def accumulate(
-    window: np.ndarray,
-    mask: np.ndarray,
-    shares: np.ndarray,
-    derivatives: np.ndarray,
+    window: Array,
+    mask: Array,
+    shares: Array,
+    derivatives: Array,
     contrast: float,
     ground: float,
     settings: FitSettings,
-    normal: np.ndarray,
-    right: np.ndarray,
+    normal: Array,
+    right: Array,
 ) -> float:
     """Add up the normal matrix (7,7), lower triangle, and right-hand side (7,); returns the weighted squared misfit."""
     normal[:], right[:], misfit = 0.0, 0.0, 0.0
@@ -139,7 +139,7 @@ def accumulate(
 
 
 @compiled
-def start_ellipse(window: np.ndarray, settings: FitSettings, parameters: np.ndarray) -> None:
+def start_ellipse(window: Array, settings: FitSettings, parameters: Array) -> None:
     """First parameters (7,) from the moments; a uniform ellipse has spread A A / 4."""
     ground, contrast, x, y, xx, xy, yy = moments(window, settings.core_share)
     xx, xy, yy = bound_radii(xx, xy, yy, (0.5 * settings.smallest_start) ** 2, (0.25 * window.shape[1]) ** 2)
@@ -151,7 +151,7 @@ def start_ellipse(window: np.ndarray, settings: FitSettings, parameters: np.ndar
 
 
 @compiled
-def mask_ring(parameters: np.ndarray, shape: np.ndarray, reach: float, mask: np.ndarray) -> int:
+def mask_ring(parameters: Array, shape: Array, reach: float, mask: Array) -> int:
     """Mark the pixels within ``reach`` radii of the ellipse; returns their number."""
     m, count = inverse_of(shape), 0
     for row in range(mask.shape[0]):
@@ -163,7 +163,7 @@ def mask_ring(parameters: np.ndarray, shape: np.ndarray, reach: float, mask: np.
 
 
 @compiled
-def step_within_bounds(parameters: np.ndarray, step: np.ndarray, settings: FitSettings, size: int) -> float:
+def step_within_bounds(parameters: Array, step: Array, settings: FitSettings, size: int) -> float:
     """Add a step (7,), cut to its largest values, and keep the centre in the window and the radii between limits.
 
     Returns how far the ellipse was to move, px.
@@ -183,14 +183,14 @@ def step_within_bounds(parameters: np.ndarray, step: np.ndarray, settings: FitSe
 
 
 @compiled
-def set_shape(parameters: np.ndarray, shape: np.ndarray) -> None:
+def set_shape(parameters: Array, shape: Array) -> None:
     """The matrix A (2,2) of an ellipse's parameters."""
     shape[0, 0], shape[0, 1], shape[1, 0], shape[1, 1] = parameters[2], parameters[3], parameters[3], parameters[4]
 
 
 @compiled
 def light_of_still(
-    centre_x: float, centre_y: float, shape: np.ndarray, psf_px: float, shares: np.ndarray, derivatives: np.ndarray
+    centre_x: float, centre_y: float, shape: Array, psf_px: float, shares: Array, derivatives: Array
 ) -> None:
     """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that stands still."""
     if psf_px > 0.0:
@@ -200,9 +200,7 @@ def light_of_still(
 
 
 @compiled
-def add_light(
-    shares: np.ndarray, derivatives: np.ndarray, weight: float, to_shares: np.ndarray, to_derivatives: np.ndarray
-) -> None:
+def add_light(shares: Array, derivatives: Array, weight: float, to_shares: Array, to_derivatives: Array) -> None:
     """Add shares (h, w) and derivatives (h, w, 5), weighted, to others; whole-array sums would compile for seconds."""
     for row in range(shares.shape[0]):
         for column in range(shares.shape[1]):
@@ -213,12 +211,7 @@ def add_light(
 
 @compiled
 def light_of_moving(
-    parameters: np.ndarray,
-    shape: np.ndarray,
-    smear: np.ndarray,
-    settings: FitSettings,
-    shares: np.ndarray,
-    derivatives: np.ndarray,
+    parameters: Array, shape: Array, smear: Array, settings: FitSettings, shares: Array, derivatives: Array
 ) -> None:
     """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5) of an ellipse that moves evenly by ``smear`` (2,) px during
     the exposure, by the midpoint rule; its parameters are those in the middle."""
@@ -245,12 +238,7 @@ def light_of_moving(
 
 @compiled
 def fit_window(
-    window: np.ndarray,
-    smear: np.ndarray,
-    settings: FitSettings,
-    parameters: np.ndarray,
-    shape: np.ndarray,
-    covariance: np.ndarray,
+    window: Array, smear: Array, settings: FitSettings, parameters: Array, shape: Array, covariance: Array
 ) -> float:
     """Gauss-Newton from ``parameters`` (7,), which it moves; returns the reduced chi-square.
 
@@ -283,15 +271,15 @@ def fit_window(
 
 @compiled
 def fit_windows(
-    windows: np.ndarray,
-    smears: np.ndarray,
+    windows: Array,
+    smears: Array,
     size: int,
     settings: FitSettings,
-    corners: np.ndarray,
-    parameters: np.ndarray,
-    shapes: np.ndarray,
-    covariances: np.ndarray,
-    misfits: np.ndarray,
+    corners: Array,
+    parameters: Array,
+    shapes: Array,
+    covariances: Array,
+    misfits: Array,
 ) -> None:
     """Fit the part of ``size`` px around the bright spot of each window (n,h,h) of floats, which moved by ``smears``
     (n,2) px during the exposure.

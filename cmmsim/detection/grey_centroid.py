@@ -16,10 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, no_centres
+from cmmsim.detection.detector import DetectedCentres, Detector, SpotWindows, no_centres
 from cmmsim.detection.ellipse_fit import RING_REACH
 from cmmsim.geometry.pose import Array
-from cmmsim.radiometry.noise import CameraNoise
 
 THRESHOLD = 0.1  # share of the contrast
 CORE_THRESHOLD = 0.4  # the same where only the spot itself is wanted, whatever surrounds it
@@ -43,35 +42,28 @@ class BrightSpots:
     spreads: Array
 
 
-def detect_by_centroid(
-    windows: NDArray,
-    corners: NDArray[np.integer],
-    noise: CameraNoise,
-    fit_size: int,
-    limits: FitLimits | None = None,
-    psf_px: float = 0.0,
-    smears: Array | None = None,
-) -> DetectedCentres:
-    """Grey centroids. Parameters as of ``DetectWindows``; neither the point spread nor smears play a part."""
-    limits = limits or FitLimits()
-    if len(windows) == 0:
+def detect_by_centroid(given: SpotWindows) -> DetectedCentres:
+    """Grey centroids; neither the point spread nor smears play a part."""
+    if len(given.windows) == 0:
         return no_centres()
-    spots = bright_spots(windows, corners, fit_size)
-    x, y = _offsets(spots.centroids, fit_size)
+    spots = bright_spots(given)
+    x, y = _offsets(spots.centroids, given.fit_size)
     influence = (spots.weights > 0.0) / _total(spots.weights)[:, None, None]  # a threshold pixel has derivative 0 or 1
     jacobian = np.stack([x * influence, y * influence], axis=1)
-    variance = noise.variance(spots.windows)
+    variance = given.noise.variance(spots.windows)
     covariances = np.einsum("niyx,njyx,nyx->nij", jacobian, jacobian, variance)
-    good = (spots.contrast >= limits.smallest_contrast) & whole_inside(spots.centroids, spots.spreads, fit_size)
+    good = (spots.contrast >= given.limits.smallest_contrast) & whole_inside(
+        spots.centroids, spots.spreads, given.fit_size
+    )
     return DetectedCentres(spots.centroids + spots.corners, covariances, good)
 
 
 GREY_CENTROID = Detector("grey_centroid", detect_by_centroid, 0.009)
 
 
-def bright_spots(windows: NDArray, corners: NDArray[np.integer], size: int) -> BrightSpots:
-    """Find the bright spot of each window (n, h, h) and keep the ``size`` x ``size`` part around it."""
-    values = windows.astype(float)
+def bright_spots(given: SpotWindows) -> BrightSpots:
+    """Find the bright spot of each window and keep the part around it that is to be looked at."""
+    values, size = given.windows.astype(float), given.fit_size
     rough = _centroids(_weights(values, CORE_THRESHOLD)[0])
     first = np.clip(np.rint(rough - 0.5 * (size - 1)).astype(int), 0, values.shape[1] - size)
     ticks = np.arange(size)
@@ -82,7 +74,7 @@ def bright_spots(windows: NDArray, corners: NDArray[np.integer], size: int) -> B
     spreads = _spreads(core, middles)
     within = _within_ring(middles, spreads, size)
     weights = _weights(parts, THRESHOLD)[0] * within
-    return BrightSpots(parts, corners + first, contrast, weights, within, _centroids(weights), spreads)
+    return BrightSpots(parts, given.corners + first, contrast, weights, within, _centroids(weights), spreads)
 
 
 def whole_inside(centres: Array, spreads: Array, size: int, margin: float = 0.0) -> NDArray[np.bool_]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from cmmsim.checks import Section
 from cmmsim.errors import SensorFileError
 from cmmsim.geometry.pose import Array
 from cmmsim.plugins import AUTO, DEFAULT_DETECTOR, require_detector, require_renderer
@@ -19,11 +20,7 @@ WIDEST_JITTER = 3.0  # standard deviations: no frame's latency is farther from t
 NARROWEST_PSF = 0.1  # px: a narrower point spread is lost between the points that images are drawn on
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Timing(_Section):
+class Timing(Section):
     """When the sensor looks, and when its poses can be used.
 
     frame_rate Hz; exposure s: a measured pose is that in its middle; latency s, from the middle of the exposure to the
@@ -67,7 +64,7 @@ class Timing(_Section):
         return min(WIDEST_JITTER * self.latency_jitter, self.latency)
 
 
-class Calibrated(_Section):
+class Calibrated(Section):
     """A camera as calibrated: focal_px along x and y and centre_px, the principal point, px; distortion k1, k2, p1, p2,
     k3 of Brown and Conrady in OpenCV's order and meaning."""
 
@@ -76,14 +73,14 @@ class Calibrated(_Section):
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-class RightFromLeft(_Section):
+class RightFromLeft(Section):
     """Where the right camera stands: x_right = R(rotation_vector) x_left + translation; m and rad."""
 
     translation: Vector3
     rotation_vector: Vector3
 
 
-class Rig(_Section):
+class Rig(Section):
     """baseline m; focal_px, width, height px; position (the middle of the baseline) and target m in the base frame.
 
     distance m, where given: the position is moved along its line to the target to stand that far from it.
@@ -110,7 +107,7 @@ class Rig(_Section):
         return self
 
 
-class Camera(_Section):
+class Camera(Section):
     """EMVA 1288 figures: electrons, grey values per electron, grey values; prnu relative, dsnu electrons.
 
     noise = false leaves out all noise, the pattern of prnu and dsnu too; pattern_seed makes another specimen.
@@ -137,7 +134,7 @@ class Camera(_Section):
         return self
 
 
-class Lens(_Section):
+class Lens(Section):
     """What both lenses do beside the distortion that stands with each camera.
 
     psf_px: standard deviation of the Gaussian point spread, px; vignetting: share of the light missing in the corner
@@ -154,7 +151,7 @@ class Lens(_Section):
         return self
 
 
-class Detection(_Section):
+class Detection(Section):
     """detector: which one finds the centres of stickers in windows when poses are measured, see :mod:`cmmsim.plugins`.
 
     Teaching always takes the maximum-likelihood one, whichever is named here; see :mod:`cmmsim.teaching`.
@@ -163,7 +160,7 @@ class Detection(_Section):
     detector: Annotated[str, AfterValidator(require_detector)] = DEFAULT_DETECTOR
 
 
-class Stickers(_Section):
+class Stickers(Section):
     """Radii and placement distances m; levels of 255.
 
     per_plane: that many stickers on each plane of the platform instead of those listed there, evenly on an ellipse.
@@ -199,7 +196,7 @@ class Stickers(_Section):
         return self
 
 
-class HalfSpace(_Section):
+class HalfSpace(Section):
     """normal outwards, any length; point on the plane, m."""
 
     normal: Vector3
@@ -213,7 +210,7 @@ class StickerPlane(HalfSpace):
     stickers: Annotated[list[tuple[float, float]], Field(min_length=3)]
 
 
-class Planes(_Section):
+class Planes(Section):
     """The three planes of a body."""
 
     A: StickerPlane
@@ -221,7 +218,7 @@ class Planes(_Section):
     C: StickerPlane
 
 
-class Body(_Section):
+class Body(Section):
     """A convex body with stickers on three planes."""
 
     planes: Planes
@@ -234,7 +231,7 @@ class Platform(Body):
     home: tuple[float, float, float, float, float, float]
 
 
-class SensorFile(_Section):
+class SensorFile(Section):
     """A whole sensor file.
 
     based_on: a built-in sensor, or a file beside this one, whose entries hold where this file has none; note: what a

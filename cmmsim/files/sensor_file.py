@@ -1,8 +1,6 @@
 """Reading sensor files (TOML): how a name becomes a file, and a file with changes a checked content.
 
-Any number of stickers on a plane with the same middle and the same spread, so that their number alone differs.
-Points evenly spaced in angle on an ellipse have the same mean and the same second moments whatever their number is,
-from three on: n stickers know a plane or a pose sqrt(n) times better than one would.
+Changes are other entries than a file's, by dotted key as ``{"camera.dark_noise": 40.0}`` or nested as in it.
 """
 
 from __future__ import annotations
@@ -15,13 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from cmmsim.checks import require_kind
+from cmmsim.checks import checked, parsed, read_text, require_kind
 from cmmsim.errors import SensorFileError, UnknownSensorError
 from cmmsim.files.schema import SensorFile
-from cmmsim.files.settings import checked, parsed, read_text
 from cmmsim.geometry.pose import Array
-
-# Changes to the entries of a sensor file, by dotted key as `{"camera.dark_noise": 40.0}` or nested as in it.
 
 
 def dotted(changes: Mapping[str, Any], section: str = "") -> dict[str, Any]:
@@ -73,7 +68,11 @@ def _replace(content: dict[str, Any], path: str, value: Any, source: str) -> Non
 
 
 def ring_of_stickers(listed: Sequence[tuple[float, float]], count: int) -> Array:
-    """Places (count, 2) [u, v], m, on the ellipse one standard deviation around the middle of those listed (n, 2)."""
+    """Places (count, 2) [u, v], m, on the ellipse one standard deviation around the middle of those listed (n, 2).
+
+    Points evenly spaced in angle on an ellipse have the same mean and the same second moments whatever their number is,
+    from three on: n stickers know a plane or a pose sqrt(n) times better than one would.
+    """
     places = np.asarray(listed, dtype=float)
     reach = np.linalg.cholesky(np.cov(places.T, bias=True))
     angle = 2.0 * np.pi * np.arange(count) / count

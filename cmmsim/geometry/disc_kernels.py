@@ -1,7 +1,7 @@
 """Compiled: discs as a camera sees them, and their light in each pixel, sharp and blurred.
 
-Compiled: exact share of pixels that an ellipse covers, see ``ellipse_coverage`` for the formulas.
-An ellipse comes as its centre and the matrix m = A^-1 (2,2) that carries px into the axes of the unit disc.
+The formulas stand in ``disc_image``. An ellipse comes as its centre and the matrix m = A^-1 (2,2) that carries px into
+the axes of the unit disc.
 """
 
 from __future__ import annotations
@@ -10,22 +10,14 @@ import math
 
 import numpy as np
 
-from cmmsim.compiled import compiled
-
-# Compiled: discs as a camera sees them.
+from cmmsim.compiled import Array, compiled
 
 
 @compiled
 def project_disc(
-    centre: np.ndarray,
-    normal: np.ndarray,
-    radius: float,
-    focal: np.ndarray,
-    principal: np.ndarray,
-    middle: np.ndarray,
-    shape: np.ndarray,
+    centre: Array, normal: Array, radius: float, focal: Array, principal: Array, middle: Array, shape: Array
 ) -> None:
-    """Ellipse of a disc, see ``projected_disc``: ``middle`` (2,) px and ``shape`` (2,2) px, the root of a matrix M:
+    """Ellipse of a disc: ``middle`` (2,) px and ``shape`` (2,2) px, the root of a matrix M:
     (M + d I) / sqrt(trace M + 2 d), d² = det M."""
     depth = centre[2] ** 2 - radius**2 * (1.0 - normal[2] ** 2)
     at = np.empty(2)
@@ -48,13 +40,7 @@ def project_disc(
 
 @compiled
 def project_all(
-    centres: np.ndarray,
-    normals: np.ndarray,
-    radii: np.ndarray,
-    focal: np.ndarray,
-    principal: np.ndarray,
-    middles: np.ndarray,
-    shapes: np.ndarray,
+    centres: Array, normals: Array, radii: Array, focal: Array, principal: Array, middles: Array, shapes: Array
 ) -> None:
     """``project_disc`` for n discs: centres (n,3), normals (n,3), radii (n,), middles (n,2), shapes (n,2,2)."""
     for n in range(len(centres)):
@@ -62,14 +48,7 @@ def project_all(
 
 
 @compiled
-def place_discs(
-    moves: np.ndarray,
-    owners: np.ndarray,
-    places: np.ndarray,
-    directions: np.ndarray,
-    centres: np.ndarray,
-    normals: np.ndarray,
-) -> None:
+def place_discs(moves: Array, owners: Array, places: Array, directions: Array, centres: Array, normals: Array) -> None:
     """Centres and normals (n,3) in camera axes of discs at ``places`` with normals ``directions`` (n,3) in the axes of
     their ``owners`` (n,); moves (b,4,4) camera from bodies."""
     for n in range(len(places)):
@@ -82,7 +61,7 @@ def place_discs(
 
 
 @compiled
-def probe_discs(centres: np.ndarray, normals: np.ndarray, radii: np.ndarray, probes: np.ndarray) -> None:
+def probe_discs(centres: Array, normals: Array, radii: Array, probes: Array) -> None:
     """Fill probes (n,k,3): the middle of each disc, then k - 1 points on its rim."""
     count = probes.shape[1] - 1
     u = np.empty(3)
@@ -136,7 +115,7 @@ def side_share(start_x: float, start_y: float, step_x: float, step_y: float) -> 
 
 
 @compiled
-def reach_of_pixel(m: np.ndarray) -> float:
+def reach_of_pixel(m: Array) -> float:
     """Largest distance, in disc units, of a pixel's points from its middle."""
     return 0.5 * math.sqrt(
         max((m[0, 0] + m[0, 1]) ** 2 + (m[1, 0] + m[1, 1]) ** 2, (m[0, 0] - m[0, 1]) ** 2 + (m[1, 0] - m[1, 1]) ** 2)
@@ -144,7 +123,7 @@ def reach_of_pixel(m: np.ndarray) -> float:
 
 
 @compiled
-def cover_pixel(x: float, y: float, m: np.ndarray) -> tuple[float, float, float, float, float, float]:
+def cover_pixel(x: float, y: float, m: Array) -> tuple[float, float, float, float, float, float]:
     """Share of the pixel with middle (x, y), px from the ellipse's centre, and its derivatives by [c_x, c_y, A_xx,
     A_xy, A_yy]: along each side the boundary moves by v = dc + dA A^-1 (x - c)."""
     det = 1.0 / (m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0])
@@ -173,7 +152,7 @@ def cover_pixel(x: float, y: float, m: np.ndarray) -> tuple[float, float, float,
 
 
 @compiled
-def inverse_of(shape: np.ndarray) -> np.ndarray:
+def inverse_of(shape: Array) -> Array:
     """Inverse (2,2) of a (2,2) matrix."""
     det = shape[0, 0] * shape[1, 1] - shape[0, 1] * shape[1, 0]
     m = np.empty((2, 2))
@@ -182,9 +161,7 @@ def inverse_of(shape: np.ndarray) -> np.ndarray:
 
 
 @compiled
-def cover_window(
-    centre_x: float, centre_y: float, shape: np.ndarray, shares: np.ndarray, derivatives: np.ndarray
-) -> None:
+def cover_window(centre_x: float, centre_y: float, shape: Array, shares: Array, derivatives: Array) -> None:
     """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5); only pixels on the rim need more than a distance."""
     m = inverse_of(shape)
     reach = reach_of_pixel(m)
@@ -203,13 +180,10 @@ def cover_window(
 
 
 @compiled
-def cover_windows(centres: np.ndarray, shapes: np.ndarray, shares: np.ndarray, derivatives: np.ndarray) -> None:
+def cover_windows(centres: Array, shapes: Array, shares: Array, derivatives: Array) -> None:
     """``cover_window`` for n ellipses: centres (n,2), shapes (n,2,2), shares (n,h,w), derivatives (n,h,w,5)."""
     for k in range(len(centres)):
         cover_window(centres[k, 0], centres[k, 1], shapes[k], shares[k], derivatives[k])
-
-
-# Compiled: light of an ellipse blurred by a Gaussian in each pixel, see `blurred_coverage` for the formulas.
 
 
 REACH = 5.5  # standard deviations from the rim beyond which no light is followed: 4e-8 of it
@@ -219,7 +193,7 @@ SQRT_HALF, SQRT_TWO_PI = math.sqrt(0.5), math.sqrt(2.0 * math.pi)
 
 
 @compiled
-def carried(start: float, first: int, last: int, psf_px: float, across: np.ndarray, passed: np.ndarray) -> None:
+def carried(start: float, first: int, last: int, psf_px: float, across: Array, passed: Array) -> None:
     """What the point spread carries from ``start``, px along one axis, into pixels first..last: ``across`` g is the
     share of a point's light, ``passed`` P its integral from -infinity to ``start``."""
     u = (first - 0.5 - start) / psf_px
@@ -235,7 +209,7 @@ def carried(start: float, first: int, last: int, psf_px: float, across: np.ndarr
 
 
 @compiled
-def rim_points(shape: np.ndarray, psf_px: float) -> int:
+def rim_points(shape: Array, psf_px: float) -> int:
     """Points on the rim so close that the trapezoidal rule has converged."""
     extent = math.sqrt(max(shape[0, 0] ** 2 + shape[0, 1] ** 2, shape[1, 0] ** 2 + shape[1, 1] ** 2))
     return max(FEWEST_POINTS, math.ceil(2.0 * math.pi * extent * POINTS_PER_SIGMA / psf_px))
@@ -243,7 +217,7 @@ def rim_points(shape: np.ndarray, psf_px: float) -> int:
 
 @compiled
 def blur_window(
-    centre_x: float, centre_y: float, shape: np.ndarray, psf_px: float, shares: np.ndarray, derivatives: np.ndarray
+    centre_x: float, centre_y: float, shape: Array, psf_px: float, shares: Array, derivatives: Array
 ) -> None:
     """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5)."""
     height, width = shares.shape
@@ -278,9 +252,7 @@ def blur_window(
 
 
 @compiled
-def blur_windows(
-    centres: np.ndarray, shapes: np.ndarray, psf_px: float, shares: np.ndarray, derivatives: np.ndarray
-) -> None:
+def blur_windows(centres: Array, shapes: Array, psf_px: float, shares: Array, derivatives: Array) -> None:
     """``blur_window`` for n ellipses: centres (n,2), shapes (n,2,2), shares (n,h,w), derivatives (n,h,w,5)."""
     for k in range(len(centres)):
         blur_window(centres[k, 0], centres[k, 1], shapes[k], psf_px, shares[k], derivatives[k])

@@ -6,16 +6,13 @@ import math
 
 import numpy as np
 
-from cmmsim.compiled import compiled
-
-# Compiled: small symmetric systems of equations, where a call of LAPACK costs more than the work.
-
+from cmmsim.compiled import Array, compiled
 
 SMALLEST_PIVOT = 1e-300
 
 
 @compiled
-def factor(matrix: np.ndarray) -> None:
+def factor(matrix: Array) -> None:
     """Cholesky factor of a symmetric matrix (n,n), in its lower triangle."""
     for j in range(len(matrix)):
         for i in range(j, len(matrix)):
@@ -26,7 +23,7 @@ def factor(matrix: np.ndarray) -> None:
 
 
 @compiled
-def solve_factored(lower: np.ndarray, right: np.ndarray) -> None:
+def solve_factored(lower: Array, right: Array) -> None:
     """Solve L L' x = right (n,) in place."""
     n = len(right)
     for i in range(n):
@@ -40,7 +37,7 @@ def solve_factored(lower: np.ndarray, right: np.ndarray) -> None:
 
 
 @compiled
-def invert_factored(lower: np.ndarray, inverse: np.ndarray) -> None:
+def invert_factored(lower: Array, inverse: Array) -> None:
     """Fill ``inverse``, the leading (m,m) part of the inverse of L L'."""
     column = np.empty(len(lower))
     for k in range(len(inverse)):
@@ -51,11 +48,8 @@ def invert_factored(lower: np.ndarray, inverse: np.ndarray) -> None:
             inverse[i, k] = column[i]
 
 
-# Compiled: Gauss-Newton steps of points seen by two cameras, and of a rigid fit of points to points.
-
-
 @compiled
-def project_point(projection: np.ndarray, point: np.ndarray, pixel: np.ndarray, jacobian: np.ndarray) -> None:
+def project_point(projection: Array, point: Array, pixel: Array, jacobian: Array) -> None:
     """Pixel (2,) of a point (3,) by a projection matrix (3,4), and its derivative (2,3) by the point."""
     depth = projection[2, 3]
     for i in range(3):
@@ -70,9 +64,7 @@ def project_point(projection: np.ndarray, point: np.ndarray, pixel: np.ndarray, 
 
 
 @compiled
-def add_weighted(
-    jacobian: np.ndarray, weight: np.ndarray, residual: np.ndarray, normal: np.ndarray, right: np.ndarray
-) -> float:
+def add_weighted(jacobian: Array, weight: Array, residual: Array, normal: Array, right: Array) -> float:
     """Add J' W J to ``normal`` and J' W r to ``right``; returns r' W r."""
     rows, columns = jacobian.shape
     squared = 0.0
@@ -89,13 +81,7 @@ def add_weighted(
 
 @compiled
 def refine_points(
-    projections: np.ndarray,
-    observed: np.ndarray,
-    weights: np.ndarray,
-    steps: int,
-    points: np.ndarray,
-    covariances: np.ndarray,
-    gaps: np.ndarray,
+    projections: Array, observed: Array, weights: Array, steps: int, points: Array, covariances: Array, gaps: Array
 ) -> None:
     """Move n points to where they explain their pixels best.
 
@@ -122,12 +108,7 @@ def refine_points(
 
 @compiled
 def rigid_step(
-    source: np.ndarray,
-    target: np.ndarray,
-    weights: np.ndarray,
-    transform: np.ndarray,
-    covariance: np.ndarray,
-    change: np.ndarray,
+    source: Array, target: Array, weights: Array, transform: Array, covariance: Array, change: Array
 ) -> None:
     """One step of the rigid fit target = transform(source): ``change`` (6,) is [dt, dphi], ``covariance`` (6,6) its
     covariance.

@@ -1,4 +1,8 @@
-"""Two cameras held by one rigid bar, and points triangulated from both of their images."""
+"""Two cameras held by one rigid bar, and points triangulated from both of their images.
+
+The camera frame C of the sensor is the frame of the left camera. Points come from OpenCV's linear triangulation,
+followed by weighted Gauss-Newton steps.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ from cmmsim.errors import ShapeError
 from cmmsim.geometry.camera import NDArrayBool, PinholeCamera
 from cmmsim.geometry.pose import Array, apply, invert
 
-# Two cameras held by one rigid bar. The camera frame C of the sensor is the frame of the left camera.
+STEPS = 2  # of Gauss-Newton after the linear start
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,10 @@ class StereoRig:
         if self.right_from_left.shape != (4, 4):
             raise ShapeError(f"right_from_left must be (4,4), got {self.right_from_left.shape}")
         self.right_from_left.setflags(write=False)
+
+    def __repr__(self) -> str:
+        sizes = " and ".join(f"{camera.width} x {camera.height} px" for camera in self.cameras)
+        return f"StereoRig({sizes}, {np.linalg.norm(self.right_from_left[:3, 3]):.4g} m apart)"
 
     @property
     def cameras(self) -> tuple[PinholeCamera, PinholeCamera]:
@@ -127,12 +135,6 @@ def _look_at(eye: Array, target: Array) -> Array:
     base_from_camera[:3, :3] = np.column_stack([x, np.cross(z, x), z])
     base_from_camera[:3, 3] = eye
     return invert(base_from_camera)
-
-
-# Points from pixel pairs: OpenCV's linear triangulation, then weighted Gauss-Newton steps, and covariances.
-
-
-STEPS = 2  # of Gauss-Newton after the linear start
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""One exposure of a camera: the poses that it sees, the light of windows or whole images over it, and noise.
+"""One exposure of two cameras: the poses that they see, the light of windows or whole images over it, and noise.
 
-Windows of one camera's image over the moments of an exposure, in which most of the scene stands still.
-A window that nothing reaches shows the background and is not drawn; one that no moving body reaches is drawn once.
+Most of the scene stands still during an exposure: a window that nothing reaches shows the background and is not drawn,
+one that no moving body reaches is drawn once.
 """
 
 from __future__ import annotations
@@ -24,11 +24,15 @@ from cmmsim.imaging.scene import DiscStack
 from cmmsim.radiometry.images import StereoFrame, Windows
 from cmmsim.radiometry.noise import CameraNoise, FixedPattern, draw_pattern
 
-# The poses through which a moving platform goes during one exposure.
-
-
 LARGEST_STEP_PX = 0.3  # between two sub-frames no sticker moves farther
 MOST_SUB_FRAMES = 500
+SUPERSAMPLING = 9
+PASTED_SIZE = 24  # px side of the finely drawn window around a bright spot
+LARGEST_PASTED_SIZE = 96  # px: a larger spot is left coarse
+DARK_RIM = 8  # px of the surroundings that are drawn finely with a spot that is longer than a sticker
+BRIGHT = 0.4  # radiance above which a spot is drawn finely
+TILE = 64  # px side of the pieces that are bent and blurred at a time
+COARSE = 2  # drawn samples a pixel and axis away from bright spots
 
 
 def sub_frame_poses(pose: Array, pose_rate: Array, exposure: float, sticker_pixels: Callable[[Array], Array]) -> Array:
@@ -88,21 +92,13 @@ def exposed_windows(
     return mean, brightest
 
 
-# Whole images: drawn coarsely, and as finely as windows are around each bright spot.
-
-
-PASTED_SIZE = 24  # px side of the finely drawn window around a bright spot
-LARGEST_PASTED_SIZE = 96  # px: a larger spot is left coarse
-DARK_RIM = 8  # px of the surroundings that are drawn finely with a spot that is longer than a sticker
-BRIGHT = 0.4  # radiance above which a spot is drawn finely
-TILE = 64  # px side of the pieces that are bent and blurred at a time
-COARSE = 2  # drawn samples a pixel and axis away from bright spots
-
-
 def whole_image(
     formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array], supersampling: int
 ) -> NDArray[np.float32]:
-    """Mean radiance (height, width) of one camera's image over moments with bodies (b,4,4) each."""
+    """Mean radiance (height, width) of one camera's image over moments with bodies (b,4,4) each.
+
+    It is drawn coarsely, and as finely as windows are around each bright spot.
+    """
     image, bright = _coarse(formation, camera, moments)
     corners, size = _spots(bright, fixed_size=len(moments) == 1 and formation.draws_pixels([camera]))
     if len(corners):
@@ -152,12 +148,6 @@ def _illumination(formation: ImageFormation, camera: PinholeCamera) -> NDArray[n
     return formation.optics.illumination(camera, pixels).astype(np.float32)
 
 
-# The two virtual cameras: they look at the true scene and hand out noisy grey values.
-
-
-SUPERSAMPLING = 9
-
-
 @dataclass(frozen=True)
 class Quality:
     """How windows are made: supersampling per pixel and axis, and the number of exposures that are averaged."""
@@ -166,27 +156,22 @@ class Quality:
     exposures: int = 1
 
 
+@dataclass(frozen=True)
 class VirtualStereoCamera:
-    """The true rig, its true place in the base frame, and what stands before it.
+    """Two cameras that look at the true scene and hand out noisy grey values.
 
-    Parameters: rig; camera_from_base (4,4); formation: how its light becomes images, its drawable's body 0 the
-    platform and body 1 the base, the others being ``obstacle_names`` in order; noise; exposure in s; pattern_seed: of
-    what differs from pixel to pixel.
+    rig and camera_from_base (4,4), its place in the base frame, the true ones; formation: how light becomes images, its
+    drawable's body 0 the platform and body 1 the base, the others being ``obstacle_names`` in order; noise; exposure
+    in s; pattern_seed: of what differs from pixel to pixel.
     """
 
-    def __init__(
-        self,
-        rig: StereoRig,
-        camera_from_base: Array,
-        formation: ImageFormation,
-        noise: CameraNoise,
-        obstacle_names: Sequence[str] = (),
-        exposure: float = 0.0,
-        pattern_seed: int = 0,
-    ) -> None:
-        self._rig, self._noise, self._formation = rig, noise, formation
-        self._obstacle_names, self._exposure, self._pattern_seed = tuple(obstacle_names), exposure, pattern_seed
-        self._from_base = [move @ camera_from_base for move in rig.from_camera]
+    rig: StereoRig
+    camera_from_base: Array
+    formation: ImageFormation
+    noise: CameraNoise
+    obstacle_names: Sequence[str] = ()
+    exposure: float = 0.0
+    pattern_seed: int = 0
 
     def look(
         self,
@@ -202,8 +187,8 @@ class VirtualStereoCamera:
         stand still.
         """
         poses = pose[None]
-        if pose_rate is not None and self._exposure > 0.0:
-            poses = sub_frame_poses(pose, pose_rate, self._exposure, self._sticker_pixels)
+        if pose_rate is not None and self.exposure > 0.0:
+            poses = sub_frame_poses(pose, pose_rate, self.exposure, self._sticker_pixels)
         moments = [self._placed(pose_to_transform(p), obstacles or {}) for p in poses]
         return LiveImages(self, moments, rng, quality or Quality())
 
@@ -214,36 +199,35 @@ class VirtualStereoCamera:
 
         ``placed``: camera_from_body (b,4,4) of all bodies for the left and the right camera.
         """
-        sides = [Side(*side) for side in zip(self._rig.cameras, placed, corners, strict=True)]
-        return np.stack(self._formation.windows(sides, size, supersampling))
+        sides = [Side(*side) for side in zip(self.rig.cameras, placed, corners, strict=True)]
+        return np.stack(self.formation.windows(sides, size, supersampling))
 
     def whole_exposure(self, side: int, moments: Sequence[Array], supersampling: int) -> NDArray[np.float32]:
         """Mean radiance (height, width) of one whole image over the moments of an exposure."""
-        return whole_image(self._formation, self._rig.cameras[side], moments, supersampling)
+        return whole_image(self.formation, self.rig.cameras[side], moments, supersampling)
 
     def patterns(self) -> Sequence[FixedPattern | None]:
         """What differs from pixel to pixel of the left and of the right camera; None where nothing does."""
-        return self._patterns if self._noise.has_pattern else (None, None)
+        return self._patterns if self.noise.has_pattern else (None, None)
 
     def centre_error_px(self, quality: Quality) -> float:
         """What drawing leaves in a sticker's centre, px rms."""
-        return self._formation.centre_error_px(self._rig.cameras, quality.supersampling)
+        return self.formation.centre_error_px(self.rig.cameras, quality.supersampling)
 
-    @property
-    def noise(self) -> CameraNoise:
-        """The cameras' noise figures."""
-        return self._noise
+    @cached_property
+    def _from_base(self) -> list[Array]:
+        return [move @ self.camera_from_base for move in self.rig.from_camera]
 
     @cached_property
     def _patterns(self) -> Sequence[FixedPattern]:
         return [
             draw_pattern(
                 (camera.height, camera.width),
-                self._noise.prnu,
-                self._noise.dsnu,
-                np.random.default_rng([self._pattern_seed, side]),
+                self.noise.prnu,
+                self.noise.dsnu,
+                np.random.default_rng([self.pattern_seed, side]),
             )
-            for side, camera in enumerate(self._rig.cameras)
+            for side, camera in enumerate(self.rig.cameras)
         ]
 
     def _placed(self, base_from_platform: Array, obstacles: Mapping[str, Array]) -> list[Array]:
@@ -253,14 +237,14 @@ class VirtualStereoCamera:
         return [
             np.stack(
                 [c @ p for p in (base_from_platform, np.eye(4))]
-                + [c @ obstacles[n] if n in obstacles else absent for n in self._obstacle_names]
+                + [c @ obstacles[n] if n in obstacles else absent for n in self.obstacle_names]
             )
             for c in self._from_base
         ]
 
     def _sticker_pixels(self, pose: Array) -> Array:
         """Pixels (2, n, 2) of the platform's stickers."""
-        drawable = self._formation.drawable
+        drawable = self.formation.drawable
         places = np.array(
             [
                 patch.discs[-1].centre
@@ -271,7 +255,7 @@ class VirtualStereoCamera:
         return np.stack(
             [
                 camera.project(apply(c @ pose_to_transform(pose), places))[0]
-                for camera, c in zip(self._rig.cameras, self._from_base, strict=True)
+                for camera, c in zip(self.rig.cameras, self._from_base, strict=True)
             ]
         )
 

@@ -1,15 +1,14 @@
 """From posed bodies to the light on each pixel, before noise: draw, bend, spread, average, darken.
 
-Images bent by a lens: values of a finely drawn window at the places that the lens shows.
-Where the lens takes the light of a pixel from is known exactly on three by three nodes of a window and quadratic in
-both directions in between; over some tens of pixels the rest is below 1e-4 px. Values between drawn pixels come from
-Keys' cubic convolution, which reproduces quadratics, so that no edge is moved or widened.
-Source: R. G. Keys, Cubic convolution interpolation for digital image processing, IEEE Trans. ASSP 29 (1981).
-
 Windows are drawn through perfect lenses on a grid finer than the pixels, with a margin for the light that comes in from
 outside; distortion takes each fine pixel from where the lens takes it; the point spread and the mean over each pixel
 follow, then the relative illumination. All of it in linear light. A perfect lens with no point spread is drawn on the
 pixels at once.
+
+Where the lens takes the light of a pixel from is known exactly on three by three nodes of a window and quadratic in
+both directions in between; over some tens of pixels the rest is below 1e-4 px. Values between drawn pixels come from
+Keys' cubic convolution, which reproduces quadratics, so that no edge is moved or widened.
+Source: R. G. Keys, Cubic convolution interpolation for digital image processing, IEEE Trans. ASSP 29 (1981).
 """
 
 from __future__ import annotations
@@ -27,6 +26,9 @@ from cmmsim.imaging.renderer import Drawable, Renderer, View
 
 _QUADRATIC = np.array([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])  # from values at -1, 0, 1
 _QUADRATIC.setflags(write=False)
+# Fine pixels along each side of a pixel: the point spread smooths what resampling leaves, without it edges need more.
+SUB_PIXELS, SHARP_SUB_PIXELS = 6, 12
+SIDE_STEP = 4  # px: sides of drawn windows are multiples, so that few frame buffers serve all
 REACH = 2  # drawn pixels that the cubic needs on either side
 
 
@@ -41,11 +43,6 @@ def resample(drawn: NDArray[np.float32], nodes: Array, size: int) -> NDArray[np.
     result = np.empty((len(drawn), size, size), dtype=np.float32)
     resample_windows(np.ascontiguousarray(drawn), coefficients, result)
     return result
-
-
-# Fine pixels along each side of a pixel: the point spread smooths what resampling leaves, without it edges need more.
-SUB_PIXELS, SHARP_SUB_PIXELS = 6, 12
-SIDE_STEP = 4  # px: sides of drawn windows are multiples, so that few frame buffers serve all
 
 
 @dataclass(frozen=True)

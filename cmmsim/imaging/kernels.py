@@ -7,20 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cmmsim.compiled import compiled
+from cmmsim.compiled import Array, compiled
 from cmmsim.geometry.disc_kernels import cover_pixel, inverse_of, reach_of_pixel
-
-# Compiled: which bounding boxes reach into which windows.
 
 
 @compiled
 def boxes_reaching(
-    pixels_from_bodies: np.ndarray,
-    body_index: np.ndarray,
-    boxes: np.ndarray,
-    windows: np.ndarray,
-    near: float,
-    reaching: np.ndarray,
+    pixels_from_bodies: Array, body_index: Array, boxes: Array, windows: Array, near: float, reaching: Array
 ) -> None:
     """Fill reaching (n, patches) for windows (n,4) of one exposure: lowest x, y and highest x, y, px.
 
@@ -53,11 +46,8 @@ def boxes_reaching(
                 )
 
 
-# Compiled: drawn cells averaged into the pixels of windows.
-
-
 @compiled
-def mean_of_cells(drawn: np.ndarray, columns: int, supersampling: int, windows: np.ndarray) -> None:
+def mean_of_cells(drawn: Array, columns: int, supersampling: int, windows: Array) -> None:
     """Fill windows (n, h, w) float32, 0 to 1, with the means of ``supersampling``² drawn pixels, 0 to 255.
 
     ``drawn`` holds the cell of each window in reading order, ``columns`` of them a row.
@@ -80,9 +70,6 @@ def mean_of_cells(drawn: np.ndarray, columns: int, supersampling: int, windows: 
                 windows[n, y, x] = np.float32(total) * share / white
 
 
-# Compiled: values of drawn windows between their pixels, see `resampling`.
-
-
 @compiled
 def keys_weights(share: float) -> tuple:
     """Weights of the four pixels around a place that lies ``share`` (0 to 1) after the second one."""
@@ -96,7 +83,7 @@ def keys_weights(share: float) -> tuple:
 
 
 @compiled
-def resample_windows(drawn: np.ndarray, coefficients: np.ndarray, result: np.ndarray) -> None:
+def resample_windows(drawn: Array, coefficients: Array, result: Array) -> None:
     """Fill windows (n, size, size) from drawn ones (n, h, w) at places given by biquadratic coefficients (n,3,3,2)."""
     n, height, width = drawn.shape
     size = result.shape[1]
@@ -127,34 +114,31 @@ def resample_windows(drawn: np.ndarray, coefficients: np.ndarray, result: np.nda
                 result[k, row, column] = value
 
 
-# Compiled: solids and discs laid over windows one after another, see `analytic`.
-
-
 class Solids(NamedTuple):
     """Solids from far to near: half_planes (m,3) are a, b, c of a x + b y <= c, px, those of solid k from starts[k] to
     starts[k + 1]; boxes (k,4) are lowest x, y and highest x, y; levels (k,); slots (k,) where its cover is kept, or
     -1."""
 
-    half_planes: np.ndarray
-    starts: np.ndarray
-    boxes: np.ndarray
-    levels: np.ndarray
-    slots: np.ndarray
+    half_planes: Array
+    starts: Array
+    boxes: Array
+    levels: Array
+    slots: Array
 
 
 class Discs(NamedTuple):
     """Discs in the order in which they are laid: ellipses' centres (m,2) px, shapes (m,2,2) px, half extents (m,2) px;
     levels (m,); behind (m,slots) whether the solid of that slot stands before the disc."""
 
-    centres: np.ndarray
-    shapes: np.ndarray
-    extents: np.ndarray
-    levels: np.ndarray
-    behind: np.ndarray
+    centres: Array
+    shapes: Array
+    extents: Array
+    levels: Array
+    behind: Array
 
 
 @compiled
-def half_planes_of(corners: np.ndarray, half_planes: np.ndarray) -> int:
+def half_planes_of(corners: Array, half_planes: Array) -> int:
     """Fill half_planes with a, b, c of a x + b y <= c for the sides of a convex polygon (n,2); returns their number,
     sides of no length being left out."""
     n, count, middle_x, middle_y = len(corners), 0, 0.0, 0.0
@@ -173,7 +157,7 @@ def half_planes_of(corners: np.ndarray, half_planes: np.ndarray) -> int:
 
 
 @compiled
-def polygon_holds(half_planes: np.ndarray, x: float, y: float, width: int, height: int) -> bool:
+def polygon_holds(half_planes: Array, x: float, y: float, width: int, height: int) -> bool:
     """Whether the box from (x, y) on lies wholly inside a convex polygon."""
     for k in range(len(half_planes)):
         a, b, c = half_planes[k]
@@ -183,7 +167,7 @@ def polygon_holds(half_planes: np.ndarray, x: float, y: float, width: int, heigh
 
 
 @compiled
-def cover_by_polygon(half_planes: np.ndarray, x: float, y: float, lines: int, share: np.ndarray) -> None:
+def cover_by_polygon(half_planes: Array, x: float, y: float, lines: int, share: Array) -> None:
     """Share (h, w) of the pixels of a box from (x, y) on: exact along x, the mean of ``lines`` scan lines along y."""
     height, width = share.shape
     share[:] = 0.0
@@ -205,7 +189,7 @@ def cover_by_polygon(half_planes: np.ndarray, x: float, y: float, lines: int, sh
 
 
 @compiled
-def lay_solids(image: np.ndarray, x: float, y: float, solids: Solids, lines: int, covers: np.ndarray) -> None:
+def lay_solids(image: Array, x: float, y: float, solids: Solids, lines: int, covers: Array) -> None:
     """Lay solids over a window (h, w) whose first pixel begins at (x, y), and note the ``covers`` (slots, h, w)."""
     height, width = image.shape
     share = np.empty((height, width))
@@ -226,7 +210,7 @@ def lay_solids(image: np.ndarray, x: float, y: float, solids: Solids, lines: int
 
 
 @compiled
-def shown_share(behind: np.ndarray, covers: np.ndarray, row: int, column: int) -> float:
+def shown_share(behind: Array, covers: Array, row: int, column: int) -> float:
     """Share of a pixel that none of the solids before a disc covers."""
     shown = 1.0
     for slot in range(len(behind)):
@@ -236,7 +220,7 @@ def shown_share(behind: np.ndarray, covers: np.ndarray, row: int, column: int) -
 
 
 @compiled
-def lay_disc(image: np.ndarray, centre_x: float, centre_y: float, k: int, discs: Discs, covers: np.ndarray) -> None:
+def lay_disc(image: Array, centre_x: float, centre_y: float, k: int, discs: Discs, covers: Array) -> None:
     """Lay disc ``k`` over a window (h, w), its centre given in px of the window."""
     height, width = image.shape
     m = inverse_of(discs.shapes[k])
@@ -256,9 +240,7 @@ def lay_disc(image: np.ndarray, centre_x: float, centre_y: float, k: int, discs:
 
 
 @compiled
-def lay_layers(
-    images: np.ndarray, group: np.ndarray, corners: np.ndarray, solids: Solids, lines: int, discs: Discs
-) -> None:
+def lay_layers(images: Array, group: Array, corners: Array, solids: Solids, lines: int, discs: Discs) -> None:
     """Lay solids, then discs, over the windows ``images[group]`` (h, w) with first pixels ``corners`` (n, 2)."""
     _, height, width = images.shape
     covers = np.empty((discs.behind.shape[1], height, width))
@@ -278,7 +260,7 @@ def lay_layers(
 
 
 @compiled
-def hides(eye: np.ndarray, point: np.ndarray, normals: np.ndarray, offsets: np.ndarray, touching: float) -> bool:
+def hides(eye: Array, point: Array, normals: Array, offsets: Array, touching: float) -> bool:
     """Whether the convex solid normal . x + offset <= 0 stands between an eye (3,) and a point (3,) in its axes."""
     enter, leave = -np.inf, np.inf
     for k in range(len(normals)):
@@ -297,12 +279,7 @@ def hides(eye: np.ndarray, point: np.ndarray, normals: np.ndarray, offsets: np.n
 
 @compiled
 def hidden_points(
-    body_from_camera: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    offsets: np.ndarray,
-    touching: float,
-    hidden: np.ndarray,
+    body_from_camera: Array, points: Array, normals: Array, offsets: Array, touching: float, hidden: Array
 ) -> None:
     """``hides`` for points (n,3) in camera axes, into ``hidden`` (n,)."""
     eye, point = np.empty(3), np.empty(3)

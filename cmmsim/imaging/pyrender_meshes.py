@@ -1,14 +1,12 @@
 """What pyrender is given: stickers as softened triangles, and patches laid over each other in a known order.
 
-Stickers as triangles, softened as far as they are sampled.
-The rim of a sharp disc aliases between the samples that a pixel is drawn with. Here the uppermost disc's rim falls off
-to the level around it over RIM_SAMPLES distances of samples, which leaves its centre and its light what they are, so
-that what is drawn comes close to the disc faster with more samples than that of a sharp rim.
+**Soft discs.** The rim of a sharp disc aliases between the samples that a pixel is drawn with. Here the uppermost
+disc's rim falls off to the level around it over RIM_SAMPLES distances of samples, which leaves its centre and its light
+what they are, so that what is drawn comes close to the disc faster with more samples than that of a sharp rim.
 
-Windows in which patches lie over each other in a known order, so that no depths are needed to draw them.
-They show one solid and at most one stack of discs that lies on it: a camera before the plane of a disc sees the disc,
-for all of the solid lies behind that plane. Where the solid is convex and fills a window, its level is all that shows
-of it.
+**Painter's order.** Windows that show one solid and at most one stack of discs that lies on it need no depths: a camera
+before the plane of a disc sees the disc, for all of the solid lies behind that plane. Where the solid is convex and
+fills a window, its level is all that shows of it.
 """
 
 from __future__ import annotations
@@ -27,6 +25,12 @@ from cmmsim.imaging.scene import ConvexSolid, Disc, DiscStack, Mesh
 RIM_SAMPLES = 1.8
 LARGEST_SAG = 0.08  # samples by which a side of the polygon may fall short of the rim
 FEWEST_SIDES, GROUND_SIDES = 16, 16
+RIM_PX = 0.5  # around a window that the solid must fill, too: far more than rounding
+CLEARANCE = 1e-6  # m by which a disc must lie over its solid
+FLATTEST = 1e-6  # volume of a solid over that of a cube as long; a flatter one fills no window
+OUTWARDS = np.array([-1.0, -1.0, 1.0, 1.0])
+OUTWARDS.setflags(write=False)
+CORNERS = [[0, 1], [2, 1], [0, 3], [2, 3]]  # of bounds: lowest x, y and highest x, y
 
 
 def disc_mesh(stack: DiscStack, sample: float) -> Mesh:
@@ -93,14 +97,6 @@ def _balanced_triangles(sides: int) -> NDArray[np.int_]:
             triangles.append((start, middle, end))
             arcs += [(start, middle), (middle, end)]
     return np.array(triangles)
-
-
-RIM_PX = 0.5  # around a window that the solid must fill, too: far more than rounding
-CLEARANCE = 1e-6  # m by which a disc must lie over its solid
-FLATTEST = 1e-6  # volume of a solid over that of a cube as long; a flatter one fills no window
-OUTWARDS = np.array([-1.0, -1.0, 1.0, 1.0])
-OUTWARDS.setflags(write=False)
-CORNERS = [[0, 1], [2, 1], [0, 3], [2, 3]]  # of bounds: lowest x, y and highest x, y
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ projection, drawn larger by the supersampling factor, and averaged in linear lig
 several of pyrender's multisampling cost more than they gain on the stickers' soft rims. A cell draws only the patches
 whose bounding box reaches into it. Projection and camera_from_body are multiplied in double precision, so that the
 shader sees one well-scaled matrix. Depths are asked for only where they are needed, and a solid that fills a cell is
-its ground, see `laid_views`.
+its ground, see ``LaidSolids``.
 Pieces of the atlas are handed over as they are ready, so that OpenGL fills them while the next ones are prepared.
 """
 

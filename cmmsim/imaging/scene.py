@@ -18,9 +18,9 @@ from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.plane_frame import PLANE_NAMES
 from cmmsim.geometry.pose import Array, apply, invert
 
-# Convex solids as the analytic renderer needs them: what they hide, and their outline in an image.
-
-
+SUNK = 0.0003  # m the solid surface lies below the sticker planes
+RING_SUNK = 0.0001  # m the dark ring lies below its sticker
+SHORTEST_ROD = 1e-9  # m: of a shorter one rounding is the direction
 TOUCHING = 1e-6  # share of the way to a point in which meeting a solid is taken for lying on it
 
 
@@ -62,11 +62,6 @@ class Outline:
         self.box = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
         half_planes = np.empty((len(corners), 3))
         self.half_planes = half_planes[: half_planes_of(corners, half_planes)]
-
-
-SUNK = 0.0003  # m the solid surface lies below the sticker planes
-RING_SUNK = 0.0001  # m the dark ring lies below its sticker
-SHORTEST_ROD = 1e-9  # m: of a shorter one rounding is the direction
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,14 @@ class Measurement:
                 f"finite={finite}, reason={self.reason!r}"
             )
 
+    def __repr__(self) -> str:
+        if not self.ok:
+            return f"Measurement(lost: {self.reason})"
+        shift, turn = (np.sqrt(np.trace(self.covariance[k : k + 3, k : k + 3])) for k in (0, 3))
+        place = ", ".join(f"{value:.6f}" for value in self.pose)
+        spread = f"{1e6 * shift:.2g} um and {1e6 * turn:.2g} urad"
+        return f"Measurement(pose [{place}] m, rad to {spread}, {len(self.target_ids)} stickers)"
+
 
 def lost_measurement(reason: str) -> Measurement:
     """A measurement that holds no pose, and says why."""
@@ -116,6 +124,9 @@ class PoseEstimator(Observer):
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise UnknownOptionError("method", self.method, METHODS)
+
+    def __repr__(self) -> str:
+        return f"PoseEstimator({self.method}, {len(self.platform.sticker_ids)} stickers, {self.rig!r})"
 
     def locate(self, images: StereoImages) -> Array:
         """Rough camera_from_platform (4,4) from whole images, without prior. Raises LostError.

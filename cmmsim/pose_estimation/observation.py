@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, find_detector
+from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, SpotWindows, find_detector
 from cmmsim.detection.ellipse_fit import MAXIMUM_LIKELIHOOD, SMEAR_STEP_PX, EllipseFits, fit_ellipses
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.disc_image import centre_offset
@@ -190,7 +190,7 @@ class StickerWindows:
         )
 
     def ellipses(self, smears: Array | None = None) -> EllipseFits:
-        """Ellipses fitted to all 2k windows, good ones of any misfit; ``smears`` (2k,2) as of ``DetectWindows``."""
+        """Ellipses fitted to all 2k windows, good ones of any misfit; ``smears`` (2k,2) as of ``SpotWindows``."""
         settings = self.observer.settings
         limits = replace(settings.limits, largest_misfit=np.inf)
         return fit_ellipses(
@@ -210,7 +210,7 @@ class StickerWindows:
             return fits.within(settings.limits, noise).detected
         fit_size = settings.fit_size + 2 * detector.margin_px
         return detector.detect(
-            *self._flat, noise, fit_size, settings.limits, psf_px=settings.optics.psf_px, smears=smears
+            SpotWindows(*self._flat, noise, fit_size, settings.limits, settings.optics.psf_px, smears)
         )
 
     @property

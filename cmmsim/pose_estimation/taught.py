@@ -17,6 +17,8 @@ from cmmsim.files.schema import SensorFile
 from cmmsim.files.sensor_file import dotted
 from cmmsim.geometry.pose import Array, compose_covariance, pose_covariance, pose_to_transform, skew
 
+SHOWN_CHANGES, SHOWN_CHARACTERS = 3, 40  # of what differs between two setups
+
 
 @dataclass(frozen=True)
 class Taught:
@@ -25,7 +27,7 @@ class Taught:
     sensor_name; base_from_camera (4,4) and base_covariance (6,6) of its small error [dt, dphi]; platform_places (n,3)
     sticker coordinates in platform axes, m, and place_covariances (n,3,3); platform_covariance (6,6): error of the
     platform frame itself, in platform axes; base_places (k,3) sticker coordinates in base axes, m. setup: what of the
-    sensor file this holds for, see :mod:`cmmsim.taught_setup`; empty for one put together by hand.
+    sensor file this holds for, see ``setup_of``; empty for one put together by hand.
     """
 
     sensor_name: str
@@ -54,6 +56,10 @@ class Taught:
             if isinstance(value := getattr(self, name), np.ndarray):
                 value.setflags(write=False)
 
+    def __repr__(self) -> str:
+        stickers = f"{len(self.platform_places)} stickers of the platform, {len(self.base_places)} of the base"
+        return f"Taught({self.sensor_name!r}, {stickers})"
+
     def calibration_covariance(self, pose: Array) -> Array:
         """Covariance (6,6) of the part of the pose error that teaching left; the same in every frame."""
         base_from_platform = pose_to_transform(pose)
@@ -62,9 +68,6 @@ class Taught:
         total = lever @ self.base_covariance @ lever.T
         total += compose_covariance(base_from_platform, self.platform_covariance)
         return pose_covariance(base_from_platform, total)
-
-
-SHOWN_CHANGES, SHOWN_CHARACTERS = 3, 40
 
 
 def setup_of(file: SensorFile) -> str:

@@ -32,6 +32,10 @@ class StereoFrame:
                     f"the {name} image must be (height, width) uint8 or uint16, got {image.shape} {image.dtype}"
                 )
 
+    def __repr__(self) -> str:
+        height, width = self.left.shape
+        return f"StereoFrame(two images of {width} x {height} px, {self.left.dtype})"
+
 
 @runtime_checkable
 class StereoImages(Protocol):

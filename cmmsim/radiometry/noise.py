@@ -15,12 +15,18 @@ from numpy.typing import NDArray
 from cmmsim.errors import CmmError
 from cmmsim.geometry.pose import Array
 
-# What differs from pixel to pixel of one camera, the same in every image (EMVA 1288: PRNU and DSNU).
+BIT_DEPTHS = (8, 10, 12)
+ROUNDING_TERMS = 50  # of a series, which leave 0.002 of 0.25 without noise
+NO_SWING = 1.5  # grey values squared: beyond, rounding_excess is 1 to 1e-11
+GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """sensitivity of each pixel relative to the mean, and its offset in the dark in e-; arrays of one shape."""
+    """What differs from pixel to pixel of one camera, the same in every image (EMVA 1288: PRNU and DSNU).
+
+    sensitivity of each pixel relative to the mean, and its offset in the dark in e-; arrays of one shape.
+    """
 
     sensitivity: NDArray[np.float32]
     offset: NDArray[np.float32]
@@ -44,12 +50,6 @@ def draw_pattern(shape: tuple[int, int], prnu: float, dsnu: float, rng: np.rando
     for values in (sensitivity, offset):
         values.setflags(write=False)
     return FixedPattern(sensitivity, offset)
-
-
-BIT_DEPTHS = (8, 10, 12)
-ROUNDING_TERMS = 50  # of a series, which leave 0.002 of 0.25 without noise
-NO_SWING = 1.5  # grey values squared: beyond, rounding_excess is 1 to 1e-11
-GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ def centres_of(sensor, pose, supersampling=SUPERSAMPLING):
         for camera, p, n in zip(sensor.rig.cameras, points, normals, strict=True)
     ]
     corners = np.rint(np.stack(expected) - 7.5).astype(int)
-    windows = sensor._camera.radiance(placed, corners, 16, supersampling).reshape(-1, 16, 16)
+    windows = sensor.camera.radiance(placed, corners, 16, supersampling).reshape(-1, 16, 16)
     fits = fit_ellipses(NOISE.mean_grey(windows), corners.reshape(-1, 2), NOISE, 14)
     assert fits.good.all()
     return fits.centres, np.concatenate(expected)
@@ -97,7 +97,7 @@ def test_both_renderers_agree_in_every_sticker_centre_behind_a_real_lens(tmp_pat
         corners = np.rint(expected_centres(first, pose) - 8.5).astype(int)
         centres = []
         for sensor in (first, other):
-            windows = sensor._camera.radiance(placed_at(sensor, pose), corners, 18, SUPERSAMPLING).reshape(-1, 18, 18)
+            windows = sensor.camera.radiance(placed_at(sensor, pose), corners, 18, SUPERSAMPLING).reshape(-1, 18, 18)
             fits = fit_ellipses(
                 NOISE.mean_grey(windows),
                 corners.reshape(-1, 2),
@@ -127,7 +127,7 @@ def test_both_renderers_show_the_same_image(analytic, taught):
                 strict=True,
             )
         ]
-        images.append(sensor._camera.whole_exposure(0, [bodies[0]], 6))
+        images.append(sensor.camera.whole_exposure(0, [bodies[0]], 6))
     gap = np.abs(images[0] - images[1])
     assert (gap > 0.02).sum() < 6000  # edges of bodies, of 3 million pixels
     assert gap.mean() < 1e-4
@@ -138,8 +138,8 @@ def test_windows_are_cut_out_of_the_whole_image(analytic):
     placed = placed_at(analytic, analytic.home)
     points = apply(placed[0][0], analytic._scene[0].sticker_places)
     corners = np.rint(CAMERA.project(points)[0] - 5.5).astype(int)
-    windows = analytic._camera.radiance(placed, np.stack([corners, corners]), 12, 6)[0]
-    image = analytic._camera.whole_exposure(0, [placed[0]], 6)
+    windows = analytic.camera.radiance(placed, np.stack([corners, corners]), 12, 6)[0]
+    image = analytic.camera.whole_exposure(0, [placed[0]], 6)
     for (x, y), window in zip(corners, windows, strict=True):
         np.testing.assert_allclose(image[y : y + 12, x : x + 12], window, atol=1e-6)
 

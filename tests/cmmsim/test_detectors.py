@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cmmsim.detection.detector import FitLimits, find_detector
+from cmmsim.detection.detector import FitLimits, SpotWindows, find_detector
 from cmmsim.detector_leaderboard import Condition, draw_discs, random_ellipses, scene_of
 from cmmsim.errors import CmmError, SensorFileError, UnknownOptionError
 from cmmsim.files.schema import Detection, SensorFile
@@ -40,7 +40,7 @@ def test_names():
 
 @EVERY
 def test_no_windows_no_centres(detector):
-    found = detector.detect(np.zeros((0, SIZE, SIZE)), corners(0), SCENE.noise, FIT)
+    found = detector.detect(SpotWindows(np.zeros((0, SIZE, SIZE)), corners(0), SCENE.noise, FIT))
     assert (found.centres.shape, found.covariances.shape, found.good.shape) == ((0, 2), (0, 2, 2), (0,))
 
 
@@ -54,7 +54,9 @@ def test_covariance_is_that_of_sampled_noise(detector, condition):
     """Normalised squared error of what the noise does to a centre: 2 within 12 %, where 800 draws allow some 7 %."""
     _, clean, noisy, noise = drawn(condition, 800, 1)
     size = FIT + 2 * detector.margin_px
-    found, without = (detector.detect(w, corners(800), noise, size, NO_LIMIT, condition.psf_px) for w in (noisy, clean))
+    found, without = (
+        detector.detect(SpotWindows(w, corners(800), noise, size, NO_LIMIT, condition.psf_px)) for w in (noisy, clean)
+    )
     assert found.good.all()
     change = found.centres - without.centres
     squared = np.einsum("ni,nij,nj->n", change, np.linalg.inv(found.covariances), change)
@@ -65,7 +67,7 @@ def test_covariance_is_that_of_sampled_noise(detector, condition):
 @EVERY
 def test_averaged_exposures_divide_the_covariance(detector):
     _, clean, _, noise = drawn(Condition(3.8, 0.8, 0.027), 5, 2)
-    one, many = (detector.detect(clean, corners(5), replace(noise, frames=n), FIT) for n in (1, 50))
+    one, many = (detector.detect(SpotWindows(clean, corners(5), replace(noise, frames=n), FIT)) for n in (1, 50))
     np.testing.assert_allclose(many.covariances, one.covariances / 50.0, rtol=1e-6)
 
 
@@ -73,7 +75,7 @@ def test_averaged_exposures_divide_the_covariance(detector):
 def test_bias_is_as_stated(detector):
     """Without noise, sharp, at the radius and tilt that the stated figure is for."""
     centres, clean, _, noise = drawn(Condition(3.8, np.pi / 4.0, 0.027), 600, 3)
-    error = detector.detect(clean, corners(600), noise, FIT).centres - centres
+    error = detector.detect(SpotWindows(clean, corners(600), noise, FIT)).centres - centres
     rms = np.sqrt(np.mean(error**2))
     assert rms == pytest.approx(detector.bias_px, rel=0.1, abs=1e-5)
     assert np.abs(error.mean(axis=0)).max() < 5.0 * rms / np.sqrt(600) + 1e-6  # over all places in a pixel it cancels
@@ -82,10 +84,10 @@ def test_bias_is_as_stated(detector):
 @EVERY
 def test_moved_and_mirrored_windows_give_moved_and_mirrored_centres(detector):
     _, _, noisy, noise = drawn(Condition(3.8, 0.8, 0.027), 20, 4)
-    found = detector.detect(noisy, corners(20), noise, FIT)
-    moved = detector.detect(noisy, corners(20) + np.array([100, 7]), noise, FIT)
+    found = detector.detect(SpotWindows(noisy, corners(20), noise, FIT))
+    moved = detector.detect(SpotWindows(noisy, corners(20) + np.array([100, 7]), noise, FIT))
     np.testing.assert_allclose(moved.centres, found.centres + np.array([100, 7]), atol=1e-9)
-    mirrored = detector.detect(np.ascontiguousarray(noisy.transpose(0, 2, 1)), corners(20), noise, FIT)
+    mirrored = detector.detect(SpotWindows(np.ascontiguousarray(noisy.transpose(0, 2, 1)), corners(20), noise, FIT))
     np.testing.assert_allclose(mirrored.centres, found.centres[:, ::-1], atol=1e-6)
     np.testing.assert_allclose(mirrored.covariances, found.covariances[:, ::-1, ::-1], rtol=1e-4, atol=1e-9)
 
@@ -100,7 +102,7 @@ def test_what_lies_beyond_the_dark_ring_does_not_matter(detector):
     beside = (away > 2.5 * condition.radius_px) & (ticks > 9)
     lit = np.where(beside, clean + 22.0, clean)
     assert beside.any(axis=(1, 2)).all()
-    found, without = (detector.detect(w, corners(60), noise, FIT).centres for w in (lit, clean))
+    found, without = (detector.detect(SpotWindows(w, corners(60), noise, FIT)).centres for w in (lit, clean))
     assert np.abs(found - without).max() < 0.002
 
 
@@ -113,7 +115,7 @@ def test_empty_dim_and_cut_spots_are_not_good(detector):
     bad[1] = np.rint(ground + 0.15 * (clean[1] - ground))
     bad[2] = np.roll(noisy[2], 8, axis=1)
     bad[2, :, :4] = ground  # half of the spot is beyond the window's right side
-    found = detector.detect(bad, corners(4), noise, FIT)
+    found = detector.detect(SpotWindows(bad, corners(4), noise, FIT))
     assert found.good.tolist() == [False, False, False, True]
     assert np.all(np.isfinite(found.centres))
     assert np.all(np.isfinite(found.covariances))
@@ -167,7 +169,10 @@ def test_lines_of_the_dual_conic_that_the_window_cuts_off_move_no_good_centre(ra
     """Discs so large that their rims come near the window's sides: exact to the stated bias, or not good."""
     centres, clean, _, noise = drawn(Condition(radius_px, np.pi / 4.0, 0.027), 200, 8)
     dual_conic = find_detector("dual_conic")
-    seen = {size: dual_conic.detect(clean, corners(200), noise, size) for size in (12, 12 + 2 * dual_conic.margin_px)}
+    seen = {
+        size: dual_conic.detect(SpotWindows(clean, corners(200), noise, size))
+        for size in (12, 12 + 2 * dual_conic.margin_px)
+    }
     for found in seen.values():
         assert np.all(np.abs(found.centres - centres)[found.good] < 5.0 * dual_conic.bias_px)
     assert seen[12 + 2 * dual_conic.margin_px].good.all()

@@ -26,7 +26,7 @@ def tiles():
 @pytest.mark.parametrize("lens", ["perfect", "all"])
 def test_they_show_what_drawing_every_window_at_every_moment_shows(tmp_path, monkeypatch, lens):
     sensor, drawn = lens_sensor(tmp_path, lens), []
-    formation, camera, moments = sensor._camera._formation, sensor.rig.left, moments_of(sensor, 4)
+    formation, camera, moments = sensor.camera.formation, sensor.rig.left, moments_of(sensor, 4)
     every = [formation.windows([Side(camera, bodies, tiles())], SIZE, 2, 1, shade=False)[0] for bodies in moments]
     draw = ImageFormation.windows
 
@@ -45,7 +45,7 @@ def test_they_show_what_drawing_every_window_at_every_moment_shows(tmp_path, mon
 def test_one_moment_is_drawn_once(tmp_path):
     sensor = lens_sensor(tmp_path)
     (bodies,) = moments_of(sensor, 1)
-    formation, camera = sensor._camera._formation, sensor.rig.left
+    formation, camera = sensor.camera.formation, sensor.rig.left
     expected = formation.windows([Side(camera, bodies, tiles())], SIZE, 2, shade=False)[0]
     for found in exposed_windows(formation, camera, [bodies], tiles(), SIZE, 2):
         np.testing.assert_array_equal(found, expected)

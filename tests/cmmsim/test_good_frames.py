@@ -59,7 +59,7 @@ def test_good_frames_are_not_lost(taught, monkeypatch, record_property):
     Each pose is drawn once and exposed many times.
     """
     sensor = cmmsim.load_sensor("ctrack780", seed=0, taught=taught, renderer="analytic")
-    camera, drawn = sensor._camera, {}
+    camera, drawn = sensor.camera, {}
 
     def radiance(placed, corners, size, supersampling, draw=camera.radiance):
         key = corners.tobytes()

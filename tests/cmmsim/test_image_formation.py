@@ -23,7 +23,7 @@ def centre_errors(sensor, pose, supersampling=SUPERSAMPLING):
     expected = expected_centres(sensor, pose)
     corners = np.rint(expected - 7.5).astype(int)
     noise = replace(sensor.noise, enabled=False)
-    grey = noise.mean_grey(sensor._camera.radiance(placed_at(sensor, pose), corners, 16, supersampling))
+    grey = noise.mean_grey(sensor.camera.radiance(placed_at(sensor, pose), corners, 16, supersampling))
     grey = replace(sensor.observer, noise=noise).evenly_lit(grey, corners)
     fits = fit_ellipses(grey.reshape(-1, 16, 16), corners.reshape(-1, 2), noise, 14, psf_px=sensor.optics.psf_px)
     assert fits.good.all()
@@ -40,7 +40,7 @@ def finely_drawn(sensor, side, pose, corner, size):
         centre_y_px=FINE * (camera.centre_y_px + 0.5) - 0.5,
     )
     view = View(fine, placed_at(sensor, pose)[side], (FINE * corner[0], FINE * corner[1]), (FINE * size, FINE * size))
-    formation = sensor._camera._formation
+    formation = sensor.camera.formation
     return formation.renderer.draw(formation.drawable, [view], 1, formation.background)[0]
 
 
@@ -69,7 +69,7 @@ def test_point_spread_is_a_gaussian(tmp_path, psf_px):
     sensor = lens_sensor(tmp_path, "blurred", changes=[("psf_px = 0.5", f"psf_px = {psf_px}")])
     pose, size, margin = sensor.home, 16, 10
     corners = np.rint(expected_centres(sensor, pose)[:, :4] - 7.5).astype(int)
-    windows = sensor._camera.radiance(placed_at(sensor, pose), corners, size, 6)
+    windows = sensor.camera.radiance(placed_at(sensor, pose), corners, size, 6)
     for side in (0, 1):
         for corner, window in zip(corners[side], windows[side], strict=True):
             fine = finely_drawn(sensor, side, pose, corner - margin, size + 2 * margin)
@@ -83,7 +83,7 @@ def test_bent_images_show_what_opencv_says(tmp_path):
     sensor = lens_sensor(tmp_path, "distorted")
     pose, size, margin = sensor.home, 16, 6
     corners = np.rint(expected_centres(sensor, pose)[:, ::6] - 7.5).astype(int)
-    windows = sensor._camera.radiance(placed_at(sensor, pose), corners, size, 6)
+    windows = sensor.camera.radiance(placed_at(sensor, pose), corners, size, 6)
     for side, camera in enumerate(sensor.rig.cameras):
         lens = camera.distortion
         for corner, window in zip(corners[side], windows[side], strict=True):
@@ -103,7 +103,7 @@ def test_bent_images_show_what_opencv_says(tmp_path):
 
 def test_a_perfect_lens_is_drawn_on_the_pixels(tmp_path):
     sensor = lens_sensor(tmp_path)
-    formation, placed = sensor._camera._formation, placed_at(sensor, sensor.home)
+    formation, placed = sensor.camera.formation, placed_at(sensor, sensor.home)
     corners = np.rint(expected_centres(sensor, sensor.home) - 7.5).astype(int)
     views = [
         View(camera, bodies, (int(x), int(y)), (16, 16))
@@ -111,7 +111,7 @@ def test_a_perfect_lens_is_drawn_on_the_pixels(tmp_path):
         for x, y in side
     ]
     drawn = formation.renderer.draw(formation.drawable, views, 6, 0.0).reshape(2, -1, 16, 16)
-    np.testing.assert_array_equal(sensor._camera.radiance(placed, corners, 16, 6), drawn)
+    np.testing.assert_array_equal(sensor.camera.radiance(placed, corners, 16, 6), drawn)
 
 
 def test_vignetting_darkens_with_the_square_of_the_distance():
@@ -129,8 +129,8 @@ def test_vignetting_is_laid_over_windows_and_whole_images(tmp_path):
     dark, bright = lens_sensor(tmp_path, "darkened"), lens_sensor(tmp_path)
     placed = placed_at(dark, dark.home)
     corners = np.rint(expected_centres(dark, dark.home) - 7.5).astype(int)
-    share = [s._camera.radiance(placed, corners, 16, 6) for s in (dark, bright)]
-    whole = [s._camera.whole_exposure(1, [placed[1]], 6) for s in (dark, bright)]
+    share = [s.camera.radiance(placed, corners, 16, 6) for s in (dark, bright)]
+    whole = [s.camera.whole_exposure(1, [placed[1]], 6) for s in (dark, bright)]
     y, x = np.mgrid[:1536, :2048]
     expected = 1.0 - 0.3 * ((x - 1023.5) ** 2 + (y - 767.5) ** 2) / (1024.0**2 + 768.0**2)
     np.testing.assert_allclose(whole[0], whole[1] * expected, atol=1e-6)
@@ -142,8 +142,8 @@ def test_whole_images_show_the_windows(tmp_path):
     sensor = lens_sensor(tmp_path, "all")
     placed = placed_at(sensor, sensor.home)
     corners = np.rint(expected_centres(sensor, sensor.home) - 4.5).astype(int)
-    windows = sensor._camera.radiance(placed, corners, 10, 6)
-    image = sensor._camera.whole_exposure(0, [placed[0]], 6)
+    windows = sensor.camera.radiance(placed, corners, 10, 6)
+    image = sensor.camera.whole_exposure(0, [placed[0]], 6)
     for (x, y), window in zip(corners[0], windows[0], strict=True):
         np.testing.assert_allclose(image[y : y + 10, x : x + 10], window, atol=2e-3)
 

@@ -30,7 +30,7 @@ def centre_errors(sensor, pose, supersampling):
         windows_of.append(pixels + bias)
         corners.append(np.rint(pixels - 7.5).astype(int))
     placed = [np.stack([m @ base_from_platform, m]) for m in moves]
-    radiance = sensor._camera.radiance(placed, np.stack(corners), 16, supersampling)
+    radiance = sensor.camera.radiance(placed, np.stack(corners), 16, supersampling)
     for windows, corner, expected in zip(radiance, corners, windows_of, strict=True):
         fits = fit_ellipses(NOISE.mean_grey(windows), corner, NOISE, 14)
         assert fits.good.all()
@@ -65,9 +65,9 @@ def test_whole_image_shows_the_windows(sensor):
     ]
     points = apply(sensor._camera_from_base @ pose_to_transform(sensor.home), sensor._scene[0].sticker_places)
     corners = np.rint(sensor.rig.project(points)[0] - 5.5).astype(int)
-    windows = sensor._camera.radiance(placed, corners, 12, SUPERSAMPLING)
+    windows = sensor.camera.radiance(placed, corners, 12, SUPERSAMPLING)
     for side in (0, 1):
-        image = sensor._camera.whole_exposure(side, [placed[side]], SUPERSAMPLING)
+        image = sensor.camera.whole_exposure(side, [placed[side]], SUPERSAMPLING)
         for (x, y), window in zip(corners[side], windows[side], strict=True):
             assert np.abs(image[y : y + 12, x : x + 12] - window).max() < 1.0 / SUPERSAMPLING**2
 
