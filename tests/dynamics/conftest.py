@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import dynamics
-from dynamics import closed_loop
+from dynamics import closed_loop, compilation
 
 BOX = np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])
 
@@ -150,28 +150,26 @@ def motion(robot: dynamics.Robot) -> Motion:
     return Motion(robot.home_pose, BOX * rng.uniform(0.5, 1, 6), rng.uniform(4, 9, 6), rng.uniform(0, 6, 6))
 
 
-def reference(robot: dynamics.Robot, frames: int, rate_hz: float = 60.0, scale: float = 1.0) -> closed_loop.Reference:
-    """A smooth motion that starts at rest at home: sines under an envelope."""
-    t = np.arange(frames)[:, None] / rate_hz
-    amplitude = scale * np.array([6e-3, 5e-3, 4e-3, 0.02, 0.015, 0.02])
-    frequency = 2 * np.pi * np.array([0.9, 1.2, 1.5, 1.05, 1.35, 0.75])
-    envelope, slope = 1 - np.exp(-((t / 0.4) ** 3)), 3 * t**2 / 0.4**3 * np.exp(-((t / 0.4) ** 3))
-    wave, wave_rate = np.sin(frequency * t), frequency * np.cos(frequency * t)
-    return closed_loop.Reference(
-        robot.home_pose + amplitude * envelope * wave, amplitude * (envelope * wave_rate + slope * wave)
-    )
+@dataclass(frozen=True)
+class Loop:
+    """Closed-loop runs of one robot: references, settings and parameters (67,) that serve where no others are given."""
 
+    robot: dynamics.Robot
+    parameters: np.ndarray
 
-@pytest.fixture(scope="session")
-def make_reference(robot: dynamics.Robot) -> Callable[..., closed_loop.Reference]:
-    return lambda frames, rate_hz=60.0, scale=1.0: reference(robot, frames, rate_hz, scale)
+    def reference(self, frames: int, rate_hz: float = 60.0, scale: float = 1.0) -> closed_loop.Reference:
+        """A smooth motion that starts at rest at home: sines under an envelope."""
+        t = np.arange(frames)[:, None] / rate_hz
+        amplitude = scale * np.array([6e-3, 5e-3, 4e-3, 0.02, 0.015, 0.02])
+        frequency = 2 * np.pi * np.array([0.9, 1.2, 1.5, 1.05, 1.35, 0.75])
+        envelope, slope = 1 - np.exp(-((t / 0.4) ** 3)), 3 * t**2 / 0.4**3 * np.exp(-((t / 0.4) ** 3))
+        wave, wave_rate = np.sin(frequency * t), frequency * np.cos(frequency * t)
+        return closed_loop.Reference(
+            self.robot.home_pose + amplitude * envelope * wave, amplitude * (envelope * wave_rate + slope * wave)
+        )
 
-
-@pytest.fixture(scope="session")
-def make_settings() -> Callable[..., closed_loop.LoopSettings]:
-    """Loop settings with the paper's servo gains; 60 Hz, no delay, zero hold, exact friction unless told otherwise."""
-
-    def make(
+    def settings(
+        self,
         rate_hz: float = 60.0,
         latency_s: float = 0.0,
         hold: str = "zero",
@@ -179,6 +177,7 @@ def make_settings() -> Callable[..., closed_loop.LoopSettings]:
         steps: int = 4,
         friction: closed_loop.FrictionLaw | None = None,
     ) -> closed_loop.LoopSettings:
+        """The paper's servo gains; 60 Hz, no delay, zero hold, exact friction unless told otherwise."""
         name = "smoothed" if smoothing_velocity else "coulomb_viscous"
         return closed_loop.LoopSettings(
             closed_loop.ServoGains(kp=0.3, kd=0.001, ki=2.4),
@@ -187,4 +186,40 @@ def make_settings() -> Callable[..., closed_loop.LoopSettings]:
             steps,
         )
 
-    return make
+    def run(
+        self,
+        reference: closed_loop.Reference | int,
+        settings: closed_loop.LoopSettings | None = None,
+        parameters: np.ndarray | None = None,
+        **options: object,
+    ) -> closed_loop.ClosedLoopRun:
+        """One run; a number of frames stands for the reference with so many."""
+        reference = self.reference(reference) if isinstance(reference, int) else reference
+        parameters = self.parameters if parameters is None else parameters
+        return closed_loop.simulate(self.robot, parameters, reference, settings or self.settings(), **options)
+
+    def both(self, *arguments: object, **options: object) -> list[closed_loop.ClosedLoopRun]:
+        """The same run compiled and plain."""
+        return [self.run(*arguments, compiled=compiled, **options) for compiled in (True, False)]
+
+
+@pytest.fixture(scope="session")
+def loop(robot: dynamics.Robot, identified: np.ndarray) -> Loop:
+    if compilation.find_compiler() is None:
+        pytest.skip("needs a C compiler")
+    return Loop(robot, identified)
+
+
+@pytest.fixture
+def flat_robot(robot, load_changed, monkeypatch):
+    """A robot whose links all lie in the plane of the platform: they carry no vertical force, J_a2 is singular."""
+    monkeypatch.setattr("dynamics.robot.load_library", lambda *_: None)  # one robot is not worth compiling
+    legs = robot.geometry
+    tips = legs.base_joints + legs.crank_length * legs.crank_zero_directions
+    flat = np.linalg.norm(legs.platform_joints - tips, axis=1)[0]
+    return load_changed(
+        {
+            "home_pose = [0.0, 0.0, 0.2,": "home_pose = [0.0, 0.0, 0.0,",
+            "link_length = 0.30133373938841": f"link_length = {flat:.17g}",
+        }
+    )

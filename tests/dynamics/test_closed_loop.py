@@ -1,4 +1,4 @@
-"""The sampled loop: compiled against plain, the frame protocol, and runs that end early."""
+"""The sampled loop: compiled against plain, the frame protocol, a user's controller, batches, runs that end early."""
 
 import re
 import warnings
@@ -7,13 +7,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from dynamics import closed_loop, compilation, robot_file
+from dynamics import closed_loop, compilation, fast_forward_dynamics, robot_file, simulate_batch
 from dynamics import robot as robot_module
-from dynamics.closed_loop import plain_loop as plain_closed_loop
 from dynamics.errors import DynamicsError, SimulationError
 
 PERIOD = 1 / 60
-
 TIMINGS = {
     "no delay": {},
     "half a frame": {"latency_s": 0.5 * PERIOD},
@@ -22,27 +20,19 @@ TIMINGS = {
     "linear": {"hold": "linear"},
     "2.7 frames": {"latency_s": 2.7 * PERIOD},
 }
-STRIBECK = closed_loop.FrictionLaw("stribeck", static_ratio=1.4, stribeck_velocity=0.05)
 FRICTION = {
     "exact": {},
     "smoothed": {"smoothing_velocity": 0.05, "steps": 8},
-    "stribeck": {"friction": STRIBECK},
+    "stribeck": {"friction": closed_loop.FrictionLaw("stribeck", static_ratio=1.4, stribeck_velocity=0.05)},
 }
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiler():
-    if compilation.find_compiler() is None:
-        pytest.skip("needs a C compiler")
+paths = pytest.mark.parametrize("compiled", [True, False], ids=["compiled", "plain"])
 
 
 def _sensor(lost=(), bias=2e-5):
     """A sensor with a repeatable error that loses some frames."""
 
     def measure(frame, time, pose):
-        if frame in lost:
-            return None
-        return pose + bias * np.sin(frame + np.arange(6))
+        return None if frame in lost else pose + bias * np.sin(frame + np.arange(6))
 
     return measure
 
@@ -52,8 +42,7 @@ def _assert_same(compiled, plain, tolerance=1e-9):
     np.testing.assert_array_equal(compiled.measured_ok, plain.measured_ok)
     for name in ("time", "pose", "pose_rate", "torque", "command", "measured"):
         ours, other = getattr(compiled, name), getattr(plain, name)
-        scale = np.nanmax(np.abs(other))
-        np.testing.assert_allclose(ours, other, atol=tolerance * scale, rtol=0, err_msg=name)
+        np.testing.assert_allclose(ours, other, atol=tolerance * np.nanmax(np.abs(other)), rtol=0, err_msg=name)
     if plain.pose_sensitivity is not None:
         largest = np.abs(plain.pose_sensitivity).max(axis=(0, 1))
         # Columns that are zero in exact arithmetic (inertias that do no work) hold rounding only.
@@ -63,24 +52,17 @@ def _assert_same(compiled, plain, tolerance=1e-9):
 
 @pytest.mark.parametrize("friction", FRICTION)
 @pytest.mark.parametrize("timing", TIMINGS)
-def test_compiled_run_equals_plain_run(robot, identified, make_reference, make_settings, timing, friction):
+def test_compiled_run_equals_plain_run(loop, timing, friction):
     """C and NumPy, written apart, agree to 1e-9 in pose, rate, torque, command and all 67 sensitivities."""
-    settings, reference = make_settings(**TIMINGS[timing], **FRICTION[friction]), make_reference(32)
-    runs = [
-        closed_loop.simulate(robot, identified, reference, settings, sensitivities=True, compiled=compiled)
-        for compiled in (True, False)
-    ]
+    runs = loop.both(32, loop.settings(**TIMINGS[timing], **FRICTION[friction]), sensitivities=True)
     assert (runs[1].events > 3) == (friction != "smoothed")
     _assert_same(*runs)
 
 
-def test_compiled_run_equals_plain_run_with_lost_frames(robot, identified, make_reference, make_settings):
-    """A sensor with errors that loses the first frame, single frames and two in a row: both hold the last command."""
-    settings, reference, lost = make_settings(latency_s=0.4 * PERIOD), make_reference(24), {0, 5, 9, 10}
-    runs = [
-        closed_loop.simulate(robot, identified, reference, settings, _sensor(lost), compiled=compiled)
-        for compiled in (True, False)
-    ]
+def test_both_paths_hold_the_last_command_where_the_sensor_loses_a_frame(robot, loop):
+    """The first frame, single frames and two in a row."""
+    lost = {0, 5, 9, 10}
+    runs = loop.both(24, loop.settings(latency_s=0.4 * PERIOD), sensor=_sensor(lost))
     _assert_same(*runs)
     run = runs[0]
     assert set(np.flatnonzero(~run.measured_ok)) == lost
@@ -89,98 +71,140 @@ def test_compiled_run_equals_plain_run_with_lost_frames(robot, identified, make_
     np.testing.assert_allclose(run.command[0], robot.inverse_kinematics(robot.home_pose), atol=1e-15)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_noise_of_the_ideal_sensor_is_a_sensor_with_that_noise(
-    robot, identified, make_reference, make_settings, compiled
-):
-    """Rows of noise, with frames lost, do what a sensor that adds them and answers None does."""
-    settings, reference = make_settings(latency_s=0.4 * PERIOD), make_reference(12)
+@paths
+def test_lost_frames_and_noise_of_the_ideal_sensor_are_a_sensor_that_has_them(loop, compiled):
+    """Masks and rows do what a sensor that adds them and answers None does; sensitivities then still come."""
+    settings, options = loop.settings(latency_s=0.4 * PERIOD), {"compiled": compiled}
     noise, lost = 2e-5 * np.sin(np.arange(12)[:, None] + np.arange(6)), np.isin(np.arange(12), (0, 5))
-    asked = closed_loop.simulate(robot, identified, reference, settings, _sensor({0, 5}), compiled=compiled)
-    drawn = closed_loop.simulate(robot, identified, reference, settings, noise=noise, lost=lost, compiled=compiled)
+    asked = loop.run(12, settings, sensor=_sensor({0, 5}), **options)
+    drawn = loop.run(12, settings, noise=noise, lost=lost, **options)
     for name in ("pose", "measured", "measured_ok", "command"):
         np.testing.assert_array_equal(getattr(drawn, name), getattr(asked, name), err_msg=name)
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-def test_ideal_sensor_with_lost_frames_is_a_sensor_that_loses_them(
-    robot, identified, make_reference, make_settings, compiled
-):
-    """A mask of lost frames does what a perfect sensor that answers None does; sensitivities then still come."""
-    settings, reference, lost = make_settings(latency_s=0.4 * PERIOD), make_reference(24), {0, 5, 9, 10}
-    mask = np.isin(np.arange(24), list(lost))
-    masked = closed_loop.simulate(robot, identified, reference, settings, lost=mask, compiled=compiled)
-    sensed = closed_loop.simulate(robot, identified, reference, settings, _sensor(lost, bias=0.0), compiled=compiled)
-    assert np.array_equal(masked.pose, sensed.pose)
-    assert np.array_equal(masked.command, sensed.command)
-    with_tangents = closed_loop.simulate(
-        robot, identified, reference, settings, lost=mask, sensitivities=True, compiled=compiled
-    )
-    step = np.zeros(67)
-    step[52] = 1e-5
-    ahead, behind = (
-        closed_loop.simulate(robot, identified + sign * step, reference, settings, lost=mask, compiled=compiled).pose
-        for sign in (1, -1)
-    )
+    options["lost"] = np.isin(np.arange(24), (0, 5, 9, 10))
+    derived = loop.run(24, settings, sensitivities=True, **options)
+    step = 1e-5 * np.eye(67)[52]
+    ahead, behind = (loop.run(24, settings, loop.parameters + sign * step, **options).pose for sign in (1, -1))
     expected = (ahead - behind) / 2e-5
-    assert np.abs(with_tangents.pose_sensitivity[:, :, 52] - expected).max() < 1e-3 * np.abs(expected).max()
+    assert np.abs(derived.pose_sensitivity[:, :, 52] - expected).max() < 1e-3 * np.abs(expected).max()
 
 
-def test_compiled_run_equals_plain_run_with_logged_commands(robot, identified, make_reference, make_settings):
-    """Driven by recorded commands, with sensitivities (the servo's share is then absent)."""
-    settings, reference = make_settings(), make_reference(24)
-    commands = closed_loop.simulate(robot, identified, reference, settings).command * 1.01
-    options = {"commands": commands, "sensitivities": True}
-    runs = [closed_loop.simulate(robot, identified, reference, settings, compiled=c, **options) for c in (True, False)]
+def test_a_perfect_sensor_is_the_ideal_one_and_called_once_a_frame(loop):
+    calls = []
+
+    def sensor(frame, time, pose):
+        calls.append((frame, time))
+        return pose
+
+    np.testing.assert_array_equal(loop.run(30, sensor=sensor).pose, loop.run(30).pose)
+    assert calls == [(n, n * (1 / 60)) for n in range(30)]
+
+
+@paths
+def test_a_rate_sensor_gets_the_true_pose_and_its_rate(loop, compiled):
+    seen = []
+
+    def measure(frame, time, pose, rate):
+        seen.append((frame, time, pose, rate))
+        return pose
+
+    run = loop.run(24, sensor=closed_loop.RateSensor(measure), compiled=compiled)
+    columns = [np.array(column) for column in zip(*seen, strict=True)]
+    for column, expected in zip(columns, (np.arange(24), run.time, run.pose, run.pose_rate), strict=True):
+        np.testing.assert_array_equal(column, expected)
+    assert np.abs(columns[-1]).max() > 0.01
+
+
+@paths
+def test_logged_commands_drive_and_what_is_measured_beside_them_steers_nothing(loop, compiled):
+    """The commands of a run repeat it bit by bit, whatever the servo's gains, sensors and lost frames."""
+    first = loop.run(45, compiled=compiled)
+    plain = loop.settings()
+    other = closed_loop.LoopSettings(closed_loop.ServoGains(9.0, 9.0, 9.0), plain.timing)
+    options = {"commands": first.command, "compiled": compiled}
+    np.testing.assert_array_equal(loop.run(45, other, **options).pose, first.pose)
+    lost = np.arange(45) == 2
+    sensed = loop.run(45, sensor=lambda frame, time, pose: pose + 0.1, **options)
+    masked = loop.run(45, lost=lost, **options)
+    for run in (sensed, masked):
+        np.testing.assert_array_equal(run.pose, first.pose)
+        np.testing.assert_array_equal(run.command, first.command)
+    np.testing.assert_array_equal(sensed.measured, first.pose + 0.1)
+    np.testing.assert_array_equal(masked.measured_ok, ~lost)
+
+
+def test_compiled_run_equals_plain_run_with_logged_commands(loop):
+    """With sensitivities: the servo's share is then absent."""
+    commands = loop.run(24).command * 1.01
+    runs = loop.both(24, commands=commands, sensitivities=True)
     _assert_same(*runs)
     np.testing.assert_array_equal(runs[0].command, commands)
 
 
-def test_servo_follows_equation_30(robot, identified, make_reference, make_settings):
-    """Commands recomputed from the measured poses of a run, in three lines of NumPy, equal those the loop issued."""
-    settings, reference = make_settings(), make_reference(30)
-    run = closed_loop.simulate(robot, identified, reference, settings, _sensor())
-    gains = settings.servo
-    error = reference.poses - run.measured
-    start = closed_loop.equilibrium(robot, identified, reference.poses[0], gains).servo_integral
-    integral = start + PERIOD * np.cumsum(error, axis=0)
-    rate = np.diff(np.vstack([reference.poses[:1], run.measured]), axis=0) / PERIOD
-    demand = gains.kp * error + gains.kd * (reference.rates - rate) + gains.ki * integral
-    expected = (robot.pose_jacobian(run.measured) @ demand[..., None])[..., 0]
-    np.testing.assert_allclose(run.command, expected, atol=1e-13)
+class PaperServo:
+    """Eq. 30, written down once more from the robot's public Jacobian; it starts as the loop's equilibrium does."""
+
+    def __init__(self, robot, settings, start):
+        self.robot, self.gains = robot, settings.servo
+        self.period = 1 / settings.timing.frame_rate_hz
+        self.before, self.before_at = start, -self.period
+        angles = robot.inverse_kinematics(start)
+        self.integral = np.linalg.solve(robot.pose_jacobian(start), angles) / self.gains.ki
+
+    def __call__(self, frame, t, measured, desired, desired_rate):
+        error = desired - measured
+        self.integral = self.integral + self.period * error
+        rate = (measured - self.before) / (t - self.before_at)
+        self.before, self.before_at = measured, t
+        demand = self.gains.kp * error + self.gains.kd * (desired_rate - rate) + self.gains.ki * self.integral
+        return self.robot.pose_jacobian(measured) @ demand
 
 
-def test_commands_arrive_after_the_latency(robot, identified, make_settings):
-    """A step of the logged command, given at frame 10, first moves the platform in the frame that it reaches."""
-    poses = np.tile(robot.home_pose, (24, 1))
-    reference, commands = closed_loop.Reference(poses, 0 * poses), np.zeros((24, 6))
-    commands[10:] = 0.05
-    for latency, first_moved in ((0.0, 11), (0.6, 11), (1.0, 12), (2.5, 13), (3.0, 14)):
-        settings = make_settings(latency_s=latency * PERIOD)
-        run = closed_loop.simulate(robot, identified, reference, settings, commands=commands)
-        moved = np.flatnonzero(np.abs(run.pose - robot.home_pose).max(axis=1))
-        assert moved[0] == first_moved, latency
+@paths
+@pytest.mark.parametrize("latency_s", [0.0, 0.025])
+def test_the_servo_of_equation_30_written_by_a_user_runs_as_the_built_in_one(robot, loop, latency_s, compiled):
+    """As a controller, with a sensor that errs and loses frames, late commands, against both paths."""
+    settings, reference, sensor = loop.settings(latency_s=latency_s), loop.reference(40), _sensor({5, 6, 17})
+    own = loop.run(reference, settings, sensor=sensor, controller=PaperServo(robot, settings, reference.poses[0]))
+    built_in = loop.run(reference, settings, sensor=sensor, compiled=compiled)
+    np.testing.assert_allclose(own.command, built_in.command, atol=1e-11)
+    np.testing.assert_allclose(own.pose, built_in.pose, atol=1e-11)
+    assert np.abs(np.diff(own.command, axis=0)).max() > 1e-3
 
 
-def test_run_starts_in_equilibrium(robot, identified, make_settings):
+def test_a_controller_is_asked_with_copies_where_the_frame_was_measured(robot, loop):
+    reference, asked, command = loop.reference(20), [], np.zeros(6)
+
+    def spoiling(frame, t, measured, desired, desired_rate):
+        asked.append((frame, t))
+        assert np.array_equal(desired, reference.poses[frame])
+        assert np.array_equal(desired_rate, reference.rates[frame])
+        command[:] = robot.inverse_kinematics(desired)
+        measured[:] = np.nan
+        return command
+
+    run = loop.run(reference, sensor=_sensor({5, 6, 17}), controller=spoiling)
+    good = [frame for frame in range(20) if frame not in (5, 6, 17)]
+    assert asked == [(frame, frame * (1 / 60)) for frame in good]
+    assert np.isfinite(run.measured[good]).all()
+    np.testing.assert_array_equal(run.command[good], robot.inverse_kinematics(reference.poses[good]))
+    np.testing.assert_array_equal(run.command[[5, 6, 17]], run.command[[4, 4, 16]])
+
+
+def test_run_starts_in_equilibrium(robot, loop):
     """With the reference at rest, away from home, nothing moves and the torque holds the weight exactly."""
     pose = robot.home_pose + np.array([0.005, -0.004, 0.006, 0.02, -0.01, 0.03])
     poses = np.tile(pose, (60, 1))
-    settings, reference = make_settings(), closed_loop.Reference(poses, 0 * poses)
-    run = closed_loop.simulate(robot, identified, reference, settings)
+    run = loop.run(closed_loop.Reference(poses, 0 * poses))
     np.testing.assert_allclose(run.pose, poses, atol=1e-14)
-    weight = robot.static_torque(pose, identified[:64])
+    weight = robot.static_torque(pose, loop.parameters[:64])
     np.testing.assert_allclose(run.torque, np.tile(weight, (60, 1)), atol=1e-11)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_unstable_loop_ends_with_frame_and_reason(robot, make_reference, make_settings, compiled):
-    """Table 1 parameters at 29 Hz with one frame of delay: the loop is unstable and says where it ended."""
-    settings, reference = make_settings(29.0, latency_s=1 / 29), make_reference(580, 29.0)
-    with pytest.raises(closed_loop.LoopFailure, match=r"stopped at frame \d+ \(t = .* s\): .*unstable") as caught:
-        closed_loop.simulate(robot, robot.parameter_sets["initial"].vector, reference, settings, compiled=compiled)
-    assert 5 < caught.value.frame < 580
-    assert f"frame {caught.value.frame} " in str(caught.value)
+def test_stable_where_the_paper_is(loop):
+    """Table 2 parameters at 29 Hz with one frame of delay follow the reference within 20 mm for 20 s."""
+    reference = loop.reference(580, 29.0, scale=0.5)
+    run = loop.run(reference, loop.settings(29.0, latency_s=1 / 29))
+    assert np.abs(run.pose - reference.poses)[:, :3].max() < 0.02
 
 
 def _reach_margins(robot, pose, numerics):
@@ -192,38 +216,31 @@ def _reach_margins(robot, pose, numerics):
     return 1 - ((square + g.crank_length**2 - g.link_length**2) / (2 * g.crank_length)) ** 2 / in_plane
 
 
-def test_the_leg_that_leaves_its_reach_is_named(robot, make_reference, make_settings, numerics):
-    """Both paths, written apart, name the same leg and margin, out of reach; at the frame before, all legs reach."""
-    settings, reference = make_settings(29.0, latency_s=1 / 29), make_reference(580, 29.0)
+def test_an_unstable_loop_names_frame_time_and_the_leg_that_leaves_its_reach(robot, loop, numerics):
+    """Table 1 at 29 Hz with one frame of delay: both paths say the same; at the frame before, all legs reach."""
+    settings, reference = loop.settings(29.0, latency_s=1 / 29), loop.reference(580, 29.0)
     unstable, messages = robot.parameter_sets["initial"].vector, []
     for compiled in (True, False):
         with pytest.raises(closed_loop.LoopFailure) as caught:
-            closed_loop.simulate(robot, unstable, reference, settings, compiled=compiled)
+            loop.run(reference, settings, unstable, compiled=compiled)
         messages.append(str(caught.value))
+    frame = caught.value.frame
+    assert 5 < frame < 580
     assert messages[0] == messages[1]
-    margin = re.search(r"unstable\): leg [1-6] has the least reach margin, (\S+), must be > 0$", messages[0])
+    said = rf"stopped at frame {frame} \(t = .* s\): .*unstable\): leg [1-6] has the least reach margin, (\S+), must be"
+    margin = re.search(said, messages[0])
     assert -0.5 < float(margin[1]) <= 0
-    stop = caught.value.frame + 1
-    shorter = closed_loop.Reference(reference.poses[:stop], reference.rates[:stop])
-    assert _reach_margins(robot, closed_loop.simulate(robot, unstable, shorter, settings).pose[-1], numerics).min() > 0
-
-
-def test_stable_where_the_paper_is(robot, identified, make_reference, make_settings):
-    """Table 2 parameters at 29 Hz with one frame of delay follow the reference within 20 mm for 20 s."""
-    settings, reference = make_settings(29.0, latency_s=1 / 29), make_reference(580, 29.0, scale=0.5)
-    run = closed_loop.simulate(robot, identified, reference, settings)
-    assert np.abs(run.pose - reference.poses)[:, :3].max() < 0.02
+    shorter = closed_loop.Reference(reference.poses[: frame + 1], reference.rates[: frame + 1])
+    assert _reach_margins(robot, loop.run(shorter, settings, unstable).pose[-1], numerics).min() > 0
 
 
 class Unplugged(Exception):
     """A stranger's error."""
 
 
-@pytest.mark.parametrize("compiled", [True, False])
+@paths
 @pytest.mark.parametrize("error", [Unplugged("cable"), KeyboardInterrupt()], ids=["exception", "interrupt"])
-def test_errors_of_the_sensor_reach_the_caller_unchanged(
-    robot, identified, make_reference, make_settings, compiled, error
-):
+def test_errors_of_the_sensor_reach_the_caller_unchanged(loop, compiled, error):
     """The very exception object that the sensor raised comes out, and the sensor is not called again."""
     calls = []
 
@@ -234,14 +251,14 @@ def test_errors_of_the_sensor_reach_the_caller_unchanged(
         return pose
 
     with pytest.raises(type(error)) as caught:
-        closed_loop.simulate(robot, identified, make_reference(20), make_settings(), sensor, compiled=compiled)
+        loop.run(20, sensor=sensor, compiled=compiled)
     assert caught.value is error
     assert calls == list(range(8))
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_measured_pose_out_of_reach_ends_the_run(robot, identified, make_reference, make_settings, numerics, compiled):
-    """A gross measurement error at frame 3 is named as such, not as instability, with leg and margin."""
+@paths
+def test_measured_pose_out_of_reach_ends_the_run_without_warnings(robot, loop, numerics, compiled):
+    """A gross error at frame 3 is named as such, with leg and margin; one that overflows has a margin of -inf."""
     answers = []
 
     def sensor(frame, time, pose):
@@ -249,37 +266,62 @@ def test_measured_pose_out_of_reach_ends_the_run(robot, identified, make_referen
         return answers[-1]
 
     with pytest.raises(closed_loop.LoopFailure, match=r"frame 3 .*measured pose is out of reach") as caught:
-        closed_loop.simulate(robot, identified, make_reference(5), make_settings(), sensor, compiled=compiled)
+        loop.run(5, sensor=sensor, compiled=compiled)
     margins = _reach_margins(robot, answers[-1], numerics)
     leg = int(np.argmin(margins))
     assert margins[leg] < 0
     assert f"there leg {leg + 1} has the least reach margin, {margins[leg]:.3g}, must be > 0" in str(caught.value)
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-def test_a_measured_pose_that_overflows_ends_the_run_without_warnings(
-    robot, identified, make_reference, make_settings, compiled
-):
-    """Differences of the largest floats are infinite; the error is the only thing said."""
-    settings, sensor = make_settings(), lambda frame, time, pose: np.full(6, 1e308)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(closed_loop.LoopFailure, match=r"frame 0 .*least reach margin, -inf, must be > 0"):
-            closed_loop.simulate(robot, identified, make_reference(5), settings, sensor, compiled=compiled)
+            loop.run(5, sensor=lambda frame, time, pose: np.full(6, 1e308), compiled=compiled)
 
 
-def test_runs_in_threads_equal_runs_in_turn(robot, identified, make_reference, make_settings):
+@paths
+def test_a_singular_mass_matrix_is_said(loop, compiled):
+    """A platform without inertia on massless legs cannot be accelerated: named as such, on both paths."""
+    parameters = loop.parameters.copy()
+    parameters[1:64] = 0
+    with pytest.raises(DynamicsError, match=r"not positive definite|singular"):
+        loop.run(10, parameters=parameters, compiled=compiled)
+
+
+def test_runs_in_threads_equal_runs_in_turn(loop):
     """The compiled loop keeps no state between calls: sixteen runs on four threads give the same bits."""
-    settings, reference = make_settings(), make_reference(120)
-    sets = [identified * (1 + 0.001 * n * np.cos(np.arange(67))) for n in range(16)]
+    sets = [loop.parameters * (1 + 0.001 * n * np.cos(np.arange(67))) for n in range(16)]
 
     def run(values):
-        return closed_loop.simulate(robot, values, reference, settings, _sensor({4})).pose
+        return loop.run(120, parameters=values, sensor=_sensor({4})).pose
 
     expected = [run(values) for values in sets]
     with ThreadPoolExecutor(4) as pool:
         for ours, other in zip(pool.map(run, sets), expected, strict=True):
             np.testing.assert_array_equal(ours, other)
+
+
+def test_a_batch_is_its_runs_in_order_for_any_number_of_workers(robot, loop):
+    """Many vectors with one reference, and one vector with many references; other lengths do not pair up."""
+    settings, reference = loop.settings(), loop.reference(30)
+    vectors = loop.parameters * np.linspace(0.95, 1.05, 5)[:, None] ** np.arange(67)[None, :].clip(0, 1)
+    for workers in (1, 3):
+        runs = simulate_batch(robot, vectors, reference, settings, sensitivities=True, workers=workers)
+        for vector, run in zip(vectors, runs, strict=True):
+            alone = loop.run(reference, settings, vector, sensitivities=True)
+            assert np.array_equal(run.pose, alone.pose)
+            assert np.array_equal(run.pose_sensitivity, alone.pose_sensitivity)
+    references = [loop.reference(20, scale=scale) for scale in (0.5, 1.0)]
+    for given, run in zip(references, simulate_batch(robot, loop.parameters, references, settings), strict=True):
+        assert np.array_equal(run.pose, loop.run(given).pose)
+    with pytest.raises(SimulationError, match="5 parameter vectors and 2 references do not pair up"):
+        simulate_batch(robot, vectors, references, settings)
+
+
+def test_fast_forward_dynamics_is_the_robots(robot, identified, states):
+    fast = fast_forward_dynamics(robot, identified[:64])
+    for pose, twist, torque in zip(states.pose[:20], states.twist, states.twist_dot, strict=False):
+        np.testing.assert_array_equal(
+            fast(pose, twist, torque), robot.forward_dynamics(pose, twist, torque, identified[:64])
+        )
 
 
 def _forget():
@@ -288,11 +330,9 @@ def _forget():
 
 
 @pytest.fixture
-def compiled_results(robot, identified, states, make_reference, make_settings):
+def compiled_results(robot, loop, states):
     """Accelerations and a run from the compiled path, taken before the compiler is taken away."""
-    accelerations = robot.forward_dynamics(states.pose, states.twist, states.twist_dot)
-    run = closed_loop.simulate(robot, identified, make_reference(10), make_settings(), compiled=True)
-    return accelerations, run
+    return robot.forward_dynamics(states.pose, states.twist, states.twist_dot), loop.run(10, compiled=True)
 
 
 @pytest.fixture(params=["missing", "broken", "no folder"])
@@ -314,38 +354,18 @@ def no_compiler(request, compiled_results, monkeypatch, tmp_path):
     _forget()
 
 
-def test_everything_works_without_a_compiler_after_one_warning(
-    identified, states, make_reference, make_settings, compiled_results, no_compiler
-):
+def test_everything_works_without_a_compiler_after_one_warning(states, loop, compiled_results, no_compiler):
     """Robot and loop fall back to CasADi's virtual machine with the same numbers, and say so in exactly one line."""
-    reference, settings = make_reference(10), make_settings()
+    reference, settings = loop.reference(10), loop.settings()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         fresh = robot_module.Robot(robot_file.read_robot_file("rss6"))
         accelerations = fresh.forward_dynamics(states.pose, states.twist, states.twist_dot)
-        runs = [closed_loop.simulate(fresh, identified, reference, settings) for _ in range(2)]
+        runs = [closed_loop.simulate(fresh, loop.parameters, reference, settings) for _ in range(2)]
         with pytest.raises(SimulationError, match="compiled=True"):
-            closed_loop.simulate(fresh, identified, reference, settings, compiled=True)
+            closed_loop.simulate(fresh, loop.parameters, reference, settings, compiled=True)
     assert [warning.category for warning in caught] == [compilation.CompilerWarning]
     assert no_compiler in str(caught[0].message)
     assert "\n" not in str(caught[0].message)
     np.testing.assert_allclose(accelerations, compiled_results[0], rtol=1e-10, atol=1e-12)
     _assert_same(compiled_results[1], runs[1])
-
-
-def test_robots_of_equal_geometry_share_what_was_built(robot):
-    """Loading a robot again builds nothing anew; another geometry is another key."""
-    again = robot_module.load_robot("rss6")
-    assert again is not robot
-    assert again.functions is robot.functions
-    assert again.geometry == robot.geometry
-    assert plain_closed_loop._functions(again.geometry) is plain_closed_loop._functions(robot.geometry)
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-def test_a_singular_mass_matrix_is_said(robot, identified, make_reference, make_settings, compiled):
-    """A platform without inertia on massless legs cannot be accelerated: named as such, on both paths."""
-    parameters = identified.copy()
-    parameters[1:64] = 0
-    with pytest.raises(DynamicsError, match=r"not positive definite|singular"):
-        closed_loop.simulate(robot, parameters, make_reference(10), make_settings(), compiled=compiled)

@@ -1,13 +1,11 @@
 """The cache of compiled code: content as key, whole files only, no recompiling."""
 
 import ctypes
-import pickle
 import subprocess
 import sys
 from pathlib import Path
 
 import casadi as ca
-import numpy as np
 import pytest
 
 from dynamics import compilation, load_robot
@@ -95,10 +93,3 @@ def test_compiler_may_have_arguments_of_its_own(monkeypatch):
         assert compilation.find_compiler() == (plain[0], "-pipe")
     finally:
         compilation.find_compiler.cache_clear()
-
-
-def test_robots_can_be_sent_to_other_processes(robot):
-    """Pickling a robot that has been used keeps its data and not its compiled functions."""
-    robot_again = pickle.loads(pickle.dumps(robot))
-    assert robot_again.geometry == robot.geometry
-    np.testing.assert_array_equal(robot_again.nominal_parameters, robot.nominal_parameters)

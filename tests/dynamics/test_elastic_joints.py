@@ -27,9 +27,9 @@ def frictionless(identified):
 
 
 @pytest.fixture
-def make_elastic(make_settings):
+def make_elastic(loop):
     def make(elasticity, steps=80, **options):
-        return dataclasses.replace(make_settings(steps=steps, **options), elasticity=elasticity)
+        return dataclasses.replace(loop.settings(steps=steps, **options), elasticity=elasticity)
 
     return make
 
@@ -55,7 +55,7 @@ def _least_energy(start, *arguments):
     return start + scale * fsolve(slope, np.zeros(6), xtol=1e-10)
 
 
-def test_a_load_sinks_to_the_pose_of_least_energy(robot, frictionless, legs_at, make_elastic):
+def test_a_load_sinks_to_the_pose_of_least_energy(loop, robot, frictionless, legs_at, make_elastic):
     """Motors held where they are, 8 kg put on the platform: after the vibration has died the sum of the energies of
     gravity and springs is least; the cranks have given way by torque over stiffness."""
     stiff_loop = frictionless.copy()
@@ -67,7 +67,7 @@ def test_a_load_sinks_to_the_pose_of_least_energy(robot, frictionless, legs_at, 
     loaded[0] += 8.0
     reference = closed_loop.Reference(np.tile(pose, (300, 1)), np.zeros((300, 6)))
     commands = np.tile(start.commands[0], (300, 1))
-    run = closed_loop.simulate(robot, loaded, reference, settings, start=start, commands=commands)
+    run = loop.run(reference, settings, loaded, start=start, commands=commands)
     np.testing.assert_allclose(run.motor_angle[-1], commands[0], atol=1e-8)
     sunk = _least_energy(pose, commands[0], SOFT.stiffness, loaded[:64], robot, legs_at)
     assert np.abs(sunk - pose)[2] > 1e-4
@@ -76,20 +76,20 @@ def test_a_load_sinks_to_the_pose_of_least_energy(robot, frictionless, legs_at, 
     np.testing.assert_allclose(given_way, robot.static_torque(run.pose[-1], loaded[:64]) / SOFT.stiffness, atol=1e-8)
 
 
-def test_the_equilibrium_is_the_pose_of_least_energy_and_stays(robot, frictionless, legs_at, make_elastic):
+def test_the_equilibrium_is_the_pose_of_least_energy_and_stays(loop, robot, frictionless, legs_at, make_elastic):
     settings, pose = make_elastic(SOFT), robot.home_pose
     start = closed_loop.equilibrium(robot, frictionless, pose, settings.servo, elasticity=SOFT)
     least = _least_energy(pose + 1e-5, start.motor_angle, SOFT.stiffness, frictionless[:64], robot, legs_at)
     np.testing.assert_allclose(least, pose, atol=1e-8)
     reference = closed_loop.Reference(np.tile(pose, (20, 1)), np.zeros((20, 6)))
-    run = closed_loop.simulate(robot, frictionless, reference, settings)
+    run = loop.run(reference, settings, frictionless)
     np.testing.assert_allclose(run.pose, reference.poses, atol=1e-13)
 
 
-def test_motion_is_that_of_the_twist_space_model_with_springs(robot, frictionless, make_elastic, make_reference):
+def test_motion_is_that_of_the_twist_space_model_with_springs(loop, robot, frictionless, make_elastic):
     """Three frames of moving commands against DOP853 on forward dynamics (eq. 40) with the springs as its actuators."""
     el, frames = SOFT, 3
-    reference = make_reference(frames)
+    reference = loop.reference(frames)
     settings = make_elastic(el, steps=200)
     run = closed_loop.simulate(
         robot, frictionless, reference, settings, commands=0.02 * np.sin(np.arange(frames))[:, None] * np.ones(6)
@@ -121,46 +121,43 @@ def test_motion_is_that_of_the_twist_space_model_with_springs(robot, frictionles
         np.testing.assert_allclose(run.motor_rate[k + 1], rate, atol=1e-6)
 
 
-def test_stiff_springs_give_the_rigid_run_to_first_order(robot, frictionless, make_reference, make_elastic):
+def test_stiff_springs_give_the_rigid_run_to_first_order(loop, robot, frictionless, make_elastic):
     """The difference halves with the compliance: the order between stiffnesses of 1, 2 and 4e4 N m/rad is 1."""
-    reference = make_reference(30)
+    reference = loop.reference(30)
     rigid = closed_loop.simulate(robot, frictionless, reference, make_elastic(None))
     misses = []
     for stiffness in (1e4, 2e4, 4e4):
         settings = make_elastic(JointElasticity(stiffness, 3e-4, 0.02), steps=200)
-        misses.append(np.abs(closed_loop.simulate(robot, frictionless, reference, settings).pose - rigid.pose).max())
+        misses.append(np.abs(loop.run(reference, settings, frictionless).pose - rigid.pose).max())
     np.testing.assert_allclose(np.log2(misses[0] / np.array(misses[1:])), [1, 2], atol=0.02)
 
 
 @pytest.mark.parametrize("friction", [FrictionLaw(), FrictionLaw("stribeck", None, 1.5, 0.05)], ids=lambda f: f.name)
-def test_both_paths_stick_and_slip_alike(robot, identified, make_reference, make_elastic, friction):
-    reference = make_reference(40)
+def test_both_paths_stick_and_slip_alike(loop, make_elastic, friction):
+    reference = loop.reference(40)
     settings = make_elastic(SOFT, steps=60, friction=friction, latency_s=1.3 / 60, hold="linear")
-    start = closed_loop.simulate(robot, identified, reference, settings).state_at(32)
+    start = loop.run(reference, settings).state_at(32)
     rest = closed_loop.Reference(reference.poses[32:], reference.rates[32:])
-    ours, plain = (
-        closed_loop.simulate(robot, identified, rest, settings, start=start, compiled=compiled)
-        for compiled in (True, False)
-    )
+    ours, plain = (loop.run(rest, settings, start=start, compiled=compiled) for compiled in (True, False))
     assert ours.events == plain.events > 3
     for name in ("pose", "pose_rate", "motor_angle", "motor_rate", "torque", "command", "joint_integral"):
         np.testing.assert_allclose(getattr(ours, name), getattr(plain, name), atol=1e-10, err_msg=name)
 
 
-def test_a_run_from_the_state_of_another_repeats_its_rest(robot, identified, make_reference, make_elastic):
-    reference, settings = make_reference(30), make_elastic(SOFT)
-    run = closed_loop.simulate(robot, identified, reference, settings)
+def test_a_run_from_the_state_of_another_repeats_its_rest(loop, make_elastic):
+    reference, settings = loop.reference(30), make_elastic(SOFT)
+    run = loop.run(reference, settings)
     rest = closed_loop.Reference(reference.poses[17:], reference.rates[17:])
-    again = closed_loop.simulate(robot, identified, rest, settings, start=run.state_at(17))
+    again = loop.run(rest, settings, start=run.state_at(17))
     np.testing.assert_array_equal(again.pose, run.pose[17:])
     np.testing.assert_array_equal(again.motor_rate, run.motor_rate[17:])
 
 
-def test_what_cannot_be_simulated_is_refused(robot, identified, make_reference, make_elastic):
-    reference = make_reference(5)
+def test_what_cannot_be_simulated_is_refused(loop, robot, identified, make_elastic):
+    reference = loop.reference(5)
 
     def run(elasticity, steps=80, **options):
-        closed_loop.simulate(robot, identified, reference, make_elastic(elasticity, steps), **options)
+        loop.run(reference, make_elastic(elasticity, steps), **options)
 
     with pytest.raises(SimulationError, match=r"joint stiffness is 0\.0 N m/rad, must be finite and > 0"):
         JointElasticity(0.0, 3e-4)

@@ -71,11 +71,9 @@ def test_forward_kinematics_of_the_plant_closes_its_own_loops(robot, plant, nume
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compiled", [True, False])
-def test_the_servo_commands_with_the_kinematics_it_knows(
-    robot, plant, identified, make_reference, make_settings, compiled
-):
+def test_the_servo_commands_with_the_kinematics_it_knows(loop, robot, plant, identified, compiled):
     """Eq. 30 worked out from what was measured, with the nominal Jacobian by differences of its inverse kinematics."""
-    reference, settings = make_reference(12), make_settings()
+    reference, settings = loop.reference(12), loop.settings()
     run = closed_loop.simulate(
         plant, identified, reference, settings, lambda k, t, pose: pose, servo_robot=robot, compiled=compiled
     )
@@ -92,8 +90,8 @@ def test_the_servo_commands_with_the_kinematics_it_knows(
 
 
 @pytest.mark.slow
-def test_both_paths_agree_and_the_servos_ignorance_matters(robot, plant, identified, make_reference, make_settings):
-    reference, settings = make_reference(40), make_settings()
+def test_both_paths_agree_and_the_servos_ignorance_matters(loop, robot, plant, identified):
+    reference, settings = loop.reference(40), loop.settings()
     arguments = (plant, identified, reference, settings, lambda k, t, pose: pose)
     ours = closed_loop.simulate(*arguments, servo_robot=robot)
     plain = closed_loop.simulate(*arguments, servo_robot=robot, compiled=False)
@@ -101,12 +99,12 @@ def test_both_paths_agree_and_the_servos_ignorance_matters(robot, plant, identif
     assert ours.events == plain.events > 3
     np.testing.assert_allclose(ours.pose, plain.pose, atol=1e-13)
     assert np.abs(ours.pose - knowing.pose).max() > 1e-7
-    same = closed_loop.simulate(robot, identified, reference, settings, servo_robot=robot)
-    np.testing.assert_array_equal(same.pose, closed_loop.simulate(robot, identified, reference, settings).pose)
+    same = loop.run(reference, settings, servo_robot=robot)
+    np.testing.assert_array_equal(same.pose, loop.run(reference, settings).pose)
 
 
-def test_sensitivities_need_a_servo_that_knows_the_robot(robot, identified, make_reference, make_settings):
-    arguments = (robot, identified, make_reference(5), make_settings())
+def test_sensitivities_need_a_servo_that_knows_the_robot(loop, robot, identified):
+    arguments = (robot, identified, loop.reference(5), loop.settings())
     with pytest.raises(SimulationError, match="pass servo_robot=None"):
         closed_loop.simulate(*arguments, servo_robot=robot, sensitivities=True)
     with pytest.raises(SimulationError, match="servo_robot must be of type Robot"):

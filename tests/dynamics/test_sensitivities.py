@@ -1,10 +1,13 @@
-"""Sensitivities of the closed loop with respect to the 67 parameters."""
+"""Derivatives of runs with respect to the 67 parameters and the start, and runs from a given state."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from dynamics import closed_loop
-from dynamics.closed_loop.joints import FrictionLaw
+from dynamics import closed_loop, simulate_batch
+from dynamics.closed_loop import FrictionLaw
+from dynamics.errors import SimulationError, UnreachablePoseError
 
 STRIBECK = FrictionLaw("stribeck", static_ratio=1.3, stribeck_velocity=0.1)
 CASES = {
@@ -15,14 +18,14 @@ CASES = {
     "exact friction, 16 steps": ({"steps": 16}, range(0, 67, 9), 1e-6),
     "exact friction, 2 steps": ({"steps": 2}, (0, 2, 3, 12), 1e-7),
 }
+FRAME = 20  # of the reference: there four joints move and two stick
+ENTRIES = ("pose", "pose_rate", "joint_integral", "servo_integral")
+TIMINGS = {"no delay": {}, "1.3 frames, linear": {"latency_s": 1.3 / 60, "hold": "linear"}}
 
 
-def _difference(run, parameters, index, step):
-    """Fourth-order central difference of the poses, and whether all its runs had the same number of events."""
-    runs = {n: run(parameters + n * step * np.eye(67)[index]) for n in (-2, -1, 1, 2)}
-    poses = {n: result.pose for n, result in runs.items()}
-    difference = (8 * (poses[1] - poses[-1]) - (poses[2] - poses[-2])) / (12 * step)
-    return difference, len({result.events for result in runs.values()}) == 1
+def _central(values, step):
+    """Fourth-order central difference of values at -2, -1, 1 and 2 steps."""
+    return (8 * (values[1] - values[-1]) - (values[2] - values[-2])) / (12 * step)
 
 
 def _assert_derivative(run, parameters, index, ours, tolerance):
@@ -31,14 +34,16 @@ def _assert_derivative(run, parameters, index, ours, tolerance):
     Steps that move the poses by 1e-7, 1e-8, 1e-6 (m, rad) are tried; one must pass. Rounding in the poses, 1e-15, is
     then 1e-7 at most; where a step changes the pattern of events the poses have a kink.
     """
-    largest, misses = np.abs(ours).max(), []
+    largest, misses, unit = np.abs(ours).max(), [], np.eye(67)[index]
     if largest == 0:  # an inertia about an axis that nothing turns about
-        far = run(parameters + 0.4 * parameters * np.eye(67)[index]).pose
+        far = run(parameters + 0.4 * parameters * unit).pose
         np.testing.assert_array_equal(far, run(parameters).pose, err_msg=f"parameter {index}")
         return
     for movement in (1e-7, 1e-8, 1e-6):
         step = min(movement / largest, 0.4 * abs(parameters[index]))
-        numeric, same = _difference(run, parameters, index, step)
+        runs = {n: run(parameters + n * step * unit) for n in (-2, -1, 1, 2)}
+        same = len({result.events for result in runs.values()}) == 1
+        numeric = _central({n: result.pose for n, result in runs.items()}, step)
         misses.append(np.abs(ours - numeric).max() / largest if same else np.inf)
         if misses[-1] <= tolerance:
             return
@@ -48,56 +53,216 @@ def _assert_derivative(run, parameters, index, ours, tolerance):
 @pytest.mark.parametrize(
     ("case", "driven"), [*[(case, False) for case in CASES], pytest.param("exact friction", True, id="logged commands")]
 )
-def test_sensitivities_are_finite_differences_of_the_run(
-    robot, identified, make_reference, make_settings, case, driven
-):
+def test_sensitivities_are_finite_differences_of_the_run(loop, case, driven):
     """Within one pattern of events the poses are smooth in the parameters, and the sensitivities are their derivatives
     at the usual 4 steps a frame: steps that events cut are differentiated as they are computed."""
     options, indices, tolerance = CASES[case]
-    reference, settings = make_reference(45), make_settings(**options)
-    commands = closed_loop.simulate(robot, identified, reference, settings).command if driven else None
+    reference, settings = loop.reference(45), loop.settings(**options)
+    commands = loop.run(reference, settings).command if driven else None
 
     def run(values, sensitivities=False):
-        return closed_loop.simulate(robot, values, reference, settings, commands=commands, sensitivities=sensitivities)
+        return loop.run(reference, settings, values, commands=commands, sensitivities=sensitivities)
 
-    base = run(identified, sensitivities=True)
+    base = run(loop.parameters, sensitivities=True)
     assert (base.events > 10) == (case != "smoothed friction")
     for index in indices if not driven else range(0, 67, 3):
-        _assert_derivative(run, identified, index, base.pose_sensitivity[:, :, index], tolerance)
+        _assert_derivative(run, loop.parameters, index, base.pose_sensitivity[:, :, index], tolerance)
 
 
-def test_a_common_factor_of_all_parameters_cannot_be_seen(robot, identified, make_reference, make_settings):
+def test_a_common_factor_of_all_parameters_cannot_be_seen(loop):
     """Xi and (lp, li, ld) times c leave every pose unchanged; the sensitivity along that direction vanishes."""
-    reference, settings = make_reference(60), make_settings()
-    base = closed_loop.simulate(robot, identified, reference, settings, sensitivities=True)
-    scaled = closed_loop.simulate(robot, 1.7 * identified, reference, settings)
+    base = loop.run(60, sensitivities=True)
+    scaled = loop.run(60, parameters=1.7 * loop.parameters)
     np.testing.assert_allclose(scaled.pose, base.pose, atol=1e-12)
     np.testing.assert_allclose(scaled.torque, 1.7 * base.torque, rtol=1e-8, atol=1e-9)
-    along = base.pose_sensitivity @ identified
-    largest = np.abs(base.pose_sensitivity * identified).max()
-    assert np.abs(along).max() < 1e-8 * largest
+    along = base.pose_sensitivity @ loop.parameters
+    assert np.abs(along).max() < 1e-8 * np.abs(base.pose_sensitivity * loop.parameters).max()
 
 
-def test_logged_commands_leave_the_servo_out(robot, identified, make_reference, make_settings):
-    """Driven by the commands of a run, the same robot repeats that run bit by bit; servo gains do not matter."""
-    reference, settings = make_reference(45), make_settings()
-    first = closed_loop.simulate(robot, identified, reference, settings)
-    gains = closed_loop.ServoGains(9.0, 9.0, 9.0)
-    other = closed_loop.LoopSettings(gains, settings.timing, settings.friction, settings.steps_per_frame)
-    again = closed_loop.simulate(robot, identified, reference, other, commands=first.command)
-    np.testing.assert_array_equal(again.pose, first.pose)
+def _from(reference, frame):
+    return closed_loop.Reference(reference.poses[frame:], reference.rates[frame:])
 
 
-def test_measuring_without_error_is_the_ideal_sensor(robot, identified, make_reference, make_settings):
-    """A sensor that returns the true pose gives the run of `sensor=None` bit by bit, and is called once a frame."""
-    reference, settings = make_reference(30), make_settings()
-    calls = []
+@pytest.fixture(scope="module")
+def half_way(loop):
+    """(frames, **settings) -> the rest of a reference, the settings, and the state that a run over it has reached."""
 
-    def sensor(frame, time, pose):
-        calls.append((frame, time))
-        return pose
+    def make(frames=45, frame=FRAME, **options):
+        reference, settings = loop.reference(frames), loop.settings(**options)
+        return _from(reference, frame), settings, loop.run(reference, settings).state_at(frame)
 
-    ideal = closed_loop.simulate(robot, identified, reference, settings)
-    run = closed_loop.simulate(robot, identified, reference, settings, sensor)
-    np.testing.assert_array_equal(run.pose, ideal.pose)
-    assert calls == [(n, n * (1 / 60)) for n in range(30)]
+    return make
+
+
+def _moved(start, direction):
+    """The start state, moved by a vector of its 24 entries."""
+    changes = {name: getattr(start, name) + part for name, part in zip(ENTRIES, np.split(direction, 4), strict=True)}
+    return replace(start, **changes)
+
+
+@pytest.mark.parametrize("timing", TIMINGS)
+def test_a_run_from_the_state_of_another_repeats_its_rest(loop, timing):
+    """Bit by bit: the state is complete. Joints stick at some of these frames, and commands are on their way."""
+    reference, settings = loop.reference(45), loop.settings(**TIMINGS[timing])
+    run = loop.run(reference, settings)
+    for frame in (0, 3, FRAME, 33):
+        rest = loop.run(_from(reference, frame), settings, start=run.state_at(frame))
+        for name in ("pose", "pose_rate", "torque", "command", "measured", "joint_integral", "servo_integral"):
+            np.testing.assert_array_equal(getattr(rest, name), getattr(run, name)[frame:], err_msg=name)
+
+
+def test_the_default_start_is_the_equilibrium(robot, loop):
+    """Given or not, it is the same start, and the sensitivities contain that it follows the parameters."""
+    reference, settings = loop.reference(20), loop.settings()
+    start = closed_loop.equilibrium(robot, loop.parameters, reference.poses[0], settings.servo)
+    given, default = (loop.run(reference, start=s, sensitivities=True) for s in (start, None))
+    np.testing.assert_array_equal(given.pose, default.pose)
+    np.testing.assert_array_equal(given.pose_sensitivity, default.pose_sensitivity)
+    fixed = replace(start, joint_integral_sensitivity=np.zeros((6, 67)))
+    held = loop.run(reference, start=fixed, sensitivities=True)
+    assert np.abs(held.pose_sensitivity[-1] - default.pose_sensitivity[-1]).max() > 0
+    through = loop.run(reference, start=start, start_sensitivities=True).start_sensitivity[:, :, 12:18]
+    through = through @ start.joint_integral_sensitivity
+    np.testing.assert_allclose(held.pose_sensitivity + through, default.pose_sensitivity, rtol=1e-9, atol=1e-12)
+
+
+def _directions(robot, start):
+    """Unit moves of pose and integrals, and pose rates that turn one joint by 1 rad/s; which of these joints stick."""
+    jacobian = robot.pose_jacobian(start.pose)
+    rates = np.zeros((6, 24))
+    rates[:, 6:12] = np.linalg.inv(jacobian).T
+    others = np.delete(np.eye(24), np.arange(6, 12), axis=0)
+    sticking = np.abs(jacobian @ start.pose_rate) < 1e-12
+    return np.vstack([others, rates[~sticking]]), rates[sticking]
+
+
+@pytest.fixture
+def derivatives(loop, half_way):
+    """(settings) -> start, its sensitivities (frames, 6, 24), and the differences of runs along a move of the start."""
+
+    def make(**options):
+        reference, settings, start = half_way(**options)
+
+        def difference(direction, step):
+            moves = {n: _moved(start, n * step * direction) for n in (-2, -1, 1, 2)}
+            return _central({n: loop.run(reference, settings, start=moved).pose for n, moved in moves.items()}, step)
+
+        return start, loop.run(reference, settings, start=start, start_sensitivities=True).start_sensitivity, difference
+
+    return make
+
+
+@pytest.mark.parametrize("timing", TIMINGS)
+def test_start_sensitivities_are_finite_differences_of_the_run(robot, derivatives, timing):
+    """To 1e-6 of the largest, for every pose, integral and velocity of a joint that slips at the start."""
+    start, by_start, difference = derivatives(**TIMINGS[timing])
+    directions, _ = _directions(robot, start)
+    assert len(directions) == 22
+    for direction in directions:
+        ours = by_start @ direction
+        largest = np.abs(ours).max()
+        misses = [np.abs(ours - difference(direction, d / largest)).max() / largest for d in (1e-7, 1e-8)]
+        assert min(misses) <= 1e-6, (direction, misses)
+
+
+def test_start_velocities_of_joints_that_stick_are_lost(robot, derivatives):
+    """Such a velocity is lost after a path that grows with its square: extrapolating from two steps takes that kink
+    out. It also cuts a step, which changes the error of the integrator: hence 16 steps a frame."""
+    start, by_start, difference = derivatives(steps=16)
+    _, directions = _directions(robot, start)
+    assert len(directions) == 2
+    for direction in directions:
+        ours = by_start @ direction
+        h = 1e-7 / np.abs(ours).max()
+        numeric = 2 * difference(direction, h) - difference(direction, 2 * h)
+        np.testing.assert_allclose(numeric, ours, rtol=0, atol=1e-6 * np.abs(ours).max())
+
+
+def test_velocities_of_a_robot_at_rest_have_no_effect(loop, half_way):
+    """With all joints stuck a start velocity is lost at once: its derivative is zero, what is left is its square."""
+    reference, settings, start = half_way(frame=0)
+    run = loop.run(reference, settings, start=start, start_sensitivities=True)
+    np.testing.assert_array_equal(run.start_sensitivity[:, :, 6:12], 0)
+    direction = np.repeat([0.0, 1.0, 0.0, 0.0], 6)
+    changes = [
+        np.abs(loop.run(reference, settings, start=_moved(start, speed * direction)).pose - run.pose).max()
+        for speed in (1e-4, 1e-5)
+    ]
+    assert 50 < changes[0] / changes[1] < 200
+
+
+@pytest.mark.parametrize("timing", TIMINGS)
+def test_the_end_state_moves_with_start_and_parameters_as_runs_do(robot, loop, half_way, timing):
+    """All 24 entries of the last frame's state, by finite differences of runs along the start and the parameters."""
+    reference, settings, start = half_way(**TIMINGS[timing])
+
+    def end(move, change):
+        run = loop.run(reference, settings, loop.parameters + change, start=_moved(start, move))
+        state = run.state_at(len(reference.poses) - 1)
+        return np.concatenate([getattr(state, name) for name in ENTRIES])
+
+    run = loop.run(reference, settings, start=start, start_sensitivities=True)
+    assert run.end_sensitivity.shape == (24, 67)
+    assert run.end_start_sensitivity.shape == (24, 24)
+    moves = [(direction, np.zeros(67)) for direction in _directions(robot, start)[0]]
+    moves += [(np.zeros(24), loop.parameters * np.eye(67)[k]) for k in (0, 1, 7, 28, 29, *range(52, 67))]
+    for move, change in moves:
+        ours = run.end_start_sensitivity @ move + run.end_sensitivity @ change
+        scale = np.maximum(np.abs(ours).reshape(4, 6).max(axis=1).repeat(6), 1e-3 * np.abs(ours).max())
+        misses = []
+        for step in (1e-7, 1e-8, 1e-9):
+            h = step / np.abs(ours[:6]).max()
+            ends = {n: end(n * h * move, n * h * change) for n in (-2, -1, 1, 2)}
+            misses.append((np.abs(_central(ends, h) - ours) / scale).max())
+            if misses[-1] <= 1e-6:
+                break
+        assert min(misses) <= 1e-6, (move, change, misses)
+
+
+@pytest.mark.parametrize("timing", TIMINGS)
+def test_both_paths_give_the_same_from_a_start(loop, half_way, timing):
+    """Compiled and plain: poses, and the derivatives with respect to start and parameters, to 1e-9."""
+    reference, settings, start = half_way(FRAME + 12, **TIMINGS[timing])
+    ours, plain = loop.both(reference, settings, start=start, start_sensitivities=True)
+    assert ours.events == plain.events > 3
+    for name in ("pose", "joint_integral", "servo_integral", "pose_sensitivity", "start_sensitivity"):
+        other = getattr(plain, name)
+        scale = np.abs(other).max(axis=(0, 1))
+        assert (np.abs(getattr(ours, name) - other) <= 1e-9 * scale + 1e-14).all(), name
+    for name in ("end_sensitivity", "end_start_sensitivity"):
+        other = getattr(plain, name)
+        scale = np.abs(other).reshape(4, 6, -1).max(axis=1).repeat(6, axis=0)
+        assert (np.abs(getattr(ours, name) - other) <= 1e-9 * scale + 1e-14).all(), name
+
+
+def test_a_batch_carries_starts_and_their_sensitivities(robot, loop, half_way):
+    """Three starts for one parameter vector, as multiple shooting wants them: what three single runs give."""
+    reference, settings, start = half_way(30)
+    starts = [_moved(start, scale * np.ones(24)) for scale in (0, 1e-5, 2e-5)]
+    runs = simulate_batch(robot, loop.parameters, reference, settings, starts=starts, start_sensitivities=True)
+    for begin, run in zip(starts, runs, strict=True):
+        alone = loop.run(reference, settings, start=begin, start_sensitivities=True)
+        for name in ("pose", "pose_sensitivity", "start_sensitivity"):
+            np.testing.assert_array_equal(getattr(run, name), getattr(alone, name))
+    assert not np.array_equal(runs[0].pose, runs[1].pose)
+    with pytest.raises(SimulationError, match="2 parameter vectors and 1 references and 3 start states"):
+        simulate_batch(robot, np.tile(loop.parameters, (2, 1)), reference, settings, starts=starts)
+
+
+def test_bad_starts_and_states_that_a_run_does_not_know_are_refused(loop, half_way):
+    reference, settings, start = half_way(30)
+    for change, words in (
+        ({"pose_rate": np.zeros(5)}, r"start pose_rate must have shape \(6,\), got \(5,\)"),
+        ({"servo_integral": np.full(6, np.nan)}, r"start servo_integral\[0\] is nan, must be finite"),
+        ({"commands": np.zeros((0, 6))}, "start commands must have at least 1 row, got 0"),
+    ):
+        with pytest.raises(SimulationError, match=words):
+            replace(start, **change)
+    with pytest.raises(UnreachablePoseError, match="leg"):
+        loop.run(reference, settings, start=replace(start, pose=start.pose + 0.5 * np.eye(6)[2]))
+    run = loop.run(10, lost=np.arange(10) == 4)
+    with pytest.raises(SimulationError, match="frame is 10, must be a whole number >= 0 and <= 9"):
+        run.state_at(10)
+    with pytest.raises(SimulationError, match="frame 5 follows a lost measurement"):
+        run.state_at(5)
+    assert run.state_at(0) is run.start

@@ -1,0 +1,133 @@
+"""Robot files: `rss6` holds the robot that its construction describes, and what makes no robot is refused by name."""
+
+import itertools
+import pickle
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import dynamics
+from dynamics.errors import RobotFileError
+
+BOX = np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])
+
+
+def _constructed():
+    """Platform joints and crank tips at home, from radii and angles; leg order k0-, k0+, k1-, k1+, k2-, k2+."""
+    legs = [(k, s) for k in range(3) for s in (-1, 1)]
+    angle_a = np.array([2 * np.pi / 3 * k + s * 0.95 for k, s in legs])
+    angle_t = np.array([2 * np.pi / 3 * k + s * 0.10 for k, s in legs])
+    zero = np.zeros(6)
+    joints = 0.200 * np.column_stack([np.cos(angle_a), np.sin(angle_a), zero])
+    tips = 0.300 * np.column_stack([np.cos(angle_t), np.sin(angle_t), zero])
+    return joints, tips, np.array([s for _, s in legs])
+
+
+def test_the_file_holds_the_constructed_robot(robot):
+    """Joints, cranks, link length and base radius agree with the construction from radii and angles to 1e-14 m."""
+    joints, tips, side = _constructed()
+    g = robot.geometry
+    link = joints + np.array([0, 0, 0.200]) - tips
+    along = side[:, None] * np.column_stack([-link[:, 1], link[:, 0], np.zeros(6)])
+    along /= np.linalg.norm(link[:, :2], axis=1, keepdims=True)
+    np.testing.assert_allclose(g.platform_joints, joints, atol=1e-14)
+    np.testing.assert_allclose(g.crank_zero_directions, along, atol=1e-14)
+    np.testing.assert_allclose(g.base_joints, tips - 0.060 * along, atol=1e-14)
+    np.testing.assert_allclose(np.linalg.norm(link, axis=1), g.link_length, atol=1e-14)
+    np.testing.assert_array_equal(g.crank_axes, np.tile([0, 0, 1], (6, 1)))
+    assert (g.crank_length, tuple(g.home_pose), tuple(g.gravity)) == (0.06, (0, 0, 0.2, 0, 0, 0), (0, 0, -9.81))
+    assert g.travel_limit == 0.9948
+    assert not g.base_joints.flags.writeable
+    np.testing.assert_allclose(robot.inverse_kinematics(robot.home_pose), 0, atol=1e-14)
+
+
+def test_the_stated_travel_covers_the_box(robot):
+    """Over the box +-10 mm, +-0.04 rad (its 64 corners and 5000 poses inside) no crank leaves +-0.803 rad.
+
+    The largest angle is that of a corner, 0.8029 rad.
+    """
+    corners = np.array(list(itertools.product([-1, 1], repeat=6)))
+    inside = np.random.default_rng(0).uniform(-1, 1, (5000, 6))
+    theta = robot.inverse_kinematics(robot.home_pose + BOX * np.vstack([corners, inside]))
+    np.testing.assert_allclose(np.abs(theta).max(), 0.8029, atol=1e-4)
+    assert np.abs(theta).argmax() < 64 * 6
+
+
+offsets = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(np.array)
+
+
+@settings(max_examples=100, deadline=None)
+@given(offset=offsets)
+def test_legs_close_on_the_branch_of_home(robot, legs_at, offset):
+    """From T, built with the angles of the inverse kinematics, A lies one link length away, on the side it has at home.
+
+    The side is the sign of (w x l) . s, which vanishes only where crank and link are stretched or folded.
+    """
+    place, home = legs_at(robot.home_pose + 1.3 * BOX * offset), legs_at(robot.home_pose)
+    link, home_link = place.joint - place.tip, home.joint - home.tip
+    np.testing.assert_allclose(np.linalg.norm(link, axis=1), robot.geometry.link_length, rtol=1e-13)
+    axes = robot.geometry.crank_axes
+    side, home_side = (np.sum(np.cross(p, q) * axes, axis=1) for p, q in ((place.crank, link), (home.crank, home_link)))
+    assert (side * home_side > 0).all()
+
+
+FIRST_JOINT = "[0.33383501391252074, -0.0784425512051534, 0.0]"
+
+
+def test_what_names_no_robot_is_one_line_with_what_was_given_and_the_valid_names(tmp_path):
+    with pytest.raises(RobotFileError, match=r"unknown robot `rss7`; built-in robots: rss6; or give the path"):
+        dynamics.load_robot("rss7")
+    with pytest.raises(RobotFileError, match=r"cannot read robot file .*none\.toml"):
+        dynamics.load_robot(tmp_path / "none.toml")
+    with pytest.raises(RobotFileError, match=r"cannot read robot file .*null byte"):
+        dynamics.load_robot("rss6\0.toml")
+    for name in (None, ["rss6"]):
+        with pytest.raises(RobotFileError, match=re.escape(f"by its name or the path of its file, got {name!r}")):
+            dynamics.load_robot(name)
+    (tmp_path / "picture.toml").write_bytes(b"\x89PNG\xff\xfe")
+    with pytest.raises(RobotFileError, match="cannot read robot file"):
+        dynamics.load_robot(tmp_path / "picture.toml")
+    with pytest.raises(RobotFileError, match="description must be of type RobotDescription, got 'rss6' of type str"):
+        dynamics.Robot("rss6")
+    assert dynamics.built_in_robots() == ["rss6"]
+
+
+def test_a_file_by_path_and_a_robot_sent_to_another_process_are_the_same_robot(load_changed, robot):
+    """Equal geometry and parameters; compiled functions are shared by geometry and not sent along."""
+    for copy in (load_changed({}), pickle.loads(pickle.dumps(robot))):
+        assert copy is not robot
+        assert copy.geometry == robot.geometry
+        assert copy.functions is robot.functions
+        np.testing.assert_array_equal(copy.nominal_parameters, robot.nominal_parameters)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('name = "rss6"', 'name = "rss6"\ncolour = "red"', "unknown key colour; valid: name, family, home_pose"),
+        ("crank_length = 0.06", "crank_lenght = 0.06", "legs: .*unknown key crank_lenght; valid: crank_length"),
+        ("crank_length = 0.06\n", "", "legs.crank_length: Field required"),
+        ("mass = 24.0, ", "mass = 24.0, weight = 1, ", "initial.platform: .*unknown key weight; valid: mass"),
+        ('family = "rss6"', 'family = "delta"', "family: Input should be 'rss6'"),
+        ("link_length = 0.30133373938841", "link_length = -0.3", "link_length must be positive and finite, got -0.3"),
+        ("link_length = 0.30133373938841", "link_length = nan", "link_length must be positive and finite, got nan"),
+        ("link_length = 0.30133373938841", "link_length = 0.1", "leg 1 cannot reach the home pose: reach margin -"),
+        ("link_length = 0.30133373938841", 'link_length = "long"', "legs.link_length: Input should be a valid number"),
+        (f"    {FIRST_JOINT},\n", "", r"base_joints must be .*\(6, 3\), got shape \(5, 3\)"),
+        (FIRST_JOINT, "[0.33, -0.07]", "base_joints of leg 1 needs 3 numbers, got 2"),
+        ("    [0.0, 0.0, 1.0],\n", "    [0.0, 0.0, 2.0],\n", "crank_axes of leg 1 has length 2, must be 1"),
+        ("    [0.0, 0.0, 1.0],\n", "    [0.0, 0.6, 0.8],\n", "leg 1 must be normal to its crank axis; .*limit 1e-9"),
+        ("mass = [0.671, ", "mass = [", r"crank.mass needs one value or 6 values, got 5"),
+        ("crank = { mass = 0.685", "crank = { mass = -0.685", r"crank1.mass = -0.685 kg is not allowed"),
+        ("home_pose = [0.0, ", "home_pose = [", r"home_pose must be finite with shape \(6,\)"),
+        ("[parameters.initial]", "[parameters.first]", "needs a parameter set `initial`; it has .*first"),
+        ('name = "rss6"', "name = ", "is not valid TOML"),
+    ],
+)
+def test_robot_files_that_make_no_robot(load_changed, old, new, message):
+    """Unknown keys list the valid ones; places, counts, values and legs are named; the file is named first."""
+    with pytest.raises(RobotFileError, match=rf"robot file .*changed.toml.*{message}"):
+        load_changed({old: new})
