@@ -14,19 +14,19 @@ from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
 from identify.estimation import identification
 from identify.excitation import design_trajectories
-from identify.experiment.plant import build_plant
+from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import excitation_run, taught_sensor, teach, untaught_sensor
 from identify.experiment.sensor_in_loop import with_renderer
 from identify.experiment.truth import read_truth, true_parameters
 from identify.files.atomic import write_text
-from identify.files.dataset import read_covariance, write_covariance
+from identify.files.dataset import write_covariance
 from identify.files.run_folder import RunFolder, check_entries, load_result, rms_figures, save_result
 from identify.files.versions import versions
-from identify.loop_parameters import NAMES, check_parameter_set
+from identify.loop_parameters import check_parameter_set
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.checks import check_length, check_trajectory
-from identify.record.provenance import ENTRY, RECORDS, check_made_of, check_robot, file_digests
+from identify.record.provenance import ENTRY, RECORDS, RunFiles, check_robot, digest
 from identify.record.recorded_run import recorded_reference
 from identify.record.recording import build_model_run, write_model_runs
 from identify.reporting.report import write_report
@@ -46,15 +46,16 @@ from identify.validation.unseen import model_run, predicted_runs, run_unseen
 def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:
     """All stages: excite, record, identify, validate, report. What cannot work is refused before any file."""
     began, scenario = time.perf_counter(), with_renderer(scenario)
-    sensor = untaught_sensor(scenario, load_robot(scenario.robot), seed)
+    plant = build_plant(scenario)
+    sensor = untaught_sensor(scenario, plant.nominal, seed)
     if scenario.renderer == "pyrender":
         cmmsim.require_opengl()
-    trajectories = _designed(scenario, seed, progress)
+    trajectories = _designed(plant, seed, progress)
     excited_at = time.perf_counter()
     teach(sensor, progress)
     taught_at = time.perf_counter()
     _write_plan(folder, scenario, trajectories)
-    taught = record(folder, progress, workers, sensor)
+    taught = record(folder, progress, workers, sensor, plant)
     identify(folder, progress)
     validate(folder, progress, workers, taught)
     report(folder, progress)
@@ -65,26 +66,32 @@ def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers
 def excite(scenario: Scenario, seed: int, folder: Path, progress: Progress) -> None:
     """Choose the trajectories; writes scenario.toml and trajectories.json."""
     scenario = with_renderer(scenario)
-    _write_plan(folder, scenario, _designed(scenario, seed, progress))
+    _write_plan(folder, scenario, _designed(build_plant(scenario), seed, progress))
 
 
 def record(
-    folder: Path, progress: Progress, workers: int | None = None, sensor: cmmsim.Sensor | None = None
+    folder: Path,
+    progress: Progress,
+    workers: int | None = None,
+    sensor: cmmsim.Sensor | None = None,
+    plant: Plant | None = None,
 ) -> cmmsim.Taught:
     """Run the plant on the exciting trajectory; writes experiment.nc, and payload.nc where the scale anchor is a
-    payload. Returns what the sensor was taught."""
+    payload. Returns what the sensor was taught.
+
+    sensor, plant: those of the scenario where they are at hand, the sensor taught.
+    """
     run_folder, scenario, trajectories, robot = _open(folder)
     began = time.perf_counter()
     sensor = sensor or taught_sensor(scenario, robot, trajectories.seed, progress)
-    targets = [run_folder.experiment, *_payload_files(run_folder, scenario)]
-    plant, frames = build_plant(scenario, robot), scenario.timing.frames(scenario.excitation.duration_s)
-    with progress.stage("record", frames * len(targets)) as advance:
-        for target in targets:
-            payload = target == run_folder.payload
-            arguments = (trajectories.excitation, trajectories.seed, advance, payload)
-            experiment = excitation_run(plant, sensor, *arguments)
+    plant, names = plant or build_plant(scenario, robot), _record_files(scenario)
+    frames = scenario.timing.frames(scenario.excitation.duration_s)
+    with progress.stage("record", frames * len(names)) as advance:
+        for name in names:
+            loaded = name == run_folder.payload.name
+            experiment = excitation_run(plant, sensor, trajectories.excitation, trajectories.seed, advance, loaded)
             stored = experiment.record.assign_attrs(record_seconds=time.perf_counter() - began)
-            recording.write(target, stored, experiment.truth)
+            recording.write(run_folder.path / name, stored, experiment.truth)
     return sensor.taught
 
 
@@ -98,12 +105,13 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
     run_folder, planned, trajectories, robot = _open(folder)
     scenario = with_estimator_settings(planned, settings or {})
     began = time.perf_counter()
-    payload_files = _payload_files(run_folder, scenario)
-    run_folder.require(*(file.name for file in payload_files))
-    plan = scenario, trajectories, robot
-    origin = file_digests(run_folder, *(file.name for file in (run_folder.experiment, *payload_files)))
-    seen, *loaded = [_read_record(file, *plan) for file in (run_folder.experiment, *payload_files)]
-    result = identification.identify([seen, *loaded], robot, scenario, progress)
+    files, names = RunFiles(run_folder), _record_files(scenario)
+    run_folder.require(*names)
+    records = [files.content(name) for name in names]
+    for name, one in zip(names, records, strict=True):
+        _check_planned(run_folder.path / name, one, scenario, trajectories)
+    result = identification.identify(records, robot, scenario, progress)
+    seen = files.experiment
     measured, ok = recording.poses(seen, "measured"), seen["measured_ok"].values.astype(bool)
     reference = recorded_reference(seen)
     before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))
@@ -118,7 +126,7 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
             "seed": trajectories.seed,
             "settings": estimator_settings(scenario),
             "versions": versions(),
-            ENTRY: origin | file_digests(run_folder, run_folder.covariance.name),
+            ENTRY: files.digests(*names) | {"covariance.nc": digest(result.covariance)},
             "seconds": {
                 "record": seen.attrs.get("record_seconds"),
                 "identify": time.perf_counter() - began,
@@ -139,32 +147,33 @@ def validate(folder: Path, progress: Progress, workers: int | None = None, taugh
     run_folder, scenario, trajectories, robot = _open(folder)
     began = time.perf_counter()
     run_folder.require("covariance.nc")
-    result, covariance = load_result(run_folder.result), read_covariance(run_folder.covariance, NAMES)
-    excitation_record = _read_record(run_folder.experiment, scenario, trajectories, robot)
+    files, result = RunFiles(run_folder), load_result(run_folder.result)
+    check_robot(files.experiment, robot)
+    _check_planned(run_folder.experiment, files.experiment, scenario, trajectories)
     excitation_truth = read_truth(run_folder.experiment)
     check_entries(run_folder.result, result, "identify")
-    check_made_of(run_folder, result, *RECORDS, run_folder.covariance.name)
+    files.check_made_of(*RECORDS, run_folder.covariance.name, result=result)
     models = _identified_models(run_folder, result)
     taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
     runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, workers, progress)
     recording.write_runs(run_folder.validation, [(unseen.record, unseen.truth) for unseen in runs])
-    records = [excitation_record, *(run.record for run in runs)]
+    records = [files.experiment, *(run.record for run in runs)]
     model_poses = [_model_poses(robot, scenario, models, seen) for seen in records]
-    predictions = predicted_runs(robot, scenario, records[1:], models[1], covariance, trajectories.seed, progress)
+    predictions = predicted_runs(robot, scenario, records[1:], models[1], files.covariance, trajectories.seed, progress)
     deviations = [None, *(prediction.std for prediction in predictions)]
     drawn = [
         build_model_run(seen["time"].values, initial, identified, std)
         for seen, (initial, identified), std in zip(records, model_poses, deviations, strict=True)
     ]
-    write_model_runs(run_folder.model, drawn[0], drawn[1:])
-    pairs = [(excitation_record, excitation_truth), *((run.record, run.truth) for run in runs)]
+    model_runs = write_model_runs(run_folder.model, drawn[0], drawn[1:])
+    pairs = [(files.experiment, excitation_truth), *((run.record, run.truth) for run in runs)]
     result["sensor"] = sensor_entry(pairs)
     result["validation"] = [
         validation_entry(*pair, *poses) | prediction_entry(prediction, pair[1])
         for pair, poses, prediction in zip(pairs[1:], model_poses[1:], predictions, strict=True)
     ]
     add_truth(result["identification"], true_parameters(excitation_truth))
-    result[ENTRY] = result.get(ENTRY, {}) | file_digests(run_folder, "validation.nc", "model.nc")
+    result[ENTRY] = result.get(ENTRY, {}) | {"validation.nc": digest(records[1:]), "model.nc": digest(model_runs)}
     result["seconds"]["validate"] = time.perf_counter() - began
     save_result(run_folder.result, result)
 
@@ -182,27 +191,23 @@ def _open(folder: Path) -> tuple[RunFolder, Scenario, TrajectorySet, Robot]:
     return run_folder, scenario, load_trajectories(run_folder.trajectories), load_robot(scenario.robot)
 
 
-def _read_record(file: Path, scenario: Scenario, trajectories: TrajectorySet, robot: Robot) -> xr.Dataset:
-    """The record of a file, which must be of the folder's robot and trajectory."""
-    record = recording.read(file)
+def _check_planned(file: Path, record: xr.Dataset, scenario: Scenario, trajectories: TrajectorySet) -> None:
+    """The record of a file must be of the folder's exciting trajectory."""
     try:
-        check_robot(record, robot)
         check_trajectory(record, trajectories.excitation, scenario)
     except EstimationError as error:
         raise EstimationError(f"{file}: {error}") from None
-    return record
 
 
-def _payload_files(run_folder: RunFolder, scenario: Scenario) -> list[Path]:
-    """The file of the run under a load, where the scenario asks for one."""
-    return [run_folder.payload] if scenario.identification.scale_anchor == "payload" else []
+def _record_files(scenario: Scenario) -> tuple[str, ...]:
+    """The file of the record and, where the scenario asks for one, that of the run under a load."""
+    return RECORDS if scenario.identification.scale_anchor == "payload" else RECORDS[:1]
 
 
-def _designed(scenario: Scenario, seed: int, progress: Progress) -> TrajectorySet:
+def _designed(plant: Plant, seed: int, progress: Progress) -> TrajectorySet:
     """Trajectories that stay clear of limits and singularities; compiles the robot on first use."""
+    scenario, robot = plant.scenario, plant.nominal
     check_length(scenario.timing.frames(scenario.excitation.duration_s), scenario, "excitation.duration_s gives")
-    plant = build_plant(scenario)
-    robot = plant.nominal
     check_parameter_set(robot, scenario.model.start_parameters)
     with progress.stage("compile the robot", 4) as advance:
         for one in (robot, plant.robot):

@@ -61,15 +61,16 @@ def estimators(
     """
     from identify.estimators.estimator import find_estimators
     from identify.experiment.joint_instruments import JointInstruments
-    from identify.record.provenance import check_folder
+    from identify.record.provenance import RunFiles
     from identify.validation.estimator_comparison import compare_on_run, estimators_figure
 
     folder = RunFolder(out)
     folder.require("scenario.toml", "experiment.nc", "validation.nc")
-    check_folder(folder, "experiment.nc", "validation.nc")
+    files = RunFiles(folder)
+    files.check_made_of("experiment.nc", "validation.nc")
     instruments = JointInstruments(torque_noise, encoder_noise, 2 * math.pi / 2**encoder_bits)
     chosen = find_estimators(only) | (find_estimators(add) if add else {})
-    scores = compare_on_run(folder, instruments, chosen, seed, terminal_progress(quiet))
+    scores = compare_on_run(files, instruments, chosen, seed, terminal_progress(quiet))
     entry = {"seed": seed, "instruments": asdict(instruments), "estimators": {s.name: _entry(s) for s in scores}}
     save_files(folder.path, {"estimators.json": entry, "figures/estimators.png": estimators_figure(scores)})
     if not quiet:
@@ -148,7 +149,7 @@ def variation(
     """
     from dynamics import load_robot
     from identify.record import recording
-    from identify.record.provenance import check_folder
+    from identify.record.provenance import RunFiles
     from identify.reporting import variation_tables as tables
     from identify.trajectory import load_trajectories
     from identify.validation.variation import designed_runs, identify_each
@@ -164,8 +165,9 @@ def variation(
         recording.write_runs(out / "variation.nc", [(run.record, run.truth) for run in runs])
         records, origin = [run.record for run in runs], f"designed: {scenario.excitation.method}"
     else:
-        check_folder(folder, "validation.nc")
-        records, origin = recording.read_runs(folder.validation), "unseen"
+        seen = RunFiles(folder)
+        seen.check_made_of("validation.nc")
+        records, origin = seen.validation, "unseen"
     found = variation_of(identify_each(records, robot, scenario, progress))
     table = tables.variation_table(found)
     files = {

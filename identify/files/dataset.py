@@ -23,7 +23,8 @@ ENGINE: Literal["h5netcdf"] = "h5netcdf"
 def write_groups(path: Path | str, groups: Mapping[str, xr.Dataset]) -> None:
     """Write datasets as groups of one file; the name ``""`` is the main group.
 
-    Nothing is left behind, and an older file of this name stays as it was, when writing fails.
+    Nothing is left behind, and an older file of this name stays as it was, when writing fails. Group by group: an
+    `xarray.DataTree` would give each truth the coordinates of its record.
     """
     with atomic_path(path) as temporary:
         mode: Literal["w", "a"] = "w"

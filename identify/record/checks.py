@@ -1,4 +1,4 @@
-"""What a record must be to carry an identification: of this robot, long enough, moving, and whole.
+"""What a whole record must be to carry an identification: of this robot and loop, long enough, and moving.
 
 Each check raises EstimationError with what it found, in frames counted from 0.
 """
@@ -28,7 +28,6 @@ REFERENCE_GAP = 0.05
 ROUNDING = 1e-9
 """m or rad: difference that means nothing, of a reference from its trajectory or from one that stands still; and
 relative, of a frame rate."""
-
 
 ASYMMETRY = 1e-6
 """Difference of two mirrored entries of a covariance that rounding may make, in units of the standard deviations."""
@@ -134,31 +133,18 @@ def check_good_share(ok: NDArray[np.bool_]) -> None:
 
 
 def check_channels(measured: Array, logged: Array, ok: NDArray[np.bool_]) -> None:
-    """No measured pose (N, 6) in a good frame, and no command (N, 6), that is dead or not finite."""
-    good, every = np.flatnonzero(ok), np.arange(len(ok))
-    channels = [(name, good, column) for name, column in zip(POSE, measured[ok].T, strict=True)]
-    channels += [(f"command of joint {k + 1}", every, column) for k, column in enumerate(logged.T)]
-    for name, frames, values in channels:
-        unknown = frames[~np.isfinite(values)]
-        if len(unknown):
-            raise EstimationError(
-                f"{name} is not finite in {len(unknown)} frames that count as measured, the first is frame {unknown[0]}"
-            )
+    """No measured pose (N, 6) in the good frames, `ok` (N,), and no command (N, 6), that is dead."""
+    channels = list(zip(POSE, measured[ok].T, strict=True))
+    channels += [(f"command of joint {joint}", column) for joint, column in enumerate(logged.T, start=1)]
+    for name, values in channels:
         if np.ptp(values) == 0:
             raise EstimationError(f"{name} is {values[0]:g} in every frame: nothing moved, or the channel is dead")
 
 
 def checked_covariance(covariances: Array, ok: NDArray[np.bool_]) -> Array:
     """Mean (6, 6) of the covariances (N, 6, 6) of the good frames, `ok` (N,)."""
-    frames, good = np.flatnonzero(ok), covariances[ok]
-    unknown = frames[~np.isfinite(good).all(axis=(1, 2))]
-    if len(unknown):
-        raise EstimationError(
-            f"measured_covariance is not finite in {len(unknown)} frames that count as measured, the first is frame "
-            f"{unknown[0]}"
-        )
-    _check_symmetry(good, frames)
-    mean = good.mean(axis=0)
+    _check_symmetry(covariances[ok], np.flatnonzero(ok))
+    mean = covariances[ok].mean(axis=0)
     if np.linalg.eigvalsh(mean)[0] <= 0:
         raise EstimationError("the record's mean measured_covariance is not positive definite")
     return np.asarray(mean, dtype=float)

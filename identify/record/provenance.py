@@ -1,14 +1,14 @@
-"""Where a record comes from: its scenario, seed and robot, and the digests of the files that a result was made of.
+"""Where a record comes from, and what a result was made of: scenario, seed, robot, and digests of what was read.
 
-Which files a result was made of, by their digests: a file that was changed or replaced since is refused.
-A stage that is repeated leaves the files of later ones where they are, and these stages tell what is no longer theirs.
+A stage that is repeated leaves the files of later ones where they are; by the digests these stages tell what is no
+longer theirs.
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from functools import cached_property
 from hashlib import sha256
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,26 @@ from identify.record.payload import ADDED
 from identify.record.recording import VARIABLES, read, read_model_runs, read_runs
 from identify.scenario import Scenario, scenario_from_toml
 
-# What a record states of its own making: the scenario it was made with, and the seed of what was drawn for it.
+ROBOT = "robot_geometry"
+"""Attribute with the geometry of the robot file: a name alone does not say which robot file was meant."""
+
+ROUNDING = 1e-9
+"""Largest difference of any number [SI] of a geometry that another computer's arithmetic may make."""
+
+STATED = (
+    "robot", ROBOT, "seed", "frame_rate_hz", "scale_anchor", "scale_anchor_value", "scale_anchor_std",
+    *ADDED, *(f"{name}_std" for name in ADDED),
+)  # fmt: skip
+"""Attributes that an identification reads; beside them timing and servo of the scenario."""
+
+ENTRY = "made_of"
+"""Of a result: digests by the file's name. Results of older versions have none, and nothing is asked of them."""
+
+RECORDS = ("experiment.nc", "payload.nc")
+"""What an identification may have read."""
+
+_AGAIN = {"validation.nc": "validate", "model.nc": "validate"}
+"""The stage that makes a result of the file as it now is, where it is not `identify`."""
 
 
 def recorded_scenario(record: xr.Dataset) -> Scenario:
@@ -60,18 +79,9 @@ def recorded_seed(record: xr.Dataset) -> int:
     return int(seed)
 
 
-# The geometry of the robot that a record is of, kept with it: a name alone does not say which robot file was meant.
-
-
-ATTRIBUTE = "robot_geometry"
-
-ROUNDING = 1e-9
-"""Largest difference of any number [SI] that another computer's arithmetic may make."""
-
-
 def store_robot(record: xr.Dataset, robot: Robot) -> None:
     """Keep the geometry of the robot file with the record, as JSON."""
-    record.attrs[ATTRIBUTE] = json.dumps(_numbers(robot))
+    record.attrs[ROBOT] = json.dumps(_numbers(robot))
 
 
 def check_robot(record: xr.Dataset, robot: Robot) -> None:
@@ -83,13 +93,13 @@ def check_robot(record: xr.Dataset, robot: Robot) -> None:
     """
     if record.attrs.get("robot") != robot.name:
         raise EstimationError(f"the record is of robot {shown(record.attrs.get('robot'))}, not of {robot.name!r}")
-    if ATTRIBUTE not in record.attrs:
+    if ROBOT not in record.attrs:
         return
-    recorded = _read(record.attrs[ATTRIBUTE])
+    recorded = _read(record.attrs[ROBOT])
     for name, ours in _numbers(robot).items():
         theirs, known = recorded.get(name, np.zeros(0)), np.asarray(ours)
         if theirs.shape != known.shape:
-            raise RecordError(f"{name} in the record's {ATTRIBUTE} has shape {theirs.shape}, expected {known.shape}")
+            raise RecordError(f"{name} in the record's {ROBOT} has shape {theirs.shape}, expected {known.shape}")
         gap = np.abs(theirs - known)
         if not gap.max() <= ROUNDING:
             worst = np.unravel_index(int(np.argmax(gap)), gap.shape)
@@ -109,21 +119,96 @@ def _read(text: object) -> dict[str, Array]:
     try:
         return {name: np.asarray(values, dtype=float) for name, values in json.loads(str(text)).items()}
     except (ValueError, TypeError, AttributeError) as error:
-        raise RecordError(f"the record's attribute {ATTRIBUTE} is no JSON object of numbers: {error}") from error
+        raise RecordError(f"the record's attribute {ROBOT} is no JSON object of numbers: {error}") from error
 
 
-# A digest of records: equal where an identification reads the same, in whatever file and whenever it was written.
+class RunFiles:
+    """What the files of a run hold, each read once, when it is first asked for.
+
+    Raises RecordError for a file that is damaged.
+    """
+
+    def __init__(self, folder: RunFolder) -> None:
+        self.folder = folder
+
+    @cached_property
+    def experiment(self) -> xr.Dataset:
+        """The record of the excitation."""
+        return read(self.folder.experiment)
+
+    @cached_property
+    def payload(self) -> xr.Dataset:
+        """That of the same run under a known load."""
+        return read(self.folder.payload)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (67, 67) of the estimates."""
+        return read_covariance(self.folder.covariance, NAMES)
+
+    @cached_property
+    def validation(self) -> list[xr.Dataset]:
+        """The records of the unseen runs."""
+        return read_runs(self.folder.validation)
+
+    @cached_property
+    def model(self) -> Mapping[str, xr.Dataset]:
+        """What the models do, by the run's name."""
+        return read_model_runs(self.folder.model)
+
+    def content(self, name: str) -> Any:
+        """What a file holds, by its name, as ``experiment.nc``."""
+        return getattr(self, name.removesuffix(".nc"))
+
+    def digests(self, *names: str) -> dict[str, str]:
+        """Digests of files by their names."""
+        return {name: digest(self.content(name)) for name in names}
+
+    def check_made_of(self, *names: str, result: Mapping[str, Any] | None = None) -> None:
+        """Refuse files of these names that are not those that the result was made of, as far as it states them.
+
+        result: None: that of the folder, where it has one.
+
+        Raises:
+            OutputFolderError: one of them is gone.
+            RecordError: one of them is another, with the stage to repeat; or damaged; or digests that are none.
+        """
+        run = self.folder
+        if result is None:
+            result = load_result(run.result) if run.result.is_file() else {}
+        known = result.get(ENTRY, {})
+        if not isinstance(known, dict):
+            raise RecordError(f"{run.result}: {ENTRY} must be digests by the file's name")
+        for name in (name for name in names if name in known):
+            run.require(name)
+            if self.digests(name)[name] != known[name]:
+                what = f"another record than {name}" if name in RECORDS else f"another {name}"
+                stage = _AGAIN.get(name, "identify")
+                raise RecordError(f"{run.result} is of {what}: run `cmmsim {stage} --out {run.path}` again")
 
 
-STATED = (
-    "robot", ATTRIBUTE, "seed", "frame_rate_hz", "scale_anchor", "scale_anchor_value", "scale_anchor_std",
-    *ADDED, *(f"{name}_std" for name in ADDED),
-)  # fmt: skip
-"""Attributes that an identification reads; beside them timing and servo of the scenario."""
+def digest(content: xr.Dataset | Sequence[xr.Dataset] | Mapping[str, xr.Dataset] | Array) -> str:
+    """Digest, hexadecimal, of a record or of records in their order, of model runs by name, or of a covariance.
+
+    Equal where what follows reads the same, in whatever file and whenever it was written.
+    Raises RecordError for a record that does not state its scenario.
+    """
+    if isinstance(content, np.ndarray):
+        return array_digest({"covariance": content})
+    if isinstance(content, xr.Dataset):
+        return _record_digest([content])
+    if isinstance(content, Mapping):
+        return array_digest(
+            {f"{run}/{name}": one[name].values for run, one in content.items() for name in one.data_vars}
+        )
+    return _record_digest(content)
 
 
 def array_digest(arrays: Mapping[str, ArrayLike]) -> str:
-    """Digest of named arrays of numbers, hexadecimal; their order and their type do not matter."""
+    """Digest of named arrays of numbers, hexadecimal; their order and their type do not matter.
+
+    Of the numbers, not of a file's bytes, which differ from one writing to the next.
+    """
     whole = sha256()
     for name in sorted(arrays):
         values = np.ascontiguousarray(arrays[name], dtype="<f8")
@@ -132,11 +217,7 @@ def array_digest(arrays: Mapping[str, ArrayLike]) -> str:
     return whole.hexdigest()
 
 
-def record_digest(*records: xr.Dataset) -> str:
-    """Digest of one or several records in their order, hexadecimal.
-
-    Raises RecordError for a record that does not state its scenario.
-    """
+def _record_digest(records: Sequence[xr.Dataset]) -> str:
     whole = sha256()
     for record in records:
         arrays = {name: record[name].values for name in ("time", *VARIABLES)}
@@ -149,58 +230,3 @@ def record_digest(*records: xr.Dataset) -> str:
 
 def _plain(value: object) -> object:
     return value.item() if isinstance(value, np.generic) else value
-
-
-ENTRY = "made_of"
-"""Of a result: digests by the file's name. Results of older versions have none, and nothing is asked of them."""
-
-RECORDS = ("experiment.nc", "payload.nc")
-"""What an identification may have read."""
-
-
-def _of_models(path: Path) -> str:
-    runs = read_model_runs(path)
-    return array_digest({f"{run}/{name}": runs[run][name].values for run in runs for name in runs[run].data_vars})
-
-
-_DIGESTS: Mapping[str, Callable[[Path], str]] = {
-    "experiment.nc": lambda path: record_digest(read(path)),
-    "payload.nc": lambda path: record_digest(read(path)),
-    "covariance.nc": lambda path: array_digest({"covariance": read_covariance(path, NAMES)}),
-    "validation.nc": lambda path: record_digest(*read_runs(path)),
-    "model.nc": _of_models,
-}
-
-_AGAIN = {"validation.nc": "validate", "model.nc": "validate"}
-"""The stage that makes a result of the file as it now is, where it is not `identify`."""
-
-
-def file_digests(run: RunFolder, *names: str) -> dict[str, str]:
-    """Digests of the content of files of a run, by name. Raises RecordError for one that is damaged."""
-    return {name: _DIGESTS[name](run.path / name) for name in names}
-
-
-def check_made_of(run: RunFolder, result: Mapping[str, Any], *names: str) -> None:
-    """Refuse files of these names that are not those that the result was made of, as far as it states them.
-
-    Raises:
-        OutputFolderError: one of them is gone.
-        RecordError: one of them is another, with the stage to repeat; or damaged; or digests that are none.
-    """
-    known = result.get(ENTRY, {})
-    if not isinstance(known, dict):
-        raise RecordError(f"{run.result}: {ENTRY} must be digests by the file's name")
-    for name in names:
-        if name not in known:
-            continue
-        run.require(name)
-        if file_digests(run, name)[name] != known[name]:
-            what = f"another record than {name}" if name in RECORDS else f"another {name}"
-            stage = _AGAIN.get(name, "identify")
-            raise RecordError(f"{run.result} is of {what}: run `cmmsim {stage} --out {run.path}` again")
-
-
-def check_folder(run: RunFolder, *names: str) -> None:
-    """As `check_made_of`, by the result of the folder where it has one."""
-    if run.result.is_file():
-        check_made_of(run, load_result(run.result), *names)

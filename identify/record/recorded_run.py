@@ -1,6 +1,6 @@
 """One record as the estimator needs it: what was asked of the robot, what was measured, and the model's side of it.
 
-A record that cannot carry an identification is refused, see `record_checks`.
+A record that cannot carry an identification is refused, see `identify.record.checks`.
 """
 
 from dataclasses import dataclass, replace
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, LoopSettings, Reference, simulate
 from identify.arrays import Array
-from identify.files.dataset import check_variables
 from identify.loop_parameters import model_settings
 from identify.record.checks import (
     check_channels,
@@ -23,7 +22,7 @@ from identify.record.checks import (
     checked_covariance,
 )
 from identify.record.payload import recorded_payload, recorded_payload_std
-from identify.record.recording import VARIABLES, poses
+from identify.record.recording import check_record, poses
 from identify.scenario import Scenario
 
 LONG_GAP_S = 0.5
@@ -111,8 +110,8 @@ def recorded_run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> Record
 
     Raises:
         RecordError, EstimationError: as `watched_run` does.
-        EstimationError: too short, a constant channel, numbers that are not finite, a reference that stands still or is
-            faster than the frames can show.
+        EstimationError: too short, a constant channel, a reference that stands still or is faster than the frames can
+            show.
     """
     _check_origin(record, robot, scenario)
     check_length(record.sizes["time"], scenario)
@@ -126,9 +125,9 @@ def watched_run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> Recorde
     """A record of this robot and loop, and of a sensor whose noise it tells: long enough for a prediction at least.
 
     Raises:
-        RecordError: something is missing or of a wrong shape, a bad payload.
+        RecordError: something is missing, of a wrong shape or not finite; a bad payload.
         EstimationError: another robot, timing or servo; too many lost frames (its subclass TooFewFramesError), a
-            covariance that is none: not finite, not symmetric, not positive definite.
+            covariance that is none: not symmetric, not positive definite.
     """
     _check_origin(record, robot, scenario)
     return _run(record, robot, scenario)
@@ -142,7 +141,7 @@ def recorded_reference(record: xr.Dataset) -> Reference:
 
 def _check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
     """The record must be whole, of this robot, and made with the loop of the scenario."""
-    check_variables(record, VARIABLES, "the record")
+    check_record(record, "the record")
     check_origin(record, robot, scenario)
 
 

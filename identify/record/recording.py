@@ -1,11 +1,8 @@
 """What the experimenter sees of a run, as an xarray dataset in netCDF, and what models do on the same motion.
 
-What the experimenter sees of a run, as an xarray dataset in the main group of a netCDF file.
-The truth stands in a group of its own (:mod:`identify.experiment.truth`), so that an estimator that reads a record
-cannot see it. Several runs share a file as the groups ``run01``, ``run01/truth``, ``run02``, ...
-
-What the starting and the identified model do on the trajectories of a run, for figures and reports (``model.nc``).
-Groups ``excitation``, ``run01``, ``run02``, ...; a starting model may be unstable, so its poses may be NaN.
+A record is the main group of its file. The truth stands in a group of its own (:mod:`identify.experiment.truth`), so
+that an estimator that reads a record cannot see it. Several runs share a file as the groups ``run01``, ``run01/truth``,
+``run02``, ...; model runs (``model.nc``) are the groups ``excitation``, ``run01``, ``run02``, ...
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +17,6 @@ from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import (
     Variables,
-    check_finite,
     check_variables,
     described_dataset,
     group_names,
@@ -191,10 +187,14 @@ def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
         )
     ok = stated.astype(bool)
     for name in VARIABLES:
-        values = record[name].values
-        check_finite(values[ok] if name in MAY_BE_LOST else values, name, source)
-    if np.any(np.diff(record["time"].values) <= 0):
-        raise RecordError(f"{source}: time does not increase")
+        rows = record[name].values.reshape(len(ok), -1)
+        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1) & (ok if name in MAY_BE_LOST else True))
+        if len(bad):
+            which = "frames that count as measured" if name in MAY_BE_LOST else "frames"
+            raise RecordError(f"{source}: {name} is not finite in {len(bad)} {which}, the first is frame {bad[0]}")
+    steps = np.diff(record["time"].values)
+    if not (steps > 0).all():
+        raise RecordError(f"{source}: time does not increase after frame {np.argmin(steps > 0)}")
     return record
 
 
@@ -239,10 +239,13 @@ def build_model_run(
     return described_dataset(finite, time, variables)
 
 
-def write_model_runs(path: Path | str, excitation: xr.Dataset, validation: Sequence[xr.Dataset] = ()) -> None:
-    """Write the model runs as the groups ``excitation``, ``run01``, ``run02``, ..."""
-    runs = {run_name(number): run for number, run in enumerate(validation, start=1)}
-    write_groups(path, {EXCITATION: excitation, **runs})
+def write_model_runs(
+    path: Path | str, excitation: xr.Dataset, validation: Sequence[xr.Dataset] = ()
+) -> Mapping[str, xr.Dataset]:
+    """Write the model runs as the groups ``excitation``, ``run01``, ``run02``, ..., and return them so."""
+    runs = {EXCITATION: excitation} | {run_name(number): run for number, run in enumerate(validation, start=1)}
+    write_groups(path, runs)
+    return runs
 
 
 def read_model_runs(path: Path | str) -> Mapping[str, xr.Dataset]:

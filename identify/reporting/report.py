@@ -14,12 +14,11 @@ from identify.errors import RecordError
 from identify.estimation.covariance import correlation_matrix
 from identify.experiment.truth import read_truth_runs, true_poses
 from identify.files.atomic import write_figure, write_text
-from identify.files.dataset import read_covariance
 from identify.files.run_folder import RunFolder, check_entries, load_result
 from identify.loop_parameters import NAMES
 from identify.progress import Progress, SilentProgress
-from identify.record.provenance import RECORDS, check_made_of
-from identify.record.recording import EXCITATION, poses, read, read_model_runs, read_runs, run_name
+from identify.record.provenance import RECORDS, RunFiles
+from identify.record.recording import EXCITATION, poses, run_name
 from identify.reporting import figures, report_plots, tables
 from identify.reporting.figures import Fit
 from identify.reporting.goals import check_goals
@@ -109,13 +108,14 @@ def read_report_data(run: RunFolder) -> ReportData:
     Raises:
         RecordError: a file is damaged, or the files are not of one run.
     """
+    files = RunFiles(run)
     data = ReportData(
-        result=_checked_result(run),
-        experiment=read(run.experiment),
-        validation=read_runs(run.validation),
+        result=_checked_result(run, files),
+        experiment=files.experiment,
+        validation=files.validation,
         validation_truth=read_truth_runs(run.validation),
-        models=read_model_runs(run.model),
-        covariance=read_covariance(run.covariance, NAMES),
+        models=files.model,
+        covariance=files.covariance,
         trajectories=load_trajectories(run.trajectories) if run.trajectories.is_file() else None,
     )
     records = {EXCITATION: data.experiment}
@@ -126,11 +126,11 @@ def read_report_data(run: RunFolder) -> ReportData:
     return data
 
 
-def _checked_result(run: RunFolder) -> dict[str, Any]:
+def _checked_result(run: RunFolder, files: RunFiles) -> dict[str, Any]:
     """The whole result of a run, made of the files that are there."""
     result = load_result(run.result)
     check_entries(run.result, result, "identify", "validate")
-    check_made_of(run, result, *RECORDS, "covariance.nc", "validation.nc", "model.nc")
+    files.check_made_of(*RECORDS, "covariance.nc", "validation.nc", "model.nc", result=result)
     try:
         check_intervals(result["identification"])
     except RecordError as error:

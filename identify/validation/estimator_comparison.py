@@ -33,7 +33,7 @@ from identify.files.run_folder import RunFolder, rms_figures, rms_row
 from identify.loop_parameters import NAMES
 from identify.progress import Progress
 from identify.random_streams import INSTRUMENTS, LATENCY, mixed_generator, stream_seed
-from identify.record import recording
+from identify.record.provenance import RunFiles
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, load_scenario
 from identify.validation.unseen import model_run
@@ -97,7 +97,7 @@ class Score:
 
 
 def compare_on_run(
-    folder: RunFolder,
+    files: RunFiles,
     instruments: JointInstruments,
     estimators: Mapping[str, Estimator],
     seed: int,
@@ -107,8 +107,8 @@ def compare_on_run(
 
     Where the PID is known it has the true gains. Raises RecordError for files that are damaged.
     """
-    scenario = load_scenario(folder.scenario)
-    record, truth = recording.read(folder.experiment), read_truth(folder.experiment)
+    folder, record = files.folder, files.experiment
+    scenario, truth = load_scenario(folder.scenario), read_truth(folder.experiment)
     draws = np.random.default_rng(stream_seed(int(record.attrs["seed"]), LATENCY, 0))
     latencies = scenario.timing.drawn_latencies(record.sizes["time"], draws)
     rng, channels = mixed_generator(INSTRUMENTS, seed), folder.path / "instruments.nc"
@@ -117,7 +117,7 @@ def compare_on_run(
     true = np.array([known[name] for name in NAMES])
     problem = output_error_problem([record], load_robot(scenario.robot), scenario)
     evidence = Evidence(problem, scenario, joint_channels(read_channels(channels), record), true[64:])
-    unseen = zip(recording.read_runs(folder.validation), read_truth_runs(folder.validation), strict=True)
+    unseen = zip(files.validation, read_truth_runs(folder.validation), strict=True)
     return compare(evidence, examination(evidence, true, list(unseen)), estimators, progress)
 
 

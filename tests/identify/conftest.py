@@ -1,4 +1,4 @@
-"""A small run with known errors."""
+"""Small runs: one with known errors, finished; one with drawn noise, recorded."""
 
 import shutil
 
@@ -11,6 +11,7 @@ from identify.files.run_folder import RunFolder, rms_figures, save_result
 from identify.loop_parameters import NAMES
 from identify.record.recording import build_model_run, build_record, write, write_model_runs, write_runs
 from identify.scenario import load_scenario
+from tests.identify.synthetic import recorded_run_folder
 
 HOME = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
 
@@ -141,6 +142,12 @@ def finished_run(tmp_path_factory):
 def run_folder(finished_run, tmp_path):
     """A copy of the finished run."""
     return RunFolder(shutil.copytree(finished_run.path, tmp_path / "run"))
+
+
+@pytest.fixture
+def recorded_folder(tmp_path):
+    """A folder as `cmmsim record` leaves it, of a short run with drawn noise."""
+    return recorded_run_folder(tmp_path)
 
 
 @pytest.fixture(name="make_record")

@@ -9,9 +9,11 @@ import numpy as np
 from dynamics import Robot, load_robot
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.experiment.plant import build_plant
-from identify.record.recording import build_record
+from identify.files.run_folder import RunFolder
+from identify.record.provenance import store_robot
+from identify.record.recording import build_record, write
 from identify.scenario import load_scenario
-from identify.trajectory import random_trajectory
+from identify.trajectory import TrajectorySet, random_trajectory, save_trajectories
 
 SIGMA = np.repeat([5e-6, 30e-6], 3)
 
@@ -79,3 +81,24 @@ class Stages:
         steps = []
         self.seen.append((name, total, steps))
         yield lambda n=1: steps.append(n)
+
+
+SHORT = quick(**{"excitation.duration_s": 2.0, "identification.max_iterations": 1})
+"""Two seconds, and one iteration: enough for what is written and refused."""
+
+
+@cache
+def short_run():
+    """(record, run of the plant) of SHORT's excitation, in which one frame was lost."""
+    record, run = run_plant(SHORT, seed=1, duration_s=2.0, lost=(5,))
+    store_robot(record, rss6())
+    return record, run
+
+
+def recorded_run_folder(path, chosen=None):
+    """A folder as `cmmsim record` leaves it; chosen: another exciting trajectory than that of the record."""
+    folder, (record, run) = RunFolder(path), short_run()
+    folder.scenario.write_text(SHORT.to_toml(), encoding="utf-8")
+    save_trajectories(folder.trajectories, TrajectorySet(0, chosen or trajectory(0), (trajectory(5),), 1.0, 1.0, 1.0))
+    write(folder.experiment, record, build_plant(SHORT, rss6()).truth(run))
+    return folder

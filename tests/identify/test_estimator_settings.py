@@ -6,43 +6,31 @@ import pytest
 from identify import pipeline
 from identify.errors import ScenarioError
 from identify.estimation.identification import identify
-from identify.files.run_folder import RunFolder, load_result
+from identify.files.run_folder import load_result
 from identify.progress import SilentProgress
-from identify.record.recording import read, write
+from identify.record.recording import read
 from identify.reporting.report import provenance_section, read_report_data
 from identify.reporting.run_result import parameter_vector
 from identify.reporting.tables import changed_settings_table
 from identify.scenario import Scenario, load_scenario
 from identify.scenario.scenario import SECTIONS, estimator_settings, with_estimator_settings
-from identify.trajectory import TrajectorySet, save_trajectories
 from tests.identify.commands import command, one_line
-from tests.identify.synthetic import quick, rss6, run_plant, trajectory
+from tests.identify.synthetic import SHORT, rss6
 
-SCENARIO = quick(**{"excitation.duration_s": 2.0, "identification.max_iterations": 1})
 DRIVEN = {"identification.method": "command_driven"}
 
 
-@pytest.fixture(scope="module")
-def record():
-    return run_plant(SCENARIO, seed=1, duration_s=2.0)[0]
-
-
 @pytest.fixture
-def run(tmp_path, record):
-    """A folder as `cmmsim record` leaves it."""
-    folder = RunFolder(tmp_path)
-    folder.scenario.write_text(SCENARIO.to_toml(), encoding="utf-8")
-    save_trajectories(folder.trajectories, TrajectorySet(0, trajectory(0), (trajectory(5),), 1.0, 1.0, 1.0))
-    write(folder.experiment, record)
-    return folder
+def run(recorded_folder):
+    return recorded_folder
 
 
 def test_a_setting_acts_and_is_kept_for_the_next_stages_and_the_reader(run):
     pipeline.identify(run.path, SilentProgress(), DRIVEN)
     kept, result = load_scenario(run.scenario), load_result(run.result)
-    assert kept == SCENARIO.with_overrides(DRIVEN)
+    assert kept == SHORT.with_overrides(DRIVEN)
     assert result["settings"]["identification.method"] == "command_driven"
-    expected = identify(read(run.experiment), rss6(), SCENARIO.with_overrides(DRIVEN))
+    expected = identify(read(run.experiment), rss6(), SHORT.with_overrides(DRIVEN))
     np.testing.assert_array_equal(parameter_vector(result["identification"], "estimate"), expected.estimate)
     assert result["identification"]["searches"] == ["command_driven"]
     table = changed_settings_table(result, read(run.experiment).attrs["scenario"])
@@ -52,12 +40,12 @@ def test_a_setting_acts_and_is_kept_for_the_next_stages_and_the_reader(run):
 
 
 def test_without_settings_the_scenario_is_left_as_it_is(run):
-    run.scenario.write_text("# mine\n" + SCENARIO.to_toml(), encoding="utf-8")
+    run.scenario.write_text("# mine\n" + SHORT.to_toml(), encoding="utf-8")
     pipeline.identify(run.path, SilentProgress())
     assert run.scenario.read_text(encoding="utf-8").startswith("# mine\n")
     result = load_result(run.result)
-    assert result["settings"] == estimator_settings(SCENARIO)
-    assert changed_settings_table(result, SCENARIO.to_toml()).rows == ()
+    assert result["settings"] == estimator_settings(SHORT)
+    assert changed_settings_table(result, SHORT.to_toml()).rows == ()
     assert changed_settings_table({}, "").rows == ()
 
 
@@ -93,13 +81,13 @@ def test_what_the_record_was_made_with_is_refused_in_one_line(run, capfd, settin
 
 def test_a_wrong_name_or_value_is_refused_as_in_a_scenario():
     with pytest.raises(ScenarioError, match=r"valid names in \[identification\]: method, scale_anchor"):
-        with_estimator_settings(SCENARIO, {"identification.methode": "closed_loop"})
+        with_estimator_settings(SHORT, {"identification.methode": "closed_loop"})
     with pytest.raises(ScenarioError, match="model: friction = 'stribeck' with static_ratio = None"):
-        with_estimator_settings(SCENARIO, {"model.friction": "stribeck"})
+        with_estimator_settings(SHORT, {"model.friction": "stribeck"})
 
 
 def test_every_setting_of_the_sections_is_listed():
-    listed = {key.partition(".")[0] for key in estimator_settings(SCENARIO)}
+    listed = {key.partition(".")[0] for key in estimator_settings(SHORT)}
     assert listed == set(SECTIONS) < set(Scenario.model_fields)
 
 

@@ -1,3 +1,5 @@
+"""Files of a run: records, their truth and what models do, read back as written, whole or not at all."""
+
 import os
 
 import h5py
@@ -7,6 +9,7 @@ import xarray as xr
 
 from identify.errors import RecordError
 from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
+from identify.files.atomic import atomic_path, write_text
 from identify.files.dataset import group_names, write_groups
 from identify.record import recording
 from identify.record.recording import (
@@ -15,38 +18,31 @@ from identify.record.recording import (
     read,
     read_model_runs,
     read_runs,
+    run_name,
+    run_names,
     write,
     write_model_runs,
     write_runs,
 )
 
 
-def test_record_and_truth_read_back_identical(tmp_path, make_record, make_truth):
+def test_record_and_truth_read_back_identical_and_apart(tmp_path, make_record, make_truth):
+    """By us, by plain xarray and by plain HDF5; who reads the record does not see the truth."""
     path = tmp_path / "experiment.nc"
     record, truth = make_record(), make_truth()
     write(path, record, truth)
     xr.testing.assert_identical(read(path), record)
     xr.testing.assert_identical(read_truth(path), truth)
     assert true_parameters(read_truth(path)) == {"platform.mass": 23.5, "joint1.coulomb": 0.104}
-
-
-def test_plain_xarray_and_plain_hdf5_open_the_file(tmp_path, make_record, make_truth):
-    path = tmp_path / "experiment.nc"
-    write(path, make_record(), make_truth())
-    with xr.open_dataset(path) as main, xr.open_dataset(path, group="truth") as truth:
+    assert not [name for name in read(path).variables if "true" in str(name) or "torque" in str(name)]
+    with xr.open_dataset(path) as main, xr.open_dataset(path, group="truth") as plain:
         assert "position" not in main
         assert main["time"].dtype == float
         assert main["time"].attrs["units"] == "s"
-        assert truth["joint_torque"].attrs["units"] == "N m"
+        assert plain["joint_torque"].attrs["units"] == "N m"
     with h5py.File(path) as file:
         np.testing.assert_array_equal(file["truth/parameter_value"], [23.5, 0.104])
         assert file["measured_position"].attrs["units"] == "m"
-
-
-def test_record_never_holds_the_truth(tmp_path, make_record, make_truth):
-    path = tmp_path / "experiment.nc"
-    write(path, make_record(), make_truth())
-    assert not [name for name in read(path).variables if "true" in str(name) or "torque" in str(name)]
 
 
 def test_every_variable_has_a_unit_and_a_name(make_record, make_truth):
@@ -77,7 +73,9 @@ def test_lost_frames_may_be_nan_and_only_they(make_record):
     measured, ok = np.zeros((120, 6)), np.ones(120, dtype=bool)
     measured[7], ok[7] = np.nan, False
     assert make_record(measured_pose=measured, measured_ok=ok)["measured_ok"].values.sum() == 119
-    with pytest.raises(RecordError, match="3 of 360 values of measured_position are not finite"):
+    with pytest.raises(
+        RecordError, match="position is not finite in 1 frames that count as measured, the first is frame 7"
+    ):
         make_record(measured_pose=measured)
     with pytest.raises(RecordError, match="command"):
         make_record(command=np.full((120, 6), np.inf))
@@ -130,54 +128,60 @@ def test_truncated_file_is_one_clear_error(tmp_path, make_record, kept):
         read(path)
 
 
-def test_missing_file_group_and_variable_are_named(tmp_path, make_record):
+def test_what_a_file_lacks_or_damages_is_named(tmp_path, make_record):
     with pytest.raises(RecordError, match="there is no file"):
         read(tmp_path / "nothing.nc")
     path = tmp_path / "experiment.nc"
     write(path, make_record())
     with pytest.raises(RecordError, match="no group 'truth'"):
         read_truth(path)
+    with h5py.File(path, "r+") as file:
+        file["reference_position"][3, 1] = np.nan
+    with pytest.raises(RecordError, match="reference_position is not finite in 1 frames, the first is frame 3"):
+        read(path)
     write(path, make_record().drop_vars(["command", "measured_ok"]))
     with pytest.raises(RecordError, match="lacks measured_ok, command"):
         read(path)
 
 
-def test_damaged_values_in_a_file_are_named(tmp_path, make_record):
-    path = tmp_path / "experiment.nc"
-    write(path, make_record())
-    with h5py.File(path, "r+") as file:
-        file["reference_position"][3, 1] = np.nan
-    with pytest.raises(RecordError, match="1 of 360 values of reference_position"):
-        read(path)
-
-
-def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, make_record):
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, make_record):
     path = tmp_path / "experiment.nc"
     write(path, make_record())
     before = path.read_bytes()
     bad = xr.Dataset({"x": ("n", np.array([object()], dtype=object))})
     with pytest.raises((TypeError, ValueError)):
         write_groups(path, {"": make_record(), "truth": bad})
+
+    def write_half():
+        with atomic_path(path) as temporary:
+            temporary.write_text("half")
+            assert path.read_bytes() == before
+            assert temporary.suffix == ".nc"
+            raise RuntimeError("disk full")
+
+    with pytest.raises(RuntimeError, match="disk full"):
+        write_half()
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["experiment.nc"]
 
 
+def test_a_written_file_has_the_usual_rights(tmp_path):
+    write_text(tmp_path / "folder" / "a.txt", "x")
+    (tmp_path / "b.txt").write_text("x")
+    assert (tmp_path / "folder" / "a.txt").stat().st_mode == (tmp_path / "b.txt").stat().st_mode
+
+
 def test_runs_share_a_file_and_keep_their_order(tmp_path, make_record, make_truth):
     path = tmp_path / "validation.nc"
-    write_runs(path, [(make_record(seed=n), make_truth(values=(n, 0.0))) for n in range(11)])
-    assert [record.attrs["seed"] for record in read_runs(path)] == list(range(11))
-    assert [true_parameters(t)["platform.mass"] for t in read_truth_runs(path)] == list(range(11))
-    assert group_names(path)[:3] == ["run01", "run01/truth", "run02"]
-    with xr.open_dataset(path, group="run11/truth") as truth:
+    write_runs(path, [(make_record(seed=n), make_truth(values=(n, 0.0))) for n in range(2)])
+    assert [record.attrs["seed"] for record in read_runs(path)] == [0, 1]
+    assert [true_parameters(t)["platform.mass"] for t in read_truth_runs(path)] == [0, 1]
+    assert group_names(path) == ["run01", "run01/truth", "run02", "run02/truth"]
+    with xr.open_dataset(path, group="run02/truth") as truth:
         assert truth.sizes["time"] == 120
-
-
-def test_more_than_99_runs_keep_their_order():
-    assert [recording.run_name(n) for n in (1, 99, 100)] == ["run01", "run99", "run100"]
-
-
-def test_file_without_runs_is_refused(tmp_path, make_record):
-    path = tmp_path / "experiment.nc"
+    many = [run_name(number) for number in (1, 9, 10, 99, 100)]
+    write_groups(path, dict.fromkeys(reversed(many), xr.Dataset({"x": 1.0})))
+    assert run_names(path) == many == ["run01", "run09", "run10", "run99", "run100"]
     write(path, make_record())
     with pytest.raises(RecordError, match="holds no runs"):
         read_runs(path)
