@@ -11,6 +11,12 @@ def taught() -> cmmsim.Taught:
     return cmmsim.load_sensor("ctrack780", seed=0).taught
 
 
+@pytest.fixture(scope="session")
+def taught_analytic() -> cmmsim.Taught:
+    """What a sensor teaches itself without OpenGL."""
+    return cmmsim.load_sensor("ctrack780", seed=0, renderer="analytic").taught
+
+
 @pytest.fixture
 def sensor(taught: cmmsim.Taught) -> cmmsim.Sensor:
     return cmmsim.load_sensor("ctrack780", seed=0, taught=taught)

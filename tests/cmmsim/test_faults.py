@@ -1,6 +1,12 @@
-"""Spoilt images: what is left is measured, or the frame is lost for a reason; no wrong pose is reported as good."""
+"""Spoilt images: what is left is measured, or the frame is lost for a reason; no wrong pose is reported as good.
 
-import os
+Each fault is laid over one frame after a good one. The sensor is taught exactly, from the scene's truth: what is left
+of the pose error is observation noise, which alone the measurement's covariance states.
+"""
+
+import copy
+from collections import Counter
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -8,11 +14,11 @@ from scipy.stats import binom, chi2
 
 import cmmsim
 from cmmsim.fault_images import DiscMark, Fault, FaultyImages, FillMark, GlintMark, PlateMark, paint
-from cmmsim.faults import FaultGenerator
+from cmmsim.faults import FaultGenerator, fault_bodies
 from cmmsim.radiometry.images import FrameImages, StereoFrame
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.tracker import Tracker
-from tests.cmmsim.fault_run import exactly_taught, run_faults
+from tests.cmmsim.sensors import CROPPED, exact, squared_error
 
 FIVE_SIGMA = 5.733e-7  # two-sided, of a normal variable
 WRONG = chi2.isf(FIVE_SIGMA, 6)
@@ -20,11 +26,58 @@ REGION = chi2.ppf(0.95, 6)
 LOSING = ("one_camera_dark", "one_camera_covered", "swapped", "black", "saturated")
 SPOILING = ("hidden", "half_hidden", "obstacles", "false_discs", "false_points", "glint", "merging", "several")
 NOISE = CameraNoise(1600.0, 0.13, 26.0, 1800.0, 16.0)
+REACH = np.array([0.009] * 3 + [0.035] * 3)  # m, rad: of the poses
+UNPREDICTED = np.array([3e-4] * 3 + [1e-3] * 3)  # m, rad: between two frames
+
+
+@dataclass
+class Outcome:
+    """Normalised squared errors of the frames reported good, their numbers of stickers, and why others were lost."""
+
+    frames: int = 0
+    squared: list[float] = field(default_factory=list)
+    stickers: list[int] = field(default_factory=list)
+    reasons: Counter = field(default_factory=Counter)
+
+    def add(self, measurement, pose):
+        self.frames += 1
+        if measurement.ok:
+            self.squared.append(float(squared_error(measurement, pose)))
+            self.stickers.append(len(measurement.target_ids))
+        else:
+            self.reasons[measurement.reason] += 1
+
+
+def before_boxes(method="registration", renderer="analytic"):
+    """A sensor that sees the platform and little else; the boxes of faults are registered."""
+    sensor = exact("perfect", CROPPED, renderer, method=method)
+    sensor.add_bodies(fault_bodies())
+    return sensor
 
 
 @pytest.fixture(scope="module")
 def sensor():
-    return exactly_taught()
+    return before_boxes()
+
+
+def run_faults(sensor, kinds, frames, seed, untracked=0.05):
+    """One fault a frame, of the ``kinds`` in turn; a share ``untracked`` of them without a predicted pose."""
+    rng = np.random.default_rng(seed)
+    sensor.start_run(seed)
+    faults, outcomes = FaultGenerator(sensor.estimator), {kind: Outcome() for kind in kinds}
+    for frame in range(frames):
+        kind = kinds[frame % len(kinds)]
+        if frame % 20 == 0:  # twenty faults each after the same good frame
+            pose, good = sensor.home + REACH * rng.uniform(-1.0, 1.0, 6), Tracker(sensor.estimator)
+            assert good.measure(sensor.look(pose)).ok
+        moved = pose + UNPREDICTED * rng.uniform(-1.0, 1.0, 6)
+        tracker = copy.copy(good)
+        if rng.random() < untracked:
+            tracker.forget()
+        fault = faults.draw(kind, moved, rng)
+        images = FaultyImages(sensor.look(moved, fault.obstacles), fault, sensor.noise, rng)
+        outcomes[kind].add(tracker.measure(images), moved)
+    return outcomes
 
 
 def require_honest(outcomes):
@@ -39,11 +92,47 @@ def require_honest(outcomes):
         assert min(o.stickers, default=4) >= 4
 
 
-def test_no_wrong_pose_in_some_hundred_faults(sensor):
-    outcomes = run_faults(sensor, SPOILING, 150, 1, untracked=0.0)
+def require_measured_or_lost(sensor, seed):
+    """No wrong pose in 80 faults, and what spoils little is measured."""
+    outcomes = run_faults(sensor, SPOILING, 80, seed, untracked=0.0)
     require_honest(outcomes)
     for kind in ("obstacles", "false_discs", "false_points", "glint"):
-        assert len(outcomes[kind].squared) > 0.9 * outcomes[kind].frames, (kind, outcomes[kind].reasons)
+        assert len(outcomes[kind].squared) > 0.9 * outcomes[kind].frames - 1, (kind, outcomes[kind].reasons)
+
+
+def test_no_wrong_pose_in_eighty_faults(sensor):
+    require_measured_or_lost(sensor, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.rendering
+def test_no_wrong_pose_in_eighty_faults_drawn_by_pyrender():
+    require_measured_or_lost(before_boxes(renderer="pyrender"), 5)
+
+
+@pytest.mark.slow
+def test_planes_report_no_wrong_pose_in_eighty_faults():
+    require_honest(run_faults(before_boxes("planes"), SPOILING, 80, 200, untracked=0.02))
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("part", range(10))
+def test_no_wrong_pose_in_ten_thousand_faults(sensor, part):
+    """A thousand in each part, a twentieth of them without a predicted pose."""
+    kinds = [*SPOILING, *SPOILING, *SPOILING, *LOSING]
+    require_honest(run_faults(sensor, kinds, 1000, 100 + part))
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("part", range(8))
+def test_planes_report_no_wrong_pose_in_two_thousand_faults(part):
+    require_honest(run_faults(before_boxes("planes"), SPOILING, 250, 200 + part, untracked=0.02))
+
+
+@pytest.mark.thorough
+@pytest.mark.rendering
+def test_no_wrong_pose_in_two_hundred_faults_drawn_by_pyrender():
+    require_honest(run_faults(before_boxes(renderer="pyrender"), SPOILING, 200, 5))
 
 
 @pytest.mark.parametrize("kind", LOSING)
@@ -52,20 +141,6 @@ def test_whole_frame_faults_are_lost_with_the_reason(sensor, kind):
     assert not outcome.squared
     for reason in outcome.reasons:
         assert "needed" in reason or "two poses" in reason or "contradict" in reason, reason
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("part", range(10 if os.environ.get("ALL_FAULTS") else 1))
-def test_no_wrong_pose_in_ten_thousand_faults(sensor, part):
-    """With the tests of the same name 1,000 faults, and 10,000 where the environment has ALL_FAULTS=1."""
-    kinds = [*SPOILING, *SPOILING, *SPOILING, *LOSING]
-    require_honest(run_faults(sensor, kinds, 1000, 100 + part))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("part", range(8 if os.environ.get("ALL_FAULTS") else 1))
-def test_planes_report_no_wrong_pose(part):
-    require_honest(run_faults(exactly_taught("planes"), SPOILING, 250, 200 + part, untracked=0.02))
 
 
 def jump(rng):
@@ -94,7 +169,7 @@ def require_found_again(sensor):
 def require_right(m, pose):
     assert m.ok, m.reason
     assert len(m.target_ids) >= 17
-    assert (m.pose - pose) @ np.linalg.solve(m.covariance, m.pose - pose) < WRONG
+    assert squared_error(m, pose) < WRONG
 
 
 def test_lost_frames_and_jumps_are_found_again(sensor):
@@ -104,13 +179,16 @@ def test_lost_frames_and_jumps_are_found_again(sensor):
 @pytest.mark.slow
 @pytest.mark.rendering
 def test_lost_frames_and_jumps_are_found_again_by_pyrender():
-    require_found_again(exactly_taught(renderer="pyrender"))
+    require_found_again(before_boxes(renderer="pyrender"))
 
 
-@pytest.mark.slow
-@pytest.mark.rendering
-def test_no_wrong_pose_drawn_by_pyrender():
-    require_honest(run_faults(exactly_taught(renderer="pyrender"), SPOILING, 200, 5))
+def test_a_whole_frame_is_tracked_and_spoilt_like_one_that_is_drawn_as_far_as_it_is_read(sensor):
+    rng, frame = np.random.default_rng(0), sensor.capture(sensor.home)
+    tracked = Tracker(sensor.estimator).measure(frame)
+    np.testing.assert_array_equal(tracked.pose, cmmsim.measure_frame(frame, sensor.estimator).pose)
+    spoilt = FaultyImages(frame, Fault("none"), sensor.noise, rng)
+    np.testing.assert_array_equal(spoilt.full().left, frame.left)
+    np.testing.assert_array_equal(Tracker(sensor.estimator).measure(spoilt).pose, tracked.pose)
 
 
 def test_opaque_marks_have_their_own_mean_and_noise():
@@ -148,11 +226,6 @@ def test_marks_reach_windows_and_whole_images_alike():
         np.random.default_rng(0),
     )
     assert swapped.full().left.max() == swapped.windows(corners, 16)[0].max() == 25
-
-
-def test_unknown_fault_names_the_valid_ones(sensor):
-    with pytest.raises(cmmsim.UnknownOptionError, match="half_hidden"):
-        FaultGenerator(sensor.estimator).draw("gremlin", sensor.home, np.random.default_rng(0))
 
 
 def test_same_seed_same_fault(sensor):

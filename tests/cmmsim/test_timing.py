@@ -1,4 +1,4 @@
-"""Rate, latency with jitter and dropout of a sensor, and sensor files that are based on another."""
+"""Rate, latency with jitter and dropout of a sensor."""
 
 from types import SimpleNamespace
 
@@ -6,85 +6,17 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import cmmsim
 from cmmsim.acceptance import SensorUnderTest, common_volume, latency_test
 from cmmsim.files.schema import Timing
-from cmmsim.files.sensor_file import read_sensor_file, sensor_text
+from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.pose_estimation.estimator import PoseEstimator, lost_measurement
 from cmmsim.tracker import Tracker
-
-DROPPING = 'name = "ctrack780"\nbased_on = "ctrack780"\nrenderer = "analytic"\n[timing]\ndropout = {}\n'
-
-
-@pytest.fixture(scope="module")
-def taught():
-    """What the sensors of this file are taught: they differ in nothing that teaching sees."""
-    return cmmsim.load_sensor("ctrack780", seed=0, renderer="analytic").taught
+from tests.cmmsim.sensors import CROPPED, exact
 
 
-@pytest.fixture
-def dropping(tmp_path, taught):
-    """Sensors with a dropout, by its probability."""
-
-    def make(probability, seed=0):
-        path = tmp_path / "dropping.toml"
-        path.write_text(DROPPING.format(probability), encoding="utf-8")
-        return cmmsim.load_sensor(path, seed=seed, taught=taught)
-
-    return make
-
-
-def test_the_29_hz_sensor_is_labelled_as_assumed_and_differs_in_nothing_but_its_timing():
-    slow, usual = read_sensor_file("ctrack780_29hz"), read_sensor_file("ctrack780")
-    assert (slow.timing.frame_rate, slow.timing.latency * slow.timing.frame_rate) == (29.0, 1.0)
-    assert "assumed" in slow.note
-    assert "assumed" in cmmsim.load_sensor("ctrack780_29hz").note
-    assert usual.note == ""
-    own = {"name", "based_on", "note", "timing"}
-    assert slow.model_dump(exclude=own) == usual.model_dump(exclude=own)
-
-
-def test_a_file_based_on_another_changes_single_entries_of_a_section(tmp_path):
-    base = sensor_text("ctrack780").replace("gain = 0.13", "gain = 0.26")
-    (tmp_path / "base.toml").write_text(base, encoding="utf-8")
-    mine = tmp_path / "mine.toml"
-    mine.write_text('name = "mine"\nbased_on = "base.toml"\n[camera]\ndark_noise = 3.0\n[lens]\npsf_px = 0.5\n')
-    found = read_sensor_file(mine)
-    assert (found.name, found.camera.gain, found.camera.dark_noise, found.lens.psf_px) == ("mine", 0.26, 3.0, 0.5)
-    assert found.rig == read_sensor_file("ctrack780").rig
-
-
-@pytest.mark.parametrize(
-    ("basis", "message"),
-    [
-        ('"ctrack78"', r"mine.toml: based_on: unknown sensor .*ctrack78.*ctrack780"),
-        ('"mine.toml"', "which is itself based on 'mine.toml': name a sensor whose file is complete"),
-        ('"ctrack780_29hz"', "which is itself based on 'ctrack780'"),
-        ("3", "based_on: Input should be a valid string"),
-    ],
-)
-def test_a_bad_basis_is_refused(tmp_path, basis, message):
-    """One level only: neither a chain nor a circle."""
-    mine = tmp_path / "mine.toml"
-    mine.write_text(f'name = "mine"\nbased_on = {basis}\n')
-    with pytest.raises(cmmsim.SensorFileError, match=message):
-        read_sensor_file(mine)
-
-
-@pytest.mark.parametrize(
-    ("entry", "message"),
-    [
-        ("dropout = 1.1", "timing.dropout: .*less than or equal to 1"),
-        ("dropout = -0.1", "timing.dropout: .*greater than or equal to 0"),
-        ("latency = 0.01\nlatency_jitter = 0.02", r"timing: latency_jitter 0.02 s is larger than latency 0.01 s$"),
-        ("exposure = 0.02", r"timing: exposure 0.02 s is longer than a frame of 60 Hz, 0.01667 s$"),
-    ],
-)
-def test_contradictions_in_the_timing_are_refused(tmp_path, entry, message):
-    mine = tmp_path / "mine.toml"
-    mine.write_text(f'name = "mine"\nbased_on = "ctrack780"\n[timing]\n{entry}\n')
-    with pytest.raises(cmmsim.SensorFileError, match=message):
-        read_sensor_file(mine)
+def dropping(probability, seed=0):
+    """A sensor with a dropout, which sees the platform and little else."""
+    return exact("perfect", CROPPED | {"timing.dropout": probability}, seed=seed)
 
 
 @pytest.mark.parametrize("jitter", [0.002, 0.008, 0.020])
@@ -118,7 +50,7 @@ def test_the_acceptance_test_of_latency_finds_the_jitter():
     assert found.resolution < 1e-4
 
 
-def test_frames_drop_out_as_often_as_stated_and_independently(dropping):
+def test_frames_drop_out_as_often_as_stated_and_independently():
     sensor = dropping(0.3)
     lost = np.array([not sensor.measure(sensor.home).ok for _ in range(400)])
     low, high = stats.binom.interval(0.999, 400, 0.3)
@@ -127,7 +59,7 @@ def test_frames_drop_out_as_often_as_stated_and_independently(dropping):
     assert low <= (lost[::2] & lost[1::2]).sum() <= high
 
 
-def test_a_dropped_frame_says_so_and_the_same_seed_drops_the_same(dropping):
+def test_a_dropped_frame_says_so_and_the_same_seed_drops_the_same():
     sensor = dropping(1.0)
     measured = sensor.measure(sensor.home)
     assert not measured.ok
@@ -139,9 +71,9 @@ def test_a_dropped_frame_says_so_and_the_same_seed_drops_the_same(dropping):
     assert patterns[0] == patterns[1] != patterns[2]
 
 
-def test_the_images_of_other_frames_are_the_same_with_and_without_dropout(dropping):
+def test_the_images_of_other_frames_are_the_same_with_and_without_dropout():
     """Six frames of which some drop out, then one more: the same grey values, noise and all."""
-    corners = np.array([[[900, 700], [1000, 800]], [[950, 700], [1100, 800]]])
+    corners = np.array([[[400, 300], [450, 320]], [[410, 300], [480, 330]]])
     grey = []
     for probability in (0.0, 0.5, 1.0):
         sensor = dropping(probability, seed=5)
@@ -153,7 +85,7 @@ def test_the_images_of_other_frames_are_the_same_with_and_without_dropout(droppi
     assert not np.array_equal(grey[0], sensor.look(sensor.home).windows(corners, 16))
 
 
-def test_after_dropped_frames_the_moving_platform_is_measured_again_at_once(dropping, moving_path):
+def test_after_dropped_frames_the_moving_platform_is_measured_again_at_once(moving_path):
     sensor, lost = dropping(0.4), 0
     for pose in moving_path(60):
         measured = sensor.measure(pose)

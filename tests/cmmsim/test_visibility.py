@@ -33,8 +33,3 @@ def test_expected_covariance_is_the_one_the_taught_sensor_states(method, taught_
     expected = expected_covariance("ctrack780", HOME, method)
     deviations = np.sqrt(np.diag(expected) / np.diag(stated))
     np.testing.assert_allclose(deviations, 1.0, atol=0.05)
-
-
-@pytest.fixture(scope="module")
-def taught_analytic():
-    return cmmsim.load_sensor("ctrack780", renderer="analytic").teach()

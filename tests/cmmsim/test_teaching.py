@@ -1,0 +1,208 @@
+"""Teaching: the frames and windows that it finds, and which sensors may take over what another one was taught."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import cmmsim
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.geometry.pose import apply, invert, rotation_log
+from cmmsim.geometry.registration import rigid_start
+from cmmsim.teaching import exactly_taught, radius_at, window_sizes
+
+TAUGHT = exactly_taught(read_sensor_file("ctrack780"))
+UM_AND_URAD = np.array([1e6] * 6)
+WIDE_RINGS = {"stickers.ring_radius": 0.012}
+LARGER = [
+    pytest.param(WIDE_RINGS | {"stickers.radius": 0.0035}, id="radius 3.5 mm", marks=pytest.mark.thorough),
+    pytest.param(WIDE_RINGS | {"stickers.radius": 0.0045}, id="radius 4.5 mm", marks=pytest.mark.slow),
+    pytest.param({"rig.distance": 1.0, "rig.height": 2200}, id="distance 1 m", marks=pytest.mark.slow),
+]
+
+
+def load(changes=None, taught=TAUGHT, name="ctrack780"):
+    return cmmsim.load_sensor(name, taught=taught, changes=changes)
+
+
+@pytest.mark.rendering
+def test_teaching_error_is_as_stated(sensor, taught):
+    """The taught frames against the true ones: small, and within what the teaching covariance states."""
+    frame = rigid_start(sensor.truth.platform_places, taught.platform_places)
+    error = {"platform": frame, "base": taught.base_from_camera @ invert(sensor.truth.base_from_camera)}
+    stated = {"platform": taught.platform_covariance, "base": taught.base_covariance}
+    for name, transform in error.items():
+        values = np.concatenate([transform[:3, 3], rotation_log(transform[:3, :3])])
+        assert np.all(np.abs(values) * UM_AND_URAD < [2, 2, 2, 10, 10, 10]), (name, values)
+        assert values @ np.linalg.solve(stated[name], values) < 22.5, (name, values)  # one in a thousand
+    total = np.sqrt(np.diag(taught.calibration_covariance(sensor.home))) * UM_AND_URAD
+    assert np.all(total < [2, 2, 2, 10, 10, 10])
+
+
+@pytest.mark.rendering
+@pytest.mark.parametrize(
+    ("seed", "frames"),
+    [
+        pytest.param(1, 100, marks=pytest.mark.slow),
+        *(pytest.param(seed, 600, marks=pytest.mark.thorough) for seed in (1, 2, 3)),
+    ],
+)
+def test_teaching_is_repeatable_and_unbiased(seed, frames, moving_path):
+    sensor = cmmsim.load_sensor("ctrack780", seed=seed)
+    steps: list[tuple[int, int]] = []
+    sensor.teach(lambda done, total: steps.append((done, total)))
+    assert steps[0][0] == 0
+    assert steps[-1][0] == steps[-1][1]
+    path = moving_path(600)[:: 600 // frames]
+    errors = np.array([sensor.measure(pose).pose for pose in path]) - path
+    assert np.all(np.isfinite(errors))
+    assert np.all(np.abs(errors.mean(axis=0)) * UM_AND_URAD < [2, 2, 2, 10, 10, 10])
+    assert np.all(np.sqrt((errors**2).mean(axis=0)) * UM_AND_URAD < [6, 6, 6, 40, 40, 40])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rig.target": [0.30, 0.0, 0.185]}, r"rig.target \[0.3, 0.0, 0.18\] there, \[0.3, 0.0, 0.185\] here"),
+        ({"rig.distance": 1.5}, r"rig.position \[1.44, 0.0, 1.28\] there, \[1.37"),
+        ({"rig.baseline": 0.8}, "rig.baseline 1.0 there, 0.8 here"),
+        (
+            {"rig.left": {"focal_px": [2301.0, 2301.0], "centre_px": [1023.5, 767.5]}},
+            "rig.left.centre_px nothing there",
+        ),
+        (
+            {"rig.right_from_left": {"translation": [-0.9, 0.0, 0.3], "rotation_vector": [0.0, 0.6, 0.0]}},
+            "right_from_left",
+        ),
+        ({"stickers.placement_seed": 781}, "stickers.placement_seed 780 there, 781 here"),
+        ({"base.planes.A.point": [0.0, 0.0, 0.181]}, "base.planes.A.point"),
+        ({"stickers.per_plane": 4}, "platform.planes.A.stickers .* platform.planes.C.stickers"),
+    ],
+)
+def test_what_another_sensor_was_taught_is_refused_with_what_differs(changes, message):
+    with pytest.raises(cmmsim.TeachingError, match=message) as refusal:
+        load(changes)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"camera.dark_noise": 3.0, "camera.bit_depth": 12, "camera.prnu": 0.01},
+        {"timing.exposure": 0.001, "timing.frame_rate": 29.0},
+        {"lens.psf_px": 0.5, "lens.vignetting": 0.2},
+        {"detection": {"detector": "dual_conic"}, "renderer": "analytic"},
+        {"rig.distance": 1.5841717078650281},  # where it stands anyway
+    ],
+)
+def test_what_does_not_change_teaching_may_differ(changes):
+    assert load(changes).taught is TAUGHT
+
+
+def test_a_sensor_based_on_another_takes_what_that_was_taught():
+    assert load(name="ctrack780_29hz").taught is TAUGHT
+
+
+def test_teaching_states_its_setup(taught_analytic):
+    taught = taught_analytic
+    assert taught.setup == TAUGHT.setup
+    assert load(taught=pickle.loads(pickle.dumps(taught))).taught.setup == TAUGHT.setup
+
+
+def test_one_put_together_by_hand_needs_the_name_and_all_stickers():
+    by_hand = replace(TAUGHT, setup="")
+    assert load(taught=by_hand).taught is by_hand
+    with pytest.raises(cmmsim.TeachingError, match="'ctrack780', not to 'ctrack780_29hz'"):
+        load(taught=by_hand, name="ctrack780_29hz")
+    with pytest.raises(cmmsim.TeachingError, match="holds 18 stickers of the platform, sensor 'ctrack780' has 12"):
+        load({"stickers.per_plane": 4}, taught=by_hand)
+
+
+def test_one_kept_from_before_setups_were_stated_still_loads():
+    old = pickle.dumps(TAUGHT)
+    state = dict(TAUGHT.__dict__)
+    del state["setup"]
+    again = pickle.loads(old)
+    again.__dict__.clear()
+    again.__dict__.update(state)
+    assert load(taught=again).taught is again
+
+
+def test_arrays_of_another_shape_are_refused():
+    with pytest.raises(cmmsim.ShapeError, match=r"place_covariances must have the shape \(17, 3, 3\), got \(18"):
+        replace(TAUGHT, platform_places=TAUGHT.platform_places[1:])
+
+
+def teaching_itself(changes):
+    return cmmsim.load_sensor("ctrack780", seed=2, renderer="analytic", changes=changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sizes"),
+    [
+        ({}, (14, 12)),
+        ({"stickers.radius": 0.002}, (14, 12)),
+        ({"rig.distance": 3.0}, (14, 12)),
+        ({"lens.psf_px": 0.6}, (16, 14)),
+        ({"timing.exposure": 0.004}, (16, 14)),
+    ],
+)
+def test_the_built_in_stickers_and_smaller_ones_get_the_smallest_windows(changes, sizes):
+    settings = teaching_itself(changes).settings
+    assert (settings.window_size, settings.fit_size) == sizes
+
+
+def test_windows_of_teaching_grow_as_those_of_measuring():
+    smallest, larger = window_sizes(3.0, 4.0, 0.0, False), window_sizes(12.0, 4.0, 0.0, False)
+    assert (smallest.fit, smallest.growth) == (12, 1.0)
+    plan, grown = smallest.plan(), larger.plan()
+    assert (plan.base_window, plan.first_window, plan.platform_window) == (20, 24, 16)
+    for name in ("base_window", "first_window", "platform_window"):
+        assert getattr(grown, name) == pytest.approx(getattr(plan, name) * larger.fit / 12, abs=1)
+
+
+def test_a_sticker_s_image_is_as_large_as_its_distance_makes_it():
+    """A disc that faces a camera looks focal length * radius / distance large; the cameras stand half a metre aside."""
+    sensor = load()
+    found = radius_at(sensor.rig, invert(sensor.truth.base_from_camera), np.array([0.3, 0.0, 0.18]), 0.003)
+    assert found == pytest.approx(2300.0 * 0.003 / np.hypot(1.5841717, 0.5), rel=1e-6)
+
+
+@pytest.mark.parametrize("factor", [1.5, 2.0, 4.0])
+def test_what_is_fitted_holds_a_sticker_that_is_a_fifth_nearer(factor):
+    """A disc that faces a camera looks focal length * radius / distance large; its middle is rounded to a pixel."""
+    sensor = teaching_itself({"stickers.radius": 0.003 * factor, "stickers.ring_radius": 0.009 * factor})
+    nearest = 0.82 * np.hypot(1.5841717, 0.5)
+    reach = 2300.0 * 0.003 * factor / nearest + 0.5
+    assert reach < 0.5 * sensor.settings.fit_size < 1.3 * reach + 1.0
+    assert sensor.settings.window_size >= sensor.settings.fit_size + 2
+
+
+@pytest.mark.parametrize("changes", LARGER)
+def test_larger_stickers_are_taught_and_measured_with_a_true_covariance(changes, moving_path):
+    """150 frames: their mean squared error, normalised by the stated covariances, is 6 with a deviation of 0.28."""
+    sensor, path = teaching_itself(changes), moving_path(150)
+    found = [sensor.measure(pose) for pose in path]
+    assert [m.reason for m in found if not m.ok] == []
+    assert min(len(m.target_ids) for m in found) >= 17
+    errors = np.array([m.pose for m in found]) - path
+    spread = np.array([m.covariance for m in found]) + sensor.taught.calibration_covariance(sensor.home)
+    squared = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(spread), errors)
+    assert squared.mean() == pytest.approx(6.0, abs=1.0), squared.mean()
+
+
+def test_teaching_names_the_stickers_that_no_image_shows():
+    """One metre from the middle of platform and base, the lower stickers of the base lie below both images."""
+    sensor = teaching_itself({"rig.distance": 1.0})
+    places = apply(invert(sensor.truth.base_from_camera), sensor.base.nominal)
+    below = sensor.base.sticker_ids[~sensor.rig.project(places)[1].all(axis=0)]
+    with pytest.raises(cmmsim.TeachingError, match=f"; {', '.join(below)} lie outside of an image"):
+        sensor.teach()
+
+
+def test_planes_that_meet_in_no_point_cannot_be_taught():
+    sensor = teaching_itself({"platform.planes.B.normal": [0.0, 0.0, 1.0]})
+    with pytest.raises(cmmsim.TeachingError, match=r"planes A, B and C meet in no point.*volume of 0") as error:
+        sensor.teach()
+    assert "\n" not in str(error.value)
