@@ -1,11 +1,10 @@
 """The figures that the README quotes, and the files that keep them.
 
-    pytest tests/benchmarks -m "slow or not slow" --dynamics-figures .readme/dynamics.json
-    pytest tests/benchmarks -m "slow or not slow" --sensor-figures .readme/sensor.json
+    pytest tests/benchmarks -m thorough --dynamics-figures .readme/dynamics.json --sensor-figures .readme/sensor.json
 
-measure them again, on a machine with nothing else to do. A file is written when each of its figures was measured and
-its goal reached; otherwise it stays as it was. The README's tables then take the new figures over: `pytest
-tests/test_readme.py` prints the rows that it wants.
+(a part of `sh .ci/thorough`) measure them again, on a machine with nothing else to do. A file is written when each of
+its figures was measured and its goal reached; otherwise it stays as it was. The README's tables then take the new
+figures over: `pytest tests/test_readme.py` prints the rows that it wants.
 """
 
 import json

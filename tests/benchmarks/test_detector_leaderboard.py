@@ -1,7 +1,5 @@
 """The leaderboard of detectors: the default one works at the Cramer-Rao bound, and no unbiased one beats it."""
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -38,10 +36,12 @@ def test_working_point_is_what_the_sensor_sees():
     assert 0.02 < point.noise < 0.035
 
 
+@pytest.mark.slow
 def test_all_detectors_and_both_peers_compete(at_work):
     assert list(at_work) == [*DETECTORS, *(peer.name for peer in PEERS)]
 
 
+@pytest.mark.slow
 def test_default_detector_is_the_closest_to_the_bound_at_the_working_point(at_work):
     default = at_work[DEFAULT_DETECTOR]
     assert min(at_work.values(), key=lambda score: score.ratio) is default
@@ -49,6 +49,7 @@ def test_default_detector_is_the_closest_to_the_bound_at_the_working_point(at_wo
     assert default.lost == 0.0
 
 
+@pytest.mark.slow
 def test_unbiased_detector_does_not_beat_the_bound(at_work):
     default = at_work[DEFAULT_DETECTOR]
     assert default.bias_px < 0.01 * default.bound_px
@@ -78,7 +79,7 @@ def test_one_draw_is_refused():
 
 
 @pytest.mark.slow
-def test_default_detector_stays_at_the_bound_over_all_conditions(capsys):
+def test_default_detector_stays_at_the_bound_over_all_conditions():
     """Radius 2.5 to 10 px, noise 0.2 to 5 %, tilt 0 to 60 degrees; some blurred."""
     conditions = [
         Condition(radius, np.radians(tilt), noise)
@@ -88,16 +89,6 @@ def test_default_detector_stays_at_the_bound_over_all_conditions(capsys):
     ]
     conditions += [Condition(radius, np.radians(45.0), noise, 0.6) for radius in (2.5, 10.0) for noise in (0.002, 0.05)]
     scores = compete(SCENE, conditions, 400, np.random.default_rng(5))
-    lines = [
-        f"  {s.condition.radius_px:5.1f} px {np.degrees(s.condition.tilt):3.0f} deg "
-        f"{100 * s.condition.noise:4.1f} % psf {s.condition.psf_px:.1f} {s.detector:<19} "
-        f"bound {s.bound_px:.5f} rms {s.rms_px:.5f} px, "
-        f"ratio {s.ratio:7.3f} [{s.ratio_low:.3f}, {s.ratio_high:.3f}], bias {s.bias_px:.5f}, "
-        f"lost {s.lost:.1%}"
-        for s in scores
-    ]
-    with capsys.disabled():
-        sys.stdout.write("\n".join(["\ndetectors:", *lines, ""]))
     for score in (s for s in scores if s.detector == DEFAULT_DETECTOR):
         assert wide_interval(score)[1] <= LIMIT, score
         assert wide_interval(score)[1] >= 1.0, score

@@ -5,13 +5,8 @@ own with the very step of the peer's model; so it shows what a tool makes of a p
 is, and of one that it does not. Where one figure is asked for, the peer is quoted with the plant that it does better
 on. Both tools get 1.4 times the truth as first guess; this package starts from a linear fit, and the guess only scales
 its steps. Two excitations: sines as in the peer's tests, and the one that this package designs.
-
-    ALL_SEEDS=1 pytest tests/benchmarks/test_sysid_peer.py -m slow
-
-takes ten noise seeds everywhere and a hundred for the coverage, and shows the peer with fourth-order steps.
 """
 
-import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,17 +18,15 @@ from tests.benchmarks.servo_estimator import ServoProblem, estimate, standard_de
 from tests.benchmarks.servo_experiment import designed_commands, measure, run, sine_commands, truth
 from tests.benchmarks.timing import OtherLoad, judge
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.thorough
 peer = pytest.importorskip(
     "tests.benchmarks.mujoco_sysid_peer", reason="needs mujoco.sysid: pip install 'mujoco[sysid]'", exc_type=ImportError
 )
 
-ALL = bool(os.environ.get("ALL_SEEDS"))
 SINES, DESIGN = EXCITATIONS = "its sines", "our design"
 EXACT, MUJOCO = PLANTS = "exact plant", "MuJoCo plant"
 OURS, PEER, RK4 = "this package", "mujoco.sysid", "mujoco.sysid, RK4"
-SEEDS = {SINES: 10 if ALL else 3, DESIGN: 10 if ALL else 1}
-COVERAGE_SEEDS = 100 if ALL else 15
+SEEDS, COVERAGE_SEEDS = 10, 100
 GUESS = 1.4
 
 
@@ -100,14 +93,13 @@ def rows(commands, plants):
     with OtherLoad() as load:
         for (excitation, plant), poses in plants.items():
             driven, both = commands[excitation], {OURS: [], PEER: []}
-            for seed in range(SEEDS[excitation]):
+            for seed in range(SEEDS):
                 seen = measure(poses, np.random.default_rng(seed))
                 both[OURS].append(estimate(driven, seen.pose, guess))
                 both[PEER].append(peer.estimate(driven, seen, guess))
             found |= {(excitation, plant, tool): Row.of(estimates) for tool, estimates in both.items()}
-        if ALL:
-            seen = measure(plants[SINES, EXACT], np.random.default_rng(0))
-            found[SINES, EXACT, RK4] = Row.of([peer.estimate(commands[SINES], seen, guess, "RK4")])
+        seen = measure(plants[SINES, EXACT], np.random.default_rng(0))
+        found[SINES, EXACT, RK4] = Row.of([peer.estimate(commands[SINES], seen, guess, "RK4")])
     return found, load
 
 
@@ -126,15 +118,11 @@ def best_of_peer(rows, excitation):
     return min((rows[excitation, plant, PEER] for plant in PLANTS), key=lambda row: row.error)
 
 
-def show(capsys, *lines):
-    with capsys.disabled():
-        print("", *lines, sep="\n  ")  # noqa: T201
-
-
-def test_it_takes_at_most_a_fifth_of_the_peers_time(rows, capsys):
+def test_it_takes_at_most_a_fifth_of_the_peers_time(rows, record_property):
     """Medians with the peer's sines; of the peer's two plants the one that it is faster on."""
     found, load = rows
-    show(capsys, *[f"{', '.join(key):39} {row}" for key, row in found.items()])
+    for key, row in found.items():
+        record_property(", ".join(key), str(row))
     theirs = min(found[SINES, plant, PEER].time for plant in PLANTS)
     ours = found[SINES, EXACT, OURS].time
     judge(ours <= theirs / 5, f"{ours:.2f} s, mujoco.sysid {theirs:.2f} s: {ours / theirs:.3f}, goal 0.2", load)
@@ -146,25 +134,22 @@ def test_its_error_with_the_peers_sines_is_no_larger(rows):
     assert found[SINES, EXACT, OURS].error <= best_of_peer(found, SINES).error
 
 
-def test_its_error_on_our_design_is_a_fifth_of_the_peers_on_the_same_plant(rows, capsys):
+def test_its_error_on_our_design_is_a_fifth_of_the_peers_on_the_same_plant(rows, record_property):
     """On the exact plant, which the peer's steps of 1 ms only approximate. On data of its own simulator the peer comes
     to the Cramér-Rao bound as we do on ours; nothing can be five times better than that, and the ratio is only shown.
     """
     found, _ = rows
     ours, exact, best = found[DESIGN, EXACT, OURS], found[DESIGN, EXACT, PEER], best_of_peer(found, DESIGN)
-    show(
-        capsys,
-        f"{DESIGN}: {ours.error / exact.error:.3f} times the peer's error on the same plant, "
-        f"{ours.error / best.error:.2f} times that on its own simulation, "
-        f"{ours.error / best_of_peer(found, SINES).error:.2f} times that with its sines there",
-    )
+    record_property("over the peer's error on the same plant", ours.error / exact.error)
+    record_property("over its error on its own simulation", ours.error / best.error)
+    record_property("over that with its sines", ours.error / best_of_peer(found, SINES).error)
     assert ours.error <= exact.error / 5
 
 
-def test_95_percent_intervals_cover_93_to_97_percent(many, capsys):
+def test_95_percent_intervals_cover_93_to_97_percent(many, record_property):
     """Both excitations together, as far as so many intervals can tell."""
     words, low, high = coverage(np.concatenate([row.covered for row in many.values()]))
-    show(capsys, f"intervals of this package cover {words}")
+    record_property("intervals cover", words)
     assert low <= 0.97
     assert high >= 0.93
 

@@ -1,8 +1,9 @@
 """Timing that other load disturbs least, and what a figure is worth on a machine that is not free.
 
-Figures are ratios of fastest rounds, taken in turn. On a free machine a goal is reached or missed. Where others take a
-part of the cores a missed goal is skipped, with what was measured of them; where they leave no whole core a reached one
-is skipped too, as that flatters: what takes longer is interrupted more, and more threads get a larger share.
+Goals are ratios of fastest rounds in one run, taken in turn; times alone are recorded and never judged. On a free
+machine a goal is reached or missed. Where others take a part of the cores a missed goal is skipped, with what was
+measured of them; where they leave no whole core a reached one is skipped too, as that flatters: what takes longer is
+interrupted more, and more threads get a larger share.
 """
 
 import os
@@ -10,18 +11,16 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
-
-TICKS_PER_SECOND = os.sysconf("SC_CLK_TCK")
 
 FREE = 0.25
 """Cores that others may take on a free machine; half of it where all cores are timed."""
 
 WHOLE_SECOND_CORE = 1.9
-"""Least gain of the calibration loop from the second core; two threads of one physical core stay far below."""
+"""Least gain of a loop from the second core; two threads of one physical core stay far below."""
 
 
 def seconds(function: Callable[[], object]) -> float:
@@ -40,25 +39,15 @@ def fastest(rounds: dict[str, Callable[[], object]], count: int) -> dict[str, fl
     return best
 
 
-REFERENCE_SECONDS = 0.026
-"""Fastest `calibration` on the machine whose absolute figures are the goals."""
-
-
-def calibration() -> object:
-    """A fixed piece of work in NumPy and Python on one core."""
+def plain_work() -> object:
+    """A fixed piece of work in NumPy and Python on one core, by which others can be measured."""
     values = np.random.default_rng(0).standard_normal(200_000)
     return np.sort(values)[0] + sum(k * k for k in range(300_000))
 
 
-def slowness() -> float:
-    """How many times slower this machine is than the one of the absolute goals; at least 1, so that none is eased on a
-    fast machine."""
-    return max(1.0, fastest({"work": calibration}, 15)["work"] / REFERENCE_SECONDS)
-
-
 @dataclass(frozen=True)
 class CoreTime:
-    """Wall time, time in which cores were busy, and what of it this process and its ended children took, all in s."""
+    """Wall time, time in which cores were busy, and what of it this process and its children took, all in s."""
 
     wall: float
     busy: float
@@ -66,19 +55,15 @@ class CoreTime:
 
     @classmethod
     def now(cls) -> "CoreTime":
-        """The present reading."""
-        used = os.times()
-        return cls(time.perf_counter(), busy_seconds(Path("/proc/stat").read_text()), sum(used[:4]))
+        """The present reading; what a hypervisor stole counts as busy, of the children also those that live on."""
+        cores, here = psutil.cpu_times(), psutil.Process()
+        own = sum(here.cpu_times()[:4]) + sum(sum(child.cpu_times()[:2]) for child in here.children(recursive=True))
+        busy = cores.user + cores.nice + cores.system + cores.irq + cores.softirq + cores.steal
+        return cls(time.perf_counter(), busy, own)
 
     def others_until(self, later: "CoreTime") -> float:
         """Cores that others kept busy between two readings, on average."""
         return max(0.0, (later.busy - self.busy) - (later.own - self.own)) / (later.wall - self.wall)
-
-
-def busy_seconds(stat: str) -> float:
-    """Time in which cores were not idle, from the text of /proc/stat; what a hypervisor stole counts as busy."""
-    user, nice, system, _idle, _iowait, irq, softirq, steal = (int(word) for word in stat.split()[1:9])
-    return (user + nice + system + irq + softirq + steal) / TICKS_PER_SECOND
 
 
 class OtherLoad:
@@ -115,6 +100,11 @@ def second_core_gain() -> float:
 
     best = fastest({"one": work, "two": both}, 5)
     return 2 * best["one"] / best["two"]
+
+
+def resident_bytes() -> int:
+    """Memory in use now; the peak of the process would hide growth below what earlier tests took."""
+    return psutil.Process().memory_info().rss
 
 
 def judge(reached: bool, figure: str, load: OtherLoad, disturbed: str = "") -> None:

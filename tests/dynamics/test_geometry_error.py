@@ -6,7 +6,7 @@ from scipy.optimize import fsolve
 from scipy.stats import chi2
 
 from dynamics import closed_loop
-from dynamics.errors import RobotFileError, SimulationError
+from dynamics.errors import RobotFileError
 from dynamics.robot import with_geometry_error
 
 ERROR = 1e-4
@@ -101,11 +101,3 @@ def test_both_paths_agree_and_the_servos_ignorance_matters(loop, robot, plant, i
     assert np.abs(ours.pose - knowing.pose).max() > 1e-7
     same = loop.run(reference, settings, servo_robot=robot)
     np.testing.assert_array_equal(same.pose, loop.run(reference, settings).pose)
-
-
-def test_sensitivities_need_a_servo_that_knows_the_robot(loop, robot, identified):
-    arguments = (robot, identified, loop.reference(5), loop.settings())
-    with pytest.raises(SimulationError, match="pass servo_robot=None"):
-        closed_loop.simulate(*arguments, servo_robot=robot, sensitivities=True)
-    with pytest.raises(SimulationError, match="servo_robot must be of type Robot"):
-        closed_loop.simulate(*arguments, servo_robot="rss6")
