@@ -16,15 +16,13 @@ from cmmsim.acceptance.artefacts import (
     HALF_WIDTH,
     SensorUnderTest,
     estimator_of,
-    facing_rotation,
     locate,
-    pose_in_base,
     rigid_bar,
 )
 from cmmsim.acceptance.statistics import Interval, interval_of_mean
 from cmmsim.acceptance.volume import MeasuringVolume
 from cmmsim.errors import AcceptanceError, ShapeError
-from cmmsim.geometry.pose import Array
+from cmmsim.geometry.pose import Array, apply
 from cmmsim.tracker import Tracker
 
 STREAM = 201
@@ -121,16 +119,15 @@ def latency_test(
     require_room(volume)
     sensor = under_test.facing(rigid_bar(), STREAM)
     estimator = estimator_of(sensor, sensor.platform, under_test.base_from_camera)
-    facing = facing_rotation(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0]))
 
     def pose(time: float) -> Array:
-        return pose_in_base(volume.base_from_volume, facing, _circle(np.array([time]))[0])
+        return volume.pose(np.array([1.0, 0.0, 0.0]), _circle(np.array([time]))[0])
 
     def rate(time: float) -> Array:
         return (pose(time + STEP) - pose(time - STEP)) / (2.0 * STEP)
 
     def motion(times: Array) -> Array:
-        return _circle(times) @ volume.base_from_volume[:3, :3].T + volume.base_from_volume[:3, 3]
+        return apply(volume.base_from_volume, _circle(times))
 
     locate(estimator, sensor.look(pose(0.0)))
     tracker = Tracker(estimator)
@@ -143,14 +140,9 @@ def latency_test(
     if good.sum() < 4:
         raise AcceptanceError(f"latency: {good.sum()} of {frames} frames are measured: {measured[-1].reason}")
     reported = (taken + sensor.timing.drawn_latencies(frames, np.random.default_rng([under_test.seed, STREAM])))[good]
-    kept = [m for m in measured if m.ok]
-    latency = estimate_latency(
-        reported,
-        np.array([m.pose[:3] for m in kept]),
-        motion,
-        0.5 * PERIOD,
-        np.array([m.covariance[:3, :3] for m in kept]),
-    )
+    positions = np.array([m.pose[:3] for m in measured])[good]
+    covariances = np.array([m.covariance[:3, :3] for m in measured])[good]
+    latency = estimate_latency(reported, positions, motion, 0.5 * PERIOD, covariances)
     return LatencyTest(latency, reported, sensor.timing.latency, 1.0 / sensor.timing.frame_rate, int((~good).sum()))
 
 
@@ -163,10 +155,7 @@ def _circle(times: Array) -> Array:
 def _coarse_delay(reported: Array, positions: Array, motion: Motion, largest: float) -> float:
     """The best of a grid of common delays."""
     grid = np.linspace(0.0, largest, 101)
-    misfit = []
-    for delay in grid:
-        residuals = positions - motion(reported - delay)
-        misfit.append(np.sum((residuals - residuals.mean(axis=0)) ** 2))
+    misfit = [np.var(positions - motion(reported - delay), axis=0).sum() for delay in grid]
     return float(grid[int(np.argmin(misfit))])
 
 

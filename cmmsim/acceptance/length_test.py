@@ -13,16 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmmsim.acceptance.artefacts import (
-    SensorUnderTest,
-    StickerRow,
-    board,
-    estimator_of,
-    facing_rotation,
-    locate,
-    observe_stickers,
-    pose_in_base,
-)
+from cmmsim.acceptance.artefacts import SensorUnderTest, board, estimator_of, locate, observe_stickers
 from cmmsim.acceptance.volume import MeasuringLine, MeasuringVolume, seven_lines
 from cmmsim.errors import AcceptanceError
 from cmmsim.files.schema import Platform
@@ -91,9 +82,9 @@ def length_artefact(line: MeasuringLine) -> Platform:
     longest = float(line.lengths.max())
     along = np.concatenate([[0.0], line.lengths]) - 0.5 * longest
     return board(
-        StickerRow(along, np.zeros(len(along))),
-        StickerRow(longest * np.array(RECOGNITION_B), RECOGNITION_ACROSS),
-        StickerRow(longest * np.array(RECOGNITION_C), RECOGNITION_ACROSS),
+        (along, np.zeros(len(along))),
+        (longest * np.array(RECOGNITION_B), RECOGNITION_ACROSS),
+        (longest * np.array(RECOGNITION_C), RECOGNITION_ACROSS),
     )
 
 
@@ -118,8 +109,7 @@ def length_test(
 
 def measure_line(sensor: Sensor, volume: MeasuringVolume, line: MeasuringLine, exposures: int) -> list[MeasuredLength]:
     """The lengths of one line, whose artefact the sensor faces, from ``exposures`` pictures."""
-    rotation = facing_rotation(line.direction, np.array([0.0, 0.0, -1.0]))
-    pose = pose_in_base(volume.base_from_volume, rotation, 0.5 * (line.start + line.end))
+    pose = volume.pose(line.direction, 0.5 * (line.start + line.end))
     estimator = estimator_of(sensor, sensor.platform)
     expected = locate(estimator, sensor.look(pose))
     count = 1 + len(line.lengths)  # the row comes first among the stickers

@@ -1,9 +1,9 @@
 """Relative pose error of a moving rigid bar in the style of ASTM E3064-16.
 
-How the bar is moved: two rasters in three orientations of the bar, after standing still where each begins.
-As in ASTM E3064-16 one raster goes to and fro along the volume's x axis while it advances along y, the other the other
-way round, and the bar is held in three orientations. It is not held along the line of sight, where flat stickers cannot
-be seen, but turned by ``TOWARDS_DEPTH`` from the image plane. On top of that it turns smoothly about all its axes.
+The bar moves along two rasters in three orientations, after standing still where each begins. One raster goes to and
+fro along the volume's x axis while it advances along y, the other the other way round. The bar is not held along the
+line of sight, where flat stickers cannot be seen, but turned by ``TOWARDS_DEPTH`` from the image plane. On top of that
+it turns smoothly about all its axes.
 
 The sensor measures the poses of the clusters at both ends in the same exposure. What the second is to the first is
 certified; the difference to what was measured is the error, of a bar that stands and of one that moves.
@@ -24,15 +24,21 @@ from cmmsim.acceptance.artefacts import (
     SensorUnderTest,
     bar_ends,
     estimator_of,
-    facing_rotation,
     locate,
-    pose_in_base,
-    relative_pose,
     rigid_bar,
 )
 from cmmsim.acceptance.volume import MeasuringVolume
 from cmmsim.errors import AcceptanceError
-from cmmsim.geometry.pose import Array, euler_rates_matrix, pose_to_transform, rotation_exp, rotation_log, skew
+from cmmsim.geometry.pose import (
+    Array,
+    compose_covariance,
+    euler_rates_matrix,
+    invert,
+    pose_to_transform,
+    rotation_exp,
+    rotation_log,
+    skew,
+)
 from cmmsim.pose_estimation.estimator import Measurement
 from cmmsim.sensor import Sensor
 from cmmsim.tracker import Tracker
@@ -44,6 +50,9 @@ TURN_CYCLES = np.array([1.0, 1.5, 0.5])
 TOWARDS_DEPTH = np.deg2rad(35.0)
 STEP = 1e-4  # s, of the difference quotient of a path
 SPEED_SAMPLES = 100
+STREAM = 101
+STANDING = 15  # exposures of the standing bar before each run
+GIVEN_UP = 5  # frames lost in a row end a run: each costs a search of whole images, and the rest would be lost as well
 RASTERS = {"x": 0, "y": 1}
 ORIENTATIONS = {
     "along x": np.array([1.0, 0.0, 0.0]),
@@ -67,8 +76,7 @@ class BarPath:
         slow = -np.cos(0.5 * phase) * self.reach
         slow[self.fast] = -np.cos(CYCLES * phase) * self.reach[self.fast]
         turn = rotation_exp(-TURN * np.cos(TURN_CYCLES * phase))
-        rotation = facing_rotation(self.along, np.array([0.0, 0.0, -1.0])) @ turn
-        return pose_in_base(self.volume.base_from_volume, rotation, slow)
+        return self.volume.pose(self.along, slow, turn)
 
     def pose_rate(self, time: float) -> Array:
         """Rate (6,) of the pose, by central differences."""
@@ -104,11 +112,6 @@ def bar_paths(volume: MeasuringVolume) -> tuple[BarPath, ...]:
             needed = " x ".join(f"{2e3 * v:.0f}" for v in room_of_bar(path.along))
             raise AcceptanceError(f"{path.name}: the bar needs {needed} mm, the volume has {volume}")
     return paths
-
-
-STREAM = 101
-STANDING = 15  # exposures of the standing bar before each run
-GIVEN_UP = 5  # frames lost in a row end a run: each costs a search of whole images, and the rest would be lost as well
 
 
 @dataclass(frozen=True)
@@ -197,8 +200,7 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
     for estimator in estimators:
         locate(estimator, sensor.look(path.pose(0.0)))
     trackers = [Tracker(estimator) for estimator in estimators]
-    rows: list[tuple[Array, float, float]] = []
-    seen: list[float] = []
+    rows, seen = [], []
     in_a_row, reason = 0, ""
     for time in times:
         images = sensor.look(path.pose(max(time, 0.0)), pose_rate=path.pose_rate(time) if time > 0.0 else None)
@@ -211,24 +213,17 @@ def bar_run(sensor: Sensor, path: BarPath, times: Array) -> BarRun:
             in_a_row, reason = in_a_row + 1, first.reason or second.reason
             if in_a_row == GIVEN_UP:
                 break
-    if not (np.any(np.array(seen) < 0.0) and np.any(np.array(seen) >= 0.0)):
+    if not (seen and seen[0] < 0.0 <= seen[-1]):
         raise AcceptanceError(f"{path.name}: no frame of the standing or none of the moving bar is measured: {reason}")
     errors, distances, ratios = (np.array(column) for column in zip(*rows, strict=True))
-    return BarRun(
-        path.name,
-        np.array(seen),
-        errors,
-        distances,
-        ratios,
-        len(times) - len(seen),
-        reason if in_a_row == GIVEN_UP else "",
-    )
+    given_up = reason if in_a_row == GIVEN_UP else ""
+    return BarRun(path.name, np.array(seen), errors, distances, ratios, len(times) - len(seen), given_up)
 
 
 def relative_error(first: Measurement, second: Measurement) -> tuple[Array, float, float]:
     """Error (6,) of the second end's pose relative to the first one's, in axes of the first; error of their distance;
     squared error in units of the stated covariance, over six."""
-    measured = relative_pose(first.pose, second.pose)
+    measured = invert(pose_to_transform(first.pose)) @ pose_to_transform(second.pose)
     turn = rotation_log(measured[:3, :3] @ END_FROM_END[:3, :3].T)
     error = np.concatenate([measured[:3, 3] - END_FROM_END[:3, 3], turn])
     distance = float(np.linalg.norm(measured[:3, 3]) - np.linalg.norm(END_FROM_END[:3, 3]))
@@ -238,13 +233,10 @@ def relative_error(first: Measurement, second: Measurement) -> tuple[Array, floa
 
 def relative_covariance(first: Measurement, second: Measurement) -> Array:
     """Covariance (6,6) of the small error [shift, turn] of the relative pose, in axes of the first end."""
-    step = second.pose[:3] - first.pose[:3]
     by_first = -np.eye(6)
-    by_first[:3, 3:] = skew(step)
-    back = np.zeros((6, 6))
-    back[:3, :3] = back[3:, 3:] = pose_to_transform(first.pose)[:3, :3].T
+    by_first[:3, 3:] = skew(second.pose[:3] - first.pose[:3])
     total = by_first @ _small_covariance(first) @ by_first.T + _small_covariance(second)
-    return np.asarray(back @ total @ back.T)
+    return compose_covariance(invert(pose_to_transform(first.pose)), total)
 
 
 def _small_covariance(measurement: Measurement) -> Array:

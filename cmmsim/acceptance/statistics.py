@@ -1,7 +1,7 @@
 """Statistics of errors with 95 % intervals, and the published figures that stand beside ours.
 
-Figures that makers and laboratories have published for real instruments, as they stand beside ours.
-Each comes with its own test, volume and targets; none of them was measured here.
+Published figures are those of makers and laboratories for real instruments. Each comes with its own test, volume and
+targets; none of them was measured here.
 """
 
 from __future__ import annotations
@@ -10,13 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import sem
 from scipy.stats import t as student
 
 from cmmsim.errors import ShapeError
 from cmmsim.geometry.pose import Array
-
-# Statistics of errors with 95 % intervals.
-
 
 LEVEL = 0.95
 RESAMPLES = 1000
@@ -57,9 +55,8 @@ def interval_of_mean(values: Array) -> Interval:
     _require_finite(values)
     if len(values) < 2:
         raise ShapeError("the interval of a mean needs at least two values, got 1")
-    half = float(student.ppf(0.5 + 0.5 * LEVEL, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
-    mean = float(values.mean())
-    return mean - half, mean + half
+    low, high = student.interval(LEVEL, len(values) - 1, loc=values.mean(), scale=sem(values))
+    return float(low), float(high)
 
 
 def _rms(values: Array) -> Array:

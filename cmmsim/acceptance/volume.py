@@ -1,12 +1,8 @@
-"""The measuring volume, wholly seen by both cameras, and the seven measuring lines in it (VDI/VDE 2634-1).
+"""The measuring volume, a cuboid wholly seen by both cameras, and seven lines in it by the rules of VDI/VDE 2634-1.
 
-The measuring volume: a cuboid around the point that both cameras look at, wholly seen by both.
 Volume axes are x to the right and y downwards as the rig sees them, and z away from it along the line from the middle
-of the baseline to the target; the origin is the target.
-
-Seven measuring lines after the rules of VDI/VDE 2634-1, and the check of these rules.
-The four space diagonals have an end in every corner of the volume; one diagonal of each of three faces that meet in a
-corner leads along the outside.
+of the baseline to the target; the origin is the target. Of the lines the four space diagonals have an end in every
+corner of the volume; one diagonal of each of three faces that meet in a corner leads along the outside.
 """
 
 from __future__ import annotations
@@ -20,7 +16,7 @@ import numpy as np
 from cmmsim.errors import AcceptanceError
 from cmmsim.files.schema import Rig
 from cmmsim.files.setup import rig_from_file
-from cmmsim.geometry.pose import Array, apply, invert
+from cmmsim.geometry.pose import Array, apply, invert, rigid, transform_to_pose
 from cmmsim.geometry.stereo_rig import StereoRig
 
 MARGIN_PX = 40.0  # the corners stay this far inside the images: room for the width of the artefacts
@@ -28,6 +24,20 @@ LARGEST_SHARE = 0.8  # the front face stays beyond a fifth of the way from the b
 SMALLEST_SIZE = 0.1  # m; below, the stickers of an artefact do not find room
 CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 CORNERS.setflags(write=False)
+FEWEST_LINES, FEWEST_LENGTHS = 7, 5
+LONGEST_SHARE = 2.0 / 3.0  # of the volume's space diagonal
+USED_SHARE = 0.9  # of a line between the sides of the volume; the rest is room for the ends of the artefact
+LENGTH_SHARES = np.array([0.19, 0.41, 0.6, 0.82, 1.0])  # test lengths of a line, of its longest
+LENGTH_SHARES.setflags(write=False)
+LINES = {  # their ends in half sides of the volume
+    "space 1": ((-1, -1, -1), (1, 1, 1)),
+    "space 2": ((1, -1, -1), (-1, 1, 1)),
+    "space 3": ((-1, 1, -1), (1, -1, 1)),
+    "space 4": ((1, 1, -1), (-1, -1, 1)),
+    "front face": ((-1, 1, -1), (1, -1, -1)),
+    "bottom face": ((-1, 1, -1), (1, 1, 1)),
+    "right face": ((1, 1, -1), (1, -1, 1)),
+}
 
 
 @dataclass(frozen=True)
@@ -49,6 +59,15 @@ class MeasuringVolume:
 
     def __str__(self) -> str:
         return " x ".join(f"{1e3 * side:.0f}" for side in np.ravel(self.size)) + " mm"
+
+    def pose(self, along: Array, position: Array, turn: Array | None = None) -> Array:
+        """Pose (6,) in the base frame of an artefact at ``position`` (3,) m in volume axes, its x axis along ``along``
+        (3,), of any length, and its side A towards the rig; then turned by ``turn`` (3,3) in its own axes."""
+        x, towards = along / np.linalg.norm(along), np.array([0.0, 0.0, -1.0])
+        z = towards - (towards @ x) * x
+        z = z / np.linalg.norm(z)
+        rotation = np.column_stack([x, np.cross(z, x), z])
+        return transform_to_pose(self.base_from_volume @ rigid(rotation if turn is None else rotation @ turn, position))
 
     @property
     def diagonal(self) -> float:
@@ -107,10 +126,7 @@ def _volume_frame(rig: StereoRig, camera_from_base: Array, place: Rig) -> tuple[
     z = view / distance
     x = (centres[1] - centres[0]) - ((centres[1] - centres[0]) @ z) * z
     x /= np.linalg.norm(x)
-    frame = np.eye(4)
-    frame[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    frame[:3, 3] = place.target
-    return frame, distance
+    return rigid(np.column_stack([x, np.cross(z, x), z]), place.target), distance
 
 
 def _unseen(rig: StereoRig, camera_from_volume: Array, size: Array, distance: float) -> str | None:
@@ -135,17 +151,6 @@ def _unseen(rig: StereoRig, camera_from_volume: Array, size: Array, distance: fl
     return None
 
 
-FEWEST_LINES, FEWEST_LENGTHS = 7, 5
-LONGEST_SHARE = 2.0 / 3.0  # of the volume's space diagonal
-USED_SHARE = 0.9  # of a line between the sides of the volume; the rest is room for the ends of the artefact
-LENGTH_SHARES = np.array([0.19, 0.41, 0.6, 0.82, 1.0])  # test lengths of a line, of its longest
-LENGTH_SHARES.setflags(write=False)
-# ends of the lines in half sides of the volume
-SPACE_DIAGONALS = ((-1, -1, -1), (1, -1, -1), (-1, 1, -1), (1, 1, -1))
-FACE_DIAGONALS = (((-1, 1, -1), (1, -1, -1)), ((-1, 1, -1), (1, 1, 1)), ((1, 1, -1), (1, -1, 1)))
-LINE_NAMES = ("space 1", "space 2", "space 3", "space 4", "front face", "bottom face", "right face")
-
-
 @dataclass(frozen=True)
 class MeasuringLine:
     """name; start and end (3,) of the longest test length in volume axes, m; lengths (k,) m from the start."""
@@ -167,13 +172,12 @@ class MeasuringLine:
 
 def seven_lines(volume: MeasuringVolume) -> tuple[MeasuringLine, ...]:
     """The seven lines of a volume, five test lengths each. Raises AcceptanceError when a rule is broken."""
-    ends = [(np.array(a, dtype=float), -np.array(a, dtype=float)) for a in SPACE_DIAGONALS]
-    ends += [(np.array(a, dtype=float), np.array(b, dtype=float)) for a, b in FACE_DIAGONALS]
-    lines = tuple(
-        _line(name, 0.5 * a * volume.size, 0.5 * b * volume.size) for name, (a, b) in zip(LINE_NAMES, ends, strict=True)
-    )
+    lines = []
+    for name, corners in LINES.items():
+        start, end = (USED_SHARE * (0.5 * np.array(corner) * volume.size) for corner in corners)
+        lines.append(MeasuringLine(name, start, end, LENGTH_SHARES * float(np.linalg.norm(end - start))))
     require_rules(lines, volume)
-    return lines
+    return tuple(lines)
 
 
 def require_rules(lines: Sequence[MeasuringLine], volume: MeasuringVolume) -> None:
@@ -195,9 +199,3 @@ def require_rules(lines: Sequence[MeasuringLine], volume: MeasuringVolume) -> No
         for point in (line.start, line.end):
             if np.any(np.abs(point) > 0.5 * volume.size + 1e-9):
                 raise AcceptanceError(f"line {line.name} leaves the volume at {np.round(1e3 * point)} mm")
-
-
-def _line(name: str, corner: Array, opposite: Array) -> MeasuringLine:
-    """The middle part of a line between two corners, pulled towards the middle of the volume by the same share."""
-    start, end = USED_SHARE * corner, USED_SHARE * opposite
-    return MeasuringLine(name, start, end, LENGTH_SHARES * float(np.linalg.norm(end - start)))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cmmsim.calibration.board import Board
 from cmmsim.errors import CalibrationError
 from cmmsim.geometry.camera import Optics, PinholeCamera
-from cmmsim.geometry.pose import Array, apply, invert, rotation_exp
+from cmmsim.geometry.pose import Array, apply, invert, rigid, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.formation import ImageFormation, Side
 from cmmsim.imaging.renderer import Drawable, Renderer
@@ -41,8 +41,8 @@ OUTLINE_POINTS = 15  # along each side of the plate, to know where a bent one re
 def board_drawable(board: Board, distance: float) -> Drawable:
     """Everything of a board as one body in the board frame, seen from ``distance`` m; the points lie in z = 0."""
     ground, mark = (BRIGHT, DARK) if board.dark else (DARK, BRIGHT)
-    marks: list[Patch] = [*(_squares(board, mark) if board.kind == "chessboard" else _dots(board, mark))]
-    patches = [*marks, _plate(board, ground)]
+    dots = [DiscStack((Disc(point, FRONT, board.dot_radius, mark),)) for point in board.points]
+    patches: list[Patch] = [*(_squares(board, mark) if board.kind == "chessboard" else dots), _plate(board, ground)]
     return Drawable(patches, [0] * len(patches), distance)
 
 
@@ -60,10 +60,6 @@ def _plate(board: Board, level: float) -> Mesh:
     mesh = trimesh.creation.box(extents=size)
     mesh.apply_translation([*corners[:, :2].mean(axis=0), SUNK + 0.5 * THICKNESS])
     return solid_mesh(mesh, level)
-
-
-def _dots(board: Board, level: float) -> list[DiscStack]:
-    return [DiscStack((Disc(point, FRONT, float(board.radius or 0.0), level),)) for point in board.points]
 
 
 def _squares(board: Board, level: float) -> list[Mesh]:
@@ -109,9 +105,8 @@ def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generat
         cell = (4 + 2 * number) % CELLS**2 if attempt < TRIES // 2 else int(rng.integers(CELLS**2))
         depth = meeting_depth(rig) * rng.uniform(*DEPTH_RANGE)
         place = apply(invert(from_left), _point_in_cell(camera, cell, depth, rng))
-        pose = np.eye(4)
-        pose[:3, :3] = _facing(0.5 * _right_eye(rig) - place) @ _tilt(rng)
-        pose[:3, 3] = place - pose[:3, :3] @ middle
+        rotation = _facing(0.5 * _right_eye(rig) - place) @ _tilt(rng)
+        pose = rigid(rotation, place - rotation @ middle)
         if rig.project(apply(pose, corners))[1].all() and _front_to_both(rig, pose, middle):
             return pose
     width, height = np.ptp(corners[:, :2], axis=0)

@@ -17,7 +17,7 @@ from cmmsim.calibration.board import Board
 from cmmsim.calibration.detection import BoardView
 from cmmsim.calibration.sightings import SIDES, PairView, views_of
 from cmmsim.errors import CalibrationError
-from cmmsim.geometry.pose import Array, invert
+from cmmsim.geometry.pose import Array, invert, rigid
 
 FEWEST_VIEWS = 3
 ALIKE_PX = 2.0  # rms distance of the points of two pictures that show the board in one place
@@ -63,7 +63,7 @@ def _one_camera(
             f"OpenCV finds no {SIDES[side]} camera for these views: {error.err}; show the board tilted to several sides"
         ) from error
     values = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *np.ravel(terms)[:5]], dtype=float)
-    places = [_transform(cv2.Rodrigues(turn)[0], shift) for turn, shift in zip(turns, shifts, strict=True)]
+    places = [rigid(cv2.Rodrigues(turn)[0], np.ravel(shift)) for turn, shift in zip(turns, shifts, strict=True)]
     if not (np.isfinite(values).all() and values[:2].min() > 0.0 and np.isfinite(places).all()):
         raise CalibrationError(
             f"OpenCV's {SIDES[side]} camera is not finite (focal lengths {values[:2]}): show the "
@@ -133,10 +133,8 @@ def _renaming_move(board: Board, order: NDArray[np.int_]) -> Array:
     points, renamed = board.points, board.points[order]
     a, b = renamed[1] - renamed[0], points[1] - points[0]
     angle = np.arctan2(b[1], b[0]) - np.arctan2(a[1], a[0])
-    move = np.eye(4)
-    move[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    move[:3, 3] = points[0] - move[:3, :3] @ renamed[0]
-    return move
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+    return rigid(turn, points[0] - turn @ renamed[0])
 
 
 def _alike(places: Array) -> Array:
@@ -170,11 +168,5 @@ def _stereo(
         found = cv2.stereoCalibrate(points, left, right, *lenses[0], *lenses[1], size, flags=cv2.CALIB_FIX_INTRINSIC)
     except cv2.error:
         return guess
-    place = _transform(found[5], found[6])
+    place = rigid(found[5], np.ravel(found[6]))
     return place if np.isfinite(place).all() else guess
-
-
-def _transform(rotation: Array, shift: Array) -> Array:
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = rotation, np.ravel(shift)
-    return transform

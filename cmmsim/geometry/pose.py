@@ -65,6 +65,13 @@ def transform_to_pose(transform: ArrayLike) -> Array:
     return np.array([*values[:3, 3], alpha, beta, gamma])
 
 
+def rigid(rotation: ArrayLike, translation: ArrayLike) -> Array:
+    """Transform (4,4) of a rotation (3,3) and a translation (3,)."""
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation, translation
+    return transform
+
+
 def invert(transform: Array) -> Array:
     """Inverse (4,4) of a rigid transform."""
     inverse = np.eye(4)
