@@ -6,11 +6,9 @@ targets; none of them was measured here.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import sem
 from scipy.stats import t as student
 
 from cmmsim.errors import ShapeError
@@ -38,16 +36,31 @@ class Statistics:
 def summarise(values: Array, rng: np.random.Generator, block: int = 1) -> Statistics:
     """Statistics of magnitudes (n,) of errors.
 
-    block: neighbours that are drawn together, because they are not independent. Raises ShapeError for no values or
-    values that are not finite.
+    block: neighbours that are drawn together, because they are not independent (scipy.stats.bootstrap draws single
+    values only). Raises ShapeError for no values or values that are not finite.
     """
     _require_finite(values)
     starts = rng.integers(0, len(values), (RESAMPLES, -(-len(values) // block)))
     drawn = ((starts[:, :, None] + np.arange(block)) % len(values)).reshape(RESAMPLES, -1)[:, : len(values)]
-    sampled = values[drawn]
-    interval = {name: _percentile_interval(figure(sampled)) for name, figure in _FIGURES.items()}
-    mean, rms, p95 = (float(figure(values)) for figure in _FIGURES.values())
-    return Statistics(len(values), mean, rms, p95, float(values.max()), interval)
+    limits = {
+        k: np.percentile(v, [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)]) for k, v in _figures(values[drawn]).items()
+    }
+    found = {name: float(value) for name, value in _figures(values).items()}
+    return Statistics(
+        len(values),
+        **found,
+        maximum=float(values.max()),
+        interval={k: (float(a), float(b)) for k, (a, b) in limits.items()},
+    )
+
+
+def _figures(values: Array) -> dict[str, Array]:
+    """Mean, root mean square and 95th percentile of values (..., n)."""
+    return {
+        "mean": np.mean(values, axis=-1),
+        "rms": np.sqrt(np.mean(values**2, axis=-1)),
+        "p95": np.percentile(values, 95.0, axis=-1),
+    }
 
 
 def interval_of_mean(values: Array) -> Interval:
@@ -55,24 +68,8 @@ def interval_of_mean(values: Array) -> Interval:
     _require_finite(values)
     if len(values) < 2:
         raise ShapeError("the interval of a mean needs at least two values, got 1")
-    low, high = student.interval(LEVEL, len(values) - 1, loc=values.mean(), scale=sem(values))
-    return float(low), float(high)
-
-
-def _rms(values: Array) -> Array:
-    return np.asarray(np.sqrt(np.mean(values**2, axis=-1)))
-
-
-_FIGURES: dict[str, Callable[[Array], Array]] = {
-    "mean": lambda values: np.asarray(values.mean(axis=-1)),
-    "rms": _rms,
-    "p95": lambda values: np.asarray(np.percentile(values, 95.0, axis=-1)),
-}
-
-
-def _percentile_interval(samples: Array) -> Interval:
-    low, high = np.percentile(samples, [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
-    return float(low), float(high)
+    half = float(student.ppf(0.5 + 0.5 * LEVEL, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
+    return float(values.mean()) - half, float(values.mean()) + half
 
 
 def _require_finite(values: Array) -> None:

@@ -32,6 +32,7 @@ MOST_STEPS = 60
 SMALLEST_GAIN = 1e-11  # relative decrease of the sum of squares that ends the iteration
 SINGULAR = 1e-14  # smallest eigenvalue of N, scaled to a unit diagonal, below which nothing is determined
 POSE = 6
+COMMON, BOARD = slice(None, -POSE), slice(-POSE, None)  # unknowns of all views, and of one
 
 
 def free_directions(distortion: str, fix_aspect: bool) -> Array:
@@ -121,16 +122,34 @@ class Adjustment:
 
 @dataclass(frozen=True)
 class _Normal:
-    """Blocks of the normal equations by view: common (v,c,c), mixed (v,c,6), boards (v,6,6), right-hand sides (v,c)
-    and (v,6); residuals of both cameras; cost: sum of squares, px²."""
+    """Normal equations by view: upper blocks of the matrix (v,s,s) and right-hand side (v,s) of the c common unknowns
+    and, last, of the pose of the view's board, s = c + 6; residuals of both cameras; cost: sum of squares, px²."""
 
-    common: Array
-    mixed: Array
-    boards: Array
-    common_side: Array
-    board_side: Array
+    matrix: Array
+    side: Array
     residuals: tuple[Array, Array]
     cost: float
+
+    def blocks(self, damping: float = 0.0) -> tuple[Array, Array, Array]:
+        """Blocks of the common unknowns (v,c,c), mixed (v,c,6) and of the boards (v,6,6), their diagonal enlarged."""
+        damped = self.matrix + damping * self.matrix * np.eye(self.matrix.shape[1])
+        return damped[:, COMMON, COMMON], damped[:, COMMON, BOARD], damped[:, BOARD, BOARD]
+
+    def reduced(self, damping: float = 0.0) -> tuple[Array, Array]:
+        """Each view's share of the reduced normal matrix (v,c,c) and of its right-hand side (v,c)."""
+        common, mixed, boards = self.blocks(damping)
+        eliminated = np.linalg.solve(boards, mixed.swapaxes(1, 2)).swapaxes(1, 2)
+        matrix = np.asarray(common - eliminated @ mixed.swapaxes(1, 2), dtype=np.float64)
+        return matrix, self.side[:, COMMON] - np.einsum("vci,vi->vc", eliminated, self.side[:, BOARD])
+
+    def step(self, damping: float) -> tuple[Array, Array]:
+        """Damped changes of the common unknowns (c,) and of the boards (v,6)."""
+        matrix, side = (part.sum(axis=0) for part in self.reduced(damping))
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        common = scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * side, rcond=1e-15)[0]
+        _, mixed, boards = self.blocks(damping)
+        rest = self.side[:, BOARD] - np.einsum("vci,c->vi", mixed, common)
+        return common, np.linalg.solve(boards, rest[..., None])[..., 0]
 
 
 def adjust(points: Array, sightings: tuple[Sightings, Sightings], start: RigState, free: Array) -> Adjustment:
@@ -145,13 +164,13 @@ def adjust(points: Array, sightings: tuple[Sightings, Sightings], start: RigStat
 
     state, steps = _minimise(build, start, free)
     normal = build(state)
-    size = normal.common.shape[1]
+    size = normal.side.shape[1] - POSE
     freedom = sum(2 * len(s.view) for s in sightings) - size - POSE * len(state.left_from_boards)
     if freedom < 1:
         raise CalibrationError(
             f"too few points: {freedom + size} more observations than board poses, more than {size} needed"
         )
-    information, scores = _reduced(normal, 0.0)
+    information, scores = normal.reduced()
     reduced = information.sum(axis=0)
     scale = 1.0 / np.sqrt(np.diag(reduced))
     eigenvalues = np.linalg.eigvalsh(reduced * scale[:, None] * scale)
@@ -183,7 +202,7 @@ def _minimise(build: Callable[[RigState], _Normal], state: RigState, free: Array
     normal = build(state)
     k = free.shape[1]
     for step in range(1, MOST_STEPS + 1):
-        common, boards = _solve(normal, damping)
+        common, boards = normal.step(damping)
         trial = state.moved(common[: 2 * k].reshape(2, k) @ free.T, common[2 * k :], boards)
         attempt = build(trial)
         if attempt.cost < normal.cost:
@@ -191,55 +210,36 @@ def _minimise(build: Callable[[RigState], _Normal], state: RigState, free: Array
             state, normal, damping = trial, attempt, max(0.1 * damping, 1e-12)
             if gain < SMALLEST_GAIN:
                 return state, step
-        elif damping > 1e6 or _is_small(common, normal):
-            return state, step
+        elif damping > 1e6 or abs(common @ normal.side[:, COMMON].sum(axis=0)) <= 1e-8 * normal.cost:
+            return state, step  # what does not help is rounding: it would lower the cost by next to nothing
         else:
             damping *= 10.0
+    rms = np.sqrt(normal.cost / sum(len(r) for r in normal.residuals))
     raise CalibrationError(
-        f"the adjustment has not converged in {MOST_STEPS} steps (rms {_rms(normal):.3g} px, board "
+        f"the adjustment has not converged in {MOST_STEPS} steps (rms {rms:.3g} px, board "
         f"normals differ by at most {np.degrees(state.largest_tilt):.1f} degrees): show the board "
         "tilted to several sides, by 30 degrees and more, or free fewer terms of distortion"
     )
 
 
-def _is_small(change: Array, normal: _Normal) -> bool:
-    """Whether a change that does not help is rounding: it would lower the cost by next to nothing."""
-    return bool(abs(change @ normal.common_side.sum(axis=0)) <= 1e-8 * normal.cost)
-
-
-def _rms(normal: _Normal) -> float:
-    return float(np.sqrt(normal.cost / sum(len(r) for r in normal.residuals)))
-
-
 def _normal_equations(points: Array, sightings: tuple[Sightings, Sightings], state: RigState, free: Array) -> _Normal:
-    k, views = free.shape[1], len(state.left_from_boards)
-    size = 2 * k + POSE
-    common, mixed = np.zeros((views, size, size)), np.zeros((views, size, POSE))
-    boards = np.zeros((views, POSE, POSE))
-    common_side, board_side, residuals = np.zeros((views, size)), np.zeros((views, POSE)), []
+    common, views, residuals = 2 * free.shape[1] + POSE, len(state.left_from_boards), []
+    matrix, sides = np.zeros((views, common + POSE, common + POSE)), np.zeros((views, common + POSE))
     for side, seen in enumerate(sightings):
         computed, by_common, by_board = _predict(points, seen, state, side, free)
         error = seen.pixels - computed
         residuals.append(error)
         edges = np.searchsorted(seen.view, np.arange(views + 1))
         for v, (first, last) in enumerate(pairwise(edges)):
-            jc = by_common[first:last].reshape(-1, size)
-            jb, e = by_board[first:last].reshape(-1, POSE), error[first:last].ravel()
-            common[v] += jc.T @ jc
-            mixed[v] += jc.T @ jb
-            boards[v] += jb.T @ jb
-            common_side[v] += jc.T @ e
-            board_side[v] += jb.T @ e
+            jc, e = by_common[first:last].reshape(-1, common), error[first:last].ravel()
+            jb = by_board[first:last].reshape(-1, POSE)
+            matrix[v, COMMON, COMMON] += jc.T @ jc
+            matrix[v, COMMON, BOARD] += jc.T @ jb
+            matrix[v, BOARD, BOARD] += jb.T @ jb
+            sides[v, COMMON] += jc.T @ e
+            sides[v, BOARD] += jb.T @ e
     cost = float(sum(np.sum(r**2) for r in residuals))
-    return _Normal(
-        common,
-        mixed,
-        boards,
-        common_side,
-        board_side,
-        (residuals[0], residuals[1]),
-        cost if np.isfinite(cost) else np.inf,
-    )
+    return _Normal(matrix, sides, (residuals[0], residuals[1]), cost if np.isfinite(cost) else np.inf)
 
 
 def _predict(points: Array, seen: Sightings, state: RigState, side: int, free: Array) -> tuple[Array, Array, Array]:
@@ -249,7 +249,6 @@ def _predict(points: Array, seen: Sightings, state: RigState, side: int, free: A
     turned = np.einsum("mij,mj->mi", moves[:, :3, :3], points[seen.point])
     places = turned + moves[:, :3, 3]
     place_by_board = np.concatenate([np.broadcast_to(np.eye(3), (len(places), 3, 3)), -skew(turned)], axis=2)
-    by_common = np.zeros((len(places), 2, 2 * k + POSE))
     if side == 1:
         rotation = state.right_from_left[:3, :3]
         turned = places @ rotation.T
@@ -258,27 +257,9 @@ def _predict(points: Array, seen: Sightings, state: RigState, side: int, free: A
     ahead = places[:, 2] > 1e-6
     pixels, by_intrinsics, by_place = project(state.intrinsics[side], np.where(ahead[:, None], places, [0.0, 0.0, 1.0]))
     pixels[~ahead] = np.inf  # a step that puts a board behind a camera is no improvement
+    by_common = np.zeros((len(places), 2, 2 * k + POSE))
     by_common[:, :, side * k : (side + 1) * k] = by_intrinsics @ free
     if side == 1:
         by_common[:, :, 2 * k : 2 * k + 3] = by_place
         by_common[:, :, 2 * k + 3 :] = by_place @ -skew(turned)
     return pixels, by_common, by_place @ place_by_board
-
-
-def _reduced(normal: _Normal, damping: float) -> tuple[Array, Array]:
-    """Each view's share of the reduced normal matrix (v,c,c) and of its right-hand side (v,c)."""
-    boards = normal.boards + damping * normal.boards * np.eye(POSE)
-    eliminated = np.asarray(np.linalg.solve(boards, normal.mixed.swapaxes(1, 2)).swapaxes(1, 2), dtype=np.float64)
-    matrix = normal.common + damping * normal.common * np.eye(normal.common.shape[1])
-    matrix = matrix - eliminated @ normal.mixed.swapaxes(1, 2)
-    return matrix, normal.common_side - np.einsum("vci,vi->vc", eliminated, normal.board_side)
-
-
-def _solve(normal: _Normal, damping: float) -> tuple[Array, Array]:
-    """Damped step: changes of the common unknowns (c,) and of the boards (v,6)."""
-    matrix, side = (part.sum(axis=0) for part in _reduced(normal, damping))
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    common = scale * np.linalg.lstsq(matrix * scale[:, None] * scale, scale * side, rcond=1e-15)[0]
-    boards = normal.boards + damping * normal.boards * np.eye(POSE)
-    rest = normal.board_side - np.einsum("vci,c->vi", normal.mixed, common)
-    return common, np.linalg.solve(boards, rest[..., None])[..., 0]
