@@ -22,7 +22,7 @@ from identify.errors import ScenarioError, StudyError
 from identify.experiment.sensor_in_loop import with_renderer
 from identify.random_streams import SAMPLED_POINTS, child, mixed_generator
 from identify.scenario import Scenario, load_scenario
-from identify.studies.rows import find_kind
+from identify.studies.rows import KINDS, find_kind
 from identify.studies.rows.kind import Kind, check_read
 from identify.studies.study_file import Law, Range, Study
 
@@ -118,7 +118,8 @@ class Design:
         values = self._study.factors[path]
         if isinstance(values, list):
             return values[int(share * len(values))]
-        field = valid_keys(find_kind(self._study.kind).options).get(path)
+        kind = KINDS.get(self._study.kind)  # a table is read where the module of one's own kind may not be
+        field = valid_keys(kind.options if kind else None).get(path)
         if field is not None and field.annotation is int:
             return int(values.low) + int(share * (values.high - values.low + 1))
         if values.scale == "log":

@@ -1,5 +1,6 @@
 """Rows for the tests of studies: figures that follow from the seed and the factors alone, and rows that misbehave."""
 
+import json
 import os
 import signal
 import sys
@@ -7,6 +8,9 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
+
+from identify.studies.store import JOURNAL
 
 KIND = "tests.identify.study_rows:row"
 
@@ -45,3 +49,14 @@ def row(scenario, seed, options):
         "rate_hz": scenario.timing.frame_rate_hz,
         **({options["also"]: 1.0} if "also" in options else {}),
     }
+
+
+def journal(folder):
+    """Numbers of the rows that are kept in a study's folder, in the order in which they were done."""
+    lines = (folder / JOURNAL).read_bytes().splitlines(keepends=True)
+    return [json.loads(line)["number"] for line in lines if line.endswith(b"\n")]
+
+
+def same_numbers(one, other):
+    """Assert that two tables are the same but for the seconds that rows took."""
+    pd.testing.assert_frame_equal(one.drop(columns="seconds"), other.drop(columns="seconds"), check_exact=True)

@@ -1,4 +1,7 @@
-"""Studies on real clusters of processes: the same numbers as in one process, whoever dies in the middle."""
+"""Studies on clusters: the same numbers as in one process, whoever dies in the middle; no row is blamed for one death.
+
+First with a client that plays Dask, then on real clusters of processes.
+"""
 
 import json
 import os
@@ -11,61 +14,138 @@ from collections import Counter
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import dask
 import numpy as np
-import pandas as pd
 import pytest
+from distributed import KilledWorker
 
 from identify.errors import StudyError
 from identify.files.versions import OtherVersionsWarning, versions
 from identify.progress import SilentProgress
-from identify.studies.dask_cluster import local_cluster, running_cluster
-from identify.studies.runner import run_study
+from identify.studies import dask_cluster
+from identify.studies.dask_cluster import DaskExecutor, local_cluster, running_cluster
+from identify.studies.design import Case, Finished
+from identify.studies.runner import Batches, run_study
 from identify.studies.store import JOURNAL
 from identify.studies.study_file import Study
-from tests.identify.study_rows import KIND
+from tests.identify.study_rows import KIND, journal, same_numbers
 
-pytestmark = pytest.mark.slow
+LOST = TimeoutError("its worker died with the result")
+DIED = KilledWorker("task", SimpleNamespace(address="tcp://a:1"), 0)
+
+
+class Future:
+    """A batch that is done at once, and whose result comes in the given steps: an error each, or what is found."""
+
+    def __init__(self, key, steps):
+        self.key, self._steps = key, steps
+
+    def add_done_callback(self, action):
+        action(self)
+
+    def result(self, timeout=None):
+        assert timeout is not None, "waits without a limit"
+        step = next(self._steps)
+        if isinstance(step, Exception):
+            raise step
+        return step
+
+
+class Client:
+    """A client of a cluster with so many workers; `steps(cases, time)`: results of a batch sent the so many-th time."""
+
+    status = "running"
+
+    def __init__(self, steps, workers=1):
+        self._steps, self._workers, self.sent = steps, workers, []
+
+    def submit(self, _, version, setup, cases, key, pure):
+        numbers = [case.number for case in cases]
+        self.sent.append(numbers)
+        return Future(key, iter(self._steps(numbers, self.sent.count(numbers))))
+
+    def nthreads(self, callback_timeout=None):
+        assert callback_timeout is not None, "waits without a limit"
+        return dict.fromkeys(range(self._workers), 1)
+
+
+def found(numbers):
+    return [Finished(number, {}, 0.0) for number in numbers]
+
+
+def computed(client, rows):
+    cases = (Case(number, 0, {}) for number in range(rows))
+    return {row.number: row.error for batch in DaskExecutor(client)(None, Batches(cases, rows)) for row in batch}
+
+
+def test_result_that_died_with_its_worker_is_waited_for_and_noted_once():
+    client = Client(lambda numbers, _: [LOST, LOST, found(numbers)])
+    assert computed(client, 3) == {0: "", 1: "", 2: ""}
+    assert client.sent == [[0], [1], [2]]
+
+
+def test_result_that_died_with_the_last_worker_ends_the_study_in_one_line(monkeypatch):
+    monkeypatch.setattr(dask_cluster, "WORKERLESS_SECONDS", 0.05)
+    with pytest.raises(StudyError, match=r"^no Dask worker for 0.05 s; the same command goes on from here$"):
+        computed(Client(lambda *_: iter(lambda: LOST, None), workers=0), 1)
+
+
+def test_scheduler_that_does_not_answer_ends_the_study_in_one_line(monkeypatch):
+    client = Client(lambda numbers, _: [found(numbers)])
+
+    def no_answer(callback_timeout):
+        raise TimeoutError(f"timed out after {callback_timeout} s")
+
+    monkeypatch.setattr(client, "nthreads", no_answer)
+    with pytest.raises(StudyError, match=r"^the Dask scheduler is gone; .* timed out after \d+ s$"):
+        computed(client, 1)
+
+
+def test_row_is_blamed_for_the_second_death_of_its_worker_and_not_for_the_first():
+    deaths = {0: 1, 1: 9}
+    client = Client(lambda numbers, time: [DIED if time <= deaths.get(numbers[0], 0) else found(numbers)])
+    errors = computed(client, 3)
+    assert client.sent == [[0], [1], [2], [1], [0]]
+    assert (errors[0], errors[2]) == ("", "")
+    assert errors[1].startswith("KilledWorker: ")
+
+
+def test_row_that_is_the_only_one_is_tried_again_too():
+    client = Client(lambda numbers, time: [DIED if time == 1 else found(numbers)])
+    assert computed(client, 1) == {0: ""}
+    assert client.sent == [[0], [0]]
+
+
+# Real processes.
+
 
 ROOT = Path(__file__).parents[2]
 DARK = "sensor.camera.dark_noise"
+LEVELS = [13.0, 26.0, 52.0]
 PATIENCE = 120
 """Seconds for what takes a few on a free machine."""
 
 
 def study(**options):
-    factors, options = {DARK: [13.0, 26.0, 52.0]}, {"seconds": 0.02} | options
-    return Study(name="mine", kind=KIND, factors=factors, repeats=40, seed=4, options=options)
+    options = {"seconds": 0.02} | options
+    return Study(name="mine", kind=KIND, factors={DARK: LEVELS}, repeats=40, seed=4, options=options)
 
 
 def process(*arguments, before=ROOT):
     """A process of this Python, in a group of its own; what is in the folder `before` it finds first."""
     environment = os.environ | {"PYTHONPATH": f"{before}:{ROOT}"}
+    command = [sys.executable, "-m", *map(str, arguments)]
+    pipe = subprocess.PIPE
     return subprocess.Popen(
-        [sys.executable, *map(str, arguments)],
-        cwd=before,
-        env=environment,
-        start_new_session=True,
-        stderr=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
+        command, cwd=before, env=environment, start_new_session=True, stderr=pipe, stdout=pipe, text=True
     )
 
 
 def worker(address, folder, before=ROOT):
-    return process(
-        "-m",
-        "distributed.cli.dask_worker",
-        address,
-        "--no-nanny",
-        "--nthreads",
-        1,
-        "--no-dashboard",
-        "--local-directory",
-        folder,
-        before=before,
-    )
+    options = ("--no-nanny", "--nthreads", 1, "--no-dashboard", "--local-directory", folder)
+    return process("distributed.cli.dask_worker", address, *options, before=before)
 
 
 def other_versions(folder, **packages):
@@ -88,23 +168,12 @@ def wait_for(condition, what):
 def cluster(folder, workers, before=ROOT):
     """A scheduler and workers, each a process of its own: address, scheduler, workers; `before`: see `process`."""
     file = folder / "scheduler.json"
-    scheduler = process(
-        "-m",
-        "distributed.cli.dask_scheduler",
-        "--host",
-        "127.0.0.1",
-        "--port",
-        0,
-        "--no-dashboard",
-        "--scheduler-file",
-        file,
-    )
-    there = []
+    options = ("--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--scheduler-file", file)
+    scheduler, there = process("distributed.cli.dask_scheduler", *options), []
     try:
         wait_for(lambda: file.exists() and file.read_text().endswith("}"), "scheduler")
         address = json.loads(file.read_text())["address"]
-        for _ in range(workers):
-            there.append(worker(address, folder, before))
+        there += [worker(address, folder, before) for _ in range(workers)]
         yield address, scheduler, there
     finally:
         for one in [scheduler, *there]:
@@ -131,35 +200,32 @@ class At(SilentProgress):
         yield advance
 
 
-def journal(folder):
-    """Numbers of the rows that are kept."""
-    path = folder / JOURNAL
-    return [json.loads(line)["number"] for line in path.read_bytes().splitlines(keepends=True) if line.endswith(b"\n")]
-
-
-def same_numbers(one, other):
-    pd.testing.assert_frame_equal(one.drop(columns="seconds"), other.drop(columns="seconds"), check_exact=True)
-
-
 @pytest.fixture(scope="module")
 def serial(tmp_path_factory):
     """The table of the study, computed in this process."""
     return run_study(study(seconds=0.0), tmp_path_factory.mktemp("serial") / "a", SilentProgress()).frame
 
 
-def test_worker_killed_in_the_middle_changes_no_number(tmp_path, serial):
-    log = tmp_path / "log"
-    with cluster(tmp_path, workers=2) as (address, _, workers):
-        workers_there = partial(running_cluster, address)
-        outcome = run_study(study(log=str(log)), tmp_path / "a", At(40, workers[0].kill), workers_there)
+@pytest.mark.slow
+def test_worker_killed_in_the_middle_changes_no_number_and_other_packages_are_one_warning(tmp_path, serial):
+    log, there = tmp_path / "log", other_versions(tmp_path / "there", numpy="1.2.3", casadi="0.1")
+    with cluster(tmp_path, 2, there) as (address, _, workers):
+        progress, workers_there = At(40, workers[0].kill), partial(running_cluster, address)
+        with pytest.warns(OtherVersionsWarning) as caught:
+            outcome = run_study(study(log=str(log)), tmp_path / "a", progress, workers_there)
         assert workers[0].wait(10) == -signal.SIGKILL
         assert workers[1].poll() is None
     same_numbers(outcome.frame, serial)
     assert sorted(journal(tmp_path / "a")) == list(range(120))
     again = [number for number, times in Counter(log.read_text().split()).items() if times > 1]
     assert len(again) <= 3 * 15, "more than the batches that the dead worker had"
+    (text,) = [str(one.message) for one in caught]
+    place = r"\(worker tcp://\S+( and 1 more)?\), here"
+    assert re.search(rf"numpy 1.2.3 {place} {np.__version__}; casadi 0.1 {place}", text)
+    assert "scipy" not in text
 
 
+@pytest.mark.slow
 def test_lost_scheduler_is_one_line_and_the_study_goes_on_with_another(tmp_path, serial):
     with cluster(tmp_path, workers=1) as (address, scheduler, _), pytest.raises(StudyError) as caught:
         run_study(study(), tmp_path / "a", At(30, scheduler.kill), partial(running_cluster, address))
@@ -172,6 +238,7 @@ def test_lost_scheduler_is_one_line_and_the_study_goes_on_with_another(tmp_path,
     same_numbers(outcome.frame, serial)
 
 
+@pytest.mark.slow
 def test_rows_that_end_their_worker_are_errors_and_no_other_row_is(tmp_path, serial):
     """Also where there is no other worker, and it needs longer to start again than Dask is told elsewhere to wait for
     it, as on a busy machine."""
@@ -183,25 +250,22 @@ def test_rows_that_end_their_worker_are_errors_and_no_other_row_is(tmp_path, ser
     same_numbers(frame.drop(index=[3, 7]), serial.drop(index=[3, 7]))
 
 
-def test_workers_with_another_version_of_the_product_are_refused_at_the_start(tmp_path):
-    there = other_versions(tmp_path / "there", cmmsim="9.8.7")
-    with cluster(tmp_path, 1, there) as (address, _, _), pytest.raises(StudyError) as caught:
-        run_study(study(), tmp_path / "a", SilentProgress(), partial(running_cluster, address))
-    here = versions()["cmmsim"]
-    assert re.fullmatch(rf"worker tcp://\S+ has cmmsim 9.8.7, here is {here}; install .*", str(caught.value))
-    assert not (tmp_path / "a").exists()
-
-
-def test_worker_that_comes_later_with_another_version_computes_no_row(tmp_path):
-    there, late = other_versions(tmp_path / "there", cmmsim="9.8.7"), []
+@pytest.mark.slow
+def test_worker_with_another_version_of_the_product_is_refused_at_the_start_and_later(tmp_path):
+    there, here = other_versions(tmp_path / "there", cmmsim="9.8.7"), versions()["cmmsim"]
+    refusal = rf"^worker tcp://\S+ has cmmsim 9\.8\.7, here is {here}; install \S[^\n]*$"
     with cluster(tmp_path, 1) as (address, _, workers):
-        come = At(1, lambda: late.append(worker(address, tmp_path, there)))
-        with pytest.raises(StudyError, match=r"worker tcp://\S+ has cmmsim 9\.8\.7, here is \S+; install"):
-            run_study(study(seconds=0.5), tmp_path / "a", come, partial(running_cluster, address))
-        workers += late
-    assert 1 <= len(journal(tmp_path / "a")) < 120
+        workers_there = partial(running_cluster, address)
+        come = At(1, lambda: workers.append(worker(address, tmp_path, there)))
+        with pytest.raises(StudyError, match=refusal):
+            run_study(study(seconds=0.5), tmp_path / "a", come, workers_there)
+        assert 1 <= len(journal(tmp_path / "a")) < 120
+        with pytest.raises(StudyError, match=refusal):
+            run_study(study(), tmp_path / "b", SilentProgress(), workers_there)
+    assert not (tmp_path / "b").exists()
 
 
+@pytest.mark.slow
 def test_worker_that_lacks_the_product_is_named(tmp_path):
     (tmp_path / "there" / "identify").mkdir(parents=True)
     (tmp_path / "there" / "identify" / "__init__.py").write_text("raise ImportError('none here')\n")
@@ -210,28 +274,14 @@ def test_worker_that_lacks_the_product_is_named(tmp_path):
         run_study(study(), tmp_path / "a", SilentProgress(), partial(running_cluster, address))
 
 
-def test_other_versions_of_other_packages_are_one_warning(tmp_path, serial):
-    there = other_versions(tmp_path / "there", numpy="1.2.3", casadi="0.1")
-    with cluster(tmp_path, 2, there) as (address, _, _), pytest.warns(OtherVersionsWarning) as caught:
-        outcome = run_study(study(), tmp_path / "a", SilentProgress(), partial(running_cluster, address))
-    assert len(caught) == 1
-    text = str(caught[0].message)
-    assert re.search(
-        rf"numpy 1.2.3 \(worker tcp://\S+( and 1 more)?\), here {np.__version__}; casadi 0.1 \(worker tcp://", text
-    )
-    assert "scipy" not in text
-    same_numbers(outcome.frame, serial)
-
-
 @pytest.fixture
 def command(tmp_path):
     """A function that starts the command on so many workers and waits until 30 rows are done, or for the condition
     given, of the process: process, folder, log."""
     folder, log, started = tmp_path / "a", tmp_path / "log", []
-    text = study(log=str(log))
     (tmp_path / "mine.toml").write_text(
-        f'name = "mine"\nkind = "{KIND}"\nrepeats = {text.repeats}\nseed = 4\n[factors]\n'
-        f'{DARK} = {text.factors[DARK]}\n[options]\nseconds = 0.02\nlog = "{log}"\n'
+        f'name = "mine"\nkind = "{KIND}"\nrepeats = 40\nseed = 4\n[factors]\n'
+        f'{DARK} = {LEVELS}\n[options]\nseconds = 0.02\nlog = "{log}"\n'
     )
 
     def rows_done(_):
@@ -239,7 +289,7 @@ def command(tmp_path):
 
     def start(workers, until=rows_done):
         arguments = ("study", tmp_path / "mine.toml", "--workers", workers, "--out", folder)
-        started.append(process("-m", "identify", *arguments))
+        started.append(process("identify", *arguments))
         wait_for(lambda: until(started[-1]), until.__name__)
         return started[-1], folder, log
 
@@ -270,6 +320,18 @@ def starts_workers(command):
         return False
 
 
+def interrupted(running, folder):
+    """End the command and all its processes as Ctrl-C in a terminal does; the rows that it has kept."""
+    os.killpg(running.pid, signal.SIGINT)
+    _, error = running.communicate(timeout=PATIENCE)
+    kept = journal(folder)
+    assert error == f"stopped: {len(kept)} of 120 rows are done and kept; the same command goes on from there\n"
+    assert running.returncode == 130
+    wait_for(lambda: not in_group(running.pid), "workers outlive the interrupted command")
+    return kept
+
+
+@pytest.mark.slow
 def test_killed_command_loses_nothing_finished_and_computes_nothing_twice(command, serial):
     running, folder, log = command(workers=2)
     running.kill()
@@ -285,25 +347,17 @@ def test_killed_command_loses_nothing_finished_and_computes_nothing_twice(comman
     assert sorted(times) == list(range(120))
 
 
+@pytest.mark.thorough
 def test_interrupted_command_ends_with_one_line_and_goes_on(command, serial):
     running, folder, log = command(workers=1)
-    os.killpg(running.pid, signal.SIGINT)
-    _, error = running.communicate(timeout=PATIENCE)
-    assert running.returncode == 130
-    kept = journal(folder)
-    assert error == f"stopped: {len(kept)} of 120 rows are done and kept; the same command goes on from there\n"
-    wait_for(lambda: not in_group(running.pid), "workers outlive the interrupted command")
+    kept = interrupted(running, folder)
     outcome = run_study(study(log=str(log)), folder, SilentProgress())
     assert outcome.found == len(kept)
     same_numbers(outcome.frame, serial)
 
 
+@pytest.mark.slow
 def test_command_interrupted_while_its_workers_start_ends_with_one_line(command):
     """Also the processes that start get the signal, as from a terminal; none of them says anything, or stays."""
     running, folder, _ = command(workers=1, until=starts_workers)
-    os.killpg(running.pid, signal.SIGINT)
-    _, error = running.communicate(timeout=PATIENCE)
-    assert error == "stopped: 0 of 120 rows are done and kept; the same command goes on from there\n"
-    assert running.returncode == 130
-    assert journal(folder) == []
-    wait_for(lambda: not in_group(running.pid), "workers outlive the interrupted command")
+    assert interrupted(running, folder) == []

@@ -226,7 +226,7 @@ def test_identification_finds_the_parameters_to_what_it_states():
     assert np.sqrt(np.mean([row["normalised_error"] ** 2 for row in found])) < 1.5
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_identification_from_images_is_as_good_as_from_drawn_noise():
     settings = scenario(**{"identification.method": "command_driven", "validation.count": 1})
     drawn, images = (

@@ -1,25 +1,29 @@
-"""Studies in one process: what is written, what an end in the middle leaves, and what is refused."""
+"""Studies in one process: what an end in the middle leaves, how rows are added to a folder, and what it refuses.
+
+One study, one version: workers of a cluster are asked here as they answer; real ones are in `test_study_cluster`.
+"""
 
 import errno
 import fcntl
 import json
 import os
+import warnings
+from contextlib import contextmanager
 
-import numpy as np
 import pandas as pd
-import pyarrow.parquet as pq
 import pytest
 
 from identify.errors import StudyError, StudyInterrupted
+from identify.files.versions import OtherVersionsWarning, versions
 from identify.progress import SilentProgress
-from identify.scenario import load_scenario
 from identify.studies import runner
+from identify.studies.dask_cluster import check_workers
 from identify.studies.design import Case, Finished
 from identify.studies.runner import BATCH_SECONDS, LARGEST_BATCH, Batches, compute, run_study
 from identify.studies.store import JOURNAL, LOCK, STUDY, TABLE
 from identify.studies.study_file import Study
-from identify.studies.table import figure_names, read_table, to_xarray
-from tests.identify.study_rows import KIND, row
+from identify.studies.table import figure_names, read_table
+from tests.identify.study_rows import KIND, journal, same_numbers
 
 DARK, METHOD = "sensor.camera.dark_noise", "scenario.pose_method"
 FACTORS = {DARK: [13.0, 26.0, 52.0], METHOD: ["registration", "planes"]}
@@ -33,19 +37,11 @@ def run(folder, chosen=None):
     return run_study(chosen or study(), folder, SilentProgress())
 
 
-def same_numbers(one, other):
-    pd.testing.assert_frame_equal(one.drop(columns="seconds"), other.drop(columns="seconds"), check_exact=True)
-
-
-def journal_rows(folder):
-    return [json.loads(line)["number"] for line in (folder / JOURNAL).read_text().splitlines()]
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A study that ran without a break."""
+    """The folder of a study that ran without a break, and its table."""
     folder = tmp_path_factory.mktemp("whole") / "study"
-    return folder, run(folder)
+    return folder, run(folder).frame
 
 
 def stopping_after(rows, error):
@@ -53,17 +49,22 @@ def stopping_after(rows, error):
 
     def execute(setup, batches):
         for _ in range(rows):
-            yield compute(setup, [next(batches._cases)])
+            yield compute(setup, batches.take(1))
         raise error
 
-    class Workers:
-        def __enter__(self):
-            return execute
+    @contextmanager
+    def workers():
+        yield execute
 
-        def __exit__(self, *_):
-            pass
+    return workers
 
-    return Workers
+
+def stop(folder, rows, chosen=None, error=None):
+    """Run a study in a folder until so many rows are done and Ctrl-C, or an error, comes; what is then raised."""
+    workers = stopping_after(rows, error or KeyboardInterrupt())
+    with pytest.raises(type(error) if error else StudyInterrupted) as caught:
+        run_study(chosen or study(), folder, SilentProgress(), workers)
+    return str(caught.value)
 
 
 @pytest.mark.parametrize(("row_seconds", "workers"), [(1e-5, 1), (0.004, 2), (0.1, 8), (30.0, 3)])
@@ -81,127 +82,56 @@ def test_batches_hold_every_row_once_and_a_quarter_second_of_work(row_seconds, w
     assert sizes[-1] <= max(1, 5000 // workers // 100)
 
 
-def test_table_has_a_row_each_with_factors_seed_and_figures(whole):
-    """Each row can be computed again from what the table says of it."""
-    frame, paper = whole[1].frame, load_scenario("paper")
-    assert list(frame.columns) == [
-        "row",
-        "repeat",
-        "seed_entropy",
-        "seed_spawn_key",
-        DARK,
-        METHOD,
-        "error_um",
-        "spread_um",
-        "rate_hz",
-        "seconds",
-        "error",
-    ]
-    assert frame["row"].tolist() == list(range(18))
-    for entry in frame.to_dict("records"):
-        seed = np.random.SeedSequence(int(entry["seed_entropy"]), spawn_key=(entry["seed_spawn_key"],))
-        scenario = paper.with_overrides({"sensor_changes.camera.dark_noise": entry[DARK]})
-        assert row(scenario, seed, {}) == {name: entry[name] for name in ("error_um", "spread_um", "rate_hz")}
-
-
-def test_parquet_holds_the_table_and_the_study(whole):
-    folder, outcome = whole
-    frame, found = read_table(folder / TABLE)
-    pd.testing.assert_frame_equal(frame, outcome.frame)
-    assert found == study()
-    versions = json.loads(pq.read_schema(folder / TABLE).metadata[b"cmmsim.versions"])
-    assert {"python", "cmmsim", "numpy"} <= set(versions)
-    assert json.loads((folder / STUDY).read_text())["sensor"]["name"] == "ctrack780"
-
-
-def test_view_has_the_figures_by_factor_and_repeat(whole):
-    frame = whole[1].frame
-    view = to_xarray(frame, study())
-    assert dict(view.sizes) == {DARK: 3, METHOD: 2, "repeat": 3}
-    assert list(view[METHOD].values) == FACTORS[METHOD]
-    for entry in frame.to_dict("records"):
-        place = {DARK: entry[DARK], METHOD: entry[METHOD], "repeat": entry["repeat"]}
-        assert float(view["error_um"].sel(place)) == entry["error_um"]
-
-
-def test_view_of_a_sample_has_points_with_the_factors_as_coordinates(tmp_path):
-    chosen = study(factors={DARK: {"low": 1.0, "high": 50.0}, "options.pair": [[1, 2], [3, 4]]}, sample=5, repeats=2)
-    frame = run(tmp_path / "a", chosen).frame
-    view = to_xarray(frame, chosen)
-    assert dict(view.sizes) == {"point": 5, "repeat": 2}
-    assert view[DARK].values.tolist() == frame[DARK][:5].tolist()
-    assert set(frame["options.pair"]) <= {"[1, 2]", "[3, 4]"}
-    assert view["error_um"].values.T.ravel().tolist() == frame["error_um"].tolist()
-
-
 def test_a_study_that_is_done_computes_nothing_again(whole, monkeypatch):
-    folder, outcome = whole
+    folder, frame = whole
     monkeypatch.setattr(runner, "compute", None)
     again = run(folder)
     assert (again.found, again.rows) == (18, 18)
-    pd.testing.assert_frame_equal(again.frame, outcome.frame)
+    pd.testing.assert_frame_equal(again.frame, frame)
 
 
-@pytest.mark.parametrize(("error", "raised"), [(KeyboardInterrupt(), StudyInterrupted), (SystemError(), SystemError)])
-def test_a_study_that_was_stopped_goes_on_where_it_was(whole, tmp_path, error, raised):
-    log = tmp_path / "log"
-    chosen = study(options={"log": str(log)})
-    with pytest.raises(raised) as caught:
-        run_study(chosen, tmp_path / "a", SilentProgress(), stopping_after(7, error))
-    if raised is StudyInterrupted:
-        assert "7 of 18 rows are done" in str(caught.value)
+@pytest.mark.parametrize("error", [None, SystemError("crash")])
+def test_a_study_that_was_stopped_goes_on_where_it_was(whole, tmp_path, error):
+    chosen = study(options={"log": str(tmp_path / "log")})
+    assert stop(tmp_path / "a", 7, chosen, error) in ("stopped: 7 of 18 rows are done and kept", "crash")
     outcome = run(tmp_path / "a", chosen)
     assert outcome.found == 7
-    same_numbers(outcome.frame, whole[1].frame)
-    assert sorted(map(int, log.read_text().split())) == list(range(18))
+    same_numbers(outcome.frame, whole[1])
+    assert sorted(map(int, (tmp_path / "log").read_text().split())) == list(range(18))
 
 
 @pytest.mark.parametrize("torn", [b'{"number": 3, "figu', b'{"number": 3, "figures": {}, "seconds": 1.0, "error": ""}'])
 def test_a_torn_last_line_does_not_count(whole, tmp_path, torn):
-    with pytest.raises(StudyInterrupted):
-        run_study(study(), tmp_path, SilentProgress(), stopping_after(3, KeyboardInterrupt()))
+    stop(tmp_path, 3)
     with (tmp_path / JOURNAL).open("ab") as file:
         file.write(torn)
     outcome = run(tmp_path)
     assert outcome.found == 3
-    assert sorted(journal_rows(tmp_path)) == list(range(18))
-    same_numbers(outcome.frame, whole[1].frame)
-
-
-def test_a_damaged_line_in_the_middle_is_named(tmp_path):
-    run(tmp_path)
-    lines = (tmp_path / JOURNAL).read_bytes().splitlines(keepends=True)
-    (tmp_path / JOURNAL).write_bytes(b"".join([*lines[:4], b"\x00" * 30 + b"\n", *lines[5:]]))
-    with pytest.raises(StudyError, match=r"line 5 of .*rows.jsonl is damaged"):
-        run(tmp_path)
+    assert sorted(journal(tmp_path)) == list(range(18))
+    same_numbers(outcome.frame, whole[1])
 
 
 @pytest.mark.parametrize(
     ("entry", "says"),
     [
+        (b"\x00" * 30, "it is "),
         ({"figures": {"error_um": "four"}}, "figures.error_um is 'four': Input should be a valid number"),
         ({"figures": {"error_um": float("nan")}}, "figures.error_um is nan: Input should be a finite number"),
-        ({"figures": {"error_um": 10**400}}, "error_um is 10000"),
-        ({"figures": {"error_um": True}}, "error_um is True"),
-        ({"figures": [1.0]}, "figures is [1.0]"),
+        ({"figures": {"error_um": 10**400}}, "figures.error_um is 10000"),
         ({"seconds": None}, "seconds is None"),
         ({"number": "3"}, "number is '3'"),
         ({"number": -1}, "number is -1"),
-        ({"error": None}, "error is None"),
         ({"figure": {}}, "figure is {}: Unexpected keyword argument"),
     ],
 )
-def test_a_line_with_what_no_study_writes_is_named_and_not_taken_as_done(tmp_path, entry, says):
+def test_a_line_that_no_study_writes_is_named_and_not_taken_as_done(tmp_path, entry, says):
     run(tmp_path)
-    lines = (tmp_path / JOURNAL).read_text().splitlines()
-    lines[4] = json.dumps(json.loads(lines[4]) | entry)
-    (tmp_path / JOURNAL).write_text("\n".join(lines) + "\n")
-    with pytest.raises(StudyError) as caught:
-        run(tmp_path)
-    assert str(caught.value).startswith(f"line 5 of {tmp_path / JOURNAL} is damaged: ")
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 250
+    lines = (tmp_path / JOURNAL).read_bytes().splitlines()
+    lines[4] = entry if isinstance(entry, bytes) else json.dumps(json.loads(lines[4]) | entry).encode()
+    (tmp_path / JOURNAL).write_bytes(b"\n".join(lines) + b"\n")
+    message = refusal(run, tmp_path)
+    assert message.startswith(f"line 5 of {tmp_path / JOURNAL} is damaged: {says}")
+    assert len(message) < 250
 
 
 @pytest.mark.parametrize("part", [0, 40])
@@ -221,33 +151,29 @@ def test_full_disk_leaves_whole_lines_and_the_study_goes_on_later(whole, tmp_pat
         patch.setattr(os, "pwrite", full)
         with pytest.raises(StudyError, match=r"rows.jsonl cannot be written: No space left on device; 2 rows are safe"):
             run_study(study(), tmp_path, SilentProgress(), stopping_after(18, AssertionError()))
-    assert journal_rows(tmp_path) == [0, 1]
+    assert journal(tmp_path) == [0, 1]
     outcome = run(tmp_path)
     assert outcome.found == 2
-    same_numbers(outcome.frame, whole[1].frame)
+    same_numbers(outcome.frame, whole[1])
 
 
-def test_a_failing_row_says_why_and_the_others_go_on(whole, tmp_path):
-    outcome = run(tmp_path, study(options={"fails": [2, 11], "odd": 5}))
-    frame = outcome.frame
-    assert len(outcome.failures) == 3
-    assert outcome.failures[0] == "row 2: ValueError: row 2 has no answer"
-    assert frame["error"][5] == "ArithmeticError: error_um is nan"
-    failed = frame["row"].isin([2, 5, 11])
-    assert frame.loc[failed, figure_names(frame, study())].isna().all(axis=None)
-    same_numbers(frame[~failed], whole[1].frame[~failed])
+def test_a_row_that_fails_or_exits_the_program_says_why_and_the_others_go_on(whole, tmp_path):
+    outcome = run(tmp_path, study(options={"fails": [2, 11], "odd": 5, "exits": [7]}))
+    assert outcome.failures == [
+        "row 2: ValueError: row 2 has no answer",
+        "row 5: ArithmeticError: error_um is nan",
+        "row 7: SystemExit: bye",
+        "row 11: ValueError: row 11 has no answer",
+    ]
+    failed = outcome.frame["error"] != ""
+    assert outcome.frame.loc[failed, figure_names(outcome.frame, study())].isna().all(axis=None)
+    same_numbers(outcome.frame[~failed], whole[1][~failed])
 
 
-def test_a_row_that_exits_the_program_is_an_error_of_this_row(whole, tmp_path):
-    frame = run(tmp_path, study(options={"exits": [2]})).frame
-    assert frame["error"][2] == "SystemExit: bye"
-    same_numbers(frame.drop(index=2), whole[1].frame.drop(index=2))
-
-
-def test_ctrl_c_in_a_row_stops_the_study_and_is_no_error_of_the_row(whole, tmp_path):
+def test_ctrl_c_in_a_row_stops_the_study_and_is_no_error_of_the_row(tmp_path):
     with pytest.raises(StudyInterrupted, match=r"stopped: \d+ of 18 rows are done"):
         run(tmp_path, study(options={"interrupt": 7}))
-    assert set(journal_rows(tmp_path)) <= set(range(7))
+    assert set(journal(tmp_path)) <= set(range(7))
 
 
 @pytest.mark.parametrize("name", ["row", "seconds", DARK])
@@ -264,22 +190,14 @@ def test_factors_that_contradict_each_other_in_one_row_are_an_error_of_this_row(
     assert ["Nyquist" in error for error in frame["error"]] == [False, False, True, False] * 3
 
 
-@pytest.mark.parametrize(
-    ("other", "differs"),
-    [
-        ({"seed": 5}, "study.seed"),
-        ({"seed": 5, "repeats": 4}, "study.seed; name"),
-        ({"factors": {DARK: [1.0]}}, "study.factors."),
-        ({"factors": FACTORS | {DARK: [13.0, 26.0, 52.0, 99.0]}, "repeats": 4}, f"study.factors.{DARK}; name"),
-    ],
-)
-def test_the_folder_of_another_study_is_refused(tmp_path, other, differs):
-    run(tmp_path)
-    before = (tmp_path / JOURNAL).read_bytes()
-    with pytest.raises(StudyError, match=rf"study.json is of another study, which differs in {differs}"):
-        run(tmp_path, study(**other))
-    assert (tmp_path / JOURNAL).read_bytes() == before
-    run(tmp_path, study(title="another title"))
+# Further repeats, and folders of others.
+
+
+def refusal(action, *arguments):
+    with pytest.raises(StudyError) as caught:
+        action(*arguments)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 def test_more_repeats_are_added_to_those_that_are_there(whole, tmp_path):
@@ -287,7 +205,7 @@ def test_more_repeats_are_added_to_those_that_are_there(whole, tmp_path):
     log, more = tmp_path / "log", {"repeats": 5}
     chosen = study(options={"log": str(log)})
     few = run(tmp_path / "a", chosen)
-    same_numbers(few.frame, whole[1].frame)
+    same_numbers(few.frame, whole[1])
     many = run(tmp_path / "a", chosen.model_copy(update=more))
     assert (few.rows, many.found, many.rows) == (18, 18, 30)
     same_numbers(many.frame[:18], few.frame)
@@ -309,22 +227,36 @@ def test_fewer_repeats_leave_the_others_out_of_the_table_but_lose_none(whole, tm
     """Also of a study that was stopped, which so ends with the repeats that it has."""
     log = tmp_path / "log"
     chosen = study(options={"log": str(log)})
-    with pytest.raises(StudyInterrupted):
-        run_study(chosen, tmp_path / "a", SilentProgress(), stopping_after(13, KeyboardInterrupt()))
+    stop(tmp_path / "a", 13, chosen)
     two = run(tmp_path / "a", chosen.model_copy(update={"repeats": 2}))
     assert (two.found, two.rows, two.beyond) == (12, 12, 1)
-    same_numbers(two.frame, whole[1].frame[:12])
+    same_numbers(two.frame, whole[1][:12])
     three = run(tmp_path / "a", chosen)
     assert (three.found, three.beyond) == (13, 0)
-    same_numbers(three.frame, whole[1].frame)
+    same_numbers(three.frame, whole[1])
     assert sorted(map(int, log.read_text().split())) == list(range(18))
 
 
 def test_a_study_stopped_while_repeats_were_added_says_how_many_rows_of_these_are_done(tmp_path):
     run(tmp_path)
-    with pytest.raises(StudyInterrupted, match="20 of 24 rows are done"):
-        run_study(study(repeats=4), tmp_path, SilentProgress(), stopping_after(2, KeyboardInterrupt()))
+    assert stop(tmp_path, 2, study(repeats=4)) == "stopped: 20 of 24 rows are done and kept"
     assert run(tmp_path, study(repeats=4)).found == 20
+
+
+@pytest.mark.parametrize(
+    ("other", "differs"),
+    [
+        ({"seed": 5, "repeats": 4}, "study.seed; name"),
+        ({"factors": {DARK: [1.0]}}, "study.factors."),
+        ({"factors": FACTORS | {DARK: [13.0, 26.0, 52.0, 99.0]}, "repeats": 4}, f"study.factors.{DARK}; name"),
+    ],
+)
+def test_the_folder_of_another_study_is_refused(tmp_path, other, differs):
+    run(tmp_path)
+    before = (tmp_path / JOURNAL).read_bytes()
+    assert f"study.json is of another study, which differs in {differs}" in refusal(run, tmp_path, study(**other))
+    assert (tmp_path / JOURNAL).read_bytes() == before
+    run(tmp_path, study(title="another title"))
 
 
 def test_a_changed_sensor_file_makes_another_study(tmp_path):
@@ -333,35 +265,98 @@ def test_a_changed_sensor_file_makes_another_study(tmp_path):
     chosen = study(changes={"scenario.sensor": str(mine)})
     run(tmp_path / "a", chosen)
     mine.write_text('name = "mine"\nbased_on = "ctrack780"\n[lens]\npsf_px = 0.5\n')
-    with pytest.raises(StudyError, match=r"differs in sensor\.lens\.psf_px"):
-        run(tmp_path / "a", chosen)
+    assert "differs in sensor.lens.psf_px" in refusal(run, tmp_path / "a", chosen)
 
 
 def test_a_table_of_another_study_is_refused(whole, tmp_path):
     (tmp_path / TABLE).write_bytes((whole[0] / TABLE).read_bytes())
-    with pytest.raises(StudyError, match=r"study.parquet is of another study, which differs in study.seed"):
-        run(tmp_path, study(seed=5))
+    message = refusal(run, tmp_path, study(seed=5))
+    assert "study.parquet is of another study, which differs in study.seed" in message
     pd.DataFrame({"x": [1.0]}).to_parquet(tmp_path / TABLE)
-    with pytest.raises(StudyError, match=r"study.parquet is no table of a study"):
-        run(tmp_path)
+    assert "study.parquet is no table of a study" in refusal(run, tmp_path)
     (tmp_path / TABLE).write_text("no table")
-    with pytest.raises(StudyError, match=r"study.parquet is no table of a study"):
-        run(tmp_path)
+    assert "study.parquet is no table of a study" in refusal(run, tmp_path)
 
 
 def test_two_at_once_on_one_folder_are_refused(tmp_path):
     run(tmp_path)
     with (tmp_path / LOCK).open("a+") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
-        with pytest.raises(StudyError, match="in use by another process"):
-            run(tmp_path)
+        assert "in use by another process" in refusal(run, tmp_path)
     assert run(tmp_path).found == 18
 
 
 def test_folders_of_other_things_are_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("precious")
-    with pytest.raises(StudyError, match=r"holds thesis.tex and no study.json"):
-        run(tmp_path)
-    with pytest.raises(StudyError, match="is a file"):
-        run(tmp_path / "thesis.tex")
+    assert "holds thesis.tex and no study.json" in refusal(run, tmp_path)
+    assert "is a file" in refusal(run, tmp_path / "thesis.tex")
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+# Versions.
+
+
+def begun_by(folder, **changes):
+    """Say in the folder that other versions began it."""
+    entry = json.loads((folder / STUDY).read_text())
+    (folder / STUDY).write_text(json.dumps(entry | {"versions": entry["versions"] | changes}))
+
+
+def test_workers_as_here_or_that_died_meanwhile_are_no_news():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_workers({"tcp://a:1": versions(), "tcp://b:1": versions(), "tcp://c:1": OSError("closed")})
+
+
+@pytest.mark.parametrize(
+    ("there", "evidence"),
+    [
+        (versions() | {"cmmsim": "9.8.7"}, f"worker tcp://b:1 has cmmsim 9.8.7, here is {versions()['cmmsim']}"),
+        (versions() | {"cmmsim": "not installed"}, "worker tcp://b:1 has cmmsim not installed, here is"),
+        (Exception("ImportError('none\\nhere')\n"), "worker tcp://b:1 cannot run cmmsim"),
+    ],
+)
+def test_another_product_is_refused_in_one_line(there, evidence):
+    assert evidence in refusal(check_workers, {"tcp://a:1": versions() | {"numpy": "0.1"}, "tcp://b:1": there})
+
+
+def test_one_warning_names_each_version_once_with_how_many_workers_have_it():
+    here = versions()
+    there = {f"tcp://{name}:1": here | {"numpy": "1.2.3"} for name in "abc"} | {"tcp://d:1": here | {"casadi": "3.0"}}
+    with pytest.warns(OtherVersionsWarning) as caught:
+        check_workers(there)
+    assert [str(one.message) for one in caught] == [
+        "figures may differ a little where versions do: numpy 1.2.3 (worker tcp://a:1 and 2 more), here "
+        f"{here['numpy']}; casadi 3.0 (worker tcp://d:1), here {here['casadi']}"
+    ]
+
+
+def test_no_rows_are_added_to_those_of_another_version(tmp_path):
+    run(tmp_path)
+    begun_by(tmp_path, cmmsim="9.8.7")
+    kept = (tmp_path / JOURNAL).read_bytes()
+    with pytest.raises(StudyError, match=r"has cmmsim 9\.8\.7, here is \S+; go on with that version"):
+        run(tmp_path, study(repeats=4))
+    assert (tmp_path / JOURNAL).read_bytes() == kept
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert run(tmp_path).found == 18
+
+
+def test_rows_are_added_with_a_warning_where_only_other_packages_changed(tmp_path):
+    run(tmp_path, study(repeats=1))
+    begun_by(tmp_path, scipy="0.1")
+    with pytest.warns(OtherVersionsWarning, match=r"scipy 0\.1 \(.*\), here"):
+        run(tmp_path, study(repeats=2))
+    assert json.loads((tmp_path / STUDY).read_text())["versions"] == versions() | {"scipy": "0.1"}
+
+
+def test_folder_without_rows_or_versions_goes_on_whatever_made_it(tmp_path):
+    run(tmp_path, study(repeats=1))
+    begun_by(tmp_path, cmmsim="9.8.7")
+    (tmp_path / JOURNAL).write_bytes(b"")
+    assert run(tmp_path, study(repeats=1)).found == 0
+    entry = json.loads((tmp_path / STUDY).read_text())
+    assert entry.pop("versions") == versions()
+    (tmp_path / STUDY).write_text(json.dumps(entry))
+    assert run(tmp_path, study(repeats=2)).found == 6
