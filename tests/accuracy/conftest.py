@@ -2,8 +2,9 @@
 
 import textwrap
 
-import numpy  # noqa: F401  before any project: it cannot be loaded twice
+import numpy.fft  # noqa: F401  before any project: NumPy cannot be loaded twice
 import pytest
+import scipy.special  # noqa: F401
 
 collect_ignore = ["guide"]  # an outsider's files: test_guide.py runs them as an outsider would
 

@@ -9,9 +9,20 @@ from identify.accuracy.figure import mean_interval
 pytest_plugins = "pytester"
 
 
-@pytest.mark.parametrize(
-    ("value", "limit", "better", "passes"),
-    [
+def outcomes(project, calls):
+    """Outcome of each call of the fixture in a test of its own: 'passed', or the lines of its failure."""
+    done = project("".join(f"def test_{n}(accuracy): accuracy.{call}\n" for n, call in enumerate(calls)), "-rA")
+    failed = {}
+    for line in done.outlines:
+        if line.startswith("____"):
+            failed[int(line.strip("_ ").removeprefix("test_"))] = lines = []
+        elif line.startswith("E "):
+            lines.append(line[1:].strip())
+    return [failed.get(n, "passed") for n in range(len(calls))], done
+
+
+def test_a_value_beyond_its_limit_fails(project):
+    cases = [
         (1.0, 2.0, "lower", True),
         (2.0, 2.0, "lower", True),
         (2.1, 2.0, "lower", False),
@@ -20,17 +31,14 @@ pytest_plugins = "pytester"
         (-1.0, -2.0, "lower", False),
         (0.1, 0.0, "lower", False),
         (1e300, None, "lower", True),
-    ],
-)
-def test_a_value_beyond_its_limit_fails(project, value, limit, better, passes):
-    done = project(f"def test_it(accuracy): accuracy.record('bias', {value}, limit={limit}, better={better!r})")
-    done.assert_outcomes(passed=int(passes), failed=int(not passes))
+    ]
+    calls = [f"record('bias', {value}, limit={limit}, better={better!r})" for value, limit, better, _ in cases]
+    assert [found == "passed" for found in outcomes(project, calls)[0]] == [passes for *_, passes in cases]
 
 
-@pytest.mark.parametrize(
-    ("values", "limit", "better", "passes"),
-    [
-        # mean 10, interval 10 +- 12.706 * 1 (two values) and 10 +- 0.04 (2000 values)
+def test_a_sample_fails_only_when_its_whole_interval_is_beyond(project):
+    """Mean 10, interval 10 +- 12.706 * 1 (two values) and 10 +- 0.04 (2000 values)."""
+    cases = [
         ("[9.0, 11.0]", -2.0, "lower", True),
         ("[9.0, 11.0]", -3.0, "lower", False),
         ("[9.0, 11.0]", 22.0, "higher", True),
@@ -41,22 +49,17 @@ def test_a_value_beyond_its_limit_fails(project, value, limit, better, passes):
         ("[1.7e308, 1.7e308]", 2.0, "lower", False),
         ("[5, 5, 5]", 5, "lower", True),
         ("[5, 5, 5]", 4.9, "lower", False),
-    ],
-)
-def test_a_sample_fails_only_when_its_whole_interval_is_beyond(project, values, limit, better, passes):
-    done = project(f"def test_it(accuracy): accuracy.sample('bias', {values}, limit={limit}, better={better!r})")
-    done.assert_outcomes(passed=int(passes), failed=int(not passes))
+    ]
+    calls = [f"sample('bias', {values}, limit={limit}, better={better!r})" for values, limit, better, _ in cases]
+    assert [found == "passed" for found in outcomes(project, calls)[0]] == [passes for *_, passes in cases]
 
 
-def test_the_interval_is_students(subtests):
-    rng = np.random.default_rng(1)
-    for count in (2, 3, 10, 1000):
-        with subtests.test(count=count):
-            values = rng.normal(3.0, 2.0, count)
-            low, high = stats.t.interval(0.95, count - 1, np.mean(values), stats.sem(values))
-            mean, interval = mean_interval(values)
-            assert mean == pytest.approx(values.mean())
-            assert interval == pytest.approx((low, high))
+@pytest.mark.parametrize("count", [2, 3, 10, 1000])
+def test_the_interval_is_students(count):
+    values = np.random.default_rng(1).normal(3.0, 2.0, count)
+    mean, interval = mean_interval(values)
+    assert mean == pytest.approx(values.mean())
+    assert interval == pytest.approx(stats.t.interval(0.95, count - 1, np.mean(values), stats.sem(values)))
 
 
 @pytest.mark.parametrize("power", [-1000, -600, 0, 520, 1000])
@@ -94,54 +97,37 @@ def test_a_failure_says_everything_and_points_at_the_users_line(project):
             "test_mine.py:*: Failed",
         ]
     )
-    assert "recorder.py" not in done.stdout.str()
+    assert "figure.py" not in done.stdout.str()
 
 
-@pytest.mark.parametrize(
-    ("call", "says"),
-    [
-        ("record('x', float('nan'))", "x: value is nan, not a finite number"),
-        ("record('x', np.float32('inf'))", "x: value is inf, not a finite number"),
-        ("record('x', '1.0')", "x: value must be one number, got '1.0'"),
-        ("record('x', None)", "x: value must be one number, got None"),
-        ("record('x', True)", "x: value must be one number, got True"),
-        ("record('x', [1.0, 2.0])", "x: value must be one number, got an array of shape (2,)"),
-        ("record('x', 1.0, limit=float('nan'))", "x: limit is nan, not a finite number"),
-        ("record('x', 1.0, limit='2')", "x: limit must be one number, got '2'"),
-        ("record('x', 1.0, better='smaller')", "x: better is 'smaller', must be 'lower' or 'higher'"),
-        ("record('', 1.0)", "the name of a figure is a line of text, got ''"),
-        ("record('x', 1.0, unit=3)", "the unit of a figure is a line of text, got 3"),
-        ("sample('x', [])", "x: a sample needs at least 2 values, got 0"),
-        ("sample('x', [1.0])", "x: a sample needs at least 2 values, got 1"),
-        ("sample('x', 1.0)", "x: values must be a row of numbers, got an array of shape ()"),
-        ("sample('x', np.ones((50, 6)))", "x: values must be a row of numbers, got an array of shape (50, 6)"),
-        ("sample('x', [1.0, 2.0, float('inf')])", "x: values[2] is inf, not a finite number"),
-        ("sample('x', [-1.7e308, 1.7e308])", "x: the interval of the mean is -inf .. inf, not finite"),
-        ("record('x', np.longdouble('1e400'))", "x: value is inf, not a finite number"),
-        ("sample('x', ['a', 'b'])", "x: values must be a row of numbers, got ['a', 'b']"),
-        ("sample('x', [[1], [2, 3]])", "x: values must be a row of numbers, got rows of different lengths"),
-    ],
-)
-def test_what_is_no_figure_is_one_line(project, call, says):
-    done = project(f"def test_it(accuracy): accuracy.{call}")
-    done.assert_outcomes(failed=1)
-    evidence = [line[1:].strip() for line in done.outlines if line.startswith("E ")]
-    assert evidence == [f"identify.accuracy.figure.AccuracyError: {says}"]
-    assert not [line for line in done.outlines if "= accuracy =" in line]
+BAD = {
+    "record('x', float('nan'))": "x: value is nan, not a finite number",
+    "record('x', np.float32('inf'))": "x: value is inf, not a finite number",
+    "record('x', '1.0')": "x: value must be one number, got '1.0'",
+    "record('x', None)": "x: value must be one number, got None",
+    "record('x', True)": "x: value must be one number, got True",
+    "record('x', [1.0, 2.0])": "x: value must be one number, got an array of shape (2,)",
+    "record('x', 1.0, limit=float('nan'))": "x: limit is nan, not a finite number",
+    "record('x', 1.0, limit='2')": "x: limit must be one number, got '2'",
+    "record('x', 1.0, better='smaller')": "x: better is 'smaller', must be 'lower' or 'higher'",
+    "record('', 1.0)": "the name of a figure is a line of text, got ''",
+    "record('x', 1.0, unit=3)": "the unit of a figure is a line of text, got 3",
+    "sample('x', [1.0])": "x: a sample needs at least 2 values, got 1",
+    "sample('x', 1.0)": "x: values must be a row of numbers, got an array of shape ()",
+    "sample('x', np.ones((50, 6)))": "x: values must be a row of numbers, got an array of shape (50, 6)",
+    "sample('x', [1.0, 2.0, float('inf')])": "x: values[2] is inf, not a finite number",
+    "sample('x', [-1.7e308, 1.7e308])": "x: the interval of the mean is -inf .. inf, not finite",
+    "record('x', np.longdouble('1e400'))": "x: value is inf, not a finite number",
+    "sample('x', ['a', 'b'])": "x: values must be a row of numbers, got ['a', 'b']",
+    "sample('x', [[1], [2, 3]])": "x: values must be a row of numbers, got rows of different lengths",
+    "sample('x', [1, 2]), accuracy.record('x', 1)": "x: recorded already in this test",
+}
 
 
-def test_a_name_is_recorded_once_a_test(project):
-    done = project(
-        """
-        @pytest.mark.parametrize("twice", [False, True])
-        def test_it(accuracy, twice):
-            accuracy.record("x", 1.0)
-            if twice:
-                accuracy.sample("x", [1.0, 2.0])
-        """
-    )
-    done.assert_outcomes(passed=1, failed=1)
-    done.stdout.fnmatch_lines(["E*AccuracyError: x: recorded already in this test"])
+def test_what_is_no_figure_is_one_line(project):
+    found, done = outcomes(project, BAD)
+    assert found == [[f"identify.accuracy.figure.AccuracyError: {says}"] for says in BAD.values()]
+    assert len([line for line in done.outlines if line.startswith("  x ")]) == 1, "nothing of it is a figure"
 
 
 def test_a_failure_can_be_expected_but_not_swallowed(project):

@@ -1,4 +1,4 @@
-"""The end of a session: the table, saved figures, and what got worse than they were."""
+"""The end of a session: the table and saved figures; and what is refused before it begins."""
 
 import json
 
@@ -16,9 +16,16 @@ def test_sensor(accuracy):
 
 @pytest.mark.parametrize("method", ["planes", "registration"])
 def test_pose(accuracy, method):
-    accuracy.sample("pose", {mean} + RNG.normal(0, 1, 50), unit="um")
+    accuracy.sample("pose", 10 + np.random.default_rng(len(method)).normal(0, 1, 50), unit="um")
 """
-START = FIGURES.format(bias=0.002, mean=10)
+START = FIGURES.format(bias=0.002)
+SAVE = ("--accuracy-save", "before")
+
+
+@pytest.fixture
+def saved(pytester):
+    """The file of figures saved as `before`."""
+    return pytester.path / ".accuracy" / "before.json"
 
 
 def table(result):
@@ -30,10 +37,9 @@ def table(result):
 
 
 def test_the_table_shows_value_interval_unit_limit_and_margin(project):
-    done = project(START)
-    values = 10 + np.random.default_rng(0).normal(0, 1, 100)
-    mean, reach = values[:50].mean(), 2.00958 * values[:50].std(ddof=1) / np.sqrt(50)  # Student, 49 degrees of freedom
-    lines = [line.split() for line in table(done)]
+    lines = [line.split() for line in table(project(START))]
+    values = 10 + np.random.default_rng(len("planes")).normal(0, 1, 50)
+    mean, reach = values.mean(), 2.00958 * values.std(ddof=1) / np.sqrt(50)  # Student, 49 degrees of freedom
     assert lines[0] == ["value", "95%", "interval", "unit", "limit", "margin"]
     assert lines[1] == ["test_mine.py::test_pose[planes]"]
     assert lines[2] == ["pose", f"{mean:.4g}", f"{mean - reach:.4g}", "..", f"{mean + reach:.4g}", "um"]
@@ -43,13 +49,7 @@ def test_the_table_shows_value_interval_unit_limit_and_margin(project):
     assert lines[7] == ["seen", "0.98", "≥", "0.95", "3%"]
 
 
-def test_a_session_without_figures_has_no_table(project):
-    done = project("def test_nothing(): pass")
-    done.assert_outcomes(passed=1)
-    assert "accuracy" not in done.stdout.str()
-
-
-def test_figures_of_setup_and_of_failed_tests_are_shown(project):
+def test_figures_of_setup_and_of_failed_tests_are_shown_and_without_figures_there_is_no_table(project):
     done = project(
         """
         @pytest.fixture
@@ -64,84 +64,60 @@ def test_figures_of_setup_and_of_failed_tests_are_shown(project):
     )
     assert [line.split()[:2] for line in table(done)][2:5] == [["in", "setup"], ["in", "the"], ["in", "teardown"]]
     assert [line for line in table(done) if "FAILED" in line and "in the test" in line]
+    plain = project("def test_it(record_property): record_property('accuracy', 0.93)")
+    plain.assert_outcomes(passed=1)
+    assert "accuracy" not in plain.stdout.str(), "a user's own property of that name is left alone"
 
 
-def test_saved_figures_are_json_that_says_where_they_come_from(project, pytester):
-    project(START, "--accuracy-save", "before", "--accuracy-seed", "3").assert_outcomes(passed=3)
-    saved = json.loads((pytester.path / ".accuracy" / "before.json").read_text())
-    assert (saved["format"], saved["schema"], saved["name"], saved["seed"]) == ("cmmsim accuracy", 1, "before", 3)
-    assert {"cmmsim", "numpy", "python"} <= set(saved["versions"])
-    assert set(saved["machine"]) == {"system", "processor", "cores"}
-    first, _, bias, _ = saved["figures"]
+def test_a_sample_whose_interval_holds_the_limit_is_undecided(project):
+    done = project(
+        """
+        def test_it(accuracy):
+            accuracy.sample("wide", [100, 300], limit=2)
+            accuracy.sample("good", [1.0, 1.1], limit=3)
+            accuracy.sample("few seen", [0.8, 0.9], limit=0.95, better="higher")
+            accuracy.sample("seen", [0.98, 0.98], limit=0.95, better="higher")
+            accuracy.sample("open", [1, 9])
+            accuracy.record("value", 1, limit=2)
+        """
+    )
+    done.assert_outcomes(passed=1)
+    ends = {line[2:10].strip(): line.rpartition("  ")[2] for line in done.outlines if line.startswith("  ")}
+    assert ends["wide"] == "-9900% undecided"
+    assert ends["few seen"] == "-11% undecided"
+    assert not [name for name in ("good", "seen", "open", "value") if "undecided" in ends[name]]
+    done.stdout.fnmatch_lines(["undecided: passed, as the interval holds the limit; more values would tell"])
+
+
+def test_saved_figures_are_json_that_says_where_they_come_from_and_become_a_markdown_table(project, saved, capsys):
+    project(START, *SAVE, "--accuracy-seed", "3", "--junit-xml", "report.xml").assert_outcomes(passed=3)
+    content = json.loads(saved.read_text())
+    assert (content["format"], content["schema"], content["name"], content["seed"]) == (
+        "cmmsim accuracy",
+        1,
+        "before",
+        3,
+    )
+    assert {"cmmsim", "numpy", "python"} <= set(content["versions"])
+    assert set(content["machine"]) == {"system", "processor", "cores"}
+    first, _, bias, _ = content["figures"]
     assert bias == {
         "test": "test_mine.py::test_sensor", "name": "bias", "value": 0.002, "unit": "px", "better": "lower",
         "limit": 0.003, "interval": None, "count": 1,
     }  # fmt: skip
     assert first["count"] == 50
     assert first["interval"][0] < first["value"] < first["interval"][1]
-
-
-def test_the_table_compares_with_saved_figures(project):
-    project(START, "--accuracy-save", "before")
-    again = project(FIGURES.format(bias=0.0025, mean=10), "--accuracy-compare", "before")
-    again.assert_outcomes(passed=3)
-    lines = [line.split() for line in table(again)]
-    assert lines[0][-2:] == ["before", "change"]
-    assert lines[6][-2:] == ["0.002", "+25.0%"]
-    assert lines[7][-2:] == ["0.98", "+0.0%"]
-
-
-def test_new_and_missing_figures_are_told(project):
-    project(START, "--accuracy-save", "before")
-    again = project("def test_new(accuracy): accuracy.record('new', 1.0)", "--accuracy-compare", "before")
-    assert [line for line in again.outlines if line.startswith("  new") and line.endswith("  new")]
-    again.stdout.fnmatch_lines(["4 of 4 figures saved as before were not measured now:"])
-
-
-def test_another_seed_is_told(project):
-    project(START, "--accuracy-save", "before")
-    again = project(START, "--accuracy-compare", "before", "--accuracy-seed", "7")
-    again.stdout.fnmatch_lines(["before was saved with --accuracy-seed 0, this is 7"])
-
-
-@pytest.mark.parametrize(
-    ("bias", "mean", "ratio", "exit_status"),
-    [
-        (0.002, 10, "0", 0),
-        (0.00215, 10, "0.1", 0),
-        (0.00225, 10, "0.1", 1),
-        (0.001, 5, "0", 0),  # better
-        (0.002, 10.3, "0", 0),  # a shift of two standard errors of the difference is noise: the intervals overlap
-        (0.002, 11.5, "0", 1),
-        (0.002, 11.5, "0.2", 0),
-    ],
-)
-def test_the_session_fails_when_a_figure_got_worse_by_more_than_the_ratio(project, bias, mean, ratio, exit_status):
-    project(START, "--accuracy-save", "before")
-    again = project(FIGURES.format(bias=bias, mean=mean), "--accuracy-compare", "before", "--accuracy-fail", ratio)
-    again.assert_outcomes(passed=3)
-    assert again.ret == exit_status
-    assert bool([line for line in again.outlines if line.startswith("worse by more than")]) == bool(exit_status)
-
-
-@pytest.mark.parametrize(
-    ("better", "value", "worse"), [("higher", 0.8, True), ("higher", 1.2, False), ("lower", 1e-9, True)]
-)
-def test_worse_is_what_the_figure_says(project, better, value, worse):
-    """A value of 0 that was exact gets worse by any step: the ratio of nothing is nothing."""
-    body = "def test_it(accuracy): accuracy.record('x', {}, better={!r})"
-    project(body.format(1.0 if better == "higher" else 0.0, better), "--accuracy-save", "before")
-    again = project(body.format(value, better), "--accuracy-compare", "before", "--accuracy-fail", "0.1")
-    assert again.ret == int(worse)
-
-
-def test_figures_in_another_unit_are_not_compared(project):
-    project("def test_it(accuracy): accuracy.record('x', 1.0, unit='mm')", "--accuracy-save", "before")
-    other = "def test_it(accuracy): accuracy.record('x', 1000.0, unit='um')"
-    assert project(other, "--accuracy-compare", "before").ret == 0
-    guarded = project(other, "--accuracy-compare", "before", "--accuracy-fail", "0.1")
-    assert guarded.ret == 1
-    guarded.stdout.fnmatch_lines(["*::test_it: x cannot be compared: unit is 'um', was 'mm'"])
+    assert (saved.parents[1] / "report.xml").read_text().count('name="cmmsim_accuracy"') == 4
+    capsys.readouterr()
+    assert main([str(saved)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "| figure | value | 95% interval | unit | limit | margin |"
+    assert lines[1] == "| --- | --: | --: | --- | --: | --: |"
+    assert lines[2].startswith("| pose [planes] | ")
+    assert lines[4] == "| bias | 0.002 |  | px | ≤ 0.003 | 33% |"
+    assert main(["no.json"]) == "no.json cannot be read: No such file or directory"
+    assert main([str(saved.parent)]).endswith(" cannot be read: Is a directory")
+    assert main([]).startswith("usage: ")
 
 
 @pytest.mark.parametrize(
@@ -149,53 +125,64 @@ def test_figures_in_another_unit_are_not_compared(project):
     [
         ("def test_bad(): assert False", "no figures were recorded"),
         ("def test_it(accuracy): accuracy.record('x', 3, limit=2)", "the session did not pass"),
+        (START + "\ndef test_z(): pytest.exit('enough')", "the session did not pass"),
     ],
+    ids=["none", "failed", "interrupted"],
 )
-def test_a_session_that_fails_saves_nothing(project, pytester, body, why):
-    project(START, "--accuracy-save", "before")
-    whole = (pytester.path / ".accuracy" / "before.json").read_bytes()
-    done = project(body, "--accuracy-save", "before")
-    done.stdout.fnmatch_lines([f"not saved as before: {why}"])
-    assert (pytester.path / ".accuracy" / "before.json").read_bytes() == whole
+def test_a_session_that_fails_saves_nothing(project, saved, body, why):
+    project(body, *SAVE).stdout.fnmatch_lines([f"not saved as before: {why}"])
+    assert not saved.parent.exists()
+    project(START, *SAVE)
+    whole = saved.read_bytes()
+    project(body, *SAVE).stdout.fnmatch_lines([f"not saved as before: {why}"])
+    assert saved.read_bytes() == whole
 
 
-def test_an_interrupted_session_saves_nothing(project, pytester):
-    done = project(START + "\ndef test_z(): pytest.exit('enough')", "--accuracy-save", "before")
-    done.stdout.fnmatch_lines(["not saved as before: the session did not pass"])
-    assert not (pytester.path / ".accuracy").exists()
+def test_saving_never_loses_the_figures_of_another_session(project, saved):
+    project(START, *SAVE)
+    whole = saved.read_bytes()
+    done = project(START, *SAVE, "-k", "planes")
+    assert done.ret == 1
+    done.stdout.fnmatch_lines(
+        [
+            "not saved as before: *before.json holds figures that were not measured now (*::test_pose[[]registration]: "
+            "pose; *::test_sensor: bias, seen); take another name, or remove that file"
+        ]
+    )
+    assert saved.read_bytes() == whole
+    more = FIGURES.format(bias=0.001) + "\ndef test_new(accuracy): accuracy.record('new', 1.0)\n"
+    assert project(more, *SAVE).ret == 0
+    names = [(figure["name"], figure["value"]) for figure in json.loads(saved.read_text())["figures"]]
+    assert {("bias", 0.001), ("seen", 0.98), ("new", 1.0)} < set(names)
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_a_figure_beyond_its_limit_is_not_saved_though_its_test_may_fail(project, saved, strict):
+    bad = """
+    @pytest.mark.xfail(strict={})
+    def test_bad(accuracy): accuracy.record("r", 10, limit=2)
+
+    def test_good(accuracy): accuracy.record("s", 1, limit=2)
+    """
+    done = project(bad.format(strict), *SAVE)
+    done.assert_outcomes(passed=1, xfailed=1)
+    done.stdout.fnmatch_lines(["not saved as before: beyond their limits are test_mine.py::test_bad: r"])
+    assert done.ret == 1
+    assert not saved.parent.exists()
+    assert project(bad.replace("10,", "1,").format(False), *SAVE).ret == 0
+    assert saved.exists()
 
 
 def test_the_folder_can_be_chosen(project, pytester):
-    project(START, "--accuracy-save", "before", "--accuracy-dir", "kept/figures").assert_outcomes(passed=3)
+    project(START, *SAVE, "--accuracy-dir", "kept/figures").assert_outcomes(passed=3)
     assert [path.name for path in (pytester.path / "kept" / "figures").iterdir()] == ["before.json"]
     assert project(START, "--accuracy-compare", "before", "--accuracy-dir", "kept/figures").ret == 0
 
 
-def test_saved_figures_become_a_markdown_table(project, pytester, capsys):
-    project(START, "--accuracy-save", "before")
-    capsys.readouterr()
-    assert main([str(pytester.path / ".accuracy" / "before.json")]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[:2] == [
-        "| figure | value | 95% interval | unit | limit | margin |",
-        "| --- | --: | --: | --- | --: | --: |",
-    ]
-    assert lines[2].startswith("| pose [planes] | ")
-    assert lines[4] == "| bias | 0.002 |  | px | ≤ 0.003 | 33% |"
-    assert main(["no.json"]) == "no.json cannot be read: No such file or directory"
-    assert main([str(pytester.path)]).endswith(" cannot be read: Is a directory")
-    assert main([]).startswith("usage: ")
-
-
-def test_junit_reports_carry_the_figures(project, pytester):
-    project(START, "--junit-xml", "report.xml")
-    assert (pytester.path / "report.xml").read_text().count('name="cmmsim_accuracy"') == 4
-
-
-def test_a_users_own_property_of_that_name_is_left_alone(project):
-    done = project("def test_it(record_property): record_property('accuracy', 0.93)")
-    done.assert_outcomes(passed=1)
-    assert done.ret == 0
+def test_a_folder_that_is_lost_meanwhile_fails_the_session_in_one_line(project):
+    done = project(START + "\ndef test_z(): open('.accuracy', 'w').close()", *SAVE)
+    assert done.ret == 1
+    done.stdout.fnmatch_lines(["*.accuracy/before.json cannot be written: *"])
 
 
 def test_it_lives_beside_pytest_benchmark(project, pytester):
@@ -215,7 +202,7 @@ def test_it_lives_beside_pytest_benchmark(project, pytester):
 
 @pytest.mark.slow
 def test_with_xdist_the_table_and_the_file_are_the_same(project, pytester):
-    body = FIGURES.format(bias=0.002, mean=10).replace("RNG", "np.random.default_rng(5)") + (
+    body = START + (
         "\n@pytest.mark.xdist_group('one')\n"
         "@pytest.mark.parametrize('number', range(20))\n"
         "def test_many(accuracy, cmmsim_seed, number): accuracy.record('seed', cmmsim_seed)\n"
@@ -231,3 +218,52 @@ def test_with_xdist_the_table_and_the_file_are_the_same(project, pytester):
         assert one["figures"] == two["figures"]
     worse = body.replace("0.002", "0.0029")
     assert project(worse, "-n", "2", "--accuracy-compare", "plain", "--accuracy-fail", "0.1").ret == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--accuracy-compare", "befor"], "no accuracy figures are saved as 'befor' in *.accuracy; saved are: before"),
+        (["--accuracy-save", "../x"], "'../x' is no name for saved figures: up to 100 letters, digits, *"),
+        (["--accuracy-save", "x" * 300], "'xxx*' is no name for saved figures: up to 100 letters, digits, *"),
+        (["--accuracy-save", "full.json"], "'full.json' is no name for saved figures: 'full' makes that file"),
+        (["--accuracy-save", "x", "--accuracy-dir", "test_mine.py"], "/*/x.json cannot be written: Not a directory"),
+        (["--accuracy-save", "x", "--accuracy-dir", "/proc/none"], "/proc/none/x.json cannot be written: *"),
+        (["--accuracy-save", "x", "--accuracy-dir", "y" * 300], "/*/x.json cannot be written: File name too long"),
+        (["--accuracy-fail", "0.1"], "--accuracy-fail needs --accuracy-compare NAME: worse than what?"),
+        (["--accuracy-fail", "-1"], "*argument --accuracy-fail: RATIO is -1, must be 0 or more, such as 0.1 for 10 %"),
+        (["--accuracy-fail", "ten"], "*argument --accuracy-fail: invalid ratio value: 'ten'"),
+        (["--accuracy-seed", "-1"], "*argument --accuracy-seed: the seed is -1, must be 0 or more"),
+    ],
+)
+def test_wrong_options_are_refused_before_any_test(project, saved, options, says):
+    saved.parent.mkdir()
+    saved.touch()
+    done = project(START, *options)
+    assert done.ret == pytest.ExitCode.USAGE_ERROR
+    done.stderr.fnmatch_lines([says if says.startswith("*") else f"ERROR: {says}"])
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("{", "cannot be read as JSON: *"),
+        ("[1]", "holds no accuracy figures (no entry format = 'cmmsim accuracy')"),
+        ('{"benchmarks": []}', "holds no accuracy figures (no entry format = 'cmmsim accuracy')"),
+        ('{"format": "cmmsim accuracy", "schema": 2}', "has schema 2, this version reads 1"),
+        ('{"format": "cmmsim accuracy", "schema": 1, "name": "x", "seed": 0}', "figures: Field required *"),
+        (
+            '{"format": "cmmsim accuracy", "schema": 1, "name": "x", "seed": 0, "figures": [{"test": "t", "name": "n", '
+            '"value": NaN, "unit": "", "better": "lower"}]}',
+            "figures.0.value: Input should be a finite number (got nan)",
+        ),
+    ],
+)
+def test_a_file_that_is_none_is_one_line_and_is_not_replaced(project, saved, text, says):
+    saved.parent.mkdir()
+    saved.write_text(text)
+    for option in ("--accuracy-compare", "--accuracy-save"):
+        done = project(START, option, "before")
+        assert done.ret == pytest.ExitCode.USAGE_ERROR
+        done.stderr.fnmatch_lines([f"ERROR: *before.json*{says.replace('[', '[[]')}"])
+    assert saved.read_text() == text

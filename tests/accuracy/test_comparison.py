@@ -1,0 +1,156 @@
+"""Figures beside saved ones: what got worse, what is held to less than it was or to nothing, and what is gone."""
+
+import json
+
+import numpy as np
+import pytest
+
+pytest_plugins = "pytester"
+
+BEFORE = """
+def test_sensor(accuracy):
+    accuracy.record("bias", 0.002, unit="px", limit=0.003)
+    accuracy.record("seen", 0.98, limit=0.95, better="higher")
+
+@pytest.mark.parametrize("method", ["planes", "registration"])
+def test_pose(accuracy, method):
+    accuracy.record("pose", 10.0, unit="um")
+"""
+SAVE, COMPARE = ("--accuracy-save", "before"), ("--accuracy-compare", "before")
+GUARDS = ((), ("--accuracy-fail", "0.1"))
+
+
+def test_the_table_compares_with_saved_figures_and_tells_of_new_ones_and_of_another_seed(project):
+    project(BEFORE, *SAVE)
+    now = BEFORE.replace("0.002", "0.0025") + "\ndef test_new(accuracy): accuracy.record('new', 1.0)\n"
+    again = project(now, *COMPARE, "--accuracy-seed", "7")
+    again.assert_outcomes(passed=4)
+    cells = {line.split()[0]: line.split()[-2:] for line in again.outlines if line.startswith("  ")}
+    assert cells["value"] == ["before", "change"]
+    assert cells["bias"] == ["0.002", "+25.0%"]
+    assert cells["seen"] == ["0.98", "+0.0%"]
+    assert cells["new"] == ["1", "new"]
+    again.stdout.fnmatch_lines(["before was saved with --accuracy-seed 0, this is 7"])
+
+
+SAMPLE = list(np.random.default_rng(0).normal(10, 1, 50).round(3))
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "ratio", "worse"),
+    [
+        ("record('x', 2.0)", "record('x', 2.0)", "0", False),
+        ("record('x', 2.0)", "record('x', 2.15)", "0.1", False),
+        ("record('x', 2.0)", "record('x', 2.25)", "0.1", True),
+        ("record('x', 2.0)", "record('x', 1.0)", "0", False),
+        ("record('x', 1.0, better='higher')", "record('x', 0.8, better='higher')", "0.1", True),
+        ("record('x', 1.0, better='higher')", "record('x', 1.2, better='higher')", "0.1", False),
+        ("record('x', 0.0)", "record('x', 1e-9)", "0.1", True),  # the ratio of nothing is nothing
+        (f"sample('x', {SAMPLE})", f"sample('x', np.array({SAMPLE}) - 5)", "0", False),
+        # a shift of two standard errors of the difference is noise: the intervals overlap
+        (f"sample('x', {SAMPLE})", f"sample('x', np.array({SAMPLE}) + 0.3)", "0", False),
+        (f"sample('x', {SAMPLE})", f"sample('x', np.array({SAMPLE}) + 1.5)", "0", True),
+        (f"sample('x', {SAMPLE})", f"sample('x', np.array({SAMPLE}) + 1.5)", "0.2", False),
+        ("record('x', 1.0, unit='mm')", "record('x', 1.0, unit='um')", "0.1", True),
+    ],
+)
+def test_the_session_fails_when_a_figure_got_worse_by_more_than_the_ratio(project, before, now, ratio, worse):
+    project(f"def test_it(accuracy): accuracy.{before}", *SAVE)
+    body = f"def test_it(accuracy): accuracy.{now}"
+    assert project(body, *COMPARE).ret == 0
+    guarded = project(body, *COMPARE, "--accuracy-fail", ratio)
+    guarded.assert_outcomes(passed=1)
+    assert guarded.ret == int(worse)
+    if "unit" in now:
+        guarded.stdout.fnmatch_lines(["*::test_it: x cannot be compared: unit is 'um', was 'mm'"])
+    else:
+        assert any(line.startswith("worse by more than") for line in guarded.outlines) == worse
+
+
+FEWER = BEFORE.replace('    accuracy.record("seen", 0.98', '    dict(name="seen", value=0.98')
+SKIPPED = BEFORE.replace("accuracy, method):", "accuracy, method):\n    if method == 'planes': pytest.skip('none')")
+MODULE = "pytest.skip('no library', allow_module_level=True)\n" + BEFORE
+RENAMED = BEFORE.replace("test_sensor", "test_other")
+
+
+@pytest.mark.parametrize(
+    ("body", "options", "missing", "guarded"),
+    [
+        (SKIPPED, (), ["test_pose[planes]: pose (the test was skipped)"], 1),
+        (FEWER, (), ["test_sensor: seen (the test passed without)"], 1),
+        (RENAMED, (), ["test_sensor: bias, seen (the test did not run)"], 0),
+        (BEFORE, ("-k", "planes or sensor"), ["test_pose[registration]: pose (the test did not run)"], 0),
+        (
+            MODULE,
+            (),
+            [
+                "test_pose[planes]: pose (the test was skipped)",
+                "test_pose[registration]: pose (the test was skipped)",
+                "test_sensor: bias, seen (the test was skipped)",
+            ],
+            1,
+        ),
+        pytest.param(
+            SKIPPED,
+            ("-n", "1", "--dist", "loadgroup"),
+            ["test_pose[planes]: pose (the test was skipped)"],
+            1,
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["skipped", "fewer", "renamed", "selected", "module", "in a group of a worker"],
+)
+def test_figures_that_are_missing_are_named(project, pytester, body, options, missing, guarded):
+    """With --accuracy-fail a test that is there has to bring all its figures."""
+    pytester.makepyfile(test_other="def test_it(): pass")
+    grouped = "\npytestmark = pytest.mark.xdist_group('one')\n"
+    project(grouped + BEFORE, *SAVE)
+    for guard in GUARDS:
+        done = project(grouped + body, *COMPARE, *guard, *options)
+        lines = [line.removeprefix("  test_mine.py::") for line in done.outlines if line.startswith("  test_mine.py::")]
+        assert lines == missing
+        assert (done.ret == 1) == bool(guard and guarded)
+        done.stdout.fnmatch_lines(["* of 4 figures saved as before were not measured now:"])
+
+
+NUMBER, SIX = "record('r', 10, limit=20)", "sample('s', [1, 2, 3, 4, 5, 6])"
+WIDE = "sample('r', [1, 50, 2, 60], limit=20)"
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "says", "fails"),
+    [
+        ("record('b', 1, 'px', 3)", "record('b', 1, 'px', 30)", "the limit of b is ≤ 30 px, was ≤ 3 px", 0),
+        ("record('b', 1, 'px', 3)", "record('b', 1, 'px')", "the limit of b is none, was ≤ 3 px", 0),
+        ("record('b', 1)", "record('b', 1, '', 3)", "the limit of b is ≤ 3, was none", 0),
+        (NUMBER, WIDE, "r is a sample of 4 values, was one number", 1),
+        (WIDE, NUMBER, "r is one number, was a sample of 4 values", 1),
+        (SIX, "sample('s', [1, 300])", "s is a sample of 2 values, was a sample of 6 values", 1),
+        (SIX, "sample('s', [1, 2, 3, 4, 5, 6, 3.5])", "", 0),
+        (NUMBER, NUMBER, "", 0),
+    ],
+)
+def test_a_figure_held_to_another_limit_or_resting_on_less_is_told(project, before, now, says, fails):
+    """A wide interval overlaps any other, so nothing else would ever say that it got worse."""
+    project(f"def test_it(accuracy): accuracy.{before}", *SAVE)
+    for guard in GUARDS:
+        done = project(f"def test_it(accuracy): accuracy.{now}", *COMPARE, *guard)
+        done.assert_outcomes(passed=1)
+        told = [line for line in done.outlines if ", was " in line]
+        assert told == ([f"test_mine.py::test_it: {says}"] if says else [])
+        assert done.ret == int(bool(fails and guard))
+
+
+def test_huge_numbers_are_short_in_the_table_and_saved(project, pytester):
+    body = """
+    def test_it(accuracy):
+        accuracy.sample("mid", {scale} * np.array([1.0, 1.01, 1.02]), limit={limit}, better="higher")
+    """
+    assert project(body.format(scale="1.0", limit=2e-300), *SAVE).ret == 0
+    done = project(body.format(scale="1e160", limit=2.0), *COMPARE, "--accuracy-save", "huge")
+    assert done.ret == 0
+    line = next(line for line in done.outlines if line.startswith("  mid"))
+    assert [cell for cell in line.split() if len(cell) > 10] == []
+    assert line.endswith(" 5e+161%    1.01  +1.0e+162%")
+    figure = json.loads((pytester.path / ".accuracy" / "huge.json").read_text())["figures"][0]
+    assert 0.9e160 < figure["interval"][0] < figure["value"] < figure["interval"][1] < 1.1e160
