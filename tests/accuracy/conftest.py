@@ -6,7 +6,7 @@ import numpy.fft  # noqa: F401  before any project: NumPy cannot be loaded twice
 import pytest
 import scipy.special  # noqa: F401
 
-collect_ignore = ["guide"]  # an outsider's files: test_guide.py runs them as an outsider would
+collect_ignore = ["guide"]  # an outsider's files: test_outside_project.py runs them as an outsider would
 
 QUICK = ("-p", "no:cacheprovider", "-p", "no:hypothesispytest")  # Hypothesis would be imported anew by each
 

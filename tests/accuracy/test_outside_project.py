@@ -1,20 +1,25 @@
-"""A project outside this one, in an environment of its own with the distribution installed from a wheel."""
+"""The guide in a project outside this one, in an environment of its own where the distribution is a wheel."""
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import sysconfig
+import zipfile
 from pathlib import Path
 
 import pytest
 
-pytestmark = [pytest.mark.slow, pytest.mark.rendering]
-
 ROOT = Path(__file__).parents[2]
-SOURCES = ("pyproject.toml", "README.md", "LICENSE", "cmmsim_command.py", "cmmsim", "dynamics", "identify")
-PROJECT = """
+PACKAGES = ("cmmsim", "dynamics", "identify")
+SOURCES = ("pyproject.toml", "README.md", "LICENSE", "cmmsim_command.py", *PACKAGES)
+GUIDE = Path(__file__).parent / "guide"
+FILES = sorted(GUIDE.glob("test_*.py"))
+TEXT = (GUIDE / "README.md").read_text(encoding="utf-8")
+
+INSTALLED = """
 import cmmsim
 import numpy as np
 import pytest
@@ -24,14 +29,6 @@ def test_installed(request):
     assert request.config.rootpath.as_posix() in cmmsim.__file__
 
 
-@pytest.mark.parametrize("method", ["planes", "registration"])
-def test_pose(accuracy, cmmsim_sensor, cmmsim_seed, method):
-    cmmsim_sensor.method = method
-    poses = cmmsim_sensor.home + 0.003 * np.random.default_rng(cmmsim_seed).uniform(-1, 1, (8, 6))
-    errors = [1e6 * np.linalg.norm((cmmsim_sensor.measure(pose).pose - pose)[:3]) for pose in poses]
-    accuracy.sample("position error", errors, unit="um", limit=50)
-
-
 @pytest.mark.cmmsim(scenario="mine.toml")
 def test_dynamics(accuracy, cmmsim_robot, cmmsim_scenario):
     assert cmmsim_scenario.name == "mine"
@@ -39,6 +36,19 @@ def test_dynamics(accuracy, cmmsim_robot, cmmsim_scenario):
     torque = cmmsim_robot.inverse_dynamics(pose, motion, motion)
     error = np.abs(cmmsim_robot.forward_dynamics(pose, motion, torque) - motion).max()
     accuracy.record("forward after inverse dynamics", error, unit="m/s2", limit=1e-9)
+"""
+
+SENSOR = """
+import numpy as np
+import pytest
+
+
+@pytest.mark.parametrize("method", ["planes", "registration"])
+def test_pose(accuracy, cmmsim_sensor, cmmsim_seed, method):
+    cmmsim_sensor.method = method
+    poses = cmmsim_sensor.home + 0.003 * np.random.default_rng(cmmsim_seed).uniform(-1, 1, (8, 6))
+    errors = [1e6 * np.linalg.norm((cmmsim_sensor.measure(pose).pose - pose)[:3]) for pose in poses]
+    accuracy.sample("position error", errors, unit="um", limit=50)
 """
 
 
@@ -51,67 +61,95 @@ def run(*command, cwd):
 
 
 @pytest.fixture(scope="module")
-def outside(tmp_path_factory):
-    """A folder with an environment `venv`: the wheel in it, the packages it depends on beside this interpreter's."""
-    folder = tmp_path_factory.mktemp("outside")
+def wheel(tmp_path_factory):
+    """The distribution, built from a copy of its sources."""
+    folder = tmp_path_factory.mktemp("wheel")
     source = folder / "source"
     source.mkdir()
     for name in SOURCES:
-        whole = ROOT / name
-        copy = shutil.copytree if whole.is_dir() else shutil.copy
-        copy(whole, source / name, **({"ignore": shutil.ignore_patterns("__pycache__")} if whole.is_dir() else {}))
-    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
-    built = run(*pip, "wheel", "--no-deps", "--wheel-dir", folder, source, cwd=folder)
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(ROOT / name, source)
+    command = (sys.executable, "-m", "pip", "--disable-pip-version-check", "wheel", "--no-deps")
+    built = run(*command, "--wheel-dir", folder, source, cwd=folder)
     if "Could not find a version that satisfies the requirement setuptools" in built.stderr:
         pytest.skip("no package index to take the build's setuptools from")
     assert built.returncode == 0, built.stderr
-    wheel = next(folder.glob("*.whl"))
+    return next(folder.glob("*.whl"))
+
+
+@pytest.fixture(scope="module")
+def outside(wheel, tmp_path_factory):
+    """A folder with an environment `venv`: the wheel in it, the packages it depends on beside this interpreter's."""
+    folder = tmp_path_factory.mktemp("outside")
     python = folder / "venv" / "bin" / "python"
     assert run(sys.executable, "-m", "venv", "--without-pip", folder / "venv", cwd=folder).returncode == 0
-    installed = run(*pip, "--python", python, "install", "--no-deps", wheel, cwd=folder)
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", python)
+    installed = run(*pip, "install", "--no-deps", wheel, cwd=folder)
     assert installed.returncode == 0, installed.stderr
     packages = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=folder).stdout.strip()
     (Path(packages) / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    shutil.rmtree(source)
-    (folder / "test_mine.py").write_text(PROJECT)
-    shutil.copy(ROOT / "tests" / "accuracy" / "guide" / "test_own_pose_estimator.py", folder)
     (folder / "mine.toml").write_text('name = "mine"\n')
     return folder
 
 
-def test_its_tests_find_the_fixtures_and_save_their_figures(outside):
-    done = run("venv/bin/python", "-m", "pytest", "--strict-markers", "--accuracy-save", "first", cwd=outside)
+def test_the_guide_names_every_option_and_every_file_and_no_other(pytestconfig):
+    named = set(re.findall(r"--accuracy-[a-z]+", TEXT))
+    known = {name for name in dir(pytestconfig.option) if name.startswith("accuracy_")}
+    assert {name[2:].replace("-", "_") for name in named} | {"accuracy_robot", "accuracy_scenario"} == known
+    assert "likewise for `robot` and `scenario`" in TEXT
+    assert set(re.findall(r"\]\(([^)]+)\)", TEXT)) == {path.name for path in FILES}
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_every_file_of_the_packages(wheel):
+    files = {p.relative_to(ROOT) for name in PACKAGES for p in (ROOT / name).rglob("*") if p.is_file()}
+    wanted = {path.as_posix() for path in files if path.suffix not in (".pyc", ".nbc", ".nbi")}
+    assert wanted | {"cmmsim_command.py"} <= set(zipfile.ZipFile(wheel).namelist())
+
+
+@pytest.mark.slow
+@pytest.mark.rendering
+def test_the_guides_example_and_its_complete_files_run_where_the_wheel_is_installed(outside):
+    """What the files test is held to limits that it meets and could miss."""
+    (outside / "test_installed.py").write_text(INSTALLED)
+    (outside / "test_example.py").write_text(re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)[0])
+    for file in FILES:
+        shutil.copy(file, outside)
+    pytest_ = ("venv/bin/python", "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:hypothesispytest")
+    done = run(*pytest_, "--strict-markers", "--accuracy-save", "mine", cwd=outside)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "5 passed" in done.stdout
-    figures = json.loads((outside / ".accuracy" / "first.json").read_text())["figures"]
-    mine = {figure["test"]: figure["value"] for figure in figures if figure["test"].startswith("test_mine.py::")}
-    assert [name[14:] for name in mine] == ["test_dynamics", "test_pose[planes]", "test_pose[registration]"]
-    _, by_planes, by_registration = mine.values()
-    assert 0 < by_registration < by_planes < 50  # um; plane by plane, a pose is less exact
-    assert len(figures) == 7, "the guide's own pose estimator has four"
+    assert f"{3 + len(FILES)} passed" in done.stdout
+    saved = json.loads((outside / ".accuracy" / "mine.json").read_text())["figures"]
+    assert len(saved) == 1 + 2 + 4 * len(FILES)
+    for file in FILES:
+        held = [f for f in saved if f["test"].startswith(f"{file.name}::") and f["limit"] is not None]
+        assert [figure["unit"] for figure in held] == ["um", "urad"]
+        assert all(figure["limit"] / 10 < figure["value"] < figure["limit"] for figure in held), held
+    table = run("venv/bin/python", "-m", "identify.accuracy", ".accuracy/mine.json", cwd=outside).stdout.splitlines()
+    assert table[0] == "| figure | value | 95% interval | unit | limit | margin |"
+    assert len(table) == 2 + len(saved)
 
 
-def test_its_second_version_is_held_to_the_first(outside):
+@pytest.mark.thorough
+@pytest.mark.rendering
+def test_a_second_version_is_held_to_the_first(outside):
     """On two workers: the same figures to the last digit, but for the one that was made worse."""
+    test = outside / "test_pose.py"
+    test.write_text(SENSOR)
+    pytest_ = ("venv/bin/python", "-m", "pytest", "test_pose.py")
+    first = run(*pytest_, "--accuracy-save", "first", cwd=outside)
+    assert first.returncode == 0, first.stdout + first.stderr
+    figures = json.loads((outside / ".accuracy" / "first.json").read_text())["figures"]
+    by_planes, by_registration = (figure["value"] for figure in figures)
+    assert 0 < by_registration < by_planes < 50  # um; plane by plane, a pose is less exact
     error = "1e6 * np.linalg"
-    worse = PROJECT.replace("limit=50)", "limit=500)").replace(error, f"(10 if method == 'planes' else 1) * {error}")
-    (outside / "test_mine.py").write_text(worse)
-    options = ("-n", "2", "--accuracy-compare", "first", "--accuracy-fail", "0.2")
-    again = run("venv/bin/python", "-m", "pytest", "test_mine.py", *options, cwd=outside)
+    worse = SENSOR.replace("limit=50)", "limit=500)").replace(error, f"(10 if method == 'planes' else 1) * {error}")
+    test.write_text(worse)
+    again = run(*pytest_, "-n", "2", "--accuracy-compare", "first", "--accuracy-fail", "0.2", cwd=outside)
     assert again.returncode == 1, again.stdout + again.stderr
-    assert "4 passed" in again.stdout
-    assert again.stdout.count("+0.0%") == 2
+    assert again.stdout.count("+0.0%") == 1
     assert [line.partition(" is ")[0] for line in again.stdout.splitlines() if line.startswith("worse by")] == [
-        "worse by more than 20%: test_mine.py::test_pose[planes]: position error"
+        "worse by more than 20%: test_pose.py::test_pose[planes]: position error"
     ]
-    assert "4 of 7 figures saved as first were not measured now" in again.stdout
-
-
-def test_its_command_line_prints_the_table(outside):
-    done = run("venv/bin/python", "-m", "identify.accuracy", ".accuracy/first.json", cwd=outside)
-    lines = done.stdout.splitlines()
-    assert lines[0] == "| figure | value | 95% interval | unit | limit | margin |"
-    assert len(lines) == 9
-    missing = run("venv/bin/python", "-m", "identify.accuracy", ".accuracy/second.json", cwd=outside)
-    assert missing.returncode == 1
-    assert len(missing.stderr.splitlines()) == 1, missing.stderr

@@ -1,9 +1,7 @@
 """This project's own figures of accuracy, recorded through its own plugin, with the goals of its design as limits.
 
-    pytest tests/accuracy/test_own_figures.py -m "slow or not slow" --accuracy-dir .readme --accuracy-save accuracy
-
-keeps them, and `python -m identify.accuracy .readme/accuracy.json` prints them as a table. What makes them so is proved
-in the tests of each package.
+`sh .ci/thorough` keeps them, and `python -m identify.accuracy .readme/accuracy.json` prints them as a table. What makes
+them so is proved in the tests of each package.
 """
 
 import numpy as np
@@ -17,6 +15,8 @@ from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.plugins import DEFAULT_DETECTOR
 from identify.experiment.sensor_in_loop import make_sensor
 from tests.dynamics.conftest import random_states
+
+pytestmark = [pytest.mark.thorough, pytest.mark.rendering]
 
 TRAVEL = np.array([0.009, 0.009, 0.009, 0.03, 0.03, 0.03])  # m and rad around home
 STATES = 200
@@ -34,8 +34,6 @@ def sticker_centres(sensor, pose):
     return sensor.rig.project(apply(camera_from_platform, sensor._scene[0].sticker_places))[0]
 
 
-@pytest.mark.slow
-@pytest.mark.rendering
 def test_sticker_centres_without_noise(accuracy, cmmsim_scenario, cmmsim_robot, cmmsim_sensor, cmmsim_seed):
     """What images, detection and their pixel convention leave when the camera makes no noise."""
     silent = cmmsim_scenario.with_overrides({"sensor_changes.camera.noise": False})
@@ -50,8 +48,6 @@ def test_sticker_centres_without_noise(accuracy, cmmsim_scenario, cmmsim_robot, 
     accuracy.record("sticker centre without noise, mean", np.abs(found.mean(axis=0)).max(), unit="px", limit=0.0005)
 
 
-@pytest.mark.slow
-@pytest.mark.rendering
 @pytest.mark.parametrize("method", ["registration", "planes"])
 def test_poses(accuracy, cmmsim_sensor, cmmsim_seed, method):
     """The design's goals for the method that is taken unless told otherwise; plane intersection against theory."""
@@ -96,7 +92,6 @@ def test_dynamics_against_pinocchio(accuracy, cmmsim_robot, cmmsim_seed):
     accuracy.record("inverse dynamics against Pinocchio, relative", error, limit=1e-9)
 
 
-@pytest.mark.slow
 def test_papers_loop_against_mujoco(accuracy, cmmsim_robot):
     pytest.importorskip("mujoco")
     from identify.verification.against_mujoco import judge, verify
@@ -106,8 +101,6 @@ def test_papers_loop_against_mujoco(accuracy, cmmsim_robot):
     accuracy.record("the paper's loop against MuJoCo, angle", verdict.angle_steady_urad, unit="urad", limit=20)
 
 
-@pytest.mark.slow
-@pytest.mark.rendering
 def test_identified_model_on_unseen_trajectories(accuracy, cmmsim_scenario, cmmsim_robot, cmmsim_seed):
     """Scenario `quick`: RMS of the worst component and run, model against the true plant."""
     record = identify.run_experiment(cmmsim_scenario, seed=cmmsim_seed)
