@@ -29,7 +29,7 @@ from identify.estimation.identification import output_error_problem
 from identify.estimators.estimator import Estimate, Estimator, Evidence, joint_channels
 from identify.experiment.joint_instruments import JointInstruments, measure_joints, read_channels, write_channels
 from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
-from identify.files.run_folder import RunFolder, rms_figures, rms_row
+from identify.files.run_folder import rms_figures, rms_row
 from identify.loop_parameters import NAMES
 from identify.progress import Progress
 from identify.random_streams import INSTRUMENTS, LATENCY, mixed_generator, stream_seed

@@ -95,10 +95,13 @@ def short_run():
     return record, run
 
 
-def recorded_run_folder(path, chosen=None):
-    """A folder as `cmmsim record` leaves it; chosen: another exciting trajectory than that of the record."""
-    folder, (record, run) = RunFolder(path), short_run()
-    folder.scenario.write_text(SHORT.to_toml(), encoding="utf-8")
+def recorded_run_folder(path, scenario=SHORT, made=None, chosen=None):
+    """A folder as `cmmsim record` leaves it, of a scenario and (record, run of the plant), by default a short one.
+
+    chosen: another exciting trajectory than that of the record.
+    """
+    folder, (record, run) = RunFolder(path), made or short_run()
+    folder.scenario.write_text(scenario.to_toml(), encoding="utf-8")
     save_trajectories(folder.trajectories, TrajectorySet(0, chosen or trajectory(0), (trajectory(5),), 1.0, 1.0, 1.0))
-    write(folder.experiment, record, build_plant(SHORT, rss6()).truth(run))
+    write(folder.experiment, record, build_plant(scenario, rss6()).truth(run))
     return folder
