@@ -13,8 +13,7 @@ from identify.progress import SilentProgress
 from identify.record import recording
 from identify.validation.estimator_comparison import START, compare, estimators_figure, examination
 from tests.identify.commands import command, one_line
-from tests.identify.estimator_evidence import evidence, truth_of, unseen
-from tests.identify.synthetic import quick, run_plant, truth
+from tests.identify.synthetic import evidence, quick, run_plant, truth, truth_of, unseen
 
 
 @pytest.fixture(scope="module")

@@ -28,8 +28,7 @@ from identify.experiment.joint_instruments import (
 from identify.files.dataset import write_groups
 from identify.loop_parameters import NAMES, StartingGuess
 from identify.record.recorded_run import recorded_run
-from tests.identify.estimator_evidence import PERFECT, evidence, truth_of
-from tests.identify.synthetic import quick, rss6, run_plant, truth
+from tests.identify.synthetic import PERFECT, evidence, quick, rss6, run_plant, truth, truth_of
 
 LD = NAMES.index("joint_pid.ld")
 

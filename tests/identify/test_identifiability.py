@@ -1,12 +1,30 @@
-"""What counts as identified: worked out by hand for parameters, sums and differences, and blind to the estimate."""
+"""What counts as identified, what rests on the guess, and conditioning: worked out by hand, and named for the robot."""
 
 import numpy as np
 import pytest
+from scipy.linalg import null_space
 
-from identify.estimation.base_parameters import base_parameters, structural_regressor
-from identify.estimation.identifiability import Identifiability, group_estimates, group_rows, identifiability
-from identify.loop_parameters import NAMES, holding_torque, index_of, starting_guess
-from tests.identify.synthetic import rss6, truth
+from identify.estimation.base_parameters import BaseParameters, base_parameters, structural_regressor
+from identify.estimation.covariance import correlation_matrix, strongest_pairs
+from identify.estimation.identifiability import (
+    POOR,
+    Identifiability,
+    conditioning,
+    group_estimates,
+    group_rows,
+    identifiability,
+    rests_on_prior,
+)
+from identify.estimation.identification import identify
+from identify.estimation.scale_anchor import ScaleAnchor
+from identify.loop_parameters import NAMES, StartingGuess, holding_torque, index_of, starting_guess
+from identify.record.recorded_run import recorded_run
+from identify.reporting.tables import ON_GUESS, parameter_table
+from tests.identify.synthetic import quick, rss6, run_plant, truth
+
+WEIGHED = ScaleAnchor("platform_mass", 23.5, 0.005)
+GAIN = ScaleAnchor("joint_gain", 10.5, 0.01)
+JOINTS = [k for k, name in enumerate(NAMES) if name.startswith("joint")]
 
 
 def unit(name):
@@ -58,3 +76,100 @@ def test_the_estimate_does_not_decide(factor):
     groups = group_estimates(base, guess, criterion, factor * truth(), covariance)
     assert groups.identifiable.all()
     assert not criterion.judge(group_rows(base), 9 * covariance).any()
+
+
+def resting(anchor):
+    sizes = identifiability(starting_guess(rss6(), "initial", 1.0), rss6()).sizes
+    found = rests_on_prior(base_parameters(structural_regressor(rss6())), anchor, truth(), sizes)
+    return {name for name, rests in zip(NAMES, found, strict=True) if rests}
+
+
+def test_links_and_inertias_in_sums_rest_on_the_guess_and_friction_and_gains_do_not():
+    named = resting(GAIN)
+    assert {f"link{k}.mass" for k in range(1, 7)} | {"platform.mass", "platform.Ixx", "crank1.Ixx"} <= named
+    assert named.isdisjoint(NAMES[k] for k in JOINTS)
+
+
+def test_a_weighed_platform_stands_alone_and_brings_izz_with_it():
+    """Masses of links that the platform carries stand in its mass as in Izz over the squared radius of its joints."""
+    radius = np.linalg.norm(rss6().geometry.platform_joints[0, :2])
+    base = base_parameters(structural_regressor(rss6()))
+    mass, inertia = (base.combinations[base.pivots.index(index_of(f"platform.{kind}"))] for kind in ("mass", "Izz"))
+    carried = [index_of(f"link{k}.mass") for k in range(1, 7)]
+    np.testing.assert_allclose(inertia[carried], radius**2 * mass[carried], atol=1e-9)
+    assert resting(GAIN) - resting(WEIGHED) == {"platform.mass", "platform.Izz"}
+
+
+def test_without_an_anchor_everything_rests_on_the_guess():
+    assert resting(ScaleAnchor("prior")) == set(NAMES)
+    assert resting(ScaleAnchor("payload")) == resting(GAIN)
+
+
+def test_what_rests_on_the_guess_can_change_with_no_pose_changing_and_nothing_else_can():
+    """A large change along all that neither poses nor weighing show, run through the closed loop."""
+    base = base_parameters(structural_regressor(rss6()))
+    gains = np.eye(len(NAMES))[64:]
+    shown = np.concatenate([group_rows(base), gains, WEIGHED.row()[0]]) * truth()
+    unseen = null_space(shown / np.linalg.norm(shown, axis=1, keepdims=True))
+    change = unseen @ np.random.default_rng(0).standard_normal(unseen.shape[1])
+    assert {name for name, moved in zip(NAMES, change, strict=True) if abs(moved) > 1e-6} == resting(WEIGHED)
+    run = recorded_run(run_plant(quick(), seed=0, duration_s=3.0)[0], rss6(), quick())
+    before, after = (run.model_poses(truth() * (1 + scale * change / np.abs(change).max())) for scale in (0.0, 0.3))
+    assert np.abs(after - before).max() < 1e-9
+    assert np.abs(run.model_poses(truth() * (1 + 1e-3 * np.eye(67)[JOINTS[0]])) - before).max() > 1e-7
+
+
+def test_a_result_names_what_rests_on_the_guess_among_what_is_identified():
+    record = run_plant(quick(), seed=1, duration_s=5.0)[0]
+    result = identify(record, rss6(), quick(**{"identification.method": "command_driven"}))
+    named = {name for name, rests in zip(NAMES, result.rests_on_prior, strict=True) if rests}
+    assert {"platform.Ixx", "platform.Iyy"} <= named < resting(WEIGHED)
+    assert not (result.rests_on_prior & ~result.identifiable).any()
+    entries = result.to_dict()["parameters"]
+    assert {name for name, entry in entries.items() if entry["rests_on_prior"]} == named
+    rows = parameter_table({"identification": result.to_dict()}).rows
+    assert {row[0] for row in rows if row[-1] == ON_GUESS} == named
+
+
+def three_unknowns(poses):
+    """Conditioning of two dynamic parameters, one group each, and one gain, all of size one with a guess of 1 ± 1."""
+    base = BaseParameters(("a", "b"), np.eye(2), (0, 1), (), (0.0, 1.0))
+    return conditioning(poses, np.eye(3), base, StartingGuess(np.ones(3), np.ones(3)), np.ones(3))
+
+
+def test_condition_numbers_are_those_worked_out_by_hand():
+    """Poses that show a - b with weight 8 and a + b - 2 gain with weight 0.5, and nothing of the common factor."""
+    first, second = np.array([1.0, -1.0, 0.0]) / np.sqrt(2), np.array([1.0, 1.0, -2.0]) / np.sqrt(6)
+    found = three_unknowns(8 * np.outer(first, first) + 0.5 * np.outer(second, second))
+    assert found.with_guess == pytest.approx(9.0)
+    assert found.poses_alone == pytest.approx(16.0)
+    assert (found.directions, found.unshown) == (2, 1)
+    assert found.warnings() == ()
+
+
+def test_what_the_poses_show_of_nothing_but_the_guess_is_a_warning():
+    weak = np.array([1.0, 1.0, -2.0]) / np.sqrt(6)
+    strong = np.array([1.0, -1.0, 0.0]) / np.sqrt(2)
+    found = three_unknowns(2 * np.outer(strong, strong) + 0.1 / POOR * np.outer(weak, weak))
+    assert found.poor
+    assert "1 of 2 directions" in found.warnings()[0]
+
+
+def test_a_group_counts_as_one_unknown():
+    """Two parameters that only act as a + 2 b: the information of the pair has rank one, that of the group is full."""
+    row = np.array([1.0, 2.0, 0.0])
+    gain = np.array([0.0, 0.0, 1.0])
+    base = BaseParameters(("a", "b"), np.array([[1.0, 2.0]]), (0,), (), (0.0, 1.0))
+    poses = 3.0 * np.outer(row - 3 * gain, row - 3 * gain)  # blind to a common factor of (a, b, gain) = (1, 1, 1)
+    found = conditioning(poses, np.eye(3), base, StartingGuess(np.ones(3), np.ones(3)), np.ones(3))
+    assert found.directions == 1
+    assert found.poses_alone == pytest.approx(1.0)
+
+
+def test_correlations_and_the_strongest_pairs():
+    covariance = np.array([[4.0, 1.8, 0.0], [1.8, 1.0, -0.3], [0.0, -0.3, 9.0]])
+    correlations = correlation_matrix(covariance)
+    np.testing.assert_allclose(correlations, [[1, 0.9, 0], [0.9, 1, -0.1], [0, -0.1, 1]])
+    pairs = strongest_pairs(correlations, ["a", "b", "c"], 2)
+    assert [(p.first, p.second) for p in pairs] == [("a", "b"), ("b", "c")]
+    assert [p.correlation for p in pairs] == pytest.approx([0.9, -0.1])

@@ -129,23 +129,17 @@ def test_an_exactly_known_load_leaves_every_digit_as_it_was(records, scenario):
     ("attributes", "says"),
     [
         ({"payload_mass_std": -0.04}, r"payload_mass_std is -0.04, must be a number >= 0 in kg"),
-        ({"payload_mass_std": np.nan}, r"payload_mass_std is nan, must be a number >= 0 in kg"),
-        ({"payload_mass_std": "0.04"}, r"payload_mass_std is '0.04', must be a number >= 0 in kg"),
         ({"payload_mass_std": 9.0}, r"payload_mass_std = 9 kg exceeds payload_mass = 8 kg"),
         ({"payload_Izz_std": 0.05}, r"payload_Izz_std = 0.05 kg m2 exceeds payload_Izz = 0.04 kg m2"),
     ],
-    ids=["negative", "NaN", "text", "more than the load", "moment"],
+    ids=["negative", "more than the load", "moment"],
 )
 def test_a_deviation_that_cannot_be_is_refused_with_its_value_and_limit(records, scenario, attributes, says):
     wrong = records[1].assign_attrs(attributes)
     with pytest.raises(RecordError, match=says):
         identify([records[0], wrong], rss6(), scenario)
-
-
-def test_a_deviation_without_its_load_is_refused(records):
-    alone = records[0].assign_attrs(payload_mass_std=0.04)
     with pytest.raises(RecordError, match="payload_mass is None, must be a number >= 0 in kg"):
-        recorded_payload_std(alone)
+        recorded_payload_std(records[0].assign_attrs(payload_mass_std=0.04))
 
 
 def test_a_deviation_does_not_make_a_load_of_none(records, scenario):
@@ -190,11 +184,13 @@ def test_an_experiment_states_the_load_and_keeps_the_drawn_one_in_its_truth(scen
     np.testing.assert_array_equal(*(one.truth["parameter_value"].values for one in (heavy, known)))
 
 
-@pytest.mark.slow
-def test_gains_miss_the_truth_as_often_as_they_say_where_the_load_is_drawn(scenario):
+@pytest.mark.parametrize(
+    "count", [pytest.param(4, marks=pytest.mark.slow), pytest.param(40, marks=pytest.mark.thorough)]
+)
+def test_gains_miss_the_truth_as_often_as_they_say_where_the_load_is_drawn(scenario, count):
     """Whole experiments, each with noise and a load of its own: errors of the gain in standard deviations have the
     variance one (99.8 % of chance); were the load called exact, twice the deviation and more."""
-    sensor, count = DrawnSensor(np.diag(SIGMA**2)), 10
+    sensor = DrawnSensor(np.diag(SIGMA**2))
     weighed = scenario.with_overrides({"payload.mass_std_kg": 0.08, "identification.scale_anchor": "payload"})
 
     plant = build_plant(weighed, rss6())

@@ -140,11 +140,14 @@ def _identified(**switch):
     return identify(run_plant(scenario, seed=0)[0], rss6(), scenario)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "switch",
-    [STRIBECK, ELASTIC, MISPLACED, MISPLACED | {"plant.geometry_seed": 1}],
-    ids=["stribeck friction", "elastic joints", "joints off by 0.1 mm", "joints off by 0.1 mm, another robot"],
+    [
+        pytest.param(STRIBECK, id="stribeck friction", marks=pytest.mark.slow),
+        pytest.param(ELASTIC, id="elastic joints", marks=pytest.mark.slow),
+        pytest.param(MISPLACED, id="joints off by 0.1 mm", marks=pytest.mark.slow),
+        pytest.param(MISPLACED | {"plant.geometry_seed": 1}, id="another robot", marks=pytest.mark.thorough),
+    ],
 )
 def test_the_residuals_say_that_the_model_is_wrong(switch):
     result = _identified(**switch)
@@ -162,7 +165,7 @@ def test_elastic_joints_that_the_closed_loop_hides_leave_nothing_identified():
     assert any("driven by the logged commands, the model misses" in said for said in result.warnings)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_intervals_hold_though_joints_are_off_by_a_third_of_a_millimetre():
     """The misfit is as large as the noise; intervals of white noise would miss by 4.5 standard deviations."""
     result = _identified(**MISPLACED | {"plant.geometry_error_m": 3e-4})

@@ -6,13 +6,11 @@ import pytest
 from dynamics.closed_loop import LoopFailure
 from dynamics.errors import ParameterError
 from identify.errors import EstimationError
-from identify.estimation.identification import identify
 from identify.progress import SilentProgress
 from identify.record.recorded_run import recorded_run
 from identify.reporting.run_result import prediction_entry
 from identify.validation.unseen import PosePrediction, predict_poses, predicted_runs
-from tests.identify.estimator_evidence import truth_of
-from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
+from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth, truth_of
 
 
 def test_normalised_squared_error_is_one_for_errors_of_the_stated_covariance():
@@ -75,21 +73,3 @@ def test_exactly_known_parameters_leave_what_the_noise_does_through_the_servo():
         prediction = predict_poses(run, truth(), np.zeros((67, 67)), np.random.default_rng(seed))
         ratios.append(prediction.normalised_squared_error(plant.pose))
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.1), ratios
-
-
-@pytest.mark.slow
-def test_the_error_on_unseen_motions_is_the_one_predicted():
-    """Squared error of the identified model against the true plant in units of what was predicted: one on average.
-
-    Six identifications, two unseen motions each. The starting guess, which is closer than it says, makes it a little
-    smaller.
-    """
-    scenario, ratios = quick(), []
-    for seed in range(6):
-        result = identify(run_plant(scenario, seed=seed)[0], rss6(), scenario)
-        for unseen in (2 * seed, 2 * seed + 1):
-            record, plant = run_plant(scenario, seed=100 + unseen, trajectory_seed=50 + unseen, duration_s=5.0)
-            rng = np.random.default_rng(unseen)
-            prediction = predict_poses(recorded_run(record, rss6(), scenario), result.estimate, result.covariance, rng)
-            ratios.append(prediction.normalised_squared_error(plant.pose))
-    assert 0.8 < np.mean(ratios) < 1.2, ratios

@@ -1,21 +1,21 @@
-"""An error of the model that noise does not explain: found, told from chance, and brought into the intervals."""
+"""Whether the model explains its record: misfits told from chance and brought into the intervals, and whiteness."""
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
-from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white
+from identify.errors import EstimationError
+from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white, whiteness
 from identify.estimation.identification import identify
 from tests.identify.synthetic import quick, rss6, run_plant
 
-LASTING = 0.9
 
-
-def lasting(rng, frames):
-    """Six residuals of variance one that follow each other with the correlation LASTING (an AR(1) process)."""
+def noise(rng, frames=600, memory=0.0):
+    """Six residuals of variance one that follow each other with the correlation `memory` (an AR(1) process)."""
     rows = np.empty((frames, 6))
     rows[0] = rng.standard_normal(6)
     for k in range(1, frames):
-        rows[k] = LASTING * rows[k - 1] + np.sqrt(1 - LASTING**2) * rng.standard_normal(6)
+        rows[k] = memory * rows[k - 1] + np.sqrt(1 - memory**2) * rng.standard_normal(6)
     return rows
 
 
@@ -39,7 +39,7 @@ def test_scores_of_lasting_residuals_spread_as_it_says_and_four_times_as_far_as_
     rng, frames = np.random.default_rng(1), 600
     ok = np.ones(frames, dtype=bool)
     wave = np.sin(2 * np.pi * np.arange(frames) / 200)[:, None, None] * rng.standard_normal((6, 1))
-    drawn = [lasting(rng, frames) for _ in range(300)]
+    drawn = [noise(rng, frames, memory=0.9) for _ in range(300)]
     spread = np.std([np.tensordot(r, wave, 2)[0] for r in drawn])
     said = np.sqrt(np.mean([coloured_score_covariance(r, wave, ok)[0, 0] for r in drawn]))
     white = np.sqrt(np.sum(wave**2))
@@ -74,3 +74,27 @@ def test_frames_marked_as_lost_afterwards_leave_nothing_identified():
     assert not result.identifiable.any()
     assert not result.groups.identifiable.any()
     assert "nothing counts as identified" in result.warnings[0]
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.1], ids=["whole", "one frame in ten lost"])
+def test_the_probability_of_white_noise_is_uniform(lost):
+    rng = np.random.default_rng(5)
+    values = []
+    for _ in range(200):
+        ok = rng.random(600) >= lost
+        residuals = np.where(ok[:, None], rng.standard_normal((600, 6)), np.nan)
+        values.append(whiteness(residuals, ok).p_value)
+    assert kstest(values, "uniform").pvalue > 1e-3
+
+
+def test_a_little_memory_is_seen():
+    """A correlation of 0.2 from frame to frame, in 600 frames of six components."""
+    ok = np.ones(600, dtype=bool)
+    assert all(whiteness(noise(np.random.default_rng(seed), memory=0.2), ok).suspicious for seed in range(20))
+    found = whiteness(noise(np.random.default_rng(3), 20_000, 0.5), np.ones(20_000, dtype=bool)).autocorrelations
+    assert np.allclose(found[:, :3], 0.5 ** np.arange(1, 4), atol=0.04)
+
+
+def test_too_few_frames_are_refused():
+    with pytest.raises(EstimationError, match=r"40 good frames are too few to test 10 lags, 100"):
+        whiteness(np.zeros((40, 6)), np.ones(40, dtype=bool))

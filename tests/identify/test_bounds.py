@@ -1,0 +1,350 @@
+"""Bounded least squares: the search against scipy's solvers, among bodies that can exist, and the intervals that hold.
+
+The linear problems have known statistics: the estimate without bounds is that of `numpy.linalg.lstsq`.
+"""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares, minimize, nnls
+
+from dynamics.inertia import UnphysicalInertiaError, physical_inertias
+from identify.estimation.bounded_least_squares import StopCriteria, minimise
+from identify.estimation.bounds import (
+    BoundedEstimate,
+    InCoordinates,
+    ParameterBounds,
+    bounded_estimate,
+    parameter_bounds,
+)
+from identify.estimation.identification import identify
+from identify.loop_parameters import NAMES, StartingGuess, index_of
+from identify.scenario import load_scenario
+from tests.identify.synthetic import quick, rss6, run_plant, truth
+
+CRITERIA = StopCriteria(cost_tolerance=1e-12, parameter_tolerance=1e-9, max_iterations=200)
+DRAWS = 500
+LOWEST = 0.95 - 3 * np.sqrt(0.95 * 0.05 / DRAWS)
+"""What chance makes of 95 % in so many draws, in one of a thousand tests."""
+
+
+class FromFunctions:
+    """A least-squares problem that remembers what it was asked for."""
+
+    def __init__(self, residual, jacobian):
+        self.residual, self.jacobian, self.calls = residual, jacobian, []
+
+    def cost(self, parameters):
+        self.calls.append("cost")
+        return float(np.sum(self.residual(parameters) ** 2))
+
+    def linearise(self, parameters):
+        self.calls.append("linearise")
+        residual, jacobian = self.residual(parameters), self.jacobian(parameters)
+        factor = np.linalg.qr(np.column_stack([jacobian, residual]), mode="r")
+        n = len(parameters)
+        return float(residual @ residual), factor[:n, :n], factor[:n, n]
+
+
+def exponential():
+    t = np.linspace(0, 3, 40)
+    data = 2.0 * np.exp(-1.3 * t) + 0.05 * np.sin(20 * t)
+    return FromFunctions(
+        lambda p: p[0] * np.exp(-p[1] * t) - data,
+        lambda p: np.column_stack([np.exp(-p[1] * t), -p[0] * t * np.exp(-p[1] * t)]),
+    )
+
+
+def linear(matrix, data):
+    return FromFunctions(lambda p: matrix @ p - data, lambda p: matrix)
+
+
+def test_it_finds_the_minimum_that_scipy_finds():
+    problem = exponential()
+    mine = minimise(problem, np.array([0.5, 4.0]), np.zeros(2), np.ones(2), CRITERIA)
+    scipys = least_squares(problem.residual, [0.5, 4.0], xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    assert np.allclose(mine.parameters, scipys.x, rtol=1e-6)
+    assert np.all(np.diff(mine.costs) < 0)
+
+
+def test_it_stays_inside_the_bounds_and_finds_the_constrained_minimum():
+    problem = exponential()
+    lower = np.array([0.0, 2.0])
+    mine = minimise(problem, np.array([0.5, 4.0]), lower, np.ones(2), CRITERIA)
+    scipys = least_squares(problem.residual, [0.5, 4.0], bounds=(lower, np.inf), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    assert mine.parameters[1] >= 2.0
+    assert np.allclose(mine.parameters, scipys.x, rtol=1e-5)
+
+
+def test_a_start_on_a_bound_does_not_hold_the_search_up():
+    """The model cannot run below its bounds, and a step along a bound may end below it by rounding."""
+    problem = exponential()
+    plain = problem.cost
+    problem.cost = lambda p: plain(p) if np.all(p >= 0.0) else np.inf
+    free = minimise(problem, np.array([0.0, 0.0]), np.zeros(2), np.array([0.3, 0.7]), CRITERIA)
+    assert np.allclose(free.parameters, least_squares(problem.residual, [1.0, 1.0], xtol=1e-15).x, rtol=1e-5)
+
+
+def test_parameters_held_at_their_bound_stay_there_exactly():
+    """The unconstrained minimum has a negative entry: it ends at zero, and the others still move."""
+    matrix = np.random.default_rng(2).standard_normal((30, 5))
+    target = matrix @ np.array([1.0, -2.0, 0.5, 3.0, -0.1])
+    problem = linear(matrix, target)
+    plain = problem.cost
+    problem.cost = lambda p: plain(p) if np.all(p >= 0.0) else np.inf
+    found = minimise(problem, np.array([1.0, 0.0, 1.0, 1.0, 0.0]), np.zeros(5), np.full(5, 0.37), CRITERIA)
+    expected = nnls(matrix, target)[0]
+    assert np.allclose(found.parameters, expected, atol=1e-9)
+    assert np.all(found.parameters >= 0)
+
+
+def test_a_region_where_the_model_cannot_run_is_stepped_around():
+    """Rosenbrock's valley with infinite cost on one side: the trust region shrinks and goes on."""
+    problem = FromFunctions(
+        lambda p: np.array([10 * (p[1] - p[0] ** 2), 1 - p[0]]), lambda p: np.array([[-20 * p[0], 10], [-1, 0]])
+    )
+    plain = problem.cost
+    problem.cost = lambda p: np.inf if p[1] > 1.6 else plain(p)
+    found = minimise(problem, np.array([-1.2, 1.0]), np.full(2, -np.inf), np.ones(2), CRITERIA)
+    assert np.allclose(found.parameters, [1, 1], atol=1e-5)
+
+
+def test_the_stop_reason_names_the_criterion():
+    one = minimise(exponential(), np.array([0.5, 4.0]), np.zeros(2), np.ones(2), StopCriteria(1e-3, 1e-12, 50))
+    assert "tol1 = 0.001" in one.stop_reason
+    assert "eq. 35" in one.stop_reason
+    two = minimise(exponential(), np.array([0.5, 4.0]), np.zeros(2), np.ones(2), StopCriteria(1e-15, 1e-15, 2))
+    assert "max_iterations = 2" in two.stop_reason
+    assert two.iterations == 2
+
+
+@pytest.mark.parametrize("criteria", [(1e-3, 1e-12, 50), (1e-15, 1e-15, 2), (0.0, 0.0, 200)])
+def test_every_linearisation_is_stepped_from(criteria):
+    """However the search ends: converged, after the iterations allowed, or without a step that lowers the cost."""
+    problem = exponential()
+    found = minimise(problem, np.array([0.5, 4.0]), np.zeros(2), np.ones(2), StopCriteria(*criteria))
+    stuck = found.stop_reason.startswith("no step")
+    assert stuck == (criteria[0] == 0)
+    assert problem.calls.count("linearise") == found.iterations + stuck
+    assert found.evaluations == len(problem.calls)
+    assert found.costs[-1] == exponential().cost(found.parameters)
+
+
+INERTIAS = slice(1, 4)
+
+
+def valley(target, matrix):
+    """Residuals in the four platform parameters, curved; the others are held near 1 by their own rows."""
+
+    def residual(p):
+        curved = p[:4] + 0.1 * np.array([p[1] * p[2], 0, 0, p[1] ** 2])
+        return np.concatenate([matrix @ (curved - target), p[4:] - 1])
+
+    def jacobian(p):
+        bend = np.eye(4)
+        bend[0, 1], bend[0, 2], bend[3, 1] = 0.1 * p[2], 0.1 * p[1], 0.2 * p[1]
+        whole = np.zeros((len(matrix) + 63, 67))
+        whole[: len(matrix), :4] = matrix @ bend
+        whole[len(matrix) :, 4:] = np.eye(63)
+        return whole
+
+    return FromFunctions(residual, jacobian)
+
+
+def searched(problem, physical):
+    guess = StartingGuess(np.ones(67), np.ones(67))
+    bounds = parameter_bounds(guess, physical)
+    found = minimise(
+        InCoordinates(problem, bounds),
+        bounds.coordinates(bounds.nearest(guess.values)),
+        bounds.lower,
+        np.ones(67),
+        StopCriteria(1e-14, 1e-10, 200),
+    )
+    return bounds.parameters(found.parameters), tuple(np.array(bounds.statements)[found.at_bound])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_constrained_optimum_is_the_one_that_scipy_finds(seed):
+    """SLSQP with the inequalities in the moments themselves, of a target that breaks one of them."""
+    rng = np.random.default_rng(seed)
+    target = np.array([2.0, *rng.permutation([0.4, 0.7, 1.9])])
+    problem = valley(target, rng.standard_normal((9, 4)))
+    found, active = searched(problem, physical=True)
+    triangle = {"type": "ineq", "fun": lambda x: np.array([1, 1, 1]) * x[INERTIAS].sum() - 2 * x[INERTIAS]}
+    own = minimize(
+        lambda x: problem.cost(np.concatenate([x, np.ones(63)])),
+        np.ones(4),
+        method="SLSQP",
+        bounds=[(1e-3, None), *[(0, None)] * 3],
+        constraints=triangle,
+        options={"ftol": 1e-15, "maxiter": 1000},
+    )
+    assert np.allclose(found[:4], own.x, atol=2e-6), (found[:4], own.x)
+    assert len(active) >= 1
+    assert all(name.startswith("platform.I") for name in active)
+    free, nothing = searched(problem, physical=False)
+    assert problem.cost(free) <= problem.cost(found)
+    assert nothing == ()
+    with pytest.raises(UnphysicalInertiaError, match="platform"):
+        physical_inertias(free[:64])
+
+
+def test_where_no_inequality_is_in_the_way_both_searches_agree():
+    problem = valley(np.array([2.0, 0.8, 0.9, 1.0]), np.random.default_rng(0).standard_normal((9, 4)))
+    held, active = searched(problem, physical=True)
+    free, _ = searched(problem, physical=False)
+    assert np.allclose(held, free, atol=1e-9)
+    assert active == ()
+
+
+def test_the_nearest_parameters_are_within_the_bounds_and_physical_ones_stay():
+    """The paper's starting values break the triangle inequality; the motion does not feel what is changed."""
+    initial = rss6().parameter_sets["initial"].vector
+    bounds = parameter_bounds(StartingGuess(initial, initial), physical=True)
+    near = bounds.nearest(initial)
+    physical_inertias(near[:64])
+    changed = {NAMES[k] for k in np.flatnonzero(np.abs(near - initial) > 1e-9)}
+    assert changed
+    assert changed <= {
+        f"{body}{leg}.{moment}"
+        for leg in range(1, 7)
+        for body, moment in (("crank", "Ixx"), ("crank", "Iyy"), ("link", "Izz"))
+    }
+    assert np.allclose(bounds.nearest(near), near, rtol=1e-12)
+    plain = parameter_bounds(StartingGuess(initial, initial), physical=False)
+    assert np.array_equal(plain.nearest(initial), initial)
+
+
+def flat_platform():
+    """Parameters of bodies that can exist, the platform's Izz just below Ixx + Iyy, as of a plate."""
+    parameters = truth()
+    parameters[:52] = physical_inertias(parameters[:64], allow_changes=True).values.ravel()
+    parameters[NAMES.index("platform.Izz")] = 0.999 * parameters[1:3].sum()
+    return parameters
+
+
+def assert_spanned(plain, physical):
+    """Intervals with bounds hold the estimate and, where bodies can exist, what an interval without bounds holds: it is
+    predicted by a linearisation, to a fifth of a standard deviation of the estimate of the search without bounds."""
+    low, high = physical.intervals.T
+    known, slack = physical.identifiable, 0.2 * physical.std
+    assert np.all((low >= 0) & (low <= physical.estimate) & (physical.estimate <= high))
+    outer = plain.estimate + np.outer([-1.96, 1.96], physical.std)
+    assert np.all((low <= np.maximum(outer[0], 0) + slack)[known])
+    assert np.all((high >= outer[1] - slack)[known])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (2, 3))])
+def test_bodies_that_exist_are_identified_as_such(seed):
+    """With noise the plain search finds bodies that cannot exist; the other one does not, and fits as well."""
+    scenario = quick(**{"identification.method": "command_driven"})
+    consistent = scenario.with_overrides({"identification.physical_consistency": True})
+    record, _ = run_plant(scenario, seed=seed, parameters=flat_platform())
+    plain, physical = identify(record, rss6(), scenario), identify(record, rss6(), consistent)
+    with pytest.raises(UnphysicalInertiaError):
+        physical_inertias(plain.estimate[:64])
+    physical_inertias(physical.estimate[:64])
+    assert physical.active_bounds
+    assert any("held at" in warning for warning in physical.warnings)
+    assert_spanned(plain, physical)
+    assert physical.noise_ratio < plain.noise_ratio + 0.005
+    assert load_scenario("paper").identification.physical_consistency is False
+
+
+def fitted(matrix, data, bounds, start) -> BoundedEstimate:
+    problem = InCoordinates(linear(matrix, data), bounds)
+    found = minimise(problem, bounds.coordinates(start), bounds.lower, np.ones(len(start)), CRITERIA)
+    estimate, information = bounds.parameters(found.parameters), matrix.T @ matrix
+    gradient = matrix.T @ (matrix @ estimate - data)
+    return bounded_estimate(estimate, found.at_bound, gradient, information, np.linalg.inv(information), bounds)
+
+
+def not_negative(size):
+    return ParameterBounds(np.eye(size), np.zeros(size), tuple(f"p{k} >= 0" for k in range(size)), physical=False)
+
+
+def coverage(estimates, truth, rows, intervals):
+    """Share (n,) of the estimates whose intervals of rows (n, p) @ parameters hold the true values."""
+    ends = np.array([intervals(one, rows) for one in estimates])
+    true = rows @ truth
+    return np.mean((ends[:, :, 0] <= true) & (true <= ends[:, :, 1]), axis=0)
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.5, 1.5])
+def test_correlated_parameters_near_their_bounds_are_covered(distance):
+    """Five unknowns that the data tie together, three of them within some of their standard deviations of zero."""
+    rng = np.random.default_rng(0)
+    matrix = rng.standard_normal((12, 5)) + 1.5
+    std = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)))
+    truth = std * np.array([distance, distance, distance, 5.0, 20.0])
+    rows = np.vstack([np.eye(5), np.ones(5), rng.uniform(0, 1, 5), [1, -1, 0, 0, 0]])
+    bounds = not_negative(5)
+    estimates = [fitted(matrix, matrix @ truth + rng.standard_normal(12), bounds, truth) for _ in range(DRAWS)]
+    assert 0.05 < np.mean([one.at_bound[0] for one in estimates]) < 0.95
+    found = coverage(estimates, truth, rows, BoundedEstimate.intervals)
+    assert np.all(found >= LOWEST), found
+
+
+def test_a_sum_of_many_at_their_bounds_is_covered_where_the_cut_interval_of_the_estimate_is_not():
+    """Thirty independent unknowns that are zero: what is drawn below is raised, and so their sum is far too high."""
+    rng = np.random.default_rng(1)
+    size, bounds, rows = 30, not_negative(30), np.ones((1, 30))
+    data = rng.standard_normal((DRAWS, size))
+    one = np.eye(size)
+    estimates = [bounded_estimate(np.maximum(y, 0), y < 0, np.maximum(-y, 0), one, one, bounds) for y in data]
+
+    def cut(found, rows):
+        half, value = 1.96 * np.sqrt(size), rows @ found.estimate
+        return np.stack([np.maximum(value - half, 0), value + half], axis=1)
+
+    assert coverage(estimates, np.zeros(size), rows, cut)[0] < 0.6
+    assert coverage(estimates, np.zeros(size), rows, BoundedEstimate.intervals)[0] >= LOWEST
+
+
+def body_fit(seed, physical):
+    """67 parameters near one whose platform has Izz > Ixx + Iyy, from noisy data."""
+    rng = np.random.default_rng(seed)
+    truth = np.ones(67)
+    truth[1:4] = 1.0, 1.0, 2.6
+    matrix = np.vstack([rng.standard_normal((70, 67)), 3 * np.eye(67)])
+    data = matrix @ truth + 0.3 * rng.standard_normal(len(matrix))
+    bounds = parameter_bounds(StartingGuess(np.ones(67), np.ones(67)), physical)
+    return fitted(matrix, data, bounds, bounds.nearest(np.ones(67))), np.linalg.lstsq(matrix, data)[0]
+
+
+@pytest.mark.parametrize("physical", [False, True])
+def test_the_unheld_estimate_is_that_of_the_problem_without_bounds(physical):
+    found, unbounded = body_fit(0, physical)
+    assert bool(found.active_bounds) == physical
+    assert np.allclose(found.unheld, unbounded, atol=1e-8)
+
+
+def test_intervals_end_at_the_bounds_and_hold_the_estimate():
+    found, _ = body_fit(1, physical=True)
+    wide = BoundedEstimate(found.estimate, found.at_bound, found.unheld, 100 * found.covariance, found.bounds)
+    for one in (found, wide):
+        intervals = one.intervals(np.eye(67))
+        assert np.all(intervals[:, 0] >= 0)
+        assert np.all((intervals[:, 0] <= one.estimate) & (one.estimate <= intervals[:, 1]))
+    platform = wide.intervals(np.eye(67))[index_of("platform.mass")]
+    assert platform[0] == pytest.approx(1e-3), "the model needs a thousandth of the guess"
+
+
+def test_where_no_bound_is_near_the_interval_is_the_usual_one():
+    found, _ = body_fit(0, physical=False)
+    row = np.random.default_rng(0).standard_normal((1, 67))
+    std = np.sqrt(row @ found.covariance @ row.T)[0, 0]
+    assert found.intervals(row)[0] == pytest.approx((row @ found.estimate)[0] + 1.959964 * std * np.array([-1, 1]))
+    assert found.warnings() == ()
+
+
+def test_the_warning_names_bound_and_distance():
+    found, unbounded = body_fit(0, physical=True)
+    said = found.warnings()[0]
+    back, row = np.array([0.5, 0.5, -0.5]), np.zeros(67)
+    row[1:4] = back
+    beyond = -(row @ unbounded) / np.sqrt(row @ found.covariance @ row)
+    assert f"platform.Izz <= Ixx + Iyy ({beyond:.2g})" in said
+    assert beyond > 1
+    assert "\n" not in said
