@@ -9,21 +9,16 @@ from scipy.stats import norm
 
 import cmmsim
 from cmmsim.radiometry.noise import CameraNoise, draw_pattern
-from tests.cmmsim.lenses import lens_sensor
+from tests.cmmsim.sensors import TWELVE_BIT, exact, squared_errors
 
 GAIN, DARK_NOISE, WHITE, BLACK = 0.13, 26.0, 1600.0, 16.0
 CORNERS = np.array([[[200 + 400 * i, 150 + 300 * j] for i in range(4) for j in range(4)]] * 2)
 SIZE = 60
-TWELVE_BIT = [
-    ("noise = true", "noise = true\nbit_depth = 12"),
-    ("gain = 0.13", "gain = 2.08"),
-    ("black_level = 16.0", "black_level = 256.0"),
-]
 
 
-def lit_evenly(folder, level, seed=0, changes=()):
+def lit_evenly(level, seed=0, changes=None):
     """Windows (2, 16, SIZE, SIZE) of a wall of one level that fills both images; one call is one exposure."""
-    sensor = lens_sensor(folder, seed=seed, changes=[("obstacle_level = 60", f"obstacle_level = {level}"), *changes])
+    sensor = exact("perfect", {"stickers.obstacle_level": level} | (changes or {}), seed=seed)
     sensor.add_bodies({"wall": trimesh.creation.box(extents=(0.1, 4.0, 4.0))})
     place = np.eye(4)
     place[:3, 3] = [0.9, 0.0, 0.76]
@@ -31,11 +26,11 @@ def lit_evenly(folder, level, seed=0, changes=()):
     return lambda: sensor.look(sensor.home, {"wall": place}).windows(CORNERS, SIZE).astype(float)
 
 
-def test_photon_transfer_gives_gain_and_dark_noise(tmp_path):
+def test_photon_transfer_gives_gain_and_dark_noise():
     """The variance of a pixel's grey value grows with its mean by the gain K; what the dark has is the dark noise."""
     means, variances = [], []
     for level in (0, 40, 90, 140, 190, 230):
-        expose = lit_evenly(tmp_path, level)
+        expose = lit_evenly(level)
         first, second = expose(), expose()
         means.append(0.5 * (first + second).mean())
         variances.append(0.5 * (first - second).var())  # the difference frees it from what differs between pixels
@@ -58,11 +53,11 @@ def test_rounding_excess_is_the_largest_variance_of_rounded_numbers(deviation):
     assert replace(noise, frames=9).rounding_excess(np.array(0.0)) == pytest.approx(expected, rel=0.01)
 
 
-def test_pattern_is_recovered_from_averaged_images(tmp_path):
+def test_pattern_is_recovered_from_averaged_images():
     """PRNU from a bright and DSNU from a dark level: spatial variance of the mean less what the averaging leaves."""
     spatial = {}
     for level in (0, 200):
-        expose = lit_evenly(tmp_path, level, changes=[("noise = true", "noise = true\nprnu = 0.02\ndsnu = 15.0")])
+        expose = lit_evenly(level, changes={"camera.prnu": 0.02, "camera.dsnu": 15.0})
         stack = np.stack([expose()[0] for _ in range(40)])
         spatial[level] = stack.mean(axis=0).var() - stack.var(axis=0, ddof=1).mean() / 40.0
     assert np.sqrt(spatial[0]) / GAIN == pytest.approx(15.0, rel=0.04)
@@ -70,12 +65,11 @@ def test_pattern_is_recovered_from_averaged_images(tmp_path):
     assert np.sqrt(spatial[200] - spatial[0]) / GAIN / electrons == pytest.approx(0.02, rel=0.04)
 
 
-def test_pattern_stays_and_belongs_to_the_camera(tmp_path):
+def test_pattern_stays_and_belongs_to_the_camera():
     """The same in windows and whole images and for other noise; another one for the other camera and pattern seed."""
 
     def pattern(seed, pattern_seed):
-        camera = f"noise = true\ndsnu = 60\npattern_seed = {pattern_seed}"
-        expose = lit_evenly(tmp_path, 0, seed, [("noise = true", camera)])
+        expose = lit_evenly(0, seed, {"camera.dsnu": 60.0, "camera.pattern_seed": pattern_seed})
         return np.mean([expose() for _ in range(6)], axis=0)
 
     def alike(one, other):
@@ -85,7 +79,7 @@ def test_pattern_stays_and_belongs_to_the_camera(tmp_path):
     assert alike(given[0], pattern(5, 0)[0]) > 0.9
     assert abs(alike(given[0], given[1])) < 0.03
     assert abs(alike(given[0], pattern(0, 1)[0])) < 0.03
-    sensor = lens_sensor(tmp_path, changes=[("noise = true", "noise = true\ndsnu = 60"), ("_level = 30", "_level = 0")])
+    sensor = exact("perfect", {"camera.dsnu": 60.0, "stickers.body_level": 0})
     frame = sensor.capture(sensor.home)
     x, y = CORNERS[0, -1]
     assert alike(given[0, -1], frame.left[y : y + SIZE, x : x + SIZE].astype(float)) > 0.8
@@ -122,31 +116,8 @@ def test_averaging_reduces_what_changes_but_not_the_pattern():
     assert grey.var() == pytest.approx(noise.variance(grey.mean()), rel=0.03)
 
 
-def test_twelve_bits_measure_as_well_as_eight(tmp_path):
-    sensor = lens_sensor(tmp_path, changes=TWELVE_BIT)
+def test_twelve_bits_measure_as_well_as_eight():
+    sensor = exact("perfect", TWELVE_BIT)
     found = [sensor.measure(sensor.home) for _ in range(8)]
     assert all(len(m.target_ids) == 18 for m in found)
-    errors = np.array([m.pose for m in found]) - sensor.home
-    squared = [e @ np.linalg.solve(m.covariance, e) for e, m in zip(errors, found, strict=True)]
-    assert 3.0 < np.mean(squared) < 10.0  # 6 expected of 8 draws
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("noise = true", "noise = true\nbit_depth = 9", "camera.bit_depth: .*8, 10 or 12.*9"),
-        ("noise = true", "noise = true\nprnu = -0.01", "camera.prnu: .*greater than or equal to 0"),
-        ("noise = true", "noise = true\ndsnu = nan", "camera.dsnu: .*finite"),
-        ("noise = true", "noise = true\npattern_seed = -1", "camera.pattern_seed: .*greater than or equal to 0"),
-        ("black_level = 16.0", "black_level = 256.0", "camera: .*black_level 256 must lie below .* 255"),
-    ],
-)
-def test_bad_noise_in_a_sensor_file(tmp_path, old, new, message):
-    with pytest.raises(cmmsim.SensorFileError, match=message):
-        lens_sensor(tmp_path, changes=[(old, new)])
-
-
-def test_images_of_another_bit_depth_are_refused(tmp_path):
-    deep = cmmsim.StereoFrame(*[np.zeros((1536, 2048), dtype=np.uint16)] * 2)
-    with pytest.raises(cmmsim.ShapeError, match="left image is uint16, but the camera's bit_depth 8 makes uint8"):
-        cmmsim.measure_frame(deep, lens_sensor(tmp_path).estimator)
+    assert 3.0 < squared_errors(found, [sensor.home] * 8).mean() < 10.0  # 6 expected of 8 draws

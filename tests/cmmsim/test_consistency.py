@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import kstest
 
 from cmmsim.errors import LostError
-from cmmsim.geometry.disc_image import sticker_outlines, symmetric_root
+from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import triangulate
@@ -84,14 +84,6 @@ def test_outline_misfit_is_in_units_of_its_noise():
     assert misfits[0, 0] == pytest.approx(9.0)
     assert misfits[1].max() == 0.0
     assert 21.0 < LARGEST_MISFIT < 21.2
-
-
-def test_symmetric_root():
-    half = np.random.default_rng(8).normal(size=(5, 2, 2))
-    matrices = half @ half.swapaxes(1, 2)
-    roots = symmetric_root(matrices)
-    np.testing.assert_allclose(roots @ roots, matrices, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(roots, roots.swapaxes(1, 2))
 
 
 def test_drifted_camera_enlarges_the_covariance():

@@ -10,18 +10,29 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 import cmmsim
 from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.geometry.camera import Optics, PinholeCamera
-from cmmsim.geometry.pose import apply, pose_to_transform
+from cmmsim.geometry.pose import apply
 from cmmsim.imaging.exposure import SUPERSAMPLING
 from cmmsim.imaging.renderer import View
-from tests.cmmsim.lenses import LENSES, expected_centres, lens_sensor, placed_at, pose_errors, poses_about_home
+from tests.cmmsim.sensors import (
+    LENSES,
+    NOISE_FREE,
+    TWELVE_BIT,
+    camera_from,
+    corners_about,
+    exact,
+    expected_centres,
+    placed_at,
+    pose_errors,
+    poses_about_home,
+    squared_errors,
+)
 
 FINE = 16
 
 
 def centre_errors(sensor, pose, supersampling=SUPERSAMPLING):
     """Fitted minus expected ellipse centres (36, 2) px from unrounded noise-free windows."""
-    expected = expected_centres(sensor, pose)
-    corners = np.rint(expected - 7.5).astype(int)
+    expected, corners = expected_centres(sensor, pose), corners_about(sensor, pose, 16)
     noise = replace(sensor.noise, enabled=False)
     grey = noise.mean_grey(sensor.camera.radiance(placed_at(sensor, pose), corners, 16, supersampling))
     grey = replace(sensor.observer, noise=noise).evenly_lit(grey, corners)
@@ -45,9 +56,9 @@ def finely_drawn(sensor, side, pose, corner, size):
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_centres_through_each_lens(tmp_path, lens):
+def test_centres_through_each_lens(lens):
     """At most 0.0005 px in every sticker; sharp edges that are bent leave up to three times that in single ones."""
-    sensor = lens_sensor(tmp_path, lens)
+    sensor = exact(lens)
     errors = np.concatenate([centre_errors(sensor, pose) for pose in poses_about_home(sensor, 3)])
     assert np.abs(errors).max() < (15e-4 if lens == "distorted" else 5e-4)
     assert np.all(np.sqrt((errors**2).mean(axis=0)) < 4e-4)
@@ -56,8 +67,8 @@ def test_centres_through_each_lens(tmp_path, lens):
 
 @pytest.mark.rendering
 @pytest.mark.parametrize("lens", ["perfect", "all"])
-def test_centres_drawn_by_pyrender(tmp_path, lens):
-    sensor = lens_sensor(tmp_path, lens, "pyrender")
+def test_centres_drawn_by_pyrender(lens):
+    sensor = exact(lens, renderer="pyrender")
     errors = np.concatenate([centre_errors(sensor, pose) for pose in poses_about_home(sensor, 4)])
     assert np.all(np.sqrt((errors**2).mean(axis=0)) < 8e-4)
     assert np.all(np.abs(errors.mean(axis=0)) < 2e-4)
@@ -65,10 +76,10 @@ def test_centres_drawn_by_pyrender(tmp_path, lens):
 
 
 @pytest.mark.parametrize("psf_px", [0.5, 1.2])
-def test_point_spread_is_a_gaussian(tmp_path, psf_px):
-    sensor = lens_sensor(tmp_path, "blurred", changes=[("psf_px = 0.5", f"psf_px = {psf_px}")])
+def test_point_spread_is_a_gaussian(psf_px):
+    sensor = exact("perfect", {"lens.psf_px": psf_px})
     pose, size, margin = sensor.home, 16, 10
-    corners = np.rint(expected_centres(sensor, pose)[:, :4] - 7.5).astype(int)
+    corners = corners_about(sensor, pose, 16)[:, :4]
     windows = sensor.camera.radiance(placed_at(sensor, pose), corners, size, 6)
     for side in (0, 1):
         for corner, window in zip(corners[side], windows[side], strict=True):
@@ -78,11 +89,11 @@ def test_point_spread_is_a_gaussian(tmp_path, psf_px):
             assert np.abs(window - expected[margin:-margin, margin:-margin]).max() < 1e-3
 
 
-def test_bent_images_show_what_opencv_says(tmp_path):
+def test_bent_images_show_what_opencv_says():
     """Each fine point of a window, undistorted by OpenCV, looked up in a finely drawn image of a perfect lens."""
-    sensor = lens_sensor(tmp_path, "distorted")
+    sensor = exact("distorted")
     pose, size, margin = sensor.home, 16, 6
-    corners = np.rint(expected_centres(sensor, pose)[:, ::6] - 7.5).astype(int)
+    corners = corners_about(sensor, pose, 16)[:, ::6]
     windows = sensor.camera.radiance(placed_at(sensor, pose), corners, size, 6)
     for side, camera in enumerate(sensor.rig.cameras):
         lens = camera.distortion
@@ -101,10 +112,10 @@ def test_bent_images_show_what_opencv_says(tmp_path):
             assert np.sqrt((gap**2).mean()) < 0.001
 
 
-def test_a_perfect_lens_is_drawn_on_the_pixels(tmp_path):
-    sensor = lens_sensor(tmp_path)
+def test_a_perfect_lens_is_drawn_on_the_pixels():
+    sensor = exact()
     formation, placed = sensor.camera.formation, placed_at(sensor, sensor.home)
-    corners = np.rint(expected_centres(sensor, sensor.home) - 7.5).astype(int)
+    corners = corners_about(sensor, sensor.home, 16)
     views = [
         View(camera, bodies, (int(x), int(y)), (16, 16))
         for camera, bodies, side in zip(sensor.rig.cameras, placed, corners, strict=True)
@@ -125,10 +136,10 @@ def test_vignetting_darkens_with_the_square_of_the_distance():
     assert optics.illumination(camera, half_way) == pytest.approx(0.9)
 
 
-def test_vignetting_is_laid_over_windows_and_whole_images(tmp_path):
-    dark, bright = lens_sensor(tmp_path, "darkened"), lens_sensor(tmp_path)
+def test_vignetting_is_laid_over_windows_and_whole_images():
+    dark, bright = exact("darkened"), exact()
     placed = placed_at(dark, dark.home)
-    corners = np.rint(expected_centres(dark, dark.home) - 7.5).astype(int)
+    corners = corners_about(dark, dark.home, 16)
     share = [s.camera.radiance(placed, corners, 16, 6) for s in (dark, bright)]
     whole = [s.camera.whole_exposure(1, [placed[1]], 6) for s in (dark, bright)]
     y, x = np.mgrid[:1536, :2048]
@@ -138,10 +149,10 @@ def test_vignetting_is_laid_over_windows_and_whole_images(tmp_path):
         np.testing.assert_allclose(share[0][1, k], share[1][1, k] * expected[y0 : y0 + 16, x0 : x0 + 16], atol=1e-6)
 
 
-def test_whole_images_show_the_windows(tmp_path):
-    sensor = lens_sensor(tmp_path, "all")
+def test_whole_images_show_the_windows():
+    sensor = exact("all")
     placed = placed_at(sensor, sensor.home)
-    corners = np.rint(expected_centres(sensor, sensor.home) - 4.5).astype(int)
+    corners = corners_about(sensor, sensor.home, 10)
     windows = sensor.camera.radiance(placed, corners, 10, 6)
     image = sensor.camera.whole_exposure(0, [placed[0]], 6)
     for (x, y), window in zip(corners[0], windows[0], strict=True):
@@ -149,52 +160,60 @@ def test_whole_images_show_the_windows(tmp_path):
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_poses_from_noise_free_images(tmp_path, lens):
+def test_poses_from_noise_free_images(lens):
     """At most 2 um and 10 urad; rounding to 8 bit is all that is left."""
-    sensor = lens_sensor(tmp_path, lens, changes=[("noise = true", "noise = false")])
+    sensor = exact(lens, NOISE_FREE)
     errors, found = pose_errors(sensor, poses_about_home(sensor, 4))
     assert all(len(m.target_ids) == 18 for m in found)
     assert np.all(np.abs(errors) < [2, 2, 2, 10, 10, 10])
 
 
-@pytest.mark.slow
 @pytest.mark.rendering
 @pytest.mark.parametrize("lens", ["perfect", "all"])
-def test_poses_from_noise_free_images_of_pyrender(tmp_path, lens):
+@pytest.mark.parametrize(
+    "count", [pytest.param(30, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.thorough)]
+)
+def test_poses_from_noise_free_images_of_pyrender(lens, count):
     """At most 2 um and 10 urad at every pose; 0.9 um and 4.5 urad were the largest in 300 poses."""
-    sensor = lens_sensor(tmp_path, lens, "pyrender", changes=[("noise = true", "noise = false")])
-    errors, _ = pose_errors(sensor, poses_about_home(sensor, 200))
+    sensor = exact(lens, NOISE_FREE, "pyrender")
+    errors, _ = pose_errors(sensor, poses_about_home(sensor, count))
     assert np.all(np.sqrt((errors**2).mean(axis=0)) < [0.5, 0.5, 0.5, 2, 2, 2])
     assert np.all(np.abs(errors) < [2, 2, 2, 10, 10, 10])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("renderer", ["analytic", pytest.param("pyrender", marks=pytest.mark.rendering)])
-def test_noise_free_teaching_and_measuring_through_all_effects(tmp_path, renderer):
+def test_noise_free_teaching_and_measuring_through_all_effects(renderer):
     """At most 2 um and 10 urad at every pose; 0.8 um and 4 urad were the largest."""
-    given = lens_sensor(tmp_path, "all", renderer, changes=[("noise = true", "noise = false")])
-    sensor = cmmsim.load_sensor(tmp_path / "sensor.toml", renderer=renderer)
+    sensor = cmmsim.load_sensor("ctrack780", changes=LENSES["all"] | NOISE_FREE, renderer=renderer)
     sensor.teach()
-    errors, _ = pose_errors(sensor, poses_about_home(given, 40))
+    errors, _ = pose_errors(sensor, poses_about_home(sensor, 20))
     assert np.all(np.abs(errors) < [2, 2, 2, 10, 10, 10])
 
 
-@pytest.mark.slow
-def test_covariance_is_true_through_all_effects(tmp_path):
-    """300 draws of noise, each at its own pose: the mean squared error in units of the stated covariance is 6."""
-    sensor = lens_sensor(tmp_path, "all", changes=[("noise = true", "noise = true\nprnu = 0.01\ndsnu = 8.0")])
-    errors, found = pose_errors(sensor, poses_about_home(sensor, 300))
-    squared = [e @ np.linalg.solve(m.covariance, e) for e, m in zip(1e-6 * errors, found, strict=True)]
-    assert 5.3 < np.mean(squared) < 6.8  # three standard deviations of the mean are 0.6
-    assert np.abs(errors.mean(axis=0) / (errors.std(axis=0) / np.sqrt(300))).max() < 4.0
+@pytest.mark.parametrize(
+    ("count", "lowest", "highest"),
+    [
+        pytest.param(60, 4.6, 7.5, marks=pytest.mark.slow),
+        pytest.param(300, 5.3, 6.8, marks=pytest.mark.thorough),
+    ],
+)
+def test_covariance_is_true_through_all_effects(count, lowest, highest):
+    """Draws of noise, each at its own pose: the mean squared error in units of the stated covariance is 6; the limits
+    are three of its standard deviations."""
+    sensor = exact("all", {"camera.prnu": 0.01, "camera.dsnu": 8.0})
+    poses = poses_about_home(sensor, count)
+    errors, found = pose_errors(sensor, poses)
+    assert lowest < squared_errors(found, poses).mean() < highest
+    assert np.abs(errors.mean(axis=0) / (errors.std(axis=0) / np.sqrt(count))).max() < 4.0
 
 
 @pytest.mark.parametrize("lens", ["distorted", "all"])
-def test_pixels_and_points_of_a_measurement(tmp_path, lens):
+def test_pixels_and_points_of_a_measurement(lens):
     """Pixels are those of the image as it is; points lie where the stickers are."""
-    sensor = lens_sensor(tmp_path, lens)
+    sensor = exact(lens)
     pose = poses_about_home(sensor, 1)[0]
-    truth = apply(sensor._camera_from_base @ pose_to_transform(pose), sensor._scene[0].sticker_places)
+    truth = apply(camera_from(sensor, pose), sensor.truth.platform_places)
     _, (m,) = pose_errors(sensor, pose[None])
     left, right = sensor.rig.project(truth)[0]
     assert np.linalg.norm(left - sensor.rig.ideal.project(truth)[0][0], axis=1).max() > 2.0
@@ -204,34 +223,12 @@ def test_pixels_and_points_of_a_measurement(tmp_path, lens):
     assert 1.2 < squared.mean() < 5.5  # 3 expected of 18 points
 
 
-def test_search_of_whole_images_through_all_effects(tmp_path):
+def test_search_of_whole_images_through_all_effects():
     """A first frame of 12 bit without prior; the same frame handed over as arrays."""
-    sensor = lens_sensor(
-        tmp_path,
-        "all",
-        changes=[
-            ("noise = true", "noise = true\nbit_depth = 12"),
-            ("gain = 0.13", "gain = 2.08"),
-            ("black_level = 16.0", "black_level = 256.0"),
-        ],
-    )
+    sensor = exact("all", TWELVE_BIT)
     pose = poses_about_home(sensor, 1, seed=3)[0]
     frame = sensor.capture(pose)
     assert frame.left.dtype == np.uint16
     m = cmmsim.measure_frame(frame, sensor.estimator)
     assert m.ok, m.reason
     assert np.all(np.abs(m.pose - pose) * 1e6 < [20, 20, 20, 100, 100, 100])
-
-
-@pytest.mark.parametrize(
-    ("addition", "message"),
-    [
-        ("[lens]\npsf_px = -0.5", "lens.psf_px: .*greater than or equal to 0"),
-        ("[lens]\npsf_px = 0.01", "lens: .*psf_px 0.01 must be 0 or at least 0.1 px"),
-        ("[lens]\nvignetting = 1.0", "lens.vignetting: .*less than or equal to 0.9"),
-        ("[lens]\nvignette = 0.3", "unknown key 'lens.vignette', valid are psf_px, vignetting"),
-    ],
-)
-def test_bad_lens_in_a_sensor_file(tmp_path, addition, message):
-    with pytest.raises(cmmsim.SensorFileError, match=message):
-        lens_sensor(tmp_path, changes=[("[stickers]", f"{addition}\n[stickers]")])

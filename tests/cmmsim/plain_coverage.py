@@ -1,18 +1,18 @@
-"""Exact share of each pixel that an ellipse covers, for all windows at once in plain numpy: the oracle of the compiled
-one, whose derivation holds here too (``cmmsim.ellipse_coverage``)."""
+"""Share of light in each pixel of an ellipse, sharp or blurred, for all windows at once in plain numpy: the oracle of
+the compiled one, whose derivation holds here too (``cmmsim.geometry.disc_image``)."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.special import ndtr
 
-from cmmsim.geometry.pose import Array
+from cmmsim.geometry.disc_image import SHAPE_BASIS
 
-SHAPE_BASIS = np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
-SHAPE_BASIS.setflags(write=False)
+POINTS_PER_SIGMA = 1.25  # rim points to one standard deviation of the point spread
+FEWEST_POINTS = 24
 
 
-def coverage(centres: Array, shapes: Array, size: int) -> tuple[Array, Array]:
+def coverage(centres: np.ndarray, shapes: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """As the product's ``coverage``."""
     inverse = np.asarray(np.linalg.inv(shapes), dtype=np.float64)
     across_x, across_y = _all_sides(centres, inverse, size)
@@ -31,12 +31,12 @@ def coverage(centres: Array, shapes: Array, size: int) -> tuple[Array, Array]:
     return area, derivatives
 
 
-def covered_area(centres: Array, shapes: Array, size: int) -> Array:
+def covered_area(centres: np.ndarray, shapes: np.ndarray, size: int) -> np.ndarray:
     """As the product's ``covered_area``."""
     return _area(shapes, *_all_sides(centres, np.asarray(np.linalg.inv(shapes)), size))
 
 
-def _all_sides(centres: Array, inverse: NDArray[np.floating], size: int) -> tuple[_Sides, _Sides]:
+def _all_sides(centres: np.ndarray, inverse: np.ndarray, size: int) -> tuple[_Sides, _Sides]:
     """Sides along x, indexed (n, line y, pixel x), and along y (n, pixel y, line x)."""
     ticks = np.arange(size + 1) - 0.5
     along = np.arange(size) - 0.5
@@ -46,7 +46,7 @@ def _all_sides(centres: Array, inverse: NDArray[np.floating], size: int) -> tupl
     )
 
 
-def _area(shapes: Array, across_x: _Sides, across_y: _Sides) -> Array:
+def _area(shapes: np.ndarray, across_x: _Sides, across_y: _Sides) -> np.ndarray:
     area = across_x.area[:, :-1] - across_x.area[:, 1:] + across_y.area[:, :, 1:] - across_y.area[:, :, :-1]
     area *= np.linalg.det(shapes)[:, None, None]
     return area
@@ -55,7 +55,7 @@ def _area(shapes: Array, across_x: _Sides, across_y: _Sides) -> Array:
 class _Sides:
     """All pixel sides along one axis: shared area of each (in disc units) and the part that lies inside the disc."""
 
-    def __init__(self, inverse: NDArray[np.floating], x: Array, y: Array, axis: int) -> None:
+    def __init__(self, inverse: np.ndarray, x: np.ndarray, y: np.ndarray, axis: int) -> None:
         n = len(inverse)
         self._x, self._y, self._axis = x[:, None, :], y[:, :, None], axis
         m = inverse[:, :, :, None, None]
@@ -74,17 +74,49 @@ class _Sides:
         sectors += np.arctan2((1.0 - leave) * cross, to_end)
         self.area = 0.5 * (sectors + self.length * cross)
 
-    def velocity(self, row: Array) -> Array:
+    def velocity(self, row: np.ndarray) -> np.ndarray:
         """``row . (x - c)`` at the middle of each side's part inside the disc; ``row`` (n, 2)."""
         x = self._x + self._middle if self._axis == 0 else self._x
         y = self._y + self._middle if self._axis == 1 else self._y
         return row[:, 0, None, None] * x + row[:, 1, None, None] * y
 
 
-def _inside_part(start2: Array, dot: Array, step2: Array) -> tuple[Array, Array]:
+def _inside_part(start2: np.ndarray, dot: np.ndarray, step2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where the side start + t step, t in [0, 1], enters and leaves the unit disc (equal when it stays outside)."""
     discriminant = dot * dot - step2 * (start2 - 1.0)
     root = np.sqrt(np.maximum(discriminant, 0.0))
     enter = np.clip((-dot - root) / step2, 0.0, 1.0)
     leave = np.clip((-dot + root) / step2, 0.0, 1.0)
     return enter, leave
+
+
+def blurred_coverage(
+    centres: np.ndarray, shapes: np.ndarray, size: int, psf_px: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """As the product's ``blurred_coverage``."""
+    count = rim_points(float(np.linalg.norm(shapes, axis=2).max(initial=0.0)), psf_px)
+    angle = 2.0 * np.pi * np.arange(count) / count
+    u = np.stack([np.cos(angle), np.sin(angle)])
+    rim = centres[:, :, None] + shapes @ u
+    normal = np.linalg.det(shapes)[:, None, None] * np.linalg.solve(shapes, np.broadcast_to(u, rim.shape))
+    normal *= 2.0 * np.pi / count
+    ticks = (np.arange(size + 1) - 0.5)[:, None]
+    below = [(ticks - rim[:, None, k]) / psf_px for k in range(2)]
+    across = [np.diff(ndtr(b), axis=1) for b in below]  # g, (n, size, count)
+    density = np.exp(-0.5 * below[0] ** 2) / np.sqrt(2.0 * np.pi)
+    passed = 1.0 - psf_px * np.diff(below[0] * ndtr(below[0]) + density, axis=1)  # P
+    share = across[1] @ (passed * normal[:, :1]).transpose(0, 2, 1)
+    rates = (
+        normal[:, 0],
+        normal[:, 1],
+        u[0] * normal[:, 0],
+        u[1] * normal[:, 0] + u[0] * normal[:, 1],
+        u[1] * normal[:, 1],
+    )
+    derivatives = [across[1] @ (across[0] * rate[:, None]).transpose(0, 2, 1) for rate in rates]
+    return share, np.stack(derivatives, axis=-1)
+
+
+def rim_points(largest_radius: float, psf_px: float) -> int:
+    """Points on the rim of an ellipse whose largest radius is known, px."""
+    return max(FEWEST_POINTS, int(np.ceil(2.0 * np.pi * largest_radius * POINTS_PER_SIGMA / psf_px)))

@@ -1,0 +1,71 @@
+"""Where compiled kernels are kept, and when they are compiled anew."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cmmsim
+
+PROBE = (
+    "import numpy as np; from cmmsim.geometry.disc_image import covered_area as c;"
+    "print(c(np.full((1, 2), 5.2), np.eye(2)[None] * 3.0, 12).sum())"
+)
+
+
+def run_copy(folder, environment):
+    return subprocess.run(
+        [sys.executable, "-c", PROBE],
+        cwd=folder,
+        env={**os.environ, **environment},
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
+
+
+@pytest.fixture
+def copied(tmp_path):
+    """A folder with a copy of the package, without any compiled kernel."""
+    shutil.copytree(
+        Path(cmmsim.__file__).parent, tmp_path / "install" / "cmmsim", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    return tmp_path / "install"
+
+
+@pytest.mark.slow
+def test_kernel_is_compiled_anew_when_one_that_it_calls_changes(copied):
+    before = float(run_copy(copied, {}))
+    index = copied / "cmmsim" / "__pycache__"
+    kept = {p: p.stat().st_mtime_ns for p in index.glob("*.nbi")}
+    assert kept
+    assert float(run_copy(copied, {})) == before
+    assert {p: p.stat().st_mtime_ns for p in index.glob("*.nbi")} == kept
+    callee = copied / "cmmsim" / "detection" / "fit_kernels.py"  # any kernel counts, whether called or not
+    callee.write_text(callee.read_text() + "\n")
+    run_copy(copied, {})
+    assert {p: p.stat().st_mtime_ns for p in kept} != kept
+
+
+@pytest.mark.slow
+def test_kernels_compile_where_the_package_cannot_be_written(copied, tmp_path):
+    """The cache goes to the user's folder; without one they are compiled in every process."""
+    if os.geteuid() == 0:
+        (copied / "cmmsim" / "__pycache__").write_text("")  # root may write anywhere, but not into a file
+    else:
+        (copied / "cmmsim").chmod(0o555)
+    home = {"HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": str(tmp_path / "home")}
+    assert float(run_copy(copied, home)) == pytest.approx(9.0 * np.pi)
+    assert list((tmp_path / "home").rglob("coverage_kernel*.nbi"))
+    (tmp_path / "nowhere").write_text("")
+    nowhere = {"HOME": str(tmp_path / "nowhere"), "XDG_CACHE_HOME": str(tmp_path / "nowhere")}
+    assert float(run_copy(copied, nowhere)) == pytest.approx(9.0 * np.pi)
+
+
+def test_importing_the_package_does_not_import_the_compiler():
+    code = "import sys, cmmsim; sys.exit('numba' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,272 @@
+"""The image of a disc: its ellipse, the place of the ellipse's centre, and the share of light in each pixel."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+import cmmsim
+from cmmsim.detection.detector import FitLimits
+from cmmsim.detection.ellipse_fit import fit_ellipses
+from cmmsim.geometry import disc_kernels
+from cmmsim.geometry.camera import Distortion, PinholeCamera
+from cmmsim.geometry.disc_image import (
+    SHAPE_BASIS,
+    bending,
+    blurred_coverage,
+    centre_offset,
+    coverage,
+    eccentricity,
+    project_discs,
+    symmetric_root,
+)
+from cmmsim.geometry.pose import apply, invert, pose_to_transform
+from cmmsim.pose_estimation.observation import DetectionSettings, Observer
+from cmmsim.radiometry.noise import CameraNoise
+from tests.cmmsim import plain_coverage
+from tests.cmmsim.ellipses import random_ellipses
+
+CAMERA = PinholeCamera(2300.0, 1023.5, 767.5, 2048, 1536)
+NOISE_FREE = CameraNoise(1600.0, 0.13, 26.0, 1800.0, 16.0, enabled=False)
+BENT = Distortion(-0.12, 0.03, 1e-3, -7e-4, -4e-3)
+CENTRE = np.array([0.62, 0.42, 1.8])  # seen near the corner of the image
+RADIUS, LINES = 0.0075, 100  # m: a radius of some 9.6 px
+LARGE = {
+    "A": [[0.12, 0.0], [-0.05, 0.12], [-0.08, -0.12]],
+    "B": [[0.05, -0.06], [0.12, -0.06], [0.2, -0.06]],
+    "C": [[-0.05, -0.06], [-0.12, -0.06], [-0.2, -0.06]],
+}
+
+
+def circle(normal, count):
+    """Points (count, 3) on the unit circle across a normal, in order."""
+    u, v = np.linalg.svd(normal[None])[2][1:]
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[:, None]
+    return np.cos(angle) * u + np.sin(angle) * v
+
+
+def conic_centre(pixels):
+    """Centre (2,) px of the conic through points of a rim (n, 2), by linear least squares."""
+    middle = pixels.mean(axis=0)
+    x, y = ((pixels - middle) / 100.0).T
+    a, b, c, d, e = np.linalg.lstsq(np.column_stack([x * x, x * y, y * y, x, y]), np.ones(len(x)), rcond=None)[0]
+    return middle + 100.0 * np.linalg.solve([[2 * a, b], [b, 2 * c]], [-d, -e])
+
+
+def test_ellipse_of_a_disc_holds_its_projected_rim():
+    rng = np.random.default_rng(1)
+    centres = rng.uniform([-0.3, -0.3, 1.2], [0.3, 0.3, 2.0], (30, 3))
+    normals = rng.normal((0.0, 0.0, -2.0), 1.0, (30, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    radii = rng.uniform(0.002, 0.03, 30)
+    pixels, shapes = project_discs(CAMERA, centres, normals, radii)
+    for centre, normal, radius, middle, shape in zip(centres, normals, radii, pixels, shapes, strict=True):
+        rim = CAMERA.project(centre + radius * circle(normal, 50))[0]
+        np.testing.assert_allclose(np.linalg.norm(np.linalg.solve(shape, (rim - middle).T), axis=0), 1.0, atol=1e-9)
+
+
+def test_symmetric_root():
+    half = np.random.default_rng(8).normal(size=(5, 2, 2))
+    matrices = half @ half.swapaxes(1, 2)
+    roots = symmetric_root(matrices)
+    np.testing.assert_allclose(roots @ roots, matrices, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(roots, roots.swapaxes(1, 2))
+
+
+def test_eccentricity_is_that_of_the_conic_through_the_projected_rim():
+    centre, normal, radius = np.array([0.2, -0.1, 1.1]), np.array([0.5, 0.3, -0.8]), 0.05
+    normal /= np.linalg.norm(normal)
+    found = conic_centre(CAMERA.project(centre + radius * circle(normal, 50))[0]) - CAMERA.project(centre)[0]
+    predicted = eccentricity(centre[None], normal[None], radius, CAMERA.focal_px)[0]
+    assert np.linalg.norm(predicted) > 0.3
+    np.testing.assert_allclose(found, predicted, atol=1e-7)
+
+
+def drawn(camera, normal, corner, size):
+    """Share of each pixel within the rim, projected point by point: exact along x, the mean of scan lines along y."""
+    rim = camera.project(CENTRE + RADIUS * circle(normal, 2000))[0]
+    rim = np.roll(rim - corner, -np.argmin(rim[:, 1]), axis=0)  # from the top round and back
+    lowest = np.argmax(rim[:, 1])
+    lines = (np.arange(size * LINES) + 0.5) / LINES - 0.5
+    ends = np.sort(
+        [
+            np.interp(lines, side[:, 1], side[:, 0], np.inf, np.inf)
+            for side in (rim[: lowest + 1], np.roll(rim, -1, axis=0)[lowest - 1 :][::-1])
+        ],
+        axis=0,
+    )[..., None]
+    ticks = np.arange(size)
+    share = np.clip(np.minimum(ends[1], ticks + 0.5) - np.maximum(ends[0], ticks - 0.5), 0.0, 1.0)
+    return np.where(np.isfinite(ends[0]), share, 0.0).reshape(size, LINES, size).mean(axis=1)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize(("lens", "limit"), [(BENT, 5e-5), (Distortion(-0.5, 0.3), 4e-4)], ids=["usual", "strong"])
+def test_fitted_centre_of_a_distorted_sticker(tilt, lens, limit):
+    camera = replace(CAMERA, distortion=lens)
+    normal = np.array([0.6 * np.sin(tilt), 0.8 * np.sin(tilt), -np.cos(tilt)])
+    projected = camera.project(CENTRE)[0]
+    corner = np.rint(projected - 15.5).astype(int)
+    grey = NOISE_FREE.black_level + 200.0 * drawn(camera, normal, corner, 32)
+    fit = fit_ellipses(grey[None], corner[None], NOISE_FREE, 30, FitLimits(largest_misfit=np.inf), iterations=6)
+    found = fit.centres[0] - projected
+    predicted = centre_offset(camera, CENTRE[None], normal[None], RADIUS)[0]
+    perfect = eccentricity(CENTRE[None], normal[None], RADIUS, camera.focal_px)[0]
+    assert np.linalg.norm(found - perfect) > 1.5e-3  # without the lens's share
+    assert np.linalg.norm(found - predicted) < limit
+
+
+def test_round_image_follows_the_second_derivative():
+    """The closed form (H_ijj + 2 H_jij) / 8 in the axes of a small round ellipse."""
+    camera = replace(CAMERA, distortion=BENT)
+    middle, step = np.array([1700.0, 300.0]), 2.0
+    jacobian = camera.distortion_jacobian(middle)
+    shape = 3.0 * np.linalg.inv(jacobian)  # its distorted image is round, of 3 px
+    curvature = np.stack(
+        [
+            (camera.distortion_jacobian(middle + d) - camera.distortion_jacobian(middle - d)) / (2.0 * step)
+            for d in step * np.eye(2)
+        ],
+        axis=-1,
+    )
+    bent = np.einsum("ijk,jm,kn->imn", curvature, shape, shape) / 3.0
+    expected = 3.0 * (np.einsum("ijj->i", bent) + 2.0 * np.einsum("jij->i", bent)) / 8.0
+    np.testing.assert_allclose(bending(camera, middle[None], shape[None])[0], expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize("radius", [0.02, 0.03])
+def test_observation_takes_the_predicted_eccentricity_of_large_stickers_away(radius):
+    """Three stickers of plane A, seen at 45 to 60 degrees, all dark around them and no noise. Without the correction
+    the bias is the one that projected rims have."""
+    sensor = cmmsim.load_sensor(
+        "ctrack780",
+        renderer="analytic",
+        changes={
+            "camera.noise": False,
+            "stickers.radius": radius,
+            "stickers.ring_radius": 1.02 * radius,
+            "stickers.placement": (0.0, 0.0),
+            "stickers.body_level": 8,
+            **{f"platform.planes.{plane}.stickers": places for plane, places in LARGE.items()},
+        },
+    )
+    camera_from_body = invert(sensor.truth.base_from_camera) @ pose_to_transform(sensor.home)
+    places, normals = sensor.platform.nominal[:3], sensor.platform.sticker_normals[:3]
+    expected = sensor.rig.project(apply(camera_from_body, places))[0]
+    size = 2 * int(np.ceil(1.3 * sensor.rig.left.focal_px * radius / 1.6)) + 8
+    errors = []
+    for taken in (radius, 0.0):
+        observer = Observer(sensor.rig, sensor.noise, DetectionSettings(size + 2, size, taken))
+        seen = observer.observe(sensor.look(sensor.home), camera_from_body, places, normals)
+        assert seen.index.tolist() == [0, 1, 2]
+        errors.append(np.stack([seen.left_pixels, seen.right_pixels]) - expected)
+    for side, (camera, move) in enumerate(zip(sensor.rig.cameras, sensor.rig.from_camera, strict=True)):
+        centres, turned = apply(move @ camera_from_body, places), normals @ (move @ camera_from_body)[:3, :3].T
+        tilts = np.degrees(np.arccos(-np.einsum("ni,ni->n", centres, turned) / np.linalg.norm(centres, axis=1)))
+        assert np.all((tilts > 45.0) & (tilts < 62.0)), tilts
+        for k, (centre, normal) in enumerate(zip(centres, turned, strict=True)):
+            rim, middle = camera.project(centre + radius * circle(normal, 200))[0], camera.project(centre)[0]
+            predicted = np.array(cv2.fitEllipseDirect((rim - middle).astype(np.float32))[0])
+            assert np.linalg.norm(predicted) > 0.05
+            np.testing.assert_allclose(errors[1][side, k], predicted, atol=0.002)
+    assert np.abs(errors[0]).max() < 0.002
+
+
+def light(centres, shapes, size, psf_px):
+    """Shares and derivatives, sharp where there is no point spread."""
+    return coverage(centres, shapes, size) if psf_px == 0.0 else blurred_coverage(centres, shapes, size, psf_px)
+
+
+def test_coverage_matches_sampling_each_pixel():
+    centres, shapes = random_ellipses(np.random.default_rng(0), 3, 18)
+    area, _ = coverage(centres, shapes, 18)
+    fine = 50
+    ticks = (np.arange(18 * fine) + 0.5) / fine - 0.5
+    x, y = np.meshgrid(ticks, ticks)
+    for centre, shape, exact in zip(centres, shapes, area, strict=True):
+        unit = np.linalg.solve(shape, np.stack([x - centre[0], y - centre[1]]).reshape(2, -1))
+        sampled = ((unit**2).sum(axis=0) < 1.0).reshape(18, fine, 18, fine).mean(axis=(1, 3))
+        assert np.abs(sampled - exact).max() < 0.01
+        assert exact.sum() == pytest.approx(np.pi * np.linalg.det(shape), rel=1e-12)
+
+
+@pytest.mark.parametrize("radii", [(3.8, 2.4), (0.2, 0.1), (0.5, 9.0), (1.0, 1.0), (30.0, 30.0)])
+def test_coverage_is_that_of_plain_numpy(radii):
+    """In all cases of a side: within, outside, crossed once or twice; centres on pixel corners are among them."""
+    centres, shapes = random_ellipses(np.random.default_rng(0), 50, 16, radii)
+    centres[:10] = np.round(2.0 * centres[:10]) / 2.0
+    for found, expected in zip(
+        coverage(centres, shapes, 16), plain_coverage.coverage(centres, shapes, 16), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, atol=2e-12)
+
+
+@pytest.mark.parametrize("psf_px", [0.2, 0.5, 1.5])
+def test_blurred_coverage_is_that_of_plain_numpy(psf_px):
+    centres, shapes = random_ellipses(np.random.default_rng(1), 20, 16)
+    for found, expected in zip(
+        blurred_coverage(centres, shapes, 16, psf_px),
+        plain_coverage.blurred_coverage(centres, shapes, 16, psf_px),
+        strict=True,
+    ):
+        np.testing.assert_allclose(found, expected, atol=1e-7)
+
+
+def integrated(centre, shape, psf_px, rings=120, rays=240):
+    """Light of each pixel by quadrature over the whole disc in polar coordinates; (20, 20)."""
+    node, weight = np.polynomial.legendre.leggauss(rings)
+    radius, angle = 0.5 * (node + 1.0)[:, None], 2.0 * np.pi * np.arange(rays) / rays
+    unit = np.stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()])
+    area = np.linalg.det(shape) * np.pi / rays * (weight[:, None] * radius * np.ones(rays)).ravel()
+    ends = np.arange(20 + 1)[:, None] - 0.5
+    x, y = (np.diff(ndtr((ends - p) / psf_px), axis=0) for p in shape @ unit + centre[:, None])
+    return (y * area) @ x.T
+
+
+@pytest.mark.parametrize("psf_px", [0.3, 0.5, 1.0, 2.0])
+def test_shares_match_brute_force_integration(psf_px):
+    centres, shapes = random_ellipses(np.random.default_rng(0), 3, 20)
+    shares, _ = blurred_coverage(centres, shapes, 20, psf_px)
+    for centre, shape, share in zip(centres, shapes, shares, strict=True):
+        np.testing.assert_allclose(share, integrated(centre, shape, psf_px), atol=2e-7)
+
+
+@pytest.mark.parametrize("psf_px", [0.05, 0.4, 1.0])
+@pytest.mark.parametrize("radii", [(1.0, 0.85), (3.8, 2.4), (7.0, 3.0)])
+def test_all_light_is_kept_however_narrow_and_small(psf_px, radii):
+    centres, shapes = random_ellipses(np.random.default_rng(1), 5, 20, radii)
+    shares, _ = blurred_coverage(centres + 0.5 * 20, shapes, 2 * 20, psf_px)
+    np.testing.assert_allclose(shares.sum(axis=(1, 2)), np.pi * np.prod(radii), rtol=1e-6)
+    assert shares.min() > -1e-6
+    assert shares.max() < 1.0 + 1e-6
+
+
+@pytest.mark.parametrize(("psf_px", "step", "limit"), [(0.0, 1e-6, 1e-7), (0.5, 1e-5, 1e-6)])
+def test_derivatives_match_finite_differences(psf_px, step, limit):
+    centres, shapes = random_ellipses(np.random.default_rng(1), 4, 18)
+    _, derivatives = light(centres, shapes, 18, psf_px)
+    for k, unit in enumerate(step * np.eye(5)):
+        turn = np.tensordot(unit[2:], SHAPE_BASIS, 1)
+        ahead, behind = (light(centres + s * unit[:2], shapes + s * turn, 18, psf_px)[0] for s in (1.0, -1.0))
+        np.testing.assert_allclose(derivatives[..., k], (ahead - behind) / (2.0 * step), atol=limit)
+
+
+def test_kernels_compute_the_same_uncompiled():
+    centres, shapes = random_ellipses(np.random.default_rng(4), 1, 16)
+    for kernel, more in ((disc_kernels.cover_window, ()), (disc_kernels.blur_window, (0.6,))):
+        results = []
+        for function in (kernel, kernel.py_func):
+            shares, derivatives = np.empty((16, 16)), np.empty((16, 16, 5))
+            function(*centres[0], shapes[0], *more, shares, derivatives)
+            results.append(np.dstack([shares, derivatives]))
+        np.testing.assert_allclose(*results, atol=1e-13)
+    m = np.linalg.inv(shapes[0])
+    for x, y in ((0.2, 0.1), (3.0, 1.0), (2.2, -2.0), (9.0, 9.0)):
+        np.testing.assert_allclose(
+            disc_kernels.cover_pixel(x, y, m), disc_kernels.cover_pixel.py_func(x, y, m), atol=1e-14
+        )
+    sides = np.random.default_rng(5).normal(size=(200, 4))
+    for side in sides:
+        np.testing.assert_allclose(disc_kernels.side_share(*side), disc_kernels.side_share.py_func(*side), atol=1e-14)
