@@ -1,5 +1,17 @@
 """Dynamics of parallel robots: kinematics, virtual-work dynamics, joint PID, visual servo and closed loop.
 
+Robots
+    load_robot(name_or_path) -> Robot           built in (`built_in_robots() -> list[str]`), or a TOML file
+    Robot                                       kinematics and dynamics, one pose or a batch
+    fast_forward_dynamics(robot, parameters)    forward dynamics for inner loops, as a function without checks
+    workspace.check_motion(robot, pose, times)  may it move so? travel, reach and singularities
+
+The closed loop
+    closed_loop.simulate(robot, parameters, reference, settings, sensor) -> ClosedLoopRun
+    simulate_batch(robot, parameters, references, settings) -> list[ClosedLoopRun]   many runs, on all cores
+
+Every error that a user can cause is a DynamicsError.
+
 Conventions: SI units and rad; pose [x y z alpha beta gamma] with R = Rx(alpha) Ry(beta) Rz(gamma); twist [h_dot, omega]
 in base-frame axes. The crank is what the paper calls the wrench.
 """

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from dynamics.checks import shown
 from dynamics.errors import DynamicsError, RobotFileError
 from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
-from dynamics.legs.rss_kinematics import check_home
+from dynamics.legs.rss_kinematics import home_angles
 from dynamics.parameters import check_parameters
 
 _PerLeg = float | list[float]
@@ -136,7 +136,7 @@ def _geometry(content: _RobotFile) -> Rss6Geometry:
         travel_limit=content.travel_limit,
         gravity=np.array(content.gravity),
     )
-    check_home(geometry)
+    home_angles(geometry)  # refuses a home pose out of reach
     return geometry
 
 

@@ -140,18 +140,23 @@ def check_motion(
         row, *leg = (int(index) for index in np.unravel_index(pick(values), values.shape))
         return Extreme(float(values[row, *leg]), limit, row, float(moments[row]), leg[0] + 1 if leg else None)
 
+    def check(worst: Extreme, within: bool, kind: type[DynamicsError], quantity: str, relation: str) -> None:
+        if not within:
+            when = f"row {worst.row}" if np.isnan(worst.time) else f"t = {worst.time:.4g} s"
+            who = f" of leg {worst.leg}" if worst.leg else ""
+            raise kind(
+                f"{quantity}{who} of {robot.name} is {worst.value:.4g} at {when}, {relation}{worst.limit:.4g} "
+                f"(pose {row_text(poses[worst.row], 4)})"
+            )
+
     reach = extreme(measures.reach_margin, 0.0, np.argmin)
-    if not reach.value > 0:
-        raise _broken(UnreachablePoseError, robot, poses, reach, "reach margin", "must be > ")
+    check(reach, reach.value > 0, UnreachablePoseError, "reach margin", "must be > ")
     travel = extreme(np.abs(measures.theta), robot.travel_limit - travel_margin, np.argmax)
-    if not travel.value <= travel.limit:
-        raise _broken(TravelError, robot, poses, travel, "|theta| in rad", "limit ")
+    check(travel, travel.value <= travel.limit, TravelError, "|theta| in rad", "limit ")
     leverage = extreme(measures.leverage, least_leverage, np.argmin)
-    if not leverage.value >= leverage.limit:
-        raise _broken(SingularPoseError, robot, poses, leverage, "leverage (J_a1)", "must be >= ")
+    check(leverage, leverage.value >= leverage.limit, SingularPoseError, "leverage (J_a1)", "must be >= ")
     condition = extreme(measures.platform_condition, most_condition, np.argmax)
-    if not condition.value <= condition.limit:
-        raise _broken(SingularPoseError, robot, poses, condition, "condition of J_a2", "limit ")
+    check(condition, condition.value <= condition.limit, SingularPoseError, "condition of J_a2", "limit ")
     return MotionExtremes(reach, travel, leverage, condition)
 
 
@@ -162,14 +167,3 @@ def _increasing(times: ArrayLike, count: int) -> np.ndarray:
         row = int(back[0]) + 1
         raise ShapeError(f"times must increase, but times[{row}] = {moments[row]} s follows {moments[row - 1]} s")
     return moments
-
-
-def _broken(
-    kind: type[DynamicsError], robot: Robot, poses: np.ndarray, worst: Extreme, quantity: str, relation: str
-) -> DynamicsError:
-    when = f"row {worst.row}" if np.isnan(worst.time) else f"t = {worst.time:.4g} s"
-    who = f" of leg {worst.leg}" if worst.leg else ""
-    return kind(
-        f"{quantity}{who} of {robot.name} is {worst.value:.4g} at {when}, {relation}{worst.limit:.4g} "
-        f"(pose {row_text(poses[worst.row], 4)})"
-    )

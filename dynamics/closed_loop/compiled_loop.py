@@ -18,7 +18,7 @@ from dynamics.closed_loop.problem import (
     RateSensor,
     measurement,
 )
-from dynamics.closed_loop.run import ClosedLoopRun, empty_run, failure
+from dynamics.closed_loop.run import RECORDS, ClosedLoopRun, empty_run, failure
 from dynamics.compilation import load_library, open_library
 from dynamics.errors import SimulationError
 from dynamics.legs.rss_geometry import Rss6Geometry
@@ -48,7 +48,6 @@ LAWS = ("coulomb_viscous", "smoothed", "stribeck")
 _TIMES_AND_FRICTION = ("frame_period", "smoothing_velocity", "static_level", "stribeck_velocity")
 # What the sensor callback returns. An error that escapes it makes ctypes return 0.
 SENSOR_RAISED, MEASURED, LOST = 0, 1, 2
-_RECORDS = ("pose", "pose_rate", "torque", "command", "measured", "joint_integral", "servo_integral")  # (frames, 6)
 _SENSITIVITIES = ("pose_sensitivity", "start_sensitivity", "end_sensitivity", "end_start_sensitivity")
 _MOTORS = ("motor_angle", "motor_rate")
 
@@ -79,7 +78,7 @@ class _Problem(Structure):
 
 class _Trajectory(Structure):
     _fields_ = [
-        *[(name, _DoublePointer) for name in _RECORDS],
+        *[(name, _DoublePointer) for name in RECORDS],
         ("measured_ok", POINTER(c_byte)),
         *[(name, _DoublePointer) for name in _SENSITIVITIES],
         *[(name, _DoublePointer) for name in _MOTORS],
@@ -108,7 +107,7 @@ def run(compiled: ctypes.CDLL, problem: LoopProblem) -> ClosedLoopRun:
     result = empty_run(problem)
     struct = _struct(problem, command_schedule(problem))
     trajectory = _Trajectory(
-        **{name: _pointer(getattr(result, name)) for name in (*_RECORDS, *_SENSITIVITIES, *_MOTORS)},
+        **{name: _pointer(getattr(result, name)) for name in (*RECORDS, *_SENSITIVITIES, *_MOTORS)},
         measured_ok=result.measured_ok.ctypes.data_as(POINTER(c_byte)),
     )
     callback, raised = _callback(problem.sensor, problem.period)
@@ -152,11 +151,8 @@ def _struct(problem: LoopProblem, schedule: CommandSchedule) -> _Problem:
         span_duration=_pointer(schedule.duration),
     )
     _fill_parameters(struct, problem)
-    struct.pose[:] = start.pose
-    struct.rate[:] = start.pose_rate
-    struct.integral[:] = start.joint_integral
-    struct.servo_integral[:] = start.servo_integral
-    struct.last_measured[:] = start.last_measured
+    struct.pose[:], struct.rate[:], struct.integral[:] = start.pose, start.pose_rate, start.joint_integral
+    struct.servo_integral[:], struct.last_measured[:] = start.servo_integral, start.last_measured
     if problem.servo_robot.geometry != problem.robot.geometry:
         known = library(problem.servo_robot.geometry)
         assert known is not None

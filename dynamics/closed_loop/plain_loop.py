@@ -24,7 +24,7 @@ from dynamics.closed_loop.servo import VisualServo
 from dynamics.closed_loop.stick_slip import MotionStopped, StickSlipMotion
 from dynamics.legs.rss_geometry import Rss6Geometry
 from dynamics.rigid_body.equation_of_motion import motion_functions
-from dynamics.rigid_body.functions import kinematic_functions
+from dynamics.rigid_body.virtual_work import kinematic_functions
 from dynamics.robot import Robot
 
 Issued = tuple[np.ndarray, np.ndarray]

@@ -17,6 +17,9 @@ from dynamics.closed_loop.problem import (
 from dynamics.errors import SimulationError
 from dynamics.robot import Robot
 
+RECORDS = ("pose", "pose_rate", "torque", "command", "measured", "joint_integral", "servo_integral")
+"""What a run keeps of every frame, (frames, 6) each."""
+
 
 @dataclass(frozen=True)
 class ClosedLoopRun:
@@ -74,18 +77,12 @@ class ClosedLoopRun:
 def empty_run(problem: LoopProblem) -> ClosedLoopRun:
     """What a run is written into: zeros, and None for the derivatives that it is not asked for."""
     frames = problem.frames
-    pose, rate, torque, command, measured, joint_integral, servo_integral = np.zeros((7, frames, 6))
+    rows = dict(zip(RECORDS, np.zeros((len(RECORDS), frames, 6)), strict=True))
     by_parameters, by_start = problem.sensitivities, problem.start_sensitivities
     return ClosedLoopRun(
         time=np.arange(frames) * problem.period,
-        pose=pose,
-        pose_rate=rate,
-        torque=torque,
-        command=command,
-        measured=measured,
+        **rows,
         measured_ok=np.zeros(frames, dtype=bool),
-        joint_integral=joint_integral,
-        servo_integral=servo_integral,
         pose_sensitivity=np.zeros((frames, 6, PARAMETER_COUNT)) if by_parameters else None,
         start_sensitivity=np.zeros((frames, 6, START_COUNT)) if by_start else None,
         end_sensitivity=np.zeros((START_COUNT, PARAMETER_COUNT)) if by_parameters else None,

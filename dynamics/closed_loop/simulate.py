@@ -75,17 +75,22 @@ def simulate(
     compiled = None if compiled is None else flag("compiled", compiled, SimulationError)
     _check_reach(robot, reference)
     frames, parameters = len(reference.poses), checked_loop_parameters(parameters)
+    if start is None:
+        start = equilibrium(robot, parameters, reference.poses[0], settings.servo, servo_robot, settings.elasticity)
+    else:
+        check_type("start", start, StartState, SimulationError)
+        check_start_pose(robot, parameters, start.pose)
     problem = LoopProblem(
         robot,
         parameters,
         reference,
         settings,
-        _start(robot, parameters, reference, settings, start, servo_robot),
+        start,
         sensor,
         sensitivities,
         start_sensitivities,
         commands=_checked_rows("commands", commands, frames),
-        lost=_checked_lost(lost, frames),
+        lost=None if lost is None else mask("lost", lost, frames, SimulationError).astype(np.int8),
         noise=_checked_rows("noise", noise, frames),
         latencies=None if latencies is None else _checked_latencies(latencies, frames, settings.timing),
         servo_robot=servo_robot or robot,
@@ -144,22 +149,6 @@ def prepare(robot: Robot) -> bool:
     return compiled_loop.library(robot.geometry) is not None
 
 
-def _start(
-    robot: Robot,
-    parameters: np.ndarray,
-    reference: Reference,
-    settings: LoopSettings,
-    start: StartState | None,
-    servo_robot: Robot | None,
-) -> StartState:
-    """The start that was given, checked, or rest at the first reference pose."""
-    if start is None:
-        return equilibrium(robot, parameters, reference.poses[0], settings.servo, servo_robot, settings.elasticity)
-    check_type("start", start, StartState, SimulationError)
-    check_start_pose(robot, parameters, start.pose)
-    return start
-
-
 def _run(problem: LoopProblem, compiled: bool | None) -> ClosedLoopRun:
     """Take the compiled path or the plain one; a user's controller is called on the plain one."""
     wanted = compiled is not False and problem.controller is None
@@ -190,13 +179,12 @@ def _check_kinds(
     controller: object,
 ) -> None:
     """Raise SimulationError for parts of a run that are not what they are called."""
-    check_type("robot", robot, Robot, SimulationError)
-    check_type("reference", reference, Reference, SimulationError)
-    check_type("settings", settings, LoopSettings, SimulationError)
+    kinds = {"robot": (robot, Robot), "reference": (reference, Reference), "settings": (settings, LoopSettings)}
+    kinds |= {} if servo_robot is None else {"servo_robot": (servo_robot, Robot)}
+    for name, (value, kind) in kinds.items():
+        check_type(name, value, kind, SimulationError)
     if sensor is not None and not callable(sensor) and not isinstance(sensor, RateSensor):
         raise SimulationError(f"sensor must be a function of frame, time and pose, or None, got {shown(sensor)}")
-    if servo_robot is not None:
-        check_type("servo_robot", servo_robot, Robot, SimulationError)
     if controller is not None and not callable(controller):
         raise SimulationError(f"controller must be a function, or None for the servo, got {shown(controller)}")
 
@@ -210,11 +198,6 @@ def _check_reach(robot: Robot, reference: Reference) -> None:
 def _checked_rows(name: str, rows: object, frames: int) -> np.ndarray | None:
     """Rows (frames, 6) as C doubles; None stays None. Raises SimulationError."""
     return None if rows is None else np.ascontiguousarray(floats(name, rows, (frames, 6), error=SimulationError))
-
-
-def _checked_lost(lost: object, frames: int) -> np.ndarray | None:
-    """Lost frames (frames,) as C bytes; None stays None. Raises SimulationError."""
-    return None if lost is None else mask("lost", lost, frames, SimulationError).astype(np.int8)
 
 
 def _checked_latencies(latencies: object, frames: int, timing: FrameTiming) -> np.ndarray:

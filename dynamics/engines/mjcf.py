@@ -67,7 +67,7 @@ def add_platform_looks(body: Xml.Element, geometry: Rss6Geometry) -> None:
     half = np.array([0.0, 0.0, PLATE_THICKNESS / 2])
     _rod(body, "cylinder", centre - half, centre + half, radius, "plate")
     for joint in geometry.platform_joints:
-        Xml.SubElement(body, "geom", type="sphere", pos=_text(joint), size=_text([BALL_RADIUS]), material="link")
+        Xml.SubElement(body, "geom", type="sphere", pos=_numbers(joint), size=_numbers(BALL_RADIUS), material="link")
 
 
 def add_crank_looks(body: Xml.Element, geometry: Rss6Geometry) -> None:
@@ -78,7 +78,7 @@ def add_crank_looks(body: Xml.Element, geometry: Rss6Geometry) -> None:
 def add_link_looks(body: Xml.Element, geometry: Rss6Geometry) -> None:
     """A rod along z from the tip to the platform, with a ball at the tip."""
     _rod(body, "capsule", [0, 0, 0], [0, 0, geometry.link_length], LINK_RADIUS, "link")
-    Xml.SubElement(body, "geom", type="sphere", pos="0 0 0", size=_text([BALL_RADIUS]), material="link")
+    Xml.SubElement(body, "geom", type="sphere", pos="0 0 0", size=_numbers(BALL_RADIUS), material="link")
 
 
 def _disc(points: np.ndarray) -> tuple[np.ndarray, float]:
@@ -88,11 +88,7 @@ def _disc(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 def _rod(parent: Xml.Element, kind: str, start: ArrayLike, end: ArrayLike, radius: float, material: str) -> None:
     ends = np.concatenate([np.asarray(start, dtype=float), np.asarray(end, dtype=float)])
-    Xml.SubElement(parent, "geom", type=kind, fromto=_text(ends), size=_text([radius]), material=material)
-
-
-def _text(values: ArrayLike) -> str:
-    return " ".join(f"{value:.6g}" for value in np.asarray(values, dtype=float))
+    Xml.SubElement(parent, "geom", type=kind, fromto=_numbers(ends), size=_numbers(radius), material=material)
 
 
 # MuJoCo silently lowers larger ones.

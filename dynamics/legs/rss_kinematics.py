@@ -133,8 +133,8 @@ def home_branch(geometry: Rss6Geometry, leg: int) -> float:
     return min(angles, key=angles.__getitem__)
 
 
-def check_home(geometry: Rss6Geometry) -> None:
-    """Raise RobotFileError, naming the leg, where the home pose is out of reach."""
+def home_angles(geometry: Rss6Geometry) -> np.ndarray:
+    """Crank angles (6,), rad, at the home pose. Raises RobotFileError, naming the leg, where that is out of reach."""
     for leg in range(LEGS):
         along, across, chord = _home_chord(geometry, leg)
         if not chord**2 < along**2 + across**2:
@@ -142,11 +142,6 @@ def check_home(geometry: Rss6Geometry) -> None:
                 f"leg {leg + 1} cannot reach the home pose: reach margin "
                 f"{1 - chord**2 / max(along**2 + across**2, 1e-300):.3g}, must be > 0"
             )
-
-
-def home_angles(geometry: Rss6Geometry) -> np.ndarray:
-    """Crank angles (6,), rad, at the home pose. Raises RobotFileError, naming the leg, where that is out of reach."""
-    check_home(geometry)
     return np.array([float(leg.angle) for leg in leg_vectors(geometry, ca.SX(geometry.home_pose))])
 
 

@@ -1,1 +1,1 @@
-"""Virtual-work dynamics in CasADi: sums over platform and legs, equation of motion, and the functions of one robot."""
+"""The rigid robot in CasADi: virtual-work dynamics in twists, and the equation of motion in pose coordinates."""
