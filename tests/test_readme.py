@@ -1,4 +1,4 @@
-"""The README is true: its figures are those of the run it quotes, its commands and files exist."""
+"""README and CONTRIBUTING are true: figures are those of the run they quote, commands, files and names exist."""
 
 import re
 import shlex
@@ -24,11 +24,17 @@ from tests.identify.synthetic import SIGMA, quick, run_plant, truth
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+SAID = " ".join(README.split())
+
+
+def kept(name):
+    return load_result(ROOT / ".readme" / f"{name}.json")
 
 
 @pytest.fixture(scope="module")
 def result():
-    return load_result(ROOT / ".readme" / "result.json")
+    return kept("result")
 
 
 def test_the_tables_are_those_of_the_quoted_run(result):
@@ -44,7 +50,7 @@ def test_the_quoted_run_is_the_paper_scenario_and_meets_every_goal(result):
 
 @pytest.fixture(scope="module")
 def dynamics_figures():
-    return load_result(ROOT / ".readme" / "dynamics.json")
+    return kept("dynamics")
 
 
 def test_the_table_of_the_dynamics_is_the_measured_one(dynamics_figures):
@@ -69,12 +75,12 @@ def test_the_table_of_the_dynamics_is_the_measured_one(dynamics_figures):
     wanted = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
     assert wanted in README, f"the README wants these rows:\n{wanted}"
     said = f"measured {dynamics_figures['date']} with Pinocchio {versions['pin']} and MuJoCo {versions['mujoco']}"
-    assert said in " ".join(README.split()), f"the README wants: {said}"
+    assert said in SAID, f"the README wants: {said}"
 
 
 def test_the_sensors_speed_is_the_measured_one():
-    kept = load_result(ROOT / ".readme" / "sensor.json")
-    found, versions = kept["figures"], kept["versions"]
+    measured = kept("sensor")
+    found, versions = measured["figures"], measured["versions"]
     rows = [
         f"| {title} | {found[f'analytic_{name}']:.0f} | {found[f'pyrender_{name}']:.0f} |"
         for title, name in (
@@ -84,8 +90,23 @@ def test_the_sensors_speed_is_the_measured_one():
     ]
     assert "\n".join(rows) in README, f"the README wants these rows:\n{rows}"
     opencv = versions["opencv-python-headless"]
-    said = f"measured {kept['date']} with OpenCV {opencv} and pyrender {versions['pyrender']}"
-    assert said in " ".join(README.split()), f"the README wants: {said}"
+    said = f"measured {measured['date']} with OpenCV {opencv} and pyrender {versions['pyrender']}"
+    assert said in SAID, f"the README wants: {said}"
+
+
+def test_the_long_proofs_last_ended_as_quoted():
+    if not (ROOT / ".readme" / "thorough.json").exists():
+        pytest.skip("no results are kept: sh .ci/thorough writes them")
+    content = kept("thorough")
+    tests = content["tests"].values()
+    count = {outcome: sum(test["outcome"] == outcome for test in tests) for outcome in ("passed", "skipped", "failed")}
+    hours, date = sum(test["seconds"] for test in tests) / 3600, max(test["date"] for test in tests)
+    said = (
+        f"{date}, on {content['cores']} cores: {count['passed']} of {len(tests)} passed, {count['skipped']} skipped, "
+        f"in {hours:.1f} hours of work"
+    )
+    assert not count["failed"]
+    assert said in SAID, f"the README wants: [the last run](.readme/thorough.json), {said}"
 
 
 def test_the_dynamics_reach_their_goals(dynamics_figures):
@@ -107,7 +128,7 @@ def test_the_table_of_accuracy_is_the_saved_one():
 
 def test_it_counts_the_estimators():
     numbers = {"eight": 8, "nine": 9, "ten": 10, "eleven": 11}
-    said = re.search(r"`cmmsim estimators [^`]+` runs (\w+) estimators", " ".join(README.split()))
+    said = re.search(r"`cmmsim estimators [^`]+` runs (\w+) estimators", SAID)
     assert said
     assert numbers[said[1]] == len(ESTIMATORS)
 
@@ -127,7 +148,7 @@ def test_its_export_command_writes_what_mujoco_loads(monkeypatch, capfd, tmp_pat
     said = capfd.readouterr().out
     changes = [float(value) for value in re.findall(r"accelerations differ by up to ([\d.]+) %", said)]
     assert len(changes) == 1, "one body alone alters the motion"
-    assert f"changes accelerations by up to {changes[0]:.1f} %" in " ".join(README.split())
+    assert f"changes accelerations by up to {changes[0]:.1f} %" in SAID
     model = mujoco.MjModel.from_xml_path("rss6.xml")
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data)
@@ -135,6 +156,7 @@ def test_its_export_command_writes_what_mujoco_loads(monkeypatch, capfd, tmp_pat
     assert np.isfinite(data.qacc).all()
 
 
+@pytest.mark.slow
 def test_its_sample_identifies_from_a_record_of_ones_own():
     """On arrays of a simulated robot, friction and gains come out as they were put in."""
     seen, run = run_plant(quick(), seed=2, duration_s=3.0)
@@ -155,17 +177,25 @@ def test_its_sample_identifies_from_a_record_of_ones_own():
     assert np.all(np.abs(result.estimate - truth())[52:] < 4 * result.std[52:])
 
 
-def test_every_linked_file_exists():
-    for target in re.findall(r"\]\(([^)#]+)\)", README):
-        if not target.startswith("http"):
-            assert (ROOT / target).exists(), target
-
-
-def test_every_command_it_names_exists():
+@pytest.mark.parametrize("text", [README, CONTRIBUTING], ids=["README", "CONTRIBUTING"])
+def test_every_file_and_command_that_is_named_exists(text):
+    for target in re.findall(r"\]\(([^)#]+)", text):
+        assert target.startswith("http") or (ROOT / target).exists(), target
+    for path in re.findall(r"`(?:sh )?((?:cmmsim|dynamics|identify|tests|\.ci|\.readme)/[\w./]*)`", text):
+        assert (ROOT / path).exists() or path == "tests/FILE.py", path
     commands = {command.name or command.callback.__name__.replace("_", "-") for command in app.registered_commands}
-    groups = {group.name for group in app.registered_groups}
-    for name in set(re.findall(r"cmmsim ([a-z][a-z-]+)", README)):
-        assert name in commands | groups, name
+    for name in set(re.findall(r"`(?:\.venv/bin/)?cmmsim ([a-z][a-z-]+)", text)):
+        assert name in commands | {group.name for group in app.registered_groups}, name
+
+
+def test_contributors_find_the_file_and_the_line_where_something_new_goes():
+    """Each row of the table: a file of the kind that it shows, and the name in the file where a new one is entered."""
+    shown = re.findall(r"`([\w/]+/)`, as `(\w+\.py)`", CONTRIBUTING)
+    entered = re.findall(r"`([A-Z]+|family)` in `([\w/]+\.py)`", CONTRIBUTING)
+    assert (len(shown), len(entered)) == (5, 6)
+    assert [folder + file for folder, file in shown if not (ROOT / folder / file).exists()] == []
+    for name, file in entered:
+        assert re.search(rf"^ *{name}\b.*[:=]", (ROOT / file).read_text(encoding="utf-8"), re.MULTILINE), (name, file)
 
 
 def test_ci_calls_the_test_command_of_the_readme():
