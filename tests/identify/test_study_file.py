@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from identify.errors import StudyError
 from identify.studies.design import Design, prepare, valid_keys
 from identify.studies.runner import compute
-from identify.studies.study_file import Law, Study, load_study, study_from_toml, study_names
+from identify.studies.study_file import Law, Study, load_study, study_from_toml
 from identify.studies.table import SENSOR_UNITS
 from tests.identify.study_rows import KIND
 
@@ -108,27 +109,13 @@ def test_a_sample_is_spread_as_its_factors_say():
 
 def test_every_key_of_a_sensor_has_its_unit_or_needs_none():
     """So that a new key is not drawn without its unit, and no unit stands for a key that is gone."""
-    without = {
-        "timing.dropout",
-        "camera.noise",
-        "camera.prnu",
-        "camera.pattern_seed",
-        "lens.vignetting",
-        "stickers.placement_seed",
-        "stickers.per_plane",
-        "rig.left.distortion",
-        "rig.right.distortion",
-        *(f"stickers.{what}_level" for what in ("sticker", "ring", "body", "obstacle", "background")),
-    }
+    without = {"timing.dropout", "camera.noise", "camera.prnu", "camera.pattern_seed", "lens.vignetting"}
+    without |= {"stickers.placement_seed", "stickers.per_plane", "rig.left.distortion", "rig.right.distortion"}
+    without |= {f"stickers.{what}_level" for what in ("sticker", "ring", "body", "obstacle", "background")}
     sections = ("timing", "rig", "camera", "lens", "stickers")
     keys = {path.removeprefix("sensor.") for path in valid_keys(None) if path.startswith("sensor.")}
     assert {key for key in keys if key.partition(".")[0] in sections} == {*SENSOR_UNITS} | without
     assert all(SENSOR_UNITS[key] == "px" for key in SENSOR_UNITS if key.endswith("_px"))
-
-
-def test_built_in_studies_can_all_be_run():
-    for name in study_names():
-        prepare(load_study(name))
 
 
 @pytest.mark.parametrize(
@@ -136,7 +123,6 @@ def test_built_in_studies_can_all_be_run():
     [
         (toml("repeats = 0"), ["repeats = 0"]),
         (toml("reapeats = 2"), ["unknown key 'reapeats'", "repeats"]),
-        (toml("seed = -1"), ["seed = -1"]),
         (toml(factors="sensor.camera.dark_noise = []"), ["sensor.camera.dark_noise", "no values"]),
         (toml(factors="sensor.camera.dark_noise = { low = 1.0, high = 2.0 }"), ["dark_noise", "sample = N"]),
         (toml("sample = 5", factors="sensor.camera.dark_noise = { low = 2.0, high = 1.0 }"), ["low = 2", "high = 1"]),
@@ -144,16 +130,9 @@ def test_built_in_studies_can_all_be_run():
         (toml("[changes]\nsensor.camera.dark_noise = 1.0"), ["sensor.camera.dark_noise", "both"]),
         (toml(factors="sensor.rig.baseline = 1.0"), ["sensor.rig.baseline = 1.0 is no list", "[changes]"]),
         (toml(factors="sensor.rig.baseline = {}"), ["sensor.rig.baseline", "low is missing"]),
-        (
-            toml("sample = 5", factors="sensor.rig.baseline = { low = 1.0, high = inf }"),
-            ["high = inf", "finite number"],
-        ),
+        (toml("sample = 5", factors="sensor.rig.baseline = { low = 1.0, high = inf }"), ["high = inf", "finite"]),
         (toml("sample = 5", factors="sensor.rig.baseline = { low = true, high = 2 }"), ["low = True", "valid number"]),
         (toml("sample = 5", factors="sensor.rig.baseline = { low = 1.0, hgh = 2.0 }"), ["'hgh'", "low, high, scale"]),
-        (
-            toml("sample = 5", factors='sensor.rig.baseline = { low = 1, high = 2, scale = "lg" }'),
-            ["sensor.rig.baseline", "scale = 'lg'", "'linear' or 'log'"],
-        ),
         ("name = 1 = 2", ["not valid TOML"]),
     ],
 )
@@ -164,6 +143,21 @@ def test_study_files_that_contradict_themselves_are_refused(text, evidence):
 
 
 @pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"factor": "x"}, "states one of exponent, equals and order, got none"),
+        ({"factor": "x", "exponent": 1.0, "equals": "other"}, "got exponent, equals"),
+        ({"exponent": 1.0}, "needs a factor"),
+        ({"equals": "other", "factor": "x"}, "has no factor"),
+        ({"factor": "x", "order": ["one"]}, "two values"),
+    ],
+)
+def test_law_states_one_thing(fields, message):
+    with pytest.raises(ValidationError, match=message):
+        Law(figure="figure_um", **fields)
+
+
+@pytest.mark.parametrize(
     ("entries", "evidence"),
     [
         ({"factors": {"sensor.camera.drk_noise": [1.0]}}, ["sensor.camera.drk_noise", "sensor.camera.dark_noise"]),
@@ -171,27 +165,30 @@ def test_study_files_that_contradict_themselves_are_refused(text, evidence):
         ({"factors": {"scenario.timing.frame_rate": [1.0]}}, ["scenario.timing.frame_rate_hz"]),
         ({"factors": {"sensor.camera.dark_noise": [1.0, "much"]}}, ["sensor.camera.dark_noise = 'much'", "number"]),
         ({"factors": {"sensor.camera.dark_noise": [True]}}, ["sensor.camera.dark_noise = True"]),
-        ({"factors": {"sensor.camera.dark_noise": [-1.0]}}, ["sensor.camera.dark_noise = -1.0", "greater"]),
         ({"factors": {"sensor.camera.bit_depth": [9]}}, ["sensor.camera.bit_depth = 9", "8, 10 or 12"]),
-        ({"factors": {"scenario.filter.order": [2.5]}}, ["scenario.filter.order = 2.5", "integer"]),
-        ({"factors": {"scenario.pose_method": ["guess"]}}, ["scenario.pose_method = 'guess'", "planes"]),
+        ({"factors": {"scenario.filter.order": {"low": 2.5, "high": 4}}, "sample": 2}, ["order = 2.5", "integer"]),
         ({"factors": {"sensor.camera": [1.0]}}, ["unknown key 'sensor.camera'"]),
         ({"factors": {"scenario.sensor_changes": [1.0]}}, ["unknown key 'scenario.sensor_changes'"]),
         ({"factors": {"sensor.camera.dark_noise": [1.0, 2.0, 1.0]}}, ["a value twice", "repeats"]),
+        ({"factors": {"options.mixed": [1, 2.5, "two"]}}, ["options.mixed", "several kinds: number, str"]),
         ({"changes": {"sensor.lens.psf": 1.0}}, ["sensor.lens.psf", "sensor.lens.psf_px"]),
+        ({"changes": {"options.odd": 1.0}}, ["changes.options.odd", "[options]"]),
         ({"changes": {"scenario.filter.cutoff_hz": 40.0}}, ["filter.cutoff_hz = 40", "Nyquist"]),
+        ({"options": {"odd": 2}, "factors": {"options.odd": [1, 4]}}, ["options.odd is both a factor and among the"]),
         ({"scenario": "papper"}, ["papper", "paper", "quick"]),
         ({"kind": "static_poses"}, ["static_poses", "static_pose", "path_pose", "module:function"]),
         ({"kind": "tests.identify.study_rows:rou"}, ["study_rows", "rou"]),
         ({"kind": "no_such_module:row"}, ["no_such_module", "PYTHONPATH"]),
-        ({"kind": "static_pose", "options": {"capturs": 4}}, ["capturs", "captures"]),
-        ({"kind": "static_pose", "factors": {"options.capturs": [4]}}, ["options.capturs", "options.captures"]),
-        ({"kind": "path_pose", "factors": {"options.zz": [4]}}, ["'options.zz'", "stretch_s, options.teaching"]),
-        ({"factors": {"options.mixed": [1, 2.5, "two"]}}, ["options.mixed", "several kinds: number, str"]),
+        ({"kind": "static_pose", "options": {"capturs": 4}}, ["unknown key 'capturs'; valid names: poses, captures"]),
+        ({"kind": "static_pose", "options": {"captures": 0}}, ["options of static_pose: captures = 0"]),
         ({"kind": "static_pose", "factors": {"options.captures": ["many"]}}, ["options.captures = 'many'"]),
+        ({"kind": "path_pose", "factors": {"options.zz": [4]}}, ["'options.zz'", "stretch_s, options.teaching"]),
+        ({"kind": f"{__name__}:wrong_row"}, ["wrong_row' takes (scenario);", "(scenario, seed) or (scenario, seed, "]),
+        ({"kind": f"{__name__}:plain_row", "options": {"odd": 1}}, ["plain_row' takes no options, got odd"]),
+        ({"kind": f"{__name__}:plain_row", "factors": {"options.odd": [1]}}, ["plain_row' takes no options, got odd"]),
     ],
 )
-def test_keys_and_values_are_checked_before_any_row(entries, evidence):
+def test_kinds_keys_and_values_are_checked_before_any_row(entries, evidence):
     message = refusal(prepare, study(**entries))
     assert all(word in message for word in evidence), message
 
@@ -205,28 +202,11 @@ def wrong_row(scenario):
     """No row: it takes no seed."""
 
 
-def own(name):
-    return f"{plain_row.__module__}:{name}"
-
-
 def test_a_function_of_ones_own_needs_no_options_where_the_study_has_none():
-    chosen = study(kind=own("plain_row"))
+    chosen = study(kind=f"{__name__}:plain_row")
     figures = compute(prepare(chosen), cases(chosen)[:1])[0].figures
     draw = np.random.default_rng(np.random.SeedSequence(0).spawn(1)[0]).normal()
     assert figures == {"rate_hz": 60.0, "draw": draw}
-
-
-@pytest.mark.parametrize(
-    ("entries", "evidence"),
-    [
-        ({"kind": own("wrong_row")}, ["wrong_row' takes (scenario);", "(scenario, seed) or (scenario, seed, options)"]),
-        ({"kind": own("plain_row"), "options": {"odd": 1}}, ["plain_row' takes no options, got odd"]),
-        ({"kind": own("plain_row"), "factors": {"options.odd": [1]}}, ["plain_row' takes no options, got odd"]),
-    ],
-)
-def test_functions_with_other_arguments_are_refused_before_any_row(entries, evidence):
-    message = refusal(prepare, study(**entries))
-    assert all(word in message for word in evidence), message
 
 
 LAW = {"figure": "position_rms_um", "factor": "sensor.camera.dark_noise", "exponent": 1.0}
@@ -257,9 +237,8 @@ def test_figures_of_a_kind_of_ones_own_are_not_known_before_its_rows_but_its_fac
 
 
 def test_unknown_study_lists_the_built_in_ones():
-    message = refusal(load_study, "pixel_nois")
-    assert "pixel_nois" in message
-    assert "pixel_noise" in message
+    assert "'pixel_nois'" in refusal(load_study, "pixel_nois")
+    assert "pixel_noise" in refusal(load_study, "pixel_nois")
 
 
 def test_rows_of_a_huge_grid_are_counted_without_making_them():

@@ -8,6 +8,7 @@ import pytest
 
 from cmmsim.files.sensor_file import read_sensor_file
 from identify.errors import IdentifyError, StudyError
+from identify.plugins import CRITERIA
 from identify.scenario import load_scenario
 from identify.studies.design import overrides, prepare, valid_keys
 from identify.studies.rows import find_kind
@@ -41,7 +42,9 @@ def others(value, annotation):
         return [not value]
     if isinstance(value, (int, float)):
         return [type(value)(other) for other in (1.25 * value, value + 1, 0.8 * value, 0.001)]
-    return [100.0, 1e-5] if value is None else [other for other in get_args(annotation) if other != value]
+    if value is None:
+        return [100.0, 1e-5]
+    return [other for other in get_args(annotation) or CRITERIA if other != value]
 
 
 def with_others(scenario, paths):
@@ -117,9 +120,6 @@ def test_what_a_held_pose_reads_acts_on_its_rows(path, value):
     [
         ({"factors": {KP: [0.1, 0.3]}}, [f"factors.{KP} does nothing", "'static_pose'", "scenario.pose_method"]),
         ({"changes": {KP: 0.1}}, [f"changes.{KP} does nothing", "sensor.camera.*", "but sensor.stickers.obstacle_l"]),
-        ({"factors": {"scenario.timing.latency_s": [0.0, 0.01]}}, ["latency_s does nothing", "timing.dropout"]),
-        ({"kind": "path_pose", "factors": {"scenario.validation.count": [1, 2]}}, ["validation.count does nothing"]),
-        ({"kind": "closed_loop", "factors": {"scenario.model.steps_per_frame": [4, 8]}}, ["steps_per_frame does"]),
         ({"kind": "identification", "factors": {"scenario.identification.qr_threshold": [1e-3, 1e-4]}},
          ["qr_threshold does nothing", "they read scenario.*, sensor.rig.*"]),
         ({"factors": {"options.hold_s": [0.2, 0.4], "options.captures": [1, 4]}},
@@ -130,10 +130,6 @@ def test_what_a_held_pose_reads_acts_on_its_rows(path, value):
         ({"kind": "identification", "changes": {NOISE: False}}, [f"changes.{NOISE}", "options.sensor is drawn"]),
         ({"kind": "identification", "factors": {"scenario.payload.mass_kg": [8.0, 9.0]}}, ["anchor is not payload"]),
         ({"kind": "closed_loop", "factors": {"scenario.plant.geometry_seed": [0, 1]}}, ["geometry_error_m is 0"]),
-        ({"options": {"captures": 2}, "factors": {"options.captures": [1, 4]}},
-         ["options.captures is both a factor and among the options"]),
-        ({"kind": KIND, "options": {"odd": 2}, "factors": {"options.odd": [1, 4]}},
-         ["options.odd is both a factor and among the options"]),
     ],
 )  # fmt: skip
 def test_what_does_nothing_is_refused_before_any_row(entries, evidence):

@@ -10,13 +10,12 @@ from cmmsim.geometry.pose import invert, rotation_log
 from cmmsim.teaching import exactly_taught
 from dynamics import load_robot
 from dynamics.closed_loop import Reference
-from identify.errors import EstimationError, StudyError
+from identify.errors import EstimationError
 from identify.experiment.plant import build_plant
 from identify.scenario import load_scenario
 from identify.studies.rows import KINDS, find_kind
-from identify.studies.rows import sensor as row_sensor
 from identify.studies.rows.identification import prediction_figures
-from identify.studies.rows.sensor import DrawnSensor
+from identify.studies.rows.sensor import SENSORS_KEPT, DrawnSensor, exact_sensor
 
 NOISELESS = {
     "sensor_changes.camera.noise": False,
@@ -39,33 +38,25 @@ def static(number=0, settings=None, **options):
 
 
 def test_same_seed_gives_the_same_row_and_another_one_another():
-    first, again, other = static(0), static(0), static(1)
-    assert first == again
-    assert first["position_rms_um"] != other["position_rms_um"]
+    given = seed()
+    first, again = (find_kind("static_pose").row(scenario(), given, {}) for _ in range(2))
+    assert first == again == static(0)
+    assert given.n_children_spawned == 0, "the seed is used up"
+    assert first["position_rms_um"] != static(1)["position_rms_um"]
     assert list(first) == list(find_kind("static_pose").columns)
 
 
 def test_row_does_not_depend_on_what_the_process_has_kept():
-    row_sensor.exact_sensor.cache_clear()
+    exact_sensor.cache_clear()
+    assert exact_sensor.cache_info().maxsize == SENSORS_KEPT
     alone = static(0)
     for dark_noise in (10.0, 40.0, 80.0):
         static(1, scenario(**{"sensor_changes.camera.dark_noise": dark_noise}))
-    kept = row_sensor.exact_sensor.cache_info()
+    kept = exact_sensor.cache_info()
     assert static(0) == alone
-    assert row_sensor.exact_sensor.cache_info().hits == kept.hits + 1
+    assert exact_sensor.cache_info().hits == kept.hits + 1
     find_kind("path_pose").row(scenario(), seed(3), {"stretch_s": 0.1})
     assert static(0) == alone
-
-
-def test_sensors_that_a_process_keeps_are_bounded():
-    assert row_sensor.exact_sensor.cache_info().maxsize == row_sensor.SENSORS_KEPT
-
-
-def test_seed_of_a_row_is_not_used_up():
-    given = seed()
-    static_row = find_kind("static_pose").row(scenario(), given, {})
-    assert given.n_children_spawned == 0
-    assert find_kind("static_pose").row(scenario(), given, {}) == static_row
 
 
 @pytest.mark.slow
@@ -168,15 +159,6 @@ def test_drawn_sensor_loses_its_share_of_frames_without_changing_the_noise_of_ot
     pairs = [(whole.measure(pose), losing.measure(pose)) for _ in range(1000)]
     assert sum(not second.ok for _, second in pairs) == pytest.approx(300, abs=60)
     assert all(np.array_equal(first.pose, second.pose) for first, second in pairs if second.ok)
-
-
-def test_unknown_kinds_and_options_name_the_valid_ones():
-    with pytest.raises(StudyError, match="static_pose, path_pose, identification, closed_loop"):
-        find_kind("pose").row(scenario(), seed(), {})
-    with pytest.raises(StudyError, match=r"unknown key 'capture'; valid names: poses, captures, hold_s, teaching"):
-        find_kind("static_pose").checked({"capture": 3})
-    with pytest.raises(StudyError, match=r"options of static_pose: captures = 0"):
-        find_kind("static_pose").checked({"captures": 0})
 
 
 @pytest.mark.parametrize("kind", KINDS)

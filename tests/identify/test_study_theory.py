@@ -3,7 +3,6 @@
 import numpy as np
 import pandas as pd
 import pytest
-from pydantic import ValidationError
 from scipy.stats import binom
 
 from identify.errors import StudyError
@@ -171,18 +170,3 @@ def test_figure_that_is_zero_or_a_factor_that_stands_still_is_undecided():
 def test_regression_needs_more_rows_than_coefficients():
     with pytest.raises(StudyError, match="2 rows do not determine 2 coefficients"):
         scale_regression(np.ones(2), np.array([[1.0, 0.0], [1.0, 1.0]]))
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"factor": "x"}, "states one of exponent, equals and order, got none"),
-        ({"factor": "x", "exponent": 1.0, "equals": "other"}, "got exponent, equals"),
-        ({"exponent": 1.0}, "needs a factor"),
-        ({"equals": "other", "factor": "x"}, "has no factor"),
-        ({"factor": "x", "order": ["one"]}, "two values"),
-    ],
-)
-def test_law_states_one_thing(fields, message):
-    with pytest.raises(ValidationError, match=message):
-        Law(figure="figure_um", **fields)
