@@ -48,7 +48,6 @@ from identify.estimation.bounds import bounded_estimate, combined_std
 from identify.estimation.covariance import Uncertainty
 from identify.estimation.explanation import Explanation
 from identify.estimation.output_error import OutputErrorProblem
-from identify.estimation.output_error_search import bounds_of
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.loop_parameters import NAMES, StartingGuess, holding_torque
 from identify.scenario import Scenario
@@ -228,7 +227,7 @@ def judge(
         uncertainty.gradient,
         uncertainty.information + known,
         uncertainty.covariance,
-        bounds_of(problem, scenario),
+        problem.bounds,
     )
     of_the_records = (warning for run in problem.runs for warning in run.warnings())
     return Judgement(

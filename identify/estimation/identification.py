@@ -105,7 +105,7 @@ def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: 
             f"the scale anchor is a payload, and the {len(runs)} records have all the same load: one with and one "
             "without it are needed"
         )
-    return OutputErrorProblem(runs, _guess(robot, scenario), anchor)
+    return OutputErrorProblem(runs, _guess(robot, scenario), anchor, scenario.identification.physical_consistency)
 
 
 def _guess(robot: Robot, scenario: Scenario) -> StartingGuess:

@@ -14,6 +14,7 @@ import numpy as np
 
 from dynamics import DynamicsError
 from identify.arrays import Array
+from identify.estimation.bounds import ParameterBounds, parameter_bounds
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.loop_parameters import StartingGuess
 from identify.record.recorded_run import RecordedRun
@@ -21,11 +22,18 @@ from identify.record.recorded_run import RecordedRun
 
 @dataclass(frozen=True)
 class OutputErrorProblem:
-    """Least-squares problem in the 67 parameters over one or several records, for `bounded_least_squares.minimise`."""
+    """Least-squares problem in the 67 parameters over one or several records, for `bounded_least_squares.minimise`;
+    physical: whether only bodies that can exist are allowed."""
 
     runs: tuple[RecordedRun, ...]
     guess: StartingGuess
     anchor: ScaleAnchor
+    physical: bool = False
+
+    @property
+    def bounds(self) -> ParameterBounds:
+        """Where a search may go."""
+        return parameter_bounds(self.guess, self.physical)
 
     def driven_by_commands(self) -> "OutputErrorProblem":
         """The same problem with the joints driven by the logged commands."""

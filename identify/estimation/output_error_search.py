@@ -13,7 +13,7 @@ from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.bounded_least_squares import Problem, Solution, StopCriteria, minimise
-from identify.estimation.bounds import InCoordinates, ParameterBounds, parameter_bounds
+from identify.estimation.bounds import InCoordinates
 from identify.estimation.multiple_shooting import MultipleShooting, measured_states, segments
 from identify.estimation.output_error import OutputErrorProblem
 from identify.progress import Advance, Progress
@@ -33,7 +33,7 @@ def output_error_searches(
     """
     found = {}
     driven = problem.driven_by_commands()
-    start = runnable_start(driven, scenario, warm)
+    start = runnable_start(driven, warm)
     if start is None:
         found["multiple_shooting"] = shoot(driven, scenario, warm, progress)
         start = found["multiple_shooting"].parameters
@@ -42,18 +42,16 @@ def output_error_searches(
     with progress.stage("identify", (2 if closed_loop else 1) * settings.max_iterations) as advance:
         found["command_driven"] = search(driven, start, scenario, advance)
         if closed_loop:
-            start = _closed_loop_start(problem, scenario, found["command_driven"].parameters)
+            start = _closed_loop_start(problem, found["command_driven"].parameters)
             found["closed_loop"] = search(problem, start, scenario, advance)
     return found
 
 
 def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance) -> Solution:
-    """Minimise one output-error problem from parameters (67,), within the bounds that the scenario asks for."""
+    """Minimise one output-error problem from parameters (67,), within its bounds."""
     settings = scenario.identification
     criteria = StopCriteria(settings.cost_tolerance, settings.parameter_tolerance, settings.max_iterations)
-    solution = _within_bounds(problem, problem, start, scenario, criteria, advance)
-    advance(settings.max_iterations - solution.iterations)
-    return solution
+    return _within_bounds(problem, problem, start, criteria, advance)
 
 
 def shoot(problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress: Progress) -> Solution:
@@ -65,14 +63,13 @@ def shoot(problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress
     settings = scenario.identification
     criteria = StopCriteria(CLOSE_ENOUGH, settings.parameter_tolerance, settings.max_iterations)
     chains = [segments(run) for run in problem.runs]
-    for start in _candidates(problem, scenario, warm):
+    for start in _candidates(problem, warm):
         states = [measured_states(chain, start, scenario) for chain in chains]
         shooting = MultipleShooting(problem, chains, states)
         if not np.isfinite(shooting.cost(start)):
             continue
         with progress.stage("multiple shooting", settings.max_iterations) as advance:
-            solution = _within_bounds(shooting, problem, start, scenario, criteria, advance)
-            advance(settings.max_iterations - solution.iterations)
+            solution = _within_bounds(shooting, problem, start, criteria, advance)
         if np.isfinite(problem.cost(solution.parameters)):
             return solution
     raise EstimationError(
@@ -81,21 +78,16 @@ def shoot(problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress
     )
 
 
-def runnable_start(problem: OutputErrorProblem, scenario: Scenario, warm: Array) -> Array | None:
+def runnable_start(problem: OutputErrorProblem, warm: Array) -> Array | None:
     """The better of warm start and starting guess (67,), within the bounds; None where the model runs with neither."""
-    costs = [(problem.cost(start), start) for start in _candidates(problem, scenario, warm)]
+    costs = [(problem.cost(start), start) for start in _candidates(problem, warm)]
     cost, start = min(costs, key=lambda entry: entry[0])
     return start if np.isfinite(cost) else None
 
 
-def bounds_of(problem: OutputErrorProblem, scenario: Scenario) -> ParameterBounds:
-    """The bounds of a problem's parameters that the scenario asks for."""
-    return parameter_bounds(problem.guess, scenario.identification.physical_consistency)
-
-
-def _closed_loop_start(problem: OutputErrorProblem, scenario: Scenario, driven: Array) -> Array:
+def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
     """The better of what the command-driven search found (67,) and the starting guess, for the closed loop."""
-    start = runnable_start(problem, scenario, driven)
+    start = runnable_start(problem, driven)
     if start is None:
         raise EstimationError(
             "the closed loop runs neither with what the command-driven search found nor with the starting guess: "
@@ -104,21 +96,15 @@ def _closed_loop_start(problem: OutputErrorProblem, scenario: Scenario, driven: 
     return start
 
 
-def _candidates(problem: OutputErrorProblem, scenario: Scenario, warm: Array) -> list[Array]:
-    bounds = bounds_of(problem, scenario)
-    return [bounds.nearest(start) for start in (warm, problem.guess.values)]
+def _candidates(problem: OutputErrorProblem, warm: Array) -> list[Array]:
+    return [problem.bounds.nearest(start) for start in (warm, problem.guess.values)]
 
 
 def _within_bounds(
-    least_squares: Problem,
-    problem: OutputErrorProblem,
-    start: Array,
-    scenario: Scenario,
-    criteria: StopCriteria,
-    advance: Advance,
+    least_squares: Problem, problem: OutputErrorProblem, start: Array, criteria: StopCriteria, advance: Advance
 ) -> Solution:
-    """Solution in the parameters of a search in the coordinates of their bounds."""
-    bounds = bounds_of(problem, scenario)
+    """Solution in the parameters of a search in the coordinates of their bounds; `advance` reaches all iterations."""
+    bounds = problem.bounds
     found = minimise(
         InCoordinates(least_squares, bounds),
         bounds.coordinates(start),
@@ -127,6 +113,7 @@ def _within_bounds(
         criteria,
         lambda i, cost: advance(),
     )
+    advance(criteria.max_iterations - found.iterations)
     return replace(found, parameters=bounds.parameters(found.parameters))
 
 

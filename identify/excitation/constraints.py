@@ -112,10 +112,11 @@ COMPONENTS = ("x", "y", "z", "alpha", "beta", "gamma")
 
 @dataclass(frozen=True)
 class Limit:
-    """One constraint: name, the limit in its unit, who it concerns (one entry a row), and whether it bounds from below
-    (a share is then limit / value)."""
+    """One constraint: name, share of it that is used, the limit itself in its unit and whom it concerns (an entry a row
+    each), and whether it bounds from below (a share is then limit / value)."""
 
     name: str
+    share: ca.SX
     limit: tuple[float, ...]
     unit: str
     who: tuple[str, ...]
@@ -145,35 +146,38 @@ class MotionConstraints:
     """The constraints of a scenario on the motion of a robot."""
 
     def __init__(self, robot: Robot, scenario: Scenario, sight: SightLines | None = None) -> None:
-        self._robot, self._settings = robot, scenario.excitation
+        settings, geometry = scenario.excitation, robot.geometry
         sight = sight or sight_lines(scenario.sensor, scenario.sensor_changes)
-        amplitude = (self._settings.position_amplitude_m, self._settings.orientation_amplitude_rad)
-        self.box = np.repeat(amplitude, 3)
+        self.box = np.repeat([settings.position_amplitude_m, settings.orientation_amplitude_rad], 3)
         stickers = required_stickers(sight, robot.home_pose)
         self.always_in_sight = within_sight(sight, stickers, robot.home_pose, self.box)
-        self._sight, self._stickers = sight, [] if self.always_in_sight else stickers
-        travel = robot.travel_limit - self._settings.travel_margin_rad
+        travel, velocity = robot.travel_limit - settings.travel_margin_rad, settings.max_joint_velocity_rad_s
         if travel <= 0:
             raise TrajectoryError(
-                f"excitation.travel_margin_rad = {self._settings.travel_margin_rad:g} rad leaves nothing of the travel "
+                f"excitation.travel_margin_rad = {settings.travel_margin_rad:g} rad leaves nothing of the travel "
                 f"limit {robot.travel_limit:g} rad of {robot.name}"
             )
-        legs = tuple(f"leg {k}" for k in range(1, 7))
+        self._pose, self._rate = ca.SX.sym("pose", 6), ca.SX.sym("rate", 6)
+        leverage, link_rows = singularity_measures(geometry, self._pose)
+        condition = ca.norm_fro(link_rows) * ca.norm_fro(ca.solve(link_rows, ca.SX.eye(6)))
+        angles, velocities = joint_angles(geometry, self._pose), pose_jacobian(geometry, self._pose) @ self._rate
+        legs, away = tuple(f"leg {k}" for k in range(1, 7)), self._pose - geometry.home_pose
         self.limits = [
-            Limit("box", tuple(self.box), "", COMPONENTS),
-            Limit("travel", (travel,) * 6, " rad", legs),
-            Limit("velocity", (self._settings.max_joint_velocity_rad_s,) * 6, " rad/s", legs),
-            Limit("leverage", (LEAST_LEVERAGE,) * 6, "", legs, lower=True),
-            Limit("conditioning", (MOST_CONDITION,), "", ("",)),
+            Limit("box", away / self.box, tuple(self.box), "", COMPONENTS),
+            Limit("travel", angles / travel, (travel,) * 6, " rad", legs),
+            Limit("velocity", velocities / velocity, (velocity,) * 6, " rad/s", legs),
+            Limit("leverage", LEAST_LEVERAGE / leverage, (LEAST_LEVERAGE,) * 6, "", legs, lower=True),
+            Limit("conditioning", condition / MOST_CONDITION, (MOST_CONDITION,), "", ("",)),
         ]
-        if self._stickers:
+        if not self.always_in_sight:
             names = [
                 f"sticker {sight.platform.sticker_ids[k]}, {side} camera, {what}"
-                for k in self._stickers
+                for k in stickers
                 for side in ("left", "right")
                 for what in ("incidence", "across", "up")
             ]
-            self.limits.append(Limit("visibility", (1.0,) * len(names), " of the limit", tuple(names)))
+            uses, limit = sight_uses(sight, stickers, self._pose), (1.0,) * len(names)
+            self.limits.append(Limit("visibility", uses, limit, " of the limit", tuple(names)))
 
     @cached_property
     def shares(self) -> ca.Function:
@@ -182,25 +186,8 @@ class MotionConstraints:
 
     def shares_of(self, names: Collection[str]) -> ca.Function:
         """As `shares`, of some limits only."""
-        pose, rate = ca.SX.sym("pose", 6), ca.SX.sym("rate", 6)
-        rows = self._rows(pose, rate)
-        return ca.Function("shares", [pose, rate], ca.cse([ca.vertcat(*[rows[n] for n in rows if n in names])]))
-
-    def _rows(self, pose: ca.SX, rate: ca.SX) -> dict[str, ca.SX]:
-        geometry, settings = self._robot.geometry, self._settings
-        travel = self._robot.travel_limit - settings.travel_margin_rad
-        leverage, link_rows = singularity_measures(geometry, pose)
-        condition = ca.norm_fro(link_rows) * ca.norm_fro(ca.solve(link_rows, ca.SX.eye(6)))
-        rows = {
-            "box": (pose - geometry.home_pose) / self.box,
-            "travel": joint_angles(geometry, pose) / travel,
-            "velocity": pose_jacobian(geometry, pose) @ rate / settings.max_joint_velocity_rad_s,
-            "leverage": LEAST_LEVERAGE / leverage,
-            "conditioning": condition / MOST_CONDITION,
-        }
-        if self._stickers:
-            rows["visibility"] = sight_uses(self._sight, self._stickers, pose)
-        return rows
+        rows = ca.vertcat(*[limit.share for limit in self.limits if limit.name in names])
+        return ca.Function("shares", [self._pose, self._rate], ca.cse([rows]))
 
     def worst(self, trajectory: FourierTrajectory, times: Array) -> list[Worst]:
         """Where a trajectory, sampled at `times` (N,) [s], comes nearest to each limit; share NaN: out of reach."""

@@ -34,15 +34,6 @@ from identify.trajectory import FourierTrajectory
 POLL_S = 0.2
 
 
-@dataclass(frozen=True)
-class PlantRuns:
-    """What a worker process needs to run the plant: all of it can be pickled."""
-
-    scenario: Scenario
-    seed: int
-    taught: cmmsim.Taught
-
-
 def run_unseen(
     scenario: Scenario,
     trajectories: tuple[FourierTrajectory, ...],
@@ -55,18 +46,18 @@ def run_unseen(
 
     Every run has its own noise stream, and all share what the sensor was taught: results do not depend on the workers.
     """
-    runs, workers = PlantRuns(scenario, seed, taught), workers or cores()
+    how, workers = (scenario, seed, taught), workers or cores()
     numbers = range(1, len(trajectories) + 1)
     frames = scenario.timing.frames(scenario.validation.duration_s) * len(trajectories)
     with progress.stage("validate", frames) as advance:
         if workers == 1 or len(trajectories) == 1:
-            worker = _Worker(runs)
+            worker = _Worker(*how)
             return [worker.run(number, path, advance) for number, path in zip(numbers, trajectories, strict=True)]
         context = multiprocessing.get_context("spawn")
         counter: Synchronized[int] = context.Value("q", 0)
         with (
             _followed(counter, advance),
-            ProcessPoolExecutor(workers, context, _start_worker, (runs, counter)) as pool,
+            ProcessPoolExecutor(workers, context, _start_worker, (counter, *how)) as pool,
         ):
             return list(pool.map(_run_in_worker, numbers, trajectories))
 
@@ -164,23 +155,21 @@ def predicted_runs(
 class _Worker:
     """One process's plant and sensor; the renderer lives as long as the process."""
 
-    def __init__(self, runs: PlantRuns) -> None:
-        self._runs = runs
-        self._plant = build_plant(runs.scenario)
-        self._sensor = make_sensor(runs.scenario, self._plant.nominal, runs.seed, runs.taught)
+    def __init__(self, scenario: Scenario, seed: int, taught: cmmsim.Taught) -> None:
+        self._plant, self._seed, self._duration_s = build_plant(scenario), seed, scenario.validation.duration_s
+        self._sensor = make_sensor(scenario, self._plant.nominal, seed, taught)
 
     def run(self, number: int, trajectory: FourierTrajectory, advance: Advance) -> Experiment:
-        duration_s = self._runs.scenario.validation.duration_s
-        return run_plant(self._plant, self._sensor, trajectory, duration_s, self._runs.seed, number, advance)
+        return run_plant(self._plant, self._sensor, trajectory, self._duration_s, self._seed, number, advance)
 
 
 _worker: _Worker
 _counter: "Synchronized[int]"
 
 
-def _start_worker(runs: PlantRuns, counter: "Synchronized[int]") -> None:
+def _start_worker(counter: "Synchronized[int]", scenario: Scenario, seed: int, taught: cmmsim.Taught) -> None:
     global _worker, _counter
-    _worker, _counter = _Worker(runs), counter
+    _worker, _counter = _Worker(scenario, seed, taught), counter
 
 
 def _run_in_worker(number: int, trajectory: FourierTrajectory) -> Experiment:

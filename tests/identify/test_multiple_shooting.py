@@ -127,7 +127,7 @@ def test_a_model_that_does_not_run_is_brought_to_the_optimum():
     driven = problem.driven_by_commands()
     with pytest.raises(DynamicsError, match="unstable"):
         search(driven, unstable, scenario, silent)
-    assert runnable_start(driven, scenario, unstable) is None
+    assert runnable_start(driven, unstable) is None
     progress = Stages()
     found = output_error_searches(problem, scenario, unstable, progress)
     assert [name for name, _, _ in progress.seen] == ["multiple shooting", "identify"]
