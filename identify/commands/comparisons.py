@@ -189,7 +189,7 @@ def compare_excitation(scenario: Scenario, seed: int, folder: Path, progress: Pr
 
     robot = load_robot(scenario.robot)
     found = compare_methods(robot, scenario, seed, progress)
-    figures = {**asdict(found), "entries": [entry.figures() for entry in found.entries], "scenario": scenario.name}
+    figures = {**asdict(found), "scenario": scenario.name}
     figure = comparison_figure(robot, scenario, found)
     save_files(folder, {"comparison.json": figures, "comparison.png": figure})
     if not quiet:

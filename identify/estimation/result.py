@@ -94,23 +94,17 @@ class IdentificationResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Estimates with their uncertainty, for a JSON file; the true values, where known, are for others to add."""
+        anchor, whiteness = self.scale_anchor, self.whiteness
         return {
-            "scale_anchor": self.scale_anchor.name,
-            "scale_anchor_value": self.scale_anchor.value,
-            "scale_anchor_std": self.scale_anchor.std,
-            "iterations": self.iterations,
-            "evaluations": self.evaluations,
-            "stop_reason": self.stop_reason,
+            "scale_anchor": anchor.name,
+            "scale_anchor_value": anchor.value,
+            "scale_anchor_std": anchor.std,
+            **{name: getattr(self, name) for name in ("iterations", "evaluations", "stop_reason")},
             "costs": [list(costs) for costs in self.costs],
             "searches": list(self.searches),
             "active_bounds": list(self.active_bounds),
-            "noise_ratio": self.noise_ratio,
-            "expected_noise_ratio": self.expected_noise_ratio,
-            "noise_ratio_std": self.noise_ratio_std,
-            "whiteness": {
-                "p_value": self.whiteness.p_value,
-                "p_values": dict(zip(POSE, self.whiteness.p_values, strict=True)),
-            },
+            **{name: getattr(self, name) for name in ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")},
+            "whiteness": {"p_value": whiteness.p_value, "p_values": dict(zip(POSE, whiteness.p_values, strict=True))},
             "conditioning": asdict(self.conditioning),
             "strongest_correlations": [asdict(pair) for pair in self._strongest_correlations()],
             "warnings": list(self.warnings),

@@ -1,8 +1,7 @@
 """The methods of excitation side by side: same criterion, same seed, same random candidates; with a figure."""
 
 import time
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -42,12 +41,6 @@ class Entry:
     iterations: int
     reason: str
     worst: tuple[Worst, ...]
-
-    def figures(self) -> dict[str, Any]:
-        """All figures, for a file."""
-        figures = asdict(self)
-        figures["trajectory"] = asdict(self.trajectory)
-        return figures
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import pytest
 from dynamics.closed_loop import simulate
 from dynamics.parameters import VISCOUS
 from identify.errors import TrajectoryError
-from identify.excitation.criteria import SMOOTHING_RAD_S, log_index, log_observability
+from identify.excitation.criteria import SMOOTHING_RAD_S, log_observability
 from identify.excitation.information import (
     harmonics,
     knowledge,
@@ -48,16 +48,6 @@ def drawn(robot, seed, scenario=SCENARIO):
         settings.orientation_amplitude_rad,
     )
     return free, free.of(trajectory), trajectory
-
-
-def test_index_is_the_papers_on_the_excited_directions():
-    """A diagonal regressor whose first column stands twice: singular values sqrt(2) |a_1|, |a_2|, |a_3|, and 0."""
-    rng = np.random.default_rng(1)
-    columns, other = (np.kron(rng.standard_normal(4), np.diag(rng.uniform(0.1, 10.0, 3))) for _ in range(2))
-    combinations = np.array([[1.0, 0.0, 0.0, 1.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
-    norms = np.linalg.norm(columns, axis=1) * [np.sqrt(2), 1, 1]
-    index = ca.evalf(ca.MX(log_index(ca.MX(ca.DM(columns)), combinations, other, 4)))
-    assert np.exp(float(index)) == pytest.approx(np.prod(norms) ** (1 / 3) / np.sqrt(4), rel=1e-12)
 
 
 @pytest.mark.parametrize("harmonics_", [2, 5])

@@ -132,6 +132,7 @@ def test_a_model_that_does_not_run_is_brought_to_the_optimum():
     found = output_error_searches(problem, scenario, unstable, progress)
     assert [name for name, _, _ in progress.seen] == ["multiple shooting", "identify"]
     assert all(sum(steps) == total for _, total, steps in progress.seen)
+    assert progress.seen[0][2][: found["multiple_shooting"].iterations] == [1] * found["multiple_shooting"].iterations
     assert list(found) == ["multiple_shooting", "command_driven", "closed_loop"]
     for name, judged in (("command_driven", driven), ("closed_loop", problem)):
         from_truth = search(judged, truth(), scenario, silent)
@@ -145,14 +146,3 @@ def test_a_model_that_no_segment_bears_is_named():
     hopeless = replace(problem, guess=replace(problem.guess, values=wild))
     with pytest.raises(EstimationError, match=r"nor does multiple shooting.*frame"):
         shoot(hopeless, scenario, wild, SilentProgress())
-
-
-def test_the_bar_moves_with_every_iteration_and_ends_full():
-    scenario, problem, _ = recorded(2.0, {"identification.max_iterations": 3})
-    unstable, problem = with_unstable_guess(problem)
-    progress = Stages()
-    found = shoot(problem, scenario, unstable, progress)
-    ((name, total, steps),) = progress.seen
-    assert (name, total, sum(steps)) == ("multiple shooting", 3, 3)
-    assert found.iterations >= 2
-    assert steps[: found.iterations] == [1] * found.iterations
