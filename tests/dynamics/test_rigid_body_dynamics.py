@@ -3,9 +3,6 @@
 import numpy as np
 import pytest
 
-import dynamics
-from dynamics.parameters import RIGID_BODY
-
 LINK_INERTIA = [4 + 24 + 4 * leg + 1 for leg in range(6)]  # index of link Ixx; Iyy follows
 
 
@@ -28,6 +25,10 @@ def test_mass_matrix_is_symmetric_and_positive_definite(robot, states, parameter
     mass = robot.mass_matrix(states.pose, parameters)
     np.testing.assert_allclose(mass, mass.transpose(0, 2, 1), atol=1e-12)
     assert np.linalg.eigvalsh(mass).min() > 0.1
+    assert len(robot.parameter_names) == len(robot.nominal_parameters) == 64
+    np.testing.assert_array_equal(
+        robot.mass_matrix(states.pose), robot.mass_matrix(states.pose, robot.parameter_sets["initial"].dynamic)
+    )
 
 
 def test_parts_regressor_and_inverse_dynamics_agree(robot, states, parameters):
@@ -132,24 +133,6 @@ def _mass_rate(robot, motion, numerics, t, values):
     return numerics.derivative(lambda d: robot.mass_matrix(motion.pose(t + d), values))
 
 
-def test_energy_balances_along_a_motion(robot, motion, numerics, round_links):
-    """Power of the torques = change of kinetic and height energy + power lost to friction, to 1e-10 of the power."""
-    coulomb, viscous = round_links[52:58], round_links[58:64]
-    for t in np.linspace(0, 3, 13):
-        pose, twist = motion.pose(t), robot.twist(motion.pose(t), motion.rate(t))
-        twist_dot = robot.twist_dot(pose, motion.rate(t), motion.acceleration(t))
-        theta_dot = robot.joint_jacobian(pose) @ twist
-
-        def kinetic(d, t=t):
-            v = robot.twist(motion.pose(t + d), motion.rate(t + d))
-            return v @ robot.mass_matrix(motion.pose(t + d), round_links) @ v / 2
-
-        given = robot.inverse_dynamics(pose, twist, twist_dot, round_links) * theta_dot
-        lost = coulomb * np.abs(theta_dot) + viscous * theta_dot**2
-        gained = numerics.derivative(kinetic) + robot.gravity_wrench(pose, round_links) @ twist
-        np.testing.assert_allclose(given.sum(), gained + lost.sum(), atol=1e-10 * np.abs(given).sum())
-
-
 def test_mass_rate_less_twice_coriolis_is_skew(robot, motion, numerics, round_links):
     """M_dot - 2 C is skew-symmetric, M_dot by finite differences; so is its quadratic form zero."""
     for t in np.linspace(0, 3, 7):
@@ -202,12 +185,3 @@ def test_wrench_is_linear_in_the_parameters(robot, states):
         more[index] += 1.0
         change = robot.inverse_dynamics(pose, twist, twist_dot, more) - robot.inverse_dynamics(pose, twist, twist_dot)
         np.testing.assert_allclose(jacobian.T @ change, regressor[:, index], atol=1e-10)
-
-
-def test_nominal_parameters_are_the_default(robot, states):
-    """Leaving the parameters out is the same as passing the set `initial` of the robot file."""
-    np.testing.assert_array_equal(
-        robot.mass_matrix(states.pose), robot.mass_matrix(states.pose, robot.parameter_sets["initial"].dynamic)
-    )
-    assert len(robot.parameter_names) == len(robot.nominal_parameters) == 64
-    assert dynamics.parameters.PARAMETER_NAMES[RIGID_BODY][-1] == "link6.Izz"
