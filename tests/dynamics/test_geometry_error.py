@@ -5,9 +5,9 @@ import pytest
 from scipy.optimize import fsolve
 from scipy.stats import chi2
 
-from dynamics import closed_loop
 from dynamics.errors import RobotFileError
 from dynamics.robot import with_geometry_error
+from tests.dynamics.conftest import Loop
 
 ERROR = 1e-4
 THETA = np.array([0.21, -0.14, 0.3, 0.05, -0.22, 0.11])
@@ -59,9 +59,9 @@ def test_an_error_that_no_home_survives_is_refused(robot):
         with_geometry_error(robot, -1.0, np.random.default_rng(0))
 
 
-@pytest.mark.slow  # compiles the plant
-def test_forward_kinematics_of_the_plant_closes_its_own_loops(robot, plant, numerics):
+def test_forward_kinematics_of_the_plant_closes_its_own_loops(robot, plant, numerics, monkeypatch):
     """Against MINPACK on the loops; the nominal robot with the same crank angles is elsewhere, by about the error."""
+    monkeypatch.setattr("dynamics.robot.load_library", lambda *_: None)
     pose = plant.forward_kinematics(THETA)
     arguments = (THETA, plant.geometry, numerics.base_from_platform)
     solved = fsolve(_gaps, plant.home_pose, args=arguments, xtol=1e-13)
@@ -69,14 +69,14 @@ def test_forward_kinematics_of_the_plant_closes_its_own_loops(robot, plant, nume
     assert 0.1 * ERROR < np.abs(pose - robot.forward_kinematics(THETA))[:3].max() < 10 * ERROR
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("compiled", [True, False])
-def test_the_servo_commands_with_the_kinematics_it_knows(loop, robot, plant, identified, compiled):
-    """Eq. 30 worked out from what was measured, with the nominal Jacobian by differences of its inverse kinematics."""
-    reference, settings = loop.reference(12), loop.settings()
-    run = closed_loop.simulate(
-        plant, identified, reference, settings, lambda k, t, pose: pose, servo_robot=robot, compiled=compiled
-    )
+@pytest.mark.slow  # compiles the plant
+def test_the_servo_commands_with_the_kinematics_it_knows(loop, robot, plant):
+    """Eq. 30 worked out from what was measured, with the nominal Jacobian by differences of its inverse kinematics;
+    both paths agree, a servo that knows the plant commands otherwise, and one that knows its robot as ever."""
+    reference, theirs = loop.reference(40), Loop(plant, loop.parameters)
+    run, plain = theirs.both(reference, sensor=lambda k, t, pose: pose, servo_robot=robot)
+    assert run.events == plain.events > 3
+    np.testing.assert_allclose(run.pose, plain.pose, atol=1e-13)
     error = reference.poses - run.measured
     before = np.vstack([run.start.last_measured, run.measured[:-1]])
     rate_error = reference.rates - (run.measured - before) * 60.0
@@ -87,17 +87,5 @@ def test_the_servo_commands_with_the_kinematics_it_knows(loop, robot, plant, ide
         jacobian = (moved[:6] - moved[6:]).T / 2e-6
         np.testing.assert_allclose(run.command[k], jacobian @ demand[k], atol=1e-8)
     np.testing.assert_allclose(run.command[0], 0, atol=1e-12)  # the plant's cranks at home
-
-
-@pytest.mark.slow
-def test_both_paths_agree_and_the_servos_ignorance_matters(loop, robot, plant, identified):
-    reference, settings = loop.reference(40), loop.settings()
-    arguments = (plant, identified, reference, settings, lambda k, t, pose: pose)
-    ours = closed_loop.simulate(*arguments, servo_robot=robot)
-    plain = closed_loop.simulate(*arguments, servo_robot=robot, compiled=False)
-    knowing = closed_loop.simulate(*arguments)
-    assert ours.events == plain.events > 3
-    np.testing.assert_allclose(ours.pose, plain.pose, atol=1e-13)
-    assert np.abs(ours.pose - knowing.pose).max() > 1e-7
-    same = loop.run(reference, settings, servo_robot=robot)
-    np.testing.assert_array_equal(same.pose, loop.run(reference, settings).pose)
+    assert np.abs(run.pose - theirs.run(reference, sensor=lambda k, t, pose: pose).pose).max() > 1e-7
+    np.testing.assert_array_equal(loop.run(reference, servo_robot=robot).pose, loop.run(reference).pose)
