@@ -112,6 +112,7 @@ def test_large_blurred_disc_reaches_the_closed_form_of_an_edge(half_axes):
     np.testing.assert_allclose(closed, exact, rtol=0.02, atol=0.02 * exact[0, 0])
 
 
+@pytest.mark.slow
 def test_twelve_bits_with_the_same_noise_keep_the_bound():
     """Sixteen times the gain: all grey values are sixteen times larger, and rounding matters less."""
     fine = replace(NOISE, bit_depth=12, gain=16.0 * NOISE.gain, black_level=256.0)

@@ -135,11 +135,11 @@ def test_scene_with_other_noise_keeps_contrast_and_ground():
 
 
 @EVERY
-def test_sensor_file_chooses_the_detector_and_poses_keep_their_covariance(detector, taught_analytic, moving_path):
+def test_sensor_file_chooses_the_detector_and_poses_keep_their_covariance(detector, taught, moving_path):
     """Squared pose errors along a path, normalised by the stated covariance with the detector's bias in it, and by that
     with what teaching left, which is the same whichever detector measures."""
     changes = {"detection.detector": detector.name}
-    sensor = load_sensor("ctrack780", 1, taught=taught_analytic, renderer="analytic", changes=changes)
+    sensor = load_sensor("ctrack780", 1, taught=taught, renderer="analytic", changes=changes)
     path = moving_path(150)
     found = [sensor.measure(pose) for pose in path]
     assert all(m.ok for m in found)

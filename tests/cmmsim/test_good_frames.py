@@ -50,12 +50,12 @@ def test_little_noise_loses_no_frame(lens, renderer, count, deviation):
     "frames",
     [pytest.param(1000, marks=pytest.mark.slow), pytest.param(100_000, marks=pytest.mark.thorough)],
 )
-def test_good_frames_are_not_lost(taught_analytic, monkeypatch, record_property, frames):
+def test_good_frames_are_not_lost(taught, monkeypatch, record_property, frames):
     """None of them; the one-sided 95 % limit of the share (Clopper and Pearson) is then 3 over their number.
 
     Each pose is drawn once and exposed many times.
     """
-    sensor = cmmsim.load_sensor("ctrack780", taught=taught_analytic, renderer="analytic")
+    sensor = cmmsim.load_sensor("ctrack780", taught=taught, renderer="analytic")
     drawn, draw = {}, VirtualStereoCamera.radiance
 
     def radiance(camera, placed, corners, size, supersampling):

@@ -55,24 +55,21 @@ def finely_drawn(sensor, side, pose, corner, size):
     return formation.renderer.draw(formation.drawable, [view], 1, formation.background)[0]
 
 
-@pytest.mark.parametrize("lens", LENSES)
-def test_centres_through_each_lens(lens):
-    """At most 0.0005 px in every sticker; sharp edges that are bent leave up to three times that in single ones."""
-    sensor = exact(lens)
-    errors = np.concatenate([centre_errors(sensor, pose) for pose in poses_about_home(sensor, 3)])
-    assert np.abs(errors).max() < (15e-4 if lens == "distorted" else 5e-4)
-    assert np.all(np.sqrt((errors**2).mean(axis=0)) < 4e-4)
-    assert np.all(np.abs(errors.mean(axis=0)) < 1e-4)
-
-
-@pytest.mark.rendering
-@pytest.mark.parametrize("lens", ["perfect", "all"])
-def test_centres_drawn_by_pyrender(lens):
-    sensor = exact(lens, renderer="pyrender")
+@pytest.mark.parametrize(
+    ("lens", "renderer", "largest", "rms", "mean"),
+    [
+        *((lens, "analytic", 15e-4 if lens == "distorted" else 5e-4, 4e-4, 1e-4) for lens in LENSES),
+        pytest.param("perfect", "pyrender", 5e-3, 8e-4, 2e-4, marks=pytest.mark.rendering),
+        pytest.param("all", "pyrender", 5e-3, 8e-4, 2e-4, marks=pytest.mark.rendering),
+    ],
+)
+def test_centres_through_each_lens(lens, renderer, largest, rms, mean):
+    """Sharp edges that are bent leave up to three times the error of others in single stickers."""
+    sensor = exact(lens, renderer=renderer)
     errors = np.concatenate([centre_errors(sensor, pose) for pose in poses_about_home(sensor, 4)])
-    assert np.all(np.sqrt((errors**2).mean(axis=0)) < 8e-4)
-    assert np.all(np.abs(errors.mean(axis=0)) < 2e-4)
-    assert np.abs(errors).max() < 5e-3
+    assert np.abs(errors).max() < largest
+    assert np.all(np.sqrt((errors**2).mean(axis=0)) < rms)
+    assert np.all(np.abs(errors.mean(axis=0)) < mean)
 
 
 @pytest.mark.parametrize("psf_px", [0.5, 1.2])
@@ -223,6 +220,7 @@ def test_pixels_and_points_of_a_measurement(lens):
     assert 1.2 < squared.mean() < 5.5  # 3 expected of 18 points
 
 
+@pytest.mark.slow
 def test_search_of_whole_images_through_all_effects():
     """A first frame of 12 bit without prior; the same frame handed over as arrays."""
     sensor = exact("all", TWELVE_BIT)

@@ -39,6 +39,7 @@ def test_first_frame_without_prior_finds_all_ids(sensor):
     assert np.all(np.abs(m.pose - pose) * AXES < [20, 20, 20, 100, 100, 100])
 
 
+@pytest.mark.slow
 def test_tracking_along_a_path_stays_within_the_limits(sensor, moving_path):
     path = moving_path(300)
     found = [sensor.measure(pose) for pose in path]
@@ -51,6 +52,7 @@ def test_tracking_along_a_path_stays_within_the_limits(sensor, moving_path):
     assert 5.4 < squared_errors(found, path).mean() < 7.0  # 6, plus the constant error of teaching
 
 
+@pytest.mark.slow
 def test_planes_and_registration_agree(taught):
     found = {}
     for method in ("registration", "planes"):
@@ -78,6 +80,7 @@ def test_same_seed_same_numbers(taught, moving_path):
     np.testing.assert_array_equal(runs[0], [sensor.measure(pose).pose for pose in moving_path(4)])
 
 
+@pytest.mark.slow
 def test_images_decide_the_result(taught):
     """One camera's image shifted by 0.1 px moves the pose as a least-squares fit of exact pixels predicts."""
     poses = {}
@@ -116,15 +119,16 @@ def test_hidden_plane_is_lost_by_name_and_found_again(taught):
     assert sensor.measure(sensor.home).ok
 
 
-def test_partly_hidden_platform_is_measured_with_what_is_left(taught):
-    sensor = cmmsim.load_sensor("ctrack780", seed=1, taught=taught)
+@pytest.mark.parametrize("renderer", ["analytic", "pyrender"])
+def test_a_partly_hidden_platform_is_measured_with_what_is_left(renderer):
+    sensor = exact("perfect", CROPPED, renderer)
     place, mesh = box_before(sensor, np.array([0.15, 0.12, 0.28]), (0.02, 0.15, 0.12), share=0.04)
     sensor.add_bodies({"box": mesh})
-    for _ in range(3):
-        m = sensor.measure(sensor.home, obstacles={"box": place})
+    m = [sensor.measure(sensor.home, obstacles={"box": place}) for _ in range(3)][-1]
     assert m.ok
     assert 3 <= len(m.target_ids) < 18
     assert squared_error(m, sensor.home) < 40.0
+    assert len(sensor.measure(sensor.home).target_ids) == 18
 
 
 def test_fully_hidden_platform_is_lost_with_a_reason():
@@ -162,11 +166,6 @@ def test_measure_frame_on_captured_images(sensor):
     m = cmmsim.measure_frame(cmmsim.StereoFrame(dark, dark), sensor.estimator)
     assert not m.ok
     assert "bright spots" in m.reason
-
-
-def test_taught_travels_to_another_process(sensor, taught):
-    again = cmmsim.load_sensor("ctrack780", seed=0, taught=pickle.loads(pickle.dumps(taught)))
-    np.testing.assert_array_equal(sensor.measure(sensor.home).pose, again.measure(again.home).pose)
 
 
 @pytest.mark.slow

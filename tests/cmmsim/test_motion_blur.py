@@ -129,6 +129,7 @@ def test_tracked_frames_of_a_moving_platform_keep_their_covariance(speed, runs, 
     assert lowest < np.mean(squared) < highest  # the mean of 64 scatters by 0.43, of 24 by 0.7
 
 
+@pytest.mark.slow
 def test_a_platform_that_has_stopped_is_not_taken_for_moving():
     """The images show no smear where the last frames make one of 1.3 px likely."""
     sensor = exact("perfect", CROPPED | {"timing.exposure": 0.008})

@@ -24,7 +24,6 @@ from tests.cmmsim.sensors import (
     expected_centres,
     placed_at,
     poses_about_home,
-    squared_error,
     squared_errors,
 )
 
@@ -71,9 +70,10 @@ def test_centres_of_pyrender_agree_with_their_projection(supersampling, limit):
 @pytest.mark.parametrize(
     ("lens", "supersampling", "count"),
     [
-        ("perfect", SUPERSAMPLING, 40),
-        ("perfect", 12, 40),
-        ("perfect", 16, 40),
+        ("perfect", SUPERSAMPLING, 10),
+        pytest.param("perfect", SUPERSAMPLING, 40, marks=pytest.mark.slow),
+        pytest.param("perfect", 12, 40, marks=pytest.mark.slow),
+        pytest.param("perfect", 16, 40, marks=pytest.mark.slow),
         pytest.param("distorted", SUPERSAMPLING, 10, marks=pytest.mark.slow),
         pytest.param("all", SUPERSAMPLING, 10, marks=pytest.mark.slow),
     ],
@@ -124,24 +124,13 @@ def test_captured_images_have_the_stated_size_and_type(sensor):
     assert frame.left.max() > 200 > 30 > np.median(frame.left)
 
 
-def test_tracking_needs_no_opengl(taught_analytic, moving_path, monkeypatch):
+def test_tracking_needs_no_opengl(taught, moving_path, monkeypatch):
     monkeypatch.setattr(pyrender_renderer, "_shared_atlas", None)  # any call would fail
-    sensor, path = cmmsim.load_sensor("ctrack780", taught=taught_analytic, renderer="analytic"), moving_path(200)
+    sensor, path = cmmsim.load_sensor("ctrack780", taught=taught, renderer="analytic"), moving_path(200)
     found = [sensor.measure(pose) for pose in path]
     errors = 1e6 * (np.array([m.pose for m in found]) - path)
     assert np.all(np.sqrt((errors**2).mean(axis=0)) < [4, 4, 4, 15, 15, 15])
     assert 5.2 < squared_errors(found, path).mean() < 7.0  # 6, plus the constant error of teaching
-
-
-def test_a_partly_hidden_platform_is_measured_with_what_is_left():
-    sensor, place, centre = exact(), np.eye(4), np.array([0.15, 0.12, 0.28])
-    place[:3, 3] = centre + 0.04 * (np.array([1.44, 0.0, 1.28]) - centre)
-    sensor.add_bodies({"box": trimesh.creation.box(extents=(0.02, 0.15, 0.12))})
-    m = [sensor.measure(sensor.home, obstacles={"box": place}) for _ in range(3)][-1]
-    assert m.ok
-    assert 3 <= len(m.target_ids) < 18
-    assert squared_error(m, sensor.home) < 40.0
-    assert len(sensor.measure(sensor.home).target_ids) == 18
 
 
 def test_solid_hides_what_a_ray_caster_says():

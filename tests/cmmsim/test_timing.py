@@ -52,10 +52,10 @@ def test_the_acceptance_test_of_latency_finds_the_jitter():
 
 def test_frames_drop_out_as_often_as_stated_and_independently():
     sensor = dropping(0.3)
-    lost = np.array([not sensor.measure(sensor.home).ok for _ in range(400)])
-    low, high = stats.binom.interval(0.999, 400, 0.3)
+    lost = np.array([not sensor.measure(sensor.home).ok for _ in range(200)])
+    low, high = stats.binom.interval(0.999, 200, 0.3)
     assert low <= lost.sum() <= high
-    low, high = stats.binom.interval(0.999, 200, 0.3**2)
+    low, high = stats.binom.interval(0.999, 100, 0.3**2)
     assert low <= (lost[::2] & lost[1::2]).sum() <= high
 
 

@@ -27,8 +27,8 @@ def test_stickers_beyond_the_image_are_not_visible():
 
 
 @pytest.mark.parametrize("method", ["registration", "planes"])
-def test_expected_covariance_is_the_one_the_taught_sensor_states(method, taught_analytic):
-    sensor = cmmsim.load_sensor("ctrack780", method=method, taught=taught_analytic, renderer="analytic")
+def test_expected_covariance_is_the_one_the_taught_sensor_states(method, taught):
+    sensor = cmmsim.load_sensor("ctrack780", method=method, taught=taught, renderer="analytic")
     stated = sensor.measure(HOME).covariance
     expected = expected_covariance("ctrack780", HOME, method)
     deviations = np.sqrt(np.diag(expected) / np.diag(stated))
