@@ -107,6 +107,11 @@ def test_the_long_proofs_last_ended_as_quoted():
     )
     assert not count["failed"]
     assert said in SAID, f"the README wants: [the last run](.readme/thorough.json), {said}"
+    found = {name: value for test in tests for name, value in test["figures"].items()}
+    covered = f"{100 * found['covered']:.1f} ± {100 * found['covered_std']:.1f} % of the 95 % intervals"
+    assert covered in SAID, f"the README wants: {covered}"
+    reached = [test["figures"].get("starts_reaching_the_optimum", 25) for test in tests]
+    assert min(reached) == 25 or f"From {min(reached)} of 25 starting guesses" in SAID, min(reached)
 
 
 def test_the_dynamics_reach_their_goals(dynamics_figures):

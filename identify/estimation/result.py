@@ -1,5 +1,7 @@
 """What an identification says: estimates with their uncertainty and judgement, as a table, as JSON, and in one line."""
 
+from __future__ import annotations
+
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,7 +75,7 @@ class IdentificationResult:
             f"iterations, {misfit}, {len(self.warnings)} warnings>"
         )
 
-    def to_dataframe(self) -> "pd.DataFrame":
+    def to_dataframe(self) -> pd.DataFrame:
         """One row a parameter: unit, initial, estimate, std, the interval from low to high, identifiable."""
         import pandas as pd
 

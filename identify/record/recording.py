@@ -5,6 +5,8 @@ that an estimator that reads a record cannot see it. Several runs share a file a
 ``run02``, ...; model runs (``model.nc``) are the groups ``excitation``, ``run01``, ``run02``, ...
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Validation: plant and models on trajectories that the estimator never saw, and how far apart they should be (4.3)."""
 
+from __future__ import annotations
+
 import multiprocessing
 import threading
 from collections.abc import Iterator, Sequence
@@ -164,10 +166,10 @@ class _Worker:
 
 
 _worker: _Worker
-_counter: "Synchronized[int]"
+_counter: Synchronized[int]
 
 
-def _start_worker(counter: "Synchronized[int]", scenario: Scenario, seed: int, taught: cmmsim.Taught) -> None:
+def _start_worker(counter: Synchronized[int], scenario: Scenario, seed: int, taught: cmmsim.Taught) -> None:
     global _worker, _counter
     _worker, _counter = _Worker(scenario, seed, taught), counter
 
@@ -181,7 +183,7 @@ def _run_in_worker(number: int, trajectory: FourierTrajectory) -> Experiment:
 
 
 @contextmanager
-def _followed(counter: "Synchronized[int]", advance: Advance) -> Iterator[None]:
+def _followed(counter: Synchronized[int], advance: Advance) -> Iterator[None]:
     """Pass what the workers have counted on to the progress bar until the context ends."""
     done, ended = 0, threading.Event()
 

@@ -39,8 +39,8 @@ def experiment_rows(count: int, processes: int) -> list[dict]:
         return [row for rows in pool.map(partial(_block, scenario, trajectory), blocks) for row in rows]
 
 
-def check_coverage(rows: list[dict]) -> None:
-    """The intervals of all that is identified hold the truth in 93 to 97 % of cases.
+def check_coverage(rows: list[dict]) -> tuple[float, float]:
+    """The intervals of all that is identified hold the truth in 93 to 97 % of cases; in what share, give or take what.
 
     Quantities of one experiment stray together, so the experiments, not the intervals, are what is independent: of
     fewer than 200, chance may account for what is missing (2.6 sigma), by the spread of their own shares.
@@ -52,6 +52,7 @@ def check_coverage(rows: list[dict]) -> None:
     allowed = 0.0 if len(rows) >= 200 else 2.6 * spread
     assert LOWEST - allowed <= share <= HIGHEST + allowed, (share, spread, quantities(rows))
     assert spread < 0.03, "the experiments are too few to tell"
+    return float(share), float(spread)
 
 
 def quantities(rows: list[dict]) -> dict[str, dict]:

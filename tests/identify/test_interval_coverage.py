@@ -13,8 +13,10 @@ def rows():
     return experiment_rows(200, 2)
 
 
-def test_intervals_cover_as_often_as_they_say(rows):
-    check_coverage(rows)
+def test_intervals_cover_as_often_as_they_say(rows, record_property):
+    share, spread = check_coverage(rows)
+    record_property("covered", share)
+    record_property("covered_std", spread)
 
 
 def test_every_parameter_is_covered(rows):
