@@ -1,11 +1,17 @@
+"""Scenarios: what the built-in ones say, what comes from the sensor's file, and what no scenario may be."""
+
 import tomllib
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from cmmsim.files import read_sensor_file
+from cmmsim.visibility import sight_lines
 from dynamics import load_robot
 from identify.errors import ScenarioError
+from identify.experiment.sensor_in_loop import make_sensor
 from identify.loop_parameters import NAMES
 from identify.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
 
@@ -74,27 +80,6 @@ def test_rate_of_a_sensor_file_that_no_scenario_may_have_is_named(tmp_path):
     sensor.write_text('name = "mine"\nbased_on = "ctrack780"\n[timing]\nframe_rate = 5000\n')
     message = refusal({"sensor": str(sensor)})
     assert f"timing of the sensor {str(sensor)!r}: frame_rate_hz = 5000.0 [Hz]" in message
-
-
-@pytest.mark.parametrize(
-    ("overrides", "evidence"),
-    [
-        ({"sensor": "ctrack79"}, ["ctrack79", "ctrack780", "ctrack780_29hz"]),
-        ({"timing.latency_s": 0.7, "timing.frame_rate_hz": 100.0}, ["0.7 s", "70.0 frames", "at most 60 frames"]),
-        (
-            {"timing.latency_s": 0.9, "timing.latency_jitter_s": 0.1},
-            ["timing.latency_jitter_s = 0.1 s", "1.2 s", "72.0 frames"],
-        ),
-        ({"timing.latency_s": 0.01, "timing.latency_jitter_s": 0.02}, ["latency_jitter 0.02 s", "latency 0.01 s"]),
-        ({"timing.dropout": 1.5}, ["timing.dropout = 1.5"]),
-        ({"timing.dropout": -0.5}, ["timing.dropout = -0.5"]),
-        ({"timing.exposure_s": 0.02}, ["exposure 0.02 s", "60 Hz"]),
-        ({"sensor": "ctrack780_29hz", "filter.cutoff_hz": 14.5}, ["14.5 Hz", "29 Hz"]),
-    ],
-)
-def test_contradictions_in_the_timing_are_refused(overrides, evidence):
-    message = refusal(overrides)
-    assert all(part in message for part in evidence), message
 
 
 @pytest.mark.parametrize("name", scenario_names())
@@ -173,117 +158,84 @@ def test_file_that_is_no_toml_is_named(tmp_path):
         load_scenario(path)
 
 
-def test_unknown_key_lists_the_valid_names():
-    assert "unknown key 'timing.frame_rat'; valid names in [timing]: frame_rate_hz, exposure_s, latency_s, " in refusal(
-        {"timing.frame_rat": 3.0}
-    )
-    assert "unknown key 'camera'" in refusal({"camera.gain": 3.0})
+PRIOR = "identification.prior"
+PAYLOAD = {"identification.scale_anchor": "payload", "identification.anchor_std": 0.1}
+SENSOR = "sensor_changes.camera"
 
 
 @pytest.mark.parametrize(
     ("overrides", "evidence"),
     [
-        ({"timing.frame_rate_hz": "60 Hz"}, ["timing.frame_rate_hz", "'60 Hz'", "[Hz]"]),
-        ({"timing.latency_s": -0.1}, ["timing.latency_s", "-0.1", "[s]"]),
-        ({"excitation.harmonics": 1}, ["excitation.harmonics", "1", "2"]),
-        ({"excitation.harmonics": 5.5}, ["excitation.harmonics", "5.5"]),
-        ({"timing.hold": "cubic"}, ["cubic", "zero", "linear"]),
-        ({"servo.kp": float("nan")}, ["servo.kp", "nan"]),
+        ({"timing.frame_rat": 3.0}, ["unknown key 'timing.frame_rat'; valid names in [timing]: frame_rate_hz, "]),
+        ({"camera.gain": 3.0}, ["unknown key 'camera'"]),
         ({"timing": 3}, ["timing", "3"]),
         ({"robot.name": "x"}, ["robot.name", "not a section"]),
         ({"name": "a/b"}, ["name", "a/b"]),
+        ({"servo.kp": float("nan")}, ["servo.kp", "nan"]),
+        ({"sensor": "ctrack79"}, ["ctrack79", "ctrack780", "ctrack780_29hz"]),
+        ({"timing.frame_rate_hz": "60 Hz"}, ["timing.frame_rate_hz", "'60 Hz'", "[Hz]"]),
+        ({"timing.latency_s": -0.1}, ["timing.latency_s = -0.1 [s]"]),
+        ({"timing.latency_s": 0.7, "timing.frame_rate_hz": 100.0}, ["0.7 s", "70.0 frames", "at most 60 frames"]),
+        ({"timing.latency_s": 0.9, "timing.latency_jitter_s": 0.1}, ["jitter_s = 0.1 s", "1.2 s", "72.0 frames"]),
+        ({"timing.latency_s": 0.01, "timing.latency_jitter_s": 0.02}, ["latency_jitter 0.02 s", "latency 0.01 s"]),
+        ({"timing.dropout": 1.5}, ["timing.dropout = 1.5"]),
+        ({"timing.exposure_s": 0.02}, ["exposure 0.02 s", "60 Hz"]),
+        ({"timing.hold": "cubic"}, ["cubic", "zero", "linear"]),
+        ({"excitation.harmonics": 1}, ["excitation.harmonics = 1 [1]", "2"]),
+        ({"excitation.harmonics": 5.5}, ["excitation.harmonics", "5.5"]),
+        ({"validation.duration_s": 5.01}, ["300.6 frames", "60 Hz"]),
+        ({"sensor": "ctrack780_29hz", "filter.cutoff_hz": 14.5}, ["14.5 Hz", "29 Hz"]),
+        ({"filter.cutoff_hz": 30.0}, ["30 Hz", "60 Hz", "Nyquist"]),
+        ({"filter.cutoff_hz": 0.4}, ["highest harmonic is 0.5 Hz"]),
+        ({"filter.cutoff_hz": 60.0, "timing.frame_rate_hz": 120.0}, ["Nyquist"]),  # the paper's, at twice its rate
+        (
+            {PRIOR: {"foo": {"value": 1.0, "std": 0.1}}},
+            ["no parameter 'foo'", "or viscous of joint1 to joint6"],
+        ),
+        ({PRIOR: {"platform": {"mass": {"value": 1.0, "std": 0.1}}}}, ["'platform'", '{"platform.…" = {value']),
+        ({PRIOR: {"platform.mass": {"value": 1.0}}}, ["identification.prior.platform.mass.std is missing"]),
+        ({PRIOR: {"platform.mass": {"value": 1.0, "std": 0.1, "a": 1}}}, ["mass.a'", "platform.mass]: value, std"]),
+        ({PRIOR: {"platform.mass": {"value": 1.0, "std": -0.1}}}, ["platform.mass.std = -0.1 [SI]"]),
+        ({PRIOR: 7}, ["identification.prior = 7"]),
+        (PAYLOAD, ["anchor_std = 0.1: the anchor payload measures no parameter", "payload.mass_std_kg"]),
+        (PAYLOAD | {"identification.scale_anchor": "prior"}, ["the anchor prior measures no parameter"]),
+        ({"payload.Ixx_kg_m2": 100.0}, ["payload: Ixx_kg_m2 100 > Iyy_kg_m2 0.02 + Izz_kg_m2 0.04 kg m2"]),
+        ({"payload.mass_kg": 0.0}, ["mass_kg = 0.0"]),
+        (
+            {"payload.mass_std_kg": -0.1},
+            ["payload.mass_std_kg = -0.1 [kg]: input should be greater than or equal"],
+        ),
+        ({"payload.mass_std_kg": 9.0}, ["payload: mass_std_kg = 9 kg exceeds mass_kg = 8 kg"]),
+        ({"payload.Izz_std_kg_m2": 0.05}, ["Izz_std_kg_m2 = 0.05 kg m2 exceeds Izz_kg_m2 = 0.04 kg m2"]),
+        ({"plant.friction": "smoothed"}, ["smoothing_velocity_rad_s"]),
+        ({"model.smoothing_velocity_rad_s": 0.001}, ["smoothing_velocity_rad_s"]),
+        ({"plant.geometry_error_m": 2e-3}, ["plant.geometry_error_m = 0.002 [m]: input should be less than or equal"]),
+        ({"plant.joint_stiffness_N_m_rad": 2e6}, ["plant.joint_stiffness_N_m_rad = 2000000.0 [N m/rad]"]),
+        ({"timing.latency_s": -1.0, "servo.kq": 1.0}, ["timing.latency_s", "servo.kq"]),  # all at once
+        ({f"{SENSOR}.drk_noise": 1.0}, ["camera.drk_noise", "dark_noise"]),
+        ({SENSOR: 1.0}, ["camera = 1.0 is a section", "dark_noise"]),
+        ({f"{SENSOR}.dark_noise.rms": 1.0}, ["'dark_noise'", "a value, not a section"]),
+        ({f"{SENSOR}.dark_noise": "much"}, ["camera.dark_noise", "'much'"]),
+        ({"sensor_changes.based_on": "ctrack780_29hz"}, ["based_on", "ctrack780_29hz", "another sensor"]),
     ],
 )
-def test_wrong_value_is_named_with_key_value_and_unit(overrides, evidence):
+def test_what_no_scenario_may_be_is_refused_by_name_in_one_line(overrides, evidence):
     message = refusal(overrides)
     assert all(part in message for part in evidence), message
 
 
-def test_cutoff_at_nyquist_names_both_numbers():
-    message = refusal({"filter.cutoff_hz": 30.0})
-    assert "30 Hz" in message
-    assert "60 Hz" in message
-    assert "Nyquist" in message
-    assert load_scenario("paper").with_overrides({"filter.cutoff_hz": 29.9}).filter.cutoff_hz == 29.9
-
-
-def test_papers_filter_needs_more_than_120_frames_a_second():
-    assert "Nyquist" in refusal({"filter.cutoff_hz": 60.0, "timing.frame_rate_hz": 120.0})
-    assert load_scenario("paper").with_overrides({"filter.cutoff_hz": 60.0, "timing.frame_rate_hz": 125.0})
-
-
-def test_cutoff_that_removes_the_excitation_is_refused():
-    assert "highest harmonic is 0.5 Hz" in refusal({"filter.cutoff_hz": 0.4})
-
-
-def test_duration_must_be_whole_frames():
-    message = refusal({"validation.duration_s": 5.01})
-    assert "300.6 frames" in message
-    assert "60 Hz" in message
-
-
-@pytest.mark.parametrize(
-    ("prior", "evidence"),
-    [
-        ({"foo": {"value": 1.0, "std": 0.1}}, ["no parameter 'foo'", "coulomb or viscous of joint1 to joint6"]),
-        ({"link7.Izz": {"value": 1.0, "std": 0.1}}, ["no parameter 'link7.Izz'"]),
-        ({"platform": {"mass": {"value": 1.0, "std": 0.1}}}, ["no parameter 'platform'", '{"platform.…" = {value']),
-        ({"platform.mass": {"value": 1.0}}, ["identification.prior.platform.mass.std is missing"]),
-        ({"platform.mass": {"value": 1.0, "std": 0.1, "a": 1}}, ["platform.mass.a'", "platform.mass]: value, std"]),
-        ({"platform.mass": {"value": 1.0, "std": -0.1}}, ["platform.mass.std = -0.1 [SI]"]),
-        (7, ["identification.prior = 7"]),
-    ],
-)
-def test_what_is_known_beforehand_is_checked_with_the_scenario(prior, evidence):
-    message = refusal({"identification.prior": prior})
-    assert all(part in message for part in evidence), message
+def test_what_lies_just_inside_the_limits_is_taken():
+    flat = {"payload.Ixx_kg_m2": 0.1, "payload.Iyy_kg_m2": 0.2, "payload.Izz_kg_m2": 0.1 + 0.2}
+    smoothed = {"model.friction": "smoothed", "model.smoothing_velocity_rad_s": 0.001}
+    paper = load_scenario("paper")
+    for overrides in (flat, smoothed, {"filter.cutoff_hz": 29.9}):
+        assert paper.with_overrides(overrides) != paper
+    assert paper.with_overrides({"filter.cutoff_hz": 60.0, "timing.frame_rate_hz": 125.0}).filter.cutoff_hz == 60.0
 
 
 def test_every_parameter_of_the_closed_loop_may_be_known_beforehand():
     known = {name: {"value": 1.0, "std": 0.1} for name in NAMES}
     assert len(load_scenario("paper").with_overrides({"identification.prior": known}).identification.prior) == 67
-
-
-@pytest.mark.parametrize("anchor", ["payload", "prior"])
-def test_an_anchor_that_measures_nothing_has_no_deviation(anchor):
-    message = refusal({"identification.scale_anchor": anchor, "identification.anchor_std": 0.1})
-    assert f"identification: anchor_std = 0.1: the anchor {anchor} measures no parameter" in message
-
-
-def test_a_load_that_no_body_has_is_refused_and_a_flat_one_is_not():
-    message = refusal({"payload.Ixx_kg_m2": 100.0})
-    assert "payload: Ixx_kg_m2 100 > Iyy_kg_m2 0.02 + Izz_kg_m2 0.04 kg m2" in message
-    assert "mass_kg = 0.0" in refusal({"payload.mass_kg": 0.0})
-    flat = {"payload.Ixx_kg_m2": 0.1, "payload.Iyy_kg_m2": 0.2, "payload.Izz_kg_m2": 0.1 + 0.2}
-    assert load_scenario("paper").with_overrides(flat).payload.Izz_kg_m2 == pytest.approx(0.3)
-
-
-def test_a_load_is_known_to_a_deviation_between_none_and_itself():
-    assert "payload.mass_std_kg = -0.1 [kg]: input should be greater than or equal to 0" in refusal(
-        {"payload.mass_std_kg": -0.1}
-    )
-    assert "payload.mass_std_kg = nan [kg]: input should be a finite number" in refusal(
-        {"payload.mass_std_kg": float("nan")}
-    )
-    assert "payload: mass_std_kg = 9 kg exceeds mass_kg = 8 kg" in refusal({"payload.mass_std_kg": 9.0})
-    message = refusal({"payload.Izz_std_kg_m2": 0.05})
-    assert "payload: Izz_std_kg_m2 = 0.05 kg m2 exceeds Izz_kg_m2 = 0.04 kg m2" in message
-    assert "payload.mass_std_kg" in refusal(
-        {"identification.scale_anchor": "payload", "identification.anchor_std": 0.1}
-    )
-
-
-def test_smoothed_friction_needs_its_velocity_and_the_exact_law_has_none():
-    assert "smoothing_velocity_rad_s" in refusal({"plant.friction": "smoothed"})
-    assert "smoothing_velocity_rad_s" in refusal({"model.smoothing_velocity_rad_s": 0.001})
-    both = {"model.friction": "smoothed", "model.smoothing_velocity_rad_s": 0.001}
-    assert load_scenario("paper").with_overrides(both).model.friction == "smoothed"
-
-
-def test_all_wrong_entries_are_named_at_once():
-    message = refusal({"timing.latency_s": -1.0, "servo.kq": 1.0})
-    assert "timing.latency_s" in message
-    assert "servo.kq" in message
 
 
 def test_scenarios_cannot_be_changed_in_place():
@@ -296,3 +248,47 @@ def test_every_number_has_a_unit():
         for name, entry in section.model_fields.items():
             if entry.annotation in (int, float, float | None) and name != "count":
                 assert entry.json_schema_extra["unit"], f"{section.__name__}.{name}"
+
+
+CHANGES = {"camera.dark_noise": 52.0, "lens.psf_px": 0.6, "rig.baseline": 0.8}
+
+
+def with_changes(scenario, changes):
+    return scenario.with_overrides({f"sensor_changes.{key}": value for key, value in changes.items()})
+
+
+def test_changed_sensor_is_that_of_a_file_with_the_same_entries(tmp_path):
+    mine = tmp_path / "mine.toml"
+    mine.write_text(
+        'name = "ctrack780"\nbased_on = "ctrack780"\n[camera]\ndark_noise = 52.0\n[lens]\npsf_px = 0.6\n'
+        "[rig]\nbaseline = 0.8\n"
+    )
+    expected = read_sensor_file(mine).model_copy(update={"based_on": None})
+    assert read_sensor_file("ctrack780", CHANGES) == expected
+    nested = {"camera": {"dark_noise": 52.0}, "lens": {"psf_px": 0.6}, "rig": {"baseline": 0.8}}
+    assert read_sensor_file("ctrack780", nested) == expected
+    assert read_sensor_file("ctrack780") == read_sensor_file("ctrack780", {})
+
+
+def test_sensor_of_the_loop_and_the_excitations_knowledge_have_the_changes():
+    """Baseline and noise decide what a pose is worth; the loop's sensor must be the changed one."""
+    changed = with_changes(load_scenario("paper"), CHANGES)
+    sensor = make_sensor(changed, load_robot("rss6"), seed=0)
+    assert (sensor.noise.dark_noise, sensor.optics.psf_px) == (52.0, 0.6)
+    assert np.linalg.norm(sensor.rig.from_camera[1][:3, 3]) == pytest.approx(0.8)
+    sight = sight_lines("ctrack780", changed.sensor_changes)
+    assert np.linalg.norm(sight.rig.from_camera[1][:3, 3]) == pytest.approx(0.8)
+
+
+def test_timing_follows_the_changes_unless_the_scenario_states_another():
+    faster = with_changes(load_scenario("paper"), {"timing.frame_rate": 125.0})
+    assert faster.timing.frame_rate_hz == 125.0
+    with pytest.raises(ScenarioError, match=r"frame_rate = 125 has no effect .* timing.frame_rate_hz = 60"):
+        faster.with_overrides({"timing.frame_rate_hz": 60.0})
+
+
+def test_resolved_scenario_with_changes_reads_back_equal():
+    more = {"timing.frame_rate": 125.0, "camera.noise": False, "platform.planes.A.stickers": [[0, 1], [1, 0], [0.1, 1]]}
+    changed = with_changes(load_scenario("paper"), CHANGES | more)
+    assert scenario_from_toml(changed.to_toml()) == changed
+    assert with_changes(changed, dict.fromkeys(changed.sensor_changes)) == load_scenario("paper")
