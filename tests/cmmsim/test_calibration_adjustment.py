@@ -145,7 +145,7 @@ def test_covariance_is_true():
     assert np.mean(sigmas) == pytest.approx(0.1, rel=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_95_percent_regions_hold_95_percent():
     runs = 1000
     errors, covariances, _ = monte_carlo(runs)

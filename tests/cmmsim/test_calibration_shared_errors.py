@@ -4,8 +4,6 @@ The errors are made here: a smooth Gaussian field over the board, drawn anew for
 drawn anew for each view, which moves both images.
 """
 
-import os
-
 import numpy as np
 import pytest
 
@@ -102,16 +100,13 @@ def test_independent_errors_leave_the_covariance_as_it_is():
     assert ratios.mean() == pytest.approx(1.0, abs=4.0 * ratios.std() / np.sqrt(30))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("views", [10, 20] if os.environ.get("ALL_COVERAGE") else [10])
+@pytest.mark.thorough
+@pytest.mark.parametrize("views", [10, 20])
 @pytest.mark.parametrize(
     ("kind", "before", "worst"), [("independent", 0.97, 0.90), ("field", 0.65, 0.87), ("bent", 0.65, 0.82)]
 )
 def test_intervals_hold_over_hundreds_of_calibrations(kind, before, worst, views):
-    """All 24 together, and each for itself: of few views, what suffers most is known roughly only.
-
-    Of twenty views too where the environment has ALL_COVERAGE.
-    """
+    """All 24 together, and each for itself: of few views, what suffers most is known roughly only."""
     errors, covariances, independent, _ = repeated(kind, 200, views)
     assert 0.93 < coverage(errors, covariances).mean() < 0.975
     assert coverage(errors, covariances).min() > worst

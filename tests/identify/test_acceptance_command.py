@@ -1,11 +1,15 @@
 """``cmmsim acceptance``: what it writes, what it prints, and what it refuses before it draws anything."""
 
 import json
+from dataclasses import replace
+from functools import partial
 
 import pytest
 
+from cmmsim.acceptance.moving_bar import SECONDS
+from identify.verification.acceptance import STANDARDS
 from identify.verification.acceptance_report import acceptance_markdown
-from tests.identify.commands import command
+from tests.identify.commands import command, one_line
 
 
 @pytest.fixture
@@ -36,20 +40,14 @@ def nothing_is_drawn(monkeypatch):
 def test_bad_input_is_one_line_before_anything_is_drawn(nothing_is_drawn, tmp_path, capsys, arguments, message):
     out = tmp_path / "out"
     assert command("acceptance", *arguments, "--out", out) == 1
-    error = capsys.readouterr().err
-    assert error.startswith("error: ")
-    assert error.count("\n") == 1
-    assert message in error
+    assert message in one_line(capsys.readouterr().err)
     assert not out.exists()
 
 
-def test_bad_folders_are_refused_before_anything_is_drawn(nothing_is_drawn, tmp_path, capsys):
-    (tmp_path / "used").mkdir()
-    (tmp_path / "used" / "file").write_text("x")
+def test_folder_in_use_is_refused_before_anything_is_drawn(nothing_is_drawn, tmp_path, capsys):
     (tmp_path / "file").write_text("x")
-    for out, message in (("used", "is not empty"), ("file", "is a file"), ("file/deeper", "cannot be made")):
-        assert command("acceptance", "--renderer", "analytic", "--out", tmp_path / out) == 1
-        assert message in capsys.readouterr().err
+    assert command("acceptance", "--renderer", "analytic", "--out", tmp_path) == 1
+    assert "is not empty" in one_line(capsys.readouterr().err)
 
 
 def test_help_teaches(capsys):
@@ -59,21 +57,30 @@ def test_help_teaches(capsys):
         assert word in text
 
 
-@pytest.fixture(scope="module")
-def lengths(tmp_path_factory):
-    """The length test alone, with a limit that no sensor keeps."""
-    out = tmp_path_factory.mktemp("acceptance") / "out"
-    status = command(
-        "acceptance", "--standard", "vdi", "--renderer", "analytic", "--limit-um", "0.01", "--out", out, "--quiet"
-    )
-    return status, out
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(0.5, marks=pytest.mark.slow),
+        pytest.param(SECONDS, marks=pytest.mark.thorough),
+    ],
+)
+def accepted(request, tmp_path_factory):
+    """Exit status and folder of all tests with a limit that no sensor keeps; the bar moves for so many seconds."""
+    out, bar = tmp_path_factory.mktemp("acceptance") / "out", STANDARDS["e3064"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(STANDARDS, "e3064", replace(bar, test=partial(bar.test, seconds=request.param)))
+        arguments = ("--renderer", "analytic", "--limit-um", "0.01", "--out", out, "--quiet")
+        return command("acceptance", *arguments), out
 
 
-def test_missed_limit_is_reported_and_written(lengths, capsys):
-    status, out = lengths
+def read(out):
+    return json.loads((out / "acceptance.json").read_text(encoding="utf-8"))
+
+
+def test_missed_limit_is_the_exit_status_and_all_is_written(accepted):
+    status, out = accepted
     assert status == 1
-    entry = json.loads((out / "acceptance.json").read_text(encoding="utf-8"))
-    test = entry["vdi_2634_1"]
+    test = read(out)["vdi_2634_1"]
     assert test["met"] is False
     errors = [length["error_um"] for line in test["lines"] for length in line["lengths"]]
     assert len(errors) == 35
@@ -81,15 +88,28 @@ def test_missed_limit_is_reported_and_written(lengths, capsys):
     for line in test["lines"]:
         for length in line["lengths"]:
             assert 1e3 * (length["measured_mm"] - length["certified_mm"]) == pytest.approx(length["error_um"], abs=1e-6)
-    assert "astm_e3064" not in entry
     assert "MISSED" in (out / "acceptance.md").read_text(encoding="utf-8")
-    assert {path.name for path in (out / "figures").iterdir()} == {"length_errors.png", "measuring_lines.png"}
+    names = ["bar_errors.png", "bar_paths.png", "latency.png", "length_errors.png", "measuring_lines.png"]
+    assert sorted(path.name for path in (out / "figures").iterdir()) == names
 
 
-def test_tables_stand_beside_the_published_figures(lengths):
-    _, out = lengths
-    entry = json.loads((out / "acceptance.json").read_text(encoding="utf-8"))
-    text = acceptance_markdown(entry)
+def test_statistics_are_consistent_and_errors_as_large_as_stated(accepted):
+    entry = read(accepted[1])
+    assert abs(entry["vdi_2634_1"]["largest_error_um"]) < 50.0  # the limit where none is named
+    bar = entry["astm_e3064"]
+    assert bar["lost_frames"] == 0
+    assert 0.9 < bar["variance_ratio"] < 1.1
+    for state in ("standing", "moving"):
+        for figures in bar[state].values():
+            assert figures["mean"] < figures["rms"] < figures["p95"] < figures["maximum"]
+            assert figures["interval"]["rms"][0] < figures["rms"] < figures["interval"]["rms"][1]
+    latency = entry["astm_e3124"]
+    assert latency["mean_interval_ms"][0] <= latency["sensor_file_ms"] <= latency["mean_interval_ms"][1]
+
+
+def test_tables_stand_beside_the_published_figures(accepted):
+    _, out = accepted
+    text = acceptance_markdown(read(out))
     assert text == (out / "acceptance.md").read_text(encoding="utf-8")
     for row in (
         "| position, static | Creaform C-Track 780 | 0.05 mm |",
@@ -101,30 +121,11 @@ def test_tables_stand_beside_the_published_figures(lengths):
     assert "What is not:" in text
 
 
-@pytest.mark.slow
-def test_whole_acceptance_of_the_built_in_sensor(tmp_path, capsys):
-    """All three tests keep the limit; statistics are consistent and the errors are as large as stated."""
+def test_one_test_alone_is_summarised_and_writes_only_its_own(tmp_path, capsys):
     out = tmp_path / "out"
-    assert command("acceptance", "--renderer", "analytic", "--out", out) == 0
-    shown = capsys.readouterr().out
-    assert "length error" in shown
-    assert "moving bar" in shown
-    assert "latency" in shown
-    entry = json.loads((out / "acceptance.json").read_text(encoding="utf-8"))
-    assert entry["vdi_2634_1"]["met"] is True
-    bar = entry["astm_e3064"]
-    assert bar["lost_frames"] == 0
-    assert 0.9 < bar["variance_ratio"] < 1.1
-    for state in ("standing", "moving"):
-        for figures in bar[state].values():
-            assert figures["mean"] < figures["rms"] < figures["p95"] < figures["maximum"]
-            assert figures["interval"]["rms"][0] < figures["rms"] < figures["interval"]["rms"][1]
-    latency = entry["astm_e3124"]
-    assert latency["mean_interval_ms"][0] <= latency["sensor_file_ms"] <= latency["mean_interval_ms"][1]
-    assert {path.name for path in (out / "figures").iterdir()} == {
-        "measuring_lines.png",
-        "length_errors.png",
-        "bar_paths.png",
-        "bar_errors.png",
-        "latency.png",
-    }
+    assert command("acceptance", "--standard", "e3124", "--renderer", "analytic", "--out", out) == 0
+    shown = capsys.readouterr()
+    assert "latency: " in shown.out
+    assert "latency (ASTM E3124): 180 of 180" in shown.err
+    assert not {"vdi_2634_1", "astm_e3064"} & read(out).keys()
+    assert [path.name for path in (out / "figures").iterdir()] == ["latency.png"]

@@ -30,7 +30,7 @@ def initial(robot):
 @pytest.fixture(scope="module")
 def short_run(robot, initial):
     pytest.importorskip("mujoco")
-    return compare_engines(robot, initial, initial, 3.0)
+    return compare_engines(robot, initial, initial, 2.1)
 
 
 @pytest.fixture
@@ -75,11 +75,18 @@ def test_engines_agree_to_nanometres_under_the_papers_pid(short_run):
     assert verdict.tracking_max_um > 500
 
 
-@pytest.mark.parametrize(("name", "factor"), [("platform.mass", 1.01), ("link1.mass", 1.01), ("platform.Ixx", 1.05)])
+@pytest.mark.parametrize(
+    ("name", "factor"),
+    [
+        ("link1.mass", 1.01),
+        pytest.param("platform.mass", 1.01, marks=pytest.mark.slow),
+        pytest.param("platform.Ixx", 1.05, marks=pytest.mark.slow),
+    ],
+)
 def test_a_wrong_parameter_in_one_engine_is_seen(robot, initial, short_run, name, factor):
     other = initial.copy()
     other[PARAMETER_NAMES.index(name)] *= factor
-    verdict, right = judge(compare_engines(robot, initial, other, 3.0)), judge(short_run)
+    verdict, right = judge(compare_engines(robot, initial, other, 2.1)), judge(short_run)
     assert verdict.angle_max_urad > 500 * right.angle_max_urad
     assert verdict.angle_max_urad > 1
 
@@ -93,7 +100,7 @@ def test_exciting_trajectory_starts_at_home_at_rest_and_stays_inside_the_travel(
 
 def test_robot_without_room_for_the_trajectory_is_refused_with_evidence(robot, monkeypatch):
     monkeypatch.setattr("identify.verification.against_mujoco.TRAVEL_MARGIN_RAD", 0.8)
-    with pytest.raises(TrajectoryError, match=r"none of 200 exciting .*travel limit 0\.9948 rad less margin 0\.8000"):
+    with pytest.raises(TrajectoryError, match=r"none of 200 exciting .*theta.* limit 0\.1948"):
         exciting_trajectory(robot)
 
 
@@ -107,8 +114,10 @@ def test_figure_has_units_goals_and_the_closure_error(made_runs):
 
 
 @pytest.mark.slow
-def test_command_verifies_the_reference_robot(capfd, tmp_path):
+def test_command_verifies_the_reference_robot(monkeypatch, capfd, tmp_path):
+    """Three seconds of it; the whole ten are one of our figures, see tests/accuracy."""
     pytest.importorskip("mujoco")
+    monkeypatch.setattr("identify.verification.against_mujoco.DURATION_S", 3.0)
     assert command("verify-model", "--out", tmp_path / "new") == 0
     entry = load_result(tmp_path / "new" / "verification.json")
     assert entry["met"]
@@ -118,7 +127,7 @@ def test_command_verifies_the_reference_robot(capfd, tmp_path):
     assert (tmp_path / "new" / "figure8.png").read_bytes().startswith(b"\x89PNG")
     said = capfd.readouterr()
     assert "MuJoCo's loop closure" in said.out
-    assert "MuJoCo: 2001 of 2001" in said.err
+    assert "MuJoCo: 601 of 601" in said.err
 
 
 def test_command_fails_in_one_line_where_a_goal_is_missed(made_runs, monkeypatch, capfd, tmp_path):

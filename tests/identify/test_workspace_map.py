@@ -7,9 +7,8 @@ import pytest
 
 import dynamics
 from dynamics.errors import UnreachablePoseError
-from identify.commands.robot import workspace
-from identify.errors import OutputFolderError
 from identify.verification import workspace_map
+from tests.identify.commands import command
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +18,9 @@ def robot():
 
 @pytest.fixture(scope="module")
 def mapped(robot):
-    return workspace_map.map_workspace(robot, points=21)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workspace_map, "JOINT_SAMPLES", 500)
+        return workspace_map.map_workspace(robot, points=21)
 
 
 def test_maps_hold_what_each_pose_alone_gives(robot, mapped):
@@ -53,11 +54,10 @@ def test_mirrored_robot_has_mirrored_maps(mapped):
     np.testing.assert_allclose(share, share[::-1], atol=1e-9)
 
 
-def test_command_writes_numbers_and_figures(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(workspace_map, "POINTS", 21)
+def test_command_writes_numbers_and_figures(mapped, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(workspace_map, "JOINT_SAMPLES", 500)
-    monkeypatch.setattr(workspace_map.map_workspace, "__defaults__", (None, 21))
-    workspace("rss6", tmp_path / "map")
+    monkeypatch.setattr(workspace_map, "map_workspace", lambda *_: mapped)
+    assert command("workspace", "rss6", "--out", tmp_path / "map") == 0
     numbers = json.loads((tmp_path / "map" / "workspace.json").read_text())
     assert numbers["whole_travel"]["without_pose"] == 0
     assert numbers["whole_travel"]["largest_condition_J_ad"] < 10
@@ -65,5 +65,5 @@ def test_command_writes_numbers_and_figures(tmp_path, monkeypatch, capsys):
     for name in ("travel.png", "conditioning.png"):
         assert (tmp_path / "map" / name).read_bytes().startswith(b"\x89PNG")
     assert "from home within travel" in capsys.readouterr().out
-    with pytest.raises(OutputFolderError, match="not empty"):
-        workspace("rss6", tmp_path / "map")
+    assert command("workspace", "rss6", "--out", tmp_path / "map") == 1
+    assert "is not empty" in capsys.readouterr().err
