@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dynamics
-from dynamics import closed_loop, compilation, simulate_batch
+from dynamics import compilation, simulate_batch
 from tests.benchmarks.timing import (
     FREE,
     WHOLE_SECOND_CORE,
@@ -20,10 +20,10 @@ from tests.benchmarks.timing import (
     second_core_gain,
     seconds,
 )
+from tests.dynamics.conftest import Loop
 
 pytestmark = pytest.mark.thorough
-SECONDS, RATE = 20.0, 60.0
-AMPLITUDE = np.array([6e-3, 5e-3, 4e-3, 0.02, 0.015, 0.02])
+FRAMES = 1200  # 20 s
 STATES, ROUNDS, GOAL, POSES = 500, 1000, 8.0, 1000
 ENGINES = ("this model", "Pinocchio constraintDynamics", "MuJoCo mj_step")
 
@@ -35,39 +35,22 @@ def robot():
     return dynamics.load_robot("rss6")
 
 
-def reference(robot, frames, frequencies, rise_s):
-    """Sines of some frequencies (6,), Hz, under an envelope that rises within `rise_s`."""
-    t = np.arange(frames)[:, None] / RATE / rise_s
-    envelope, slope = 1 - np.exp(-(t**3)), 3 * t**2 * np.exp(-(t**3)) / rise_s
-    frequency = 2 * np.pi * frequencies
-    wave, rate = np.sin(frequency * t * rise_s), frequency * np.cos(frequency * t * rise_s)
-    return closed_loop.Reference(
-        robot.home_pose + AMPLITUDE * envelope * wave, AMPLITUDE * (envelope * rate + slope * wave)
-    )
-
-
 @pytest.fixture(scope="module")
 def loop(robot):
-    """(sensitivities) -> one run of 20 s at 60 Hz with 4 steps a frame, exact friction, parameters of Table 2."""
-    parameters = robot.parameter_sets["identified"].vector
-    whole = reference(robot, round(SECONDS * RATE), np.linspace(0.3, 0.8, 6), 1.0)
-    settings = closed_loop.LoopSettings(closed_loop.ServoGains(0.3, 0.001, 2.4), closed_loop.FrameTiming(RATE))
-
-    def run(sensitivities=False, frames=None):
-        part = closed_loop.Reference(whole.poses[:frames], whole.rates[:frames])
-        return closed_loop.simulate(robot, parameters, part, settings, sensitivities=sensitivities, compiled=True)
-
-    run.parts = (robot, parameters, whole, settings)
-    run()
-    return run
+    """Runs at 60 Hz with 4 steps a frame, exact friction and the parameters of Table 2; compiled."""
+    loop = Loop(robot, robot.parameter_sets["identified"].vector)
+    loop.run(3)
+    return loop
 
 
 def test_sensitivities_against_the_plain_run_and_it_against_real_time(loop, quote):
     """All 67 sensitivities of a run cost at most 15 plain runs (finite differences would cost 67 or more)."""
+    whole = loop.reference(FRAMES)
+    rounds = {name: lambda wanted=name == "all": loop.run(whole, sensitivities=wanted) for name in ("plain", "all")}
     with OtherLoad() as load:
-        best = fastest({"plain": loop, "all": lambda: loop(True)}, 12)
+        best = fastest(rounds, 12)
     ratio = best["all"] / best["plain"]
-    quote(sensitivities_plain_runs=ratio, times_real_time=SECONDS / best["plain"])
+    quote(sensitivities_plain_runs=ratio, times_real_time=FRAMES / 60 / best["plain"])
     judge(ratio <= 15, f"sensitivities cost {ratio:.1f} plain runs, goal 15", load)
 
 
@@ -75,11 +58,10 @@ def test_a_batch_uses_both_cores(loop, quote):
     """At least 1.8 times one core on two, where a loop of plain work shows that the second one is whole and free."""
     if len(os.sched_getaffinity(0)) < 2:
         pytest.skip("needs two cores")
-    robot, parameters, whole, settings = loop.parts
-    vectors = np.tile(parameters, (24, 1))
+    vectors, whole, settings = np.tile(loop.parameters, (24, 1)), loop.reference(FRAMES), loop.settings()
 
     def batch(workers):
-        return lambda: simulate_batch(robot, vectors, whole, settings, workers=workers)
+        return lambda: simulate_batch(loop.robot, vectors, whole, settings, workers=workers)
 
     with OtherLoad() as load:
         gains, rounds = [second_core_gain()], []
@@ -112,7 +94,7 @@ def test_everything_compiles_only_once(tmp_path, monkeypatch, robot, quote):
 def test_memory_does_not_grow_over_ten_thousand_runs(loop):
     """Memory in use after 10,000 runs of three frames is that after the first thousand, within 4 MB."""
     for n in range(10_000):
-        loop(sensitivities=n % 10 == 0, frames=3)
+        loop.run(3, sensitivities=n % 10 == 0)
         if n == 1000:
             before = resident_bytes()
     assert resident_bytes() - before < 4e6
@@ -221,19 +203,11 @@ def test_papers_loop_on_both_engines(robot, quote):
     assert verdict.angle_steady_urad < 0.020
 
 
-def test_order_of_the_integrator_with_stick_and_slip(robot, quote):
+def test_order_of_the_integrator_with_stick_and_slip(loop, quote):
     """Mean order over two halvings of the step, in a motion of one second whose joints stop and turn round."""
-    motion, parameters = reference(robot, 60, np.linspace(0.7, 1.4, 6), 0.5), robot.parameter_sets["identified"].vector
-
-    def run(steps):
-        settings = closed_loop.LoopSettings(
-            closed_loop.ServoGains(0.3, 0.001, 2.4), closed_loop.FrameTiming(60.0), steps_per_frame=steps
-        )
-        return closed_loop.simulate(robot, parameters, motion, settings)
-
-    finest = run(128)
+    finest, coarse, fine = (loop.run(60, loop.settings(steps=steps)) for steps in (128, 8, 32))
     assert finest.events > 15
-    coarse, fine = (np.abs(run(steps).pose - finest.pose).max() for steps in (8, 32))
-    order = np.log2(coarse / fine) / 2
+    coarse_miss, fine_miss = (np.abs(run.pose - finest.pose).max() for run in (coarse, fine))
+    order = np.log2(coarse_miss / fine_miss) / 2
     quote(integrator_order=order)
     assert 3.5 < order < 4.5

@@ -18,9 +18,9 @@ from scipy.optimize import OptimizeResult, least_squares
 import identify
 from dynamics import DynamicsError, compilation
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
+from identify.estimation.bounds import parameter_bounds
 from identify.estimation.identification import output_error_problem
 from identify.estimation.warm_start import linear_warm_start
-from identify.loop_parameters import NAMES, index_of
 from tests.benchmarks.timing import OtherLoad, judge
 from tests.identify.synthetic import rss6, run_plant
 
@@ -31,7 +31,7 @@ CLOSE = 1e-3
 MOST_TIMES = 8.0
 """Times our own that scipy's solver may take."""
 
-SMALLEST_SHARE, INSIDE = 1e-3, 1e-3
+INSIDE = 1e-3
 UNSTABLE = 1e3
 """Residual, in standard deviations, where the model cannot run; scipy's solver needs a number."""
 
@@ -71,10 +71,7 @@ def start(problem, scenario):
 
 def lower_bounds(problem):
     """Those of an identification: nothing is negative, and mass and integral gain are needed."""
-    lower = np.zeros(len(NAMES))
-    for name in ("platform.mass", "joint_pid.li"):
-        lower[index_of(name)] = SMALLEST_SHARE * problem.guess.values[index_of(name)]
-    return lower
+    return parameter_bounds(problem.guess, physical=False).lower
 
 
 def residuals(problem, values):
