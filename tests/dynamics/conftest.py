@@ -112,20 +112,6 @@ def second_derivative(function: Callable[[float], np.ndarray], h: float = 1e-3) 
 
 
 @dataclass(frozen=True)
-class Numerics:
-    """Oracles as one fixture, since test modules do not import each other."""
-
-    derivative: Callable[..., np.ndarray]
-    second_derivative: Callable[..., np.ndarray]
-    base_from_platform: Callable[[np.ndarray], np.ndarray]
-
-
-@pytest.fixture(scope="session")
-def numerics() -> Numerics:
-    return Numerics(derivative, second_derivative, base_from_platform)
-
-
-@dataclass(frozen=True)
 class Motion:
     """A smooth motion through the box, with its exact derivatives; amplitudes (6,), frequencies (6,) in rad/s."""
 

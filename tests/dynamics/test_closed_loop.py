@@ -10,6 +10,7 @@ import pytest
 from dynamics import closed_loop, compilation, fast_forward_dynamics, robot_file, simulate_batch
 from dynamics import robot as robot_module
 from dynamics.errors import DynamicsError, SimulationError
+from tests.dynamics.conftest import base_from_platform
 
 PERIOD = 1 / 60
 TIMINGS = {
@@ -209,16 +210,16 @@ def test_stable_where_the_paper_is(loop):
     assert np.abs(run.pose - reference.poses)[:, :3].max() < 0.02
 
 
-def _reach_margins(robot, pose, numerics):
+def _reach_margins(robot, pose):
     """1 - cos^2 of the angle between crank and reach (6,) by the law of cosines in each crank's plane."""
     g = robot.geometry
-    reach = pose[:3] + g.platform_joints @ numerics.base_from_platform(pose).T - g.base_joints
+    reach = pose[:3] + g.platform_joints @ base_from_platform(pose).T - g.base_joints
     square = np.sum(reach**2, axis=1)
     in_plane = square - np.sum(reach * g.crank_axes, axis=1) ** 2
     return 1 - ((square + g.crank_length**2 - g.link_length**2) / (2 * g.crank_length)) ** 2 / in_plane
 
 
-def test_an_unstable_loop_names_frame_time_and_the_leg_that_leaves_its_reach(robot, loop, numerics):
+def test_an_unstable_loop_names_frame_time_and_the_leg_that_leaves_its_reach(robot, loop):
     """Table 1 at 29 Hz with one frame of delay: both paths say the same; at the frame before, all legs reach."""
     settings, reference = loop.settings(29.0, latency_s=1 / 29), loop.reference(580, 29.0)
     unstable, messages = robot.parameter_sets["initial"].vector, []
@@ -233,7 +234,7 @@ def test_an_unstable_loop_names_frame_time_and_the_leg_that_leaves_its_reach(rob
     margin = re.search(said, messages[0])
     assert -0.5 < float(margin[1]) <= 0
     shorter = closed_loop.Reference(reference.poses[: frame + 1], reference.rates[: frame + 1])
-    assert _reach_margins(robot, loop.run(shorter, settings, unstable).pose[-1], numerics).min() > 0
+    assert _reach_margins(robot, loop.run(shorter, settings, unstable).pose[-1]).min() > 0
 
 
 class Unplugged(Exception):
@@ -259,7 +260,7 @@ def test_errors_of_the_sensor_reach_the_caller_unchanged(loop, compiled, error):
 
 
 @paths
-def test_measured_pose_out_of_reach_ends_the_run_without_warnings(robot, loop, numerics, compiled):
+def test_measured_pose_out_of_reach_ends_the_run_without_warnings(robot, loop, compiled):
     """A gross error at frame 3 is named as such, with leg and margin; one that overflows has a margin of -inf."""
     answers = []
 
@@ -269,7 +270,7 @@ def test_measured_pose_out_of_reach_ends_the_run_without_warnings(robot, loop, n
 
     with pytest.raises(closed_loop.LoopFailure, match=r"frame 3 .*measured pose is out of reach") as caught:
         loop.run(5, sensor=sensor, compiled=compiled)
-    margins = _reach_margins(robot, answers[-1], numerics)
+    margins = _reach_margins(robot, answers[-1])
     leg = int(np.argmin(margins))
     assert margins[leg] < 0
     assert f"there leg {leg + 1} has the least reach margin, {margins[leg]:.3g}, must be > 0" in str(caught.value)

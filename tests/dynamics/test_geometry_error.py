@@ -7,7 +7,7 @@ from scipy.stats import chi2
 
 from dynamics.errors import RobotFileError
 from dynamics.robot import with_geometry_error
-from tests.dynamics.conftest import Loop
+from tests.dynamics.conftest import Loop, base_from_platform
 
 ERROR = 1e-4
 THETA = np.array([0.21, -0.14, 0.3, 0.05, -0.22, 0.11])
@@ -47,8 +47,8 @@ def _gaps(pose, theta, geometry, rotation):
     return np.linalg.norm(joint - tip, axis=1) - geometry.link_length
 
 
-def test_its_loops_close_at_home_with_cranks_at_zero(plant, numerics):
-    gaps = _gaps(plant.home_pose, np.zeros(6), plant.geometry, numerics.base_from_platform)
+def test_its_loops_close_at_home_with_cranks_at_zero(plant):
+    gaps = _gaps(plant.home_pose, np.zeros(6), plant.geometry, base_from_platform)
     np.testing.assert_allclose(gaps, 0, atol=1e-15)
 
 
@@ -59,11 +59,11 @@ def test_an_error_that_no_home_survives_is_refused(robot):
         with_geometry_error(robot, -1.0, np.random.default_rng(0))
 
 
-def test_forward_kinematics_of_the_plant_closes_its_own_loops(robot, plant, numerics, monkeypatch):
+def test_forward_kinematics_of_the_plant_closes_its_own_loops(robot, plant, monkeypatch):
     """Against MINPACK on the loops; the nominal robot with the same crank angles is elsewhere, by about the error."""
     monkeypatch.setattr("dynamics.robot.load_library", lambda *_: None)
     pose = plant.forward_kinematics(THETA)
-    arguments = (THETA, plant.geometry, numerics.base_from_platform)
+    arguments = (THETA, plant.geometry, base_from_platform)
     solved = fsolve(_gaps, plant.home_pose, args=arguments, xtol=1e-13)
     np.testing.assert_allclose(pose, solved, atol=1e-12)
     assert 0.1 * ERROR < np.abs(pose - robot.forward_kinematics(THETA))[:3].max() < 10 * ERROR

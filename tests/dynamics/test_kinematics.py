@@ -7,20 +7,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dynamics.errors import ConvergenceError, ShapeError
+from tests.dynamics.conftest import base_from_platform, derivative, second_derivative
 
 
 def _vector(matrix):
     return np.array([matrix[2, 1], matrix[0, 2], matrix[1, 0]])
 
 
-def test_pose_jacobian_is_the_derivative_of_the_inverse_kinematics(robot, states, numerics):
+def test_pose_jacobian_is_the_derivative_of_the_inverse_kinematics(robot, states):
     """J_theta equals finite differences of the crank angles along each pose coordinate (1e-9)."""
     for pose in states.pose[:10]:
-        columns = [numerics.derivative(lambda d, e=e, p=pose: robot.inverse_kinematics(p + d * e)) for e in np.eye(6)]
+        columns = [derivative(lambda d, e=e, p=pose: robot.inverse_kinematics(p + d * e)) for e in np.eye(6)]
         np.testing.assert_allclose(robot.pose_jacobian(pose), np.column_stack(columns), atol=1e-9)
 
 
-def test_joint_jacobian_is_the_derivative_along_a_screw_motion(robot, states, numerics):
+def test_joint_jacobian_is_the_derivative_along_a_screw_motion(robot, states):
     """J_ad times a twist equals finite differences of the angles while scipy turns the platform about base axes."""
     for pose, twist in zip(states.pose[:20], states.twist[:20], strict=True):
         start = Rotation.from_euler("XYZ", pose[3:])
@@ -29,28 +30,28 @@ def test_joint_jacobian_is_the_derivative_along_a_screw_motion(robot, states, nu
             turned = (Rotation.from_rotvec(t * twist[3:]) * start).as_euler("XYZ")
             return robot.inverse_kinematics(np.concatenate([pose[:3] + t * twist[:3], turned]))
 
-        np.testing.assert_allclose(robot.joint_jacobian(pose) @ twist, numerics.derivative(angles), atol=1e-10)
+        np.testing.assert_allclose(robot.joint_jacobian(pose) @ twist, derivative(angles), atol=1e-10)
 
 
-def test_twist_is_the_angular_velocity_of_the_rotation(robot, motion, numerics):
+def test_twist_is_the_angular_velocity_of_the_rotation(robot, motion):
     """Eq. 2: [omega]x = R_dot R^T with R differentiated numerically; h_dot is the pose rate itself."""
     for t in np.linspace(0, 2, 9):
-        rotation = numerics.base_from_platform(motion.pose(t))
-        rate = numerics.derivative(lambda d, t=t: numerics.base_from_platform(motion.pose(t + d)))
+        rotation = base_from_platform(motion.pose(t))
+        rate = derivative(lambda d, t=t: base_from_platform(motion.pose(t + d)))
         expected = np.concatenate([motion.rate(t)[:3], _vector(rate @ rotation.T)])
         twist = robot.twist(motion.pose(t), motion.rate(t))
         np.testing.assert_allclose(twist, expected, atol=1e-11)
         np.testing.assert_allclose(robot.pose_rate(motion.pose(t), twist), motion.rate(t), atol=1e-14)
 
 
-def test_twist_dot_is_the_angular_acceleration_of_the_rotation(robot, motion, numerics):
+def test_twist_dot_is_the_angular_acceleration_of_the_rotation(robot, motion):
     """Eq. 38: [omega_dot]x = R_ddot R^T + R_dot R_dot^T with R differentiated twice numerically."""
     for t in np.linspace(0, 2, 9):
 
         def turned(d, t=t):
-            return numerics.base_from_platform(motion.pose(t + d))
+            return base_from_platform(motion.pose(t + d))
 
-        rate, second = numerics.derivative(turned), numerics.second_derivative(turned)
+        rate, second = derivative(turned), second_derivative(turned)
         omega_dot = _vector(second @ turned(0.0).T + rate @ rate.T)
         expected = np.concatenate([motion.acceleration(t)[:3], omega_dot])
         result = robot.twist_dot(motion.pose(t), motion.rate(t), motion.acceleration(t))

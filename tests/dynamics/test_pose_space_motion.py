@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dynamics.rigid_body import equation_of_motion as model
+from tests.dynamics.conftest import derivative
 
 
 @pytest.fixture(scope="module")
@@ -29,11 +30,11 @@ def _evaluate(function, *arguments):
     return [array[:, 0] if array.shape[1] == 1 else array for array in arrays]
 
 
-def _columns(numerics, function, h=1e-4):
-    return np.column_stack([numerics.derivative(lambda d, e=e: function(d * e), h) for e in np.eye(6)])
+def _columns(function, h=1e-4):
+    return np.column_stack([derivative(lambda d, e=e: function(d * e), h) for e in np.eye(6)])
 
 
-def test_equation_of_motion_is_the_wrench_balance_in_pose_coordinates(robot, functions, samples, identified, numerics):
+def test_equation_of_motion_is_the_wrench_balance_in_pose_coordinates(robot, functions, samples, identified):
     """M, b, J_theta, J_theta_dot rate and theta against `Robot` (twist coordinates, 6x6 Jacobians) and differences."""
     rigid = identified[:52]
     frictionless = np.concatenate([rigid, np.zeros(12)])
@@ -46,11 +47,11 @@ def test_equation_of_motion_is_the_wrench_balance_in_pose_coordinates(robot, fun
         np.testing.assert_allclose(mass @ acceleration + bias, jacobian.T @ torque, atol=1e-10)
         np.testing.assert_allclose(jacobian, robot.pose_jacobian(pose), atol=1e-12)
         np.testing.assert_allclose(angle, robot.inverse_kinematics(pose), atol=1e-14)
-        expected = numerics.derivative(lambda d, p=pose, r=rate: robot.pose_jacobian(p + d * r) @ r)
+        expected = derivative(lambda d, p=pose, r=rate: robot.pose_jacobian(p + d * r) @ r)
         np.testing.assert_allclose(drift, expected, atol=1e-10)
 
 
-def test_motion_derivatives_are_finite_differences_of_the_residual(functions, samples, identified, numerics):
+def test_motion_derivatives_are_finite_differences_of_the_residual(functions, samples, identified):
     """d(M q_ddot + b - J^T torque) and d(theta_ddot), by pose, rate and the 52 inertial parameters (1e-7 relative)."""
     rigid = identified[:52]
 
@@ -63,9 +64,9 @@ def test_motion_derivatives_are_finite_differences_of_the_residual(functions, sa
             functions["motion_derivatives"], pose, rate, acceleration, torque, rigid
         )
         rest = (acceleration, torque)
-        numeric = _columns(numerics, lambda d, p=pose, r=rate, rest=rest: residual(p + d, r, *rest))
+        numeric = _columns(lambda d, p=pose, r=rate, rest=rest: residual(p + d, r, *rest))
         np.testing.assert_allclose(np.vstack([by_pose, crank_by_pose]), numeric, rtol=1e-7, atol=1e-7)
-        numeric = _columns(numerics, lambda d, p=pose, r=rate, rest=rest: residual(p, r + d, *rest))
+        numeric = _columns(lambda d, p=pose, r=rate, rest=rest: residual(p, r + d, *rest))
         np.testing.assert_allclose(np.vstack([by_rate, crank_by_rate]), numeric, rtol=1e-7, atol=1e-7)
         for index in range(52):
             unit = np.zeros(52)
@@ -74,9 +75,9 @@ def test_motion_derivatives_are_finite_differences_of_the_residual(functions, sa
             np.testing.assert_allclose(columns[:, index], change[:6], atol=1e-9)
 
 
-def test_rate_map_derivative_is_the_derivative_of_the_jacobian(robot, functions, samples, numerics):
+def test_rate_map_derivative_is_the_derivative_of_the_jacobian(robot, functions, samples):
     """d(J_theta g)/d(pose) for constant g, against finite differences of `Robot.pose_jacobian`."""
     for pose, rate, _, _ in samples:
         (by_pose,) = _evaluate(functions["rate_map_derivative"], pose, rate)
-        numeric = _columns(numerics, lambda d, p=pose, r=rate: robot.pose_jacobian(p + d) @ r)
+        numeric = _columns(lambda d, p=pose, r=rate: robot.pose_jacobian(p + d) @ r)
         np.testing.assert_allclose(by_pose, numeric, atol=1e-8)

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from tests.dynamics.conftest import base_from_platform, derivative
+
 LINK_INERTIA = [4 + 24 + 4 * leg + 1 for leg in range(6)]  # index of link Ixx; Iyy follows
 
 
@@ -79,21 +81,20 @@ def test_batches_equal_single_calls(robot, states, parameters):
         assert none.shape == (0, *batch.shape[1:]), name
 
 
-def _energies(robot, legs_at, numerics, pose_at, values):
+def _energies(robot, legs_at, pose_at, values):
     """Kinetic energy at t = 0 and height energy, body by body, from numerically differentiated centres and axes."""
-    velocity = numerics.derivative
     gravity = -robot.geometry.gravity
 
     def body(index, centre):
         mass = values[4 * index]
-        speed = velocity(centre)
+        speed = derivative(centre)
         return mass * speed @ speed / 2, mass * gravity @ centre(0.0)
 
     kinetic, height = body(0, lambda t: pose_at(t)[:3])
-    turn = numerics.base_from_platform(pose_at(0.0)).T @ velocity(lambda t: numerics.base_from_platform(pose_at(t)))
+    turn = base_from_platform(pose_at(0.0)).T @ derivative(lambda t: base_from_platform(pose_at(t)))
     omega = np.array([turn[2, 1], turn[0, 2], turn[1, 0]])
     kinetic += omega @ (values[1:4] * omega) / 2
-    theta_dot = velocity(lambda t: robot.inverse_kinematics(pose_at(t)))
+    theta_dot = derivative(lambda t: robot.inverse_kinematics(pose_at(t)))
     for leg in range(6):
         crank = body(1 + leg, lambda t, leg=leg: (lambda p: p.tip[leg] - p.crank[leg] / 2)(legs_at(pose_at(t))))
         link = body(7 + leg, lambda t, leg=leg: (lambda p: (p.tip[leg] + p.joint[leg]) / 2)(legs_at(pose_at(t))))
@@ -101,7 +102,7 @@ def _energies(robot, legs_at, numerics, pose_at, values):
         height += crank[1] + link[1]
         along = lambda t, leg=leg: (lambda p: p.joint[leg] - p.tip[leg])(legs_at(pose_at(t)))  # noqa: E731
         l = along(0.0)
-        spin = np.cross(l, velocity(along)) / (l @ l)
+        spin = np.cross(l, derivative(along)) / (l @ l)
         x = np.cross(robot.geometry.crank_axes[leg], l)
         x /= np.linalg.norm(x)
         y = np.cross(l, x) / np.linalg.norm(l)
@@ -110,45 +111,45 @@ def _energies(robot, legs_at, numerics, pose_at, values):
     return kinetic, height
 
 
-def test_mass_matrix_gives_the_kinetic_energy_of_the_13_bodies(robot, legs_at, motion, numerics, parameters):
+def test_mass_matrix_gives_the_kinetic_energy_of_the_13_bodies(robot, legs_at, motion, parameters):
     """1/2 v^T M v equals the sum over platform, cranks and links, moved by finite differences (1e-9 relative)."""
     for t in (0.1, 0.5, 1.3):
-        kinetic, _ = _energies(robot, legs_at, numerics, lambda d, t=t: motion.pose(t + d), parameters)
+        kinetic, _ = _energies(robot, legs_at, lambda d, t=t: motion.pose(t + d), parameters)
         twist = robot.twist(motion.pose(t), motion.rate(t))
         mass = robot.mass_matrix(motion.pose(t), parameters)
         np.testing.assert_allclose(twist @ mass @ twist / 2, kinetic, rtol=1e-9)
 
 
-def test_gravity_wrench_is_the_gradient_of_the_height_energy(robot, legs_at, motion, numerics, parameters):
+def test_gravity_wrench_is_the_gradient_of_the_height_energy(robot, legs_at, motion, parameters):
     """G . v equals the rate of sum(m g z) over the 13 bodies, differentiated numerically."""
     for t in (0.1, 0.5, 1.3):
-        power = numerics.derivative(
-            lambda d, t=t: np.array(_energies(robot, legs_at, numerics, lambda e: motion.pose(t + d), parameters)[1])
+        power = derivative(
+            lambda d, t=t: np.array(_energies(robot, legs_at, lambda e: motion.pose(t + d), parameters)[1])
         )
         twist = robot.twist(motion.pose(t), motion.rate(t))
         np.testing.assert_allclose(robot.gravity_wrench(motion.pose(t), parameters) @ twist, power, rtol=1e-9)
 
 
-def _mass_rate(robot, motion, numerics, t, values):
-    return numerics.derivative(lambda d: robot.mass_matrix(motion.pose(t + d), values))
+def _mass_rate(robot, motion, t, values):
+    return derivative(lambda d: robot.mass_matrix(motion.pose(t + d), values))
 
 
-def test_mass_rate_less_twice_coriolis_is_skew(robot, motion, numerics, round_links):
+def test_mass_rate_less_twice_coriolis_is_skew(robot, motion, round_links):
     """M_dot - 2 C is skew-symmetric, M_dot by finite differences; so is its quadratic form zero."""
     for t in np.linspace(0, 3, 7):
         twist = robot.twist(motion.pose(t), motion.rate(t))
-        rate = _mass_rate(robot, motion, numerics, t, round_links)
+        rate = _mass_rate(robot, motion, t, round_links)
         skew = rate - 2 * robot.coriolis_matrix(motion.pose(t), twist, round_links)
         assert abs(twist @ skew @ twist) < 1e-11
         np.testing.assert_allclose(skew, -skew.T, atol=1e-9 * np.abs(rate).max())
 
 
-def test_links_without_spin_break_the_energy_balance_by_a_known_amount(robot, legs_at, motion, numerics, parameters):
+def test_links_without_spin_break_the_energy_balance_by_a_known_amount(robot, legs_at, motion, parameters):
     """A link that never spins (eq. 12) but keeps its x axis normal to the crank axis is no rigid body if Ixx != Iyy:
     v^T (M_dot - 2 C) v is then 2 spin (Ixx - Iyy) omega_x omega_y, where spin is how fast the axes turn about z."""
     for t in (0.2, 0.9):
         pose, twist = motion.pose(t), robot.twist(motion.pose(t), motion.rate(t))
-        skew = _mass_rate(robot, motion, numerics, t, parameters) - 2 * robot.coriolis_matrix(pose, twist, parameters)
+        skew = _mass_rate(robot, motion, t, parameters) - 2 * robot.coriolis_matrix(pose, twist, parameters)
         expected = 0.0
         for leg in range(6):
 
@@ -159,7 +160,7 @@ def test_links_without_spin_break_the_energy_balance_by_a_known_amount(robot, le
                 x /= np.linalg.norm(x)
                 return np.column_stack([x, np.cross(z, x), z])
 
-            turn = axes(0.0).T @ numerics.derivative(axes)
+            turn = axes(0.0).T @ derivative(axes)
             omega_x, omega_y, spin = turn[2, 1], turn[0, 2], turn[1, 0]
             ixx, iyy = parameters[LINK_INERTIA[leg]], parameters[LINK_INERTIA[leg] + 1]
             expected += 2 * spin * (ixx - iyy) * omega_x * omega_y
