@@ -105,19 +105,14 @@ def test_fit_of_noise_free_smeared_windows_is_exact(smear, psf_px):
 
 
 @pytest.mark.parametrize(
-    ("speed", "runs", "lowest", "highest"),
-    [
-        pytest.param(0.3, 3, 3.5, 8.5, marks=pytest.mark.slow),
-        pytest.param(0.2, 8, 4.5, 7.5, marks=pytest.mark.thorough),
-        pytest.param(0.3, 8, 4.5, 7.5, marks=pytest.mark.thorough),
-    ],
+    "speed", [pytest.param(0.3, marks=pytest.mark.slow), pytest.param(0.2, marks=pytest.mark.thorough)]
 )
-def test_tracked_frames_of_a_moving_platform_keep_their_covariance(speed, runs, lowest, highest):
+def test_tracked_frames_of_a_moving_platform_keep_their_covariance(speed):
     """Squared pose errors along y in units of the stated covariance, with 2 ms of exposure through a sharp lens: after
     the first frame of each run, whose movement nobody can know."""
     sensor = exact("perfect", {"timing.exposure": 0.002})
     rate, squared = np.array([0.0, speed, 0.0, 0.0, 0.0, 0.0]), []
-    for run, start in enumerate(poses_about_home(sensor, runs)):
+    for run, start in enumerate(poses_about_home(sensor, 8)):
         sensor.start_run(run)
         path = start + np.outer(np.arange(-4, 5) / 60.0, rate) - [0.0, start[1], 0.0, 0.0, 0.0, 0.0]
         for pose in path:
@@ -125,8 +120,8 @@ def test_tracked_frames_of_a_moving_platform_keep_their_covariance(speed, runs, 
             assert m.ok, m.reason
             if not np.array_equal(pose, path[0]):
                 squared.append(squared_error(m, pose))
-    assert len(squared) == 8 * runs
-    assert lowest < np.mean(squared) < highest  # the mean of 64 scatters by 0.43, of 24 by 0.7
+    assert len(squared) == 64
+    assert 4.5 < np.mean(squared) < 7.5  # the mean of 64 scatters by 0.43
 
 
 @pytest.mark.slow
