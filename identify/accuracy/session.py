@@ -11,18 +11,8 @@ from typing import Any
 
 import pytest
 
+from identify.accuracy import saved
 from identify.accuracy.figure import CONFIDENCE, PROPERTY, AccuracyError, Figure, percent
-from identify.accuracy.saved import (
-    Comparison,
-    Key,
-    SavedSession,
-    check_writable,
-    compare,
-    find_saved,
-    missing,
-    save,
-    saved_path,
-)
 
 Row = tuple[str, ...]
 UNDECIDED = "undecided"
@@ -30,7 +20,7 @@ HEADER: Row = ("figure", "value", f"{CONFIDENCE:.0%} interval", "unit", "limit",
 
 
 def terminal_table(
-    figures: Sequence[Figure], comparisons: Mapping[Key, Comparison], compared_with: str | None
+    figures: Sequence[Figure], comparisons: Mapping[saved.Key, saved.Comparison], compared_with: str | None
 ) -> list[str]:
     """Lines of the table, the figures of a test under its node id; aligned, with the saved values where compared."""
     header: Row = ("", *HEADER[1:], *((compared_with, "change") if compared_with else ()))
@@ -65,7 +55,7 @@ def _cells(figure: Figure) -> Row:
     return f"{figure.value:.4g}", interval, figure.unit, figure.limit_text, f"{margin} {mark}".strip()
 
 
-def _compared(comparison: Comparison | None) -> Row:
+def _compared(comparison: saved.Comparison | None) -> Row:
     if comparison is None:
         return "", "new"
     if comparison.mismatch:
@@ -112,12 +102,12 @@ class AccuracySession:
             return
         try:
             if self._save is not None:
-                check_writable(saved_path(self._folder, self._save))
+                saved.check_writable(saved.saved_path(self._folder, self._save))
             if self._compare is not None:
-                saved = find_saved(self._folder, self._compare)
-                self._saved = saved.figures
-                if saved.seed != self._seed:
-                    self._remark(f"{self._compare} was saved with --accuracy-seed {saved.seed}, this is {self._seed}")
+                before = saved.find_saved(self._folder, self._compare)
+                self._saved = before.figures
+                if before.seed != self._seed:
+                    self._remark(f"{self._compare} was saved with --accuracy-seed {before.seed}, this is {self._seed}")
         except AccuracyError as error:
             raise pytest.UsageError(str(error)) from error
 
@@ -127,9 +117,9 @@ class AccuracySession:
         return [figure for test in sorted(self._figures) for figure in self._figures[test]]
 
     @property
-    def comparisons(self) -> dict[Key, Comparison]:
+    def comparisons(self) -> dict[saved.Key, saved.Comparison]:
         """Figures beside the saved ones."""
-        return dict(compare(self.figures, self._saved))
+        return dict(saved.compare(self.figures, self._saved))
 
     def pytest_collectreport(self, report: pytest.CollectReport) -> None:
         """Take the outcome of a module that is skipped as a whole."""
@@ -180,7 +170,7 @@ class AccuracySession:
 
     def _tell_missing(self, session: pytest.Session) -> None:
         """Name the saved figures that were not measured; fail, if asked to, where their test was run or skipped."""
-        gone = missing(self.figures, self._saved)
+        gone = saved.missing(self.figures, self._saved)
         if not gone:
             return
         count = sum(map(len, gone.values()))
@@ -198,7 +188,7 @@ class AccuracySession:
         return None
 
     def _keep(self, session: pytest.Session) -> None:
-        path = saved_path(self._folder, self._save)
+        path = saved.saved_path(self._folder, self._save)
         if session.exitstatus != pytest.ExitCode.OK or not self._figures:
             why = "the session did not pass" if self._figures else "no figures were recorded"
             self._remark(f"not saved as {self._save}: {why}")
@@ -208,7 +198,7 @@ class AccuracySession:
             self._fail(session, f"not saved as {self._save}: beyond their limits are {'; '.join(beyond)}")
             return
         try:
-            save(path, SavedSession(name=self._save, seed=self._seed, figures=self.figures))
+            saved.save(path, saved.SavedSession(name=self._save, seed=self._seed, figures=self.figures))
         except AccuracyError as error:
             self._fail(session, str(error))
         else:

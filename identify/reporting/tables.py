@@ -1,8 +1,7 @@
 """Tables like the paper's 2, 3 and 4 beside the paper's own figures, and what a run says of itself at the terminal.
 
-The paper's own RMS figures (its tables 3 and 4), in um and urad, to stand beside ours.
-They compare the identified model with the *measurement* of a real robot; no truth was known there.
-Order: x, y, z [um], alpha, beta, gamma [urad].
+The paper's figures, RMS of x, y, z [um], alpha, beta, gamma [urad], compare the identified model with the measurement
+of a real robot; no truth was known there.
 """
 
 import math
@@ -40,10 +39,6 @@ VALIDATION = (
 
 INDEX_FIRST, INDEX_BEST = 0.38, 1.345
 """Observability index at the start and after 324 iterations of a genetic algorithm (section 4.2)."""
-
-
-# Tables like the paper's 2, 3 and 4 beside the paper's own figures, as rows of text with units in the header.
-
 
 AXIS_UNITS = ("um", "um", "um", "urad", "urad", "urad")
 NOT_SHOWN = "not identifiable"
@@ -152,11 +147,11 @@ def excitation_error_table(result: dict[str, Any]) -> Table:
 def validation_table(result: dict[str, Any]) -> Table:
     """Models against measurement and truth on the unseen trajectories, like table 4, and the paper's rows."""
     rows: list[tuple[str, ...]] = []
-    for number_, run in enumerate(result.get("validation", []), start=1):
-        rows.append((f"{number_} true", *_rms(rms_row(run["true"]))))
-        rows.append((f"{number_} measured", *_rms(rms_row(run["measured"]))))
+    for n, run in enumerate(result.get("validation", []), start=1):
+        rows.append((f"{n} true", *_rms(rms_row(run["true"]))))
+        rows.append((f"{n} measured", *_rms(rms_row(run["measured"]))))
         if "initial_true" in run:
-            rows.append((f"{number_} starting model, true", *_rms(rms_row(run["initial_true"]))))
+            rows.append((f"{n} starting model, true", *_rms(rms_row(run["initial_true"]))))
     rows += [(f"paper {n} measured", *map(number, row)) for n, row in enumerate(VALIDATION, start=1)]
     return Table(
         "RMS on unseen trajectories (like the paper's table 4)",
@@ -169,10 +164,10 @@ def validation_table(result: dict[str, Any]) -> Table:
 def prediction_table(result: dict[str, Any]) -> Table:
     """Predicted deviation of the plant from the identified model beside the deviation found, on unseen trajectories."""
     rows: list[tuple[str, ...]] = []
-    for number_, run in enumerate(result.get("validation", []), start=1):
+    for n, run in enumerate(result.get("validation", []), start=1):
         ratio = run.get("predicted", {}).get("normalised_squared_error")
-        rows.append((f"{number_} predicted std", *map(number, predicted_row(run)), ""))
-        rows.append((f"{number_} found RMS", *_rms(rms_row(run["true"])), number(ratio)))
+        rows.append((f"{n} predicted std", *map(number, predicted_row(run)), ""))
+        rows.append((f"{n} found RMS", *_rms(rms_row(run["true"])), number(ratio)))
     return Table(
         "Identified model against the true plant: predicted and found",
         ("run", *AXIS_HEADER, "normalised"),
@@ -255,9 +250,6 @@ def _percent(parameter: dict[str, Any]) -> str:
     if not true or estimate is None:
         return "-"
     return f"{100 * (estimate - true) / abs(true):+.2f}"
-
-
-# What a run says of itself at the terminal, on standard output.
 
 
 def print_identification(result: dict[str, Any], path: Path) -> None:

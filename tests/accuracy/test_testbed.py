@@ -33,18 +33,6 @@ def test_a_seed_is_that_of_its_test_alone(project):
     assert not set(seeds(project(SEEDS, "--accuracy-seed", "1"))) & set(first)
 
 
-def test_defaults_are_the_quick_scenario_with_its_robot_and_sensor(project):
-    done = project(
-        """
-        def test_it(cmmsim_scenario, cmmsim_robot):
-            assert cmmsim_scenario.name == "quick"
-            assert cmmsim_robot.name == cmmsim_scenario.robot == "rss6"
-            assert cmmsim_scenario.sensor == "ctrack780"
-        """
-    )
-    done.assert_outcomes(passed=1)
-
-
 CHOOSING = """
 @pytest.mark.cmmsim(sensor="ctrack780_29hz")
 class TestMarked:
@@ -55,34 +43,36 @@ class TestMarked:
     def test_closest(self, cmmsim_scenario):
         assert (cmmsim_scenario.name, cmmsim_scenario.timing.frame_rate_hz) == ("paper", 40.0)
 
-def test_plain(cmmsim_scenario):
+def test_plain(cmmsim_scenario, cmmsim_robot):
     assert (cmmsim_scenario.name, cmmsim_scenario.timing.frame_rate_hz) == ({name!r}, {rate})
+    assert cmmsim_robot.name == cmmsim_scenario.robot == "rss6"
 """
 
 
 def test_markers_and_options_choose_built_in_names_or_files(project, pytester):
-    """The closest marker holds before those around it, and any marker before the command line."""
+    """The closest marker holds before those around it, and any marker before the command line; `quick` by default."""
     (pytester.path / "mine.toml").write_text('name = "mine"\nbased_on = "ctrack780"\n[timing]\nframe_rate = 40.0\n')
     project(CHOOSING.format(name="quick", rate=60.0)).assert_outcomes(passed=3)
     chosen = ("--accuracy-scenario", "paper", "--accuracy-sensor", "mine.toml")
     project(CHOOSING.format(name="paper", rate=40.0), *chosen).assert_outcomes(passed=3)
 
 
-@pytest.mark.parametrize(
-    ("marker", "says"),
-    [
-        ("camera='mine'", "AccuracyError: marker cmmsim: 'camera' unknown; it takes scenario, robot, sensor"),
-        ("'mine'", "AccuracyError: marker cmmsim: 'mine' unknown; it takes scenario, robot, sensor"),
-        ("scenario='papper'", "ScenarioError: scenario 'papper' is neither built in (paper, quick) nor a file"),
-        ("robot='rss7'", "RobotFileError: *rss7*rss6*"),
-        ("sensor=5", "AccuracyError: marker cmmsim: sensor is 5, must be a built-in name or a file"),
-        ("robot=None", "AccuracyError: marker cmmsim: robot is None, must be a built-in name or a file"),
-    ],
-)
-def test_what_does_not_exist_is_one_line_with_the_valid_names(project, marker, says):
-    done = project(f"@pytest.mark.cmmsim({marker})\ndef test_it(cmmsim_robot): pass")
-    done.assert_outcomes(errors=1)
-    done.stdout.fnmatch_lines([f"E  *{says}"])
+WRONG_MARKERS = {
+    "camera='mine'": "AccuracyError: marker cmmsim: 'camera' unknown; it takes scenario, robot, sensor",
+    "'mine'": "AccuracyError: marker cmmsim: 'mine' unknown; it takes scenario, robot, sensor",
+    "scenario='papper'": "ScenarioError: scenario 'papper' is neither built in (paper, quick) nor a file",
+    "robot='rss7'": "RobotFileError: *rss7*rss6*",
+    "sensor=5": "AccuracyError: marker cmmsim: sensor is 5, must be a built-in name or a file",
+}
+
+
+def test_what_does_not_exist_is_one_line_with_the_valid_names(project):
+    tests = [
+        f"@pytest.mark.cmmsim({marker})\ndef test_{n}(cmmsim_robot): pass" for n, marker in enumerate(WRONG_MARKERS)
+    ]
+    done = project("\n".join(tests))
+    done.assert_outcomes(errors=len(WRONG_MARKERS))
+    done.stdout.fnmatch_lines([f"E  *{says}" for says in WRONG_MARKERS.values()])
 
 
 @pytest.mark.parametrize(
