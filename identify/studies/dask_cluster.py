@@ -18,7 +18,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from multiprocessing import active_children, resource_tracker
-from uuid import uuid4
 
 import dask
 from distributed import Client, Future, KilledWorker, LocalCluster, WorkerPlugin, get_worker, rpc
@@ -52,12 +51,11 @@ class DaskExecutor:
     """Computes the batches of a study on the workers of a client, only a few of them on their way at a time."""
 
     def __init__(self, client: Client) -> None:
-        self._client, self._name = client, f"study-{uuid4().hex[:8]}"
+        self._client = client
         self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
         self._open: dict[str, tuple[Future, list[Case]]] = {}
         self._suspects: list[Case] = []
         self._deaths: Counter[int] = Counter()
-        self._sent = 0
         self._workers, self._asked, self._seen = 1, -math.inf, time.monotonic()
 
     def __call__(self, setup: Setup, batches: Batches) -> Iterator[list[Finished]]:
@@ -85,9 +83,7 @@ class DaskExecutor:
         return bool(self._open)
 
     def _send(self, setup: Setup, cases: list[Case]) -> None:
-        self._sent += 1
-        key = f"{self._name}-{self._sent}"
-        future = self._client.submit(_compute_alike, product_version(), setup, cases, key=key, pure=False)
+        future = self._client.submit(_compute_alike, product_version(), setup, cases, pure=False)
         self._open[future.key] = (future, cases)
         future.add_done_callback(self._done.put)
 

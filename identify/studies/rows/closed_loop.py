@@ -18,32 +18,16 @@ from identify.experiment.truth import true_poses
 from identify.random_streams import stream_seed
 from identify.record import recording
 from identify.scenario import Scenario
-from identify.studies.rows.kind import (
-    NOISE_OFF,
-    PICTURES,
-    PLANT,
-    POSE_COLUMNS,
-    Column,
-    Kind,
-    Reads,
-    Row,
-    RowOptions,
-    pose_figures,
-    rms_um,
-)
-from identify.studies.rows.sensor import Teaching
+from identify.studies.rows.kind import NOISE_OFF, PATH, PICTURES, PLANT, Column, Kind, Reads, Row, RowOptions
+from identify.studies.rows.sensor import POSE_COLUMNS, Teaching, pose_figures, rms_um
 
 EXPERIMENT, TRAJECTORY = 0, 1
 
 COLUMNS = {
     "frames": Column("1", "frames of the run"),
     "lost_frames": Column("1", "frames without a pose; they do not count in the sensor's error", main=True),
-    "tracking_position_rms_um": Column(
-        "um", "true position against the desired one, rms over frames and axes", main=True
-    ),
-    "tracking_orientation_rms_urad": Column(
-        "urad", "true orientation against the desired one, rms likewise", main=True
-    ),
+    "tracking_position_rms_um": Column("um", "true against desired position, rms over frames and axes", main=True),
+    "tracking_orientation_rms_urad": Column("urad", "true against desired orientation, rms likewise", main=True),
     **POSE_COLUMNS,
     "torque_rms_N_m": Column("N m", "torque of the joint controllers, rms over frames and joints", main=True),
 }
@@ -63,17 +47,9 @@ READS = Reads(
         "sensor.timing.",
         "scenario.servo.",
         "scenario.plant.",
-        *(
-            f"scenario.excitation.{name}"
-            for name in (
-                "fundamental_hz",
-                "harmonics",
-                "position_amplitude_m",
-                "orientation_amplitude_rad",
-                "travel_margin_rad",
-                "max_joint_velocity_rad_s",
-            )
-        ),
+        *PATH,
+        "scenario.excitation.travel_margin_rad",
+        "scenario.excitation.max_joint_velocity_rad_s",
         "scenario.validation.duration_s",
     ),
     idle=(NOISE_OFF, *PLANT),

@@ -28,21 +28,8 @@ from identify.progress import SilentProgress
 from identify.random_streams import stream_seed
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, scenario_from_toml
-from identify.studies.rows.kind import (
-    NOISE_OFF,
-    PLANT,
-    SENSOR,
-    Column,
-    Idle,
-    Kind,
-    Reads,
-    Row,
-    RowOptions,
-    rms_um,
-    stated_um,
-    timing,
-)
-from identify.studies.rows.sensor import DrawnSensor
+from identify.studies.rows.kind import NOISE_OFF, PLANT, SENSOR, Column, Idle, Kind, Reads, Row, RowOptions, timing
+from identify.studies.rows.sensor import DrawnSensor, rms_um, stated_um
 from identify.trajectory import TrajectorySet
 from identify.validation.unseen import model_run
 
@@ -69,10 +56,7 @@ COLUMNS = {
     "normalised_error": Column("1", "error of those over its stated standard deviation, rms; 1 where stated well"),
     "noise_ratio": Column("1", "mean squared whitened residual; 1 where noise is all that is left"),
     "iterations": Column("1", "iterations of all searches"),
-    "prediction_rms_um": Column(
-        "um",
-        "identified model against the true one on unseen trajectories, neither with noise: position, rms over axes",
-    ),
+    "prediction_rms_um": Column("um", "identified against true model on unseen trajectories, without noise: position"),
     "stated_prediction_rms_um": Column("um", "the same, as the covariance of the parameters states it"),
     "unseen_position_rms_um": Column("um", "model against true plant on unseen trajectories, rms over axes", main=True),
     "unseen_orientation_rms_urad": Column(

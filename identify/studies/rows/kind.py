@@ -9,7 +9,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from cmmsim.files import read_sensor_file
-from identify.arrays import Array
 from identify.errors import StudyError
 from identify.scenario import Scenario
 from identify.scenario.settings_file import one_line
@@ -69,6 +68,10 @@ SENSOR = (
 
 PICTURES = ("scenario.sensor", "scenario.renderer", "scenario.pose_method", *SENSOR)
 """What pictures, and the poses measured in them, depend on beside the timing."""
+
+BOX = ("scenario.excitation.position_amplitude_m", "scenario.excitation.orientation_amplitude_rad")
+PATH = ("scenario.excitation.fundamental_hz", "scenario.excitation.harmonics", *BOX)
+"""What draws a pose in the scenario's box, and a path in it."""
 
 NOISE_OFF = Idle(
     tuple(f"sensor.camera.{name}" for name in ("dark_noise", "prnu", "dsnu", "pattern_seed")),
@@ -145,7 +148,7 @@ def _always(holds: Callable[[Any], bool], path: str, study: Study, first: Scenar
     return holds(reduce(getattr, key.split("."), owner))
 
 
-_SPELLINGS = [timing(name) for name in ("frame_rate_hz", "exposure_s", "latency_s", "latency_jitter_s", "dropout")]
+_SPELLINGS = [timing(name) for name in IN_FILE]
 
 
 # A kind of row.
@@ -203,32 +206,3 @@ class Kind:
     def row(self, scenario: Scenario, seed: np.random.SeedSequence, options: Mapping[str, Any]) -> Mapping[str, float]:
         """One row. Raises StudyError for wrong options, and what the row meets."""
         return self.compute(scenario, seed, self.checked(options))
-
-
-# Figures of measured poses.
-
-
-def rms_um(errors: Array) -> float:
-    """Root mean square in 1e-6 of the unit: over all entries, so per axis and frame."""
-    return 1e6 * float(np.sqrt(np.mean(np.square(errors))))
-
-
-def stated_um(covariances: Array) -> tuple[float, float]:
-    """Rms standard deviation per axis of position [um] and orientation [urad] of covariances (n, 6, 6)."""
-    variances = np.diagonal(covariances, axis1=1, axis2=2)
-    return 1e6 * float(np.sqrt(variances[:, :3].mean())), 1e6 * float(np.sqrt(variances[:, 3:].mean()))
-
-
-POSE_COLUMNS = {
-    "position_rms_um": Column("um", "measured against true position, rms over pictures and axes", main=True),
-    "orientation_rms_urad": Column("urad", "measured against true orientation, rms over pictures and axes", main=True),
-    "stated_position_rms_um": Column("um", "the same, as the sensor's own covariance states it"),
-    "stated_orientation_rms_urad": Column("urad", "the same, as the sensor's own covariance states it"),
-}
-"""What every row says that has measured poses in it."""
-
-
-def pose_figures(errors: Array, covariances: Array) -> Row:
-    """The figures of POSE_COLUMNS of errors (n, 6) [m, rad] and stated covariances (n, 6, 6), n >= 1."""
-    figures = (rms_um(errors[:, :3]), rms_um(errors[:, 3:]), *stated_um(covariances))
-    return dict(zip(POSE_COLUMNS, figures, strict=True))

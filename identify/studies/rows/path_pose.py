@@ -14,23 +14,11 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
-from identify.studies.rows.kind import (
-    NOISE_OFF,
-    PICTURES,
-    POSE_COLUMNS,
-    Column,
-    Kind,
-    Reads,
-    Row,
-    RowOptions,
-    pose_figures,
-    rms_um,
-    timing,
-)
-from identify.studies.rows.sensor import RowSensor, Teaching, row_sensor
+from identify.studies.rows.kind import NOISE_OFF, PATH, PICTURES, Column, Kind, Reads, Row, RowOptions, timing
+from identify.studies.rows.sensor import POSE_COLUMNS, RowSensor, Teaching, pose_figures, rms_um, row_sensor
 from identify.trajectory import FourierTrajectory, random_trajectory
 
-PATH, SENSOR, LATENCY = 0, 1, 2
+DRAWN_PATH, SENSOR, LATENCY = 0, 1, 2
 INSTANTS_PER_FRAME = 16
 """Instants of a frame period at which the pose in use is compared with the true one."""
 
@@ -40,9 +28,7 @@ COLUMNS = {
     "speed_rms_mm_s": Column("mm/s", "speed of the platform along each axis, rms over the frames"),
     **POSE_COLUMNS,
     "used_position_rms_um": Column("um", "last position that had arrived against the true one at all times", main=True),
-    "used_orientation_rms_urad": Column(
-        "urad", "last orientation that had arrived against the true one at all times", main=True
-    ),
+    "used_orientation_rms_urad": Column("urad", "last orientation that had arrived, likewise", main=True),
 }
 
 
@@ -54,14 +40,7 @@ class PathPoseOptions(RowOptions):
 
 
 READS = Reads(
-    (
-        *PICTURES,
-        *timing("frame_rate_hz", "exposure_s", "latency_s", "latency_jitter_s", "dropout"),
-        "scenario.excitation.fundamental_hz",
-        "scenario.excitation.harmonics",
-        "scenario.excitation.position_amplitude_m",
-        "scenario.excitation.orientation_amplitude_rad",
-    ),
+    (*PICTURES, *timing("frame_rate_hz", "exposure_s", "latency_s", "latency_jitter_s", "dropout"), *PATH),
     but=("sensor.stickers.obstacle_level",),
     idle=(NOISE_OFF,),
 )
@@ -70,7 +49,7 @@ READS = Reads(
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseOptions) -> Row:
     """One row. Raises EstimationError where fewer than two poses were measured, and what the sensor raises."""
     eye = row_sensor(scenario, options.teaching, stream_seed(seed, SENSOR))
-    rng = np.random.default_rng(stream_seed(seed, PATH))
+    rng = np.random.default_rng(stream_seed(seed, DRAWN_PATH))
     excitation = scenario.excitation
     path = random_trajectory(
         rng,

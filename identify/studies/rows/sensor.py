@@ -1,4 +1,4 @@
-"""The sensor of a row: taught exactly or by itself, or one without images, whose noise is drawn.
+"""The sensor of a row: taught exactly or by itself, or one without images, whose noise is drawn; its figures.
 
 It is built once a process for each content of a sensor file. A row that is taught exactly depends on nothing that
 another row left behind: every picture has a noise stream of its own, begun by `start_run`. So a sensor from the cache
@@ -20,6 +20,7 @@ from cmmsim.teaching import exactly_taught
 from identify.arrays import Array
 from identify.experiment.sensor_in_loop import sensor_file
 from identify.scenario import Scenario
+from identify.studies.rows.kind import Column, Row
 
 SENSORS_KEPT = 16
 """Sensors a process keeps; one of them takes about a megabyte."""
@@ -99,3 +100,32 @@ class DrawnSensor:
             np.array([], dtype=str),
             True,
         )
+
+
+# Figures of measured poses.
+
+
+def rms_um(errors: Array) -> float:
+    """Root mean square in 1e-6 of the unit: over all entries, so per axis and frame."""
+    return 1e6 * float(np.sqrt(np.mean(np.square(errors))))
+
+
+def stated_um(covariances: Array) -> tuple[float, float]:
+    """Rms standard deviation per axis of position [um] and orientation [urad] of covariances (n, 6, 6)."""
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    return 1e6 * float(np.sqrt(variances[:, :3].mean())), 1e6 * float(np.sqrt(variances[:, 3:].mean()))
+
+
+POSE_COLUMNS = {
+    "position_rms_um": Column("um", "measured against true position, rms over pictures and axes", main=True),
+    "orientation_rms_urad": Column("urad", "measured against true orientation, rms over pictures and axes", main=True),
+    "stated_position_rms_um": Column("um", "the same, as the sensor's own covariance states it"),
+    "stated_orientation_rms_urad": Column("urad", "the same, as the sensor's own covariance states it"),
+}
+"""What every row says that has measured poses in it."""
+
+
+def pose_figures(errors: Array, covariances: Array) -> Row:
+    """The figures of POSE_COLUMNS of errors (n, 6) [m, rad] and stated covariances (n, 6, 6), n >= 1."""
+    figures = (rms_um(errors[:, :3]), rms_um(errors[:, 3:]), *stated_um(covariances))
+    return dict(zip(POSE_COLUMNS, figures, strict=True))

@@ -17,21 +17,8 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
-from identify.studies.rows.kind import (
-    NOISE_OFF,
-    PICTURES,
-    POSE_COLUMNS,
-    Column,
-    Idle,
-    Kind,
-    Reads,
-    Row,
-    RowOptions,
-    pose_figures,
-    rms_um,
-    timing,
-)
-from identify.studies.rows.sensor import RowSensor, Teaching, row_sensor
+from identify.studies.rows.kind import BOX, NOISE_OFF, PICTURES, Column, Idle, Kind, Reads, Row, RowOptions, timing
+from identify.studies.rows.sensor import POSE_COLUMNS, RowSensor, Teaching, pose_figures, rms_um, row_sensor
 
 POSES, SENSOR, DROPOUT = 0, 1, 2
 PREDICTION_ERROR = np.repeat([1e-4, 5e-4], 3)
@@ -69,12 +56,7 @@ class StaticPoseOptions(RowOptions):
 
 
 READS = Reads(
-    (
-        *PICTURES,
-        *timing("frame_rate_hz", "exposure_s", "dropout"),
-        "scenario.excitation.position_amplitude_m",
-        "scenario.excitation.orientation_amplitude_rad",
-    ),
+    (*PICTURES, *timing("frame_rate_hz", "exposure_s", "dropout"), *BOX),
     but=("sensor.stickers.obstacle_level",),
     idle=(
         NOISE_OFF,
