@@ -20,11 +20,15 @@ def zero_phase_filter(samples: ArrayLike, rate_hz: float, cutoff_hz: float, orde
     """Low-pass filter samples (N, ...) along the first axis without shifting them in time.
 
     Raises:
-        FilterError: cutoff at or above the Nyquist frequency, a record shorter than the padding, or samples that are
-            not finite.
+        FilterError: cutoff not positive, or at or above the Nyquist frequency; a record shorter than the padding; or
+            samples that are not finite.
     """
     values = _finite(samples)
-    check_cutoff(rate_hz, cutoff_hz)
+    if not 0 < cutoff_hz < rate_hz / 2:
+        raise FilterError(
+            f"filter cutoff {cutoff_hz:g} Hz must be above 0 and below the Nyquist frequency {rate_hz / 2:g} Hz "
+            f"of the sampling rate {rate_hz:g} Hz"
+        )
     padding = padding_samples(rate_hz, cutoff_hz, order)
     if len(values) <= padding:
         raise FilterError(
@@ -33,19 +37,6 @@ def zero_phase_filter(samples: ArrayLike, rate_hz: float, cutoff_hz: float, orde
         )
     sections = scipy.signal.butter(order, cutoff_hz, fs=rate_hz, output="sos")
     return np.asarray(scipy.signal.sosfiltfilt(sections, values, axis=0, padlen=padding), dtype=float)
-
-
-def check_cutoff(rate_hz: float, cutoff_hz: float) -> None:
-    """Refuse a cutoff that sampled data cannot have.
-
-    Raises:
-        FilterError: cutoff not positive, or at or above the Nyquist frequency.
-    """
-    if not 0 < cutoff_hz < rate_hz / 2:
-        raise FilterError(
-            f"filter cutoff {cutoff_hz:g} Hz must be above 0 and below the Nyquist frequency {rate_hz / 2:g} Hz "
-            f"of the sampling rate {rate_hz:g} Hz"
-        )
 
 
 def padding_samples(rate_hz: float, cutoff_hz: float, order: int) -> int:

@@ -21,9 +21,6 @@ from rich.progress import Progress as RichBars
 from rich.table import Table as RichTable
 from rich.text import Text
 
-# Progress of the stages of a run: bars with the time left on a terminal, one plain line a stage elsewhere.
-
-
 Advance = Callable[..., None]
 """``advance(n=1)``: n more steps of the stage are done."""
 
@@ -104,9 +101,6 @@ class _RateColumn(ProgressColumn):
         return Text("" if speed is None else f"{speed:.3g} {self._unit}")
 
 
-# Tables at the terminal, all in one look: 80 columns must do, since that is what a pipe gets. And warnings.
-
-
 def print_warnings(warnings: Iterable[str]) -> None:
     """One line each on standard error, `warning: ...`; they are no summary, and a quiet command gives them too."""
     for warning in warnings:
@@ -120,7 +114,7 @@ def print_table(
     title: str | None = None,
     note: str | None = None,
 ) -> None:
-    """Print rows of text under a header to standard output, the title above and the note below.
+    """Print rows of text under a header to standard output, the title above and the note below, as all tables look.
 
     words: headers of the columns that hold words, which stand to the left; numbers stand to the right. The first column
     is never broken. All text is shown as it is: what stands in brackets, such as a unit, is no markup.

@@ -11,8 +11,6 @@ from typing import ParamSpec, TypeVar, cast
 import typer
 from threadpoolctl import OpenBLASController, register, threadpool_limits
 
-# Cores of this machine: how many there are for processes, and that linear algebra keeps to one of them.
-
 
 class _CasadiBlas(OpenBLASController):
     """The BLAS that CasADi brings for IPOPT, under a name that threadpoolctl does not look for."""
@@ -39,9 +37,6 @@ def one_thread(function: Callable[P, R]) -> Callable[P, R]:
 def cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0))
-
-
-# Ctrl-C: one that comes at a bad moment is neither lost nor does it leave anything half done.
 
 
 STOPPED = 130
@@ -132,9 +127,6 @@ def _is_ours() -> bool:
     """Whether Ctrl-C may be handled here: in the main thread, and where nobody, such as nohup, has turned it off."""
     in_main = threading.current_thread() is threading.main_thread()
     return in_main and signal.getsignal(signal.SIGINT) not in (signal.SIG_IGN, None)
-
-
-# Ctrl-C ends a command that keeps what it has done in one line, at whatever moment it comes.
 
 
 def stoppable(command: Callable[P, None]) -> Callable[P, None]:

@@ -1,6 +1,5 @@
 """Reference trajectories as finite Fourier series of the pose (eq. 37), from rest at home, and their file.
 
-Reference trajectories as finite Fourier series of the pose (eq. 37), starting at home and at rest.
 Pose ``[x y z alpha beta gamma]`` in m and rad. With ``w = 2 pi f0 l`` each component is
 
     chi(t) = offset + sum_l  s_l sin(w t) / w  -  c_l cos(w t) / w.
@@ -131,9 +130,6 @@ def _without(rows: Array, direction: Array) -> Array:
     return rows - np.outer(rows @ unit, unit)
 
 
-# The trajectories of a run as JSON with units: one for the excitation, the others for validation.
-
-
 FORMAT = "cmmsim trajectories, version 1"
 EQUATION = "pose(t) = offset + sum_l sine_l sin(w t)/w - cosine_l cos(w t)/w with w = 2 pi fundamental_hz l"
 UNITS = {
@@ -206,18 +202,8 @@ def load_trajectories(path: Path | str) -> TrajectorySet:
 
 
 def _to_dict(trajectory: FourierTrajectory) -> dict[str, Any]:
-    return {
-        "fundamental_hz": trajectory.fundamental_hz,
-        "sine": trajectory.sine.tolist(),
-        "cosine": trajectory.cosine.tolist(),
-        "offset": trajectory.offset.tolist(),
-    }
+    return {name: np.asarray(value).tolist() for name, value in vars(trajectory).items()}
 
 
 def _from_dict(data: dict[str, Any]) -> FourierTrajectory:
-    return FourierTrajectory(
-        fundamental_hz=float(data["fundamental_hz"]),
-        sine=np.array(data["sine"], dtype=float),
-        cosine=np.array(data["cosine"], dtype=float),
-        offset=np.array(data["offset"], dtype=float),
-    )
+    return FourierTrajectory(float(data["fundamental_hz"]), data["sine"], data["cosine"], data["offset"])

@@ -15,15 +15,12 @@ from identify.arrays import Array
 from identify.progress import Advance
 from identify.scenario import Scenario
 
-# Cranks and links as the cameras see them: rods between the joints, which can hide stickers.
-
-
 CRANK_RADIUS_M = 0.010
 LINK_RADIUS_M = 0.006
 
 
 def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:
-    """Meshes [m] of the six cranks and six links, each along its own z axis from its first joint."""
+    """Meshes [m] of the six cranks and six links, each along its z axis from its first joint; they hide stickers."""
     crank = cmmsim.rod(robot.geometry.crank_length, CRANK_RADIUS_M)
     link = cmmsim.rod(robot.geometry.link_length, LINK_RADIUS_M)
     legs = range(1, 7)

@@ -1,4 +1,8 @@
-"""Described xarray datasets over time, checked for dimensions, units and names, and their groups in netCDF files."""
+"""Described xarray datasets over time, checked for dimensions, units and names, and their groups in netCDF files.
+
+Files are written whole or not at all, and read with clear errors. `covariance.nc` holds the covariance of the estimated
+parameters, in their SI units.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,9 +17,6 @@ from dynamics.parameters import unit_of
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.atomic import atomic_path
-
-# Groups of xarray datasets in one netCDF file: written whole or not at all, read with clear errors.
-
 
 ENGINE: Literal["h5netcdf"] = "h5netcdf"
 
@@ -71,9 +72,6 @@ def _encoding(dataset: xr.Dataset) -> dict[str, dict[str, object]]:
     compressed = {str(name): {"zlib": True, "complevel": 4} for name in numbers if dataset[name].ndim > 1}
     plain = {str(name): {"_FillValue": None} for name in numbers}
     return {name: {**plain[name], **compressed.get(name, {})} for name in plain}
-
-
-# Described xarray datasets over time: every variable has dimensions, a unit and a name, and is checked for them.
 
 
 Variables = dict[str, tuple[tuple[str, ...], str, str]]
@@ -169,16 +167,14 @@ def _description(dim: str) -> dict[str, str]:
     return {"units": unit, "long_name": text} if unit else {"long_name": text}
 
 
-# An attribute of a record as messages show it.
-
-
 def shown(value: object) -> str:
-    """The value in at most 60 characters of one line; a number of numpy, as netCDF gives it, as a plain one."""
-    plain = value.item() if isinstance(value, np.generic) else value
-    return " ".join(repr(plain).split())[:60]
+    """An attribute's value in at most 60 characters of one line, as messages show it."""
+    return " ".join(repr(plain(value)).split())[:60]
 
 
-# `covariance.nc`: the covariance of the estimated parameters, netCDF, in the SI units of the parameters.
+def plain(value: object) -> object:
+    """The value; a number of numpy, as netCDF gives it, as a plain one."""
+    return value.item() if isinstance(value, np.generic) else value
 
 
 VARIABLE = "covariance"

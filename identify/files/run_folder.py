@@ -1,4 +1,7 @@
-"""The folder of a run: which stage writes what, what is refused, and its result.json."""
+"""The folder of a run: which stage writes what, what is refused, and its figures, result.json.
+
+That is standard JSON: a figure that does not exist is null.
+"""
 
 import json
 import math
@@ -12,9 +15,6 @@ import numpy as np
 
 from identify.errors import OutputFolderError, RecordError
 from identify.files.atomic import write_figure, write_text
-
-# The folder of a run: which stage writes what, and what is refused.
-
 
 WRITTEN_BY = {
     "scenario.toml": "excite",
@@ -122,9 +122,6 @@ def new_run_folder(path: Path | str) -> RunFolder:
     return RunFolder(folder)
 
 
-# `result.json`: the figures of a run, standard JSON (a figure that does not exist is null).
-
-
 AXES = ("x", "y", "z", "alpha", "beta", "gamma")
 """Order of the RMS figures: three positions in um, three orientations in urad."""
 
@@ -191,21 +188,17 @@ def rms_figures(errors: Any, counted: Any = None) -> dict[str, list[float]]:
     return {"position_rms_um": rms[:3].tolist(), "orientation_rms_urad": rms[3:].tolist()}
 
 
-def rms_row(figures: dict[str, Any] | None) -> list[float]:
-    """The six RMS figures [um, urad] of one entry; NaN where they are null or the entry is absent."""
+def rms_row(figures: dict[str, Any] | None, of: str = "rms") -> list[float]:
+    """The six figures [um, urad] of one entry; NaN where they are null or the entry is absent."""
     if not figures:
         return [math.nan] * 6
-    values = [*figures["position_rms_um"], *figures["orientation_rms_urad"]]
+    values = [*figures[f"position_{of}_um"], *figures[f"orientation_{of}_urad"]]
     return [math.nan if value is None else float(value) for value in values]
 
 
 def predicted_row(run: dict[str, Any]) -> list[float]:
     """The six predicted standard deviations [um, urad] of a validation entry; NaN where nothing was predicted."""
-    predicted = run.get("predicted")
-    if not predicted:
-        return [math.nan] * 6
-    values = [*predicted["position_std_um"], *predicted["orientation_std_urad"]]
-    return [math.nan if value is None else float(value) for value in values]
+    return rms_row(run.get("predicted"), "std")
 
 
 def _plain(value: Any) -> Any:

@@ -39,40 +39,26 @@ def store_payload(record: xr.Dataset, payload: Array, std: Array | None = None) 
         record.attrs |= {name: float(payload[place]), f"{name}_std": float(deviations[place])}
 
 
-def recorded_payload(record: xr.Dataset) -> Array:
-    """The load (67,) of a record; zero where it states none.
+def recorded_payload(record: xr.Dataset) -> tuple[Array, Array]:
+    """The load (67,) of a record and its standard deviations (67,); zero where it states none.
 
     Raises:
-        RecordError: some but not all of its figures, one that is no finite number >= 0, or moments of no body.
+        RecordError: some but not all of its figures, one or its deviation that is no finite number >= 0, moments of no
+            body, or a deviation that exceeds its figure.
     """
-    given = [name for name in ADDED if name in record.attrs or f"{name}_std" in record.attrs]
-    if not given:
-        return np.zeros(len(NAMES))
-    added = np.zeros(len(NAMES))
-    for name, (parameter, unit) in ADDED.items():
-        added[index_of(parameter)] = _not_negative(name, record.attrs.get(name), unit)
+    load, std, stated = np.zeros(len(NAMES)), np.zeros(len(NAMES)), record.attrs
+    if not any(name in stated or f"{name}_std" in stated for name in ADDED):
+        return load, std
     try:
-        check_moments({name: float(record.attrs[name]) for name in ADDED if name != "payload_mass"})
+        for name, (parameter, unit) in ADDED.items():
+            place = index_of(parameter)
+            load[place] = _not_negative(name, stated.get(name), unit)
+            std[place] = _not_negative(f"{name}_std", stated.get(f"{name}_std", 0.0), unit)
+            check_load_std(f"{name}_std", std[place], name, load[place], unit)
+        check_moments({name: float(stated[name]) for name in ADDED if name != "payload_mass"})
     except ValueError as error:
         raise RecordError(f"the record's attribute {error}") from None
-    return added
-
-
-def recorded_payload_std(record: xr.Dataset) -> Array:
-    """Standard deviations (67,) of a record's load; zero where it states none.
-
-    Raises:
-        RecordError: as `recorded_payload`; or a deviation that is no finite number >= 0, or exceeds its figure.
-    """
-    load, deviations = recorded_payload(record), np.zeros(len(NAMES))
-    for name, (parameter, unit) in ADDED.items():
-        place = index_of(parameter)
-        deviations[place] = _not_negative(f"{name}_std", record.attrs.get(f"{name}_std", 0.0), unit)
-        try:
-            check_load_std(f"{name}_std", deviations[place], name, load[place], unit)
-        except ValueError as error:
-            raise RecordError(f"the record's attribute {error}") from None
-    return deviations
+    return load, std
 
 
 def _not_negative(name: str, value: object, unit: str) -> float:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import EstimationError, RecordError, ScenarioError
-from identify.files.dataset import read_covariance, shown
+from identify.files.dataset import plain, read_covariance, shown
 from identify.files.run_folder import RunFolder, load_result
 from identify.loop_parameters import NAMES
 from identify.record.payload import ADDED
@@ -221,12 +221,8 @@ def _record_digest(records: Sequence[xr.Dataset]) -> str:
     whole = sha256()
     for record in records:
         arrays = {name: record[name].values for name in ("time", *VARIABLES)}
-        stated = {name: _plain(record.attrs[name]) for name in STATED if name in record.attrs}
+        stated = {name: plain(record.attrs[name]) for name in STATED if name in record.attrs}
         scenario = recorded_scenario(record)
         stated |= {section: getattr(scenario, section).model_dump(mode="json") for section in ("timing", "servo")}
         whole.update(f"{array_digest(arrays)} {json.dumps(stated, sort_keys=True, default=str)}\n".encode())
     return whole.hexdigest()
-
-
-def _plain(value: object) -> object:
-    return value.item() if isinstance(value, np.generic) else value

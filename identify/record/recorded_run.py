@@ -21,7 +21,7 @@ from identify.record.checks import (
     check_reference,
     checked_covariance,
 )
-from identify.record.payload import recorded_payload, recorded_payload_std
+from identify.record.payload import recorded_payload
 from identify.record.recording import check_record, poses
 from identify.scenario import Scenario
 
@@ -149,6 +149,7 @@ def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
     """What a record holds, and what the scenario says of the model."""
     ok = record["measured_ok"].values.astype(bool)
     check_good_share(ok)
+    load, load_std = recorded_payload(record)
     return RecordedRun(
         robot=robot,
         settings=model_settings(scenario),
@@ -157,6 +158,6 @@ def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
         ok=ok,
         covariance=checked_covariance(record["measured_covariance"].values, ok),
         logged=np.asarray(record["command"].values, dtype=float),
-        payload=recorded_payload(record),
-        payload_std=recorded_payload_std(record),
+        payload=load,
+        payload_std=load_std,
     )

@@ -186,10 +186,8 @@ def _replace(data: dict[str, Any], path: str, value: Any) -> None:
         data[key] = value
 
 
-# What of a scenario is the estimator's alone: it may change after the record was made, all else may not.
-
-
 SECTIONS = ("identification", "model", "filter")
+"""What of a scenario is the estimator's alone: it may change after the record was made, all else may not."""
 
 RECORDED = ("identification.scale_anchor", "identification.anchor_std")
 """Settings of these sections that a record follows all the same: it holds what its anchor measured."""

@@ -7,9 +7,6 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from identify.plugins import CRITERIA, check_choice
 
-# What a scenario may not claim of parameters and bodies: names that do not exist, and bodies that cannot.
-
-
 VALID_NAMES = (
     "mass, Ixx, Iyy or Izz of platform, crank1 to crank6 or link1 to link6 (platform.mass), coulomb or viscous of "
     "joint1 to joint6, and joint_pid.lp, .li, .ld"

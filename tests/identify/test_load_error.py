@@ -17,7 +17,7 @@ from identify.experiment.plant import build_plant, drawn_load
 from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses
 from identify.loop_parameters import NAMES, index_of
-from identify.record.payload import recorded_payload_std, store_payload
+from identify.record.payload import recorded_payload, store_payload
 from identify.record.recording import poses
 from identify.studies.rows.sensor import DrawnSensor
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, trajectory, truth
@@ -130,7 +130,7 @@ def test_a_deviation_that_cannot_be_is_refused_with_its_value_and_limit(records,
     with pytest.raises(RecordError, match=says):
         identify([records[0], records[1].assign_attrs(attributes)], rss6(), scenario)
     with pytest.raises(RecordError, match="payload_mass is None, must be a number >= 0 in kg"):
-        recorded_payload_std(records[0].assign_attrs(payload_mass_std=0.04))
+        recorded_payload(records[0].assign_attrs(payload_mass_std=0.04))
 
 
 def test_a_deviation_does_not_make_a_load_of_none(records, scenario):
