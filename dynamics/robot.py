@@ -28,7 +28,7 @@ from dynamics.errors import (
 from dynamics.expressions import evaluate
 from dynamics.kinematics import forward_kinematics
 from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
-from dynamics.legs.rss_kinematics import home_angles
+from dynamics.legs.rss_inverse_kinematics import home_angles
 from dynamics.parameters import PARAMETER_NAMES, check_parameters, check_ranges
 from dynamics.rigid_body.virtual_work import FUNCTION_NAMES, robot_functions
 from dynamics.robot_file import ParameterSet, RobotDescription, read_robot_file

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from dynamics.checks import shown
 from dynamics.errors import DynamicsError, RobotFileError
 from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
-from dynamics.legs.rss_kinematics import home_angles
+from dynamics.legs.rss_inverse_kinematics import home_angles
 from dynamics.parameters import check_parameters
 
 _PerLeg = float | list[float]

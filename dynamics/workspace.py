@@ -9,8 +9,8 @@
   columns by the characteristic length, so that all entries are plain numbers. At infinity the platform moves with all
   cranks locked.
 
-The characteristic length is the RMS distance of the platform joints from the platform origin (0.2 m for rss6). The
-measures as CasADi expressions, for a search that keeps their limits, are `legs.rss_kinematics.singularity_measures`.
+The characteristic length is the RMS distance of the platform joints from the platform origin (0.2 m for rss6). As
+CasADi expressions, for a search that keeps their limits, they are `legs.rss_inverse_kinematics.singularity_measures`.
 """
 
 from __future__ import annotations

@@ -30,13 +30,7 @@ from identify.record.provenance import ENTRY, RECORDS, RunFiles, check_robot, di
 from identify.record.recorded_run import recorded_reference
 from identify.record.recording import build_model_run, write_model_runs
 from identify.reporting.report import write_report
-from identify.reporting.run_result import (
-    add_truth,
-    parameter_vector,
-    prediction_entry,
-    sensor_entry,
-    validation_entry,
-)
+from identify.reporting.run_result import add_truth, parameter_vector, prediction_entry, sensor_entry, validation_entry
 from identify.scenario import Scenario, load_scenario
 from identify.scenario.scenario import estimator_settings, with_estimator_settings
 from identify.trajectory import TrajectorySet, check_travel, load_trajectories, save_trajectories

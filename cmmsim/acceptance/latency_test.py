@@ -11,14 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmmsim.acceptance.artefacts import (
-    HALF_LENGTH,
-    HALF_WIDTH,
-    SensorUnderTest,
-    estimator_of,
-    locate,
-    rigid_bar,
-)
+from cmmsim.acceptance.artefacts import HALF_LENGTH, HALF_WIDTH, SensorUnderTest, estimator_of, locate, rigid_bar
 from cmmsim.acceptance.statistics import Interval, interval_of_mean
 from cmmsim.acceptance.volume import MeasuringVolume
 from cmmsim.errors import AcceptanceError, ShapeError

@@ -12,15 +12,14 @@ from dataclasses import dataclass
 import casadi as ca
 
 from dynamics.expressions import symmetric_from_lower
-from dynamics.legs.rss_kinematics import LegVectors, angle_gradient, crank_leverage
+from dynamics.legs.rss_inverse_kinematics import LegVectors, angle_gradient, crank_leverage
 
 
 @dataclass(frozen=True)
 class LegMotion:
-    """Crank rate and acceleration (scalars), second derivatives of crank and link vectors (3,), and the link's angular
+    """Crank acceleration (scalar), second derivatives of crank and link vectors (3,), and the link's angular
     velocity and acceleration (3,); the link does not spin about its own axis."""
 
-    crank_rate: ca.SX
     crank_acceleration: ca.SX
     tip_acceleration: ca.SX
     link_acceleration: ca.SX
@@ -40,7 +39,6 @@ def leg_motion(leg: LegVectors, velocity: ca.SX, acceleration: ca.SX) -> LegMoti
     link_acceleration = acceleration - tip_acceleration
     per_square = 1 / leg.link_length**2
     return LegMotion(
-        rate,
         crank_acceleration,
         tip_acceleration,
         link_acceleration,

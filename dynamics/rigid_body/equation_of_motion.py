@@ -16,7 +16,7 @@ from dynamics.expressions import function, symmetric_from_lower
 from dynamics.kinematics.platform import PlatformJointMotion, pose_rate_to_twist, twist_bias
 from dynamics.legs.rss_dynamics import leg_columns, leg_force, leg_mass, leg_motion
 from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
-from dynamics.legs.rss_kinematics import angle_gradient, leg_to
+from dynamics.legs.rss_inverse_kinematics import angle_gradient, leg_to
 from dynamics.parameters import RIGID_BODY
 from dynamics.rigid_body.virtual_work import leg_parameters, platform_columns, platform_mass
 

@@ -12,11 +12,11 @@ from dynamics.expressions import function, symmetric_from_lower
 from dynamics.kinematics.platform import joint_motion, pose_rate_to_twist, rotation_matrix, twist_bias
 from dynamics.legs.rss_dynamics import leg_columns, leg_coriolis, leg_force, leg_mass, leg_motion
 from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
-from dynamics.legs.rss_kinematics import (
+from dynamics.legs.rss_inverse_kinematics import (
     joint_angles,
     joint_jacobian,
     leg_to,
-    leg_vectors,
+    legs_at,
     loop_closure,
     platform_arms,
     pose_jacobian,
@@ -48,7 +48,7 @@ def rigid_body_regressor(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twis
     """Columns of Gamma (6, 52) for the inertial parameters of platform, cranks and links (eq. 25)."""
     gravity = ca.DM(geometry.gravity)
     cranks, links = [], []
-    for leg, arm in zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True):
+    for leg, arm in legs_at(geometry, pose):
         forces = leg_columns(leg, leg_motion(leg, *joint_motion(arm, twist, twist_dot)), gravity)
         wrenches = ca.vertcat(forces, ca.skew(arm) @ forces)
         cranks.append(wrenches[:, 0:4])
@@ -77,7 +77,7 @@ def inertial_wrench(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twist_dot
     """M twist_dot + C twist + G (6,) for the 52 inertial parameters `rigid`: the regressor times them, without it."""
     gravity = ca.DM(geometry.gravity)
     total = platform_columns(pose, twist, twist_dot, gravity) @ rigid[0:4]
-    for index, (leg, arm) in enumerate(zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True)):
+    for index, (leg, arm) in enumerate(legs_at(geometry, pose)):
         motion = leg_motion(leg, *joint_motion(arm, twist, twist_dot))
         force = leg_force(leg, motion, *leg_parameters(rigid, index), gravity)
         total += ca.vertcat(force, ca.cross(arm, force))
@@ -87,7 +87,7 @@ def inertial_wrench(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twist_dot
 def mass_matrix(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
     """M (6, 6) of eq. 23, symmetric positive definite for positive parameters."""
     total = platform_mass(pose, rigid[0:4])
-    for index, (leg, arm) in enumerate(zip(leg_vectors(geometry, pose), platform_arms(geometry, pose), strict=True)):
+    for index, (leg, arm) in enumerate(legs_at(geometry, pose)):
         at_joint = leg_mass(leg, *leg_parameters(rigid, index))
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
         total += to_joint.T @ at_joint @ to_joint

@@ -27,7 +27,7 @@ from cmmsim.pose_estimation.observation import GRAZING
 from cmmsim.visibility import EDGE_PX, SightLines, sight_lines
 from dynamics import Robot
 from dynamics.kinematics.platform import rotation_matrix
-from dynamics.legs.rss_kinematics import joint_angles, pose_jacobian, singularity_measures
+from dynamics.legs.rss_inverse_kinematics import joint_angles, pose_jacobian, singularity_measures
 from dynamics.workspace import LEAST_LEVERAGE, MOST_CONDITION
 from identify.arrays import Array
 from identify.errors import TrajectoryError

@@ -19,7 +19,7 @@ from scipy.linalg import null_space
 
 from dynamics import Robot
 from dynamics.kinematics.platform import pose_rate_to_twist, twist_bias
-from dynamics.legs.rss_kinematics import joint_jacobian
+from dynamics.legs.rss_inverse_kinematics import joint_jacobian
 from dynamics.rigid_body.virtual_work import rigid_body_regressor
 from identify.arrays import Array
 from identify.scenario import Excitation

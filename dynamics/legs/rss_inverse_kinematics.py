@@ -34,10 +34,10 @@ def platform_arms(geometry: Rss6Geometry, pose: ca.SX) -> list[ca.SX]:
     return [rotation @ geometry.platform_joints[leg] for leg in range(LEGS)]
 
 
-def leg_vectors(geometry: Rss6Geometry, pose: ca.SX) -> list[LegVectors]:
-    """The six legs at a pose (6,). Where a leg cannot reach, its entries are NaN (see `reach_margin`)."""
+def legs_at(geometry: Rss6Geometry, pose: ca.SX) -> list[tuple[LegVectors, ca.SX]]:
+    """The six legs at a pose (6,), and the vectors a to their joints. Entries of a leg that cannot reach are NaN."""
     arms = platform_arms(geometry, pose)
-    return [leg_to(geometry, leg, pose[0:3] + arm) for leg, arm in enumerate(arms)]
+    return [(leg_to(geometry, leg, pose[0:3] + arm), arm) for leg, arm in enumerate(arms)]
 
 
 def leg_to(geometry: Rss6Geometry, leg: int, joint_position: ca.SX) -> LegVectors:
@@ -59,7 +59,7 @@ def leg_to(geometry: Rss6Geometry, leg: int, joint_position: ca.SX) -> LegVector
 
 def joint_angles(geometry: Rss6Geometry, pose: ca.SX) -> ca.SX:
     """Crank angles (6,), rad, at a pose (6,)."""
-    return ca.vertcat(*[leg.angle for leg in leg_vectors(geometry, pose)])
+    return ca.vertcat(*[leg.angle for leg, _ in legs_at(geometry, pose)])
 
 
 def crank_leverage(leg: LegVectors) -> ca.SX:
@@ -74,9 +74,9 @@ def angle_gradient(leg: LegVectors) -> ca.SX:
 
 def loop_jacobians(geometry: Rss6Geometry, pose: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Diagonal of J_a1 (6,), m^2, and J_a2 (6, 6), rows [l^T, (a x l)^T], m and m^2 (eq. 7)."""
-    legs, arms = leg_vectors(geometry, pose), platform_arms(geometry, pose)
-    rows = [ca.horzcat(leg.link.T, ca.cross(arm, leg.link).T) for leg, arm in zip(legs, arms, strict=True)]
-    return ca.vertcat(*[crank_leverage(leg) for leg in legs]), ca.vertcat(*rows)
+    legs = legs_at(geometry, pose)
+    rows = [ca.horzcat(leg.link.T, ca.cross(arm, leg.link).T) for leg, arm in legs]
+    return ca.vertcat(*[crank_leverage(leg) for leg, _ in legs]), ca.vertcat(*rows)
 
 
 def joint_jacobian(geometry: Rss6Geometry, pose: ca.SX) -> ca.SX:
@@ -142,7 +142,7 @@ def home_angles(geometry: Rss6Geometry) -> np.ndarray:
                 f"leg {leg + 1} cannot reach the home pose: reach margin "
                 f"{1 - chord**2 / max(along**2 + across**2, 1e-300):.3g}, must be > 0"
             )
-    return np.array([float(leg.angle) for leg in leg_vectors(geometry, ca.SX(geometry.home_pose))])
+    return np.array([float(leg.angle) for leg, _ in legs_at(geometry, ca.SX(geometry.home_pose))])
 
 
 def _home_chord(geometry: Rss6Geometry, leg: int) -> tuple[float, float, float]:
