@@ -110,16 +110,8 @@ def test_latency_needs_a_motion():
 
 def test_published_figures_have_units_and_quantities():
     assert {figure.unit for figure in PUBLISHED} == {"mm", "deg", "ms"}
-    assert {f.instrument: f.value for f in published("position, static")} == {
-        "Creaform C-Track 780": 0.05,
-        "NDI Polaris Vega": 0.045,
-        "Vicon": 0.15,
-        "NIST, 12 cameras": 0.02,
-    }
     assert {f.instrument: f.value for f in published("position, moving")} == {
         "Creaform C-Track 780": 0.2,
         "NIST, 12 cameras": 0.2,
     }
-    assert [f.value for f in published("latency")] == [14.2]
-    assert [(f.instrument, f.value) for f in published("orientation, moving")] == [("Creaform C-Track 780", 0.1)]
     assert published("weight") == ()

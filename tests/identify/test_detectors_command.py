@@ -70,10 +70,3 @@ def test_bad_conditions_are_refused_before_anything_is_written(options, message,
         raise result.exception
     assert is_known(result.exception)
     assert not (tmp_path / "out").exists()
-
-
-def test_folder_in_use_is_refused(tmp_path):
-    (tmp_path / "mine").write_text("")
-    result = CliRunner().invoke(app, ["detectors", "--quiet", "--out", str(tmp_path)])
-    assert is_known(result.exception)
-    assert "not empty" in str(result.exception)

@@ -14,7 +14,7 @@ from identify.files.run_folder import load_result, save_result
 from identify.loop_parameters import choose_parameters
 from identify.trajectory import check_travel
 from identify.verification.against_mujoco import EngineRuns, compare_engines, exciting_trajectory, figure_8, judge
-from tests.identify.commands import command
+from tests.identify.commands import command, one_line
 
 
 @pytest.fixture(scope="module")
@@ -131,14 +131,11 @@ def test_command_verifies_the_reference_robot(monkeypatch, capfd, tmp_path):
 
 
 def test_command_fails_in_one_line_where_a_goal_is_missed(made_runs, monkeypatch, capfd, tmp_path):
-    from identify.verification import against_mujoco as model_verification
-
     off = replace(made_runs, mujoco_pose=made_runs.mujoco_pose + 1e-4)
-    monkeypatch.setattr(model_verification, "verify", lambda *_: off)
+    monkeypatch.setattr("identify.verification.against_mujoco.verify", lambda *_: off)
     assert command("verify-model", "--out", tmp_path / "new", "--quiet") == 1
-    said = capfd.readouterr().err
-    assert said.startswith("error: model and MuJoCo differ by 174 um and 171 urad, more than 10 um and 20 urad")
-    assert said.count("\n") == 1
+    said = one_line(capfd.readouterr().err)
+    assert "model and MuJoCo differ by 174 um and 171 urad, more than 10 um and 20 urad" in said
     assert json.loads((tmp_path / "new" / "verification.json").read_text())["met"] is False
 
 
@@ -157,17 +154,8 @@ def test_what_cannot_be_done_is_one_line_and_leaves_nothing(monkeypatch, capfd, 
     monkeypatch.setitem(sys.modules, "mujoco", None)
     monkeypatch.chdir(tmp_path)
     assert command(*arguments, "--quiet") == 1
-    said = capfd.readouterr().err
-    assert said.startswith("error: ")
-    assert said.count("\n") == 1
-    assert evidence in said
+    assert evidence in one_line(capfd.readouterr().err)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_verification_does_not_write_into_a_folder_that_holds_something(capfd, tmp_path):
-    (tmp_path / "mine").touch()
-    assert command("verify-model", "--out", tmp_path) == 1
-    assert "is not empty" in capfd.readouterr().err
 
 
 def test_export_writes_the_estimates_of_a_run_and_says_what_it_changed(robot, capfd, tmp_path):
@@ -226,9 +214,7 @@ def test_result_without_estimates_is_refused(robot, tmp_path, result, evidence):
     [
         (True, "estimate of crank2.mass is true, must be a finite number"),
         ("0.1", 'estimate of crank2.mass is "0.1", must be a finite number'),
-        ([0.1], r"estimate of crank2.mass is \[0.1\], must be"),
         (float("nan"), "estimate of crank2.mass is NaN, must be"),
-        (float("inf"), "estimate of crank2.mass is Infinity, must be"),
         (10**400, "estimate of crank2.mass is 10000"),
         (-0.1, r"crank2.mass = -0.1 kg is not allowed, must be finite and >= 0"),
     ],
@@ -242,8 +228,9 @@ def test_estimate_that_is_no_number_in_its_range_is_refused(robot, tmp_path, val
     assert len(str(caught.value)) < 200 + len(str(tmp_path))
 
 
-@pytest.mark.parametrize("command_name", ["verify-model", "workspace"])
-@pytest.mark.parametrize("folder", ["/proc/impossible", "/dev/null/impossible", "file/impossible"])
+@pytest.mark.parametrize(
+    ("command_name", "folder"), [("verify-model", "/proc/impossible"), ("workspace", "file/impossible")]
+)
 def test_folder_that_cannot_be_made_is_refused_before_anything_is_computed(
     monkeypatch, capfd, tmp_path, command_name, folder
 ):
@@ -255,8 +242,5 @@ def test_folder_that_cannot_be_made_is_refused_before_anything_is_computed(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     assert command(command_name, "--out", folder) == 1
-    said = capfd.readouterr().err
-    assert said.startswith("error: ")
-    assert "cannot be made" in said
-    assert said.count("\n") == 1
+    assert "cannot be made" in one_line(capfd.readouterr().err)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
