@@ -30,7 +30,7 @@ PARAMETER_NAMES = (
 )
 TABLES = ("rig.left", "rig.right", "rig.right_from_left")
 HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(#.*)?$")
-BASIS = re.compile(r"^\s*based_on\s*=.*$")
+BASIS = re.compile(r"^[ \t]*based_on[ \t]*=.*$", re.MULTILINE)
 LARGEST_RATIO = 1.5  # of the baselines of calibration and sensor file, one over the other
 
 
@@ -100,15 +100,15 @@ def rig_tables(found: Calibration) -> str:
     for side, values in zip(SIDES, state.intrinsics, strict=True):
         lines += [
             f"[rig.{side}]",
-            f"focal_px = {_row(values[:2])}",
-            f"centre_px = {_row(values[2:4])}",
-            f"distortion = {_row(values[4:])}  # k1, k2, p1, p2, k3",
+            f"focal_px = {values[:2].tolist()}",
+            f"centre_px = {values[2:4].tolist()}",
+            f"distortion = {values[4:].tolist()}  # k1, k2, p1, p2, k3",
             "",
         ]
     lines += [
         "[rig.right_from_left]",
-        f"translation = {_row(found.rig.right_from_left[:3, 3])}  # m",
-        f"rotation_vector = {_row(found.rotation_vector)}  # rad",
+        f"translation = {found.rig.right_from_left[:3, 3].tolist()}  # m",
+        f"rotation_vector = {found.rotation_vector.tolist()}  # rad",
     ]
     return "\n".join(lines) + "\n"
 
@@ -142,10 +142,6 @@ def as_dict(found: Calibration) -> dict[str, Any]:
         "rejected": found.rejected,
         "warnings": found.warnings,
     }
-
-
-def _row(values: Sequence[float] | np.ndarray) -> str:
-    return "[" + ", ".join(repr(float(value)) for value in values) + "]"
 
 
 @dataclass(frozen=True)
@@ -211,12 +207,11 @@ def _based_from(text: str, name: str | Path, folder: Path) -> str:
     if basis is None or basis in built_in_names() or Path(basis).is_absolute():
         return text
     from_folder = os.path.relpath((Path(name).parent / basis).resolve(), folder.resolve())
-    lines = text.splitlines()
-    place = next((k for k, line in enumerate(lines) if BASIS.match(line)), None)
-    if place is None:
+    entry = f"based_on = {json.dumps(from_folder, ensure_ascii=False)}"
+    text, count = BASIS.subn(lambda _: entry, text, count=1)
+    if not count:
         raise CalibrationError(f"sensor file {name}: write based_on = {json.dumps(basis)} on a line of its own")
-    lines[place] = f"based_on = {json.dumps(from_folder, ensure_ascii=False)}"
-    return "\n".join(lines) + "\n"
+    return text
 
 
 def _without_tables(text: str, names: Sequence[str]) -> str:

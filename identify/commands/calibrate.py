@@ -83,8 +83,7 @@ def calibrate(
         ),
     ] = None,
     render: Annotated[
-        int | None,
-        typer.Option("--render", min=1, help="Render this many pairs of pictures instead, and stop."),
+        int | None, typer.Option("--render", min=1, help="Render this many pairs of pictures instead, and stop.")
     ] = None,
     seed: Annotated[
         int | None,
@@ -98,7 +97,7 @@ def calibrate(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary; warnings stay.")] = False,
 ) -> None:
     """Calibrate a stereo camera from pictures of a board, or render such pictures."""
-    from cmmsim.calibration import read_board, sensor_template
+    from cmmsim.calibration import CalibrationOptions, read_board, sensor_template
 
     folder = new_run_folder(out).path
     progress = terminal_progress(quiet)
@@ -115,7 +114,8 @@ def calibrate(
     if left is None or right is None or board is None:
         missing = ["LEFT"] * (left is None) + ["RIGHT"] * (right is None) + ["--board FILE"] * (board is None)
         raise ScenarioError(f"missing {', '.join(missing)}; cmmsim calibrate --help shows examples")
-    options = _options(distortion=distortion, fix_aspect=fix_aspect, min_images=min_images)
+    given: dict[str, Any] = {"distortion": distortion, "min_images": min_images}
+    options = CalibrationOptions(fix_aspect=fix_aspect, **{k: v for k, v in given.items() if v is not None})
     template = None if sensor is None else sensor_template(sensor, folder)
     found = _calibrate(left, right, read_board(board), options, template, progress)
     refused = _write(folder, found, template)
@@ -128,13 +128,6 @@ def _require_none(reason: str, **given: object) -> None:
     """Raise ScenarioError naming the arguments that are given although they would change nothing."""
     if names := [name for name, value in given.items() if value is not None]:
         raise ScenarioError(f"{reason}: leave out {' and '.join(names)}")
-
-
-def _options(**given: Any) -> "CalibrationOptions":
-    """Options as given, the others (None) as they are without."""
-    from cmmsim.calibration import CalibrationOptions
-
-    return CalibrationOptions(**{name: value for name, value in given.items() if value is not None})
 
 
 def _calibrate(

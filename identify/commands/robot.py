@@ -176,12 +176,11 @@ def _changes(robot: "Robot", parameters: "Array") -> list[str]:
     if not inertias.changes:
         return []
     effects = acceleration_changes(robot, parameters, inertias.values)
-    said = {body: f"{change}; {_effect(effects[body])}" for body, change in inertias.changes.items()}
+    said = {}
+    for body, change in inertias.changes.items():
+        felt = f"accelerations differ by up to {100 * effects[body]:.2g} %"
+        said[body] = f"{change}; {felt if effects[body] > 1e-9 else 'the motion does not feel it'}"
     return [f"changed {line}" for line in grouped(said)]
-
-
-def _effect(change: float) -> str:
-    return f"accelerations differ by up to {100 * change:.2g} %" if change > 1e-9 else "the motion does not feel it"
 
 
 def verify_model(

@@ -33,8 +33,7 @@ def acceptance(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of all sensor noise.")] = 0,
     renderer: Annotated[
-        str | None,
-        typer.Option(help="pyrender, analytic or auto.", show_default="what the sensor file says"),
+        str | None, typer.Option(help="pyrender, analytic or auto.", show_default="what the sensor file says")
     ] = None,
     standard: Annotated[str, typer.Option(help="vdi (lengths), e3064 (moving bar), e3124 (latency) or all.")] = "all",
     volume: Annotated[
@@ -125,8 +124,7 @@ def detectors(
         list[float] | None, typer.Option(help="Tilt of the disc, degrees; repeatable.", show_default="0, 30, 60")
     ] = None,
     psf: Annotated[
-        list[float] | None,
-        typer.Option(help="Sigma of the point spread, px; repeatable.", show_default="the sensor's"),
+        list[float] | None, typer.Option(help="Sigma of the point spread, px; repeatable.", show_default="the sensor's")
     ] = None,
     draws: Annotated[int, typer.Option(min=2, help="Discs drawn for each row of the table.")] = 400,
     seed: Annotated[int, typer.Option(min=0, help="Seed of places, directions and noise.")] = 0,

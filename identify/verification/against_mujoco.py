@@ -96,7 +96,12 @@ def compare_engines(
         trajectory = exciting_trajectory(robot)
         reference = closed_loop.Reference(trajectory.pose(time), trajectory.pose_rate(time))
         commands = robot.inverse_kinematics(reference.poses)
-        model = _run_model(robot, model_parameters, reference, commands)
+        settings = closed_loop.LoopSettings(  # driven by commands that ramp from one to the next
+            closed_loop.ServoGains(0.0, 0.0, 0.0),
+            closed_loop.FrameTiming(COMMAND_RATE_HZ, hold="linear"),
+            steps_per_frame=STEPS_PER_COMMAND,
+        )
+        model = closed_loop.simulate(robot, model_parameters, reference, settings, commands=commands)
         advance()
     # Table 1's inertias break the triangle inequality in ways that the motion does not feel
     mjcf = mjcf_text(robot, mujoco_parameters[:64], allow_unphysical_inertia=True, solver=solver)
@@ -125,18 +130,6 @@ def exciting_trajectory(robot: Robot) -> FourierTrajectory:
             continue
         return candidate
     raise TrajectoryError(f"none of {ATTEMPTS} exciting trajectories stays inside the travel; the last: {reason}")
-
-
-def _run_model(
-    robot: Robot, parameters: Array, reference: closed_loop.Reference, commands: Array
-) -> closed_loop.ClosedLoopRun:
-    """This model, driven by commands that ramp from one to the next."""
-    settings = closed_loop.LoopSettings(
-        closed_loop.ServoGains(0.0, 0.0, 0.0),
-        closed_loop.FrameTiming(COMMAND_RATE_HZ, hold="linear"),
-        steps_per_frame=STEPS_PER_COMMAND,
-    )
-    return closed_loop.simulate(robot, parameters, reference, settings, commands=commands)
 
 
 def _mujoco_rows(

@@ -9,7 +9,7 @@ from cmmsim.calibration import Board, CalibrationError, PairView, calibrate, fin
 from cmmsim.calibration.detection import covered_radius
 from cmmsim.geometry.camera import Optics
 from tests.cmmsim.test_calibration_adjustment import BOARD, SHIFT, SIZE, board_poses, seen_pairs
-from tests.cmmsim.test_calibration_images import ASYMMETRIC, BENT, DOTS, PERFECT, rendered, views_of
+from tests.cmmsim.test_calibration_images import ASYMMETRIC, BENT, DOTS, PERFECT, rendered
 
 
 @pytest.fixture(scope="module")
@@ -109,11 +109,3 @@ def test_wrong_radius_is_warned_of_with_both(pairs):
     for measured, warned in ((0.0095, True), (0.0132, False)):
         seen = [PairView(p.name, *(replace(v, radius=measured) for v in p.sides)) for p in pairs]
         assert bool(lines_with(f"radius 0.014 m, in the pictures they measure {measured:g} m", board, seen)) == warned
-
-
-def test_wrong_radius_of_rendered_dots_is_warned_of():
-    _, frames = rendered(PERFECT, DOTS, 6, seed=3)
-    board = DOTS.model_copy(update={"radius": 0.0175})
-    (line,) = [line for line in calibrate(board, views_of(frames, board), (800, 600)).warnings if "radius" in line]
-    assert "radius 0.0175 m" in line
-    assert float(line.split("they measure ")[1].split()[0]) == pytest.approx(DOTS.radius, rel=0.01)

@@ -235,7 +235,7 @@ def test_eccentricity_correction_removes_the_bias_of_large_dots():
     assert off.adjustment.sigma_px > 1.1 * on.adjustment.sigma_px
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_large_rendered_dots_are_unbiased_with_the_correction_only():
     board = Board(kind="dots", columns=7, rows=6, spacing=0.08, radius=0.031)
     views = views_of(rendered(PERFECT, board, 14, seed=6)[1], board)

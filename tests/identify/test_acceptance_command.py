@@ -59,10 +59,7 @@ def test_help_teaches(capsys):
 
 @pytest.fixture(
     scope="module",
-    params=[
-        pytest.param(0.5, marks=pytest.mark.slow),
-        pytest.param(SECONDS, marks=pytest.mark.thorough),
-    ],
+    params=[pytest.param(0.5, marks=pytest.mark.slow), pytest.param(SECONDS, marks=pytest.mark.thorough)],
 )
 def accepted(request, tmp_path_factory):
     """Exit status and folder of all tests with a limit that no sensor keeps; the bar moves for so many seconds."""
