@@ -179,9 +179,9 @@ def test_ctrl_c_in_a_row_stops_the_study_and_is_no_error_of_the_row(tmp_path):
 @pytest.mark.parametrize("name", ["row", "seconds", DARK])
 def test_a_figure_that_would_hide_a_column_is_an_error_of_the_row(tmp_path, name):
     frame = run(tmp_path, study(options={"also": name}, repeats=1)).frame
-    words = f"ValueError: a figure must not be called {name!r}: the table has a column of this name"
-    assert set(frame["error"]) == {words}
-    assert frame["row"].tolist() == list(range(6))
+    assert set(frame["error"]) == {
+        f"ValueError: a figure must not be called {name!r}: the table has a column of this name"
+    }
 
 
 def test_factors_that_contradict_each_other_in_one_row_are_an_error_of_this_row(tmp_path):
@@ -306,18 +306,6 @@ def test_workers_as_here_or_that_died_meanwhile_are_no_news():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_workers({"tcp://a:1": versions(), "tcp://b:1": versions(), "tcp://c:1": OSError("closed")})
-
-
-@pytest.mark.parametrize(
-    ("there", "evidence"),
-    [
-        (versions() | {"cmmsim": "9.8.7"}, f"worker tcp://b:1 has cmmsim 9.8.7, here is {versions()['cmmsim']}"),
-        (versions() | {"cmmsim": "not installed"}, "worker tcp://b:1 has cmmsim not installed, here is"),
-        (Exception("ImportError('none\\nhere')\n"), "worker tcp://b:1 cannot run cmmsim"),
-    ],
-)
-def test_another_product_is_refused_in_one_line(there, evidence):
-    assert evidence in refusal(check_workers, {"tcp://a:1": versions() | {"numpy": "0.1"}, "tcp://b:1": there})
 
 
 def test_one_warning_names_each_version_once_with_how_many_workers_have_it():
