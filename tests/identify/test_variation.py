@@ -107,10 +107,10 @@ def test_a_folder_without_runs_is_refused(tmp_path, capsys):
     assert not (tmp_path / "variation.json").exists()
 
 
-def designed(folder, count, *settings):
+def designed(folder, count, scenario, *settings):
     """Entry of `variation.json` of runs with images, each on an exciting trajectory of its own."""
     words = [word for setting in settings for word in ("--set", setting)]
-    assert command("excite", "paper", "--out", folder, "--quiet", "--set", "renderer=analytic", *words) == 0
+    assert command("excite", scenario, "--out", folder, "--quiet", "--set", "renderer=analytic", *words) == 0
     assert command("variation", "--out", folder, "--designed", count, "--quiet") == 0
     records = recording.read_runs(folder / "variation.nc")
     paths = [recording.poses(record, "reference") for record in records]
@@ -121,9 +121,7 @@ def designed(folder, count, *settings):
 
 @pytest.mark.slow
 def test_runs_are_designed_and_recorded_one_by_one_where_asked(tmp_path):
-    entry = designed(
-        tmp_path / "run", 3, "excitation.method=random", "excitation.candidates=2", "excitation.duration_s=3"
-    )
+    entry = designed(tmp_path / "run", 3, "quick", "excitation.candidates=2", "excitation.duration_s=6")
     assert (entry["runs"], entry["trajectories"]) == (3, "designed: random")
     assert entry["worst"]["variation_percent"] > 0
 
@@ -135,7 +133,7 @@ def test_every_identified_parameter_varies_by_5_percent_at_most(tmp_path):
     Their own intervals let expect no more, and they vary no more than these say, but for one chance in a thousand.
     """
     runs = 10
-    entry = designed(tmp_path / "run", runs, "excitation.fundamental_hz=0.3")
+    entry = designed(tmp_path / "run", runs, "paper", "excitation.fundamental_hz=0.3")
     assert (entry["runs"], entry["trajectories"]) == (runs, "designed: gradient")
     found = {name: seen for name, seen in entry["parameters"].items() if seen["identified_in_every_run"]}
     assert set(found) == IDENTIFIED
