@@ -40,7 +40,7 @@ def drawn_guess(rng):
 
 @pytest.fixture(scope="module")
 def ensemble():
-    """Record and result of eight experiments that differ by noise, weighing and starting guess; the last loses frames."""
+    """Record and result of eight experiments that differ by noise, weighing and guess; the last loses frames."""
     found = []
     for seed in range(8):
         rng = np.random.default_rng([seed, 1])
