@@ -107,11 +107,11 @@ def test_a_folder_without_runs_is_refused(tmp_path, capsys):
     assert not (tmp_path / "variation.json").exists()
 
 
-def designed(folder, count, scenario, *settings):
+def designed(folder, count, scenario, *settings, workers=2):
     """Entry of `variation.json` of runs with images, each on an exciting trajectory of its own."""
     words = [word for setting in settings for word in ("--set", setting)]
     assert command("excite", scenario, "--out", folder, "--quiet", "--set", "renderer=analytic", *words) == 0
-    assert command("variation", "--out", folder, "--designed", count, "--quiet") == 0
+    assert command("variation", "--out", folder, "--designed", count, "--workers", workers, "--quiet") == 0
     records = recording.read_runs(folder / "variation.nc")
     paths = [recording.poses(record, "reference") for record in records]
     assert len(paths) == count
@@ -121,7 +121,7 @@ def designed(folder, count, scenario, *settings):
 
 @pytest.mark.slow
 def test_runs_are_designed_and_recorded_one_by_one_where_asked(tmp_path):
-    entry = designed(tmp_path / "run", 3, "quick", "excitation.candidates=2", "excitation.duration_s=6")
+    entry = designed(tmp_path / "run", 3, "quick", "excitation.candidates=2", "excitation.duration_s=6", workers=1)
     assert (entry["runs"], entry["trajectories"]) == (3, "designed: random")
     assert entry["worst"]["variation_percent"] > 0
 
