@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -26,14 +27,17 @@ class KeptResults:
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Add the time of each phase of a test; keep the first outcome that is no success, and the last figures."""
-        entry = self._found.setdefault(report.nodeid, {"outcome": "passed", "seconds": 0.0, "figures": {}})
+        test = re.sub(r"@\w+$", "", report.nodeid)  # the group of --dist loadgroup
+        entry = self._found.setdefault(test, {"outcome": "passed", "seconds": 0.0, "figures": {}})
         entry["seconds"] = round(entry["seconds"] + report.duration, 2)
         if report.outcome != "passed" and entry["outcome"] != "failed":
             entry["outcome"] = report.outcome
         entry["figures"] = dict(map(_figure, report.user_properties))
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        """Write the file, whole or not at all."""
+        """Write the file, whole or not at all, where tests were run."""
+        if not self._found:
+            return
         from identify.files.versions import versions
 
         kept = json.loads(self._path.read_text(encoding="utf-8"))["tests"] if self._path.exists() else {}

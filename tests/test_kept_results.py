@@ -9,6 +9,7 @@ pytest_plugins = "pytester"
 TESTS = """
 import pytest
 
+@pytest.mark.xdist_group("one")
 def test_proof(record_property, accuracy):
     record_property("held", 0.949123)
     accuracy.record("bias", 0.25, unit="um")
@@ -30,7 +31,7 @@ def test_each_test_of_a_session_replaces_its_entry_and_leaves_those_of_others(py
     kept.write_text(
         json.dumps({"tests": dict.fromkeys(("test_other.py::a", "gone.py::b", "test_mine.py::test_bad"), old)})
     )
-    pytester.runpytest_inprocess("-n", workers, "-p", "no:cacheprovider", "--keep-results", kept)
+    pytester.runpytest_inprocess("-n", workers, "--dist", "loadgroup", "-p", "no:cacheprovider", "--keep-results", kept)
     content = json.loads(kept.read_text())
     tests = content["tests"]
     assert {name: entry["outcome"] for name, entry in tests.items()} == {

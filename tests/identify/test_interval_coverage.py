@@ -5,7 +5,7 @@ from scipy.stats import binom
 
 from tests.identify.coverage_experiments import check_coverage, experiment_rows, quantities
 
-pytestmark = pytest.mark.thorough
+pytestmark = [pytest.mark.thorough, pytest.mark.xdist_group("coverage")]  # whose experiments are made once
 
 
 @pytest.fixture(scope="module")
