@@ -76,6 +76,7 @@ def test_rods_join_the_robots_joints():
         assert np.allclose(end, joint, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.rendering
 def test_the_measured_pose_is_the_true_one_to_the_sensors_accuracy(sensor):
     experiment = run_plant(build_plant(quick(**SHORT), rss6()), sensor, trajectory(3), 1.0, 0, 0)
@@ -87,6 +88,7 @@ def test_the_measured_pose_is_the_true_one_to_the_sensors_accuracy(sensor):
     assert np.all(rms > 1e-7), "a measurement without any error would be the truth itself"
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_record_and_another_does_not(sensor):
     plant = build_plant(quick(**SHORT), rss6())
     records = [run_plant(plant, sensor, trajectory(3), 0.1, seed, 0).record for seed in (4, 4, 5)]

@@ -103,6 +103,7 @@ OTHERS = [
 ]
 
 
+@pytest.mark.slow
 def test_a_report_takes_the_results_own_files_and_refuses_others(run_folder):
     bare = load_result(run_folder.result)
     made_of = RunFiles(run_folder).digests(*READ_BY_REPORT)
