@@ -118,6 +118,7 @@ def test_tables_stand_beside_the_published_figures(accepted):
     assert "What is not:" in text
 
 
+@pytest.mark.slow
 def test_one_test_alone_is_summarised_and_writes_only_its_own(tmp_path, capsys):
     out = tmp_path / "out"
     assert command("acceptance", "--standard", "e3124", "--renderer", "analytic", "--out", out) == 0
