@@ -23,64 +23,106 @@ Faults of images
 
 Every error that a user can cause is a CmmError, but for OpenGLMissingError. Rooms of their own: `cmmsim.calibration`
 and `cmmsim.acceptance`; detectors and renderers of a user's own: `cmmsim.plugins`. Everything else is private.
+Names are imported on first use: the command `cmmsim` begins in this package and must not wait for OpenCV and OpenGL.
 """
 
-from cmmsim.errors import (
-    CmmError,
-    LostError,
-    OpenGLMissingError,
-    SensorFileError,
-    ShapeError,
-    TeachingError,
-    UnknownBodyError,
-    UnknownOptionError,
-    UnknownSensorError,
-)
-from cmmsim.fault_images import Fault, FaultyImages
-from cmmsim.faults import FaultGenerator, fault_bodies
-from cmmsim.files.sensor_file import built_in_names
-from cmmsim.geometry.camera import PinholeCamera
-from cmmsim.geometry.pose import pose_to_transform, transform_to_pose
-from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.imaging.pyrender_renderer import require_opengl
-from cmmsim.imaging.scene import rod, rod_transform
-from cmmsim.pose_estimation.estimator import Measurement, PoseEstimator, measure_frame
-from cmmsim.pose_estimation.taught import Taught
-from cmmsim.radiometry.images import StereoFrame
-from cmmsim.sensor import Sensor, load_sensor
-from cmmsim.tracker import Tracker
-from cmmsim_command import warn_of_foreign_identify
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-warn_of_foreign_identify()
+from cmmsim.__main__ import warn_of_foreign_identify
+from cmmsim.errors import (
+    CmmError as CmmError,
+)
+from cmmsim.errors import (
+    LostError as LostError,
+)
+from cmmsim.errors import (
+    OpenGLMissingError as OpenGLMissingError,
+)
+from cmmsim.errors import (
+    SensorFileError as SensorFileError,
+)
+from cmmsim.errors import (
+    ShapeError as ShapeError,
+)
+from cmmsim.errors import (
+    TeachingError as TeachingError,
+)
+from cmmsim.errors import (
+    UnknownBodyError as UnknownBodyError,
+)
+from cmmsim.errors import (
+    UnknownOptionError as UnknownOptionError,
+)
+from cmmsim.errors import (
+    UnknownSensorError as UnknownSensorError,
+)
+
+if TYPE_CHECKING:
+    from cmmsim.fault_images import Fault as Fault
+    from cmmsim.fault_images import FaultyImages as FaultyImages
+    from cmmsim.faults import FaultGenerator as FaultGenerator
+    from cmmsim.faults import fault_bodies as fault_bodies
+    from cmmsim.files.sensor_file import built_in_names as built_in_names
+    from cmmsim.geometry.camera import PinholeCamera as PinholeCamera
+    from cmmsim.geometry.pose import pose_to_transform as pose_to_transform
+    from cmmsim.geometry.pose import transform_to_pose as transform_to_pose
+    from cmmsim.geometry.stereo_rig import StereoRig as StereoRig
+    from cmmsim.imaging.pyrender_renderer import require_opengl as require_opengl
+    from cmmsim.imaging.scene import rod as rod
+    from cmmsim.imaging.scene import rod_transform as rod_transform
+    from cmmsim.pose_estimation.estimator import Measurement as Measurement
+    from cmmsim.pose_estimation.estimator import PoseEstimator as PoseEstimator
+    from cmmsim.pose_estimation.estimator import measure_frame as measure_frame
+    from cmmsim.pose_estimation.taught import Taught as Taught
+    from cmmsim.radiometry.images import StereoFrame as StereoFrame
+    from cmmsim.sensor import Sensor as Sensor
+    from cmmsim.sensor import load_sensor as load_sensor
+    from cmmsim.tracker import Tracker as Tracker
+
+_HOME = {
+    "load_sensor": "cmmsim.sensor",
+    "Sensor": "cmmsim.sensor",
+    "built_in_names": "cmmsim.files.sensor_file",
+    "Measurement": "cmmsim.pose_estimation.estimator",
+    "StereoFrame": "cmmsim.radiometry.images",
+    "Taught": "cmmsim.pose_estimation.taught",
+    "require_opengl": "cmmsim.imaging.pyrender_renderer",
+    "measure_frame": "cmmsim.pose_estimation.estimator",
+    "PoseEstimator": "cmmsim.pose_estimation.estimator",
+    "Tracker": "cmmsim.tracker",
+    "pose_to_transform": "cmmsim.geometry.pose",
+    "transform_to_pose": "cmmsim.geometry.pose",
+    "PinholeCamera": "cmmsim.geometry.camera",
+    "StereoRig": "cmmsim.geometry.stereo_rig",
+    "rod": "cmmsim.imaging.scene",
+    "rod_transform": "cmmsim.imaging.scene",
+    "FaultGenerator": "cmmsim.faults",
+    "Fault": "cmmsim.fault_images",
+    "FaultyImages": "cmmsim.fault_images",
+    "fault_bodies": "cmmsim.faults",
+}
 
 __all__ = [
     "CmmError",
-    "Fault",
-    "FaultGenerator",
-    "FaultyImages",
     "LostError",
-    "Measurement",
     "OpenGLMissingError",
-    "PinholeCamera",
-    "PoseEstimator",
-    "Sensor",
     "SensorFileError",
     "ShapeError",
-    "StereoFrame",
-    "StereoRig",
-    "Taught",
     "TeachingError",
-    "Tracker",
     "UnknownBodyError",
     "UnknownOptionError",
     "UnknownSensorError",
-    "built_in_names",
-    "fault_bodies",
-    "load_sensor",
-    "measure_frame",
-    "pose_to_transform",
-    "require_opengl",
-    "rod",
-    "rod_transform",
-    "transform_to_pose",
+    *_HOME,
 ]
+
+if not TYPE_CHECKING:  # a type checker would take every name for one that this knows
+
+    def __getattr__(name: str) -> Any:
+        if name not in _HOME:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it has {', '.join(__all__)}")
+        warn_of_foreign_identify()
+        return getattr(import_module(_HOME[name]), name)
+
+    def __dir__() -> list[str]:
+        return [*__all__, *(name for name in globals() if name.startswith("__"))]

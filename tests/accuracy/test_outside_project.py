@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("cmmsim", "dynamics", "identify")
-SOURCES = ("pyproject.toml", "README.md", "LICENSE", "cmmsim_command.py", *PACKAGES)
+SOURCES = ("pyproject.toml", "README.md", "LICENSE", *PACKAGES)
 GUIDE = Path(__file__).parent / "guide"
 FILES = sorted(GUIDE.glob("test_*.py"))
 TEXT = (GUIDE / "README.md").read_text(encoding="utf-8")
@@ -106,7 +106,7 @@ def test_the_guide_names_every_option_and_every_file_and_no_other(pytestconfig):
 def test_the_wheel_holds_every_file_of_the_packages(wheel):
     files = {p.relative_to(ROOT) for name in PACKAGES for p in (ROOT / name).rglob("*") if p.is_file()}
     wanted = {path.as_posix() for path in files if path.suffix not in (".pyc", ".nbc", ".nbi")}
-    assert wanted | {"cmmsim_command.py"} <= set(zipfile.ZipFile(wheel).namelist())
+    assert wanted <= set(zipfile.ZipFile(wheel).namelist())
 
 
 @pytest.mark.slow

@@ -1,11 +1,13 @@
 """The command `cmmsim` from its first line on, and a warning where another `identify` stands in the place of ours.
 
-A package on PyPI has the same name. This lies beside the three packages, because nothing in ours can be found then, and
-imports none of them, so that the command starts at once.
+A package on PyPI has the same name. Nothing of ours in `identify` can be found then, so that the command begins here,
+the one place of this package that knows of what stands on it.
 """
 
 import sys
 import warnings
+from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -23,11 +25,12 @@ def foreign_identify() -> str:
     return f"{where}; install cmmsim alone into a virtual environment of its own (a PyPI package has the same name)"
 
 
+@cache
 def warn_of_foreign_identify() -> None:
-    """Say so at the import of what will meet it."""
+    """Say so once, when the first name of this package is imported."""
     said = foreign_identify()
     if said:
-        warnings.warn(said, stacklevel=3)
+        warnings.warn(said, stacklevel=4)
 
 
 def main() -> None:
@@ -35,6 +38,8 @@ def main() -> None:
     said = foreign_identify()
     if said:
         sys.exit(f"error: {said}")
-    from identify.__main__ import main as command
+    import_module("identify.__main__").main()  # by name: nothing else in this package may lean on identify
 
-    command()
+
+if __name__ == "__main__":
+    main()
