@@ -47,7 +47,7 @@ class Scenario(Section):
     excitation: Excitation = Excitation()
     filter: Filter = Filter()
     identification: Identification = Identification()
-    payload: Payload = Payload()
+    payload: Payload = Field(default_factory=Payload)  # made late: its check is one of dynamics, which loads CasADi
     validation: Validation = Validation()
 
     @field_validator("renderer")

@@ -208,3 +208,9 @@ def test_command_starts_in_a_process_of_its_own():
 def test_help_teaches(capsys, arguments, shown):
     assert command(*arguments) == 0
     assert shown in capsys.readouterr().out
+
+
+def test_help_waits_for_nothing_heavy():
+    heavy = "casadi", "cv2", "matplotlib", "numba", "pandas", "scipy.optimize"
+    code = f"import identify.commands.app, sys; print(sorted(set({heavy}) & sys.modules.keys()))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
