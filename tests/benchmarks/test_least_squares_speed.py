@@ -1,4 +1,4 @@
-"""Speed of an identification: its solver beside scipy's with finite differences, and the times of all of it.
+"""Speed of an identification (its solver beside scipy's, and the times of all of it) and of the search for excitation.
 
 The record is of the `paper` scenario (20 s at 60 Hz), with drawn noise of the sensor's size instead of images. Both
 solvers get the same problem: residuals of the same compiled model, whitened alike, beside the same rows of starting
@@ -21,6 +21,8 @@ from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.bounds import parameter_bounds
 from identify.estimation.identification import output_error_problem
 from identify.estimation.warm_start import linear_warm_start
+from identify.excitation.comparison import compare_methods
+from identify.progress import SilentProgress
 from tests.benchmarks.timing import OtherLoad, judge
 from tests.identify.synthetic import rss6, run_plant
 
@@ -162,3 +164,15 @@ def test_times_of_an_identification_and_its_stages(record, scenario, record_prop
     record_property("whole_s", time.perf_counter() - began)
     for name, value in result.seconds.items():
         record_property(f"{name}_s", value)
+
+
+@pytest.mark.parametrize(("criterion", "generations"), [("observability", 324), ("information", 150)])
+def test_gradient_search_takes_less_time_than_the_evolutionary_one(scenario, criterion, generations):
+    """The paper's settings, and for its own criterion its number of generations; that it finds more is proved apart."""
+    overrides = {"excitation.criterion": criterion, "excitation.generations": generations}
+    with OtherLoad() as load:
+        _, evolutionary, gradient = compare_methods(
+            rss6(), scenario.with_overrides(overrides), 0, SilentProgress()
+        ).entries
+    figure = f"gradient search {gradient.seconds:.1f} s, evolutionary search {evolutionary.seconds:.1f} s"
+    judge(gradient.seconds < evolutionary.seconds, figure, load)

@@ -141,12 +141,11 @@ def test_interrupt_stops_the_search(seconds, monkeypatch):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("criterion", "generations"), [("observability", 324), ("information", 150)])
-def test_gradient_method_wins_in_value_and_time(criterion, generations):
+def test_gradient_method_wins_in_value(criterion, generations):
     """The paper's settings, and for its own criterion its number of generations, in one run."""
     overrides = {"excitation.criterion": criterion, "excitation.generations": generations}
     scenario = load_scenario("paper").with_overrides(overrides)
     random, evolutionary, gradient = compare_methods(rss6(), scenario, 0, SilentProgress()).entries
     assert gradient.value > 1.02 * evolutionary.value > 1.02 * random.value
-    assert gradient.seconds < evolutionary.seconds
     for entry in (evolutionary, gradient):
         MotionConstraints(rss6(), scenario).check(entry.trajectory, sample_times(0.1, 5, 10))
