@@ -20,7 +20,7 @@ from tests.benchmarks.timing import (
     second_core_gain,
     seconds,
 )
-from tests.dynamics.conftest import Loop
+from tests.dynamics.conftest import BOX, Loop, random_states
 
 pytestmark = pytest.mark.thorough
 FRAMES = 1200  # 20 s
@@ -102,8 +102,7 @@ def test_memory_does_not_grow_over_ten_thousand_runs(loop):
 
 def test_forward_kinematics_of_a_batch_against_single_poses(robot, record_property):
     """A batch shares the overhead of Python: at least five times faster a pose than one by one."""
-    box = np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])
-    angles = robot.inverse_kinematics(robot.home_pose + box * np.random.default_rng(0).uniform(-1, 1, (POSES, 6)))
+    angles = robot.inverse_kinematics(robot.home_pose + BOX * np.random.default_rng(0).uniform(-1, 1, (POSES, 6)))
     rounds = {
         "alone": lambda: [robot.forward_kinematics(one) for one in angles[:100]],
         "batch": lambda: robot.forward_kinematics(angles),
@@ -118,10 +117,8 @@ def test_forward_kinematics_of_a_batch_against_single_poses(robot, record_proper
 @pytest.fixture(scope="module")
 def states(robot):
     """Poses in the box, twists and torques, each a list of (6,)."""
-    rng = np.random.default_rng(9)
-    pose = robot.home_pose + np.array([0.01] * 3 + [0.04] * 3) * rng.uniform(-1, 1, (STATES, 6))
-    twist = np.array([0.1] * 3 + [0.5] * 3) * rng.standard_normal((STATES, 6))
-    return [tuple(rows) for rows in zip(pose, twist, 5 * rng.standard_normal((STATES, 6)), strict=True)]
+    drawn, torques = random_states(robot, STATES, 9), 5 * np.random.default_rng(9).standard_normal((STATES, 6))
+    return [tuple(rows) for rows in zip(drawn.pose, drawn.twist, torques, strict=True)]
 
 
 @pytest.fixture(scope="module")

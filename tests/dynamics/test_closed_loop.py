@@ -3,14 +3,15 @@
 import re
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from dynamics import closed_loop, compilation, fast_forward_dynamics, robot_file, simulate_batch
+from dynamics import closed_loop, compilation, robot_file, simulate_batch
 from dynamics import robot as robot_module
 from dynamics.errors import DynamicsError, SimulationError
-from tests.dynamics.conftest import base_from_platform
+from tests.dynamics.conftest import assert_same, base_from_platform
 
 PERIOD = 1 / 60
 TIMINGS = {
@@ -38,19 +39,6 @@ def _sensor(lost=(), bias=2e-5):
     return measure
 
 
-def _assert_same(compiled, plain, tolerance=1e-9):
-    assert compiled.events == plain.events
-    np.testing.assert_array_equal(compiled.measured_ok, plain.measured_ok)
-    for name in ("time", "pose", "pose_rate", "torque", "command", "measured"):
-        ours, other = getattr(compiled, name), getattr(plain, name)
-        np.testing.assert_allclose(ours, other, atol=tolerance * np.nanmax(np.abs(other)), rtol=0, err_msg=name)
-    if plain.pose_sensitivity is not None:
-        largest = np.abs(plain.pose_sensitivity).max(axis=(0, 1))
-        # Columns that are zero in exact arithmetic (inertias that do no work) hold rounding only.
-        miss = np.abs(compiled.pose_sensitivity - plain.pose_sensitivity).max(axis=(0, 1))
-        assert (miss <= tolerance * largest + 1e-14).all(), miss / largest
-
-
 @pytest.mark.parametrize(
     "friction", ["exact", *[pytest.param(f, marks=pytest.mark.slow) for f in ("smoothed", "stribeck")]]
 )
@@ -59,14 +47,19 @@ def test_compiled_run_equals_plain_run(loop, timing, friction):
     """C and NumPy, written apart, agree to 1e-9 in pose, rate, torque, command and all 67 sensitivities."""
     runs = loop.both(32, loop.settings(**TIMINGS[timing], **FRICTION[friction]), sensitivities=True)
     assert (runs[1].events > 3) == (friction != "smoothed")
-    _assert_same(*runs)
+    assert_same(*runs)
+
+
+def test_compiled_run_with_logged_commands_equals_plain_run(loop):
+    """With sensitivities: the servo's share is then absent."""
+    assert_same(*loop.both(24, commands=loop.run(24).command * 1.01, sensitivities=True))
 
 
 def test_both_paths_hold_the_last_command_where_the_sensor_loses_a_frame(robot, loop):
     """The first frame, single frames and two in a row."""
     lost = {0, 5, 9, 10}
     runs = loop.both(24, loop.settings(latency_s=0.4 * PERIOD), sensor=_sensor(lost))
-    _assert_same(*runs)
+    assert_same(*runs)
     run = runs[0]
     assert set(np.flatnonzero(~run.measured_ok)) == lost
     assert np.isnan(run.measured[sorted(lost)]).all()
@@ -91,30 +84,24 @@ def test_lost_frames_and_noise_of_the_ideal_sensor_are_a_sensor_that_has_them(lo
     assert np.abs(derived.pose_sensitivity[:, :, 52] - expected).max() < 1e-3 * np.abs(expected).max()
 
 
-def test_a_perfect_sensor_is_the_ideal_one_and_called_once_a_frame(loop):
-    calls = []
-
-    def sensor(frame, time, pose):
-        calls.append((frame, time))
-        return pose
-
-    np.testing.assert_array_equal(loop.run(30, sensor=sensor).pose, loop.run(30).pose)
-    assert calls == [(n, n * (1 / 60)) for n in range(30)]
-
-
 @paths
-def test_a_rate_sensor_gets_the_true_pose_and_its_rate(loop, compiled):
+def test_a_sensor_is_asked_once_a_frame_for_the_true_pose_and_a_rate_sensor_gets_its_rate_too(loop, compiled):
+    """A perfect one makes the run of the ideal one, bit by bit."""
     seen = []
 
-    def measure(frame, time, pose, rate):
-        seen.append((frame, time, pose, rate))
-        return pose
+    def measure(*true):
+        seen.append(true)
+        return true[2]
 
-    run = loop.run(24, sensor=closed_loop.RateSensor(measure), compiled=compiled)
-    columns = [np.array(column) for column in zip(*seen, strict=True)]
-    for column, expected in zip(columns, (np.arange(24), run.time, run.pose, run.pose_rate), strict=True):
-        np.testing.assert_array_equal(column, expected)
-    assert np.abs(columns[-1]).max() > 0.01
+    ideal = loop.run(24, compiled=compiled)
+    for sensor in (measure, closed_loop.RateSensor(measure)):
+        seen.clear()
+        run = loop.run(24, sensor=sensor, compiled=compiled)
+        records = (np.arange(24), np.arange(24) * (1 / 60), run.pose, run.pose_rate)
+        for column, expected in zip(zip(*seen, strict=True), records, strict=sensor is not measure):
+            np.testing.assert_array_equal(column, expected)
+        np.testing.assert_array_equal(run.pose, ideal.pose)
+    assert np.abs(run.pose_rate).max() > 0.01
 
 
 @paths
@@ -125,22 +112,11 @@ def test_logged_commands_drive_and_what_is_measured_beside_them_steers_nothing(l
     other = closed_loop.LoopSettings(closed_loop.ServoGains(9.0, 9.0, 9.0), plain.timing)
     options = {"commands": first.command, "compiled": compiled}
     np.testing.assert_array_equal(loop.run(20, other, **options).pose, first.pose)
-    lost = np.arange(20) == 2
-    sensed = loop.run(20, sensor=lambda frame, time, pose: pose + 0.1, **options)
-    masked = loop.run(20, lost=lost, **options)
-    for run in (sensed, masked):
-        np.testing.assert_array_equal(run.pose, first.pose)
-        np.testing.assert_array_equal(run.command, first.command)
-    np.testing.assert_array_equal(sensed.measured, first.pose + 0.1)
-    np.testing.assert_array_equal(masked.measured_ok, ~lost)
-
-
-def test_compiled_run_equals_plain_run_with_logged_commands(loop):
-    """With sensitivities: the servo's share is then absent."""
-    commands = loop.run(24).command * 1.01
-    runs = loop.both(24, commands=commands, sensitivities=True)
-    _assert_same(*runs)
-    np.testing.assert_array_equal(runs[0].command, commands)
+    sensed = loop.run(20, sensor=lambda frame, time, pose: None if frame == 2 else pose + 0.1, **options)
+    np.testing.assert_array_equal(sensed.pose, first.pose)
+    np.testing.assert_array_equal(sensed.command, first.command)
+    np.testing.assert_array_equal(np.delete(sensed.measured, 2, axis=0), np.delete(first.pose, 2, axis=0) + 0.1)
+    np.testing.assert_array_equal(sensed.measured_ok, np.arange(20) != 2)
 
 
 class PaperServo:
@@ -237,26 +213,15 @@ def test_an_unstable_loop_names_frame_time_and_the_leg_that_leaves_its_reach(rob
     assert _reach_margins(robot, loop.run(shorter, settings, unstable).pose[-1]).min() > 0
 
 
-class Unplugged(Exception):
-    """A stranger's error."""
-
-
 @paths
-@pytest.mark.parametrize("error", [Unplugged("cable"), KeyboardInterrupt()], ids=["exception", "interrupt"])
+@pytest.mark.parametrize("error", [ConnectionError("cable"), KeyboardInterrupt()], ids=["exception", "interrupt"])
 def test_errors_of_the_sensor_reach_the_caller_unchanged(loop, compiled, error):
     """The very exception object that the sensor raised comes out, and the sensor is not called again."""
-    calls = []
-
-    def sensor(frame, time, pose):
-        calls.append(frame)
-        if frame == 7:
-            raise error
-        return pose
-
+    sensor = Mock(side_effect=[*loop.reference(7).poses, error])
     with pytest.raises(type(error)) as caught:
         loop.run(20, sensor=sensor, compiled=compiled)
     assert caught.value is error
-    assert calls == list(range(8))
+    assert sensor.call_count == 8
 
 
 @paths
@@ -319,47 +284,39 @@ def test_a_batch_is_its_runs_in_order_for_any_number_of_workers(robot, loop):
         simulate_batch(robot, vectors, references, settings)
 
 
-def test_fast_forward_dynamics_is_the_robots(robot, identified, states):
-    fast = fast_forward_dynamics(robot, identified[:64])
-    for pose, twist, torque in zip(states.pose[:20], states.twist, states.twist_dot, strict=False):
-        np.testing.assert_array_equal(
-            fast(pose, twist, torque), robot.forward_dynamics(pose, twist, torque, identified[:64])
-        )
-
-
 def _forget():
     for cached in (compilation.find_compiler, compilation.can_compile, robot_module._functions):
         cached.cache_clear()
 
 
-@pytest.fixture
-def compiled_results(robot, loop, states):
-    """Accelerations and a run from the compiled path, taken before the compiler is taken away."""
-    return robot.forward_dynamics(states.pose, states.twist, states.twist_dot), loop.run(10, compiled=True)
-
-
 @pytest.fixture(params=["missing", "broken", "no folder"])
-def no_compiler(request, compiled_results, monkeypatch, tmp_path):
-    """A machine without a compiler; with one that has no headers; without a folder to write to."""
-    if request.param == "missing":
-        monkeypatch.setenv("CC", "none-existing")
-    if request.param == "broken":
-        script = tmp_path / "cc"
-        script.write_text("#!/bin/sh\necho 'fatal error: math.h: No such file' >&2\nexit 1\n")
-        script.chmod(0o755)
-        monkeypatch.setenv("CC", str(script))
-        monkeypatch.setenv("CMMSIM_CACHE", str(tmp_path / "cache"))
-    if request.param == "no folder":
-        (tmp_path / "file").touch()
-        monkeypatch.setenv("CMMSIM_CACHE", str(tmp_path / "file" / "cache"))
-    _forget()
-    yield {"missing": "no C compiler found", "broken": "math.h", "no folder": "CMMSIM_CACHE"}[request.param]
+def without_compiler(request, monkeypatch, tmp_path):
+    """A function that takes the compiler, its headers or the folder for its results away, and tells what is missed."""
+
+    def take_away():
+        if request.param == "missing":
+            monkeypatch.setenv("CC", "none-existing")
+        if request.param == "broken":
+            script = tmp_path / "cc"
+            script.write_text("#!/bin/sh\necho 'fatal error: math.h: No such file' >&2\nexit 1\n")
+            script.chmod(0o755)
+            monkeypatch.setenv("CC", str(script))
+            monkeypatch.setenv("CMMSIM_CACHE", str(tmp_path / "cache"))
+        if request.param == "no folder":
+            (tmp_path / "file").touch()
+            monkeypatch.setenv("CMMSIM_CACHE", str(tmp_path / "file" / "cache"))
+        _forget()
+        return {"missing": "no C compiler found", "broken": "math.h", "no folder": "CMMSIM_CACHE"}[request.param]
+
+    yield take_away
     _forget()
 
 
-def test_everything_works_without_a_compiler_after_one_warning(states, loop, compiled_results, no_compiler):
+def test_everything_works_without_a_compiler_after_one_warning(robot, states, loop, without_compiler):
     """Robot and loop fall back to CasADi's virtual machine with the same numbers, and say so in exactly one line."""
     reference, settings = loop.reference(10), loop.settings()
+    compiled = robot.forward_dynamics(states.pose, states.twist, states.twist_dot), loop.run(reference, compiled=True)
+    missed = without_compiler()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         fresh = robot_module.Robot(robot_file.read_robot_file("rss6"))
@@ -368,7 +325,7 @@ def test_everything_works_without_a_compiler_after_one_warning(states, loop, com
         with pytest.raises(SimulationError, match="compiled=True"):
             closed_loop.simulate(fresh, loop.parameters, reference, settings, compiled=True)
     assert [warning.category for warning in caught] == [compilation.CompilerWarning]
-    assert no_compiler in str(caught[0].message)
+    assert missed in str(caught[0].message)
     assert "\n" not in str(caught[0].message)
-    np.testing.assert_allclose(accelerations, compiled_results[0], rtol=1e-10, atol=1e-12)
-    _assert_same(compiled_results[1], runs[1])
+    np.testing.assert_allclose(accelerations, compiled[0], rtol=1e-10, atol=1e-12)
+    assert_same(compiled[1], runs[1])

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from dynamics.closed_loop.command_schedule import command_schedule
+from tests.dynamics.conftest import assert_same
 
 PERIOD = 1 / 60
 FRAMES = 24
 JITTERED = PERIOD * np.random.default_rng(3).uniform(0.0, 3.2, FRAMES)
-RECORDS = ("pose", "pose_rate", "torque", "command", "joint_integral", "servo_integral")
 
 
 def acting_command(t, latencies, usual, hold, commands, start):
@@ -79,11 +79,7 @@ def test_the_torque_is_that_of_the_command_which_acts(loop, robot, identified, h
     """Eq. 31 solved for the command at every frame of a run whose servo is in the loop; both paths agree as well."""
     settings, reference = loop.settings(latency_s=1.3 * PERIOD, hold=hold), loop.reference(FRAMES)
     runs = loop.both(reference, settings, latencies=JITTERED, sensitivities=True)
-    for name in RECORDS:
-        ours, other = (getattr(run, name) for run in runs)
-        np.testing.assert_allclose(ours, other, rtol=0, atol=1e-9 * np.abs(other).max(), err_msg=name)
-    ours, other = (run.pose_sensitivity for run in runs)
-    assert (np.abs(ours - other).max(axis=(0, 1)) <= 1e-9 * np.abs(other).max(axis=(0, 1)) + 1e-14).all()
+    assert_same(*runs)
     run, (lp, li, ld) = runs[0], identified[64:]
     start = run.start.commands[-1]
     arrival = np.maximum.accumulate(PERIOD * np.arange(FRAMES) + JITTERED)

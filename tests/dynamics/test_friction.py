@@ -11,6 +11,7 @@ from dynamics.closed_loop.motion import Command, State
 from dynamics.closed_loop.problem import LENGTH, FrictionLaw
 from dynamics.closed_loop.stick_slip import StickSlipMotion
 from dynamics.rigid_body import equation_of_motion as model
+from tests.dynamics.conftest import BOX
 
 MASS, STIFFNESS, COULOMB = 0.8, 20.0, 1.0
 FREQUENCY = np.sqrt(STIFFNESS / MASS)
@@ -63,22 +64,16 @@ def _oscillator(t, x0, k=STIFFNESS, fc=COULOMB, mass=MASS):
     return side * centre + (start - side * centre) * np.cos(t * np.sqrt(k / mass))
 
 
-@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
-def test_slope_is_the_derivative_of_the_level(law):
-    velocity = np.linspace(0.01, 1.0, 40)
-    for direction in (1.0, -1.0):
-        v, side = direction * velocity, np.full(40, direction)
-        numeric = (law.dry_level(v + 1e-6, side) - law.dry_level(v - 1e-6, side)) / 2e-6
-        np.testing.assert_allclose(law.dry_slope(v, side), numeric, atol=1e-8)
-
-
-def test_stribeck_goes_from_breakaway_to_coulomb():
+def test_level_of_friction_has_its_slope_and_stribeck_goes_from_breakaway_to_coulomb():
     """At rest the breakaway torque, far above the Stribeck velocity the Coulomb torque, and odd in the velocity."""
-    side = np.ones(1)
-    assert STRIBECK.dry_level(np.zeros(1), side) == pytest.approx(1.5)
-    assert STRIBECK.dry_level(np.array([0.2]), side) == pytest.approx(1 + 0.5 / np.e)
-    assert STRIBECK.dry_level(np.array([5.0]), side) == pytest.approx(1.0)
-    assert STRIBECK.dry_level(np.array([-0.2]), -side) == pytest.approx(-1 - 0.5 / np.e)
+    for law, direction in itertools.product(LAWS, (1.0, -1.0)):
+        v, side = direction * np.linspace(0.01, 1.0, 40), np.full(40, direction)
+        numeric = (law.dry_level(v + 1e-6, side) - law.dry_level(v - 1e-6, side)) / 2e-6
+        np.testing.assert_allclose(law.dry_slope(v, side), numeric, atol=1e-8, err_msg=law.name)
+    for velocity, level in ((0.0, 1.5), (0.2, 1 + 0.5 / np.e), (5.0, 1.0)):
+        for side in (1, -1):
+            found = STRIBECK.dry_level(np.array([side * velocity]), np.array([float(side)]))
+            assert found == pytest.approx(side * level)
 
 
 @pytest.mark.parametrize("half_swings", [0.4, 1.5, 2.7, 3.3, 8.0])
@@ -133,18 +128,11 @@ def test_one_joint_sensitivities_are_derivatives_of_the_closed_form(half_swings)
     tangent.pose[0, BY_START] = 1
     motion = _one_joint(tangent)
     motion.segment(_displaced(x0), _command(), time, round(200 * half_swings))
-    by_stiffness, by_coulomb, by_mass, by_start = motion.tangent.pose[0, [64, 52, 0, BY_START]]
     h = 1e-5
-    for ours, values in (
-        (by_stiffness, {"k": STIFFNESS}),
-        (by_coulomb, {"fc": COULOMB}),
-        (by_mass, {"mass": MASS}),
-        (by_start, {"x0": x0}),
-    ):
-        ((name, value),) = values.items()
+    for column, name, value in ((64, "k", STIFFNESS), (52, "fc", COULOMB), (0, "mass", MASS), (BY_START, "x0", x0)):
         above, below = (_oscillator(time, **{"x0": x0, name: value + side * h}) for side in (1, -1))
         exact = (above - below) / (2 * h)
-        np.testing.assert_allclose(ours, exact, atol=1e-8, err_msg=name)
+        np.testing.assert_allclose(motion.tangent.pose[0, column], exact, atol=1e-8, err_msg=name)
 
 
 def _first_half_swing(x0, time):
@@ -202,9 +190,8 @@ def test_sticking_joints_are_those_of_the_friction_problem(robot, identified):
     those found by trying all 729 combinations."""
     rng = np.random.default_rng(4)
     functions = {function.name(): function for function in model.motion_functions(robot.geometry)}
-    box = np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])
     for _ in range(8):
-        pose, rest = robot.home_pose + box * rng.uniform(-1, 1, 6), np.zeros(6)
+        pose, rest = robot.home_pose + BOX * rng.uniform(-1, 1, 6), np.zeros(6)
         values = functions["equation_of_motion"](pose, rest, identified[:52])
         mass, bias, jacobian, drift, angle = (np.asarray(value, dtype=float) for value in values)
         torque = np.linalg.solve(jacobian.T, bias[:, 0]) + 2 * identified[52:58] * rng.standard_normal(6)
@@ -217,35 +204,23 @@ def test_sticking_joints_are_those_of_the_friction_problem(robot, identified):
         np.testing.assert_allclose(end.rate / 1e-6, acceleration, atol=1e-4 * np.abs(acceleration).max() + 1e-9)
 
 
-def _held(robot, minutes, offset):
-    """A reference at rest and commands that ask joint 3 for `offset` rad more, for some minutes at 60 Hz."""
-    frames = round(3600 * minutes)
-    poses = np.tile(robot.home_pose, (frames, 1))
-    return closed_loop.Reference(poses, 0 * poses), np.tile(offset * np.eye(6)[2], (frames, 1))
-
-
-def test_platform_stays_where_it_is_below_breakaway(loop, robot, identified):
-    """A minute with joint 3 loaded up to 0.6 of its dry friction: the pose does not change by one bit, no event."""
-    reference, commands = _held(robot, 1.0, 3e-5)
-    run = loop.run(reference, loop.settings(), commands=commands)
-    load = np.abs(run.torque[:, 2] - run.torque[0, 2]).max() + identified[64] * 3e-5
-    assert 0.5 < load / identified[54] < 0.8
-    np.testing.assert_array_equal(run.pose, np.tile(robot.home_pose, (len(run.pose), 1)))
-    np.testing.assert_array_equal(run.pose_rate, 0)
-    assert run.events == 0
-
-
-def test_platform_breaks_away_at_the_time_the_integrator_needs(loop, robot, identified):
-    """With lp d + li d t growing, joint 3 holds until that reaches f_c, to the frame; the other joints stay stuck."""
-    offset = 1e-4
+def test_platform_stays_below_breakaway_and_moves_when_the_integrator_reaches_it(loop, robot, identified):
+    """A minute with joint 3 loaded up to 0.6 of its dry friction: the pose does not change by one bit, no event. With
+    lp d + li d t growing, it holds until that reaches f_c, to the frame; the other joints stay stuck."""
     lp, li, _ = identified[64:]
+    poses = np.tile(robot.home_pose, (3600, 1))
+    reference = closed_loop.Reference(poses, 0 * poses)
+    below, beyond = (loop.run(reference, commands=np.tile(d * np.eye(6)[2], (3600, 1))) for d in (3e-5, 1e-4))
+    load = np.abs(below.torque[:, 2] - below.torque[0, 2]).max() + lp * 3e-5
+    assert 0.5 < load / identified[54] < 0.8
+    np.testing.assert_array_equal(below.pose, poses)
+    np.testing.assert_array_equal(below.pose_rate, 0)
+    assert below.events == 0
     # The jump of the first command also acts through U_dot, but during frame 0 only and below breakaway.
-    breakaway = (identified[54] - lp * offset) / (li * offset)
-    reference, commands = _held(robot, 1.0, offset)
-    run = loop.run(reference, loop.settings(), commands=commands)
-    moved = np.flatnonzero(np.abs(run.pose - robot.home_pose).max(axis=1))[0]
+    breakaway = (identified[54] - lp * 1e-4) / (li * 1e-4)
+    moved = np.flatnonzero(np.abs(beyond.pose - robot.home_pose).max(axis=1))[0]
     assert moved - 1 <= breakaway * 60 <= moved
-    others = np.delete(robot.inverse_kinematics(run.pose[: moved + 3]), 2, axis=1)
+    others = np.delete(robot.inverse_kinematics(beyond.pose[: moved + 3]), 2, axis=1)
     np.testing.assert_allclose(others, 0, atol=1e-12)
 
 
@@ -279,9 +254,7 @@ def test_smoothed_law_tends_to_the_exact_one(loop):
 
 def test_robot_without_dry_friction_runs_without_events(loop, robot):
     """Table 1 has no friction: no event, and the exact law equals the smoothed one to rounding."""
-    parameters = robot.parameter_sets["initial"].vector
-    reference = loop.reference(60)
-    exact = loop.run(reference, loop.settings(), parameters)
-    smoothed = loop.run(reference, loop.settings(smoothing_velocity=1e-3), parameters)
+    laws, parameters = (loop.settings(), loop.settings(smoothing_velocity=1e-3)), robot.parameter_sets["initial"].vector
+    exact, smoothed = (loop.run(60, law, parameters) for law in laws)
     assert exact.events == 0
     np.testing.assert_allclose(exact.pose, smoothed.pose, atol=1e-13)

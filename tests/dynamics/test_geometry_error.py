@@ -7,7 +7,7 @@ from scipy.stats import chi2
 
 from dynamics.errors import RobotFileError
 from dynamics.robot import with_geometry_error
-from tests.dynamics.conftest import Loop, base_from_platform
+from tests.dynamics.conftest import Loop, assert_same, place_legs
 
 ERROR = 1e-4
 THETA = np.array([0.21, -0.14, 0.3, 0.05, -0.22, 0.11])
@@ -18,14 +18,11 @@ def plant(robot):
     return with_geometry_error(robot, ERROR, np.random.default_rng(3))
 
 
-def _offsets(plant, robot):
-    names = ("base_joints", "platform_joints")
-    return np.stack([getattr(plant.geometry, name) - getattr(robot.geometry, name) for name in names])
-
-
 def test_joint_centres_are_off_by_normal_errors_of_the_given_size(robot):
     """The squares of 40 robots' 36 errors over the variance are chi-square, their mean is zero."""
-    errors = np.stack([_offsets(with_geometry_error(robot, ERROR, np.random.default_rng(k)), robot) for k in range(40)])
+    plants = [with_geometry_error(robot, ERROR, np.random.default_rng(k)).geometry for k in range(40)]
+    names = ("base_joints", "platform_joints")
+    errors = np.array([[getattr(plant, name) - getattr(robot.geometry, name) for name in names] for plant in plants])
     assert errors.shape == (40, 2, 6, 3)
     assert 1e-3 < chi2.cdf(np.sum(errors**2) / ERROR**2, errors.size) < 1 - 1e-3
     assert abs(errors.mean()) < 3.3 * ERROR / np.sqrt(errors.size)
@@ -37,19 +34,10 @@ def test_the_same_seed_gives_the_same_robot_and_no_error_the_robot_itself(robot,
     assert with_geometry_error(robot, 0.0, np.random.default_rng(3)) is robot
 
 
-def _gaps(pose, theta, geometry, rotation):
-    """|A - T| less the link length of every leg, from joint centres and crank angles alone."""
-    zero, angle = geometry.crank_zero_directions, theta[:, None]
-    tip = geometry.base_joints + geometry.crank_length * (
-        np.cos(angle) * zero + np.sin(angle) * np.cross(geometry.crank_axes, zero)
-    )
-    joint = pose[:3] + geometry.platform_joints @ rotation(pose).T
-    return np.linalg.norm(joint - tip, axis=1) - geometry.link_length
-
-
-def test_its_loops_close_at_home_with_cranks_at_zero(plant):
-    gaps = _gaps(plant.home_pose, np.zeros(6), plant.geometry, base_from_platform)
-    np.testing.assert_allclose(gaps, 0, atol=1e-15)
+def _gaps(pose, theta, geometry):
+    """|A - T| less the link length of every leg."""
+    legs = place_legs(geometry, pose, theta)
+    return np.linalg.norm(legs.joint - legs.tip, axis=1) - geometry.link_length
 
 
 def test_an_error_that_no_home_survives_is_refused(robot):
@@ -59,12 +47,12 @@ def test_an_error_that_no_home_survives_is_refused(robot):
         with_geometry_error(robot, -1.0, np.random.default_rng(0))
 
 
-def test_forward_kinematics_of_the_plant_closes_its_own_loops(robot, plant, monkeypatch):
+def test_the_plant_closes_its_own_loops_at_home_and_elsewhere(robot, plant, monkeypatch):
     """Against MINPACK on the loops; the nominal robot with the same crank angles is elsewhere, by about the error."""
     monkeypatch.setattr("dynamics.robot.load_library", lambda *_: None)
+    np.testing.assert_allclose(_gaps(plant.home_pose, np.zeros(6), plant.geometry), 0, atol=1e-15)
     pose = plant.forward_kinematics(THETA)
-    arguments = (THETA, plant.geometry, base_from_platform)
-    solved = fsolve(_gaps, plant.home_pose, args=arguments, xtol=1e-13)
+    solved = fsolve(_gaps, plant.home_pose, args=(THETA, plant.geometry), xtol=1e-13)
     np.testing.assert_allclose(pose, solved, atol=1e-12)
     assert 0.1 * ERROR < np.abs(pose - robot.forward_kinematics(THETA))[:3].max() < 10 * ERROR
 
@@ -75,7 +63,8 @@ def test_the_servo_commands_with_the_kinematics_it_knows(loop, robot, plant):
     both paths agree, a servo that knows the plant commands otherwise, and one that knows its robot as ever."""
     reference, theirs = loop.reference(40), Loop(plant, loop.parameters)
     run, plain = theirs.both(reference, sensor=lambda k, t, pose: pose, servo_robot=robot)
-    assert run.events == plain.events > 3
+    assert_same(run, plain)
+    assert run.events > 3
     np.testing.assert_allclose(run.pose, plain.pose, atol=1e-13)
     error = reference.poses - run.measured
     before = np.vstack([run.start.last_measured, run.measured[:-1]])

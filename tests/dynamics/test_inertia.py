@@ -1,6 +1,6 @@
 """Inertias that no rigid body has: named, changed as little as can be, and what that does to the motion."""
 
-import warnings
+import itertools
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_file_says_which_inertias_were_changed_and_that_the_motion_does_not_feel
     changed = robot.nominal_parameters.copy()
     changed[RIGID_BODY] = physical_inertias(changed, allow_changes=True).values.ravel()
     assert not np.array_equal(changed, robot.nominal_parameters)
-    torques = np.ones((100, 6))
+    torques = np.ones((300, 6))
     np.testing.assert_allclose(
         robot.forward_dynamics(states.pose, states.twist, torques, changed),
         robot.forward_dynamics(states.pose, states.twist, torques),
@@ -63,23 +63,20 @@ def test_changed_inertias_are_physical_and_keep_what_the_motion_feels(numbers):
     given_ = np.array(numbers)
     before, after = given_.reshape(13, 4), physical_inertias(given_, allow_changes=True).values
     assert (after > 0).all()
-    x, y, z = after[:, 1:].T
-    assert (x + y >= z).all()
-    assert (y + z >= x).all()
-    assert (z + x >= y).all()
+    for x, y, z in itertools.permutations(after[:, 1:].T):
+        assert (x + y >= z).all()
     floor = np.maximum(before, 1e-12)
     np.testing.assert_array_equal(after[:, 0], floor[:, 0])
     np.testing.assert_array_equal(after[1:7, 3], floor[1:7, 3])
     np.testing.assert_array_equal(after[7:, 1:3], floor[7:, 1:3])
 
 
+@pytest.mark.filterwarnings("error")
 def test_the_largest_moments_are_changed_as_small_ones_are():
     """Powers of two scale without rounding: up to the largest floats the result is the same, without overflow."""
     given_ = np.tile([0.5, 0.1, 0.2, 0.8], 13)
     expected = physical_inertias(given_, allow_changes=True).values
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        largest = physical_inertias(given_ * 2.0**1023 * 2, allow_changes=True).values
+    largest = physical_inertias(given_ * 2.0**1023 * 2, allow_changes=True).values
     np.testing.assert_array_equal(largest / 2.0**512, expected * 2.0**512)
 
 

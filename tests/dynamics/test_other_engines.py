@@ -2,24 +2,20 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as Xml
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dynamics.engines.mjcf import MjcfSolver, mjcf_text
 from dynamics.engines.mujoco_engine import MujocoMissingError, MujocoRobot
 from dynamics.inertia import physical_inertias
-from dynamics.legs.rss_geometry import Rss6Geometry
 from dynamics.parameters import BODY_NAMES, COULOMB, PARAMETER_NAMES, RIGID_BODY, VISCOUS
 from dynamics.robot import Robot
 from dynamics.robot_file import RobotDescription
-
-ROOT = Path(__file__).parents[2]
-moments = st.floats(0, 1) | st.sampled_from([0.0, 1e-12, 1e-6])
 
 
 @pytest.fixture
@@ -48,8 +44,9 @@ def physical(robot):
     return values
 
 
-def test_bodies_friction_and_gravity_are_exactly_the_parameters(mujoco, robot, physical):
-    model = MujocoRobot(robot, mjcf_text(robot, physical)).model
+def test_model_has_exactly_the_parameters_and_closed_loops_at_home(mujoco, robot, physical):
+    engine = MujocoRobot(robot, mjcf_text(robot, physical))
+    model = engine.model
     for body, row in zip(BODY_NAMES, physical[RIGID_BODY].reshape(-1, 4), strict=True):
         assert model.body(body).mass[0] == row[0]
         np.testing.assert_array_equal(model.body(body).inertia, row[1:])
@@ -60,17 +57,13 @@ def test_bodies_friction_and_gravity_are_exactly_the_parameters(mujoco, robot, p
     np.testing.assert_array_equal(model.opt.gravity, robot.geometry.gravity)
     assert not model.geom_contype.any()
     assert (model.nv, model.nu, model.neq) == (30, 6, 6)
-    without = MujocoRobot(robot, mjcf_text(robot, physical, coulomb=False)).model
-    assert not without.dof_frictionloss.any()
-    assert without.joint("joint1").damping[0] == physical[VISCOUS][0]
-
-
-def test_keyframe_is_the_home_pose_with_closed_loops(mujoco, robot):
-    engine = exported(robot)
-    mujoco.mj_resetDataKeyframe(engine.model, engine.data, engine.model.key("home").id)
+    mujoco.mj_resetDataKeyframe(model, engine.data, model.key("home").id)
     np.testing.assert_allclose(engine.pose, robot.home_pose, atol=1e-15)
     np.testing.assert_allclose(engine.crank_angle, robot.inverse_kinematics(robot.home_pose), atol=1e-15)
     assert engine.closure_error < 1e-14
+    without = MujocoRobot(robot, mjcf_text(robot, physical, coulomb=False)).model
+    assert not without.dof_frictionloss.any()
+    assert without.joint("joint1").damping[0] == physical[VISCOUS][0]
 
 
 def test_frames_of_cranks_and_links_are_those_of_the_conventions(mujoco, robot, states, legs_at):
@@ -109,16 +102,22 @@ def test_accelerations_differ_by_the_softness_of_the_loops_alone(mujoco, robot, 
     assert worst[0.999] / worst[0.9999] == pytest.approx(10, rel=0.1)
 
 
-@pytest.mark.parametrize("name", ["initial", "identified", "result"])
-def test_reloaded_bodies_accelerate_as_the_robot_with_the_changed_parameters(mujoco, robot, many_states, name):
+def quoted_estimates():
+    """Estimates of the run that the README quotes, (64,)."""
+    result = json.loads((Path(__file__).parents[2] / ".readme" / "result.json").read_text())
+    return np.array([result["identification"]["parameters"][name]["estimate"] for name in PARAMETER_NAMES])
+
+
+@pytest.mark.parametrize("name", ["initial", "identified", "quoted"])
+def test_reloaded_bodies_accelerate_as_the_robot_with_the_changed_parameters(mujoco, robot, states, name):
     """With MuJoCo's bodies in loops that are closed exactly (not by its springs), moving, with friction: to 1e-9."""
-    values = quoted_estimates() if name == "result" else robot.parameter_sets[name].dynamic
+    values = quoted_estimates() if name == "quoted" else robot.parameter_sets[name].dynamic
     engine = exported(robot, values)
     changed = values.copy()
     changed[RIGID_BODY] = physical_inertias(values, allow_changes=True).values.ravel()
     torques = 5 * np.random.default_rng(8).standard_normal((300, 6))
-    ours = robot.forward_dynamics(many_states.pose, many_states.twist, torques, changed)
-    for pose, twist, torque, acceleration in zip(many_states.pose, many_states.twist, torques, ours, strict=True):
+    ours = robot.forward_dynamics(states.pose, states.twist, torques, changed)
+    for pose, twist, torque, acceleration in zip(states.pose, states.twist, torques, ours, strict=True):
         theirs = acceleration_in_rigid_loops(mujoco, engine, pose, twist, torque)
         assert np.abs(theirs - acceleration).max() <= 1e-9 * np.abs(acceleration).max()
 
@@ -149,12 +148,6 @@ def acceleration_in_rigid_loops(mujoco, engine, pose, twist, torque):
     return np.concatenate([a[:3], platform @ a[3:6]])
 
 
-def quoted_estimates():
-    """Estimates of the run that the README quotes, (64,)."""
-    entries = json.loads((ROOT / ".readme" / "result.json").read_text())["identification"]["parameters"]
-    return np.array([entries[name]["estimate"] for name in PARAMETER_NAMES])
-
-
 def test_resting_robot_stays_in_its_dry_friction(mujoco, robot):
     """Half the breakaway torque on every crank for 1 s: MuJoCo's stiff dry friction creeps by less than 0.1 um."""
     values = robot.parameter_sets["identified"].dynamic
@@ -171,16 +164,12 @@ def test_robot_with_tilted_cranks_agrees_too(mujoco, robot, states, monkeypatch)
     monkeypatch.setattr("dynamics.robot.load_library", lambda *_: None)  # one robot is not worth compiling
     g, turn = robot.geometry, Rotation.from_rotvec([0.5, 0.4, 0.3]).as_matrix()
     turned_home = Rotation.from_matrix(turn) * Rotation.from_euler("XYZ", g.home_pose[3:])
-    geometry = Rss6Geometry(
-        g.base_joints @ turn.T,
-        g.platform_joints,
-        g.crank_axes @ turn.T,
-        g.crank_zero_directions @ turn.T,
-        g.crank_length,
-        g.link_length,
-        np.concatenate([turn @ g.home_pose[:3], turned_home.as_euler("XYZ")]),
-        g.travel_limit,
-        g.gravity,
+    geometry = replace(
+        g,
+        base_joints=g.base_joints @ turn.T,
+        crank_axes=g.crank_axes @ turn.T,
+        crank_zero_directions=g.crank_zero_directions @ turn.T,
+        home_pose=np.concatenate([turn @ g.home_pose[:3], turned_home.as_euler("XYZ")]),
     )
     tilted = Robot(RobotDescription("tilted", geometry, robot.parameter_sets))
     engine = exported(tilted)
@@ -193,20 +182,14 @@ def test_robot_with_tilted_cranks_agrees_too(mujoco, robot, states, monkeypatch)
         assert np.abs(engine.twist_dot(torque) - ours).max() < 5e-4 * np.abs(ours).max()
 
 
-@pytest.fixture
-def chain_of(robot):
-    """(parameters) -> the robot in Pinocchio."""
+@pytest.mark.parametrize("name", ["initial", "identified"])
+def test_forward_dynamics_agrees_with_pinocchio(robot, states, name):
+    """twist_dot of 300 random states and torques agrees to 1e-9 of its size; friction enters as joint torque."""
     pytest.importorskip("pinocchio")
     from tests.closed_chain import ClosedChain
 
-    return lambda values: ClosedChain(robot, values)
-
-
-@pytest.mark.parametrize("name", ["initial", "identified"])
-def test_forward_dynamics_agrees_with_pinocchio(robot, many_states, chain_of, name):
-    """twist_dot of 300 random states and torques agrees to 1e-9 of its size; friction enters as joint torque."""
-    values, states = robot.parameter_sets[name].dynamic, many_states
-    chain = chain_of(values)
+    values = robot.parameter_sets[name].dynamic
+    chain = ClosedChain(robot, values)
     torques = 5 * np.random.default_rng(5).standard_normal((300, 6))
     accelerations = robot.forward_dynamics(states.pose, states.twist, torques, values)
     for pose, twist, torque, ours in zip(states.pose, states.twist, torques, accelerations, strict=True):
@@ -218,16 +201,6 @@ def test_forward_dynamics_agrees_with_pinocchio(robot, many_states, chain_of, na
         assert speed < 1e-14
         theirs = chain.twist_dot(state)
         assert np.abs(ours - theirs).max() <= 1e-9 * np.abs(theirs).max()
-
-
-def test_torques_of_a_motion_move_pinocchio_that_way(robot, many_states, chain_of):
-    """Inverse dynamics without friction, put into Pinocchio's forward dynamics, gives the twist_dot asked for."""
-    values, states = robot.parameter_sets["initial"].dynamic, many_states
-    chain = chain_of(values)
-    torques = robot.inverse_dynamics(states.pose, states.twist, states.twist_dot, values)
-    for pose, twist, torque, wanted in zip(states.pose, states.twist, torques, states.twist_dot, strict=True):
-        result = chain.twist_dot(chain.state(pose, twist, torque))
-        np.testing.assert_allclose(result, wanted, atol=1e-9 * np.abs(wanted).max())
 
 
 def test_mujoco_accepts_what_was_changed(mujoco, robot):

@@ -1,6 +1,7 @@
 """What is refused, with name, value and limit: each checker is proved once, each entry point with one value."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -47,29 +48,23 @@ def test_arrays_are_numbers_of_a_shape_and_finite(robot, value, message):
         robot.inverse_kinematics(value)
 
 
-NUMBERS = {
-    "least 0": lambda value: checks.real("gain", value, DynamicsError, least=0, unit=" m"),
-    "above 0": lambda value: checks.real("gain", value, DynamicsError, above=0),
-}
-
-
 @pytest.mark.parametrize(
-    ("kind", "value", "message"),
+    ("limit", "value", "message"),
     [
-        ("least 0", "0.3", "gain is '0.3' m, must be a number >= 0"),
-        ("least 0", True, "gain is True m, must be a number"),
-        ("least 0", 0.3 + 1j, "must be a number"),
-        ("least 0", np.array([0.3, 0.3]), r"gain is array\(\[0.3, 0.3\]\) m, must be a number"),
-        ("least 0", 10**400, "gain is inf m, must be finite and >= 0"),
-        ("least 0", np.nan, "must be finite and >= 0"),
-        ("least 0", -1.0, "gain is -1.0 m, must be finite and >= 0"),
-        ("above 0", 0.0, "gain is 0.0, must be finite and > 0"),
-        ("above 0", None, "gain is None, must be a number > 0"),
+        ("least", "0.3", "gain is '0.3', must be a number >= 0"),
+        ("least", True, "gain is True, must be a number"),
+        ("least", 0.3 + 1j, "must be a number"),
+        ("least", np.array([0.3, 0.3]), r"gain is array\(\[0.3, 0.3\]\), must be a number"),
+        ("least", 10**400, "gain is inf, must be finite and >= 0"),
+        ("least", np.nan, "must be finite and >= 0"),
+        ("least", -1.0, "gain is -1.0, must be finite and >= 0"),
+        ("above", 0.0, "gain is 0.0, must be finite and > 0"),
+        ("above", None, "gain is None, must be a number > 0"),
     ],
 )
-def test_a_number_is_one_and_within_its_limit(kind, value, message):
+def test_a_number_is_one_and_within_its_limit(limit, value, message):
     with pytest.raises(DynamicsError, match=message):
-        NUMBERS[kind](value)
+        checks.real("gain", value, DynamicsError, **{limit: 0})
 
 
 @pytest.mark.parametrize("steps", [0, 2.5, True, "4", None, np.nan, np.inf, 10_001, 4 + 0j])
@@ -120,23 +115,20 @@ def test_every_argument_of_every_method_is_checked_by_name(robot, method):
                 getattr(robot, method)(*(batched | {name: longer}).values())
 
 
-@pytest.mark.parametrize(
-    ("index", "value", "message"),
-    [
+def test_parameters_outside_their_range_are_named_with_unit_and_row(robot):
+    for index, value, message in (
         (0, 0.0, r"platform.mass = 0 kg is not allowed, must be finite and > 0"),
         (8, -0.5, r"crank2.mass = -0.5 kg is not allowed, must be finite and >= 0"),
         (29, np.nan, r"link1.Ixx = nan kg m\^2"),
         (54, -0.1, r"joint3.coulomb = -0.1 N m is"),
         (63, np.inf, r"joint6.viscous = inf N m s/rad"),
-    ],
-)
-def test_parameters_outside_their_range_are_named_with_unit_and_row(robot, index, value, message):
-    values = robot.nominal_parameters.copy()
-    values[index] = value
-    with pytest.raises(ParameterError, match=message):
-        robot.mass_matrix(robot.home_pose, values)
-    with pytest.raises(ParameterError, match=rf"{message}.*\(row 1\)"):
-        robot.mass_matrix(robot.home_pose, np.array([robot.nominal_parameters, values]))
+    ):
+        values = robot.nominal_parameters.copy()
+        values[index] = value
+        with pytest.raises(ParameterError, match=message):
+            robot.mass_matrix(robot.home_pose, values)
+        with pytest.raises(ParameterError, match=rf"{message}.*\(row 1\)"):
+            robot.mass_matrix(robot.home_pose, np.array([robot.nominal_parameters, values]))
 
 
 def test_poses_without_an_answer_are_named_and_never_become_nan(robot):
@@ -156,146 +148,150 @@ def test_poses_without_an_answer_are_named_and_never_become_nan(robot):
         robot.forward_dynamics(robot.home_pose, rest, np.ones(6), 24.0 * np.eye(64)[0])
 
 
-def test_the_fast_forward_dynamics_refuses_by_name_and_goes_on(robot):
+def test_the_fast_forward_dynamics_names_poses_without_an_answer_and_goes_on(robot):
     fast, good = fast_forward_dynamics(robot), [robot.home_pose, np.zeros(6), np.zeros(6)]
-    for place, name in enumerate(("pose", "twist", "torque")):
-        for bad, words in (
-            ([0.0] * 6, r"must be a float64 array of shape \(6,\), got \[0.0, 0.0"),
-            (np.zeros(6, np.float32), "must be a float64 array"),
-            (np.zeros((1, 6)), r"must have shape \(6,\), got \(1, 6\)"),
-            ("rest", "must be numbers of shape"),
-        ):
-            with pytest.raises(ShapeError, match=f"^{name} {words}"):
-                fast(*good[:place], bad, *good[place + 1 :])
     for pose, twist in ((robot.home_pose + 0.5, np.zeros(6)), (robot.home_pose, np.full(6, np.nan))):
         with pytest.raises(SingularPoseError, match="not finite at pose"):
             fast(pose, twist, np.zeros(6))
     np.testing.assert_array_equal(fast(*good), robot.forward_dynamics(*good))
 
 
-def test_a_motion_needs_poses_times_and_limits_that_are_some(robot):
-    poses = np.tile(robot.home_pose, (3, 1))
-    for arguments, error, words in (
-        ((np.zeros((0, 6)),), ShapeError, "a motion needs at least one pose"),
-        ((poses, np.zeros(2)), ShapeError, r"times must have shape \(3,\), got \(2,\)"),
-        ((poses, [0.0, 0.2, 0.1]), ShapeError, r"times must increase, but times\[2\] = 0.1 s follows 0.2 s"),
-        ((poses, [0.0, 0.0, 0.1]), ShapeError, r"times\[1\] = 0.0 s follows 0.0 s"),
-    ):
-        with pytest.raises(error, match=words):
-            check_motion(robot, *arguments)
-    for option, bad in (("travel_margin", -0.1), ("least_leverage", np.nan), ("most_condition", 0.5)):
-        with pytest.raises(TravelError if "travel" in option else DynamicsError, match=f"{option} is {bad}.*must be"):
-            check_motion(robot, robot.home_pose, **{option: bad})
-    with pytest.raises(DynamicsError, match="robot must be of type Robot, got 'rss6' of type str"):
-        measure("rss6", np.zeros(6))
-
-
 @pytest.mark.parametrize(
-    ("build", "message"),
+    ("place", "value", "words"),
     [
-        (lambda: ServoGains(-1.0, 0.0, 0.0), "servo gain kp is -1.0, must be"),
-        (lambda: FrameTiming(0.0), "frame rate is 0.0 Hz, must be finite and > 0"),
-        (lambda: FrameTiming(60.0, -0.01), "latency is -0.01 s, must be >= 0 and at most 60 frames"),
-        (lambda: FrameTiming(60.0, 2.0), r"at most 60 frames \(1 s\)"),
-        (lambda: FrameTiming(60.0, hold="cubic"), "unknown hold `cubic`; valid: zero, linear"),
-        (lambda: FrictionLaw("stribek"), "unknown friction law `stribek`; valid: coulomb_viscous, smoothed, stribeck"),
-        (lambda: FrictionLaw("smoothed"), "smoothing_velocity .* is None rad/s, must be a number > 0"),
-        (lambda: FrictionLaw("stribeck", None, 0.9, 0.1), "static_ratio .* is 0.9, must be finite and >= 1"),
-        (lambda: FrictionLaw(static_ratio=1.2), "belongs to the law `stribeck`, not to `coulomb_viscous`"),
-        (lambda: JointElasticity(0.0, 3e-4), r"joint stiffness is 0\.0 N m/rad, must be finite and > 0"),
-        (lambda: JointElasticity(500.0, np.inf), "motor inertia is inf"),
-        (lambda: JointElasticity(500.0, 3e-4, -1.0), r"joint damping is -1\.0"),
-        (lambda: LoopSettings((0.3,), FrameTiming(60.0)), r"servo must be of type ServoGains, got \(0.3,\)"),
-        (lambda: LoopSettings(ServoGains(1, 0, 0), FrameTiming(60.0), None), "friction must be of type FrictionLaw"),
-        (lambda: Reference(np.zeros((5, 6)), np.zeros((4, 6))), r"\(5, 6\) and rates \(4, 6\) differ"),
-        (lambda: Reference(np.zeros((1, 6)), np.zeros((1, 6))), "reference poses must have at least 2 frames, got 1"),
-        (lambda: Reference(np.zeros((5, 6)), None), "reference rates must be numbers .*got None"),
+        (64, -1.0, "joint_pid.lp is -1.0, must be finite and >= 0"),
+        (65, 0.0, "joint_pid.li is 0.0, must be finite and > 0"),
+        (66, np.nan, "joint_pid.ld is nan, must be finite and >= 0"),
+        (12, -1.0, r"crank3\.mass = -1 kg is not allowed, must be finite and >= 0"),
     ],
 )
-def test_settings_of_the_loop_name_value_and_limit_or_the_valid_names(build, message):
-    with pytest.raises(SimulationError, match=message):
-        build()
-
-
-@pytest.mark.parametrize(
-    ("place", "value", "error", "message"),
-    [
-        (slice(3), 0.0, SimulationError, r"loop parameters must have shape \(67,\).*, got \(64,\)"),
-        (64, -1.0, SimulationError, "joint_pid.lp is -1.0, must be finite and >= 0"),
-        (65, 0.0, SimulationError, "joint_pid.li is 0.0, must be finite and > 0"),
-        (66, np.nan, SimulationError, "joint_pid.ld is nan, must be finite and >= 0"),
-        (12, -1.0, ParameterError, r"crank3\.mass = -1 kg is not allowed, must be finite and >= 0"),
-    ],
-)
-def test_parameters_of_runs_batches_and_equilibria(robot, identified, loop, place, value, error, message):
-    values = (
-        identified[place.stop :] if isinstance(place, slice) else np.where(np.arange(67) == place, value, identified)
-    )
-    settings, reference = loop.settings(), loop.reference(5)
+def test_parameters_of_runs_batches_and_equilibria(robot, loop, place, value, words):
+    values, settings, reference = np.array(loop.parameters), loop.settings(), loop.reference(5)
+    values[place] = value
     for call in (
-        lambda: closed_loop.simulate(robot, values, reference, settings),
+        lambda: loop.run(reference, parameters=values),
         lambda: closed_loop.equilibrium(robot, values, robot.home_pose, settings.servo),
         lambda: simulate_batch(robot, values, reference, settings),
     ):
-        with pytest.raises(error, match=message):
+        with pytest.raises((SimulationError, ParameterError), match=words):
             call()
+
+
+@pytest.fixture
+def asked(robot, identified, loop):
+    """Functions that run, repeat in a batch, export and check with good arguments, but for those that are given."""
+    reference, settings = loop.reference(5), loop.settings()
+    good = {"parameters": identified, "settings": settings}
+    return SimpleNamespace(
+        robot=robot,
+        run=lambda **bad: closed_loop.simulate(**{"robot": robot, "reference": reference, **good, **bad}),
+        batch=lambda **bad: simulate_batch(**{"robot": robot, "references": reference, **good, **bad}),
+        balance=lambda pose, servo=settings.servo: closed_loop.equilibrium(robot, identified, pose, servo),
+        export=lambda **bad: mjcf_text(**{"robot": robot, "allow_unphysical_inertia": True, **bad}),
+        accelerate=lambda *bad: fast_forward_dynamics(robot)(*bad, *[np.zeros(6)] * (3 - len(bad))),
+        check=lambda *bad, **limits: check_motion(robot, *(bad or (robot.home_pose,)), **limits),
+    )
 
 
 def _ideal(frame, time, pose):
     return pose
 
 
-FIVE = np.zeros(5, bool)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"robot": "rss6"}, "robot must be of type Robot, got 'rss6' of type str"),
-        ({"reference": np.zeros((5, 6))}, "reference must be of type Reference, got array"),
-        ({"settings": None}, "settings must be of type LoopSettings, got None of type NoneType"),
-        ({"start": np.zeros(6)}, "start must be of type StartState"),
-        ({"sensor": "camera"}, "sensor must be a function .*, or None, got 'camera'"),
-        ({"servo_robot": "rss6"}, "servo_robot must be of type Robot"),
-        ({"controller": 3}, "controller must be a function, or None for the servo, got 3"),
-        ({"commands": np.zeros((4, 6))}, r"commands must have shape \(5, 6\), got \(4, 6\)"),
-        ({"lost": [2, 3]}, r"lost must be bool of shape \(5,\), got int64 of shape \(2,\)"),
-        ({"noise": np.full((5, 6), np.inf)}, r"noise\[0, 0\] is inf, must be finite"),
-        ({"latencies": np.zeros(4)}, r"latencies must have shape \(5,\)"),
-        ({"latencies": -0.01 * np.eye(5)[2]}, "latency of frame 2 is -0.01 s, must be >= 0"),
-        ({"latencies": 1.1 * np.eye(5)[3]}, r"latency of frame 3 is 1.1 s, .*at most 60 frames \(1 s\)"),
-        ({"compiled": "yes"}, "compiled is 'yes', must be True or False"),
-        ({"sensitivities": True, "sensor": _ideal}, "sensitivities need the ideal sensor"),
-        ({"sensitivities": True, "servo_robot": ...}, "pass servo_robot=None"),
-        ({"sensitivities": True, "controller": _ideal}, "sensitivities are those of the servo: pass controller=None"),
-        ({"lost": FIVE, "sensor": _ideal}, "lost is for the ideal sensor: a sensor returns None at the frames that it"),
-        ({"noise": np.zeros((5, 6)), "sensor": _ideal}, "noise is for the ideal sensor: a sensor that is given adds"),
-        ({"commands": np.zeros((5, 6)), "controller": _ideal}, "commands take the place of any controller"),
-        ({"compiled": True, "controller": _ideal}, "a controller runs on the plain path"),
+POSES = np.tile([0, 0, 0.2, 0, 0, 0], (3, 1))
+FIVE = np.zeros((5, 6))
+REFUSED = {
+    SimulationError: [
+        (lambda _: ServoGains(-1.0, 0.0, 0.0), "servo gain kp is -1.0, must be"),
+        (lambda _: FrameTiming(0.0), "frame rate is 0.0 Hz, must be finite and > 0"),
+        (lambda _: FrameTiming(60.0, -0.01), "latency is -0.01 s, must be >= 0 and at most 60 frames"),
+        (lambda _: FrameTiming(60.0, 2.0), r"at most 60 frames \(1 s\)"),
+        (lambda _: FrameTiming(60.0, hold="cubic"), "unknown hold `cubic`; valid: zero, linear"),
+        (
+            lambda _: FrictionLaw("stribek"),
+            "unknown friction law `stribek`; valid: coulomb_viscous, smoothed, stribeck",
+        ),
+        (lambda _: FrictionLaw("smoothed"), "smoothing_velocity .* is None rad/s, must be a number > 0"),
+        (lambda _: FrictionLaw("stribeck", None, 0.9, 0.1), "static_ratio .* is 0.9, must be finite and >= 1"),
+        (lambda _: FrictionLaw(static_ratio=1.2), "belongs to the law `stribeck`, not to `coulomb_viscous`"),
+        (lambda _: JointElasticity(0.0, 3e-4), r"joint stiffness is 0\.0 N m/rad, must be finite and > 0"),
+        (lambda _: JointElasticity(500.0, np.inf), "motor inertia is inf"),
+        (lambda _: JointElasticity(500.0, 3e-4, -1.0), r"joint damping is -1\.0"),
+        (lambda _: LoopSettings((0.3,), FrameTiming(60.0)), r"servo must be of type ServoGains, got \(0.3,\)"),
+        (lambda _: LoopSettings(ServoGains(1, 0, 0), FrameTiming(60.0), None), "friction must be of type FrictionLaw"),
+        (lambda _: Reference(FIVE, FIVE[:4]), r"\(5, 6\) and rates \(4, 6\) differ"),
+        (lambda _: Reference(FIVE[:1], FIVE[:1]), "reference poses must have at least 2 frames, got 1"),
+        (lambda _: Reference(FIVE, None), "reference rates must be numbers .*got None"),
+        (lambda asked: asked.run(robot="rss6"), "robot must be of type Robot, got 'rss6' of type str"),
+        (lambda asked: asked.run(reference=FIVE), "reference must be of type Reference, got array"),
+        (lambda asked: asked.run(settings=None), "settings must be of type LoopSettings, got None of type NoneType"),
+        (lambda asked: asked.run(start=np.zeros(6)), "start must be of type StartState"),
+        (lambda asked: asked.run(sensor="camera"), "sensor must be a function .*, or None, got 'camera'"),
+        (lambda asked: asked.run(servo_robot="rss6"), "servo_robot must be of type Robot"),
+        (lambda asked: asked.run(controller=3), "controller must be a function, or None for the servo, got 3"),
+        (lambda asked: asked.run(commands=FIVE[:4]), r"commands must have shape \(5, 6\), got \(4, 6\)"),
+        (lambda asked: asked.run(lost=[2, 3]), r"lost must be bool of shape \(5,\), got int64 of shape \(2,\)"),
+        (lambda asked: asked.run(noise=FIVE + np.inf), r"noise\[0, 0\] is inf, must be finite"),
+        (lambda asked: asked.run(latencies=np.zeros(4)), r"latencies must have shape \(5,\)"),
+        (lambda asked: asked.run(latencies=-0.01 * np.eye(5)[2]), "latency of frame 2 is -0.01 s, must be >= 0"),
+        (lambda asked: asked.run(latencies=1.1 * np.eye(5)[3]), r"of frame 3 is 1.1 s, .*at most 60 frames \(1 s\)"),
+        (lambda asked: asked.run(parameters=np.zeros(64)), r"loop parameters must have shape \(67,\).*, got \(64,\)"),
+        (lambda asked: asked.run(compiled="yes"), "compiled is 'yes', must be True or False"),
+        (lambda asked: asked.run(sensitivities=True, sensor=_ideal), "sensitivities need the ideal sensor"),
+        (lambda asked: asked.run(sensitivities=True, servo_robot=asked.robot), "pass servo_robot=None"),
+        (lambda asked: asked.run(sensitivities=True, controller=_ideal), "those of the servo: pass controller=None"),
+        (lambda asked: asked.run(lost=FIVE[:, 0] > 0, sensor=_ideal), "lost is for the ideal sensor: a sensor returns"),
+        (
+            lambda asked: asked.run(noise=FIVE, sensor=_ideal),
+            "noise is for the ideal sensor: a sensor that is given adds",
+        ),
+        (lambda asked: asked.run(commands=FIVE, controller=_ideal), "commands take the place of any controller"),
+        (lambda asked: asked.run(compiled=True, controller=_ideal), "a controller runs on the plain path"),
+        (lambda asked: asked.batch(workers=0), "workers is 0, must be a whole number >= 1"),
+        (
+            lambda asked: asked.batch(parameters=np.zeros((0, 67))),
+            "0 parameter vectors and 1 references do not pair up",
+        ),
+        (lambda asked: asked.batch(parameters=np.zeros((2, 64))), r"shape \(67,\) or \(N, 67\), got \(2, 64\)"),
+        (lambda asked: asked.batch(references=5), "references must be of type Sequence, got 5"),
+        (lambda asked: asked.batch(references=[FIVE]), r"references\[0\] must be of type Reference, got array"),
+        (lambda asked: asked.batch(starts=[3]), r"starts\[0\] must be of type StartState, got 3"),
+        (lambda asked: asked.balance(np.zeros(6), None), "servo must be of type ServoGains, got None"),
+        (lambda _: closed_loop.prepare(6), "robot must be of type Robot, got 6 of type int"),
     ],
-)
-def test_arguments_of_a_run_and_those_that_exclude_each_other(robot, identified, loop, change, message):
-    arguments = {"robot": robot, "reference": loop.reference(5), "settings": loop.settings()}
-    changed = {name: robot if value is ... else value for name, value in change.items()}
-    with pytest.raises(SimulationError, match=message):
-        closed_loop.simulate(parameters=identified, **{**arguments, **changed})
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"workers": 0}, "workers is 0, must be a whole number >= 1"),
-        ({"parameters": np.zeros((0, 67))}, "0 parameter vectors and 1 references do not pair up"),
-        ({"parameters": np.zeros((2, 64))}, r"loop parameters must have shape \(67,\) or \(N, 67\), got \(2, 64\)"),
-        ({"references": 5}, "references must be of type Sequence, got 5"),
-        ({"references": [np.zeros((5, 6))]}, r"references\[0\] must be of type Reference, got array"),
-        ({"starts": [3]}, r"starts\[0\] must be of type StartState, got 3"),
+    ShapeError: [
+        (lambda asked: asked.balance(np.zeros((2, 6))), r"pose must have shape \(6,\), got \(2, 6\)"),
+        (lambda asked: asked.accelerate([0.0] * 6), r"^pose must be a float64 array of shape \(6,\), got \[0.0, 0.0"),
+        (lambda asked: asked.accelerate(np.zeros(6), np.zeros(6, np.float32)), "^twist must be a float64 array"),
+        (lambda asked: asked.accelerate(np.zeros((1, 6))), r"^pose must have shape \(6,\), got \(1, 6\)"),
+        (lambda asked: asked.accelerate(np.zeros(6), np.zeros(6), "rest"), "^torque must be numbers of shape"),
+        (lambda asked: asked.check(np.zeros((0, 6))), "a motion needs at least one pose"),
+        (lambda asked: asked.check(POSES, np.zeros(2)), r"times must have shape \(3,\), got \(2,\)"),
+        (lambda asked: asked.check(POSES, [0.0, 0.2, 0.1]), r"increase, but times\[2\] = 0.1 s follows 0.2 s"),
+        (lambda asked: asked.check(POSES, [0.0, 0.0, 0.1]), r"times\[1\] = 0.0 s follows 0.0 s"),
     ],
-)
-def test_arguments_of_a_batch(robot, identified, loop, change, message):
-    arguments = {"parameters": identified, "references": loop.reference(5), **change}
-    with pytest.raises(SimulationError, match=message):
-        simulate_batch(robot, settings=loop.settings(), **arguments)
+    UnreachablePoseError: [(lambda asked: asked.balance(np.full(6, 9.0)), r"leg 1 cannot reach pose \[9.")],
+    TravelError: [(lambda asked: asked.check(travel_margin=-0.1), "travel_margin is -0.1.*must be")],
+    ParameterError: [(lambda asked: asked.export(parameters=np.ones(67)), r"must have shape \(64,\), got \(67,\)")],
+    DynamicsError: [
+        (lambda asked: asked.check(least_leverage=np.nan), "least_leverage is nan.*must be"),
+        (lambda asked: asked.check(most_condition=0.5), "most_condition is 0.5.*must be"),
+        (lambda _: measure("rss6", np.zeros(6)), "robot must be of type Robot, got 'rss6' of type str"),
+        (lambda asked: asked.export(robot="rss6"), "robot must be of type Robot, got 'rss6'"),
+        (lambda asked: asked.export(coulomb=1), "coulomb is 1, must be True or False"),
+        (lambda asked: asked.export(allow_unphysical_inertia="yes"), "allow_unphysical_inertia is 'yes', must be True"),
+        (lambda asked: asked.export(source=None), "source must be of type str, got None"),
+        (lambda _: MjcfSolver(timestep_s=0.0), "timestep is 0.0 s"),
+        (lambda _: MjcfSolver(time_constant_steps=1.0), "time constant is 1.0 steps"),
+        (lambda _: MjcfSolver(impedance=1.0), "impedance is 1.0"),
+        (lambda _: MjcfSolver(integrator="midpoint"), "valid: implicitfast, RK4"),
+    ],
+}
+
+
+@pytest.mark.parametrize(("error", "call", "words"), [(error, *row) for error, rows in REFUSED.items() for row in rows])
+def test_bad_settings_and_arguments_are_refused_with_value_and_limit_or_the_valid_names(asked, error, call, words):
+    with pytest.raises(error, match=words):
+        call(asked)
 
 
 @pytest.mark.parametrize("compiled", [None, False])
@@ -325,47 +321,6 @@ def test_every_frame_of_the_reference_is_in_reach_or_the_sensor_is_never_asked(r
     with pytest.raises(UnreachablePoseError, match=words):
         loop.run(Reference(poses, reference.rates), sensor=lambda *measured: asked.append(measured))
     assert not asked
-
-
-def test_arguments_of_the_equilibrium_and_what_is_compiled(robot, identified):
-    for pose, servo, error, words in (
-        (np.zeros((2, 6)), ServoGains(0.3, 0, 2.4), ShapeError, r"pose must have shape \(6,\), got \(2, 6\)"),
-        (np.full(6, 9.0), ServoGains(0.3, 0, 2.4), UnreachablePoseError, r"leg 1 cannot reach pose \[9."),
-        (np.zeros(6), None, SimulationError, "servo must be of type ServoGains, got None"),
-    ):
-        with pytest.raises(error, match=words):
-            closed_loop.equilibrium(robot, identified, pose, servo)
-    with pytest.raises(SimulationError, match="robot must be of type Robot, got 6 of type int"):
-        closed_loop.prepare(6)
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "words"),
-    [
-        ({"robot": "rss6"}, DynamicsError, "robot must be of type Robot, got 'rss6'"),
-        ({"parameters": np.ones(67)}, ParameterError, r"must have shape \(64,\), got \(67,\)"),
-        ({"coulomb": 1}, DynamicsError, "coulomb is 1, must be True or False"),
-        ({"allow_unphysical_inertia": "yes"}, DynamicsError, "allow_unphysical_inertia is 'yes', must be True or"),
-        ({"source": None}, DynamicsError, "source must be of type str, got None"),
-    ],
-)
-def test_no_model_is_exported_from_bad_input(robot, change, error, words):
-    with pytest.raises(error, match=words):
-        mjcf_text(**{"robot": robot, "allow_unphysical_inertia": True, **change})
-
-
-@pytest.mark.parametrize(
-    ("options", "evidence"),
-    [
-        ({"timestep_s": 0.0}, "timestep is 0.0 s"),
-        ({"time_constant_steps": 1.0}, "time constant is 1.0 steps"),
-        ({"impedance": 1.0}, "impedance is 1.0"),
-        ({"integrator": "midpoint"}, "valid: implicitfast, RK4"),
-    ],
-)
-def test_solver_settings_that_mujoco_would_bend_are_refused(options, evidence):
-    with pytest.raises(DynamicsError, match=evidence):
-        MjcfSolver(**options)
 
 
 def test_the_engine_takes_no_bad_input_and_no_other_model(robot):

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
+from dynamics import fast_forward_dynamics
 from tests.dynamics.conftest import base_from_platform, derivative
-
-LINK_INERTIA = [4 + 24 + 4 * leg + 1 for leg in range(6)]  # index of link Ixx; Iyy follows
 
 
 @pytest.fixture(params=["initial", "identified"])
@@ -17,8 +16,7 @@ def parameters(request, robot):
 def round_links(robot):
     """Table 2 with Ixx = Iyy in every link, so that the missing spin of the link's axes does not matter."""
     values = robot.parameter_sets["identified"].dynamic.copy()
-    for index in LINK_INERTIA:
-        values[index + 1] = values[index]
+    values[30:52:4] = values[29:52:4]
     return values
 
 
@@ -48,13 +46,16 @@ def test_parts_regressor_and_inverse_dynamics_agree(robot, states, parameters):
 
 
 def test_forward_dynamics_inverts_inverse_dynamics(robot, states, parameters):
-    """forward(inverse(twist_dot)) = twist_dot to 1e-11 relative, in a batch and one by one."""
+    """forward(inverse(twist_dot)) = twist_dot to 1e-11 relative, in a batch, one by one and by the fast function."""
     pose, twist, twist_dot = states.pose, states.twist, states.twist_dot
     torque = robot.inverse_dynamics(pose, twist, twist_dot, parameters)
     back = robot.forward_dynamics(pose, twist, torque, parameters)
     np.testing.assert_allclose(back, twist_dot, atol=1e-11 * np.abs(twist_dot).max())
-    single = robot.forward_dynamics(pose[3], twist[3], torque[3], parameters)
-    np.testing.assert_allclose(single, back[3], rtol=1e-12)
+    fast = fast_forward_dynamics(robot, parameters)
+    for row, expected in zip(zip(pose, twist, torque, strict=True), back, strict=True):
+        single = robot.forward_dynamics(*row, parameters)
+        np.testing.assert_allclose(single, expected, rtol=1e-12)
+        np.testing.assert_array_equal(fast(*row), single)
 
 
 def test_batches_equal_single_calls(robot, states, parameters):
@@ -81,53 +82,46 @@ def test_batches_equal_single_calls(robot, states, parameters):
         assert none.shape == (0, *batch.shape[1:]), name
 
 
-def _energies(robot, legs_at, pose_at, values):
-    """Kinetic energy at t = 0 and height energy, body by body, from numerically differentiated centres and axes."""
-    gravity = -robot.geometry.gravity
-
-    def body(index, centre):
-        mass = values[4 * index]
-        speed = derivative(centre)
-        return mass * speed @ speed / 2, mass * gravity @ centre(0.0)
-
-    kinetic, height = body(0, lambda t: pose_at(t)[:3])
-    turn = base_from_platform(pose_at(0.0)).T @ derivative(lambda t: base_from_platform(pose_at(t)))
-    omega = np.array([turn[2, 1], turn[0, 2], turn[1, 0]])
-    kinetic += omega @ (values[1:4] * omega) / 2
-    theta_dot = derivative(lambda t: robot.inverse_kinematics(pose_at(t)))
-    for leg in range(6):
-        crank = body(1 + leg, lambda t, leg=leg: (lambda p: p.tip[leg] - p.crank[leg] / 2)(legs_at(pose_at(t))))
-        link = body(7 + leg, lambda t, leg=leg: (lambda p: (p.tip[leg] + p.joint[leg]) / 2)(legs_at(pose_at(t))))
-        kinetic += crank[0] + link[0] + values[4 * (1 + leg) + 3] * theta_dot[leg] ** 2 / 2
-        height += crank[1] + link[1]
-        along = lambda t, leg=leg: (lambda p: p.joint[leg] - p.tip[leg])(legs_at(pose_at(t)))  # noqa: E731
-        l = along(0.0)
-        spin = np.cross(l, derivative(along)) / (l @ l)
-        x = np.cross(robot.geometry.crank_axes[leg], l)
-        x /= np.linalg.norm(x)
-        y = np.cross(l, x) / np.linalg.norm(l)
-        inertia = values[4 * (7 + leg) + 1 : 4 * (7 + leg) + 3]
-        kinetic += inertia @ np.array([spin @ x, spin @ y]) ** 2 / 2
-    return kinetic, height
+def _centres(legs, pose):
+    """Centres of mass (13, 3) of platform, cranks and links."""
+    return np.vstack([pose[:3], legs.tip - legs.crank / 2, (legs.tip + legs.joint) / 2])
 
 
-def test_mass_matrix_gives_the_kinetic_energy_of_the_13_bodies(robot, legs_at, motion, parameters):
-    """1/2 v^T M v equals the sum over platform, cranks and links, moved by finite differences (1e-9 relative)."""
+def _link_axes(robot, legs):
+    """Axes (6, 3, 3) of the links as columns: z along the link, x normal to the crank axis."""
+    z = (legs.joint - legs.tip) / robot.geometry.link_length
+    x = np.cross(robot.geometry.crank_axes, z)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def _angular_velocity(axes_at):
+    """Of moving axes (..., 3, 3), columns in base axes, at time 0: (..., 3) in those axes."""
+    turn = axes_at(0.0).swapaxes(-1, -2) @ derivative(axes_at)
+    return np.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], axis=-1)
+
+
+def test_mass_matrix_gives_the_kinetic_energy_and_gravity_the_power_of_the_13_bodies(
+    robot, legs_at, motion, parameters
+):
+    """1/2 v^T M v is the sum over platform, cranks and links, and G . v the rate of sum(m g z), with bodies moved by
+    finite differences (1e-9 relative)."""
+    masses = parameters[:52:4]
     for t in (0.1, 0.5, 1.3):
-        kinetic, _ = _energies(robot, legs_at, lambda d, t=t: motion.pose(t + d), parameters)
-        twist = robot.twist(motion.pose(t), motion.rate(t))
-        mass = robot.mass_matrix(motion.pose(t), parameters)
-        np.testing.assert_allclose(twist @ mass @ twist / 2, kinetic, rtol=1e-9)
 
+        def pose_at(d, t=t):
+            return motion.pose(t + d)
 
-def test_gravity_wrench_is_the_gradient_of_the_height_energy(robot, legs_at, motion, parameters):
-    """G . v equals the rate of sum(m g z) over the 13 bodies, differentiated numerically."""
-    for t in (0.1, 0.5, 1.3):
-        power = derivative(
-            lambda d, t=t: np.array(_energies(robot, legs_at, lambda e: motion.pose(t + d), parameters)[1])
-        )
+        speeds = derivative(lambda d, at=pose_at: _centres(legs_at(at(d)), at(d)))
+        platform = _angular_velocity(lambda d, at=pose_at: base_from_platform(at(d)))
+        cranks = derivative(lambda d, at=pose_at: robot.inverse_kinematics(at(d)))
+        links = _angular_velocity(lambda d, at=pose_at: _link_axes(robot, legs_at(at(d))))
+        kinetic = masses @ np.sum(speeds**2, axis=1) + parameters[1:4] @ platform**2 + parameters[7:28:4] @ cranks**2
+        kinetic += parameters[29:52:4] @ links[:, 0] ** 2 + parameters[30:52:4] @ links[:, 1] ** 2
         twist = robot.twist(motion.pose(t), motion.rate(t))
-        np.testing.assert_allclose(robot.gravity_wrench(motion.pose(t), parameters) @ twist, power, rtol=1e-9)
+        np.testing.assert_allclose(twist @ robot.mass_matrix(pose_at(0), parameters) @ twist, kinetic, rtol=1e-9)
+        power = -masses @ speeds @ robot.geometry.gravity
+        np.testing.assert_allclose(robot.gravity_wrench(pose_at(0), parameters) @ twist, power, rtol=1e-9)
 
 
 def _mass_rate(robot, motion, t, values):
@@ -150,20 +144,8 @@ def test_links_without_spin_break_the_energy_balance_by_a_known_amount(robot, le
     for t in (0.2, 0.9):
         pose, twist = motion.pose(t), robot.twist(motion.pose(t), motion.rate(t))
         skew = _mass_rate(robot, motion, t, parameters) - 2 * robot.coriolis_matrix(pose, twist, parameters)
-        expected = 0.0
-        for leg in range(6):
-
-            def axes(d, leg=leg, t=t):
-                place = legs_at(motion.pose(t + d))
-                z = (place.joint[leg] - place.tip[leg]) / robot.geometry.link_length
-                x = np.cross(robot.geometry.crank_axes[leg], z)
-                x /= np.linalg.norm(x)
-                return np.column_stack([x, np.cross(z, x), z])
-
-            turn = axes(0.0).T @ derivative(axes)
-            omega_x, omega_y, spin = turn[2, 1], turn[0, 2], turn[1, 0]
-            ixx, iyy = parameters[LINK_INERTIA[leg]], parameters[LINK_INERTIA[leg] + 1]
-            expected += 2 * spin * (ixx - iyy) * omega_x * omega_y
+        omega = _angular_velocity(lambda d, t=t: _link_axes(robot, legs_at(motion.pose(t + d))))
+        expected = 2 * np.sum((parameters[29:52:4] - parameters[30:52:4]) * omega.prod(axis=1))
         np.testing.assert_allclose(twist @ skew @ twist, expected, atol=2e-11)
 
 
@@ -178,11 +160,9 @@ def test_friction_follows_the_joint_velocity(robot, states, parameters):
 
 def test_wrench_is_linear_in_the_parameters(robot, states):
     """Each column of the regressor is the wrench of one parameter alone: J^T times the torque of a unit change."""
-    pose, twist, twist_dot = states.pose[0], states.twist[0], states.twist_dot[0]
+    motion = pose, *_ = states.pose[0], states.twist[0], states.twist_dot[0]
     base = robot.nominal_parameters
-    regressor, jacobian = robot.regressor(pose, twist, twist_dot), robot.joint_jacobian(pose)
-    for index in range(64):
-        more = base.copy()
-        more[index] += 1.0
-        change = robot.inverse_dynamics(pose, twist, twist_dot, more) - robot.inverse_dynamics(pose, twist, twist_dot)
-        np.testing.assert_allclose(jacobian.T @ change, regressor[:, index], atol=1e-10)
+    many = [np.tile(entry, (65, 1)) for entry in motion]
+    torque = robot.inverse_dynamics(*many, np.vstack([base, base + np.eye(64)]))
+    wrenches = (torque[1:] - torque[0]) @ robot.joint_jacobian(pose)
+    np.testing.assert_allclose(wrenches.T, robot.regressor(*motion), atol=1e-10)

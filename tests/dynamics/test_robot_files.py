@@ -2,7 +2,6 @@
 
 import itertools
 import pickle
-import re
 
 import numpy as np
 import pytest
@@ -11,25 +10,15 @@ from hypothesis import strategies as st
 
 import dynamics
 from dynamics.errors import RobotFileError
-
-BOX = np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])
-
-
-def _constructed():
-    """Platform joints and crank tips at home, from radii and angles; leg order k0-, k0+, k1-, k1+, k2-, k2+."""
-    legs = [(k, s) for k in range(3) for s in (-1, 1)]
-    angle_a = np.array([2 * np.pi / 3 * k + s * 0.95 for k, s in legs])
-    angle_t = np.array([2 * np.pi / 3 * k + s * 0.10 for k, s in legs])
-    zero = np.zeros(6)
-    joints = 0.200 * np.column_stack([np.cos(angle_a), np.sin(angle_a), zero])
-    tips = 0.300 * np.column_stack([np.cos(angle_t), np.sin(angle_t), zero])
-    return joints, tips, np.array([s for _, s in legs])
+from tests.dynamics.conftest import BOX
 
 
-def test_the_file_holds_the_constructed_robot(robot):
-    """Joints, cranks, link length and base radius agree with the construction from radii and angles to 1e-14 m."""
-    joints, tips, side = _constructed()
-    g = robot.geometry
+def test_the_file_holds_the_robot_of_radii_and_angles(robot):
+    """Platform joints and crank tips at home to 1e-14 m; leg order k0-, k0+, k1-, k1+, k2-, k2+."""
+    g, side = robot.geometry, np.tile([-1, 1], 3)
+    at_joint, at_tip = (np.repeat(2 * np.pi / 3 * np.arange(3), 2) + side * half for half in (0.95, 0.10))
+    joints = 0.200 * np.column_stack([np.cos(at_joint), np.sin(at_joint), np.zeros(6)])
+    tips = 0.300 * np.column_stack([np.cos(at_tip), np.sin(at_tip), np.zeros(6)])
     link = joints + np.array([0, 0, 0.200]) - tips
     along = side[:, None] * np.column_stack([-link[:, 1], link[:, 0], np.zeros(6)])
     along /= np.linalg.norm(link[:, :2], axis=1, keepdims=True)
@@ -78,18 +67,17 @@ FIRST_JOINT = "[0.33383501391252074, -0.0784425512051534, 0.0]"
 
 
 def test_what_names_no_robot_is_one_line_with_what_was_given_and_the_valid_names(tmp_path):
-    with pytest.raises(RobotFileError, match=r"unknown robot `rss7`; built-in robots: rss6; or give the path"):
-        dynamics.load_robot("rss7")
-    with pytest.raises(RobotFileError, match=r"cannot read robot file .*none\.toml"):
-        dynamics.load_robot(tmp_path / "none.toml")
-    with pytest.raises(RobotFileError, match=r"cannot read robot file .*null byte"):
-        dynamics.load_robot("rss6\0.toml")
-    for name in (None, ["rss6"]):
-        with pytest.raises(RobotFileError, match=re.escape(f"by its name or the path of its file, got {name!r}")):
-            dynamics.load_robot(name)
     (tmp_path / "picture.toml").write_bytes(b"\x89PNG\xff\xfe")
-    with pytest.raises(RobotFileError, match="cannot read robot file"):
-        dynamics.load_robot(tmp_path / "picture.toml")
+    for name, words in (
+        ("rss7", r"unknown robot `rss7`; built-in robots: rss6; or give the path"),
+        (tmp_path / "none.toml", r"cannot read robot file .*none\.toml"),
+        ("rss6\0.toml", r"cannot read robot file .*null byte"),
+        (tmp_path / "picture.toml", "cannot read robot file"),
+        (None, "by its name or the path of its file, got None"),
+        (["rss6"], r"by its name or the path of its file, got \['rss6'\]"),
+    ):
+        with pytest.raises(RobotFileError, match=words):
+            dynamics.load_robot(name)
     with pytest.raises(RobotFileError, match="description must be of type RobotDescription, got 'rss6' of type str"):
         dynamics.Robot("rss6")
     assert dynamics.built_in_robots() == ["rss6"]

@@ -46,27 +46,21 @@ def test_the_whole_travel_of_the_reference_robot_is_regular(robot):
     assert np.abs(measures.theta).max() < robot.travel_limit + 1e-9
 
 
-def test_poses_out_of_reach_are_nan_and_only_they(robot):
-    poses = np.array([robot.home_pose, robot.home_pose + 0.2 * np.eye(6)[0], robot.home_pose])
-    measures = workspace.measure(robot, poses)
-    np.testing.assert_array_equal(measures.reachable, [True, False, True])
-    for values in (measures.theta, measures.leverage):
-        np.testing.assert_array_equal(np.isnan(values).all(axis=1), [False, True, False])
-    for values in (measures.platform_condition, measures.joint_condition, measures.travel_share):
-        np.testing.assert_array_equal(np.isnan(values), [False, True, False])
-    assert measures.reach_margin[1].min() < 0
-    assert workspace.measure(robot, np.zeros((0, 6))).theta.shape == (0, 6)
-
-
-def test_poses_beyond_all_numbers_are_out_of_reach(robot, recwarn):
+def test_poses_out_of_reach_are_nan_and_only_they(robot, recwarn):
     """Where squares overflow the reach margin is -inf, the rest NaN, and NumPy has nothing to warn of."""
-    measures = workspace.measure(robot, np.array([np.full(6, 1e308), robot.home_pose]))
-    np.testing.assert_array_equal(measures.reachable, [False, True])
-    assert measures.reach_margin[0].max() == -np.inf
-    assert np.isnan(measures.leverage[0]).all()
+    poses = np.array([robot.home_pose, robot.home_pose + 0.2 * np.eye(6)[0], np.full(6, 1e308), robot.home_pose])
+    measures = workspace.measure(robot, poses)
+    np.testing.assert_array_equal(measures.reachable, [True, False, False, True])
+    for name in ("theta", "leverage", "platform_condition", "joint_condition", "travel_share"):
+        lacking = np.isnan(getattr(measures, name)).reshape(4, -1)
+        np.testing.assert_array_equal(lacking.all(axis=1), [False, True, True, False], err_msg=name)
+        assert not lacking[[0, 3]].any()
+    assert -np.inf < measures.reach_margin[1].min() < 0
+    assert measures.reach_margin[2].max() == -np.inf
     with pytest.raises(UnreachablePoseError, match="reach margin of leg 1 of rss6 is -inf"):
-        workspace.check_motion(robot, np.full(6, 1e308))
+        workspace.check_motion(robot, poses[2])
     assert not recwarn.list
+    assert workspace.measure(robot, np.zeros((0, 6))).theta.shape == (0, 6)
 
 
 def along_x(robot, largest, count=41):
@@ -88,26 +82,35 @@ def test_the_worst_of_a_good_motion_comes_with_its_time_and_leg(robot):
     assert np.isnan(workspace.check_motion(robot, poses[0]).reach.time)
 
 
-def test_a_bad_motion_is_refused_with_time_leg_value_and_limit(robot):
-    times = np.linspace(0, 2, 41)
-    with pytest.raises(TravelError, match=r"\|theta\| in rad of leg \d of rss6 is 1\.\d+ at t = 2 s, limit 0\.9948"):
-        workspace.check_motion(robot, along_x(robot, 0.06), times)
-    with pytest.raises(TravelError, match=r"at row 40, limit 0\.1948"):
-        workspace.check_motion(robot, along_x(robot, 0.02), travel_margin=0.8)
-    with pytest.raises(
-        UnreachablePoseError, match=r"reach margin of leg \d of rss6 is -.* at t = 1\.\d+ s, must be > 0"
-    ):
-        workspace.check_motion(robot, along_x(robot, 0.3), times)
-    with pytest.raises(SingularPoseError, match=r"leverage \(J_a1\) of leg \d of rss6 is 0\.\d+ .*must be >= 0\.9"):
-        workspace.check_motion(robot, along_x(robot, 0.02), times, least_leverage=0.9)
-    with pytest.raises(SingularPoseError, match=r"condition of J_a2 of rss6 is 1\.\d+ .*limit 1\.2"):
-        workspace.check_motion(robot, along_x(robot, 0.02), times, most_condition=1.2)
+@pytest.mark.parametrize(
+    ("largest", "options", "error", "words"),
+    [
+        (0.06, {}, TravelError, r"\|theta\| in rad of leg \d of rss6 is 1\.\d+ at t = 2 s, limit 0\.9948"),
+        (0.02, {"times": None, "travel_margin": 0.8}, TravelError, r"at row 40, limit 0\.1948"),
+        (0.3, {}, UnreachablePoseError, r"reach margin of leg \d of rss6 is -.* at t = 1\.\d+ s, must be > 0"),
+        (0.02, {"least_leverage": 0.9}, SingularPoseError, r"\(J_a1\) of leg \d of rss6 is 0\.\d+ .*must be >= 0\.9"),
+        (0.02, {"most_condition": 1.2}, SingularPoseError, r"condition of J_a2 of rss6 is 1\.\d+ .*limit 1\.2"),
+    ],
+)
+def test_a_bad_motion_is_refused_with_time_leg_value_and_limit(robot, largest, options, error, words):
+    with pytest.raises(error, match=words):
+        workspace.check_motion(robot, along_x(robot, largest), **{"times": np.linspace(0, 2, 41), **options})
 
 
-def test_a_platform_that_moves_with_locked_cranks_is_found_and_refused(flat_robot):
+def test_a_platform_that_moves_with_locked_cranks_is_found_and_refused(robot, load_changed, monkeypatch):
     """Links in the plane of the platform carry no vertical force: the condition of J_a2 says so, leverage does not.
     M is regular there, so that eq. 40 still holds: the platform falls freely, whatever the torques."""
-    robot, pose, rest, torque = flat_robot, flat_robot.home_pose, np.zeros(6), np.linspace(-1, 1, 6)
+    monkeypatch.setattr("dynamics.robot.load_library", lambda *_: None)  # one robot is not worth compiling
+    legs = robot.geometry
+    tips = legs.base_joints + legs.crank_length * legs.crank_zero_directions
+    link = np.linalg.norm(legs.platform_joints - tips, axis=1)[0]
+    robot = load_changed(
+        {
+            "home_pose = [0.0, 0.0, 0.2,": "home_pose = [0.0, 0.0, 0.0,",
+            "link_length = 0.30133373938841": f"link_length = {link:.17g}",
+        }
+    )
+    pose, rest, torque = robot.home_pose, np.zeros(6), np.linspace(-1, 1, 6)
     measures = workspace.measure(robot, pose)
     assert measures.platform_condition[0] > 1e12
     assert measures.leverage.min() > 0.5
