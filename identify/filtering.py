@@ -19,9 +19,8 @@ SPLINE_DEGREE = 5
 def zero_phase_filter(samples: ArrayLike, rate_hz: float, cutoff_hz: float, order: int = 8) -> Array:
     """Low-pass filter samples (N, ...) along the first axis without shifting them in time.
 
-    Raises:
-        FilterError: cutoff not positive, or at or above the Nyquist frequency; a record shorter than the padding; or
-            samples that are not finite.
+    Raises FilterError: cutoff not positive, or at or above the Nyquist frequency; a record shorter than the padding; or
+    samples that are not finite.
     """
     values = _finite(samples)
     if not 0 < cutoff_hz < rate_hz / 2:
@@ -53,8 +52,7 @@ def filtered_derivatives(
     The filtered samples are interpolated by a quintic spline, which is then differentiated; towards both ends the
     derivatives are less exact, so leave the first and last few samples out of a fit.
 
-    Raises:
-        FilterError: as :func:`zero_phase_filter`.
+    Raises FilterError: as :func:`zero_phase_filter`.
     """
     smooth = zero_phase_filter(samples, rate_hz, cutoff_hz, order)
     return smooth, *spline_derivatives(smooth, rate_hz)
@@ -63,8 +61,7 @@ def filtered_derivatives(
 def spline_derivatives(samples: ArrayLike, rate_hz: float) -> tuple[Array, Array]:
     """First and second time derivative of samples (N, ...) through a quintic spline.
 
-    Raises:
-        FilterError: fewer samples than a quintic spline needs, or samples that are not finite.
+    Raises FilterError: fewer samples than a quintic spline needs, or samples that are not finite.
     """
     values = _finite(samples)
     if len(values) <= SPLINE_DEGREE:

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -57,8 +57,7 @@ def starting_guess(
     """The named parameter set of the robot file, uncertain by a fraction of each parameter's size, but for those of
     which a value and its standard deviation are known.
 
-    Raises:
-        ScenarioError: no such set (with the valid names).
+    Raises ScenarioError: no such set (with the valid names).
     """
     check_parameter_set(robot, set_name)
     chosen = robot.parameter_sets[set_name]
@@ -106,9 +105,8 @@ class ParameterChoice:
 def choose_parameters(robot: Robot, choice: str | None = None) -> ParameterChoice:
     """Parameters by the name of a set, or the estimates of a result file; the nominal set when nothing is named.
 
-    Raises:
-        ScenarioError: neither a set of the robot (with the valid names) nor a file.
-        RecordError: a result file without a complete set of estimates, or one that is no number in its range.
+    Raises ScenarioError: neither a set of the robot (with the valid names) nor a file. Raises RecordError: a result
+    file without a complete set of estimates, or one that is no number in its range.
     """
     name = NOMINAL if choice is None else choice
     if name in robot.parameter_sets:
@@ -116,28 +114,35 @@ def choose_parameters(robot: Robot, choice: str | None = None) -> ParameterChoic
     if not Path(name).is_file():
         valid = ", ".join(sorted(robot.parameter_sets))
         raise ScenarioError(f"{name!r} is neither a parameter set of robot {robot.name} ({valid}) nor a result.json")
-    return ParameterChoice(_estimates(name, load_result(name)), f"estimates of {name}")
+    result = load_result(name)
+    try:
+        values = check_parameters(parameter_column(result.get("identification"), "estimate", PARAMETER_NAMES))
+    except (RecordError, ParameterError) as error:
+        raise RecordError(f"{name}: {error}") from None
+    return ParameterChoice(values, f"estimates of {name}")
 
 
-def _estimates(path: str, result: dict[str, Any]) -> Array:
-    entries = result.get("identification")
-    entries = entries.get("parameters") if isinstance(entries, dict) else None
+def parameter_entries(identification: Any) -> dict[str, Any]:
+    """The parameters of an identification entry of a result, by name. Raises RecordError: there are none."""
+    entries = identification.get("parameters") if isinstance(identification, dict) else None
     if not isinstance(entries, dict):
-        raise RecordError(f"{path} has no identification.parameters; write it with: cmmsim identify")
-    found = {name: _estimate(entries.get(name)) for name in PARAMETER_NAMES}
+        raise RecordError("there is no identification.parameters; write it with: cmmsim identify")
+    return entries
+
+
+def parameter_column(identification: Any, column: str, names: Sequence[str]) -> list[float]:
+    """Parameters of one column ("initial", "estimate", ...) of an identification entry.
+
+    Raises RecordError: naming those that are missing, or one that is no finite number.
+    """
+    entries = parameter_entries(identification)
+    found: dict[str, Any] = {n: one.get(column) if isinstance(one := entries.get(n), dict) else None for n in names}
     absent = [name for name, value in found.items() if value is None]
     if absent:
         more = f" and {len(absent) - 3} more" if len(absent) > 3 else ""
-        raise RecordError(f"{path} has no estimate of {', '.join(absent[:3])}{more}")
+        raise RecordError(f"there is no {column} of {', '.join(absent[:3])}{more}")
     for name, value in found.items():
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not (number and abs(value) <= sys.float_info.max):
-            raise RecordError(f"{path}: estimate of {name} is {json.dumps(value):.60}, must be a finite number")
-    try:
-        return check_parameters(list(found.values()))
-    except ParameterError as error:
-        raise RecordError(f"{path}: {error}") from None
-
-
-def _estimate(entry: Any) -> Any:
-    return entry.get("estimate") if isinstance(entry, dict) else None
+            raise RecordError(f"{column} of {name} is {json.dumps(value):.60}, must be a finite number")
+    return list(found.values())

@@ -52,8 +52,7 @@ def own_function(name: str, what: str, error: type[IdentifyError]) -> Callable[.
 
     Its folder must be on PYTHONPATH, so that workers on other machines find it, too.
 
-    Raises:
-        error: no such module or function, a module that cannot be imported, or something that cannot be called.
+    Raises error: no such module or function, a module that cannot be imported, or something that cannot be called.
     """
     module, _, attribute = name.partition(":")
     try:

@@ -90,8 +90,7 @@ def random_trajectory(
 
     Normal coefficients are projected onto the conditions of a smooth start, then scaled axis by axis.
 
-    Raises:
-        TrajectoryError: fewer than two harmonics, which leave no freedom for a smooth start.
+    Raises TrajectoryError: fewer than two harmonics, which leave no freedom for a smooth start.
     """
     if harmonics < 2:
         raise TrajectoryError(f"a smooth start needs at least 2 harmonics, got {harmonics}")
@@ -114,9 +113,8 @@ def from_home(home: Array, fundamental_hz: float, sine: Array, cosine: Array) ->
 def check_travel(robot: Robot, trajectory: FourierTrajectory, t: ArrayLike, margin_rad: float = 0.0) -> float:
     """Largest crank angle [rad] of a trajectory that the robot may follow, sampled at times ``t`` (N,) [s].
 
-    Raises:
-        TrajectoryError: out of reach, beyond the travel limit less the margin, or near a singularity; the message
-            names time, leg, value and limit (`dynamics.workspace.check_motion`).
+    Raises TrajectoryError: out of reach, beyond the travel limit less the margin, or near a singularity; the message
+    names time, leg, value and limit (`dynamics.workspace.check_motion`).
     """
     times = np.asarray(t, dtype=float)
     try:
@@ -177,8 +175,7 @@ def save_trajectories(path: Path | str, trajectories: TrajectorySet) -> None:
 def load_trajectories(path: Path | str) -> TrajectorySet:
     """Read what :func:`save_trajectories` wrote.
 
-    Raises:
-        TrajectoryError: the file cannot be read, is of another format or incomplete.
+    Raises TrajectoryError: the file cannot be read, is of another format or incomplete.
     """
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))

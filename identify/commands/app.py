@@ -280,8 +280,7 @@ app.command(help=STUDY_HELP)(stoppable(study))
 def parse_settings(settings: list[str] | None) -> dict[str, Any]:
     """Overrides from ``KEY=VALUE`` texts; a value is TOML, and what is no TOML is a string.
 
-    Raises:
-        ScenarioError: a text without ``=``.
+    Raises ScenarioError: a text without ``=``.
     """
     overrides = {}
     for text in settings or []:

@@ -3,8 +3,6 @@
 Heavy imports are late.
 """
 
-import csv
-import io
 import math
 from dataclasses import asdict
 from itertools import product
@@ -138,6 +136,7 @@ def detectors(
     The first row is what the sensor sees of the platform at home; the others are all combinations of the options.
     """
     import numpy as np
+    import pandas as pd
 
     from cmmsim.detector_leaderboard import CONFIDENCE, Condition, compete, scene_of, working_point
     from cmmsim.files.sensor_file import read_sensor_file
@@ -155,7 +154,8 @@ def detectors(
     said = {"sensor": file.name, "seed": seed, "draws": draws, "confidence": CONFIDENCE}
     entry = {**said, "working_point": _columns(at_work), "scores": rows}
     figure = detectors_figure(scores, at_work)
-    save_files(folder, {"detectors.csv": _as_csv(rows), "detectors.json": entry, "detectors.png": figure})
+    table = pd.DataFrame(rows).to_csv(index=False, na_rep="nan", lineterminator="\r\n")
+    save_files(folder, {"detectors.csv": table, "detectors.json": entry, "detectors.png": figure})
     if not quiet:
         _print_scores(scores, file.name, folder)
 
@@ -174,14 +174,6 @@ def _row(score: "Score") -> dict[str, Any]:
     figures = asdict(score)
     del figures["condition"]
     return {"detector": figures.pop("detector"), **_columns(score.condition), **figures}
-
-
-def _as_csv(rows: list[dict[str, Any]]) -> str:
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]))
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def _print_scores(scores: list["Score"], sensor: str, folder: Path) -> None:

@@ -180,9 +180,9 @@ def _law_line(law: dict[str, Any]) -> str:
 
 
 def _list() -> None:
-    from identify.studies.study_file import load_study, study_names
+    from identify.studies.study_file import STUDIES, load_study
 
-    studies = [(name, load_study(name)) for name in study_names()]
+    studies = [(name, load_study(name)) for name in STUDIES.names()]
     rows = [(name, f"{found.rows:,}", found.title) for name, found in studies]
     print_table(("study", "rows", "what it asks"), rows, ("study", "what it asks"))
 

@@ -38,13 +38,11 @@ def identify(
 ) -> IdentificationResult:
     """Estimate the parameters of robot and joint PID from one or several records by closed-loop output error.
 
-    Raises:
-        RecordError: the record misses something, such as its scenario or its scale anchor, or states what is none, such
-            as a seed that is no whole number.
-        EstimationError: no robot or scenario; a record of another robot, timing or servo, or one that cannot carry an
-            identification; no model that runs from the starting guess or the warm start, or that bears the noise.
-        ScenarioError: a parameter set that the robot does not have, or a starting guess that no model has.
-        dynamics.DynamicsError: poses that the robot cannot reach.
+    Raises RecordError: the record misses something, such as its scenario or its scale anchor, or states what is none,
+    such as a seed that is no whole number. Raises EstimationError: no robot or scenario; a record of another robot,
+    timing or servo, or one that cannot carry an identification; no model that runs from the starting guess or the warm
+    start, or that bears the noise. Raises ScenarioError: a parameter set that the robot does not have, or a starting
+    guess that no model has. Raises dynamics.DynamicsError: poses that the robot cannot reach.
     """
     progress = progress or SilentProgress()
     records = [record] if isinstance(record, xr.Dataset) else list(record)
@@ -88,10 +86,9 @@ def identify(
 def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario) -> OutputErrorProblem:
     """The output-error problem of one or several records; the first brings the scale anchor.
 
-    Raises:
-        RecordError: no scale anchor, or no such poses.
-        EstimationError: no robot or scenario; a record that does not fit, or cannot carry an identification.
-        ScenarioError: no such starting guess, or one that no model has.
+    Raises RecordError: no scale anchor, or no such poses. Raises EstimationError: no robot or scenario; a record that
+    does not fit, or cannot carry an identification. Raises ScenarioError: no such starting guess, or one that no model
+    has.
     """
     for given, kind, loader in ((robot, Robot, "dynamics.load_robot"), (scenario, Scenario, "identify.load_scenario")):
         if not isinstance(given, kind):

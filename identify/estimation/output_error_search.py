@@ -28,8 +28,7 @@ def output_error_searches(
 ) -> dict[str, Solution]:
     """What each search found, in their order, from the warm start (67,); the last is that of the scenario's method.
 
-    Raises:
-        EstimationError: no model that runs.
+    Raises EstimationError: no model that runs.
     """
     found = {}
     driven = problem.driven_by_commands()
@@ -57,8 +56,7 @@ def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advanc
 def shoot(problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress: Progress) -> Solution:
     """Parameters with which the command-driven model runs, by multiple shooting from warm start or starting guess.
 
-    Raises:
-        EstimationError: no segment-wise model that runs, or none that does over the whole records.
+    Raises EstimationError: no segment-wise model that runs, or none that does over the whole records.
     """
     settings = scenario.identification
     criteria = StopCriteria(CLOSE_ENOUGH, settings.parameter_tolerance, settings.max_iterations)

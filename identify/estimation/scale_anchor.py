@@ -65,9 +65,8 @@ def store_anchor(record: xr.Dataset, anchor: ScaleAnchor) -> None:
 def read_anchor(record: xr.Dataset) -> ScaleAnchor:
     """The anchor's measurement of a record.
 
-    Raises:
-        RecordError: the record has none, so that the scale of its parameters is free; or a measured value or standard
-            deviation that is no finite number > 0.
+    Raises RecordError: the record has none, so that the scale of its parameters is free; or a measured value or
+    standard deviation that is no finite number > 0.
     """
     name = record.attrs.get("scale_anchor")
     if name not in ANCHORS:

@@ -54,19 +54,14 @@ def _stacked(runs: Sequence[RecordedRun], scenario: Scenario) -> tuple[Array, Ar
     """Equations of all runs: matrix (rows, 67 + 6 runs) and right side (rows,), N m."""
     matrices, right = [], []
     for place, run in enumerate(runs):
-        columns = regression_columns(run.robot, run.without_gaps(), run.logged, scenario)
+        balance, slipping = joint_balance(run.robot, run.without_gaps(), run.logged, scenario)
+        columns = balance[slipping]
         matrix = np.zeros((len(columns), len(NAMES) + 6 * len(runs)))
         matrix[:, : len(NAMES)] = columns[:, : len(NAMES)]
         matrix[:, len(NAMES) + 6 * place :][:, :6] = columns[:, len(NAMES) :]
         matrices.append(matrix)
         right.append(-columns[:, : len(NAMES)] @ run.payload)
     return np.concatenate(matrices), np.concatenate(right)
-
-
-def regression_columns(robot: Robot, measured: Array, commands: Array, scenario: Scenario) -> Array:
-    """Homogeneous regression (rows, 73) of the joints that slip, see `joint_balance`; N m."""
-    columns, slipping = joint_balance(robot, measured, commands, scenario)
-    return columns[slipping]
 
 
 def joint_balance(

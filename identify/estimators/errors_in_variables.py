@@ -16,7 +16,7 @@ deviations say so.
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -106,14 +106,6 @@ NOT_GENERIC = 1e-12
 """Part of the right side in the singular vector, relative to its largest entry, below which there is no solution."""
 
 
-@dataclass(frozen=True)
-class TlsFit:
-    """Solution (p,) and its covariance (p, p) to first order, in the units of the scaled unknowns."""
-
-    solution: Array
-    covariance: Array
-
-
 @estimator("torque, total LS", uses="poses, torque")
 def total_least_squares(evidence: Evidence) -> Estimate:
     """Total least squares with drawn errors of the columns.
@@ -128,16 +120,18 @@ def total_least_squares(evidence: Evidence) -> Estimate:
     rows, half = equations.whitened(noise), len(noise) // 2
     unknowns, deviations = values.copy(), std.copy()
     for block, columns in ((slice(0, half), slice(0, DYNAMIC)), (slice(half, None), slice(DYNAMIC, UNKNOWNS))):
-        fit = _fit_block(rows.matrix[block, columns], rows.right[block], errors[:, block], columns, values, std)
-        unknowns[columns] += std[columns] * fit.solution
-        deviations[columns] *= np.sqrt(np.diag(fit.covariance))
+        matrix, right = rows.matrix[block, columns], rows.right[block]
+        solution, covariance = _fit_block(matrix, right, errors[:, block], columns, values, std)
+        unknowns[columns] += std[columns] * solution
+        deviations[columns] *= np.sqrt(np.diag(covariance))
     admissible = nearest_admissible(unknowns, information(rows, guess), std)
     seconds = time.perf_counter() - began
     return Estimate(admissible[: len(NAMES)], deviations[: len(NAMES)], seconds, REWEIGHTINGS + 1)
 
 
-def truncated_tls(matrix: Array, right: Array, errors: Array) -> TlsFit:
-    """x (p,) of matrix (n, p) x = right (n,) by generalised total least squares in the directions shown.
+def truncated_tls(matrix: Array, right: Array, errors: Array) -> tuple[Array, Array]:
+    """x (p,) of matrix (n, p) x = right (n,) by generalised total least squares in the directions shown, and its
+    covariance (p, p) to first order.
 
     Rows have the standard deviation 1, and nothing beyond 0 with deviation 1 is known of x beforehand.
     errors (draws, n, p + 1): drawn errors of (matrix | right).
@@ -162,10 +156,12 @@ def truncated_tls(matrix: Array, right: Array, errors: Array) -> TlsFit:
     normal = joined[:, :-1].T @ joined[:, :-1]
     inverse = np.linalg.inv(normal - drawn[:, :-1].T @ drawn[:, :-1] / largest[0] ** 2)
     covariance = shown.T @ (inverse @ normal @ inverse) @ shown + np.eye(size) - shown.T @ shown
-    return TlsFit(np.asarray(solution, dtype=float), np.asarray(covariance, dtype=float))
+    return np.asarray(solution, dtype=float), np.asarray(covariance, dtype=float)
 
 
-def _fit_block(matrix: Array, right: Array, errors: Array, columns: slice, values: Array, std: Array) -> TlsFit:
+def _fit_block(
+    matrix: Array, right: Array, errors: Array, columns: slice, values: Array, std: Array
+) -> tuple[Array, Array]:
     """Fit of one block of unknowns, counted from the starting guess in its standard deviations."""
     block = errors[..., [*range(UNKNOWNS)[columns], -1]]
     block[..., -1] -= block[..., :-1] @ values[columns]

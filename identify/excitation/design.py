@@ -23,6 +23,12 @@ Check = Callable[[FourierTrajectory, Array], object]
 """Raises TrajectoryError for a trajectory that is not admissible at some instants (N,) [s]."""
 
 
+def drawn_trajectory(rng: np.random.Generator, home_pose: Array, settings: Excitation) -> FourierTrajectory:
+    """A random trajectory that fills the box of a scenario's excitation about a pose (6,), whatever else limits it."""
+    box = (settings.position_amplitude_m, settings.orientation_amplitude_rad)
+    return random_trajectory(rng, home_pose, settings.fundamental_hz, settings.harmonics, *box)
+
+
 def admissible_trajectories(
     robot: Robot,
     settings: Excitation,
@@ -41,14 +47,7 @@ def admissible_trajectories(
     accepted: list[FourierTrajectory] = []
     reason = TrajectoryError("none tried")
     for _ in range(ATTEMPTS * count):
-        candidate = random_trajectory(
-            rng,
-            robot.home_pose,
-            settings.fundamental_hz,
-            settings.harmonics,
-            settings.position_amplitude_m,
-            settings.orientation_amplitude_rad,
-        )
+        candidate = drawn_trajectory(rng, robot.home_pose, settings)
         try:
             check_travel(robot, candidate, t, settings.travel_margin_rad)
             check(candidate, t)
@@ -72,10 +71,8 @@ RANDOM_TOLERANCE = 1e-3
 def design_trajectories(robot: Robot, scenario: Scenario, seed: int, progress: Progress | None = None) -> TrajectorySet:
     """Exciting trajectory and validation trajectories of a scenario, each kind from its own stream of the seed.
 
-    Raises:
-        ScenarioError: no such criterion.
-        TrajectoryError: no random trajectory of this amplitude keeps the limits; no whole number of periods where a
-            search needs it; a search that finds nothing.
+    Raises ScenarioError: no such criterion. Raises TrajectoryError: no random trajectory of this amplitude keeps the
+    limits; no whole number of periods where a search needs it; a search that finds nothing.
     """
     progress, settings = progress or SilentProgress(), scenario.excitation
     check = motion_check(robot, scenario)
@@ -117,9 +114,8 @@ def search_problem(
 ) -> SearchProblem:
     """The search of a scenario among, or from, admissible random trajectories.
 
-    Raises:
-        ScenarioError: no such criterion.
-        TrajectoryError: no whole number of periods for a method that needs it.
+    Raises ScenarioError: no such criterion. Raises TrajectoryError: no whole number of periods for a method that needs
+    it.
     """
     settings = scenario.excitation
     if settings.method != "random":

@@ -104,8 +104,6 @@ def best_of(problem: SearchProblem, seed: np.random.SeedSequence, progress: Prog
     return SearchResult(best, problem.value(best), count, 0, 0, f"best of {count}")
 
 
-# Differential evolution, in the place of the paper's genetic algorithm.
-
 STALLED = 1e-10
 """The paper's stop criterion: spread of the population's values, relative."""
 
@@ -183,9 +181,7 @@ class _Filling:
         return -value if np.isfinite(value) else NOT_ADMISSIBLE
 
 
-# IPOPT.
-
-MOST_ITERATIONS = 150
+MOST_ITERATIONS = 150  # of IPOPT
 
 TOLERANCE = 1e-4
 """IPOPT's, relative: further digits of an optimum do not excite more."""

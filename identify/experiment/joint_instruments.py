@@ -107,8 +107,7 @@ def write_channels(path: Path, channels: xr.Dataset) -> None:
 def read_channels(path: Path) -> xr.Dataset:
     """Read the channels of a file, checked.
 
-    Raises:
-        RecordError: truncated, a channel or a standard deviation missing, or values that are not finite.
+    Raises RecordError: truncated, a channel or a standard deviation missing, or values that are not finite.
     """
     channels = read_group(path)
     check_variables(channels, VARIABLES, str(path))

@@ -97,8 +97,7 @@ class Plant:
 def build_plant(scenario: Scenario, nominal: Robot | None = None) -> Plant:
     """The plant of a scenario, about its robot as it is known; None: loaded from the scenario's.
 
-    Raises:
-        ScenarioError: no such parameter set (with the valid names).
+    Raises ScenarioError: no such parameter set (with the valid names).
     """
     nominal, switches = nominal or load_robot(scenario.robot), scenario.plant
     settings = loop_settings(scenario, switches)

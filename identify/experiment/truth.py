@@ -43,8 +43,7 @@ def build_truth(
     """Truth of one run at the frames: ``time`` (N,) [s], pose and joint arrays (N, 6), parameters (p,) with names;
     ``mismatch``: values of some of `MISMATCH`.
 
-    Raises:
-        RecordError: wrong shapes, or numbers that are not finite.
+    Raises RecordError: wrong shapes, or numbers that are not finite.
     """
     true_pose = pose_array(pose, "pose")
     truth = described_dataset(
@@ -68,8 +67,7 @@ def build_truth(
 def read_truth(path: Path | str, run: str = "") -> xr.Dataset:
     """Read the truth of a file, or of one of its runs (``"run01"``), checked.
 
-    Raises:
-        RecordError: truncated file, no truth in it, missing variables or wrong shapes.
+    Raises RecordError: truncated file, no truth in it, missing variables or wrong shapes.
     """
     group = f"{run}/{TRUTH_GROUP}" if run else TRUTH_GROUP
     return check_truth(read_group(path, group), f"{path}:{group}")
@@ -78,8 +76,7 @@ def read_truth(path: Path | str, run: str = "") -> xr.Dataset:
 def read_truth_runs(path: Path | str) -> list[xr.Dataset]:
     """Read the truth of all runs of a file in their order.
 
-    Raises:
-        RecordError: as :func:`read_truth`, or no runs in the file.
+    Raises RecordError: as :func:`read_truth`, or no runs in the file.
     """
     return [read_truth(path, name) for name in run_names(path)]
 
@@ -95,11 +92,7 @@ def true_parameters(truth: xr.Dataset) -> dict[str, float]:
 
 
 def check_truth(truth: xr.Dataset, source: str) -> xr.Dataset:
-    """Return the truth when it is complete and finite.
-
-    Raises:
-        RecordError: the first thing that is not so.
-    """
+    """Return the truth when it is complete and finite. Raises RecordError: the first thing that is not so."""
     expected = VARIABLES | {name: entry for name, entry in MISMATCH.items() if name in truth}
     check_variables(truth, expected, source)
     for name in expected:

@@ -35,11 +35,7 @@ def write_groups(path: Path | str, groups: Mapping[str, xr.Dataset]) -> None:
 
 
 def read_group(path: Path | str, group: str = "") -> xr.Dataset:
-    """Read one group into memory.
-
-    Raises:
-        RecordError: no such file, not a whole netCDF file, or no such group.
-    """
+    """Read one group into memory. Raises RecordError: no such file, not a whole netCDF file, or no such group."""
     names = group_names(path)
     if group and group not in names:
         raise RecordError(f"{path} has no group {group!r}; it has {', '.join(names) or 'none'}")
@@ -53,8 +49,7 @@ def read_group(path: Path | str, group: str = "") -> xr.Dataset:
 def group_names(path: Path | str) -> list[str]:
     """Names of all groups, nested ones as ``run01/truth``.
 
-    Raises:
-        RecordError: no such file, or not a whole netCDF file.
+    Raises RecordError: no such file, or not a whole netCDF file.
     """
     if not Path(path).is_file():
         raise RecordError(f"there is no file {path}")
@@ -100,11 +95,7 @@ LABELS: dict[str, list[Any]] = {
 
 
 def pose_array(values: ArrayLike, name: str) -> Array:
-    """Array (N, 6) of floats.
-
-    Raises:
-        RecordError: another shape.
-    """
+    """Array (N, 6) of floats. Raises RecordError: another shape."""
     array = np.asarray(values, dtype=float)
     if array.ndim != 2 or array.shape[1] != 6:
         raise RecordError(f"{name} has shape {array.shape}, expected (N, 6)")
@@ -114,8 +105,7 @@ def pose_array(values: ArrayLike, name: str) -> Array:
 def described_dataset(values: dict[str, Any], time: ArrayLike, variables: Variables, **labels: list[str]) -> xr.Dataset:
     """Dataset of described variables on a time axis; ``labels`` are the coordinates of further dimensions.
 
-    Raises:
-        RecordError: an array whose shape does not fit its dimensions.
+    Raises RecordError: an array whose shape does not fit its dimensions.
     """
     coordinates: dict[str, Any] = {"time": np.asarray(time, dtype=float), **LABELS, **labels}
     used = {dim for dims, _, _ in variables.values() for dim in dims}
@@ -135,8 +125,7 @@ def described_dataset(values: dict[str, Any], time: ArrayLike, variables: Variab
 def check_variables(data: xr.Dataset, variables: Variables, source: str) -> None:
     """Refuse a dataset that lacks one of the variables, or has it on other dimensions.
 
-    Raises:
-        RecordError: naming what is missing or wrong.
+    Raises RecordError: naming what is missing or wrong.
     """
     missing = [name for name in variables if name not in data]
     if missing:
@@ -154,8 +143,7 @@ def check_variables(data: xr.Dataset, variables: Variables, source: str) -> None
 def check_finite(values: Array, name: str, source: str) -> None:
     """Refuse values that are not finite.
 
-    Raises:
-        RecordError: naming the variable and how many of its values are wrong.
+    Raises RecordError: naming the variable and how many of its values are wrong.
     """
     bad = int(np.count_nonzero(~np.isfinite(values)))
     if bad:
@@ -192,8 +180,7 @@ def write_covariance(path: Path | str, names: tuple[str, ...], covariance: Array
 def read_covariance(path: Path | str, names: tuple[str, ...]) -> Array:
     """Read the covariance (n, n) of the parameters `names`.
 
-    Raises:
-        RecordError: a file that is damaged, of other parameters, or with variances that are none.
+    Raises RecordError: a file that is damaged, of other parameters, or with variances that are none.
     """
     data = read_group(path)
     if VARIABLE not in data or data[VARIABLE].dims != DIMENSIONS:

@@ -7,7 +7,6 @@ import json
 import math
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,67 +29,26 @@ WRITTEN_BY = {
 """The stage of ``cmmsim`` that writes each file."""
 
 
-@dataclass(frozen=True)
 class RunFolder:
-    """Paths of one run."""
+    """Paths of the files of one run, whose folder is `path`."""
 
-    path: Path
-
-    @property
-    def scenario(self) -> Path:
-        """The resolved scenario, TOML."""
-        return self.path / "scenario.toml"
-
-    @property
-    def trajectories(self) -> Path:
-        """Exciting and validation trajectories with the seed, JSON."""
-        return self.path / "trajectories.json"
-
-    @property
-    def experiment(self) -> Path:
-        """Record and truth of the excitation run, netCDF."""
-        return self.path / "experiment.nc"
-
-    @property
-    def payload(self) -> Path:
-        """Record and truth of the same run under a known load, netCDF; where the scale anchor is a payload."""
-        return self.path / "payload.nc"
-
-    @property
-    def covariance(self) -> Path:
-        """Covariance of the estimated parameters, netCDF."""
-        return self.path / "covariance.nc"
-
-    @property
-    def validation(self) -> Path:
-        """Records and truth of the validation runs, netCDF."""
-        return self.path / "validation.nc"
-
-    @property
-    def model(self) -> Path:
-        """What the models do on the same trajectories, netCDF."""
-        return self.path / "model.nc"
-
-    @property
-    def result(self) -> Path:
-        """Figures of the run, JSON."""
-        return self.path / "result.json"
-
-    @property
-    def report(self) -> Path:
-        """The report, one HTML file."""
-        return self.path / "report.html"
-
-    @property
-    def figures(self) -> Path:
-        """Folder of the PNG figures."""
-        return self.path / "figures"
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.scenario = path / "scenario.toml"  # resolved
+        self.trajectories = path / "trajectories.json"  # exciting and unseen ones, with the seed
+        self.experiment = path / "experiment.nc"  # record and truth of the excitation run
+        self.payload = path / "payload.nc"  # of the same run under a known load, where that is the scale anchor
+        self.covariance = path / "covariance.nc"  # of the estimated parameters
+        self.validation = path / "validation.nc"  # records and truth of the unseen runs
+        self.model = path / "model.nc"  # what the models do on the same trajectories
+        self.result = path / "result.json"  # figures of the run
+        self.report = path / "report.html"
+        self.figures = path / "figures"
 
     def require(self, *names: str) -> None:
         """Refuse to go on without files of earlier stages, such as ``require("experiment.nc")``.
 
-        Raises:
-            OutputFolderError: naming the first missing file and the stage that writes it.
+        Raises OutputFolderError: naming the first missing file and the stage that writes it.
         """
         if not self.path.is_dir():
             raise OutputFolderError(f"no run folder {self.path}; make it with: cmmsim excite --out {self.path}")
@@ -103,8 +61,7 @@ class RunFolder:
 def new_run_folder(path: Path | str) -> RunFolder:
     """A folder that does not exist yet or is empty; it is not made before something is written into it.
 
-    Raises:
-        OutputFolderError: something is there already, or the folder cannot be made.
+    Raises OutputFolderError: something is there already, or the folder cannot be made.
     """
     folder = Path(path)
     above = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
@@ -146,11 +103,7 @@ def save_files(folder: Path, files: Mapping[str, Any]) -> None:
 
 
 def load_result(path: Path | str) -> dict[str, Any]:
-    """Read a result.
-
-    Raises:
-        RecordError: no such file, or no JSON object in it.
-    """
+    """Read a result. Raises RecordError: no such file, or no JSON object in it."""
     try:
         result = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
@@ -165,8 +118,7 @@ def load_result(path: Path | str) -> dict[str, Any]:
 def check_entries(path: Path | str, result: dict[str, Any], *stages: str) -> None:
     """Refuse a result without the entries of these stages, ``identify`` and ``validate``.
 
-    Raises:
-        RecordError: naming what is missing and the stage that writes it.
+    Raises RecordError: naming what is missing and the stage that writes it.
     """
     missing = {stage: [name for name in ENTRIES[stage] if name not in result] for stage in stages}
     first = next((stage for stage in stages if missing[stage]), None)

@@ -23,9 +23,6 @@ def _version(name: str) -> str:
         return "not installed"
 
 
-# Whether all rows of a study are computed by the same software, wherever and whenever.
-
-
 class OtherVersionsWarning(UserWarning):
     """Some rows are computed with other versions of packages than are installed here."""
 
@@ -42,8 +39,7 @@ def same_versions(there: Mapping[str, Mapping[str, str]], remedy: str) -> None:
     Rows of another cmmsim are those of another simulation. Other versions of what it computes with change figures by
     little, or not at all: they are one warning that names each version once.
 
-    Raises:
-        StudyError: a place has another cmmsim, or none.
+    Raises StudyError: a place has another cmmsim, or none.
     """
     here, places = versions(), dict[tuple[str, str], list[str]]()
     for place, theirs in there.items():

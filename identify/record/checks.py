@@ -15,7 +15,7 @@ from identify.errors import EstimationError
 from identify.files.dataset import POSE, shown
 from identify.filtering import SPLINE_DEGREE, padding_samples
 from identify.record.provenance import check_robot, recorded_scenario
-from identify.record.recording import poses
+from identify.record.recording import check_record, poses
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
@@ -38,10 +38,11 @@ class TooFewFramesError(EstimationError):
 
 
 def check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
-    """The record must be of this robot, and made with the timing and the servo that the model is to have.
+    """The record must be whole, of this robot, and made with the timing and the servo that the model is to have.
 
-    Raises RecordError too, for a record that does not say so.
+    Raises RecordError too, for a record that is not whole or does not say so.
     """
+    check_record(record, "the record")
     check_robot(record, robot)
     recorded = recorded_scenario(record)
     for section in ("timing", "servo"):

@@ -42,9 +42,8 @@ def store_payload(record: xr.Dataset, payload: Array, std: Array | None = None) 
 def recorded_payload(record: xr.Dataset) -> tuple[Array, Array]:
     """The load (67,) of a record and its standard deviations (67,); zero where it states none.
 
-    Raises:
-        RecordError: some but not all of its figures, one or its deviation that is no finite number >= 0, moments of no
-            body, or a deviation that exceeds its figure.
+    Raises RecordError: some but not all of its figures, one or its deviation that is no finite number >= 0, moments of
+    no body, or a deviation that exceeds its figure.
     """
     load, std, stated = np.zeros(len(NAMES)), np.zeros(len(NAMES)), record.attrs
     if not any(name in stated or f"{name}_std" in stated for name in ADDED):

@@ -50,8 +50,7 @@ _AGAIN = {"validation.nc": "validate", "model.nc": "validate"}
 def recorded_scenario(record: xr.Dataset) -> Scenario:
     """The scenario that a record was made with.
 
-    Raises:
-        RecordError: the record states none, with what to set; or one that is no scenario.
+    Raises RecordError: the record states none, with what to set; or one that is no scenario.
     """
     text = record.attrs.get("scenario")
     if text is None:
@@ -70,8 +69,7 @@ def recorded_scenario(record: xr.Dataset) -> Scenario:
 def recorded_seed(record: xr.Dataset) -> int:
     """The seed of a record; zero where it states none, as the record of a real robot.
 
-    Raises:
-        RecordError: one that is no whole number >= 0.
+    Raises RecordError: one that is no whole number >= 0.
     """
     seed = record.attrs.get("seed", 0)
     if isinstance(seed, bool | np.bool_) or not isinstance(seed, int | np.integer) or seed < 0:
@@ -87,9 +85,8 @@ def store_robot(record: xr.Dataset, robot: Robot) -> None:
 def check_robot(record: xr.Dataset, robot: Robot) -> None:
     """The record must be of a robot of this name and, where it states one, of this geometry.
 
-    Raises:
-        EstimationError: another name, or the first number of the geometry that differs.
-        RecordError: a geometry that cannot be read.
+    Raises EstimationError: another name, or the first number of the geometry that differs. Raises RecordError: a
+    geometry that cannot be read.
     """
     if record.attrs.get("robot") != robot.name:
         raise EstimationError(f"the record is of robot {shown(record.attrs.get('robot'))}, not of {robot.name!r}")
@@ -169,9 +166,8 @@ class RunFiles:
 
         result: None: that of the folder, where it has one.
 
-        Raises:
-            OutputFolderError: one of them is gone.
-            RecordError: one of them is another, with the stage to repeat; or damaged; or digests that are none.
+        Raises OutputFolderError: one of them is gone. Raises RecordError: one of them is another, with the stage to
+        repeat; or damaged; or digests that are none.
         """
         run = self.folder
         if result is None:

@@ -22,7 +22,7 @@ from identify.record.checks import (
     checked_covariance,
 )
 from identify.record.payload import recorded_payload
-from identify.record.recording import check_record, poses
+from identify.record.recording import poses
 from identify.scenario import Scenario
 
 LONG_GAP_S = 0.5
@@ -108,12 +108,10 @@ class RecordedRun:
 def recorded_run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
     """A record that can carry an identification, with the model side of the scenario.
 
-    Raises:
-        RecordError, EstimationError: as `watched_run` does.
-        EstimationError: too short, a constant channel, a reference that stands still or is faster than the frames can
-            show.
+    Raises RecordError, EstimationError: as `watched_run` does. Raises EstimationError: too short, a constant channel, a
+    reference that stands still or is faster than the frames can show.
     """
-    _check_origin(record, robot, scenario)
+    check_origin(record, robot, scenario)
     check_length(record.sizes["time"], scenario)
     run = _run(record, robot, scenario)
     check_reference(run.reference, scenario)
@@ -124,12 +122,11 @@ def recorded_run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> Record
 def watched_run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
     """A record of this robot and loop, and of a sensor whose noise it tells: long enough for a prediction at least.
 
-    Raises:
-        RecordError: something is missing, of a wrong shape or not finite; a bad payload.
-        EstimationError: another robot, timing or servo; too many lost frames (its subclass TooFewFramesError), a
-            covariance that is none: not symmetric, not positive definite.
+    Raises RecordError: something is missing, of a wrong shape or not finite; a bad payload. Raises EstimationError:
+    another robot, timing or servo; too many lost frames (its subclass TooFewFramesError), a covariance that is none:
+    not symmetric, not positive definite.
     """
-    _check_origin(record, robot, scenario)
+    check_origin(record, robot, scenario)
     return _run(record, robot, scenario)
 
 
@@ -137,12 +134,6 @@ def recorded_reference(record: xr.Dataset) -> Reference:
     """Reference motion of a record."""
     rates = np.hstack([record["reference_velocity"].values, record["reference_orientation_rate"].values])
     return Reference(poses(record, "reference"), rates)
-
-
-def _check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
-    """The record must be whole, of this robot, and made with the loop of the scenario."""
-    check_record(record, "the record")
-    check_origin(record, robot, scenario)
 
 
 def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:

@@ -75,9 +75,8 @@ def build_record(
     on. Where ``measured_ok`` is 0 the pose was lost, and may be NaN. ``scenario_toml``: timing and servo of the run, as
     `Scenario.to_toml` gives them. ``seed``: of a simulated run; that of a real robot has none.
 
-    Raises:
-        RecordError: wrong shapes, numbers that are not finite where a measurement was not lost, or a `measured_ok`
-            that is neither 1 nor 0.
+    Raises RecordError: wrong shapes, numbers that are not finite where a measurement was not lost, or a `measured_ok`
+    that is neither 1 nor 0.
     """
     reference, rate = pose_array(reference_pose, "reference_pose"), pose_array(reference_rate, "reference_rate")
     measured = pose_array(measured_pose, "measured_pose")
@@ -117,8 +116,7 @@ def write(path: Path | str, record: xr.Dataset, truth: xr.Dataset | None = None)
 def read(path: Path | str, run: str = "") -> xr.Dataset:
     """Read the record of a file, or of one of its runs (``"run01"``), checked; never the truth.
 
-    Raises:
-        RecordError: truncated file, missing variables, wrong shapes, or numbers that are not finite.
+    Raises RecordError: truncated file, missing variables, wrong shapes, or numbers that are not finite.
     """
     return check_record(read_group(path, run), f"{path}{':' + run if run else ''}")
 
@@ -136,8 +134,7 @@ def write_runs(path: Path | str, runs: Sequence[tuple[xr.Dataset, xr.Dataset | N
 def read_runs(path: Path | str) -> list[xr.Dataset]:
     """Read the records of all runs of a file in their order, checked.
 
-    Raises:
-        RecordError: as :func:`read`, or no runs in the file.
+    Raises RecordError: as :func:`read`, or no runs in the file.
     """
     return [read(path, name) for name in run_names(path)]
 
@@ -145,8 +142,7 @@ def read_runs(path: Path | str) -> list[xr.Dataset]:
 def run_names(path: Path | str) -> list[str]:
     """Names of the runs in a file, ``["run01", "run02", ...]``.
 
-    Raises:
-        RecordError: truncated file, or no runs in it.
+    Raises RecordError: truncated file, or no runs in it.
     """
     names = [name for name in group_names(path) if name.startswith("run") and "/" not in name]
     if not names:
@@ -164,8 +160,7 @@ def poses(record: xr.Dataset, kind: str) -> Array:
 
     The same for the kinds ``initial`` and ``identified`` of a model run.
 
-    Raises:
-        RecordError: the dataset has no such poses.
+    Raises RecordError: the dataset has no such poses.
     """
     missing = [name for name in (f"{kind}_position", f"{kind}_orientation") if name not in record]
     if missing:
@@ -176,8 +171,7 @@ def poses(record: xr.Dataset, kind: str) -> Array:
 def check_record(record: xr.Dataset, source: str) -> xr.Dataset:
     """Return the record when it is complete, of the right shapes and finite where nothing was lost.
 
-    Raises:
-        RecordError: the first thing that is not so.
+    Raises RecordError: the first thing that is not so.
     """
     check_variables(record, VARIABLES, source)
     stated = record["measured_ok"].values
@@ -222,8 +216,7 @@ def build_model_run(
     """Poses (N, 6) [m, rad] of both models at the frames ``time`` (N,) [s] of a run; NaN after a model has diverged.
 
     std (N, 6): predicted deviations of the plant from the identified model, where they were predicted.
-    Raises:
-        RecordError: wrong shapes.
+    Raises RecordError: wrong shapes.
     """
     initial, identified = pose_array(initial_pose, "initial_pose"), pose_array(identified_pose, "identified_pose")
     values = {
@@ -253,8 +246,7 @@ def write_model_runs(
 def read_model_runs(path: Path | str) -> Mapping[str, xr.Dataset]:
     """Read all model runs by group name, ``excitation`` among them.
 
-    Raises:
-        RecordError: truncated file, missing variables or wrong shapes.
+    Raises RecordError: truncated file, missing variables or wrong shapes.
     """
     runs = {}
     for name in group_names(path):

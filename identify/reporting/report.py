@@ -85,9 +85,7 @@ class Section:
 def write_report(folder: Path | str, progress: Progress | None = None) -> Path:
     """Write ``figures/*.png`` and ``report.html`` of a run folder; return the path of the report.
 
-    Raises:
-        OutputFolderError: an earlier stage has not been run.
-        RecordError: a file of the run is damaged.
+    Raises OutputFolderError: an earlier stage has not been run. Raises RecordError: a file of the run is damaged.
     """
     run = RunFolder(Path(folder))
     run.require("result.json", "covariance.nc", "experiment.nc", "validation.nc", "model.nc")
@@ -103,11 +101,7 @@ def write_report(folder: Path | str, progress: Progress | None = None) -> Path:
 
 
 def read_report_data(run: RunFolder) -> ReportData:
-    """Read what the stages of a run wrote.
-
-    Raises:
-        RecordError: a file is damaged, or the files are not of one run.
-    """
+    """Read what the stages of a run wrote. Raises RecordError: a file is damaged, or the files are not of one run."""
     files = RunFiles(run)
     data = ReportData(
         result=_checked_result(run, files),

@@ -1,6 +1,5 @@
 """Entries of `result.json` from what the stages computed and recorded."""
 
-import json
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from identify.arrays import Array
 from identify.errors import RecordError
 from identify.experiment.truth import true_poses
 from identify.files.run_folder import rms_figures
-from identify.loop_parameters import NAMES
+from identify.loop_parameters import NAMES, parameter_column, parameter_entries
 from identify.record import recording
 from identify.validation.unseen import PosePrediction
 
@@ -28,16 +27,11 @@ def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
 def parameter_vector(identification: dict[str, Any], column: str) -> Array:
     """Parameters (67,) of one column ("initial", "estimate", ...) of an identification entry.
 
-    Raises:
-        RecordError: one that is missing or no number, or that no model can have.
+    Raises RecordError: one that is missing or no number, or that no model can have.
     """
-    entries = _entries(identification)
-    values = {name: entries[name].get(column) if isinstance(entries.get(name), dict) else None for name in NAMES}
-    for name, value in values.items():
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise RecordError(f"{column} of {name} is {json.dumps(value):.60}, must be a number")
+    values = parameter_column(identification, column, NAMES)
     try:
-        return checked_loop_parameters(list(values.values()))
+        return checked_loop_parameters(values)
     except DynamicsError as error:
         raise RecordError(f"{column}: {error}") from None
 
@@ -45,21 +39,12 @@ def parameter_vector(identification: dict[str, Any], column: str) -> Array:
 def check_intervals(identification: dict[str, Any]) -> None:
     """Refuse an estimate outside its own interval, which no identification gives.
 
-    Raises:
-        RecordError: naming the parameter with both.
+    Raises RecordError: naming the parameter with both.
     """
-    for name, entry in _entries(identification).items():
+    for name, entry in parameter_entries(identification).items():
         estimate, (low, high) = entry["estimate"], entry.get("interval") or (-np.inf, np.inf)
         if estimate is not None and not low <= estimate <= high:
             raise RecordError(f"the estimate {estimate:g} of {name} is outside its interval {low:g} to {high:g}")
-
-
-def _entries(identification: Any) -> dict[str, Any]:
-    """The entries of the parameters."""
-    entries = identification.get("parameters") if isinstance(identification, dict) else None
-    if not isinstance(entries, dict):
-        raise RecordError("identification has no parameters")
-    return entries
 
 
 def sensor_entry(runs: list[tuple[xr.Dataset, xr.Dataset]]) -> dict[str, Any]:

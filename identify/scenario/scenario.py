@@ -123,8 +123,7 @@ class Scenario(Section):
         A path among them starts from the current folder, and the copy holds it absolute, as files leave it. What this
         scenario took from its sensor is taken again, from the copy's.
 
-        Raises:
-            ScenarioError: a path that does not exist (with the valid names) or a value that does not fit.
+        Raises ScenarioError: a path that does not exist (with the valid names) or a value that does not fit.
         """
         data = self.model_dump(exclude_none=True, exclude_unset=True)
         for path, value in overrides.items():
@@ -159,8 +158,7 @@ def scenario_names() -> list[str]:
 def load_scenario(name_or_path: str | Path) -> Scenario:
     """Load a built-in scenario by name, or one from a TOML file, from whose folder its paths start.
 
-    Raises:
-        ScenarioError: no such scenario (with the built-in names), no TOML, or wrong content.
+    Raises ScenarioError: no such scenario (with the built-in names), no TOML, or wrong content.
     """
     return SCENARIOS.load(name_or_path)
 
@@ -168,8 +166,7 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
 def scenario_from_toml(text: str, source: str = "scenario") -> Scenario:
     """Scenario from TOML text; ``source`` names it in error messages, and its paths start from the current folder.
 
-    Raises:
-        ScenarioError: no TOML, or wrong content.
+    Raises ScenarioError: no TOML, or wrong content.
     """
     return SCENARIOS.from_toml(text, source)
 
@@ -196,8 +193,8 @@ RECORDED = ("identification.scale_anchor", "identification.anchor_std")
 def with_estimator_settings(scenario: Scenario, overrides: Mapping[str, Any]) -> Scenario:
     """Copy of the scenario of a record with other settings of the estimator, by dotted path.
 
-    Raises:
-        ScenarioError: a setting that the record was made with (with the sections allowed), or as `with_overrides` does.
+    Raises ScenarioError: a setting that the record was made with (with the sections allowed), or as `with_overrides`
+    does.
     """
     for path in overrides:
         section, _, name = path.partition(".")

@@ -21,8 +21,9 @@ Settings = TypeVar("Settings", bound=BaseModel)
 class SettingsFiles(Generic[Settings]):
     """The files of one kind, as ``scenario``: those of a folder of the package, by name, and a user's own, by path.
 
-    model: what they hold; error: what a refusal raises, with the reason in one line; files: keys that name files of
-    another kind, each with the names that are built in. Such a path starts from the file that states it.
+    model: what they hold; error: what a refusal raises, with the reason in one line; files: keys, dotted where they
+    stand in tables, that name files of another kind, each with the names that are built in. Such a path, also one in a
+    list of them, starts from the file that states it.
     """
 
     kind: str
@@ -38,8 +39,7 @@ class SettingsFiles(Generic[Settings]):
     def load(self, name_or_path: str | Path) -> Settings:
         """Read a built-in file by name, or a user's own by path.
 
-        Raises:
-            IdentifyError: of this kind: neither a built-in name nor a file (with the names), no TOML, wrong content.
+        Raises IdentifyError: of this kind: neither a built-in name nor a file (with the names), no TOML, wrong content.
         """
         name, built_in = str(name_or_path), self.names()
         path, source = Path(name), f"{self.kind} file {name}"
@@ -62,15 +62,19 @@ class SettingsFiles(Generic[Settings]):
 
     def from_dict(self, content: Mapping[str, Any], source: str, folder: Path = Path()) -> Settings:
         """Settings from nested mappings, all wrong entries named in one line. Raises as `load`."""
-        paths = {
-            key: file_path(name, folder, built_in())
-            for key, built_in in self.files.items()
-            if isinstance(name := content.get(key), str)
-        }
         try:
-            return self.model.model_validate({**content, **paths})
+            return self.model.model_validate(self._placed(content, folder))
         except ValidationError as error:
             raise self.error(f"{source}: {one_line(error, self.model)}") from error
+
+    def _placed(self, value: Any, folder: Path, key: str = "") -> Any:
+        """What stands at a dotted key, with its paths made absolute from a folder on."""
+        if isinstance(value, Mapping):
+            return {name: self._placed(one, folder, f"{key}.{name}".lstrip(".")) for name, one in value.items()}
+        if isinstance(value, list):
+            return [self._placed(one, folder, key) for one in value]
+        names = self.files.get(key)
+        return file_path(value, folder, names()) if names and isinstance(value, str) else value
 
 
 def file_path(name: str, folder: Path, built_in: Collection[str]) -> str:
@@ -131,20 +135,18 @@ def _toml_value(value: Any) -> str:
 def _complaint(details: ErrorDetails, model: type[BaseModel]) -> str:
     path = [str(part) for part in details["loc"]]
     key = ".".join(path)
+    owner = _owner(path, model)
+    fields = owner.model_fields if owner is not None else {}
     if details["type"] == "extra_forbidden":
-        return f"unknown key {key!r}; valid names{_within(path)}: {', '.join(_siblings(path, model))}"
+        within = f" in [{'.'.join(path[:-1])}]" if len(path) > 1 else ""
+        return f"unknown key {key!r}; valid names{within}: {', '.join(fields)}"
     if details["type"] == "value_error":
         return f"{key}: {details['ctx']['error']}" if key else str(details["ctx"]["error"])
     if details["type"] == "missing":
         return f"{key} is missing"
-    field = _field(path, model)
-    unit = f" [{u}]" if field is not None and (u := _unit(field)) else ""
+    unit = f" [{u}]" if path and path[-1] in fields and (u := _unit(fields[path[-1]])) else ""
     message = details["msg"]
     return f"{key} = {details['input']!r}{unit}: {message[0].lower()}{message[1:]}"
-
-
-def _within(path: list[str]) -> str:
-    return f" in [{'.'.join(path[:-1])}]" if len(path) > 1 else ""
 
 
 def _owner(path: list[str], model: type[BaseModel]) -> type[BaseModel] | None:
@@ -158,16 +160,6 @@ def _owner(path: list[str], model: type[BaseModel]) -> type[BaseModel] | None:
         else:
             return None
     return owner if isinstance(owner, type) and issubclass(owner, BaseModel) else None
-
-
-def _siblings(path: list[str], model: type[BaseModel]) -> list[str]:
-    owner = _owner(path, model)
-    return list(owner.model_fields) if owner is not None else []
-
-
-def _field(path: list[str], model: type[BaseModel]) -> FieldInfo | None:
-    owner = _owner(path, model)
-    return owner.model_fields.get(path[-1]) if owner is not None and path else None
 
 
 def _unit(field: FieldInfo) -> str:

@@ -60,11 +60,7 @@ class Timing(Section):
         return self.of_sensor().drawn_latencies(frames, rng) if self.latency_jitter_s else None
 
     def of_sensor(self) -> "SensorTiming":
-        """The same values as a sensor's file holds them.
-
-        Raises:
-            ValueError: values that contradict each other.
-        """
+        """The same values as a sensor's file holds them. Raises ValueError: values that contradict each other."""
         from cmmsim.files import Timing as SensorTiming
 
         try:
@@ -75,8 +71,7 @@ class Timing(Section):
     def check(self) -> None:
         """Refuse values that contradict each other, and a latency that the closed loop cannot hold back.
 
-        Raises:
-            ValueError: with the longest latency that is possible.
+        Raises ValueError: with the longest latency that is possible.
         """
         from dynamics.closed_loop.problem import MAX_DELAY_FRAMES
 
@@ -95,9 +90,8 @@ def completed(stated: Timing, sensor: str, changes: Mapping[str, Any]) -> tuple[
     What comes from the sensor does not count as set: with another sensor it is taken from that one. ``changes``: a
     scenario's ``[sensor_changes]`` by dotted key.
 
-    Raises:
-        ValueError: changes without effect, as the scenario itself states otherwise; or a timing that none may have.
-        cmmsim.CmmError: no such sensor, or a bad file.
+    Raises ValueError: changes without effect, as the scenario itself states otherwise; or a timing that none may have.
+    Raises cmmsim.CmmError: no such sensor, or a bad file.
     """
     from cmmsim.files import read_sensor_file
 

@@ -61,8 +61,7 @@ class DaskExecutor:
     def __call__(self, setup: Setup, batches: Batches) -> Iterator[list[Finished]]:
         """Yield batches as they are done.
 
-        Raises:
-            StudyError: the scheduler or all workers are gone, or workers cannot run this program.
+        Raises StudyError: the scheduler or all workers are gone, or workers cannot run this program.
         """
         try:
             while self._send_more(setup, batches):
@@ -147,8 +146,7 @@ class DaskExecutor:
 def _compute_alike(version: str, setup: Setup, cases: list[Case]) -> list[Finished]:
     """Compute rows on a worker, which may have come after the others were checked.
 
-    Raises:
-        StudyError: it has another version of cmmsim than the study's.
+    Raises StudyError: it has another version of cmmsim than the study's.
     """
     require_product(f"worker {get_worker().address}", product_version(), version, REMEDY)
     return compute(setup, cases)
@@ -157,9 +155,6 @@ def _compute_alike(version: str, setup: Setup, cases: list[Case]) -> list[Finish
 def gone(error: OSError) -> StudyError:
     """A scheduler that does not answer any more, as the error of the study."""
     return StudyError(f"{GONE}: {' '.join(str(error).split())}")
-
-
-# Clusters that compute a study: a local one of one process a core, or one that is running already.
 
 
 CONNECT_SECONDS = 5
@@ -235,8 +230,7 @@ def _close(cluster: LocalCluster, others: set[int | None]) -> None:
 def running_cluster(address: str) -> Iterator[DaskExecutor]:
     """Workers: those of a cluster that is running.
 
-    Raises:
-        StudyError: no scheduler answers there, or it has no workers, or one with another version of cmmsim.
+    Raises StudyError: no scheduler answers there, or it has no workers, or one with another version of cmmsim.
     """
     _silence_dask()
     try:
@@ -268,8 +262,7 @@ def check_workers(there: Mapping[str, dict[str, str] | Exception]) -> None:
 
     A worker that answered with an error cannot run cmmsim, but one that did not answer (OSError) is gone.
 
-    Raises:
-        StudyError: a worker has another cmmsim, or none.
+    Raises StudyError: a worker has another cmmsim, or none.
     """
     for worker, answer in there.items():
         if isinstance(answer, Exception) and not isinstance(answer, OSError):

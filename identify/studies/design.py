@@ -38,9 +38,6 @@ NEAREST = 4
 STRICT = ConfigDict(strict=True, allow_inf_nan=False)
 
 
-# Rows.
-
-
 @dataclass(frozen=True)
 class Case:
     """One row that is to be computed: its number, its repeat, and the value of each factor by dotted path."""
@@ -139,18 +136,13 @@ def overrides(settings: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-# A study as a whole, before its first row.
-
-
 def prepare(study: Study) -> Setup:
     """Check a study's keys, values, kind and laws, and load what its rows share.
 
     The first row is checked as a whole. Values that contradict each other only in other rows are errors of these.
 
-    Raises:
-        StudyError: an unknown kind, key, option, or figure or factor of a law, with the valid ones; a wrong value; a
-            key that the kind's rows do not read.
-        ScenarioError: no such scenario, or changes that contradict it.
+    Raises StudyError: an unknown kind, key, option, or figure or factor of a law, with the valid ones; a wrong value; a
+    key that the kind's rows do not read. Raises ScenarioError: no such scenario, or changes that contradict it.
     """
     kind = find_kind(study.kind)
     kind.checked(study.options)

@@ -66,10 +66,9 @@ def _serial(setup: Setup, batches: "Batches") -> Iterator[list[Finished]]:
 def run_study(study: Study, folder: Path, progress: Progress, workers: Workers = in_this_process) -> Outcome:
     """Run a study in its folder, or go on with it there; the same study gives the same figures whatever the workers.
 
-    Raises:
-        StudyError: see :func:`identify.studies.design.prepare` and :func:`identify.studies.store.open_folder`; the disk
-            is full; the workers are lost. Finished rows are kept, and the same call goes on from there.
-        StudyInterrupted: Ctrl-C, likewise.
+    Raises StudyError: see :func:`identify.studies.design.prepare` and :func:`identify.studies.store.open_folder`; the
+    disk is full; the workers are lost. Finished rows are kept, and the same call goes on from there. Raises
+    StudyInterrupted: Ctrl-C, likewise.
     """
     setup = prepare(study)
     entry, design = resolved(study, setup), Design(study)
@@ -101,11 +100,8 @@ def _compute_pending(
             advance(len(finished))
 
 
-# Rows in batches: as many a task as keep a worker busy for a while, so that sending them costs little.
-
-
 BATCH_SECONDS = 0.25
-"""Work in a batch; what is lost at most with each worker when everything is killed at once."""
+"""Work in a batch, so that sending it costs little; what is lost at most with each worker when everything is killed."""
 
 LARGEST_BATCH = 500
 

@@ -67,8 +67,7 @@ class Journal:
     def append(self, rows: list[Finished]) -> None:
         """Add finished rows; when this returns they are on the disk.
 
-        Raises:
-            StudyError: the disk is full or broken; the file is as it was before.
+        Raises StudyError: the disk is full or broken; the file is as it was before.
         """
         text = "".join(f"{json.dumps(asdict(row))}\n" for row in rows).encode()
         safe = f"; {self.finished.sum()} rows are safe, and the same command goes on from there"
@@ -137,9 +136,8 @@ def open_folder(folder: Path, entry: dict[str, Any], rows: int) -> Iterator[Jour
 
     What refuses the study before its first row leaves nothing behind that was not there; Ctrl-C leaves a study begun.
 
-    Raises:
-        StudyError: the folder is of another study, in use, holds something else or cannot be made; one of its files
-            is damaged; rows would be added to those of another version of cmmsim.
+    Raises StudyError: the folder is of another study, in use, holds something else or cannot be made; one of its files
+    is damaged; rows would be added to those of another version of cmmsim.
     """
     _check_content(folder)
     made = [path for path in (folder, *folder.parents) if not path.exists()]

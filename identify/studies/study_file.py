@@ -1,27 +1,7 @@
 """What a user writes: which scenario is varied how, and the laws that its rows should follow, read from TOML.
 
-    name = "pixel_noise"
-    title = "Pose error against pixel noise"
-    kind = "static_pose"                          # what a row is: a built-in kind, or module:function
-    scenario = "paper"
-    repeats = 20
-    seed = 0
-
-    [changes]                                     # for every row
-    scenario.renderer = "analytic"
-
-    [factors]                                     # a grid; with `sample = N` a random sample of N points
-    sensor.camera.dark_noise = [13.0, 26.0, 52.0]
-    options.captures = [1, 4, 16]
-    # sensor.rig.baseline = { low = 0.5, high = 2.0, scale = "log" }   # only in a sample
-
-    [[theory]]                                    # a law that the summary checks; see Law below
-    figure = "mean_position_rms_um"
-    factor = "options.captures"
-    exponent = -0.5
-
-Keys are dotted paths: ``scenario.`` and a key of a scenario, ``sensor.`` and a key of a sensor file, ``options.`` and
-an option of the kind.
+The help of ``cmmsim study`` shows a file. The keys of what is varied are dotted paths: ``scenario.`` and a key of a
+scenario, ``sensor.`` and a key of a sensor file, ``options.`` and an option of the kind.
 """
 
 import math
@@ -32,6 +12,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from identify.errors import StudyError
+from identify.scenario.scenario import SCENARIOS
 from identify.scenario.settings_file import SettingsFiles, one_line
 
 
@@ -117,7 +98,7 @@ class Study(_Table):
     name: str = Field(description="short name, used for folders", pattern=r"^[\w.-]+$")
     title: str = Field("", description="what the study asks")
     kind: str = Field(description="kind of row: a built-in one, or module:function")
-    scenario: str = Field("paper", description="built-in scenario or path of a TOML file")
+    scenario: str = Field("paper", description="built-in scenario, or path of a scenario file from this file on")
     changes: dict[str, Any] = Field({}, description="values that hold in every row, by dotted path")
     factors: dict[str, list[Any] | Range] = Field({}, description="values of each factor, by dotted path")
     sample: int | None = Field(None, description="points drawn at random; none: the whole grid", ge=1)
@@ -161,31 +142,21 @@ class Study(_Table):
         return self.points * self.repeats
 
 
-STUDIES = SettingsFiles("study", Path(__file__).parent / "built_in", Study, StudyError)
-
-
-def study_names() -> list[str]:
-    """Names of the built-in studies."""
-    return STUDIES.names()
+_VARIED = {
+    f"{table}.scenario.{key}": names for table in ("changes", "factors") for key, names in SCENARIOS.files.items()
+}
+STUDIES = SettingsFiles(
+    "study", Path(__file__).parent / "built_in", Study, StudyError, {"scenario": SCENARIOS.names, **_VARIED}
+)
 
 
 def load_study(name_or_path: str | Path) -> Study:
-    """Load a built-in study by name, or one from a TOML file.
+    """Load a built-in study by name, or one from a TOML file, from whose folder its paths start.
 
-    Raises:
-        StudyError: no such study (with the built-in names), no TOML, or wrong content; the keys of factors and changes
-            are checked by :mod:`identify.studies.design`.
+    Raises StudyError: no such study (with the built-in names), no TOML, or wrong content; the keys of factors and
+    changes are checked by :mod:`identify.studies.design`.
     """
     return STUDIES.load(name_or_path)
-
-
-def study_from_toml(text: str, source: str = "study") -> Study:
-    """Study from TOML text; ``source`` names it in error messages.
-
-    Raises:
-        StudyError: no TOML, or wrong content.
-    """
-    return STUDIES.from_toml(text, source)
 
 
 def _factor(path: str, value: Any) -> Any:

@@ -26,6 +26,9 @@ NAMED = 20
 LONGEST = 60
 """Points in the table of `summary.md`; `summary.json` has all."""
 
+Points = list[tuple[dict[str, Any], dict[str, Statistics]]]
+"""Factors and statistics of points."""
+
 
 def write(folder: Path, study: Study, frame: pd.DataFrame) -> dict[str, Any]:
     """Write summary.json, summary.md and figures/*.png into a study's folder; `frame` is its table.
@@ -73,7 +76,7 @@ def main_figures(kind: str, names: list[str]) -> list[str]:
     return [name for name, column in KINDS[kind].columns.items() if column.main and name in names]
 
 
-def _points(study: Study, done: pd.DataFrame, names: list[str]) -> list[tuple[dict[str, Any], dict[str, Statistics]]]:
+def _points(study: Study, done: pd.DataFrame, names: list[str]) -> Points:
     """Factors and statistics of each point that has a row, those of a grid in its order and those of a sample by size.
 
     A sample with single rows is one point as a whole.
@@ -101,13 +104,7 @@ def _failures(study: Study, frame: pd.DataFrame) -> dict[str, Any]:
     return {"reasons": failed["error"].value_counts().head(NAMED).to_dict(), "first": named.to_dict("records")}
 
 
-def _markdown(
-    study: Study,
-    entry: dict[str, Any],
-    verdicts: list[Verdict],
-    points: list[tuple[dict[str, Any], dict[str, Statistics]]],
-    shown: list[str],
-) -> str:
+def _markdown(study: Study, entry: dict[str, Any], verdicts: list[Verdict], points: Points, shown: list[str]) -> str:
     rows = entry["rows"]
     lines = [
         f"# {study.title or study.name}",
@@ -141,13 +138,13 @@ def _law_row(verdict: Verdict) -> str:
     return f"| {law.statement} | {law.expected} | {measured} | {interval} | {verdict.verdict} |"
 
 
-def _bands_text(points: list[tuple[dict[str, Any], dict[str, Statistics]]]) -> str:
+def _bands_text(points: Points) -> str:
     if points and all(one.rows < 2 for _, figures in points for one in figures.values()):
         return "Rms over rows. With a single repeat there is no band: the same command with --repeats 10 adds some."
     return f"Rms over rows, with its {theory.BAND_CONFIDENCE:.0%} band."
 
 
-def _table(study: Study, points: list[tuple[dict[str, Any], dict[str, Statistics]]], shown: list[str]) -> list[str]:
+def _table(study: Study, points: Points, shown: list[str]) -> list[str]:
     factors = list(points[0][0]) if points else []
     heads = [labelled(path, study) for path in factors]
     heads += ["rows", *(labelled(name, study) for name in shown)]

@@ -124,8 +124,7 @@ def written(path: Path, more: str = "") -> Iterator[None]:
 def write_table(path: Path, frame: pd.DataFrame, entry: dict[str, Any]) -> None:
     """Write a table as Parquet, whole or not at all; ``entry`` is the resolved study, kept with it.
 
-    Raises:
-        StudyError: it cannot be written.
+    Raises StudyError: it cannot be written.
     """
     table = pa.Table.from_pandas(frame, preserve_index=False)
     own = {STUDY_KEY: json.dumps(entry).encode(), VERSIONS_KEY: json.dumps(versions()).encode()}
@@ -136,8 +135,7 @@ def write_table(path: Path, frame: pd.DataFrame, entry: dict[str, Any]) -> None:
 def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
     """A study's table and the study, of its `study.parquet`.
 
-    Raises:
-        StudyError: no such file, no Parquet, or not of a study.
+    Raises StudyError: no such file, no Parquet, or not of a study.
     """
     entry = study_in(Path(path))
     if entry is None:
@@ -148,8 +146,7 @@ def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
 def study_in(path: Path) -> dict[str, Any] | None:
     """The resolved study that a table is of; None where there is no such file.
 
-    Raises:
-        StudyError: no Parquet, or not of a study.
+    Raises StudyError: no Parquet, or not of a study.
     """
     if not path.exists():
         return None
@@ -189,8 +186,7 @@ def write_view(path: Path, frame: pd.DataFrame, study: Study) -> None:
 
     A "/" in a name is a group there, so it is written as "_per_".
 
-    Raises:
-        StudyError: it cannot be written.
+    Raises StudyError: it cannot be written.
     """
     view = to_xarray(frame, study)
     with written(path):

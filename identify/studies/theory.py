@@ -136,14 +136,6 @@ class Verdict:
     reason: str = ""
 
     @property
-    def text(self) -> str:
-        """One line with the numbers."""
-        if self.measured is None:
-            return f"{self.verdict}: {self.law.statement}; {self.reason}"
-        interval = f"{self.measured:.4g} ({self.low:.4g} to {self.high:.4g}, {CONFIDENCE:.0%})"
-        return f"{self.verdict}: {self.law.statement}; measured {interval}"
-
-    @property
     def entry(self) -> dict[str, Any]:
         """The verdict as `summary.json` holds it."""
         law = {"statement": self.law.statement, "why": self.law.why, "verdict": self.verdict}

@@ -136,9 +136,8 @@ def predicted_runs(
 
     NaN throughout where its loop is unstable, or too little was measured to know the sensor's noise.
 
-    Raises:
-        RecordError, EstimationError: a record that is damaged, or of another robot, timing or servo.
-        dynamics.DynamicsError: parameters that no model can have.
+    Raises RecordError, EstimationError: a record that is damaged, or of another robot, timing or servo. Raises
+    dynamics.DynamicsError: parameters that no model can have.
     """
     predictions = []
     with progress.stage("predict", len(records)) as advance:
@@ -211,9 +210,8 @@ def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed:
     Both see by an ideal sensor, so that only the parameters and what the model leaves out make the error. NaN where the
     model's loop is unstable, and only there.
 
-    Raises:
-        dynamics.DynamicsError: parameters of another shape, not finite, or outside their range.
-        TrajectoryError: no unseen trajectory keeps the robot's limits.
+    Raises dynamics.DynamicsError: parameters of another shape, not finite, or outside their range. Raises
+    TrajectoryError: no unseen trajectory keeps the robot's limits.
     """
     values, plant = checked_loop_parameters(parameters), build_plant(scenario, robot)
     times = scenario.timing.frame_times(scenario.validation.duration_s)

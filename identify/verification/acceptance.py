@@ -71,9 +71,8 @@ def prepare(
 
     standard: the name of a test or ``all``; volume: its sides, see `parse_volume`, or the largest that is seen.
 
-    Raises:
-        CmmError: an unknown sensor, renderer or standard, a limit that is no positive number, or a volume that is not
-            seen, breaks a rule or lacks room for the bar.
+    Raises CmmError: an unknown sensor, renderer or standard, a limit that is no positive number, or a volume that is
+    not seen, breaks a rule or lacks room for the bar.
     """
     if not (math.isfinite(limit_um) and limit_um > 0.0):
         raise AcceptanceError(f"the limit of the length error must be a positive number of um, got {limit_um:g}")
@@ -91,8 +90,7 @@ def prepare(
 def parse_volume(text: str) -> np.ndarray:
     """Sides (3,) [m] of a volume written as ``0.6`` (a cube) or ``0.7x0.6x0.6``.
 
-    Raises:
-        AcceptanceError: anything else.
+    Raises AcceptanceError: anything else.
     """
     try:
         sides = np.array([float(part) for part in text.lower().split("x")])

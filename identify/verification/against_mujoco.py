@@ -21,10 +21,11 @@ from dynamics.engines.mujoco_engine import MujocoRobot, import_mujoco
 from dynamics.inertia import grouped, physical_inertias
 from dynamics.parameters import COULOMB, VISCOUS
 from identify.arrays import Array
-from identify.errors import TrajectoryError
+from identify.excitation.design import admissible_trajectories
 from identify.progress import Progress, SilentProgress
 from identify.reporting.figures import COMPONENTS
-from identify.trajectory import FourierTrajectory, check_travel, random_trajectory
+from identify.scenario import Excitation
+from identify.trajectory import FourierTrajectory
 
 PARAMETER_SET = "initial"
 DURATION_S, STEADY_FROM_S = 10.0, 2.0
@@ -32,10 +33,13 @@ COMMAND_RATE_HZ, STEPS_PER_COMMAND = 200.0, 4
 SOLVER = MjcfSolver(timestep_s=2.5e-4, integrator="RK4")
 
 # The paper's excitation (section 4.2) in the box of the reference experiment.
-FUNDAMENTAL_HZ, HARMONICS = 0.1, 5
-AMPLITUDE_M, AMPLITUDE_RAD = 0.010, 0.040
-TRAVEL_MARGIN_RAD = 0.1
-ATTEMPTS = 200
+EXCITATION = Excitation(
+    fundamental_hz=0.1,
+    harmonics=5,
+    position_amplitude_m=0.010,
+    orientation_amplitude_rad=0.040,
+    travel_margin_rad=0.1,
+)
 
 GOAL_UM, GOAL_URAD = 10.0, 20.0
 PAPER = {"position_max_um": 1250.0, "angle_max_urad": 3250.0, "position_steady_um": 100.0, "angle_steady_urad": 250.0}
@@ -65,8 +69,7 @@ class EngineRuns:
 def verify(robot: Robot, progress: Progress | None = None) -> EngineRuns:
     """Run both engines with the set `initial` less its friction (the paper's Table 1 has none).
 
-    Raises:
-        DynamicsError, TrajectoryError: see `compare_engines`.
+    Raises DynamicsError, TrajectoryError: see `compare_engines`.
     """
     values = robot.parameter_sets[PARAMETER_SET].vector.copy()
     values[COULOMB], values[VISCOUS] = 0.0, 0.0
@@ -83,9 +86,8 @@ def compare_engines(
 ) -> EngineRuns:
     """Both engines on the exciting trajectory, each with its own parameters (67,): the 64 dynamic ones, lp, li, ld.
 
-    Raises:
-        DynamicsError: MuJoCo is missing or refuses the model, or the loop is unstable.
-        TrajectoryError: no exciting trajectory of this amplitude stays inside the robot's travel.
+    Raises DynamicsError: MuJoCo is missing or refuses the model, or the loop is unstable. Raises TrajectoryError: no
+    exciting trajectory of this amplitude stays inside the robot's travel.
     """
     import_mujoco()
     progress = progress or SilentProgress()
@@ -118,18 +120,8 @@ def compare_engines(
 
 def exciting_trajectory(robot: Robot) -> FourierTrajectory:
     """The first random trajectory of eq. 37 that stays inside the travel; always the same for a robot."""
-    times = np.linspace(0.0, 1 / FUNDAMENTAL_HZ, 100 * HARMONICS)
-    rng = np.random.default_rng(0)
-    reason = TrajectoryError("none tried")
-    for _ in range(ATTEMPTS):
-        candidate = random_trajectory(rng, robot.home_pose, FUNDAMENTAL_HZ, HARMONICS, AMPLITUDE_M, AMPLITUDE_RAD)
-        try:
-            check_travel(robot, candidate, times, TRAVEL_MARGIN_RAD)
-        except TrajectoryError as error:
-            reason = error
-            continue
-        return candidate
-    raise TrajectoryError(f"none of {ATTEMPTS} exciting trajectories stays inside the travel; the last: {reason}")
+    period_s = 1 / EXCITATION.fundamental_hz
+    return admissible_trajectories(robot, EXCITATION, period_s, 1, np.random.SeedSequence(0))[0]
 
 
 def _mujoco_rows(

@@ -176,7 +176,7 @@ def test_what_reads_a_run_anew_refuses_files_of_two_origins(recorded_folder, rec
     ("spoil", "says"),
     [
         (lambda r: r.clear(), "lacks identification, before, after, seconds; write it with: cmmsim identify"),
-        (lambda r: r["identification"]["parameters"].pop("link3.mass"), "initial of link3.mass is null, must be"),
+        (lambda r: r["identification"]["parameters"].pop("link3.mass"), "there is no initial of link3.mass"),
         (lambda r: r.update(made_of=7), "made_of must be digests"),
     ],
     ids=["empty", "parameter gone", "no digests"],
@@ -195,8 +195,8 @@ def test_validation_refuses_a_result_that_is_none_in_one_line(recorded_folder, s
 @pytest.mark.parametrize(
     ("name", "value", "says"),
     [
-        ("link3.mass", None, "estimate of link3.mass is null, must be a number"),
-        ("link3.mass", "1 kg", 'estimate of link3.mass is "1 kg", must be a number'),
+        ("link3.mass", None, "there is no estimate of link3.mass"),
+        ("link3.mass", "1 kg", 'estimate of link3.mass is "1 kg", must be a finite number'),
         ("platform.mass", -5, "estimate: platform.mass = -5 kg is not allowed"),
         ("joint_pid.li", 0, "estimate: joint_pid.li"),
     ],
@@ -207,7 +207,7 @@ def test_parameters_of_a_result_that_no_model_has_are_named(name, value, says):
     entries[name]["estimate"] = value
     with pytest.raises(RecordError, match=says):
         parameter_vector({"parameters": entries}, "estimate")
-    with pytest.raises(RecordError, match="identification has no parameters"):
+    with pytest.raises(RecordError, match=r"no identification\.parameters"):
         parameter_vector([], "estimate")
 
 

@@ -11,7 +11,7 @@ from identify.commands import study as study_command
 from identify.errors import StudyInterrupted
 from identify.studies import dask_cluster, runner, summary
 from identify.studies.rows import KINDS
-from identify.studies.study_file import load_study, study_names
+from identify.studies.study_file import STUDIES, load_study
 from identify.studies.table import read_table
 from tests.identify.commands import command, one_line
 from tests.identify.study_rows import KIND
@@ -116,7 +116,7 @@ def test_interrupted_study_says_how_far_it_came_and_how_to_go_on(mine, monkeypat
 def test_list_names_every_built_in_study_with_its_rows(capsys):
     assert command("study", "--list") == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines() if line]
-    assert {(name, f"{load_study(name).rows:,}") for name in study_names()} <= {tuple(line[:2]) for line in lines}
+    assert {(name, f"{load_study(name).rows:,}") for name in STUDIES.names()} <= {tuple(line[:2]) for line in lines}
 
 
 def test_kinds_are_listed_with_their_options_figures_and_what_they_read(capsys):

@@ -7,7 +7,7 @@ from pydantic import ValidationError
 from identify.errors import StudyError
 from identify.studies.design import Design, prepare, valid_keys
 from identify.studies.runner import compute
-from identify.studies.study_file import Law, Study, load_study, study_from_toml
+from identify.studies.study_file import STUDIES, Law, Study, load_study
 from identify.studies.table import SENSOR_UNITS
 from tests.identify.study_rows import KIND
 
@@ -40,7 +40,7 @@ def test_factors_may_be_written_as_dotted_keys_tables_or_quoted_paths():
         "[factors.sensor.camera]\ndark_noise = [13.0, 26.0]",
         '"sensor.camera.dark_noise" = [13.0, 26.0]',
     ]
-    assert len({study_from_toml(toml(factors=text)).model_dump_json() for text in written}) == 1
+    assert len({STUDIES.from_toml(toml(factors=text), "study").model_dump_json() for text in written}) == 1
 
 
 def test_a_grid_has_every_combination_once_a_repeat_the_last_factor_fastest():
@@ -137,7 +137,7 @@ def test_every_key_of_a_sensor_has_its_unit_or_needs_none():
     ],
 )
 def test_study_files_that_contradict_themselves_are_refused(text, evidence):
-    message = refusal(study_from_toml, text)
+    message = refusal(STUDIES.from_toml, text, "study")
     assert all(word in message for word in evidence), message
     assert not any(word in message for word in ("function-", "list[", "Range", "valid list"))
 
@@ -239,6 +239,24 @@ def test_figures_of_a_kind_of_ones_own_are_not_known_before_its_rows_but_its_fac
 def test_unknown_study_lists_the_built_in_ones():
     assert "'pixel_nois'" in refusal(load_study, "pixel_nois")
     assert "pixel_noise" in refusal(load_study, "pixel_nois")
+
+
+def test_paths_in_a_study_file_start_from_the_file_and_built_in_names_win(tmp_path, monkeypatch):
+    """As those in a scenario do, also where they are varied, whichever way the keys are written."""
+    (tmp_path / "scenarios").mkdir()
+    own, sensor = tmp_path / "scenarios" / "paper.toml", tmp_path / "scenarios" / "eye.toml"
+    for path in (own, sensor):
+        path.write_text("")
+    scenario = 'scenario = "{}"\n[changes]\nscenario.robot = "mine.toml"'
+    factors = '"scenario.sensor" = ["ctrack780", "eye.toml", "nowhere"]'
+    for name, found in (("paper.toml", str(own)), ("paper", "paper"), ("nowhere", "nowhere")):
+        file = own.with_name("study.toml")
+        file.write_text(toml(scenario.format(name), factors=factors))
+        monkeypatch.chdir(tmp_path)
+        chosen = load_study("scenarios/study.toml")
+        assert chosen.scenario == found
+        assert chosen.changes == {"scenario.robot": str(own.with_name("mine.toml"))}
+        assert chosen.factors == {"scenario.sensor": ["ctrack780", str(sensor), "nowhere"]}
 
 
 def test_rows_of_a_huge_grid_are_counted_without_making_them():

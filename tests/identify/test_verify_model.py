@@ -13,6 +13,7 @@ from identify.errors import RecordError, ScenarioError, TrajectoryError
 from identify.files.run_folder import load_result, save_result
 from identify.loop_parameters import choose_parameters
 from identify.trajectory import check_travel
+from identify.verification import against_mujoco
 from identify.verification.against_mujoco import EngineRuns, compare_engines, exciting_trajectory, figure_8, judge
 from tests.identify.commands import command, one_line
 
@@ -93,8 +94,9 @@ def test_exciting_trajectory_starts_at_home_at_rest_and_stays_inside_the_travel(
 
 
 def test_robot_without_room_for_the_trajectory_is_refused_with_evidence(robot, monkeypatch):
-    monkeypatch.setattr("identify.verification.against_mujoco.TRAVEL_MARGIN_RAD", 0.8)
-    with pytest.raises(TrajectoryError, match=r"none of 200 exciting .*theta.* limit 0\.1948"):
+    narrow = against_mujoco.EXCITATION.model_copy(update={"travel_margin_rad": 0.8})
+    monkeypatch.setattr(against_mujoco, "EXCITATION", narrow)
+    with pytest.raises(TrajectoryError, match=r"only 0 of 50 random .*theta.* limit 0\.1948"):
         exciting_trajectory(robot)
 
 

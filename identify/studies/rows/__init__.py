@@ -23,8 +23,8 @@ KINDS: dict[str, Kind] = {kind.name: kind for kind in (STATIC_POSE, PATH_POSE, I
 def find_kind(name: str) -> Kind:
     """The kind of that name, built in or of one's own.
 
-    Raises:
-        StudyError: no such kind, with the built-in ones; no such module or function, or one that takes other arguments.
+    Raises StudyError: no such kind, with the built-in ones; no such module or function, or one that takes other
+    arguments.
     """
     if is_own(name):
         return _own(name, own_function(name, "kind", StudyError))

@@ -15,8 +15,6 @@ from identify.scenario.settings_file import one_line
 from identify.scenario.timing import IN_FILE
 from identify.studies.study_file import Range, Study
 
-# Keys of a scenario and of its sensor's file that a row reads: all that a study can vary, beside the row's options.
-
 
 @dataclass(frozen=True)
 class Idle:
@@ -94,10 +92,6 @@ PLANT = (
 """Keys of a plant that does not have what they belong to."""
 
 
-# Whether rows read what a study sets. It is told from what each kind says of itself, before any row and at no cost. To
-# see that a factor changes no figure, a row would have to be computed once more for each factor and for each change.
-
-
 BESIDE = (
     "scenario.name", "scenario.description", "scenario.sensor_note", "sensor.name", "sensor.note", "scenario.renderer",
     *timing("frame_rate_hz", "exposure_s", "latency_s", "latency_jitter_s"), "scenario.filter.",
@@ -111,10 +105,11 @@ its frame rate, for a change of that may need one of these."""
 def check_read(study: Study, reads: Reads, first: Scenario, options: BaseModel) -> None:
     """Refuse factors, changes and options that the kind never reads, or that do nothing with all values of the others.
 
+    It is told from what each kind says of itself, at no cost: to see that a factor changes no figure, a row would have
+    to be computed once more for each factor and for each change.
     ``first``: the scenario of the first row, ``options``: its options, with their defaults.
 
-    Raises:
-        StudyError: with all that the kind does read, or with the setting that leaves them without effect.
+    Raises StudyError: with all that the kind does read, or with the setting that leaves them without effect.
     """
     settings = {f"factors.{path}": path for path in study.factors}
     settings |= {f"changes.{path}": path for path in study.changes if not among(path, BESIDE)}
@@ -149,9 +144,6 @@ def _always(holds: Callable[[Any], bool], path: str, study: Study, first: Scenar
 
 
 _SPELLINGS = [timing(name) for name in IN_FILE]
-
-
-# A kind of row.
 
 
 Row = dict[str, float]

@@ -12,11 +12,12 @@ from pydantic import Field
 import cmmsim
 from identify.arrays import Array
 from identify.errors import EstimationError
+from identify.excitation.design import drawn_trajectory
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
 from identify.studies.rows.kind import NOISE_OFF, PATH, PICTURES, Column, Kind, Reads, Row, RowOptions, timing
 from identify.studies.rows.sensor import POSE_COLUMNS, RowSensor, Teaching, pose_figures, rms_um, row_sensor
-from identify.trajectory import FourierTrajectory, random_trajectory
+from identify.trajectory import FourierTrajectory
 
 DRAWN_PATH, SENSOR, LATENCY = 0, 1, 2
 INSTANTS_PER_FRAME = 16
@@ -50,16 +51,8 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
     """One row. Raises EstimationError where fewer than two poses were measured, and what the sensor raises."""
     eye = row_sensor(scenario, options.teaching, stream_seed(seed, SENSOR))
     rng = np.random.default_rng(stream_seed(seed, DRAWN_PATH))
-    excitation = scenario.excitation
-    path = random_trajectory(
-        rng,
-        eye.sensor.home,
-        excitation.fundamental_hz,
-        excitation.harmonics,
-        excitation.position_amplitude_m,
-        excitation.orientation_amplitude_rad,
-    )
-    start = rng.uniform(0.0, 1.0 / excitation.fundamental_hz)
+    path = drawn_trajectory(rng, eye.sensor.home, scenario.excitation)
+    start = rng.uniform(0.0, 1.0 / scenario.excitation.fundamental_hz)
     frames = max(2, scenario.timing.frames(options.stretch_s))
     times: Array = start + scenario.timing.frame_period_s * np.arange(frames, dtype=float)
     poses, covariances = _measured(eye, path, times)

@@ -102,9 +102,6 @@ class DrawnSensor:
         )
 
 
-# Figures of measured poses.
-
-
 def rms_um(errors: Array) -> float:
     """Root mean square in 1e-6 of the unit: over all entries, so per axis and frame."""
     return 1e6 * float(np.sqrt(np.mean(np.square(errors))))
