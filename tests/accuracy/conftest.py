@@ -6,6 +6,9 @@ import numpy.fft  # noqa: F401  before any project: NumPy cannot be loaded twice
 import pytest
 import scipy.special  # noqa: F401
 
+import cmmsim.sensor  # noqa: F401  nor what draws: pyrender closes the display of the first renderer with the second
+import identify.pipeline  # noqa: F401
+
 collect_ignore = ["guide"]  # an outsider's files: test_outside_project.py runs them as an outsider would
 
 QUICK = ("-p", "no:cacheprovider", "-p", "no:hypothesispytest")  # Hypothesis would be imported anew by each

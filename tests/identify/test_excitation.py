@@ -154,7 +154,7 @@ def test_a_criterion_that_does_not_exist_is_refused_with_the_valid_names():
 
 def test_a_criterion_of_ones_own_is_given_as_module_function(tmp_path, monkeypatch, robot):
     """Of all candidates the smallest is chosen by a function of the user's that is named nowhere else."""
-    (tmp_path / "mine.py").write_text(
+    (tmp_path / "own_criterion.py").write_text(
         "import casadi as ca\n"
         "from identify.excitation.criteria import Criterion\n"
         "def smallness(robot, scenario, unknowns, typical):\n"
@@ -164,15 +164,15 @@ def test_a_criterion_of_ones_own_is_given_as_module_function(tmp_path, monkeypat
         encoding="utf-8",
     )
     monkeypatch.syspath_prepend(tmp_path)
-    scenario = quick(criterion="mine:smallness")
+    scenario = quick(criterion="own_criterion:smallness")
     free = unknowns(robot.home_pose, scenario.excitation)
     chosen = design_trajectories(robot, scenario, 3).excitation
     drawn = random_candidates(robot, scenario, 4, 3, motion_check(robot, scenario))
     sizes = [np.linalg.norm(free.of(trajectory)) for trajectory in drawn]
     assert np.linalg.norm(free.of(chosen)) == pytest.approx(min(sizes))
     assert scenario_from_toml(scenario.to_toml()) == scenario
-    with pytest.raises(ScenarioError, match="criterion 'mine:beauty' is no importable module:function"):
-        design_trajectories(robot, quick(criterion="mine:beauty"), 3)
+    with pytest.raises(ScenarioError, match="criterion 'own_criterion:beauty' is no importable module:function"):
+        design_trajectories(robot, quick(criterion="own_criterion:beauty"), 3)
 
 
 def test_box_that_is_said_to_be_in_sight_is(robot):
