@@ -31,31 +31,15 @@ from typing import TYPE_CHECKING, Any
 
 from cmmsim.__main__ import warn_of_foreign_identify
 from cmmsim.errors import (
-    CmmError as CmmError,
-)
-from cmmsim.errors import (
-    LostError as LostError,
-)
-from cmmsim.errors import (
-    OpenGLMissingError as OpenGLMissingError,
-)
-from cmmsim.errors import (
-    SensorFileError as SensorFileError,
-)
-from cmmsim.errors import (
-    ShapeError as ShapeError,
-)
-from cmmsim.errors import (
-    TeachingError as TeachingError,
-)
-from cmmsim.errors import (
-    UnknownBodyError as UnknownBodyError,
-)
-from cmmsim.errors import (
-    UnknownOptionError as UnknownOptionError,
-)
-from cmmsim.errors import (
-    UnknownSensorError as UnknownSensorError,
+    CmmError,
+    LostError,
+    OpenGLMissingError,
+    SensorFileError,
+    ShapeError,
+    TeachingError,
+    UnknownBodyError,
+    UnknownOptionError,
+    UnknownSensorError,
 )
 
 if TYPE_CHECKING:

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.detection.cramer_rao import cramer_rao_bound, light_shares
+from cmmsim.detection.cramer_rao import cramer_rao_bound
 from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, SpotWindows, find_detector
 from cmmsim.errors import CmmError
 from cmmsim.files.schema import NARROWEST_PSF, SensorFile
 from cmmsim.files.setup import marked_body, rig_from_file
 from cmmsim.geometry.camera import PinholeCamera
-from cmmsim.geometry.disc_image import project_discs
+from cmmsim.geometry.disc_image import coverage, project_discs
 from cmmsim.geometry.pose import Array, apply, pose_to_transform
 from cmmsim.plugins import DETECTORS
 from cmmsim.radiometry.noise import CameraNoise
@@ -170,11 +170,13 @@ def random_ellipses(
 
 def draw_discs(scene: Scene, centres: Array, shapes: Array, size: int, psf_px: float) -> NDArray[np.float32]:
     """Radiance (n, size, size) of bright discs on dark ground."""
-    shares = [
-        light_shares(centres[k : k + TOGETHER], shapes[k : k + TOGETHER], size, psf_px)
-        for k in range(0, len(centres), TOGETHER)
-    ]
+    shares = [coverage(*part, size, psf_px)[0] for part in _parts(centres, shapes)]
     return (scene.dark + (scene.bright - scene.dark) * np.concatenate(shares)).astype(np.float32)
+
+
+def _parts(centres: Array, shapes: Array) -> list[tuple[Array, Array]]:
+    """Centres and shapes of discs that are drawn at once."""
+    return [(centres[k : k + TOGETHER], shapes[k : k + TOGETHER]) for k in range(0, len(centres), TOGETHER)]
 
 
 @dataclass(frozen=True)
@@ -252,10 +254,8 @@ def _round(
 def _bounds(scene: Scene, psf_px: float, centres: Array, shapes: Array, size: int) -> Array:
     """Smallest mean squared error (n,) of each centre per axis, px²."""
     parts = [
-        cramer_rao_bound(
-            centres[k : k + TOGETHER], shapes[k : k + TOGETHER], size, scene.contrast, scene.ground, scene.noise, psf_px
-        )
-        for k in range(0, len(centres), TOGETHER)
+        cramer_rao_bound(*part, size, scene.contrast, scene.ground, scene.noise, psf_px)
+        for part in _parts(centres, shapes)
     ]
     return 0.5 * np.trace(np.concatenate(parts), axis1=1, axis2=2)
 

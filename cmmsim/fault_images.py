@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.checks import require_kind
-from cmmsim.geometry.disc_image import covered_area
+from cmmsim.geometry.disc_image import coverage
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.images import StereoFrame, StereoImages, Windows, readable
 from cmmsim.radiometry.noise import CameraNoise
@@ -53,7 +53,7 @@ class DiscMark:
 
     def light(self, corner: NDArray[np.int_], shape: tuple[int, int]) -> tuple[Array, Array]:
         """See ``Mark``."""
-        share = covered_area((self.centre - corner)[None], self.shape[None], max(shape))[0, : shape[0], : shape[1]]
+        share = coverage((self.centre - corner)[None], self.shape[None], max(shape))[0][0, : shape[0], : shape[1]]
         return share, share * self.radiance
 
 

@@ -12,20 +12,22 @@ both cameras consistently have to be drawn with the scene: ``sensor.add_bodies(f
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from cmmsim.checks import require_kind
 from cmmsim.errors import UnknownOptionError
-from cmmsim.fault_images import DiscMark, Fault, FillMark, GlintMark, PlateMark
+from cmmsim.fault_images import DiscMark, Fault, FillMark, GlintMark, Mark, PlateMark
 from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, checked_pose, invert, pose_to_transform
 from cmmsim.pose_estimation.estimator import PoseEstimator
 
 BODY_SIZES = (0.008, 0.02, 0.04, 0.08, 0.16)  # m, sides of the boxes that hide stickers
 FEW = 4
-KINDS = (  # each is drawn by the method of its name
+KINDS = (  # each is drawn by the method of its name, as marks or as a whole
     *("hidden", "half_hidden", "obstacles", "one_camera_dark", "one_camera_covered", "false_discs", "false_points"),
     *("glint", "merging", "swapped", "black", "saturated", "several"),
 )
@@ -64,15 +66,14 @@ class FaultGenerator:
         if kind not in KINDS:
             raise UnknownOptionError("fault", kind, KINDS)
         require_kind(rng, np.random.Generator, "rng must be a generator, such as numpy.random.default_rng(1)")
-        found: Fault = getattr(self, f"_{kind}")(checked_pose(pose), rng)
-        return found
+        found = getattr(self, f"_{kind}")(checked_pose(pose), rng)
+        return found if isinstance(found, Fault) else Fault(kind, tuple(found))
 
-    def _outlines(self, pose: Array) -> tuple[Array, Array]:
-        """Ellipses of all stickers: centres (2, n, 2) and shapes (2, n, 2, 2), px."""
+    def _outlines(self, pose: Array, stickers: slice = slice(None), off: Array | float = 0.0) -> tuple[Array, Array]:
+        """Ellipses of n stickers moved by ``off`` (3,) m: centres (2, n, 2) and shapes (2, n, 2, 2), px."""
         camera_from_platform = invert(self._taught.base_from_camera) @ pose_to_transform(pose)
-        return sticker_outlines(
-            self._rig, camera_from_platform, self._taught.platform_places, self._platform.sticker_normals, self._radius
-        )
+        places, normals = self._taught.platform_places[stickers] + off, self._platform.sticker_normals[stickers]
+        return sticker_outlines(self._rig, camera_from_platform, places, normals, self._radius)
 
     def _some(self, rng: np.random.Generator, most: int | None = None) -> NDArray[np.int_]:
         """Random stickers: as often as not up to FEW of them, else up to all; never more than ``most``."""
@@ -80,28 +81,18 @@ class FaultGenerator:
         largest = min(most or count, FEW if rng.random() < 0.5 else count, count)
         return rng.choice(count, rng.integers(1, largest + 1), replace=False)
 
-    def _hidden(self, pose: Array, rng: np.random.Generator) -> Fault:
+    def _hidden(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
         centres, shapes = self._outlines(pose)
         sides = _one_or_both(rng)
-        return Fault(
-            "hidden",
-            tuple(
-                PlateMark(
-                    side,
-                    centres[side, k],
-                    _reach(shapes[side, k]) + rng.uniform(1.0, 12.0, 2),
-                    rng.uniform(0.0, np.pi),
-                    DARK_RADIANCE,
-                )
-                for k in self._some(rng)
-                for side in sides
-            ),
-        )
+        for k in self._some(rng):
+            for side in sides:
+                half = np.linalg.norm(shapes[side, k], 2) + rng.uniform(1.0, 12.0, 2)  # holds the ellipse at any angle
+                yield PlateMark(side, centres[side, k], half, rng.uniform(0.0, np.pi), DARK_RADIANCE)
 
-    def _half_hidden(self, pose: Array, rng: np.random.Generator) -> Fault:
+    def _half_hidden(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
         """The edge stands anywhere between a sticker's nearest and farthest rim, often close to the nearest one."""
         centres, shapes = self._outlines(pose)
-        sides, marks = _one_or_both(rng), []
+        sides = _one_or_both(rng)
         for k in self._some(rng):
             angle, depth = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.0, 1.0) ** rng.choice([1, 3])
             normal = np.array([np.cos(angle), np.sin(angle)])
@@ -109,8 +100,7 @@ class FaultGenerator:
                 rim = float(np.linalg.norm(shapes[side, k] @ normal))
                 half = np.array([rng.uniform(6.0, 20.0), 15.0])
                 away = half[0] + rim * (1.0 - 2.0 * depth)
-                marks.append(PlateMark(side, centres[side, k] + away * normal, half, angle, DARK_RADIANCE))
-        return Fault("half_hidden", tuple(marks))
+                yield PlateMark(side, centres[side, k] + away * normal, half, angle, DARK_RADIANCE)
 
     def _obstacles(self, pose: Array, rng: np.random.Generator) -> Fault:
         names = list(fault_bodies())
@@ -119,98 +109,67 @@ class FaultGenerator:
             sticker = self._taught.platform_places[rng.integers(len(self._taught.platform_places))]
             at = apply(pose_to_transform(pose), sticker)
             middle = 0.5 * (self._taught.base_from_camera[:3, 3] + self._right_eye())
-            place = np.eye(4)
-            size = BODY_SIZES[number]
-            place[:3, 3] = at + rng.uniform(0.02, 0.5) * (middle - at) + rng.uniform(-0.7, 0.7, 3) * size
-            place[:3, :3] = pose_to_transform(np.r_[0.0, 0.0, 0.0, rng.uniform(-1.0, 1.0, 3)])[:3, :3]
-            places[names[number]] = place
+            at = at + rng.uniform(0.02, 0.5) * (middle - at) + rng.uniform(-0.7, 0.7, 3) * BODY_SIZES[number]
+            places[names[number]] = pose_to_transform(np.r_[at, rng.uniform(-1.0, 1.0, 3)])
         return Fault("obstacles", obstacles=places)
 
     def _right_eye(self) -> Array:
         """Place (3,) of the right camera in the base frame."""
         return apply(self._taught.base_from_camera, invert(self._rig.right_from_left)[:3, 3])
 
-    def _one_camera_dark(self, pose: Array, rng: np.random.Generator) -> Fault:
-        return Fault("one_camera_dark", (FillMark(int(rng.integers(2)), 0.0),))
+    def _one_camera_dark(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
+        yield FillMark(int(rng.integers(2)), 0.0)
 
-    def _one_camera_covered(self, pose: Array, rng: np.random.Generator) -> Fault:
-        return Fault("one_camera_covered", (FillMark(int(rng.integers(2)), rng.uniform(0.0, 1.0)),))
+    def _one_camera_covered(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
+        yield FillMark(int(rng.integers(2)), rng.uniform(0.0, 1.0))
 
-    def _false_discs(self, pose: Array, rng: np.random.Generator) -> Fault:
+    def _false_discs(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
         """Among the stickers, on them or near them."""
         centres, shapes = self._outlines(pose)
-        marks = []
         for _ in range(rng.integers(1, 31)):
             side = int(rng.integers(2))
             near, shape = centres[side, rng.integers(centres.shape[1])], shapes[side, rng.integers(centres.shape[1])]
-            marks.append(
-                DiscMark(
-                    side,
-                    near + rng.choice([2.0, 6.0, 80.0]) * rng.standard_normal(2),
-                    rng.uniform(0.7, 1.4) * shape,
-                    _radiance(rng),
-                )
-            )
-        return Fault("false_discs", tuple(marks))
+            centre = near + rng.choice([2.0, 6.0, 80.0]) * rng.standard_normal(2)
+            yield DiscMark(side, centre, rng.uniform(0.7, 1.4) * shape, _radiance(rng))
 
-    def _false_points(self, pose: Array, rng: np.random.Generator) -> Fault:
+    def _false_points(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
         """Discs in space, on the platform's planes or somewhere around; they hide what is behind them."""
-        stickers, marks = self._taught.platform_places, []
-        camera_from_platform = invert(self._taught.base_from_camera) @ pose_to_transform(pose)
         for _ in range(rng.integers(1, 21)):
-            k = rng.integers(len(stickers))
+            k = rng.integers(len(self._taught.platform_places))
             off = rng.choice([0.0005, 0.003, 0.01, 0.1]) * rng.standard_normal(3)
-            centres, shapes = sticker_outlines(
-                self._rig,
-                camera_from_platform,
-                stickers[k : k + 1] + off,
-                self._platform.sticker_normals[k : k + 1],
-                self._radius,
-            )
+            centres, shapes = self._outlines(pose, slice(k, k + 1), off)
             radiance = _radiance(rng)
-            marks += [DiscMark(side, centres[side, 0], shapes[side, 0], radiance) for side in range(2)]
-        return Fault("false_points", tuple(marks))
+            for side in range(2):
+                yield DiscMark(side, centres[side, 0], shapes[side, 0], radiance)
 
-    def _glint(self, pose: Array, rng: np.random.Generator) -> Fault:
+    def _glint(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
         """Of one surface, so both cameras see it near the same sticker, in unlike directions and strengths."""
         centres, shapes = self._outlines(pose)
-        return Fault(
-            "glint",
-            tuple(
-                GlintMark(
-                    side,
-                    centres[side, k] + rng.uniform(0.0, 4.0) * shapes[side, k] @ _direction(rng),
-                    10.0 ** rng.uniform(-1.5, 1.0),
-                    rng.uniform(0.5, 3.0),
-                    10.0 ** rng.uniform(-2.5, 0.5),
-                    rng.uniform(2.0, 20.0),
-                    rng.uniform(0.0, np.pi),
-                )
-                for k in self._some(rng, 6)
-                for side in _one_or_both(rng)
-            ),
-        )
+        for k in self._some(rng, 6):
+            for side in _one_or_both(rng):
+                centre = centres[side, k] + rng.uniform(0.0, 4.0) * shapes[side, k] @ _direction(rng)
+                peak, core = 10.0 ** rng.uniform(-1.5, 1.0), rng.uniform(0.5, 3.0)
+                tail_peak, tail = 10.0 ** rng.uniform(-2.5, 0.5), rng.uniform(2.0, 20.0)
+                yield GlintMark(side, centre, peak, core, tail_peak, tail, rng.uniform(0.0, np.pi))
 
-    def _merging(self, pose: Array, rng: np.random.Generator) -> Fault:
+    def _merging(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
         """The discs' rims overlap, touch, or leave a small gap."""
         centres, shapes = self._outlines(pose)
-        sides, marks = _one_or_both(rng), []
+        sides = _one_or_both(rng)
         for k in self._some(rng):
             towards, gap, radiance = _direction(rng), rng.uniform(0.2, 2.4), _radiance(rng)
-            marks += [
-                DiscMark(side, centres[side, k] + gap * shapes[side, k] @ towards, shapes[side, k], radiance)
-                for side in sides
-            ]
-        return Fault("merging", tuple(marks))
+            for side in sides:
+                centre = centres[side, k] + gap * shapes[side, k] @ towards
+                yield DiscMark(side, centre, shapes[side, k], radiance)
 
     def _swapped(self, pose: Array, rng: np.random.Generator) -> Fault:
         return Fault("swapped", swapped=True)
 
-    def _black(self, pose: Array, rng: np.random.Generator) -> Fault:
-        return Fault("black", (FillMark(0, 0.0), FillMark(1, 0.0)))
+    def _black(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
+        return (FillMark(side, 0.0) for side in range(2))
 
-    def _saturated(self, pose: Array, rng: np.random.Generator) -> Fault:
-        return Fault("saturated", (FillMark(0, SATURATING), FillMark(1, SATURATING)))
+    def _saturated(self, pose: Array, rng: np.random.Generator) -> Iterator[Mark]:
+        return (FillMark(side, SATURATING) for side in range(2))
 
     def _several(self, pose: Array, rng: np.random.Generator) -> Fault:
         kinds = ["hidden", "half_hidden", "obstacles", "false_discs", "false_points", "glint", "merging"]
@@ -232,8 +191,3 @@ def _radiance(rng: np.random.Generator) -> float:
 def _direction(rng: np.random.Generator) -> Array:
     angle = rng.uniform(0.0, 2.0 * np.pi)
     return np.array([np.cos(angle), np.sin(angle)])
-
-
-def _reach(shape: Array) -> Array:
-    """Half sides (2,) px of a box that holds an ellipse however it is turned."""
-    return np.full(2, np.linalg.norm(shape, 2))

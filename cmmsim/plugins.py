@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import fields
+from typing import Any, TypeVar
 
 from cmmsim.errors import CmmError, UnknownOptionError
 
+K = TypeVar("K", bound=Any)  # Detector or Renderer
 DETECTORS = {
     "maximum_likelihood": "cmmsim.detection.ellipse_fit:MAXIMUM_LIKELIHOOD",
     "dual_conic": "cmmsim.detection.dual_conic:DUAL_CONIC",
@@ -42,10 +44,12 @@ def is_own(name: str) -> bool:
     return ":" in name
 
 
-def find(option: str, name: str, built_in: Mapping[str, str]) -> Any:
-    """What a built-in name or ``module:name`` stands for; a class is made without arguments.
+def find(option: str, name: str, built_in: Mapping[str, str], kind: type[K]) -> K:
+    """The Detector or Renderer, which ``kind`` says, of a built-in name or ``module:name``.
 
-    Raises UnknownOptionError with the valid names, and CmmError where there is no such module or nothing to be called.
+    A class of a user's own is made without arguments; what is called becomes one of the kind with that name, and with
+    those of its figures that it carries itself. Raises UnknownOptionError with the valid names, and CmmError where
+    there is no such module or nothing to be called.
     """
     module, _, attribute = built_in.get(_required(option, name, built_in), name).partition(":")
     try:
@@ -54,13 +58,13 @@ def find(option: str, name: str, built_in: Mapping[str, str]) -> Any:
         raise CmmError(
             f"{option} {name!r} is no importable module:name: {error}; its folder must be on PYTHONPATH"
         ) from error
-    return found() if isinstance(found, type) else found
-
-
-def require_callable(option: str, name: str, found: object) -> None:
-    """Raise CmmError where what was found of a user's own cannot be called."""
+    found = found() if isinstance(found, type) else found
+    if isinstance(found, kind):
+        return found
     if not callable(found):
         raise CmmError(f"{option} {name!r} is of type {type(found).__name__}, which cannot be called")
+    figures: list[Any] = [field for field in fields(kind)[2:] if hasattr(found, field.name)]
+    return kind(name, found, **{field.name: type(field.default)(getattr(found, field.name)) for field in figures})
 
 
 def _required(option: str, name: str, built_in: Mapping[str, str]) -> str:

@@ -217,7 +217,18 @@ class Sensor:
         the sensor's exposure is not zero. Raises ShapeError, UnknownBodyError, and CmmError for too long a blur or for
         obstacles that are no transforms by name.
         """
-        return self.camera.look(*self._checked(pose, obstacles), pose_rate=_checked_rate(pose_rate))
+        checked, placed = checked_pose(pose), {}
+        obstacles = {} if obstacles is None else obstacles
+        require_kind(obstacles, Mapping, "obstacles must be transforms by name, as {'link': base_from_body}, or None")
+        for name, place in obstacles.items():
+            if name not in self._obstacles:
+                raise UnknownBodyError(name, self._obstacles)
+            placed[name] = checked_transform(place, f"obstacle {name!r}: base_from_body")
+        if pose_rate is not None:
+            pose_rate = finite_array(pose_rate, (6,), "a pose rate is six finite numbers, m/s and rad/s")
+        rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
+        self._frame += 1
+        return self.camera.look(checked, rng, placed, pose_rate=pose_rate)
 
     def capture(
         self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
@@ -267,21 +278,6 @@ class Sensor:
             self._file.camera.pattern_seed,
         )
 
-    def _checked(
-        self, pose: ArrayLike, obstacles: Mapping[str, Array] | None
-    ) -> tuple[Array, np.random.Generator, Mapping[str, Array]]:
-        checked = checked_pose(pose)
-        placed: dict[str, Array] = {}
-        obstacles = {} if obstacles is None else obstacles
-        require_kind(obstacles, Mapping, "obstacles must be transforms by name, as {'link': base_from_body}, or None")
-        for name, place in obstacles.items():
-            if name not in self._obstacles:
-                raise UnknownBodyError(name, self._obstacles)
-            placed[name] = checked_transform(place, f"obstacle {name!r}: base_from_body")
-        rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
-        self._frame += 1
-        return checked, rng, placed
-
 
 def _checked_seed(seed: int) -> int:
     """The seed. Raises CmmError unless it is a whole number from 0 on."""
@@ -292,12 +288,6 @@ def _checked_seed(seed: int) -> int:
     if number < 0:
         raise CmmError(f"a seed is a whole number from 0 on, got {seed!r}")
     return number
-
-
-def _checked_rate(pose_rate: ArrayLike | None) -> Array | None:
-    if pose_rate is None:
-        return None
-    return finite_array(pose_rate, (6,), "a pose rate is six finite numbers, m/s and rad/s")
 
 
 def load_sensor(

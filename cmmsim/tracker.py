@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from cmmsim.checks import require_kind
 from cmmsim.errors import LostError
-from cmmsim.geometry.pose import Array, invert, rotation_exp, rotation_log
+from cmmsim.geometry.pose import Array, invert, rigid, rotation_exp, rotation_log
 from cmmsim.pose_estimation.estimator import Measurement, PoseEstimator, lost_measurement, require_fitting
 from cmmsim.radiometry.images import StereoFrame, StereoImages, readable
 
@@ -102,6 +100,4 @@ class Tracker:
 
 def part_of_step(step: Array, share: float) -> Array:
     """A ``share`` of a small movement (4,4), to first order."""
-    part = np.eye(4)
-    part[:3, :3], part[:3, 3] = rotation_exp(share * rotation_log(step[:3, :3])), share * step[:3, 3]
-    return part
+    return rigid(rotation_exp(share * rotation_log(step[:3, :3])), share * step[:3, 3])

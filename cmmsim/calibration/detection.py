@@ -18,8 +18,7 @@ from cmmsim.calibration.board import Board
 from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.geometry.pose import Array
-from cmmsim.radiometry.images import FrameImages, StereoFrame
-from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.radiometry.noise import CameraNoise, cut_windows
 
 FEWEST_SHARE = 0.7  # of the board's points that must be measured
 LARGEST_POINT_GAP = 0.25  # of the distance of neighbours, by which a point may leave the plane's perspective
@@ -173,12 +172,11 @@ def _refine(bright: NDArray[np.uint8], rough: Array, shapes: Array, board: Board
     largest = np.linalg.norm(shapes, axis=2).max(axis=1)
     reach = min(WINDOW_REACH, board.nearest / board.dot_radius - 1.15)  # neighbours stay outside
     sizes = 2 * np.ceil(reach * largest + 1.0).astype(int)
-    images = FrameImages(StereoFrame(bright, bright))
     fine, ratios, spread = np.full_like(rough, np.nan), np.full(len(rough), np.nan), None
     for size in np.unique(sizes)[::-1]:
         chosen = np.flatnonzero(sizes == size)
         corners = np.rint(rough[chosen] - 0.5 * (size - 1)).astype(int)
-        windows = images.windows(np.stack([corners, corners]), int(size))[0].astype(float)
+        windows = cut_windows(bright, corners, int(size)).astype(float)
         alone = _without_neighbours(windows, rough[chosen] - corners, shapes[chosen], reach)
         spread = _point_spread(alone[:PROBED], corners[:PROBED]) if spread is None else spread
         fits = fit_ellipses(alone, corners, PLAIN_NOISE, int(size), LIMITS, FIT_ITERATIONS, spread)
@@ -193,7 +191,7 @@ def _refine(bright: NDArray[np.uint8], rough: Array, shapes: Array, board: Board
 def _point_spread(windows: Array, corners: NDArray[np.int_]) -> float:
     """Sigma in px of the Gaussian blur with which ellipses fit these windows best: that of lens and focus together."""
     misfits = [
-        np.median(fit_ellipses(windows, corners, PLAIN_NOISE, windows.shape[1], LIMITS, FIT_ITERATIONS, spread).misfit)
+        np.median(fit_ellipses(windows, corners, PLAIN_NOISE, windows.shape[1], LIMITS, FIT_ITERATIONS, spread).misfits)
         for spread in SPREADS_PX
     ]
     return SPREADS_PX[int(np.argmin(misfits))]

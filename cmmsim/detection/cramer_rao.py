@@ -14,26 +14,12 @@ import numpy as np
 from scipy.special import ndtr
 
 from cmmsim.errors import CmmError
-from cmmsim.geometry.disc_image import blurred_coverage, coverage, covered_area
+from cmmsim.geometry.disc_image import coverage
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
 
 REACH = 6.0  # standard deviations within which noise is followed
 TABLE_STEPS = 64  # tabulated informations in one grey value; fewer where the noise hides the rounding
-
-
-def light_shares(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> Array:
-    """Share of light (n, size, size), 0 to 1, of each pixel.
-
-    Parameters: centres (n,2) px, (0, 0) is the middle of the window's first pixel; shapes (n,2,2) px, symmetric and
-    positive definite; psf_px: sigma of the point spread. Raises CmmError for one too narrow to be followed.
-    """
-    return covered_area(centres, shapes, size) if psf_px == 0.0 else blurred_coverage(centres, shapes, size, psf_px)[0]
-
-
-def light_share_derivatives(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> tuple[Array, Array]:
-    """Shares as of ``light_shares`` and derivatives (n, size, size, 5) by [c_x, c_y, A_xx, A_xy, A_yy]."""
-    return coverage(centres, shapes, size) if psf_px == 0.0 else blurred_coverage(centres, shapes, size, psf_px)
 
 
 def grey_value_information(mean_grey: Array, noise: CameraNoise) -> Array:
@@ -61,9 +47,9 @@ def cramer_rao_bound(
 ) -> Array:
     """Smallest covariance (n,2,2) px² of an unbiased centre, from windows of ``size`` px; contrast, ground grey values.
 
-    Other parameters as of ``light_shares``. Raises CmmError.
+    Other parameters as of ``disc_image.coverage``. Raises CmmError.
     """
-    shares, derivatives = light_share_derivatives(centres, shapes, size, psf_px)
+    shares, derivatives = coverage(centres, shapes, size, psf_px)
     information = np.interp(ground + contrast * shares, *_information_table(ground, ground + contrast, noise))
     jacobian = np.concatenate([contrast * derivatives, shares[..., None], np.ones_like(shares)[..., None]], axis=-1)
     fisher = np.einsum("nyxi,nyxj,nyx->nij", jacobian, jacobian, information, optimize=True)

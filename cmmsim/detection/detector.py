@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.geometry.pose import Array
-from cmmsim.plugins import DETECTORS, find, require_callable
+from cmmsim.plugins import DETECTORS, find
 from cmmsim.radiometry.noise import CameraNoise
 
 
@@ -90,8 +90,4 @@ def find_detector(name: str) -> Detector:
     A function may carry its own ``bias_px`` and ``margin_px``. Raises UnknownOptionError with the valid names, CmmError
     for what cannot be imported or called.
     """
-    found = find("detector", name, DETECTORS)
-    if isinstance(found, Detector):
-        return found
-    require_callable("detector", name, found)
-    return Detector(name, found, float(getattr(found, "bias_px", 0.0)), int(getattr(found, "margin_px", 0)))
+    return find("detector", name, DETECTORS, Detector)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,60 +23,31 @@ from cmmsim.radiometry.noise import CameraNoise
 RING_REACH = 2.4  # pixels beyond this many sticker radii may lie outside the dark ring and are left out
 SMALLEST_RADIUS_PX = 0.8
 ELLIPSE_UNKNOWNS = 5  # the first parameters: c_x, c_y, A_xx, A_xy, A_yy
-SMALLEST_START_PX = 1.2
 SMEAR_STEP_PX = 0.2  # or half a point spread: between two places of a moving ellipse whose light is added
 CONVERGED_PX = 1e-4  # a step shorter than this ends a fit
 MODEL_ERROR = 0.0025  # of the contrast: rms of what images and the model of a pixel differ by without noise
 FEWEST_FOR_A_THREAD = 16  # windows
-CORE_SHARE = 0.4  # a pixel with this share of the contrast belongs to the bright spot when the fit starts
 
 
 @dataclass(frozen=True)
-class EllipseFits:
-    """Result for n windows, in full-image px.
+class EllipseFits(DetectedCentres):
+    """Result for n windows: all that a detector may state, and contrast and ground (n,), grey values."""
 
-    centres (n,2); covariances (n,2,2) of the centres, px²; shapes (n,2,2) the ellipses' matrices A;
-    shape_covariances (n,3,3) of A_xx, A_xy, A_yy, px²; contrast and ground (n,) grey values; misfit (n,) the reduced
-    chi-square of the grey values; good (n,) whether the window holds one ellipse.
-    """
-
-    centres: Array
-    covariances: Array
-    shapes: Array
-    shape_covariances: Array
+    shapes: Array = field()  # which takes away the default
+    shape_covariances: Array = field()
+    misfits: Array = field()
     contrast: Array
     ground: Array
-    misfit: Array
-    good: NDArray[np.bool_]
 
     def within(self, limits: FitLimits, noise: CameraNoise) -> EllipseFits:
         """The same fits, of which only those are still good that keep within limits."""
         good = self.good & (self.contrast >= limits.smallest_contrast)
-        return replace(self, good=good & (self.misfit <= largest_misfits(limits, noise, self.contrast, self.ground)))
-
-    def selected(self, keep: NDArray[np.bool_]) -> EllipseFits:
-        """Those of only some windows."""
-        return EllipseFits(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
-
-    @property
-    def detected(self) -> DetectedCentres:
-        """What these fits are as the result of a detector."""
-        return DetectedCentres(
-            self.centres, self.covariances, self.good, self.shapes, self.shape_covariances, self.misfit
-        )
+        return replace(self, good=good & (self.misfits <= largest_misfits(limits, noise, self.contrast, self.ground)))
 
 
 def detect_by_maximum_likelihood(spots: SpotWindows) -> DetectedCentres:
     """Centres of the maximum-likelihood fit of a blurred ellipse."""
-    return fit_ellipses(
-        spots.windows,
-        spots.corners,
-        spots.noise,
-        spots.fit_size,
-        spots.limits,
-        psf_px=spots.psf_px,
-        smears=spots.smears,
-    ).detected
+    return fit_ellipses(**vars(spots))
 
 
 MAXIMUM_LIKELIHOOD = Detector("maximum_likelihood", detect_by_maximum_likelihood)
@@ -103,16 +74,14 @@ def fit_ellipses(
     from cmmsim.detection.fit_kernels import UNKNOWNS, FitSettings, fit_windows
 
     n = len(windows)
-    inner, parameters, misfit = np.empty((n, 2)), np.empty((n, UNKNOWNS)), np.empty(n)
+    inner, parameters, misfits = np.empty((n, 2)), np.empty((n, UNKNOWNS)), np.empty(n)
     shapes, covariances = np.empty((n, 2, 2)), np.empty((n, ELLIPSE_UNKNOWNS, ELLIPSE_UNKNOWNS))
     scale = noise.white_level / 255.0
     greys = scale * _GREYS
     variances = noise.variance(greys)
     largest_step = _LARGEST_STEP * [1.0, 1.0, 1.0, 1.0, 1.0, scale, scale]
     settings = FitSettings(
-        CORE_SHARE,
         RING_REACH,
-        SMALLEST_START_PX,
         SMALLEST_RADIUS_PX,
         largest_step,
         iterations,
@@ -127,28 +96,18 @@ def fit_ellipses(
     pixels = np.ascontiguousarray(windows, dtype=float)
 
     def fit(part: slice) -> None:
-        fit_windows(
-            pixels[part],
-            moved[part],
-            fit_size,
-            settings,
-            inner[part],
-            parameters[part],
-            shapes[part],
-            covariances[part],
-            misfit[part],
-        )
+        filled = (values[part] for values in (inner, parameters, shapes, covariances, misfits))
+        fit_windows(pixels[part], moved[part], fit_size, settings, *filled)
 
     _in_two_threads(fit, n)
     fits = EllipseFits(
         parameters[:, :2] + inner + corners,
         covariances[:, :2, :2],
+        _inside(parameters[:, :2], shapes, fit_size),
         shapes,
         covariances[:, 2:, 2:],
-        parameters[:, 5],
-        parameters[:, 6],
-        misfit,
-        _inside(parameters[:, :2], shapes, fit_size),
+        misfits,
+        *parameters[:, 5:].T,
     )
     return fits.within(limits or FitLimits(), noise)
 

@@ -12,18 +12,17 @@ from cmmsim.geometry.disc_kernels import blur_window, cover_window, inverse_of
 from cmmsim.geometry.point_kernels import factor, invert_factored, solve_factored
 
 UNKNOWNS = 7  # c_x, c_y, A_xx, A_xy, A_yy, contrast, ground
+CORE_SHARE = 0.4  # a pixel with this share of the contrast belongs to the bright spot when the fit starts
+SMALLEST_START_PX = 1.2
 
 
 class FitSettings(NamedTuple):
-    """core_share: a pixel with this share of the contrast belongs to the bright spot when the fit starts; ring_reach:
-    radii of the ellipse within which pixels are fitted; smallest_start and smallest radius px; largest_step (7,);
+    """ring_reach: radii of the ellipse within which pixels are fitted; smallest radius px; largest_step (7,);
     iterations at most, and the step in px below which they end; psf_px of the point spread, or 0; smear_step px between
-    two places of a moving ellipse whose light is added; variances of grey
-    values from ``first_grey`` on, ``entries_a_grey`` for each."""
+    two places of a moving ellipse whose light is added; variances of grey values from ``first_grey`` on,
+    ``entries_a_grey`` for each."""
 
-    core_share: float
     ring_reach: float
-    smallest_start: float
     smallest: float
     largest_step: Array
     iterations: int
@@ -57,7 +56,7 @@ def nth_smallest(values: Array, n: int) -> float:
 
 
 @compiled
-def moments(window: Array, core_share: float) -> tuple:
+def moments(window: Array) -> tuple:
     """Ground, contrast, centroid x, y and spread xx, xy, yy of the bright spot of a window (h, w) of floats."""
     flat = window.flatten()
     ground = nth_smallest(flat, len(flat) // 3)
@@ -66,7 +65,7 @@ def moments(window: Array, core_share: float) -> tuple:
     for row in range(window.shape[0]):
         for column in range(window.shape[1]):
             share = (window[row, column] - ground) / contrast
-            if share > core_share:
+            if share > CORE_SHARE:
                 share = min(share, 1.0)
                 area += share
                 x += share * column
@@ -139,10 +138,10 @@ def accumulate(
 
 
 @compiled
-def start_ellipse(window: Array, settings: FitSettings, parameters: Array) -> None:
+def start_ellipse(window: Array, parameters: Array) -> None:
     """First parameters (7,) from the moments; a uniform ellipse has spread A A / 4."""
-    ground, contrast, x, y, xx, xy, yy = moments(window, settings.core_share)
-    xx, xy, yy = bound_radii(xx, xy, yy, (0.5 * settings.smallest_start) ** 2, (0.25 * window.shape[1]) ** 2)
+    ground, contrast, x, y, xx, xy, yy = moments(window)
+    xx, xy, yy = bound_radii(xx, xy, yy, (0.5 * SMALLEST_START_PX) ** 2, (0.25 * window.shape[1]) ** 2)
     root = math.sqrt(xx * yy - xy * xy)
     scale = 2.0 / math.sqrt(xx + yy + 2.0 * root)  # the root of a matrix M is (M + sqrt(det) 1) / sqrt(...)
     parameters[0], parameters[1] = x, y
@@ -288,11 +287,11 @@ def fit_windows(
     the first m parameters and misfits (n,).
     """
     for k in range(len(windows)):
-        spot = moments(windows[k], settings.core_share)
+        spot = moments(windows[k])
         room = windows.shape[1] - size
         left = min(max(int(np.rint(spot[2] - 0.5 * (size - 1))), 0), room)
         top = min(max(int(np.rint(spot[3] - 0.5 * (size - 1))), 0), room)
         part = windows[k, top : top + size, left : left + size]
-        start_ellipse(part, settings, parameters[k])
+        start_ellipse(part, parameters[k])
         misfits[k] = fit_window(part, smears[k], settings, parameters[k], shapes[k], covariances[k])
         corners[k, 0], corners[k, 1] = left, top

@@ -15,7 +15,7 @@ from cmmsim.errors import SensorFileError, ShapeError, TeachingError
 from cmmsim.files.schema import Body, Calibrated, Rig, RightFromLeft, StickerPlane, unit
 from cmmsim.geometry.camera import Distortion, PinholeCamera
 from cmmsim.geometry.plane_frame import PLANE_NAMES, frame_from_planes
-from cmmsim.geometry.pose import Array, rotation_exp
+from cmmsim.geometry.pose import Array, rigid, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig, placed_rig, toed_in_rig
 
 BORDER_POINTS = 65  # along each side of the image, asked whether the distortion model holds there
@@ -44,15 +44,9 @@ def rig_from_file(section: Rig) -> tuple[StereoRig, Array]:
 def _camera(calibrated: Calibrated | None, nominal: PinholeCamera, name: str) -> PinholeCamera:
     if calibrated is None:
         return nominal
-    focal_x, focal_y = calibrated.focal_px
-    camera = replace(
-        nominal,
-        focal_px=focal_x,
-        centre_x_px=calibrated.centre_px[0],
-        centre_y_px=calibrated.centre_px[1],
-        aspect=focal_y / focal_x,
-        distortion=Distortion(*calibrated.distortion),
-    )
+    (focal_x, focal_y), size = calibrated.focal_px, (nominal.width, nominal.height)
+    lens = Distortion(*calibrated.distortion)
+    camera = PinholeCamera(focal_x, *calibrated.centre_px, *size, focal_y / focal_x, lens)
     _require_whole_image(camera, name)
     return camera
 
@@ -73,9 +67,7 @@ def _require_whole_image(camera: PinholeCamera, name: str) -> None:
 
 
 def _right_from_left(section: RightFromLeft) -> Array:
-    right_from_left = np.eye(4)
-    right_from_left[:3, :3] = rotation_exp(np.array(section.rotation_vector))
-    right_from_left[:3, 3] = section.translation
+    right_from_left = rigid(rotation_exp(np.array(section.rotation_vector)), section.translation)
     right_centre = -right_from_left[:3, :3].T @ right_from_left[:3, 3]
     if np.linalg.norm(right_centre) < SHORTEST_BASELINE:
         raise SensorFileError(

@@ -158,13 +158,8 @@ class PinholeCamera:
     @property
     def matrix(self) -> Array:
         """Camera matrix K (3,3)."""
-        return np.array(
-            [
-                [self.focal_px, 0.0, self.centre_x_px],
-                [0.0, self.focal_px * self.aspect, self.centre_y_px],
-                [0.0, 0.0, 1.0],
-            ]
-        )
+        (focal_x, focal_y), (x, y) = self.focal_lengths, self.centre
+        return np.array([[focal_x, 0.0, x], [0.0, focal_y, y], [0.0, 0.0, 1.0]])
 
     @cached_property
     def ideal(self) -> PinholeCamera:

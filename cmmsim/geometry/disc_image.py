@@ -39,6 +39,8 @@ point spread is wide.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from cmmsim.errors import CmmError
@@ -61,15 +63,8 @@ def project_discs(camera: PinholeCamera, centres: Array, normals: Array, radii: 
     from cmmsim.geometry.disc_kernels import project_all  # compiles, so it is loaded where it is first needed
 
     pixels, shapes = np.empty((len(centres), 2)), np.empty((len(centres), 2, 2))
-    project_all(
-        np.ascontiguousarray(centres, dtype=float),
-        np.ascontiguousarray(normals, dtype=float),
-        np.ascontiguousarray(radii, dtype=float),
-        camera.focal_lengths,
-        camera.centre,
-        pixels,
-        shapes,
-    )
+    centres, normals, radii = _contiguous(centres, normals, radii)
+    project_all(centres, normals, radii, camera.focal_lengths, camera.centre, pixels, shapes)
     return pixels, shapes
 
 
@@ -139,41 +134,29 @@ def bending(camera: PinholeCamera, middles: Array, shapes: Array) -> Array:
     return (local @ shift)[..., 0]
 
 
-def coverage(centres: Array, shapes: Array, size: int) -> tuple[Array, Array]:
-    """Coverage (n, size, size), 0 to 1, and its derivatives (n, size, size, 5) by [c_x, c_y, A_xx, A_xy, A_yy].
+def coverage(centres: Array, shapes: Array, size: int, psf_px: float = 0.0) -> tuple[Array, Array]:
+    """Share of light (n, size, size), 0 to 1, in each pixel, and its derivatives (n, size, size, 5) by
+    [c_x, c_y, A_xx, A_xy, A_yy].
 
     Parameters: centres (n, 2) px, where (0, 0) is the middle of the window's first pixel; shapes (n, 2, 2) px,
-    symmetric and positive definite; size: window side in px.
+    symmetric and positive definite; size: window side in px; psf_px: sigma of the point spread, 0: the covered share.
+    Raises CmmError for a point spread narrower than NARROWEST_PX.
     """
-    from cmmsim.geometry.disc_kernels import cover_windows  # compiles, so it is loaded where it is first needed
-
-    shares, derivatives = np.empty((len(centres), size, size)), np.empty((len(centres), size, size, 5))
-    cover_windows(
-        np.ascontiguousarray(centres, dtype=float), np.ascontiguousarray(shapes, dtype=float), shares, derivatives
-    )
-    return shares, derivatives
-
-
-def covered_area(centres: Array, shapes: Array, size: int) -> Array:
-    """Coverage (n, size, size) as ``coverage`` gives it, without derivatives."""
-    return coverage(centres, shapes, size)[0]
-
-
-def blurred_coverage(centres: Array, shapes: Array, size: int, psf_px: float) -> tuple[Array, Array]:
-    """Shares of light of an ellipse blurred by a point spread of sigma ``psf_px``, and their derivatives, as
-    ``coverage`` gives them without one. Raises CmmError for one narrower than NARROWEST_PX."""
-    from cmmsim.geometry.disc_kernels import blur_windows  # compiles, so it is loaded where it is first needed
+    from cmmsim.geometry.disc_kernels import blur_windows, cover_windows  # compile, so they are loaded only here
 
     require_psf(psf_px)
+    centres, shapes = _contiguous(centres, shapes)
     shares, derivatives = np.empty((len(centres), size, size)), np.empty((len(centres), size, size, 5))
-    blur_windows(
-        np.ascontiguousarray(centres, dtype=float),
-        np.ascontiguousarray(shapes, dtype=float),
-        float(psf_px),
-        shares,
-        derivatives,
-    )
+    if psf_px == 0.0:
+        cover_windows(centres, shapes, shares, derivatives)
+    else:
+        blur_windows(centres, shapes, float(psf_px), shares, derivatives)
     return shares, derivatives
+
+
+def _contiguous(*arrays: Array) -> Iterator[Array]:
+    """Arrays of floats in the layout for which kernels are compiled."""
+    return (np.ascontiguousarray(values, dtype=float) for values in arrays)
 
 
 def require_psf(psf_px: float) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.errors import LostError
-from cmmsim.geometry.pose import Array, rotation_log
+from cmmsim.geometry.pose import Array, rigid, rotation_log
 from cmmsim.geometry.registration import SMALLEST_SPREAD
 
 PLANE_NAMES = ("A", "B", "C")
@@ -69,10 +69,7 @@ def frame_from_planes(normals: Array, offsets: Array) -> Array:
     z = normals[0] / np.linalg.norm(normals[0])
     x = np.cross(normals[0], normals[1])
     x /= np.linalg.norm(x)
-    frame = np.eye(4)
-    frame[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    frame[:3, 3] = np.linalg.solve(normals, offsets)
-    return frame
+    return rigid(np.column_stack([x, np.cross(z, x), z]), np.linalg.solve(normals, offsets))
 
 
 def frame_of_points(

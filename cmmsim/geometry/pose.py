@@ -29,14 +29,12 @@ def pose_to_transform(pose: ArrayLike) -> Array:
     """Transform (4,4) of a pose (6,). Raises ShapeError when the pose is not six finite numbers."""
     values = checked_pose(pose)
     (ca, cb, cg), (sa, sb, sg) = np.cos(values[3:]), np.sin(values[3:])
-    transform = np.eye(4)
-    transform[:3, :3] = [
+    rotation = [
         [cb * cg, -cb * sg, sb],
         [ca * sg + sa * sb * cg, ca * cg - sa * sb * sg, -sa * cb],
         [sa * sg - ca * sb * cg, sa * cg + ca * sb * sg, ca * cb],
     ]
-    transform[:3, 3] = values[:3]
-    return transform
+    return rigid(rotation, values[:3])
 
 
 def checked_transform(transform: ArrayLike, name: str = "a transform") -> Array:
@@ -74,10 +72,7 @@ def rigid(rotation: ArrayLike, translation: ArrayLike) -> Array:
 
 def invert(transform: Array) -> Array:
     """Inverse (4,4) of a rigid transform."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = transform[:3, :3].T
-    inverse[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
-    return inverse
+    return rigid(transform[:3, :3].T, -transform[:3, :3].T @ transform[:3, 3])
 
 
 def apply(transform: Array, points: Array) -> Array:

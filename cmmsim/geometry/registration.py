@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmmsim.errors import LostError
-from cmmsim.geometry.pose import Array, apply, rotation_exp
+from cmmsim.geometry.pose import Array, apply, rigid, rotation_exp
 
 SMALLEST_SPREAD = 0.005  # m; points closer than this to one line do not determine a rotation
 
@@ -27,10 +27,7 @@ def rigid_start(source: Array, target: Array) -> Array:
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     u, _, vt = np.linalg.svd((target - target_mean).T @ (source - source_mean))
     rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    transform = np.eye(4)
-    transform[:3, :3] = rotation
-    transform[:3, 3] = target_mean - rotation @ source_mean
-    return transform
+    return rigid(rotation, target_mean - rotation @ source_mean)
 
 
 def rigid_starts(source: Array, targets: Array, weights: Array) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 
 from cmmsim.errors import ShapeError
 from cmmsim.geometry.camera import NDArrayBool, PinholeCamera
-from cmmsim.geometry.pose import Array, apply, invert
+from cmmsim.geometry.pose import Array, apply, invert, rigid
 
 STEPS = 2  # of Gauss-Newton after the linear start
 
@@ -120,10 +120,7 @@ def placed_rig(rig: StereoRig, position: Array, target: Array) -> Array:
     x = right_centre / np.linalg.norm(right_centre)
     y = np.cross(np.array([0.0, 0.0, 1.0]) + rig.right_from_left[2, :3], x)
     y /= np.linalg.norm(y)
-    camera_from_middle = np.eye(4)
-    camera_from_middle[:3, :3] = np.column_stack([x, y, np.cross(x, y)])
-    camera_from_middle[:3, 3] = 0.5 * right_centre
-    return camera_from_middle @ _look_at(position, target)
+    return rigid(np.column_stack([x, y, np.cross(x, y)]), 0.5 * right_centre) @ _look_at(position, target)
 
 
 def _look_at(eye: Array, target: Array) -> Array:
@@ -131,10 +128,7 @@ def _look_at(eye: Array, target: Array) -> Array:
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
-    base_from_camera = np.eye(4)
-    base_from_camera[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    base_from_camera[:3, 3] = eye
-    return invert(base_from_camera)
+    return invert(rigid(np.column_stack([x, np.cross(z, x), z]), eye))
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from cmmsim.errors import OpenGLMissingError
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array
 from cmmsim.imaging.scene import Patch
-from cmmsim.plugins import AUTO, RENDERERS, find, require_callable
+from cmmsim.plugins import AUTO, RENDERERS, find
 
 NEAR, FAR = 0.2, 10.0  # m
 _WARNED: dict[str | tuple[str, type[Warning], int], int] = {}  # what this process has said once is not said again
@@ -143,8 +143,4 @@ def choose_renderer(name: str) -> Renderer:
 
 @lru_cache
 def _renderer(name: str) -> Renderer:
-    found = find("renderer", name, RENDERERS)
-    if isinstance(found, Renderer):
-        return found
-    require_callable("renderer", name, found)
-    return Renderer(name, found, float(getattr(found, "sampling_error_px", 0.0)))
+    return find("renderer", name, RENDERERS, Renderer)

@@ -16,7 +16,7 @@ from cmmsim.files.schema import Body, Stickers, unit
 from cmmsim.files.setup import MarkedBody
 from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.plane_frame import PLANE_NAMES
-from cmmsim.geometry.pose import Array, apply, invert
+from cmmsim.geometry.pose import Array, apply, invert, rigid
 
 SUNK = 0.0003  # m the solid surface lies below the sticker planes
 RING_SUNK = 0.0001  # m the dark ring lies below its sticker
@@ -170,10 +170,7 @@ def rod_transform(start: ArrayLike, end: ArrayLike) -> Array:
         )
     z = unit(along)
     x = unit(np.cross(z, np.eye(3)[np.argmin(np.abs(z))]))
-    transform = np.eye(4)
-    transform[:3, :3] = np.column_stack([x, np.cross(z, x), z])
-    transform[:3, 3] = begin
-    return transform
+    return rigid(np.column_stack([x, np.cross(z, x), z]), begin)
 
 
 def _solid(body: MarkedBody, section: Body) -> trimesh.Trimesh:

@@ -66,17 +66,9 @@ class Measurement:
 
 def lost_measurement(reason: str) -> Measurement:
     """A measurement that holds no pose, and says why."""
-    return Measurement(
-        np.full(6, np.nan),
-        np.full((6, 6), np.nan),
-        np.zeros((0, 3)),
-        np.zeros((0, 3, 3)),
-        np.zeros((0, 2)),
-        np.zeros((0, 2)),
-        np.array([], dtype=str),
-        False,
-        reason,
-    )
+    pose, spread, names = np.full(6, np.nan), np.full((6, 6), np.nan), np.array([], dtype=str)
+    points, covariances, left, right = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 2)), np.zeros((0, 2))
+    return Measurement(pose, spread, points, covariances, left, right, names, False, reason)
 
 
 def by_registration(observation: StickerObservation, places: Array) -> Solution:

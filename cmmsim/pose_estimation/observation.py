@@ -207,7 +207,7 @@ class StickerWindows:
         detector, noise, settings = self.observer.detector, self.observer.noise, self.observer.settings
         if detector is MAXIMUM_LIKELIHOOD:
             fits = self.ellipses_at_rest if smears is None else self.ellipses(smears)
-            return fits.within(settings.limits, noise).detected
+            return fits.within(settings.limits, noise)
         fit_size = settings.fit_size + 2 * detector.margin_px
         return detector.detect(
             SpotWindows(*self._flat, noise, fit_size, settings.limits, settings.optics.psf_px, smears)

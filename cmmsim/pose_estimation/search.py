@@ -24,8 +24,8 @@ from cmmsim.geometry.pose import Array, apply
 from cmmsim.geometry.registration import rigid_starts
 from cmmsim.geometry.stereo_rig import StereoRig, linear_triangulation
 from cmmsim.pose_estimation.observation import Observer
-from cmmsim.radiometry.images import FrameImages, StereoFrame
-from cmmsim.radiometry.noise import GreyImage
+from cmmsim.radiometry.images import StereoFrame
+from cmmsim.radiometry.noise import GreyImage, cut_windows
 
 SMALLEST_AREA_PX = 8
 LARGEST_SHARE = 25 / 36  # of a square with the largest side
@@ -48,7 +48,7 @@ def bright_ellipses(frame: StereoFrame, observer: Observer) -> tuple[EllipseFits
     limits, found = replace(settings.limits, largest_misfit=np.inf), []
     for image in (frame.left, frame.right):
         corners = np.rint(find_blobs(image, noise.white_level, size) - 0.5 * (size - 1)).astype(int)
-        windows = FrameImages(StereoFrame(image, image)).windows(np.stack([corners, corners]), size)[0]
+        windows = cut_windows(image, corners, size)
         found.append(fit_ellipses(windows, corners, noise, settings.fit_size, limits, psf_px=settings.optics.psf_px))
     return found[0], found[1]
 

@@ -25,7 +25,7 @@ from scipy.stats import chi2
 from cmmsim.detection.ellipse_fit import EllipseFits
 from cmmsim.errors import LostError
 from cmmsim.geometry.disc_image import sticker_outlines
-from cmmsim.geometry.pose import Array, apply, rotation_exp
+from cmmsim.geometry.pose import Array, apply, rigid, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.pose_estimation.observation import LONGEST_SMEAR_PX, StickerWindows
 
@@ -94,12 +94,13 @@ def find_streaks(read: StickerWindows) -> Streaks | None:
     """
     observer, places = read.observer, read.places
     rig, settings = observer.rig, observer.settings
-    at_rest = sticker_outlines(rig, read.camera_from_body, places, read.normals, settings.radius)[1]
+    shapes = sticker_outlines(rig, read.camera_from_body, places, read.normals, settings.radius)[1]
+    at_rest = shapes.reshape(-1, 2, 2)
 
     def compared(smears: Array, fits: EllipseFits) -> _Ellipses:
         squares, whiten = _squares(fits, settings.centre_error_px**2)
         added = _entries(_outer(smears)) / 3.0
-        excess = squares - _entries(_square(at_rest.reshape(-1, 2, 2))) + added
+        excess = squares - _entries(at_rest @ at_rest) + added
         return _Ellipses(smears, excess, whiten, fits.contrast >= settings.limits.smallest_contrast, fits.good)
 
     def fit(smears: Array) -> _Ellipses:
@@ -176,10 +177,8 @@ def _settled(movement: Array, fit: Callable[[Array], _Ellipses], by_movement: Ar
 
 def _moved(movement: Array, middle: Array) -> Array:
     """Transform (4,4) of a movement (6,), shift and rotation vector, of a body about the point ``middle`` (3,)."""
-    transform = np.eye(4)
-    transform[:3, :3] = rotation_exp(movement[3:])
-    transform[:3, 3] = movement[:3] + middle - transform[:3, :3] @ middle
-    return transform
+    turn = rotation_exp(movement[3:])
+    return rigid(turn, movement[:3] + middle - turn @ middle)
 
 
 def _pixels_by_movement(rig: StereoRig, camera_from_body: Array, places: Array, middle: Array) -> Array:
@@ -203,10 +202,6 @@ def _outer(smears: Array) -> Array:
     return smears[..., :, None] * smears[..., None, :]
 
 
-def _square(matrices: Array) -> Array:
-    return np.asarray(matrices @ matrices)
-
-
 def _squares(fits: EllipseFits, systematic: float) -> tuple[Array, Array]:
     """Entries (k,3) px² of A A and the matrices (k,3,3) that whiten them; ``systematic`` px² of A that is not noise."""
     xx, xy, yy = _entries(fits.shapes).T
@@ -216,7 +211,7 @@ def _squares(fits: EllipseFits, systematic: float) -> tuple[Array, Array]:
         axis=1,
     )
     spread = by_shape @ (fits.shape_covariances + systematic * np.eye(3)) @ by_shape.swapaxes(1, 2)
-    return _entries(_square(fits.shapes)), np.linalg.inv(np.linalg.cholesky(spread))
+    return _entries(fits.shapes @ fits.shapes), np.linalg.inv(np.linalg.cholesky(spread))
 
 
 def _starts(still: _Ellipses, by_movement: Array) -> list[Array]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cmmsim.checks import require_kind
 from cmmsim.errors import ShapeError
-from cmmsim.radiometry.noise import GreyImage
+from cmmsim.radiometry.noise import GreyImage, cut_windows
 
 Windows = GreyImage | NDArray[np.float64]
 
@@ -60,13 +60,8 @@ class FrameImages:
 
     def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
         """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x, y)."""
-        ticks = np.arange(size)
-        cut = []
-        for image, first in zip((self._frame.left, self._frame.right), corners, strict=True):
-            rows = np.clip(first[:, 1, None] + ticks, 0, image.shape[0] - 1)
-            columns = np.clip(first[:, 0, None] + ticks, 0, image.shape[1] - 1)
-            cut.append(image[rows[:, :, None], columns[:, None, :]])
-        return np.stack(cut)
+        sides = zip((self._frame.left, self._frame.right), corners, strict=True)
+        return np.stack([cut_windows(image, first, size) for image, first in sides])
 
 
 def readable(images: StereoImages | StereoFrame) -> StereoImages:

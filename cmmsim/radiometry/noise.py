@@ -8,6 +8,7 @@ variance.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,19 @@ from cmmsim.geometry.pose import Array
 BIT_DEPTHS = (8, 10, 12)
 ROUNDING_TERMS = 50  # of a series, which leave 0.002 of 0.25 without noise
 NO_SWING = 1.5  # grey values squared: beyond, rounding_excess is 1 to 1e-11
+T = TypeVar("T", bound=np.generic)
 GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+def cut_windows(image: NDArray[T], corners: NDArray[np.int_], size: int) -> NDArray[T]:
+    """Windows (k, size, size) of an image (height, width) with first pixels ``corners`` (k, 2) as (x, y).
+
+    Outside of the image they repeat its edge.
+    """
+    ticks = np.arange(size)
+    rows = np.clip(corners[:, 1, None] + ticks, 0, image.shape[0] - 1)
+    columns = np.clip(corners[:, 0, None] + ticks, 0, image.shape[1] - 1)
+    return image[rows[:, :, None], columns[:, None, :]]
 
 
 @dataclass(frozen=True)
@@ -32,15 +45,8 @@ class FixedPattern:
     offset: NDArray[np.float32]
 
     def windows(self, corners: NDArray[np.int_], size: int) -> FixedPattern:
-        """The pattern (k, size, size) in windows with first pixels ``corners`` (k, 2) as (x, y).
-
-        Outside of the image it repeats the image's edge.
-        """
-        height, width = self.sensitivity.shape
-        ticks = np.arange(size)
-        rows = np.clip(corners[:, 1, None] + ticks, 0, height - 1)[:, :, None]
-        columns = np.clip(corners[:, 0, None] + ticks, 0, width - 1)[:, None, :]
-        return FixedPattern(self.sensitivity[rows, columns], self.offset[rows, columns])
+        """The pattern (k, size, size) in windows as of ``cut_windows``."""
+        return FixedPattern(*(cut_windows(values, corners, size) for values in (self.sensitivity, self.offset)))
 
 
 def draw_pattern(shape: tuple[int, int], prnu: float, dsnu: float, rng: np.random.Generator) -> FixedPattern:

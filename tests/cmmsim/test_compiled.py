@@ -12,8 +12,8 @@ import pytest
 import cmmsim
 
 PROBE = (
-    "import numpy as np; from cmmsim.geometry.disc_image import covered_area as c;"
-    "print(c(np.full((1, 2), 5.2), np.eye(2)[None] * 3.0, 12).sum())"
+    "import numpy as np; from cmmsim.geometry.disc_image import coverage as c;"
+    "print(c(np.full((1, 2), 5.2), np.eye(2)[None] * 3.0, 12)[0].sum())"
 )
 
 

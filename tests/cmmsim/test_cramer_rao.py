@@ -7,10 +7,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.stats import norm
 
-from cmmsim.detection import cramer_rao
-from cmmsim.detection.cramer_rao import cramer_rao_bound, grey_value_information, light_shares
+from cmmsim.detection.cramer_rao import cramer_rao_bound, grey_value_information
 from cmmsim.errors import CmmError
-from cmmsim.geometry.disc_image import SHAPE_BASIS
+from cmmsim.geometry.disc_image import SHAPE_BASIS, coverage
 from cmmsim.radiometry.noise import CameraNoise
 
 NOISE = CameraNoise(electrons_at_white=1600.0, gain=0.13, dark_noise=26.0, full_well=1800.0, black_level=16.0)
@@ -29,7 +28,7 @@ def test_light_shares_match_a_sampled_and_filtered_disc(psf_px):
     disc = ((unit**2).sum(axis=0) < 1.0).astype(float)
     blurred = gaussian_filter(disc, psf_px * fine, truncate=5.0) if psf_px else disc
     sampled = blurred.reshape(SIZE + 2 * margin, fine, -1, fine).mean(axis=(1, 3))[margin:-margin, margin:-margin]
-    error = sampled - light_shares(CENTRES, SHAPES, SIZE, psf_px)[0]
+    error = sampled - coverage(CENTRES, SHAPES, SIZE, psf_px)[0][0]
     assert np.abs(error).max() < 0.008  # the sampled edge is off by up to half a sample
     assert np.abs(error.mean()) < 1e-4
 
@@ -41,7 +40,7 @@ def test_bound_is_that_of_numerically_differentiated_images(psf_px):
     for centre, shape in zip(CENTRES, SHAPES, strict=True):
 
         def image(p):
-            share = light_shares(p[None, :2], np.tensordot(p[2:5], SHAPE_BASIS, 1)[None], SIZE, psf_px)
+            share = coverage(p[None, :2], np.tensordot(p[2:5], SHAPE_BASIS, 1)[None], SIZE, psf_px)[0]
             return (p[6] + p[5] * share).ravel()
 
         start = np.array([*centre, shape[0, 0], shape[0, 1], shape[1, 1], CONTRAST, GROUND])
@@ -55,11 +54,10 @@ def test_bound_is_that_of_numerically_differentiated_images(psf_px):
 
 
 def test_derivatives_of_blurred_shares_are_those_of_the_shares():
-    shares, derivatives = cramer_rao.light_share_derivatives(CENTRES, SHAPES, SIZE, 0.6)
-    np.testing.assert_allclose(shares, light_shares(CENTRES, SHAPES, SIZE, 0.6), atol=1e-12)
+    derivatives = coverage(CENTRES, SHAPES, SIZE, 0.6)[1]
     for k in range(5):
         move, turn = 1e-5 * np.eye(5)[k, :2], 1e-5 * np.tensordot(np.eye(5)[k, 2:], SHAPE_BASIS, 1)
-        ahead, behind = (light_shares(CENTRES + s * move, SHAPES + s * turn, SIZE, 0.6) for s in (1.0, -1.0))
+        ahead, behind = (coverage(CENTRES + s * move, SHAPES + s * turn, SIZE, 0.6)[0] for s in (1.0, -1.0))
         np.testing.assert_allclose(derivatives[..., k], (ahead - behind) / 2e-5, atol=1e-6)
 
 
@@ -136,4 +134,4 @@ def test_no_noise_and_a_point_spread_that_cannot_be_sampled_are_refused():
     with pytest.raises(CmmError, match="no Cramer-Rao bound"):
         grey_value_information(np.array([100.0]), replace(NOISE, enabled=False))
     with pytest.raises(CmmError, match=r"0\.02 px cannot be fitted, only 0 or at least 0\.05 px"):
-        light_shares(CENTRES, SHAPES, SIZE, 0.02)
+        coverage(CENTRES, SHAPES, SIZE, 0.02)

@@ -15,7 +15,6 @@ from cmmsim.geometry.camera import Distortion, PinholeCamera
 from cmmsim.geometry.disc_image import (
     SHAPE_BASIS,
     bending,
-    blurred_coverage,
     centre_offset,
     coverage,
     eccentricity,
@@ -174,11 +173,6 @@ def test_observation_takes_the_predicted_eccentricity_of_large_stickers_away(rad
     assert np.abs(errors[0]).max() < 0.002
 
 
-def light(centres, shapes, size, psf_px):
-    """Shares and derivatives, sharp where there is no point spread."""
-    return coverage(centres, shapes, size) if psf_px == 0.0 else blurred_coverage(centres, shapes, size, psf_px)
-
-
 def test_coverage_matches_sampling_each_pixel():
     centres, shapes = random_ellipses(np.random.default_rng(0), 3, 18)
     area, _ = coverage(centres, shapes, 18)
@@ -207,7 +201,7 @@ def test_coverage_is_that_of_plain_numpy(radii):
 def test_blurred_coverage_is_that_of_plain_numpy(psf_px):
     centres, shapes = random_ellipses(np.random.default_rng(1), 20, 16)
     for found, expected in zip(
-        blurred_coverage(centres, shapes, 16, psf_px),
+        coverage(centres, shapes, 16, psf_px),
         plain_coverage.blurred_coverage(centres, shapes, 16, psf_px),
         strict=True,
     ):
@@ -228,7 +222,7 @@ def integrated(centre, shape, psf_px, rings=120, rays=240):
 @pytest.mark.parametrize("psf_px", [0.3, 0.5, 1.0, 2.0])
 def test_shares_match_brute_force_integration(psf_px):
     centres, shapes = random_ellipses(np.random.default_rng(0), 3, 20)
-    shares, _ = blurred_coverage(centres, shapes, 20, psf_px)
+    shares, _ = coverage(centres, shapes, 20, psf_px)
     for centre, shape, share in zip(centres, shapes, shares, strict=True):
         np.testing.assert_allclose(share, integrated(centre, shape, psf_px), atol=2e-7)
 
@@ -237,7 +231,7 @@ def test_shares_match_brute_force_integration(psf_px):
 @pytest.mark.parametrize("radii", [(1.0, 0.85), (3.8, 2.4), (7.0, 3.0)])
 def test_all_light_is_kept_however_narrow_and_small(psf_px, radii):
     centres, shapes = random_ellipses(np.random.default_rng(1), 5, 20, radii)
-    shares, _ = blurred_coverage(centres + 0.5 * 20, shapes, 2 * 20, psf_px)
+    shares, _ = coverage(centres + 0.5 * 20, shapes, 2 * 20, psf_px)
     np.testing.assert_allclose(shares.sum(axis=(1, 2)), np.pi * np.prod(radii), rtol=1e-6)
     assert shares.min() > -1e-6
     assert shares.max() < 1.0 + 1e-6
@@ -246,10 +240,10 @@ def test_all_light_is_kept_however_narrow_and_small(psf_px, radii):
 @pytest.mark.parametrize(("psf_px", "step", "limit"), [(0.0, 1e-6, 1e-7), (0.5, 1e-5, 1e-6)])
 def test_derivatives_match_finite_differences(psf_px, step, limit):
     centres, shapes = random_ellipses(np.random.default_rng(1), 4, 18)
-    _, derivatives = light(centres, shapes, 18, psf_px)
+    _, derivatives = coverage(centres, shapes, 18, psf_px)
     for k, unit in enumerate(step * np.eye(5)):
         turn = np.tensordot(unit[2:], SHAPE_BASIS, 1)
-        ahead, behind = (light(centres + s * unit[:2], shapes + s * turn, 18, psf_px)[0] for s in (1.0, -1.0))
+        ahead, behind = (coverage(centres + s * unit[:2], shapes + s * turn, 18, psf_px)[0] for s in (1.0, -1.0))
         np.testing.assert_allclose(derivatives[..., k], (ahead - behind) / (2.0 * step), atol=limit)
 
 

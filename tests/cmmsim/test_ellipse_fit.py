@@ -5,7 +5,6 @@ import pytest
 
 import cmmsim
 from cmmsim.detection import ellipse_fit, fit_kernels
-from cmmsim.detection.cramer_rao import light_shares
 from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import RING_REACH, fit_ellipses
 from cmmsim.geometry.disc_image import coverage
@@ -18,7 +17,7 @@ def exposed(seed, count, radii=(3.8, 2.4), size=SIZE, psf_px=0.0):
     """True centres and shapes, noisy windows, and where they are cut out."""
     rng = np.random.default_rng(seed)
     centres, shapes = random_ellipses(rng, count, size, radii)
-    radiance = (8.0 + 220.0 * light_shares(centres, shapes, size, psf_px)) / 255.0
+    radiance = (8.0 + 220.0 * coverage(centres, shapes, size, psf_px)[0]) / 255.0
     return centres, shapes, NOISE.expose(radiance.astype(np.float32), rng), np.tile([1000, 700], (count, 1))
 
 
@@ -48,7 +47,7 @@ def test_the_fit_ends_where_plain_numpy_would_stay(monkeypatch):
     assert np.quantile(np.abs(steps[:, :5]) / deviation, 0.99) < 1e-3
     np.testing.assert_allclose(fits.covariances, covariances[:, :2, :2], rtol=2e-3, atol=1e-9)
     np.testing.assert_allclose(fits.shape_covariances, covariances[:, 2:, 2:], rtol=2e-3, atol=1e-8)
-    np.testing.assert_allclose(fits.misfit, misfits, rtol=1e-6)
+    np.testing.assert_allclose(fits.misfits, misfits, rtol=1e-6)
 
 
 def test_the_fit_stops_no_earlier_than_the_noise_allows():
@@ -100,7 +99,7 @@ def test_windows_fitted_together_are_those_fitted_alone():
         alone = fit_ellipses(windows[k : k + 1], corners[k : k + 1], NOISE, FIT)
         np.testing.assert_array_equal(together.centres[k], alone.centres[0])
         np.testing.assert_array_equal(together.covariances[k], alone.covariances[0])
-        assert together.misfit[k] == alone.misfit[0]
+        assert together.misfits[k] == alone.misfits[0]
 
 
 def test_windows_without_an_ellipse_give_finite_numbers():
@@ -108,7 +107,7 @@ def test_windows_without_an_ellipse_give_finite_numbers():
     flat[1], flat[2, 3, 3] = 255.0, 255.0
     fits = fit_ellipses(flat, np.zeros((3, 2), dtype=int), NOISE, FIT)
     assert not fits.good.any()
-    for name in ("centres", "covariances", "shapes", "shape_covariances", "contrast", "misfit"):
+    for name in ("centres", "covariances", "shapes", "shape_covariances", "contrast", "misfits"):
         assert np.isfinite(getattr(fits, name)).all()
 
 

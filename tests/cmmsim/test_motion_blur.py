@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import cmmsim
-from cmmsim.detection.cramer_rao import light_shares
 from cmmsim.detection.ellipse_fit import fit_ellipses
+from cmmsim.geometry.disc_image import coverage
 from cmmsim.imaging.exposure import LARGEST_STEP_PX, exposed_windows, sub_frame_poses
 from cmmsim.imaging.formation import ImageFormation, Side
 from tests.cmmsim.ellipses import NOISE, random_ellipses
@@ -96,7 +96,7 @@ def test_fit_of_noise_free_smeared_windows_is_exact(smear, psf_px):
     """Light added up over four times as many places as the fit takes; centres of the middle, shapes of the disc."""
     centres, shapes = random_ellipses(np.random.default_rng(2), 30, 20)
     parts = (np.arange(44) + 0.5) / 44 - 0.5
-    share = np.mean([light_shares(centres + part * np.array(smear), shapes, 20, psf_px) for part in parts], axis=0)
+    share = np.mean([coverage(centres + part * np.array(smear), shapes, 20, psf_px)[0] for part in parts], axis=0)
     windows, moved = NOISE.mean_grey((8.0 + 220.0 * share) / 255.0), np.tile(smear, (30, 1))
     fits = fit_ellipses(windows, np.zeros((30, 2), dtype=int), NOISE, 20, psf_px=psf_px, smears=moved)
     assert fits.good.all()
