@@ -11,11 +11,10 @@ import mujoco
 import numpy as np
 from mujoco import rollout, sysid
 from mujoco.sysid import Parameter, ParameterDict, SignalType, TimeSeries
-from scipy.spatial.transform import Rotation
 
 from dynamics.engines.mjcf import MjcfSolver, mjcf_text
 from tests.benchmarks.servo_estimator import Estimate
-from tests.benchmarks.servo_experiment import RATE_HZ, TIMES, felt_commands, robot, servo_gains, table, truth
+from tests.benchmarks.servo_experiment import RATE_HZ, TIMES, Measured, felt_commands, robot, servo_gains, table, truth
 
 BOUNDS = 0.05, 5.0
 """Of each parameter, as shares of the truth; the optimizer wants finite ones."""
@@ -44,8 +43,7 @@ def simulated_poses(commands):
     model = model_spec().compile()
     state, _ = rollout.rollout(model, mujoco.MjData(model), at_home(model), felt_commands(commands)[:-1])
     states = np.vstack([at_home(model), state[0]])[:, PLATFORM]
-    turned = Rotation.from_quat(states[:, 3:], scalar_first=True)
-    return np.hstack([states[:, :3], turned.as_euler("XYZ")])
+    return Measured(states[:, :3], states[:, 3:]).pose
 
 
 def estimate(commands, measured, guess, integrator="implicitfast"):

@@ -14,6 +14,12 @@ from dynamics import closed_loop, compilation
 from dynamics.legs.rss_geometry import Rss6Geometry
 
 BOX = np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])
+METHODS = (
+    *("inverse_kinematics", "reach_margin", "joint_jacobian", "pose_jacobian", "twist", "twist_dot", "pose_rate"),
+    *("mass_matrix", "coriolis_matrix", "gravity_wrench", "friction_wrench", "static_torque", "regressor"),
+    *("inverse_dynamics", "forward_dynamics"),
+)
+"""Of a robot, which take rows or batches of them."""
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,7 @@
 import re
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from unittest.mock import Mock
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from dynamics import closed_loop, compilation, robot_file, simulate_batch
 from dynamics import robot as robot_module
 from dynamics.errors import DynamicsError, SimulationError
-from tests.dynamics.conftest import assert_same, base_from_platform
+from tests.dynamics.conftest import assert_same
 
 PERIOD = 1 / 60
 TIMINGS = {
@@ -186,15 +187,6 @@ def test_stable_where_the_paper_is(loop):
     assert np.abs(run.pose - reference.poses)[:, :3].max() < 0.02
 
 
-def _reach_margins(robot, pose):
-    """1 - cos^2 of the angle between crank and reach (6,) by the law of cosines in each crank's plane."""
-    g = robot.geometry
-    reach = pose[:3] + g.platform_joints @ base_from_platform(pose).T - g.base_joints
-    square = np.sum(reach**2, axis=1)
-    in_plane = square - np.sum(reach * g.crank_axes, axis=1) ** 2
-    return 1 - ((square + g.crank_length**2 - g.link_length**2) / (2 * g.crank_length)) ** 2 / in_plane
-
-
 def test_an_unstable_loop_names_frame_time_and_the_leg_that_leaves_its_reach(robot, loop):
     """Table 1 at 29 Hz with one frame of delay: both paths say the same; at the frame before, all legs reach."""
     settings, reference = loop.settings(29.0, latency_s=1 / 29), loop.reference(580, 29.0)
@@ -210,7 +202,7 @@ def test_an_unstable_loop_names_frame_time_and_the_leg_that_leaves_its_reach(rob
     margin = re.search(said, messages[0])
     assert -0.5 < float(margin[1]) <= 0
     shorter = closed_loop.Reference(reference.poses[: frame + 1], reference.rates[: frame + 1])
-    assert _reach_margins(robot, loop.run(shorter, settings, unstable).pose[-1]).min() > 0
+    assert robot.reach_margin(loop.run(shorter, settings, unstable).pose[-1]).min() > 0
 
 
 @paths
@@ -235,7 +227,7 @@ def test_measured_pose_out_of_reach_ends_the_run_without_warnings(robot, loop, c
 
     with pytest.raises(closed_loop.LoopFailure, match=r"frame 3 .*measured pose is out of reach") as caught:
         loop.run(5, sensor=sensor, compiled=compiled)
-    margins = _reach_margins(robot, answers[-1])
+    margins = robot.reach_margin(answers[-1])
     leg = int(np.argmin(margins))
     assert margins[leg] < 0
     assert f"there leg {leg + 1} has the least reach margin, {margins[leg]:.3g}, must be > 0" in str(caught.value)
@@ -268,20 +260,29 @@ def test_runs_in_threads_equal_runs_in_turn(loop):
 
 
 def test_a_batch_is_its_runs_in_order_for_any_number_of_workers(robot, loop):
-    """Many vectors with one reference, and one vector with many references; other lengths do not pair up."""
-    settings, reference = loop.settings(), loop.reference(30)
-    vectors = loop.parameters * np.linspace(0.95, 1.05, 5)[:, None] ** np.arange(67)[None, :].clip(0, 1)
+    """Many vectors with one reference; one vector with many references, or with many starts, as multiple shooting
+    wants them."""
+
+    def compare(runs, references, vectors, starts, **options):
+        for run, reference, vector, start in zip(runs, references, vectors, starts, strict=True):
+            alone = loop.run(reference, parameters=vector, start=start, **options)
+            for name in ("pose", "pose_sensitivity", "start_sensitivity"):
+                np.testing.assert_array_equal(getattr(run, name), getattr(alone, name), err_msg=name)
+        assert not np.array_equal(runs[0].pose, runs[1].pose)
+
+    settings, reference, one = loop.settings(), loop.reference(30), loop.parameters
+    vectors = one * np.linspace(0.95, 1.05, 5)[:, None] ** np.arange(67)[None, :].clip(0, 1)
     for workers in (1, 3):
         runs = simulate_batch(robot, vectors, reference, settings, sensitivities=True, workers=workers)
-        for vector, run in zip(vectors, runs, strict=True):
-            alone = loop.run(reference, settings, vector, sensitivities=True)
-            assert np.array_equal(run.pose, alone.pose)
-            assert np.array_equal(run.pose_sensitivity, alone.pose_sensitivity)
+        compare(runs, [reference] * 5, vectors, [None] * 5, sensitivities=True)
     references = [loop.reference(20, scale=scale) for scale in (0.5, 1.0)]
-    for given, run in zip(references, simulate_batch(robot, loop.parameters, references, settings), strict=True):
-        assert np.array_equal(run.pose, loop.run(given).pose)
-    with pytest.raises(SimulationError, match="5 parameter vectors and 2 references do not pair up"):
-        simulate_batch(robot, vectors, references, settings)
+    compare(simulate_batch(robot, one, references, settings), references, [one] * 2, [None] * 2)
+    start = loop.run(reference).state_at(20)
+    starts = [replace(start, joint_integral=start.joint_integral + change) for change in (0, 1e-5, 2e-5)]
+    runs = simulate_batch(robot, one, reference, settings, starts=starts, start_sensitivities=True)
+    compare(runs, [reference] * 3, [one] * 3, starts, start_sensitivities=True)
+    with pytest.raises(SimulationError, match="5 parameter vectors and 1 references and 3 start states"):
+        simulate_batch(robot, vectors, reference, settings, starts=starts)
 
 
 def _forget():

@@ -9,7 +9,6 @@ from scipy.optimize import fsolve
 
 from dynamics import closed_loop
 from dynamics.closed_loop import FrictionLaw, JointElasticity
-from dynamics.errors import SimulationError
 from dynamics.parameters import COULOMB, PARAMETER_NAMES
 from tests.dynamics.conftest import assert_same
 
@@ -151,20 +150,3 @@ def test_a_run_from_the_state_of_another_repeats_its_rest(loop, make_elastic):
     again = loop.run(rest, settings, start=run.state_at(17))
     np.testing.assert_array_equal(again.pose, run.pose[17:])
     np.testing.assert_array_equal(again.motor_rate, run.motor_rate[17:])
-
-
-def test_motors_too_heavy_steps_too_long_and_starts_without_motors_are_refused(robot, identified, loop, make_elastic):
-    reference = loop.reference(5)
-
-    def run(elasticity, steps=80, **options):
-        loop.run(reference, make_elastic(elasticity, steps), **options)
-
-    with pytest.raises(SimulationError, match=r"must be below the 0.000718 kg m\^2 of crank 2 about its axis"):
-        run(JointElasticity(500.0, 1e-3))
-    with pytest.raises(SimulationError, match=r"steps_per_frame is 20, must be >= \d+ .* stiffness of 500 N m/rad"):
-        run(SOFT, steps=20)
-    with pytest.raises(SimulationError, match="pass settings with elasticity=None"):
-        run(SOFT, sensitivities=True)
-    rigid = closed_loop.equilibrium(robot, identified, reference.poses[0], make_elastic(None).servo)
-    with pytest.raises(SimulationError, match="needs motor_angle and motor_rate"):
-        run(SOFT, start=rigid)

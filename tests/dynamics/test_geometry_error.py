@@ -5,7 +5,6 @@ import pytest
 from scipy.optimize import fsolve
 from scipy.stats import chi2
 
-from dynamics.errors import RobotFileError
 from dynamics.robot import with_geometry_error
 from tests.dynamics.conftest import Loop, assert_same, place_legs
 
@@ -38,13 +37,6 @@ def _gaps(pose, theta, geometry):
     """|A - T| less the link length of every leg."""
     legs = place_legs(geometry, pose, theta)
     return np.linalg.norm(legs.joint - legs.tip, axis=1) - geometry.link_length
-
-
-def test_an_error_that_no_home_survives_is_refused(robot):
-    with pytest.raises(RobotFileError, match=r"with joints off by 0.2 m: leg \d cannot reach the home pose"):
-        with_geometry_error(robot, 0.2, np.random.default_rng(0))
-    with pytest.raises(RobotFileError, match=r"geometry error is -1.0 m, must be finite and >= 0"):
-        with_geometry_error(robot, -1.0, np.random.default_rng(0))
 
 
 def test_the_plant_closes_its_own_loops_at_home_and_elsewhere(robot, plant, monkeypatch):

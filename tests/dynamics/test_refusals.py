@@ -1,6 +1,8 @@
 """What is refused, with name, value and limit: each checker is proved once, each entry point with one value."""
 
+import inspect
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,14 +16,16 @@ from dynamics.errors import (
     ConvergenceError,
     DynamicsError,
     ParameterError,
+    RobotFileError,
     ShapeError,
     SimulationError,
     SingularPoseError,
     TravelError,
     UnreachablePoseError,
 )
-from dynamics.robot import Robot
+from dynamics.robot import Robot, with_geometry_error
 from dynamics.workspace import check_motion, measure
+from tests.dynamics.conftest import METHODS
 
 SHAPES = re.escape("numbers of shape (6,) or (N, 6)")
 
@@ -86,24 +90,10 @@ def test_a_flag_a_mask_a_choice_and_a_type_are_what_they_are_called(value):
         checks.check_type("robot", value, Robot, ParameterError)
 
 
-ARGUMENTS = {  # of a robot's methods, in their order
-    **dict.fromkeys(("inverse_kinematics", "joint_jacobian", "pose_jacobian", "reach_margin"), ("pose",)),
-    **dict.fromkeys(("static_torque", "mass_matrix", "gravity_wrench"), ("pose", "parameters")),
-    "forward_kinematics": ("theta", "initial_pose"),
-    "twist": ("pose", "pose_rate"),
-    "twist_dot": ("pose", "pose_rate", "pose_acceleration"),
-    "pose_rate": ("pose", "twist"),
-    **dict.fromkeys(("coriolis_matrix", "friction_wrench"), ("pose", "twist", "parameters")),
-    "regressor": ("pose", "twist", "twist_dot"),
-    "inverse_dynamics": ("pose", "twist", "twist_dot", "parameters"),
-    "forward_dynamics": ("pose", "twist", "torque", "parameters"),
-}
-
-
-@pytest.mark.parametrize("method", ARGUMENTS)
+@pytest.mark.parametrize("method", [*METHODS, "forward_kinematics"])
 def test_every_argument_of_every_method_is_checked_by_name(robot, method):
     good = {"pose": robot.home_pose, "initial_pose": robot.home_pose, "parameters": robot.nominal_parameters}
-    arguments = {name: good.get(name, np.zeros(6)) for name in ARGUMENTS[method]}
+    arguments = {name: good.get(name, np.zeros(6)) for name in inspect.signature(getattr(robot, method)).parameters}
     for name, value in arguments.items():
         words = r"platform.mass = nan kg" if name == "parameters" else rf"{name}\[0\] is nan, must be finite"
         with pytest.raises((ShapeError, ParameterError), match=words):
@@ -187,14 +177,22 @@ def asked(robot, identified, loop):
         run=lambda **bad: closed_loop.simulate(**{"robot": robot, "reference": reference, **good, **bad}),
         batch=lambda **bad: simulate_batch(**{"robot": robot, "references": reference, **good, **bad}),
         balance=lambda pose, servo=settings.servo: closed_loop.equilibrium(robot, identified, pose, servo),
+        misplace=lambda error: with_geometry_error(robot, error, np.random.default_rng(0)),
         export=lambda **bad: mjcf_text(**{"robot": robot, "allow_unphysical_inertia": True, **bad}),
         accelerate=lambda *bad: fast_forward_dynamics(robot)(*bad, *[np.zeros(6)] * (3 - len(bad))),
+        start=lambda **bad: replace(closed_loop.equilibrium(robot, identified, robot.home_pose, settings.servo), **bad),
+        state=loop.run(10, lost=np.arange(10) == 4).state_at,
         check=lambda *bad, **limits: check_motion(robot, *(bad or (robot.home_pose,)), **limits),
     )
 
 
 def _ideal(frame, time, pose):
     return pose
+
+
+def _elastic(motor_inertia=3e-4, steps=80):
+    elasticity = JointElasticity(500.0, motor_inertia, 0.02)
+    return LoopSettings(ServoGains(0.3, 0.001, 2.4), FrameTiming(60.0), FrictionLaw(), steps, elasticity)
 
 
 POSES = np.tile([0, 0, 0.2, 0, 0, 0], (3, 1))
@@ -256,6 +254,15 @@ REFUSED = {
         (lambda asked: asked.batch(references=[FIVE]), r"references\[0\] must be of type Reference, got array"),
         (lambda asked: asked.batch(starts=[3]), r"starts\[0\] must be of type StartState, got 3"),
         (lambda asked: asked.balance(np.zeros(6), None), "servo must be of type ServoGains, got None"),
+        (lambda asked: asked.run(settings=_elastic(1e-3)), r"below the 0.000718 kg m\^2 of crank 2 about its axis"),
+        (lambda asked: asked.run(settings=_elastic(steps=20)), r"is 20, must be >= \d+ .* stiffness of 500 N m/rad"),
+        (lambda asked: asked.run(settings=_elastic(), sensitivities=True), "pass settings with elasticity=None"),
+        (lambda asked: asked.run(settings=_elastic(), start=asked.start()), "needs motor_angle and motor_rate"),
+        (lambda asked: asked.start(pose_rate=np.zeros(5)), r"start pose_rate must have shape \(6,\), got \(5,\)"),
+        (lambda asked: asked.start(servo_integral=np.full(6, np.nan)), r"start servo_integral\[0\] is nan, must be"),
+        (lambda asked: asked.start(commands=np.zeros((0, 6))), "start commands must have at least 1 row, got 0"),
+        (lambda asked: asked.state(10), "frame is 10, must be a whole number >= 0 and <= 9"),
+        (lambda asked: asked.state(5), "frame 5 follows a lost measurement"),
         (lambda _: closed_loop.prepare(6), "robot must be of type Robot, got 6 of type int"),
     ],
     ShapeError: [
@@ -269,7 +276,14 @@ REFUSED = {
         (lambda asked: asked.check(POSES, [0.0, 0.2, 0.1]), r"increase, but times\[2\] = 0.1 s follows 0.2 s"),
         (lambda asked: asked.check(POSES, [0.0, 0.0, 0.1]), r"times\[1\] = 0.0 s follows 0.0 s"),
     ],
-    UnreachablePoseError: [(lambda asked: asked.balance(np.full(6, 9.0)), r"leg 1 cannot reach pose \[9.")],
+    UnreachablePoseError: [
+        (lambda asked: asked.balance(np.full(6, 9.0)), r"leg 1 cannot reach pose \[9."),
+        (lambda asked: asked.run(start=asked.start(pose=np.array([0, 0, 0.7, 0, 0, 0]))), "leg"),
+    ],
+    RobotFileError: [
+        (lambda asked: asked.misplace(0.2), r"with joints off by 0.2 m: leg \d cannot reach the home pose"),
+        (lambda asked: asked.misplace(-1.0), "geometry error is -1.0 m, must be finite and >= 0"),
+    ],
     TravelError: [(lambda asked: asked.check(travel_margin=-0.1), "travel_margin is -0.1.*must be")],
     ParameterError: [(lambda asked: asked.export(parameters=np.ones(67)), r"must have shape \(64,\), got \(67,\)")],
     DynamicsError: [

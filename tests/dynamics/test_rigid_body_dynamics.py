@@ -1,10 +1,13 @@
 """The virtual-work model: identities between its parts, and energy."""
 
+import inspect
+
 import numpy as np
 import pytest
 
 from dynamics import fast_forward_dynamics
-from tests.dynamics.conftest import base_from_platform, derivative
+from dynamics.rigid_body.equation_of_motion import motion_functions
+from tests.dynamics.conftest import METHODS, base_from_platform, derivative
 
 
 @pytest.fixture(params=["initial", "identified"])
@@ -60,21 +63,11 @@ def test_forward_dynamics_inverts_inverse_dynamics(robot, states, parameters):
 
 def test_batches_equal_single_calls(robot, states, parameters):
     """Every method gives for row n of a batch what it gives for that row alone; parameters may be a batch too."""
-    pose, twist, twist_dot = states.pose[:4], states.twist[:4], states.twist_dot[:4]
-    sets = parameters * np.array([[1.0], [1.1], [1.2], [1.3]])
-    calls = {
-        "inverse_kinematics": (pose,),
-        "joint_jacobian": (pose,),
-        "pose_jacobian": (pose,),
-        "mass_matrix": (pose, sets),
-        "coriolis_matrix": (pose, twist, sets),
-        "gravity_wrench": (pose, sets),
-        "friction_wrench": (pose, twist, sets),
-        "regressor": (pose, twist, twist_dot),
-        "inverse_dynamics": (pose, twist, twist_dot, sets),
-        "forward_dynamics": (pose, twist, twist_dot, sets),
-    }
-    for name, arguments in calls.items():
+    given = {"pose": states.pose[:4], "parameters": parameters * np.array([[1.0], [1.1], [1.2], [1.3]])}
+    given |= dict.fromkeys(("twist", "pose_rate"), states.twist[:4])
+    given |= dict.fromkeys(("twist_dot", "pose_acceleration", "torque"), states.twist_dot[:4])
+    for name in METHODS:
+        arguments = [given[argument] for argument in inspect.signature(getattr(robot, name)).parameters]
         batch = getattr(robot, name)(*arguments)
         rows = [getattr(robot, name)(*row) for row in zip(*arguments, strict=True)]
         np.testing.assert_allclose(batch, rows, rtol=1e-13, atol=1e-13, err_msg=name)
@@ -166,3 +159,23 @@ def test_wrench_is_linear_in_the_parameters(robot, states):
     torque = robot.inverse_dynamics(*many, np.vstack([base, base + np.eye(64)]))
     wrenches = (torque[1:] - torque[0]) @ robot.joint_jacobian(pose)
     np.testing.assert_allclose(wrenches.T, robot.regressor(*motion), atol=1e-10)
+
+
+def test_equation_of_motion_in_pose_coordinates_is_the_wrench_balance(robot, states, identified):
+    """What the closed loop integrates, M, b, J_theta, J_theta_dot rate and theta, against `Robot` (twist coordinates,
+    6x6 Jacobians) and differences. Its derivatives are proved with those of whole runs, in test_sensitivities."""
+    functions = {function.name(): function for function in motion_functions(robot.geometry)}
+    frictionless = np.concatenate([identified[:52], np.zeros(12)])
+    for pose, twist, twist_dot in zip(states.pose[:6], states.twist, states.twist_dot, strict=False):
+        rate = robot.pose_rate(pose, twist)
+        values = functions["equation_of_motion"](pose, rate, identified[:52])
+        mass, bias, jacobian, drift, angle = (np.squeeze(np.asarray(value, dtype=float)) for value in values)
+        to_twist = np.column_stack([robot.twist(pose, e) for e in np.eye(6)])
+        np.testing.assert_allclose(mass, to_twist.T @ robot.mass_matrix(pose, frictionless) @ to_twist, atol=1e-12)
+        acceleration = np.linalg.solve(to_twist, twist_dot - robot.twist_dot(pose, rate, np.zeros(6)))
+        torque = robot.inverse_dynamics(pose, twist, twist_dot, frictionless)
+        np.testing.assert_allclose(mass @ acceleration + bias, jacobian.T @ torque, atol=1e-10)
+        np.testing.assert_allclose(jacobian, robot.pose_jacobian(pose), atol=1e-12)
+        np.testing.assert_allclose(angle, robot.inverse_kinematics(pose), atol=1e-14)
+        expected = derivative(lambda d, p=pose, r=rate: robot.pose_jacobian(p + d * r) @ r)
+        np.testing.assert_allclose(drift, expected, atol=1e-10)

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dynamics import closed_loop, simulate_batch
+from dynamics import closed_loop
 from dynamics.closed_loop import FrictionLaw
-from dynamics.errors import SimulationError, UnreachablePoseError
 from tests.dynamics.conftest import RECORDS, assert_same
 
 STRIBECK = FrictionLaw("stribeck", static_ratio=1.3, stribeck_velocity=0.1)
@@ -106,6 +105,7 @@ def test_a_run_from_the_state_of_another_repeats_its_rest(loop, timing):
     """Bit by bit: the state is complete. Joints stick at some of these frames, and commands are on their way."""
     reference, settings = loop.reference(45), loop.settings(**TIMINGS[timing])
     run = loop.run(reference, settings)
+    assert run.state_at(0) is run.start
     for frame in (0, 3, FRAME, 33):
         rest = loop.run(_from(reference, frame), settings, start=run.state_at(frame))
         for name in RECORDS:
@@ -198,36 +198,3 @@ def test_both_paths_give_the_same_from_a_start(loop, half_way, timing):
     ours, plain = loop.both(reference, settings, start=start, start_sensitivities=True)
     assert_same(ours, plain)
     assert ours.events > 3
-
-
-def test_a_batch_carries_starts_and_their_sensitivities(robot, loop, half_way):
-    """Three starts for one parameter vector, as multiple shooting wants them: what three single runs give."""
-    reference, settings, start = half_way(30)
-    starts = [_moved(start, scale * np.ones(24)) for scale in (0, 1e-5, 2e-5)]
-    runs = simulate_batch(robot, loop.parameters, reference, settings, starts=starts, start_sensitivities=True)
-    for begin, run in zip(starts, runs, strict=True):
-        alone = loop.run(reference, settings, start=begin, start_sensitivities=True)
-        for name in ("pose", "pose_sensitivity", "start_sensitivity"):
-            np.testing.assert_array_equal(getattr(run, name), getattr(alone, name))
-    assert not np.array_equal(runs[0].pose, runs[1].pose)
-    with pytest.raises(SimulationError, match="2 parameter vectors and 1 references and 3 start states"):
-        simulate_batch(robot, np.tile(loop.parameters, (2, 1)), reference, settings, starts=starts)
-
-
-def test_bad_starts_and_states_that_a_run_does_not_know_are_refused(loop, half_way):
-    reference, settings, start = half_way(30)
-    for change, words in (
-        ({"pose_rate": np.zeros(5)}, r"start pose_rate must have shape \(6,\), got \(5,\)"),
-        ({"servo_integral": np.full(6, np.nan)}, r"start servo_integral\[0\] is nan, must be finite"),
-        ({"commands": np.zeros((0, 6))}, "start commands must have at least 1 row, got 0"),
-    ):
-        with pytest.raises(SimulationError, match=words):
-            replace(start, **change)
-    with pytest.raises(UnreachablePoseError, match="leg"):
-        loop.run(reference, settings, start=replace(start, pose=start.pose + 0.5 * np.eye(6)[2]))
-    run = loop.run(10, lost=np.arange(10) == 4)
-    with pytest.raises(SimulationError, match="frame is 10, must be a whole number >= 0 and <= 9"):
-        run.state_at(10)
-    with pytest.raises(SimulationError, match="frame 5 follows a lost measurement"):
-        run.state_at(5)
-    assert run.state_at(0) is run.start

@@ -6,19 +6,28 @@ import pytest
 import dynamics
 from dynamics import workspace
 from dynamics.errors import SingularPoseError, TravelError, UnreachablePoseError
+from tests.dynamics.conftest import place_legs
 
 
 def test_leverage_is_the_sine_between_crank_plane_and_link(robot, states, legs_at):
-    """|(w x l) . s| / (|w| |l|) from the joints' places; its zero is the reach margin's zero."""
+    """|(w x l) . s| / (|w| |l|) from the joints' places."""
     measures = workspace.measure(robot, states.pose)
-    for pose, leverage, margin in zip(states.pose[:20], measures.leverage, measures.reach_margin, strict=False):
+    for pose, leverage in zip(states.pose[:20], measures.leverage, strict=False):
         legs = legs_at(pose)
-        link = legs.joint - legs.tip
-        sine = np.abs(np.cross(legs.crank, link)[:, 2]) / (0.06 * robot.geometry.link_length)
+        sine = np.abs(np.cross(legs.crank, legs.joint - legs.tip)[:, 2]) / (0.06 * robot.geometry.link_length)
         np.testing.assert_allclose(leverage, sine, atol=1e-12)
-        reach = (legs.joint - legs.tip + legs.crank)[:, :2]
-        across = np.cross(np.pad(legs.crank[:, :2], ((0, 0), (0, 1))), np.pad(reach, ((0, 0), (0, 1))))[:, 2]
-        np.testing.assert_allclose(margin, (across / (0.06 * np.linalg.norm(reach, axis=1))) ** 2, atol=1e-12)
+
+
+def test_reach_margin_is_that_of_the_law_of_cosines(robot, states):
+    """1 - cos^2 of the angle between crank and reach in each crank's plane, in reach and out of it."""
+    g, poses = robot.geometry, np.vstack([states.pose[:20], robot.home_pose + 0.2 * np.eye(6)[0], robot.home_pose + 1])
+    np.testing.assert_array_equal(workspace.measure(robot, poses).reach_margin, robot.reach_margin(poses))
+    for pose, margin in zip(poses, robot.reach_margin(poses), strict=True):
+        reach = place_legs(g, pose, np.zeros(6)).joint - g.base_joints
+        square = np.sum(reach**2, axis=1)
+        in_plane = square - np.sum(reach * g.crank_axes, axis=1) ** 2
+        cosine = (square + g.crank_length**2 - g.link_length**2) / (2 * g.crank_length) / np.sqrt(in_plane)
+        np.testing.assert_allclose(margin, 1 - cosine**2, rtol=1e-12, atol=1e-12)
 
 
 def test_condition_of_the_platform_side_from_forces(robot, states, legs_at):
