@@ -31,7 +31,8 @@ from dynamics.inertia import MOMENTS, SMALLEST, physical_inertias
 from dynamics.parameters import BODY_NAMES
 from identify.arrays import Array
 from identify.estimation.bounded_least_squares import Problem
-from identify.loop_parameters import NAMES, StartingGuess, index_of
+from identify.estimation.prior import StartingGuess
+from identify.loop_parameters import NAMES, index_of
 
 
 def combined_std(rows: Array, covariance: Array) -> Array:

@@ -48,8 +48,9 @@ from identify.estimation.bounds import bounded_estimate, combined_std
 from identify.estimation.covariance import Uncertainty
 from identify.estimation.explanation import Explanation
 from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.prior import StartingGuess, holding_torque
 from identify.estimation.scale_anchor import ScaleAnchor
-from identify.loop_parameters import NAMES, StartingGuess, holding_torque
+from identify.loop_parameters import NAMES
 from identify.scenario import Scenario
 
 IDENTIFIABLE_SHARE = 0.5

@@ -17,10 +17,11 @@ from identify.estimation.explanation import explanation
 from identify.estimation.identifiability import judge
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
+from identify.estimation.prior import StartingGuess, starting_guess
 from identify.estimation.result import IdentificationResult
 from identify.estimation.scale_anchor import read_anchor
 from identify.estimation.warm_start import linear_warm_start
-from identify.loop_parameters import NAMES, StartingGuess, starting_guess
+from identify.loop_parameters import NAMES
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
 from identify.record.provenance import recorded_seed

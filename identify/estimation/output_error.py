@@ -5,7 +5,7 @@ with an ideal sensor of the same sampling, delay and hold, which loses the frame
 driven: the joints get the logged commands, so the model feels what the sensor's noise did to the plant.
 
 The residuals are the pose differences of all records, whitened by the sensor's covariance, and one row for each thing
-known beside the poses: the starting guess, with its standard deviations, and the scale anchor.
+known beside the poses (`prior`).
 """
 
 from dataclasses import dataclass, replace
@@ -15,8 +15,8 @@ import numpy as np
 from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.estimation.bounds import ParameterBounds, parameter_bounds
+from identify.estimation.prior import StartingGuess, prior_residuals
 from identify.estimation.scale_anchor import ScaleAnchor
-from identify.loop_parameters import StartingGuess
 from identify.record.recorded_run import RecordedRun
 
 
@@ -68,8 +68,5 @@ class OutputErrorProblem:
         return np.asarray(rows.T @ rows, dtype=float)
 
     def known(self, parameters: Array) -> tuple[Array, Array]:
-        """Residuals (k,) of what is known beside the poses, starting guess and scale anchor, and their rows (k, 67)."""
-        place, measured = self.anchor.row()
-        rows = np.vstack([np.diag(1 / self.guess.std), place])
-        values = np.concatenate([self.guess.values / self.guess.std, measured])
-        return rows @ parameters - values, rows
+        """Residuals (k,) of what is known beside the poses, and their rows (k, 67)."""
+        return prior_residuals(parameters, self.guess, self.anchor)

@@ -19,9 +19,10 @@ from scipy.optimize import lsq_linear
 from dynamics import Robot
 from identify.arrays import Array
 from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.prior import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.filtering import filtered_derivatives, zero_phase_filter
-from identify.loop_parameters import NAMES, StartingGuess
+from identify.loop_parameters import NAMES
 from identify.record.recorded_run import RecordedRun
 from identify.scenario import Scenario
 

@@ -23,6 +23,7 @@ import numpy as np
 from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.errors import EstimationError
+from identify.estimation.prior import StartingGuess
 from identify.estimation.warm_start import REWEIGHTINGS
 from identify.estimators.estimator import Estimate, Evidence, estimator
 from identify.estimators.least_squares import (
@@ -38,7 +39,7 @@ from identify.estimators.least_squares import (
     standard_deviations,
     torque_equations,
 )
-from identify.loop_parameters import NAMES, StartingGuess
+from identify.loop_parameters import NAMES
 from identify.random_streams import DISTURBED_COPIES, mixed_generator
 
 MAX_ITERATIONS = 10

@@ -23,11 +23,12 @@ from scipy.optimize import lsq_linear
 from dynamics import DynamicsError
 from identify.arrays import Array
 from identify.errors import EstimationError
+from identify.estimation.prior import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.estimation.warm_start import REWEIGHTINGS, bounded_fit, joint_balance
 from identify.estimators.estimator import Estimate, Evidence, estimator
 from identify.filtering import zero_phase_filter
-from identify.loop_parameters import NAMES, StartingGuess
+from identify.loop_parameters import NAMES
 from identify.record.recorded_run import RecordedRun
 from identify.scenario import Scenario
 

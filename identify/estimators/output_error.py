@@ -9,9 +9,9 @@ from identify.errors import EstimationError
 from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
+from identify.estimation.prior import StartingGuess
 from identify.estimation.warm_start import REWEIGHTINGS, linear_warm_start
 from identify.estimators.estimator import Estimate, Evidence, estimator
-from identify.loop_parameters import StartingGuess
 from identify.progress import SilentProgress
 from identify.random_streams import ROUTES_UNCERTAINTY, mixed_generator
 

@@ -37,10 +37,11 @@ from dynamics.closed_loop import LoopFailure, simulate
 from dynamics.parameters import VISCOUS
 from identify.arrays import Array
 from identify.errors import TrajectoryError
+from identify.estimation.prior import StartingGuess, starting_guess
 from identify.estimation.scale_anchor import DEFAULT_STD, MEASURED_PARAMETER
 from identify.excitation.criteria import SMOOTHING_RAD_S, Criterion
 from identify.excitation.motion import Unknowns, log_determinant, regressor, sample_times, tracked_motion
-from identify.loop_parameters import NAMES, StartingGuess, index_of, model_settings, starting_guess
+from identify.loop_parameters import NAMES, index_of, model_settings
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 

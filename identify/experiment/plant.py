@@ -18,8 +18,9 @@ from dynamics.closed_loop import (
 )
 from dynamics.robot import with_geometry_error
 from identify.arrays import Array
+from identify.estimation.prior import starting_guess
 from identify.experiment.truth import build_truth
-from identify.loop_parameters import NAMES, loop_settings, starting_guess
+from identify.loop_parameters import NAMES, loop_settings
 from identify.record.payload import payload_vector
 from identify.scenario import Scenario
 

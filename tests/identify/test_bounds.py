@@ -17,7 +17,8 @@ from identify.estimation.bounds import (
     parameter_bounds,
 )
 from identify.estimation.identification import identify
-from identify.loop_parameters import NAMES, StartingGuess, index_of
+from identify.estimation.prior import StartingGuess
+from identify.loop_parameters import NAMES, index_of
 from identify.scenario import load_scenario
 from tests.identify.synthetic import quick, rss6, run_plant, truth
 

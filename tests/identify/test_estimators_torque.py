@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from identify.errors import EstimationError, RecordError, ScenarioError
+from identify.estimation.prior import StartingGuess
 from identify.estimators.errors_in_variables import instrumental_variables, iv_fit, total_least_squares, truncated_tls
 from identify.estimators.estimator import joint_channels
 from identify.estimators.least_squares import (
@@ -26,7 +27,7 @@ from identify.experiment.joint_instruments import (
     write_channels,
 )
 from identify.files.dataset import write_groups
-from identify.loop_parameters import NAMES, StartingGuess
+from identify.loop_parameters import NAMES
 from identify.record.recorded_run import recorded_run
 from tests.identify.synthetic import PERFECT, evidence, quick, rss6, run_plant, truth, truth_of
 

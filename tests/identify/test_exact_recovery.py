@@ -12,8 +12,9 @@ import pytest
 from identify.estimation.base_parameters import base_parameters, structural_regressor
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import search
+from identify.estimation.prior import StartingGuess, starting_guess
 from identify.estimation.scale_anchor import ScaleAnchor
-from identify.loop_parameters import NAMES, StartingGuess, starting_guess
+from identify.loop_parameters import NAMES
 from identify.record.recorded_run import recorded_run
 from tests.identify.synthetic import quick, rss6, run_plant, truth
 

@@ -16,8 +16,9 @@ from identify.estimation.identifiability import (
     rests_on_prior,
 )
 from identify.estimation.identification import identify
+from identify.estimation.prior import StartingGuess, holding_torque, starting_guess
 from identify.estimation.scale_anchor import ScaleAnchor
-from identify.loop_parameters import NAMES, StartingGuess, holding_torque, index_of, starting_guess
+from identify.loop_parameters import NAMES, index_of
 from identify.record.recorded_run import recorded_run
 from identify.reporting.tables import ON_GUESS, parameter_table
 from tests.identify.synthetic import quick, rss6, run_plant, truth

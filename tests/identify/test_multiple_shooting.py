@@ -11,7 +11,7 @@ from identify.errors import EstimationError
 from identify.estimation.identification import output_error_problem
 from identify.estimation.multiple_shooting import STATES, MultipleShooting, end_state, measured_states, segments
 from identify.estimation.output_error_search import output_error_searches, runnable_start, search, shoot
-from identify.loop_parameters import StartingGuess
+from identify.estimation.prior import StartingGuess
 from identify.progress import SilentProgress
 from tests.identify.synthetic import SIGMA, Stages, quick, rss6, run_plant, truth
 

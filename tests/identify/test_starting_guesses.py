@@ -17,8 +17,8 @@ import pytest
 from identify.estimation.identifiability import identifiability
 from identify.estimation.identification import output_error_problem
 from identify.estimation.output_error_search import output_error_searches, search
+from identify.estimation.prior import StartingGuess, holding_torque, typical_sizes
 from identify.estimation.warm_start import linear_warm_start
-from identify.loop_parameters import StartingGuess, holding_torque, typical_sizes
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
 from tests.identify.synthetic import rss6, run_plant, truth
