@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from scipy.spatial.transform import Rotation
+
+from tests.dynamics.conftest import base_from_platform, link_axes, place_legs
 
 SETTINGS = pin.ProximalSettings(1e-14, 0.0, 20)
 
@@ -60,19 +61,18 @@ class ClosedChain:
     def state(self, pose, twist, torque):
         """The chain at a pose (6,), with a twist (6,) and net joint torques (6,); links do not spin (eq. 12)."""
         g = self.robot.geometry
-        turn = Rotation.from_euler("XYZ", pose[3:6]).as_matrix()
+        turn = base_from_platform(pose)
         theta, rates = self.robot.inverse_kinematics(pose), self.robot.joint_jacobian(pose) @ twist
         q, v, force = pin.neutral(self.model), np.zeros(self.model.nv), np.zeros(self.model.nv)
         q[:3], q[3:7] = pose[:3], pin.Quaternion(turn).coeffs()
         v[:3], v[3:6] = turn.T @ twist[:3], turn.T @ twist[3:]
+        legs = place_legs(g, pose, theta)
+        arms, links, frames = legs.joint - pose[:3], legs.joint - legs.tip, link_axes(g, legs)
         for leg, (crank_joint, link_joint) in enumerate(self.joints):
-            axis, zero = g.crank_axes[leg], g.crank_zero_directions[leg]
-            x = np.cos(theta[leg]) * zero + np.sin(theta[leg]) * np.cross(axis, zero)
+            axis, l, link = g.crank_axes[leg], links[leg], frames[leg]
+            x = legs.crank[leg] / g.crank_length
             crank = np.column_stack([x, np.cross(axis, x), axis])
-            arm = turn @ g.platform_joints[leg]
-            l = pose[:3] + arm - g.base_joints[leg] - g.crank_length * x
-            link = _link_frame(axis, l)
-            l_dot = twist[:3] + np.cross(twist[3:], arm) - rates[leg] * g.crank_length * np.cross(axis, x)
+            l_dot = twist[:3] + np.cross(twist[3:], arms[leg]) - rates[leg] * np.cross(axis, legs.crank[leg])
             omega = np.cross(l, l_dot) / (l @ l)
             q[crank_joint.idx_q], v[crank_joint.idx_v], force[crank_joint.idx_v] = theta[leg], rates[leg], torque[leg]
             q[link_joint.idx_q : link_joint.idx_q + 4] = pin.Quaternion(crank.T @ link).coeffs()
@@ -103,11 +103,3 @@ class ClosedChain:
             gap = max(gap, np.abs(ends[0][0] - ends[1][0]).max())
             speed = max(speed, np.abs(ends[0][1] - ends[1][1]).max())
         return gap, speed
-
-
-def _link_frame(axis, link):
-    """z along the link, x = crank axis x z, y = z x x."""
-    z = link / np.linalg.norm(link)
-    x = np.cross(axis, z)
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(z, x), z])

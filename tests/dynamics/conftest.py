@@ -93,6 +93,15 @@ def place_legs(geometry: Rss6Geometry, pose: np.ndarray, theta: np.ndarray) -> L
     return Legs(geometry.base_joints + crank, joint, crank)
 
 
+def link_axes(geometry: Rss6Geometry, legs: Legs) -> np.ndarray:
+    """Axes (6, 3, 3) of the links as columns: z along the link, x = crank axis x z, y = z x x."""
+    z = legs.joint - legs.tip
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    x = np.cross(geometry.crank_axes, z)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
 @pytest.fixture(scope="session")
 def legs_at(robot: dynamics.Robot) -> Callable[[np.ndarray], Legs]:
     """Where the legs are at a pose, for the crank angles the robot gives."""

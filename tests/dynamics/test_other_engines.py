@@ -16,6 +16,7 @@ from dynamics.inertia import physical_inertias
 from dynamics.parameters import BODY_NAMES, COULOMB, PARAMETER_NAMES, RIGID_BODY, VISCOUS
 from dynamics.robot import Robot
 from dynamics.robot_file import RobotDescription
+from tests.dynamics.conftest import link_axes
 
 
 @pytest.fixture
@@ -71,15 +72,12 @@ def test_frames_of_cranks_and_links_are_those_of_the_conventions(mujoco, robot, 
     for pose in states.pose[:10]:
         engine.put(pose, np.zeros(6))
         legs = legs_at(pose)
+        links = link_axes(robot.geometry, legs)
         for leg in range(6):
-            axis, link = robot.geometry.crank_axes[leg], legs.joint[leg] - legs.tip[leg]
-            crank_frame = engine.data.body(f"crank{leg + 1}").xmat.reshape(3, 3)
-            link_frame = engine.data.body(f"link{leg + 1}").xmat.reshape(3, 3)
-            np.testing.assert_allclose(crank_frame[:, 2], axis, atol=1e-12)
-            np.testing.assert_allclose(crank_frame[:, 0], legs.crank[leg] / robot.geometry.crank_length, atol=1e-12)
-            np.testing.assert_allclose(link_frame[:, 2], link / robot.geometry.link_length, atol=1e-12)
-            across = np.cross(axis, link)
-            np.testing.assert_allclose(link_frame[:, 0], across / np.linalg.norm(across), atol=1e-12)
+            crank, link = (engine.data.body(f"{name}{leg + 1}").xmat.reshape(3, 3) for name in ("crank", "link"))
+            np.testing.assert_allclose(crank[:, 2], robot.geometry.crank_axes[leg], atol=1e-12)
+            np.testing.assert_allclose(crank[:, 0], legs.crank[leg] / robot.geometry.crank_length, atol=1e-12)
+            np.testing.assert_allclose(link, links[leg], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["initial", "identified"])

@@ -7,7 +7,7 @@ import pytest
 
 from dynamics import fast_forward_dynamics
 from dynamics.rigid_body.equation_of_motion import motion_functions
-from tests.dynamics.conftest import METHODS, base_from_platform, derivative
+from tests.dynamics.conftest import METHODS, base_from_platform, derivative, link_axes
 
 
 @pytest.fixture(params=["initial", "identified"])
@@ -80,14 +80,6 @@ def _centres(legs, pose):
     return np.vstack([pose[:3], legs.tip - legs.crank / 2, (legs.tip + legs.joint) / 2])
 
 
-def _link_axes(robot, legs):
-    """Axes (6, 3, 3) of the links as columns: z along the link, x normal to the crank axis."""
-    z = (legs.joint - legs.tip) / robot.geometry.link_length
-    x = np.cross(robot.geometry.crank_axes, z)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return np.stack([x, np.cross(z, x), z], axis=-1)
-
-
 def _angular_velocity(axes_at):
     """Of moving axes (..., 3, 3), columns in base axes, at time 0: (..., 3) in those axes."""
     turn = axes_at(0.0).swapaxes(-1, -2) @ derivative(axes_at)
@@ -108,7 +100,7 @@ def test_mass_matrix_gives_the_kinetic_energy_and_gravity_the_power_of_the_13_bo
         speeds = derivative(lambda d, at=pose_at: _centres(legs_at(at(d)), at(d)))
         platform = _angular_velocity(lambda d, at=pose_at: base_from_platform(at(d)))
         cranks = derivative(lambda d, at=pose_at: robot.inverse_kinematics(at(d)))
-        links = _angular_velocity(lambda d, at=pose_at: _link_axes(robot, legs_at(at(d))))
+        links = _angular_velocity(lambda d, at=pose_at: link_axes(robot.geometry, legs_at(at(d))))
         kinetic = masses @ np.sum(speeds**2, axis=1) + parameters[1:4] @ platform**2 + parameters[7:28:4] @ cranks**2
         kinetic += parameters[29:52:4] @ links[:, 0] ** 2 + parameters[30:52:4] @ links[:, 1] ** 2
         twist = robot.twist(motion.pose(t), motion.rate(t))
@@ -137,7 +129,7 @@ def test_links_without_spin_break_the_energy_balance_by_a_known_amount(robot, le
     for t in (0.2, 0.9):
         pose, twist = motion.pose(t), robot.twist(motion.pose(t), motion.rate(t))
         skew = _mass_rate(robot, motion, t, parameters) - 2 * robot.coriolis_matrix(pose, twist, parameters)
-        omega = _angular_velocity(lambda d, t=t: _link_axes(robot, legs_at(motion.pose(t + d))))
+        omega = _angular_velocity(lambda d, t=t: link_axes(robot.geometry, legs_at(motion.pose(t + d))))
         expected = 2 * np.sum((parameters[29:52:4] - parameters[30:52:4]) * omega.prod(axis=1))
         np.testing.assert_allclose(twist @ skew @ twist, expected, atol=2e-11)
 
