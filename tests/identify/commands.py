@@ -2,6 +2,8 @@
 
 import sys
 
+import pytest
+
 from identify.__main__ import main
 
 
@@ -22,3 +24,11 @@ def one_line(text):
     assert text.startswith("error: ")
     assert text.count("\n") == 1, text
     return text
+
+
+def refusal(error, action, *arguments):
+    """The one line with which such an error refuses an action."""
+    with pytest.raises(error) as caught:
+        action(*arguments)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)

@@ -150,16 +150,6 @@ def recorded_folder(tmp_path):
     return recorded_run_folder(tmp_path)
 
 
-@pytest.fixture(name="make_record")
-def _make_record():
-    return make_record
-
-
-@pytest.fixture(name="make_truth")
-def _make_truth():
-    return make_truth
-
-
 @pytest.fixture(name="result")
 def _result():
     return make_result()

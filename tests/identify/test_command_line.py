@@ -9,7 +9,7 @@ import pytest
 from cmmsim.errors import OpenGLMissingError
 from dynamics.errors import RobotFileError
 from identify.commands import app as command_line
-from identify.errors import OutputFolderError, RecordError, ScenarioError
+from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import RunFolder, load_result, new_run_folder, save_result
 from tests.identify.commands import command, one_line
 from tests.identify.conftest import make_result
@@ -51,26 +51,23 @@ def warned(result):
     return result
 
 
-@pytest.mark.parametrize("quiet", [True, False])
-def test_identify_warns_on_standard_error_even_where_it_is_quiet(calls, run_folder, capfd, quiet):
-    save_result(run_folder.result, warned(load_result(run_folder.result)))
-    assert command("identify", "--out", run_folder.path, *["--quiet"] * quiet) == 0
+def test_identify_says_whether_the_model_explains_the_record_and_warns_even_where_it_is_quiet(calls, run_folder, capfd):
+    assert command("identify", "--out", run_folder.path) == 0
     out, err = capfd.readouterr()
-    assert err == "warning: not white\nwarning: a b\n"
+    assert err == ""
+    assert "the model explains the record" in out
+    save_result(run_folder.result, warned(load_result(run_folder.result)))
     said = (
         "identified: 4 of 5 parameters and 1 of 1 groups",
         "1.356 times the noise variance, noise alone gives 1.100 ± 0.040",
         "the model does NOT explain the record",
         str(run_folder.result),
     )
-    assert [text in out for text in said] == 4 * [not quiet]
-
-
-def test_identify_says_that_the_model_explains_the_record(calls, run_folder, capfd):
-    assert command("identify", "--out", run_folder.path) == 0
-    out, err = capfd.readouterr()
-    assert err == ""
-    assert "the model explains the record" in out
+    for quiet in (True, False):
+        assert command("identify", "--out", run_folder.path, *["--quiet"] * quiet) == 0
+        out, err = capfd.readouterr()
+        assert err == "warning: not white\nwarning: a b\n"
+        assert [text in out for text in said] == 4 * [not quiet]
 
 
 def test_a_run_of_a_wrong_plant_warns_and_names_the_goals_it_misses(calls, tmp_path, capfd):
@@ -95,20 +92,20 @@ def test_run_passes_scenario_seed_folder_and_workers(calls, tmp_path, monkeypatc
     assert default[3].as_posix() == "runs/paper-3"
 
 
-def test_stages_read_the_folder(calls, run_folder):
+def test_stages_read_the_folder_that_the_one_before_wrote_and_identify_takes_settings(calls, run_folder, capfd):
     for stage in STAGES:
         assert command(stage, "--out", run_folder.path, "--quiet") == 0
     assert [call[:2] for call in calls] == [(stage, run_folder.path) for stage in STAGES]
-
-
-def test_identify_passes_settings_of_the_estimator(calls, run_folder):
     settings = ("identification.method=command_driven", 'identification.prior={"link1.mass"={value=1, std=0.1}}')
     words = [word for setting in settings for word in ("--set", setting)]
     assert command("identify", "--out", run_folder.path, "--quiet", *words) == 0
-    assert calls[0][3] == {
+    assert calls[-1][3] == {
         "identification.method": "command_driven",
         "identification.prior": {"link1.mass": {"value": 1, "std": 0.1}},
     }
+    run_folder.experiment.unlink()
+    assert command("identify", "--out", run_folder.path) == 1
+    assert "cmmsim record --out" in one_line(capfd.readouterr().err)
 
 
 def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_report_is(calls, run_folder, capsys):
@@ -129,43 +126,24 @@ def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_
         (("run", "quick", "--set", "filter.cutof_hz=60"), "valid names in [filter]: order, cutoff_hz"),
         (("run", "quick", "--set", "filter"), "KEY=VALUE"),
         (("record", "--out", "nowhere"), "no run folder nowhere"),
+        (("run", "quick", "--out", "mine"), "mine is not empty"),
+        (("run", "quick", "--out", "mine/text"), "mine/text is a file"),
+        (("run", "quick", "--out", "/proc/none/here"), "/proc/none/here cannot be made: /proc is not a folder"),
     ],
 )
 def test_bad_input_is_one_line_and_status_one(calls, capfd, tmp_path, monkeypatch, arguments, evidence):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "text").touch()
     assert command(*arguments) == 1
     assert evidence in one_line(capfd.readouterr().err)
     assert calls == []
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.rglob("*")] == ["mine", "text"]
 
 
-def test_existing_output_folder_is_refused_and_left_alone(calls, capfd, tmp_path):
-    (tmp_path / "something").write_text("mine")
-    assert command("run", "quick", "--out", tmp_path) == 1
-    assert "is not empty" in one_line(capfd.readouterr().err)
-    assert calls == []
-    assert [p.name for p in tmp_path.iterdir()] == ["something"]
-
-
-def test_new_folder_may_be_absent_or_empty_but_no_file(tmp_path):
+def test_new_folder_may_be_absent_or_empty(tmp_path):
     assert not new_run_folder(tmp_path / "absent").path.exists()
     assert new_run_folder(tmp_path) == RunFolder(tmp_path)
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputFolderError, match="is a file"):
-        new_run_folder(tmp_path / "file")
-
-
-def test_stage_without_the_one_before_names_it(calls, capfd, run_folder):
-    run_folder.experiment.unlink()
-    assert command("identify", "--out", run_folder.path) == 1
-    assert "cmmsim record --out" in one_line(capfd.readouterr().err)
-
-
-def fail(error):
-    def stage(*_):
-        raise error
-
-    return lambda: SimpleNamespace(run=stage)
 
 
 @pytest.mark.parametrize(
@@ -174,43 +152,36 @@ def fail(error):
 def test_known_errors_of_every_package_are_one_line_and_others_keep_their_traceback(
     capfd, monkeypatch, tmp_path, error
 ):
-    monkeypatch.setattr(command_line, "_pipeline", fail(error))
+    def fail(*_):
+        raise errors.pop(0)
+
+    errors = [error, ZeroDivisionError("a defect")]
+    monkeypatch.setattr(command_line, "_pipeline", lambda: SimpleNamespace(run=fail))
     assert command("run", "quick", "--out", tmp_path / "new", "--quiet") == 1
     assert "a b" in one_line(capfd.readouterr().err)
-    monkeypatch.setattr(command_line, "_pipeline", fail(ZeroDivisionError("a defect")))
     with pytest.raises(ZeroDivisionError, match="a defect"):
         command("run", "quick", "--out", tmp_path / "new", "--quiet")
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [("30", 30), ("0.5", 0.5), ("true", True), ("planes", "planes"), ('"30"', "30"), ("a=b", "a=b"), ("", "")],
-)
-def test_settings_are_toml_or_text_behind_a_key(text, value):
-    assert command_line.parse_settings([f"timing.x={text}"]) == {"timing.x": value}
+def test_settings_are_toml_or_text_behind_a_key():
+    texts = ["30", "0.5", "true", "planes", '"30"', "a=b", ""]
+    parsed = command_line.parse_settings([f"x{number}={text}" for number, text in enumerate(texts)])
+    assert [*parsed.values()] == [30, 0.5, True, "planes", "30", "a=b", ""]
+    assert [*parsed] == [f"x{number}" for number in range(len(texts))]
     with pytest.raises(ScenarioError, match="KEY=VALUE"):
-        command_line.parse_settings([f"={text}"])
+        command_line.parse_settings(["=30"])
 
 
-def test_command_starts_in_a_process_of_its_own():
-    made = subprocess.run([sys.executable, "-m", "identify", "--version"], capture_output=True, text=True, check=True)
-    assert made.stdout.startswith("cmmsim 0.")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "shown"),
-    [
+def test_help_teaches_and_the_command_starts_in_a_process_of_its_own_and_waits_for_nothing_heavy(capsys):
+    heavy = "casadi", "cv2", "matplotlib", "numba", "pandas", "scipy.optimize"
+    loaded = f"import identify.commands.app, sys; print(sorted(set({heavy}) & sys.modules.keys()))"
+    for words, shown in ((["-m", "identify", "--version"], "cmmsim 0."), (["-c", loaded], "[]\n")):
+        made = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True)
+        assert made.stdout.startswith(shown)
+    for words, shown in (
         (["--help"], "identify --out mine --set identification.method=command_driven"),
         (["run", "--help"], "paper, quick"),
         (["identify", "--help"], "stays in scenario.toml"),
-    ],
-)
-def test_help_teaches(capsys, arguments, shown):
-    assert command(*arguments) == 0
-    assert shown in capsys.readouterr().out
-
-
-def test_help_waits_for_nothing_heavy():
-    heavy = "casadi", "cv2", "matplotlib", "numba", "pandas", "scipy.optimize"
-    code = f"import identify.commands.app, sys; print(sorted(set({heavy}) & sys.modules.keys()))"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+    ):
+        assert command(*words) == 0
+        assert shown in capsys.readouterr().out

@@ -4,6 +4,7 @@ That images decide the pose (one camera shifted by 0.1 px) is proved in tests/cm
 """
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,17 +12,25 @@ import xarray as xr
 
 import cmmsim
 from cmmsim.pose_estimation.estimator import lost_measurement
-from identify.errors import TrajectoryError
+from dynamics.closed_loop import simulate
+from dynamics.errors import SimulationError
+from identify.errors import RecordError, TrajectoryError
+from identify.estimation.explanation import SUSPICIOUS
+from identify.estimation.identification import identify
+from identify.experiment.joint_instruments import JointInstruments, measure_joints
 from identify.experiment.plant import build_plant
 from identify.experiment.run import run_experiment, run_plant, taught_sensor
-from identify.experiment.sensor_in_loop import SensorInLoop, make_sensor, robot_transforms
-from identify.experiment.truth import read_truth, true_poses
+from identify.experiment.sensor_in_loop import make_sensor, robot_transforms
+from identify.experiment.truth import check_truth, read_truth, true_poses
 from identify.loop_parameters import model_settings
 from identify.progress import SilentProgress
 from identify.record.recording import poses
+from identify.scenario import scenario_from_toml
 from identify.studies.rows.sensor import DrawnSensor
 from identify.trajectory import random_trajectory
-from tests.identify.synthetic import SIGMA, quick, rss6, trajectory
+from identify.validation.unseen import unseen_errors
+from tests.identify import synthetic
+from tests.identify.synthetic import SIGMA, quick, rss6, trajectory, truth
 
 SHORT = {"excitation.duration_s": 1.0, "excitation.candidates": 2}
 
@@ -78,31 +87,29 @@ def test_rods_join_the_robots_joints():
 
 @pytest.mark.slow
 @pytest.mark.rendering
-def test_the_measured_pose_is_the_true_one_to_the_sensors_accuracy(sensor):
-    experiment = run_plant(build_plant(quick(**SHORT), rss6()), sensor, trajectory(3), 1.0, 0, 0)
+def test_the_measured_pose_is_the_true_one_to_the_sensors_accuracy_with_the_noise_of_its_seed(sensor):
+    plant = build_plant(quick(**SHORT), rss6())
+    experiment = run_plant(plant, sensor, trajectory(3), 1.0, 0, 0)
     errors = poses(experiment.record, "measured") - true_poses(experiment.truth)
     rms = np.sqrt(np.mean(errors**2, axis=0))
     assert experiment.record["measured_ok"].values.all()
     assert np.all(rms[:3] < 20e-6), rms
     assert np.all(rms[3:] < 100e-6), rms
     assert np.all(rms > 1e-7), "a measurement without any error would be the truth itself"
-
-
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_record_and_another_does_not(sensor):
-    plant = build_plant(quick(**SHORT), rss6())
-    records = [run_plant(plant, sensor, trajectory(3), 0.1, seed, 0).record for seed in (4, 4, 5)]
-    one, two, other = (poses(record, "measured") for record in records)
-    assert np.array_equal(one, two)
-    assert not np.array_equal(one, other)
+    again, other = (run_plant(plant, sensor, trajectory(3), 0.1, seed, 0).record for seed in (0, 5))
+    assert np.array_equal(poses(again, "measured"), poses(experiment.record, "measured")[:6])
+    assert not np.array_equal(poses(again, "measured"), poses(other, "measured"))
 
 
 def test_a_lost_frame_is_counted_holds_the_command_and_does_not_end_the_run(sensor):
     """Nothing is seen for five frames, then the platform is found again; the sensor is told how fast it moves."""
     told = Told(sensor, closed=range(10, 15))
-    experiment = run_plant(build_plant(quick(**SHORT), rss6()), told, trajectory(3), 0.5, 0, 0)
+    experiment = run_plant(build_plant(quick(**SHORT), rss6()), told, trajectory(3), 0.5, 7, 0)
     record = experiment.record
-    assert list(np.flatnonzero(record["measured_ok"].values == 0)) == [10, 11, 12, 13, 14]
+    assert len(told.seeds) == 1
+    measured = record["measured_ok"].values == 1
+    assert list(np.flatnonzero(~measured)) == [10, 11, 12, 13, 14]
+    assert np.all(np.linalg.eigvalsh(record["measured_covariance"].values[measured]) > 0)
     assert np.isnan(poses(record, "measured")[10:15]).all()
     commands = record["command"].values
     assert np.array_equal(commands[10:15], np.tile(commands[9], (5, 1)))
@@ -110,6 +117,10 @@ def test_a_lost_frame_is_counted_holds_the_command_and_does_not_end_the_run(sens
     steps = np.diff(true_poses(experiment.truth), axis=0) * 60.0
     middle = (np.array(told.rates)[1:] + np.array(told.rates)[:-1]) / 2
     assert np.abs(middle - steps).max() < 0.05 * np.abs(steps).max()
+    wild = random_trajectory(np.random.default_rng(0), rss6().home_pose, 0.1, 5, 0.02, 0.08)
+    with pytest.raises(TrajectoryError, match=r"crank \d|leg \d"):
+        run_plant(build_plant(quick(), rss6()), told, wild, 10.0, 0, 0)
+    assert len(told.seeds) == 1, "refused before the run"
 
 
 @pytest.mark.slow
@@ -127,41 +138,22 @@ def test_run_experiment_returns_what_it_writes(tmp_path):
     assert json.loads(record.attrs["robot_geometry"])["crank_length"] == 0.06
 
 
-def test_a_trajectory_beyond_the_travel_is_refused_before_the_run():
-    wild = random_trajectory(np.random.default_rng(0), rss6().home_pose, 0.1, 5, 0.02, 0.08)
-    with pytest.raises(TrajectoryError, match=r"crank \d|leg \d"):
-        run_plant(build_plant(quick(), rss6()), DrawnSensor(np.diag(SIGMA**2)), wild, 10.0, 0, 0)
+def test_the_sensor_gets_the_scenarios_timing_and_latencies_jitter_as_it_says(sensor):
+    """A jitter of none draws nothing; the model knows the mean."""
 
+    def late(jitter_s, **more):
+        return quick(**{"timing.latency_s": 0.01, "timing.latency_jitter_s": jitter_s} | more)
 
-def test_the_loop_keeps_covariances_and_starts_the_sensors_run(sensor):
-    told = Told(sensor)
-    eye = SensorInLoop(told, rss6(), seed=7)
-    assert eye.measure(0, 0.0, rss6().home_pose, np.arange(6.0) * 1e-3) is not None
-    assert np.all(np.linalg.eigvalsh(eye.covariances[0]) > 0)
-    assert told.seeds == [7]
-    assert np.array_equal(told.rates[0], np.arange(6.0) * 1e-3)
+    def true(seed, jitter_s):
+        eye = DrawnSensor(np.diag(SIGMA**2))
+        return true_poses(run_plant(build_plant(late(jitter_s), rss6()), eye, trajectory(3), 0.5, seed, 0).truth)
 
-
-def test_the_sensor_gets_the_scenarios_timing(sensor):
-    scenario = quick(**{"timing.exposure_s": 0.004, "timing.dropout": 0.25, "timing.latency_s": 0.01})
+    scenario = late(0.0, **{"timing.exposure_s": 0.004, "timing.dropout": 0.25})
     timing = make_sensor(scenario, rss6(), 0, sensor.taught).timing
     assert (timing.frame_rate, timing.exposure, timing.dropout, timing.latency) == (60.0, 0.004, 0.25, 0.01)
-
-
-def test_latencies_are_drawn_only_where_there_is_jitter_and_the_model_knows_the_mean():
-    scenario = quick(**{"timing.latency_s": 0.01, "timing.latency_jitter_s": 0.002})
-    drawn = scenario.timing.drawn_latencies(400, np.random.default_rng(0))
-    assert drawn.std() == pytest.approx(0.002, rel=0.15)
-    assert model_settings(scenario).timing.latency_s == 0.01
-    assert quick(**{"timing.latency_s": 0.01}).timing.drawn_latencies(400, np.random.default_rng(0)) is None
-
-
-def test_jitter_changes_the_run_and_follows_the_seed():
-    def true(seed, jitter_s):
-        scenario = quick(**{"timing.latency_s": 0.01, "timing.latency_jitter_s": jitter_s})
-        eye = DrawnSensor(np.diag(SIGMA**2))
-        return true_poses(run_plant(build_plant(scenario, rss6()), eye, trajectory(3), 0.5, seed, 0).truth)
-
+    assert scenario.timing.drawn_latencies(400, np.random.default_rng(0)) is None
+    assert late(0.002).timing.drawn_latencies(400, np.random.default_rng(0)).std() == pytest.approx(0.002, rel=0.15)
+    assert model_settings(late(0.002)).timing.latency_s == 0.01
     jittered = true(0, 0.005)
     assert np.array_equal(jittered, true(0, 0.005))
     assert 1e-7 < np.abs(jittered - true(0, 0.0)).max() < 1e-3
@@ -186,3 +178,137 @@ def test_an_exposure_is_blurred_by_the_true_rate_and_its_middle_is_measured(run_
     errors = [poses(run.record, "measured") - true_poses(run.truth) for run in (sharp, blurred)]
     assert not np.array_equal(*errors)
     assert np.sqrt(np.mean(errors[1][:, :3] ** 2, axis=0)).max() < 20e-6
+
+
+# Plants that no model of the estimator can be: what the switches do, and that the residuals tell. The dynamics of these
+# plants are proved in tests/dynamics/test_elastic_joints.py and test_geometry_error.py.
+
+ELASTIC = {"plant.joint_stiffness_N_m_rad": 1000.0}
+MISPLACED = {"plant.geometry_error_m": 1e-4}
+STRIBECK = {"plant.friction": "stribeck", "plant.static_ratio": 1.3, "plant.stribeck_velocity_rad_s": 0.05}
+
+
+class PerfectSensor:
+    """Measures the pose that it is shown."""
+
+    def __init__(self):
+        self.poses = []
+
+    def start_run(self, seed):
+        self.poses.clear()
+
+    def measure(self, pose, obstacles, pose_rate):
+        self.poses.append(pose)
+        return replace(lost_measurement("none"), pose=pose, covariance=1e-12 * np.eye(6), ok=True, reason="")
+
+
+def _short(**overrides):
+    return quick(**{"excitation.duration_s": 0.5} | overrides)
+
+
+def test_the_model_knows_of_no_switch_and_without_one_the_plant_is_the_nominal_robot_bit_by_bit():
+    switched, plain = quick(**ELASTIC, **MISPLACED, **STRIBECK), _short()
+    assert model_settings(switched) == model_settings(quick())
+    assert build_plant(switched).settings.elasticity.stiffness == 1000.0
+    text = switched.to_toml()
+    assert scenario_from_toml(text) == switched
+    for line in ("joint_stiffness_N_m_rad = 1000.0", "[N m/rad]", "geometry_error_m = 0.0001", "motor_inertia_kg_m2"):
+        assert line in text
+    assert "joint_stiffness" not in quick().to_toml()
+    with pytest.raises(SimulationError, match="of crank 2 about its axis"):
+        build_plant(quick(**ELASTIC, **{"plant.motor_inertia_kg_m2": 1e-3}), rss6()).check()
+    plant, reference = build_plant(plain, rss6()), trajectory(0).reference(plain.timing.frame_times(0.5))
+    assert plant.robot is rss6()
+    ours, nominal = plant.run(reference), simulate(rss6(), truth(), reference, plant.settings)
+    np.testing.assert_array_equal(ours.pose, nominal.pose)
+    np.testing.assert_array_equal(ours.command, nominal.command)
+
+
+def _run(scenario):
+    """Half a second of the plant under a sensor that sees it as it is; and what that sensor was shown."""
+    sensor = PerfectSensor()
+    run = run_plant(build_plant(scenario, rss6()), sensor, trajectory(3), 0.5, 0, 0)
+    return run, np.array(sensor.poses)
+
+
+def test_the_truth_holds_true_poses_motors_and_switches_and_the_encoders_read_the_motors():
+    """Crank angles are those of the poses that the sensor was shown; motors are ahead by torque over stiffness."""
+    scenario = _short(**ELASTIC)
+    run, seen = _run(scenario)
+    np.testing.assert_array_equal(true_poses(run.truth), seen)
+    cranks, motors = run.truth["joint_angle"].values, run.truth["motor_angle"].values
+    np.testing.assert_allclose(cranks, rss6().inverse_kinematics(seen), atol=1e-15)
+    holding = rss6().static_torque(seen[0], truth()[:64])
+    np.testing.assert_allclose((motors - cranks)[0], holding / 1000.0, rtol=1e-9)
+    assert run.truth.attrs["plant_joint_stiffness_N_m_rad"] == 1000.0
+    assert "base_joint_error" not in run.truth
+    perfect = JointInstruments(0.0, 0.0, 0.0)
+    channels = measure_joints(run.record, run.truth, scenario.timing, perfect, np.random.default_rng(0))
+    np.testing.assert_array_equal(channels["joint_angle"].values, motors)
+    with pytest.raises(RecordError, match="motor_angle are not finite"):
+        check_truth(run.truth.assign(motor_angle=run.truth["motor_angle"] * np.nan), "broken truth")
+
+
+@pytest.mark.slow
+def test_the_truth_holds_the_joint_errors_of_the_plant():
+    run, seen = _run(_short(**MISPLACED))
+    plant, other = (build_plant(_short(**MISPLACED, **{"plant.geometry_seed": seed})).robot for seed in (0, 1))
+    errors = plant.geometry.base_joints - rss6().geometry.base_joints
+    np.testing.assert_array_equal(run.truth["base_joint_error"].values, errors)
+    assert 0.5e-4 < errors.std() < 2e-4
+    np.testing.assert_array_equal(run.truth["joint_angle"].values, plant.inverse_kinematics(seen))
+    assert other.geometry != plant.geometry
+
+
+def test_unseen_trajectories_are_run_by_the_elastic_plant():
+    """With the true parameters a rigid model misses it, and not the rigid plant with the same friction law."""
+    short = {"validation.duration_s": 1.0, "validation.count": 1, "excitation.candidates": 2}
+    rigid, elastic = (unseen_errors(truth(), rss6(), quick(**short, **switch)) for switch in ({}, ELASTIC))
+    assert np.abs(rigid).max() < 1e-8
+    assert np.abs(elastic).max() > 1e-6
+
+
+def _identified(**switch):
+    """10 s with white noise of 5 um and 30 urad, identified with the commands that were logged."""
+    scenario = quick(**{"identification.method": "command_driven"} | switch)
+    return identify(synthetic.run_plant(scenario, seed=0)[0], rss6(), scenario)
+
+
+@pytest.mark.parametrize(
+    "switch",
+    [
+        pytest.param(STRIBECK, id="stribeck friction", marks=pytest.mark.slow),
+        pytest.param(ELASTIC, id="elastic joints", marks=pytest.mark.slow),
+        pytest.param(MISPLACED, id="joints off by 0.1 mm", marks=pytest.mark.slow),
+        pytest.param(MISPLACED | {"plant.geometry_seed": 1}, id="another robot", marks=pytest.mark.thorough),
+    ],
+)
+def test_the_residuals_say_that_the_model_is_wrong(switch):
+    result = _identified(**switch)
+    assert result.whiteness.p_value < SUSPICIOUS
+    assert result.noise_ratio > 1.05
+    assert any("not white" in said and "the model is wrong" in said for said in result.warnings)
+
+
+@pytest.mark.slow
+def test_the_residuals_of_the_right_model_and_of_elastic_joints_that_the_closed_loop_hides_do_not():
+    """The closed loop explains the elastic record, with wrong parameters; the model driven by the commands does not."""
+    right, hidden = _identified(), _identified(**ELASTIC, **{"identification.method": "closed_loop"})
+    assert right.whiteness.p_value > 0.01
+    assert abs(right.noise_ratio - 1) < 0.1
+    assert not any("wrong" in said for said in right.warnings)
+    assert hidden.noise_ratio < 1.2
+    assert not hidden.identifiable.any()
+    assert any("driven by the logged commands, the model misses" in said for said in hidden.warnings)
+
+
+@pytest.mark.thorough
+def test_intervals_hold_though_joints_are_off_by_a_third_of_a_millimetre():
+    """The misfit is as large as the noise; intervals of white noise would miss by 4.5 standard deviations."""
+    result = _identified(**MISPLACED | {"plant.geometry_error_m": 3e-4})
+    assert 1.5 < result.noise_ratio < 3
+    known = result.identifiable
+    errors = ((result.estimate - truth()) / result.std)[known]
+    assert known.sum() >= 20
+    assert np.sqrt(np.mean(errors**2)) < 1.3
+    assert np.abs(errors).max() < 3

@@ -16,7 +16,7 @@ from identify.studies import study_file
 from identify.studies.runner import run_study
 from identify.studies.study_file import Study
 from tests.identify.commands import command
-from tests.identify.study_rows import KIND
+from tests.identify.study_rows import KIND, journal
 
 LINE = "stopped: what is done is kept; the same command goes on from there\n"
 
@@ -63,13 +63,17 @@ def test_held_ctrl_c_waits_for_the_end_of_the_block():
         ctrl_c()
 
 
-def test_noted_ctrl_c_is_raised_again_where_it_was_swallowed():
+def test_noted_ctrl_c_is_raised_again_where_it_was_swallowed_and_an_inner_blocks_is_noted_in_the_outer_one():
     with noted():
         raise_noted()
         swallowed()
         with pytest.raises(KeyboardInterrupt):
             raise_noted()
     raise_noted()
+    with noted() as outer:
+        with pytest.raises(KeyboardInterrupt), honoured():
+            broken_import()
+        assert outer.came
 
 
 @pytest.mark.parametrize("happens", [ctrl_c, broken_import, swallowed])
@@ -80,46 +84,36 @@ def test_ctrl_c_leaves_the_block_whatever_became_of_it(happens):
         raise ImportError("no library")
 
 
-def test_ctrl_c_of_an_inner_block_is_noted_in_the_outer_one():
-    with noted() as outer:
-        with pytest.raises(KeyboardInterrupt), honoured():
-            broken_import()
-        assert outer.came
-
-
-def test_ctrl_c_that_became_another_error_in_a_row_is_no_error_of_the_row(tmp_path):
-    options = {"interrupt": 1, "disguise": True}
-    chosen = Study(name="mine", kind=KIND, repeats=3, factors={"sensor.camera.dark_noise": [13.0]}, options=options)
-    with pytest.raises(StudyInterrupted, match="1 of 3 rows are done"):
-        run_study(chosen, tmp_path, SilentProgress())
-
-
-def test_swallowed_ctrl_c_begins_no_row(tmp_path):
+def test_ctrl_c_in_a_row_is_no_error_of_it_whatever_became_of_it_and_one_that_was_swallowed_begins_no_row(tmp_path):
     def workers():
         raise AssertionError("workers are started")
 
-    study = Study(name="mine", kind=KIND, factors={"sensor.camera.dark_noise": [13.0]})
+    for disguise in (False, True):
+        options = {"interrupt": 1, "disguise": disguise}
+        chosen = Study(name="mine", kind=KIND, repeats=3, factors={"sensor.camera.dark_noise": [13.0]}, options=options)
+        with pytest.raises(StudyInterrupted, match="1 of 3 rows are done"):
+            run_study(chosen, tmp_path / str(disguise), SilentProgress())
+        assert journal(tmp_path / str(disguise)) == [0]
     with noted():
         swallowed()
-        with pytest.raises(StudyInterrupted, match="0 of 1 rows are done"):
-            run_study(study, tmp_path, SilentProgress(), workers)
+        with pytest.raises(StudyInterrupted, match="0 of 3 rows are done"):
+            run_study(chosen, tmp_path / "b", SilentProgress(), workers)
 
 
-@pytest.mark.parametrize("happens", [ctrl_c, broken_import])
-def test_ctrl_c_in_a_command_is_one_line(happens, capsys):
-    with pytest.raises(typer.Exit) as caught:
-        stoppable(happens)()
-    assert caught.value.exit_code == 130
-    assert capsys.readouterr().err == LINE
-
-
-def test_other_errors_of_a_command_stay_what_they_are(capsys):
+def test_ctrl_c_in_a_command_is_one_line_and_other_errors_stay_what_they_are(monkeypatch, capsys):
     def fails():
         raise ImportError("no library")
 
+    for happens in (ctrl_c, broken_import):
+        with pytest.raises(typer.Exit) as caught:
+            stoppable(happens)()
+        assert (caught.value.exit_code, capsys.readouterr().err) == (130, LINE)
     with pytest.raises(ImportError, match="no library"):
         stoppable(fails)()
     assert capsys.readouterr().err == ""
+    monkeypatch.setattr(study_file, "load_study", lambda _: broken_import())
+    assert command("study", "pixel_noise") == 130
+    assert capsys.readouterr().err == LINE
 
 
 def test_ctrl_c_that_became_another_error_in_any_command_is_one_line(monkeypatch, capsys):
@@ -141,12 +135,6 @@ def test_ctrl_c_while_the_libraries_are_loaded_is_one_line(monkeypatch, capsys):
     monkeypatch.setattr(sys, "meta_path", [Slow, *sys.meta_path])
     assert command("--help") == 130
     assert capsys.readouterr() == ("", "aborted\n")
-
-
-def test_ctrl_c_before_the_study_is_read_is_one_line(monkeypatch, capsys):
-    monkeypatch.setattr(study_file, "load_study", lambda _: broken_import())
-    assert command("study", "pixel_noise") == 130
-    assert capsys.readouterr().err == LINE
 
 
 def test_processes_of_threads_that_are_started_deaf_do_not_hear_ctrl_c():

@@ -17,7 +17,7 @@ from identify.experiment.plant import build_plant, drawn_load
 from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses
 from identify.loop_parameters import NAMES, index_of
-from identify.record.payload import recorded_payload, store_payload
+from identify.record.payload import store_payload
 from identify.record.recording import poses
 from identify.studies.rows.sensor import DrawnSensor
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, trajectory, truth
@@ -51,11 +51,12 @@ def stated_load(scenario):
     return load.stated, load.std
 
 
-def stating(records, scenario, load, std=None):
-    """The problem of records whose last was made under a stated load (67,), known to std (67,)."""
-    restated = records[1].copy()
-    store_payload(restated, load, std)
-    return output_error_problem([records[0], restated], rss6(), scenario).driven_by_commands()
+def stating(records, scenario, *loads):
+    """The problem of the bare record, and of the other one for each (load (67,), std (67,) or None) as stated."""
+    restated = [records[1].copy() for _ in loads]
+    for record, (load, std) in zip(restated, loads, strict=True):
+        store_payload(record, load, std)
+    return output_error_problem([records[0], *restated], rss6(), scenario).driven_by_commands()
 
 
 def covariance(problem, parameters):
@@ -67,7 +68,7 @@ def moved(records, scenario):
     """Where the optimum lies (67,), and how far it moves where the load is stated a standard deviation too heavy."""
     load, std = stated_load(scenario)
     heavier, lighter = (
-        search(stating(records, scenario, load + sign * std), truth(), scenario, lambda n=1: None).parameters
+        search(stating(records, scenario, (load + sign * std, None)), truth(), scenario, lambda n=1: None).parameters
         for sign in (1, -1)
     )
     return (heavier + lighter) / 2, (heavier - lighter) / 2
@@ -77,7 +78,7 @@ def test_the_intervals_allow_for_how_far_a_wrong_load_moves_the_estimate(records
     """Covariance of friction and gains, with all their correlations; all members of the scale move together."""
     at, shift = moved
     load, std = stated_load(scenario)
-    known, weighed = (covariance(stating(records, scenario, load, one), at) for one in (None, std))
+    known, weighed = (covariance(stating(records, scenario, (load, one)), at) for one in (None, std))
     added, expected = (weighed - known)[np.ix_(JOINTS, JOINTS)], np.outer(shift[JOINTS], shift[JOINTS])
     assert np.abs(added - expected).max() < 0.02 * np.abs(expected).max()
     assert np.sqrt(np.diag(added)) == pytest.approx(np.abs(shift[JOINTS]), rel=0.02)
@@ -93,11 +94,7 @@ def test_records_under_the_same_load_share_its_error_and_others_do_not(records, 
     load, std = stated_load(scenario)
 
     def added(other, deviation):
-        again, second = (records[1].copy() for _ in range(2))
-        store_payload(again, load, deviation)
-        store_payload(second, other, deviation)
-        problem = output_error_problem([records[0], again, second], rss6(), scenario).driven_by_commands()
-        return covariance(problem, truth())[GAIN, GAIN]
+        return covariance(stating(records, scenario, (load, deviation), (other, deviation)), truth())[GAIN, GAIN]
 
     exact = added(load, np.zeros(67))
     same, apart = (added(other, std) - exact for other in (load, load * (1 + 1e-9)))
@@ -106,9 +103,8 @@ def test_records_under_the_same_load_share_its_error_and_others_do_not(records, 
 
 def test_an_exactly_known_load_leaves_every_digit_as_it_was(records, scenario):
     """Stated with a deviation of zero, or with none, as records of before have it."""
+    stated = covariance(stating(records, scenario, (stated_load(scenario)[0], None)), truth())
     silent = records[1].copy()
-    store_payload(silent, stated_load(scenario)[0])
-    stated = covariance(output_error_problem([records[0], silent], rss6(), scenario).driven_by_commands(), truth())
     silent.attrs = {name: value for name, value in silent.attrs.items() if not name.endswith("_std")}
     unsaid = output_error_problem([records[0], silent], rss6(), scenario).driven_by_commands()
     assert np.array_equal(covariance(unsaid, truth()), stated)
@@ -117,28 +113,18 @@ def test_an_exactly_known_load_leaves_every_digit_as_it_was(records, scenario):
     assert not exact.std.any()
 
 
-@pytest.mark.parametrize(
-    ("attributes", "says"),
-    [
-        ({"payload_mass_std": -0.04}, r"payload_mass_std is -0.04, must be a number >= 0 in kg"),
-        ({"payload_mass_std": "0.04"}, r"payload_mass_std is '0.04', must be a number >= 0 in kg"),
-        ({"payload_mass_std": 9.0}, r"payload_mass_std = 9 kg exceeds payload_mass = 8 kg"),
-        ({"payload_Izz_std": 0.05}, r"payload_Izz_std = 0.05 kg m2 exceeds payload_Izz = 0.04 kg m2"),
-    ],
-)
-def test_a_deviation_that_cannot_be_is_refused_with_its_value_and_limit(records, scenario, attributes, says):
-    with pytest.raises(RecordError, match=says):
-        identify([records[0], records[1].assign_attrs(attributes)], rss6(), scenario)
-    with pytest.raises(RecordError, match="payload_mass is None, must be a number >= 0 in kg"):
-        recorded_payload(records[0].assign_attrs(payload_mass_std=0.04))
-
-
-def test_a_deviation_does_not_make_a_load_of_none(records, scenario):
-    """Two records under the same load, known differently well, still do not show the scale."""
-    other = records[1].assign_attrs(payload_mass_std=0.01)
-    store_anchor(other, ScaleAnchor("payload"))
-    with pytest.raises(EstimationError, match="2 records have all the same load"):
-        identify([other, records[1]], rss6(), scenario)
+def test_a_deviation_that_cannot_be_is_refused_and_none_makes_two_loads_of_one(records, scenario):
+    bare, heavy = records
+    again = heavy.assign_attrs(payload_mass_std=0.01)
+    store_anchor(again, ScaleAnchor("payload"))
+    for pair, error, says in (
+        ((bare, heavy.assign_attrs(payload_mass_std="0.04")), RecordError, "mass_std is '0.04', must be a number >= 0"),
+        ((bare, heavy.assign_attrs(payload_mass_std=9.0)), RecordError, "mass_std = 9 kg exceeds payload_mass = 8 kg"),
+        ((bare.assign_attrs(payload_mass_std=0.04), heavy), RecordError, "payload_mass is None, must be a number >= 0"),
+        ((again, heavy), EstimationError, "2 records have all the same load"),
+    ):
+        with pytest.raises(error, match=says):
+            identify(list(pair), rss6(), scenario)
 
 
 def test_drawn_loads_spread_as_stated_and_are_never_negative(scenario):

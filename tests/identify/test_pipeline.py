@@ -99,7 +99,6 @@ def test_the_result_has_every_entry_of_the_contract(quick_run, result):
     assert identification["scale_anchor"] == "platform_mass"
     assert identification["base_rank"] > 30
     assert "eq. 35" in identification["stop_reason"]
-    assert len(identification["parameters"]) == 67
     for entry in identification["parameters"].values():
         assert set(entry) >= {"initial", "true", "estimate", "std", "identifiable"}
         assert all(entry[key] is not None for key in ("initial", "true", "estimate", "std"))
@@ -109,27 +108,26 @@ def test_the_result_has_every_entry_of_the_contract(quick_run, result):
     assert read(quick_run.experiment).sizes["time"] == 600
 
 
-def test_a_stage_can_be_repeated_and_gives_the_same_numbers(quick_run, result, tmp_path):
+def test_a_stage_can_be_repeated_with_the_same_numbers_and_not_from_half_a_record(quick_run, result, tmp_path, capfd):
     again = RunFolder(shutil.copytree(quick_run.path, tmp_path / "run"))
     pipeline.identify(again.path, SilentProgress())
-    repeated = load_result(again.result)["identification"]["parameters"]
-    assert {name: entry["estimate"] for name, entry in repeated.items()} == {
-        name: entry["estimate"] for name, entry in result["identification"]["parameters"].items()
-    }
+    repeated, first = load_result(again.result)["identification"], result["identification"]
+    assert len(first["parameters"]) == 67
+    for name, entry in first["parameters"].items():
+        assert repeated["parameters"][name]["estimate"] == entry["estimate"]
+    written = again.result.read_bytes()
+    os.truncate(again.experiment, again.experiment.stat().st_size // 2)
+    assert command("identify", "--out", again.path) == 1
+    assert "experiment.nc is truncated" in one_line(capfd.readouterr().err)
+    assert again.result.read_bytes() == written
 
 
 def test_planes_and_commands_identify_too(tmp_path, capfd):
     """Plane intersection in every frame is noisier, so that the goals of the default method are not asked of it; the
     command-driven search starts on a bound here."""
-    choices = (
-        "pose_method=planes",
-        "identification.method=command_driven",
-        "timing.hold=linear",
-        "validation.count=1",
-        "validation.duration_s=2",
-        "renderer=analytic",
-    )
-    settings = [word for choice in choices for word in ("--set", choice)]
+    choices = {"pose_method": "planes", "identification.method": "command_driven", "timing.hold": "linear"}
+    choices |= {"validation.count": 1, "validation.duration_s": 2, "renderer": "analytic"}
+    settings = [word for choice in choices.items() for word in ("--set", "{}={}".format(*choice))]
     assert command("run", "quick", "--out", tmp_path / "run", "--quiet", *settings) == 0, capfd.readouterr().err
     result = load_result(tmp_path / "run" / "result.json")
     position, orientation = worst(result, "true")
@@ -153,31 +151,20 @@ def test_a_plant_that_the_model_cannot_be_is_said_and_judged(tmp_path, capfd):
     assert "white residuals" in missed(load_result(run.result))
 
 
-@pytest.fixture
-def no_opengl(tmp_path):
-    """A folder for PYTHONPATH where OpenGL cannot be loaded."""
-    broken = tmp_path / "without" / "OpenGL"
+def test_without_opengl_the_analytic_renderer_draws_or_pyrender_stops_with_one_line_each(tmp_path):
+    broken, out = tmp_path / "without" / "OpenGL", tmp_path / "out"
     broken.mkdir(parents=True)
     (broken / "__init__.py").write_text("raise ImportError('no EGL here')\n")
-    return os.pathsep.join([str(broken.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
-
-
-def test_without_opengl_the_analytic_renderer_draws_and_one_line_says_so(no_opengl, tmp_path):
-    done = cmmsim("excite", "quick", "--out", tmp_path / "out", "--quiet", PYTHONPATH=no_opengl)
+    path = os.pathsep.join([str(broken.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+    done = cmmsim("run", "quick", "--set", "renderer=pyrender", "--out", out, PYTHONPATH=path)
+    assert done.returncode != 0
+    assert "libegl1" in one_line(done.stderr)
+    assert not out.exists()
+    done = cmmsim("excite", "quick", "--out", out, "--quiet", PYTHONPATH=path)
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stderr.splitlines() if line.startswith("warning")]
     assert lines == ["warning: images are drawn by the analytic renderer, pyrender found no OpenGL: no EGL here"]
-    assert load_scenario(str(tmp_path / "out" / "scenario.toml")).renderer == "analytic"
-
-
-def test_pyrender_without_opengl_stops_with_one_line_and_leaves_nothing(no_opengl, tmp_path):
-    arguments = ("run", "quick", "--set", "renderer=pyrender", "--out", tmp_path / "out")
-    done = cmmsim(*arguments, PYTHONPATH=no_opengl)
-    assert done.returncode != 0
-    lines = [line for line in done.stderr.splitlines() if line.strip()]
-    assert len(lines) == 1, done.stderr
-    assert "libegl1" in lines[0]
-    assert not (tmp_path / "out").exists()
+    assert load_scenario(str(out / "scenario.toml")).renderer == "analytic"
 
 
 @pytest.mark.parametrize(
@@ -185,7 +172,6 @@ def test_pyrender_without_opengl_stops_with_one_line_and_leaves_nothing(no_openg
     [
         ("robot=rss7", ["rss7", "rss6"]),
         ("sensor=ctrack79", ["ctrack79", "ctrack780"]),
-        ("filter.cutoff_hz=30", ["30 Hz", "60 Hz"]),
         ("excitation.position_amplitude_m=0.2", ["leg"]),
         ("excitation.travel_margin_rad=0.8", ["leg", "0.1948"]),
         ("plant.parameters=nobody", ["nobody", "identified", "initial"]),
@@ -198,13 +184,3 @@ def test_what_cannot_be_run_is_one_line_before_any_file(setting, words, tmp_path
     error = one_line(capfd.readouterr().err)
     assert all(word in error for word in words), error
     assert not (tmp_path / "out").exists()
-
-
-def test_a_truncated_record_is_one_line(quick_run, tmp_path, capfd):
-    for name in ("scenario.toml", "trajectories.json"):
-        (tmp_path / name).write_bytes((quick_run.path / name).read_bytes())
-    whole = quick_run.experiment.read_bytes()
-    (tmp_path / "experiment.nc").write_bytes(whole[: len(whole) // 2])
-    assert command("identify", "--out", tmp_path) == 1
-    assert "experiment.nc is truncated" in one_line(capfd.readouterr().err)
-    assert not (tmp_path / "result.json").exists()

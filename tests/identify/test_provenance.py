@@ -33,47 +33,27 @@ def record():
 
 
 def test_arrays_are_told_apart_by_name_shape_and_number_alone():
-    values = np.array([[1.0, np.nan], [3.0, 4.0]])
-    known = array_digest({"a": values, "b": np.zeros(2)})
-    assert array_digest({"b": np.zeros(2, dtype=np.int8), "a": np.asfortranarray(values)}) == known
-    for other in (
-        {"a": values},
-        {"a": values, "c": np.zeros(2)},
-        {"a": values.ravel(), "b": np.zeros(2)},
-        {"a": np.nextafter(values, 9), "b": np.zeros(2)},
-        {"a": values.T, "b": np.zeros(2)},
-    ):
-        assert array_digest(other) != known
+    values, more = np.array([[1.0, np.nan], [3.0, 4.0]]), np.zeros(2)
+    known = array_digest({"a": values, "b": more})
+    assert array_digest({"b": more.astype(np.int8), "a": np.asfortranarray(values)}) == known
+    for other in (values.ravel(), values.T, np.nextafter(values, 9)):
+        assert array_digest({"a": other, "b": more}) != known
+    for others in ({"a": values}, {"a": values, "c": more}):
+        assert array_digest(others) != known
 
 
-def test_a_record_is_the_same_wherever_and_whenever_it_was_written(record, tmp_path):
+def test_a_record_is_the_same_wherever_it_was_written_and_another_by_whatever_an_identification_reads(record, tmp_path):
     """Nor does it matter which estimator its scenario named: the record was made without."""
-    later = record.assign_attrs(
-        created="later",
-        record_seconds=3.0,
-        title="mine",
-        scenario=SHORT.with_overrides({"identification.method": "command_driven"}).to_toml(),
-    )
+    driven, stiffer = ({"identification.method": "command_driven"}, {"servo.kp": 0.31})
+    scenarios = [SHORT.with_overrides(settings).to_toml() for settings in (driven, stiffer)]
+    later = record.assign_attrs(created="later", record_seconds=3.0, title="mine", scenario=scenarios[0])
     write(tmp_path / "one.nc", record)
     write(tmp_path / "two.nc", later)
-    known = {digest(one) for one in (record, later, read(tmp_path / "one.nc"), read(tmp_path / "two.nc"))}
-    assert len(known) == 1
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        moved,
-        lambda r: r.assign(command=r["command"] + 1e-9),
-        lambda r: r.assign_attrs(scale_anchor_value=23.6),
-        lambda r: r.assign_attrs(payload_mass=8.0),
-        lambda r: r.assign_attrs(seed=2),
-        lambda r: r.assign_attrs(scenario=SHORT.with_overrides({"servo.kp": 0.31}).to_toml()),
-    ],
-    ids=["pose", "command", "anchor", "load", "seed", "servo"],
-)
-def test_whatever_an_identification_reads_makes_it_another_record(record, change):
-    assert digest(change(record)) != digest(record)
+    (known,) = {digest(one) for one in (record, later, read(tmp_path / "one.nc"), read(tmp_path / "two.nc"))}
+    others = [{"scale_anchor_value": 23.6}, {"payload_mass": 8.0}, {"seed": 2}, {"scenario": scenarios[1]}]
+    changed = [record.assign_attrs(attributes) for attributes in others]
+    for another in (*changed, moved(record), record.assign(command=record["command"] + 1e-9)):
+        assert digest(another) != known
 
 
 def other_experiment(run):
@@ -104,7 +84,7 @@ OTHERS = [
 
 
 @pytest.mark.slow
-def test_a_report_takes_the_results_own_files_and_refuses_others(run_folder):
+def test_a_report_takes_the_results_own_files_and_refuses_others_and_an_estimate_outside_its_interval(run_folder):
     bare = load_result(run_folder.result)
     made_of = RunFiles(run_folder).digests(*READ_BY_REPORT)
     save_result(run_folder.result, bare | {ENTRY: made_of})
@@ -115,13 +95,14 @@ def test_a_report_takes_the_results_own_files_and_refuses_others(run_folder):
         with pytest.raises(RecordError, match=f"json is {says}: run `cmmsim {stage} --out {run_folder.path}` again"):
             write_report(run_folder.path)
         assert not run_folder.report.exists()
+    save_result(run_folder.result, bare | {ENTRY: {"payload.nc": "of a second run"}})
+    with pytest.raises(OutputFolderError, match=r"no payload\.nc; write it with: cmmsim record"):
+        write_report(run_folder.path)
     save_result(run_folder.result, bare)
     read_report_data(run_folder)  # a result that states no digest asks nothing
-
-
-def test_a_record_that_is_gone_is_named_with_the_stage_that_writes_it(run_folder):
-    save_result(run_folder.result, load_result(run_folder.result) | {ENTRY: {"payload.nc": "of a second run"}})
-    with pytest.raises(OutputFolderError, match=r"no payload\.nc; write it with: cmmsim record"):
+    bare["identification"]["parameters"]["joint1.coulomb"]["estimate"] = -5
+    save_result(run_folder.result, bare)
+    with pytest.raises(RecordError, match=r"json: the estimate -5 of joint1.coulomb is outside its interval 0.103"):
         write_report(run_folder.path)
 
 
@@ -143,33 +124,28 @@ def test_identification_states_what_it_read_and_wrote(recorded_folder, record):
     assert made_of["experiment.nc"] == digest(record)
 
 
+def refused(run, name, capsys):
+    """The one line by which a stage refuses a run; it writes nothing."""
+    before = sorted(run.path.iterdir()), run.result.read_bytes()
+    assert command(name, "--out", run.path) == 1
+    assert (sorted(run.path.iterdir()), run.result.read_bytes()) == before
+    return one_line(capsys.readouterr().err)
+
+
 @pytest.mark.parametrize("replace", [other_experiment, other_covariance])
-def test_validation_refuses_another_record_and_writes_nothing(recorded_folder, replace, capsys):
+def test_what_reads_a_run_anew_refuses_files_of_two_origins(recorded_folder, record, replace, capsys):
     run = recorded_folder
     identified(run)
     replace(run)
-    before = run.result.read_text(encoding="utf-8")
-    assert command("validate", "--out", run.path) == 1
-    assert f"run `cmmsim identify --out {run.path}` again" in one_line(capsys.readouterr().err)
-    assert run.result.read_text(encoding="utf-8") == before
-    assert not run.validation.exists()
-
-
-@pytest.mark.parametrize(
-    ("name", "of", "stage"),
-    [
+    assert f"run `cmmsim identify --out {run.path}` again" in refused(run, "validate", capsys)
+    write_runs(run.validation, [(record, read_truth(run.experiment))] * 3)
+    for name, of, stage in (
         ("estimators", "experiment.nc", "identify"),
         ("estimators", "validation.nc", "validate"),
         ("variation", "validation.nc", "validate"),
-    ],
-)
-def test_what_reads_a_run_anew_refuses_files_of_two_origins(recorded_folder, record, name, of, stage, capsys):
-    run = recorded_folder
-    write_runs(run.validation, [(record, read_truth(run.experiment))] * 3)
-    save_result(run.result, {ENTRY: {of: "of a run before"}})
-    assert command(name, "--out", run.path) == 1
-    assert f"{of}: run `cmmsim {stage} --out {run.path}` again" in one_line(capsys.readouterr().err)
-    assert not (run.path / "instruments.nc").exists()
+    ):
+        save_result(run.result, {ENTRY: {of: "of a run before"}})
+        assert f"{of}: run `cmmsim {stage} --out {run.path}` again" in refused(run, name, capsys)
 
 
 @pytest.mark.parametrize(
@@ -182,38 +158,23 @@ def test_what_reads_a_run_anew_refuses_files_of_two_origins(recorded_folder, rec
     ids=["empty", "parameter gone", "no digests"],
 )
 def test_validation_refuses_a_result_that_is_none_in_one_line(recorded_folder, spoil, says, capsys):
-    run, result = recorded_folder, identified(recorded_folder)
+    result = identified(recorded_folder)
     spoil(result)
-    save_result(run.result, result)
-    assert command("validate", "--out", run.path) == 1
-    error = one_line(capsys.readouterr().err)
+    save_result(recorded_folder.result, result)
+    error = refused(recorded_folder, "validate", capsys)
     assert says in error
-    assert str(run.result) in error
-    assert not run.validation.exists()
+    assert str(recorded_folder.result) in error
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "says"),
-    [
-        ("link3.mass", None, "there is no estimate of link3.mass"),
+def test_parameters_of_a_result_that_no_model_has_are_named():
+    entries = {known: {"estimate": one} for known, one in zip(NAMES, truth(), strict=True)}
+    np.testing.assert_array_equal(parameter_vector({"parameters": entries}, "estimate"), truth())
+    for name, value, says in (
         ("link3.mass", "1 kg", 'estimate of link3.mass is "1 kg", must be a finite number'),
         ("platform.mass", -5, "estimate: platform.mass = -5 kg is not allowed"),
         ("joint_pid.li", 0, "estimate: joint_pid.li"),
-    ],
-)
-def test_parameters_of_a_result_that_no_model_has_are_named(name, value, says):
-    entries = {known: {"estimate": one} for known, one in zip(NAMES, truth(), strict=True)}
-    np.testing.assert_array_equal(parameter_vector({"parameters": entries}, "estimate"), truth())
-    entries[name]["estimate"] = value
-    with pytest.raises(RecordError, match=says):
-        parameter_vector({"parameters": entries}, "estimate")
+    ):
+        with pytest.raises(RecordError, match=says):
+            parameter_vector({"parameters": entries | {name: {"estimate": value}}}, "estimate")
     with pytest.raises(RecordError, match=r"no identification\.parameters"):
         parameter_vector([], "estimate")
-
-
-def test_a_report_refuses_an_estimate_outside_its_own_interval(run_folder):
-    result = load_result(run_folder.result)
-    result["identification"]["parameters"]["joint1.coulomb"]["estimate"] = -5
-    save_result(run_folder.result, result)
-    with pytest.raises(RecordError, match=r"json: the estimate -5 of joint1.coulomb is outside its interval 0.103"):
-        write_report(run_folder.path)

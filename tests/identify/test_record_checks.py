@@ -9,7 +9,7 @@ import pytest
 from dynamics import load_robot
 from dynamics.errors import DynamicsError
 from identify import pipeline
-from identify.errors import EstimationError, RecordError, ScenarioError
+from identify.errors import EstimationError, RecordError
 from identify.estimation.identification import identify
 from identify.files.dataset import write_covariance
 from identify.files.run_folder import load_result, save_result
@@ -57,42 +57,30 @@ def one_triangle(record):
 
 
 def nan_in(record, name, frame):
-    values = record[name].values.copy()
-    values[frame] = np.nan
-    return with_values(record, **{name: values})
+    return record.assign({name: record[name].where(record["time"] != record["time"][frame])})
 
 
-def without(record, name):
-    bare = record.copy()
-    bare.attrs = {known: value for known, value in record.attrs.items() if known != name}
-    return bare
+def without(record, *names):
+    return record.drop_attrs(deep=False).assign_attrs({k: v for k, v in record.attrs.items() if k not in names})
 
 
 @pytest.mark.parametrize(
     ("spoil", "error", "says"),
     [
-        (lambda r: r.drop_vars(["measured_ok", "command"]), RecordError, "the record lacks measured_ok, command"),
         (lambda r: r.isel(time=slice(0, 0)), RecordError, "the record has no time"),
         (lambda r: r.isel(time=slice(0, 1)), EstimationError, "1 frames .0.0167 s., at least 120 are needed"),
         (lambda r: r.assign_coords(time=r["time"].where(r["time"] > 1)), RecordError, "increase after frame 0"),
         (lambda r: r.assign_coords(time=r["time"] * 1.01), EstimationError, r"1.010 periods of 60 Hz"),
         (lambda r: nan_in(r, "measured_covariance", 7), RecordError, "covariance is not finite in 1 frames that count"),
         (lambda r: nan_in(r, "command", 8), RecordError, "command is not finite in 1 frames, the first is frame 8"),
-        (lambda r: nan_in(r, "reference_position", 9), RecordError, "reference_position is not finite in 1 frames"),
         (one_triangle, EstimationError, r"in 1 frames: in frame 9 its entry .z, gamma. is 7.5e-11 and .gamma, z. is 0"),
-        (
-            lambda r: without(r, "scenario"),
-            RecordError,
-            r"no attribute scenario, .*to_toml\(\), .*build_record",
-        ),
+        (lambda r: without(r, "scenario"), RecordError, r"no attribute scenario, .*to_toml\(\), .*build_record"),
         (lambda r: r.assign_attrs(scenario=7), RecordError, "attribute scenario is 7, must be TOML text"),
         (lambda r: r.assign_attrs(scenario="paper"), RecordError, "attribute scenario is not valid TOML"),
         (lambda r: r.assign_attrs(scenario="description = 'x'"), RecordError, "attribute scenario: name is missing"),
         (lambda r: r.assign_attrs(seed="abc"), RecordError, "attribute seed is 'abc', must be a whole number >= 0"),
-        (lambda r: r.assign_attrs(seed=np.int64(-2)), RecordError, "attribute seed is -2, must be"),
         (lambda r: r.assign_attrs(seed=True), RecordError, "attribute seed is True, must be"),
         (lambda r: r.assign_attrs(frame_rate_hz=30.0), EstimationError, "frame_rate_hz is 30.0, and timing.* is 60"),
-        (lambda r: r.assign_attrs(frame_rate_hz="60 Hz"), EstimationError, "attribute frame_rate_hz is '60 Hz', and"),
         (standstill, EstimationError, "same pose in every frame: nothing was asked to move"),
         (alias, EstimationError, "the reference's x travels 0.01, .*harmonics above half of 60 Hz"),
         (lambda r: r.assign(reference_velocity=1e3 * r["reference_velocity"]), EstimationError, "not its derivative"),
@@ -128,21 +116,12 @@ def test_a_load_that_no_body_has_is_refused_and_its_numbers_are_shown_as_plain_o
 
 
 def test_what_a_record_need_not_have_is_no_fault(record):
-    """The frame rate of its scenario once more; and more than one way to go."""
-    recorded_run(without(record, "frame_rate_hz"), rss6(), SHORT)
+    """The frame rate of its scenario once more, more than one way to go; and, of a real robot, a seed."""
     one_way = {
         "reference_position": record["reference_position"].values * [1, 0, 0] + [0, 0, 0.2],
         "reference_velocity": record["reference_velocity"].values * [1, 0, 0],
     }
-    recorded_run(with_values(record, **one_way), rss6(), SHORT)
-
-
-def test_a_frame_rate_below_twice_the_highest_harmonic_is_refused_with_the_scenario():
-    with pytest.raises(ScenarioError, match=r"frame_rate_hz = 0.9 Hz is not above twice the highest .* 0.5 Hz"):
-        quick(**{"timing.frame_rate_hz": 0.9, "filter.cutoff_hz": 0.4})
-
-
-def test_a_record_of_a_real_robot_has_no_seed(record):
+    recorded_run(with_values(without(record, "frame_rate_hz"), **one_way), rss6(), SHORT)
     once = SHORT.with_overrides({"identification.method": "command_driven"})
     assert np.all(np.isfinite(identify(without(record, "seed"), rss6(), once).estimate))
 
@@ -160,17 +139,10 @@ def test_commands_of_swapped_joints_leave_no_estimate_that_looks_good(record):
     assert not wrong.groups.identifiable.any()
 
 
-# Records of another experiment or another robot, however alike they look.
-
-
-def test_the_record_of_this_trajectory_and_robot_is_taken_as_files_keep_them(record, recorded_folder):
-    check_robot(record, rss6())
+def test_a_record_of_another_trajectory_is_refused_where_it_differs_most(record, recorded_folder):
     check_trajectory(record, trajectory(0), SHORT)
     planned = load_trajectories(recorded_folder.trajectories).excitation
     check_trajectory(read(recorded_folder.experiment), planned, SHORT)
-
-
-def test_a_record_of_another_trajectory_is_refused_where_it_differs_most(record):
     gap = np.abs(trajectory(0).pose(record["time"].values) - trajectory(1).pose(record["time"].values))
     frame, axis = np.unravel_index(gap.argmax(), gap.shape)
     assert axis >= 3, "an angle differs most"
@@ -180,7 +152,7 @@ def test_a_record_of_another_trajectory_is_refused_where_it_differs_most(record)
         check_trajectory(record, trajectory(0), quick())
 
 
-def test_a_robot_of_the_same_name_and_other_cranks_is_refused(record, tmp_path):
+def test_a_record_of_another_robot_is_refused_be_it_by_its_cranks_or_without_geometry_by_its_name(record, tmp_path):
     text = resources.files("dynamics").joinpath("robots", "rss6.toml").read_text()
     assert text.count("crank_length = 0.06\n") == 1
     path = tmp_path / "rss6.toml"
@@ -188,22 +160,14 @@ def test_a_robot_of_the_same_name_and_other_cranks_is_refused(record, tmp_path):
     assert load_robot(path).name == "rss6"
     with pytest.raises(EstimationError, match=r"crank_length was 0.06 when it was made, the robot file says 0.062"):
         identify(record, load_robot(path), SHORT)
-
-
-def test_a_record_that_states_no_geometry_is_known_by_the_robots_name(record):
     bare = without(record, "robot_geometry")
-    check_robot(bare, rss6())
+    for one in (record, bare):
+        check_robot(one, rss6())
     with pytest.raises(EstimationError, match="is of robot 'rss7', not of 'rss6'"):
         check_robot(bare.assign_attrs(robot="rss7"), rss6())
-
-
-@pytest.mark.parametrize(
-    ("geometry", "says"),
-    [("{", "no JSON object"), ("[1]", "no JSON object"), (json.dumps({"base_joints": [1]}), r"shape \(1,\), expected")],
-)
-def test_a_geometry_that_cannot_be_read_is_named(record, geometry, says):
-    with pytest.raises(RecordError, match=says):
-        check_robot(record.assign_attrs(robot_geometry=geometry), rss6())
+    for geometry, says in (("[1]", "no JSON object"), (json.dumps({"base_joints": [1]}), r"shape \(1,\), expected")):
+        with pytest.raises(RecordError, match=says):
+            check_robot(record.assign_attrs(robot_geometry=geometry), rss6())
 
 
 @pytest.mark.parametrize("stage", [pipeline.identify, pipeline.validate])

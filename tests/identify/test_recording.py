@@ -24,9 +24,10 @@ from identify.record.recording import (
     write_model_runs,
     write_runs,
 )
+from tests.identify.conftest import make_record, make_truth
 
 
-def test_record_and_truth_read_back_identical_and_apart(tmp_path, make_record, make_truth):
+def test_record_and_truth_read_back_identical_and_apart(tmp_path):
     """By us, by plain xarray and by plain HDF5; who reads the record does not see the truth."""
     path = tmp_path / "experiment.nc"
     record, truth = make_record(), make_truth()
@@ -35,6 +36,10 @@ def test_record_and_truth_read_back_identical_and_apart(tmp_path, make_record, m
     xr.testing.assert_identical(read_truth(path), truth)
     assert true_parameters(read_truth(path)) == {"platform.mass": 23.5, "joint1.coulomb": 0.104}
     assert not [name for name in read(path).variables if "true" in str(name) or "torque" in str(name)]
+    assert all(v.attrs["units"] and v.attrs["long_name"] for data in (record, truth) for v in data.data_vars.values())
+    assert (record.attrs["robot"], record.attrs["frame_rate_hz"]) == ("rss6", 60.0)
+    assert f"numpy {np.__version__}" in record.attrs["software"]
+    assert 'name = "quick"' in record.attrs["scenario"]
     with xr.open_dataset(path) as main, xr.open_dataset(path, group="truth") as plain:
         assert "position" not in main
         assert main["time"].dtype == float
@@ -45,22 +50,7 @@ def test_record_and_truth_read_back_identical_and_apart(tmp_path, make_record, m
         assert file["measured_position"].attrs["units"] == "m"
 
 
-def test_every_variable_has_a_unit_and_a_name(make_record, make_truth):
-    for data in (make_record(), make_truth()):
-        for name, variable in data.data_vars.items():
-            assert variable.attrs["units"], name
-            assert variable.attrs["long_name"], name
-
-
-def test_record_says_how_it_was_made(make_record):
-    attributes = make_record().attrs
-    assert attributes["robot"] == "rss6"
-    assert attributes["frame_rate_hz"] == 60.0
-    assert f"numpy {np.__version__}" in attributes["software"]
-    assert 'name = "quick"' in attributes["scenario"]
-
-
-def test_poses_are_the_arrays_that_were_given(make_record, make_truth):
+def test_poses_are_the_arrays_that_were_given():
     measured = np.arange(720.0).reshape(120, 6)
     record = make_record(measured_pose=measured)
     np.testing.assert_array_equal(poses(record, "measured"), measured)
@@ -69,66 +59,37 @@ def test_poses_are_the_arrays_that_were_given(make_record, make_truth):
         poses(record, "initial")
 
 
-def test_lost_frames_may_be_nan_and_only_they(make_record):
+def test_values_of_another_shape_that_are_not_finite_or_times_that_do_not_increase_are_named():
+    """Lost frames may be NaN, and only they."""
     measured, ok = np.zeros((120, 6)), np.ones(120, dtype=bool)
     measured[7], ok[7] = np.nan, False
     assert make_record(measured_pose=measured, measured_ok=ok)["measured_ok"].values.sum() == 119
-    with pytest.raises(
-        RecordError, match="position is not finite in 1 frames that count as measured, the first is frame 7"
+    for values, says in (
+        ({"measured_pose": measured}, "is not finite in 1 frames that count as measured, the first is frame 7"),
+        ({"command": np.full((120, 6), np.inf)}, "command"),
+        ({"time": np.zeros(120)}, "time does not increase"),
+        ({"command": np.zeros((120, 5))}, "120"),
+        ({"measured_covariance": np.zeros((120, 6))}, "120"),
+        ({"measured_ok": np.zeros(119)}, "119"),
+        ({"reference_pose": np.zeros((6, 120))}, "6"),
     ):
-        make_record(measured_pose=measured)
-    with pytest.raises(RecordError, match="command"):
-        make_record(command=np.full((120, 6), np.inf))
+        with pytest.raises(RecordError, match=says):
+            make_record(**values)
 
 
-@pytest.mark.parametrize(
-    ("name", "shape"),
-    [
-        ("command", (120, 5)),
-        ("measured_covariance", (120, 6)),
-        ("measured_ok", (119,)),
-        ("reference_pose", (6, 120)),
-        ("measured_pose", (119, 6)),
-    ],
-)
-def test_wrong_shape_is_named(make_record, name, shape):
-    with pytest.raises(RecordError) as caught:
-        make_record(**{name: np.zeros(shape)})
-    assert str(shape[0]) in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("frames", "value", "says"),
-    [
-        ([5], 7, "it is 7 in frame 5$"),
-        ([3, 9, 11], -1, "it is -1 in frame 3 and wrong in 2 more"),
-        ([0], np.nan, "it is nan in frame 0"),
-    ],
-)
-def test_a_frame_was_measured_or_lost_and_nothing_else(make_record, frames, value, says):
+def test_a_frame_was_measured_or_lost_and_nothing_else():
     record = make_record()
-    stated = record["measured_ok"].values.astype(float if np.isnan(value) else int)
-    stated[frames] = value
-    with pytest.raises(RecordError, match=f"mine: measured_ok must be 1 or 0, {says}"):
-        recording.check_record(record.assign(measured_ok=("time", stated)), "mine")
+    for frames, value, says in (
+        ([3, 9, 11], -1.0, "it is -1.0 in frame 3 and wrong in 2 more"),
+        ([0], np.nan, "it is nan in frame 0$"),
+    ):
+        stated = record["measured_ok"].values.astype(float)
+        stated[frames] = value
+        with pytest.raises(RecordError, match=f"mine: measured_ok must be 1 or 0, {says}"):
+            recording.check_record(record.assign(measured_ok=("time", stated)), "mine")
 
 
-def test_time_must_increase(make_record):
-    with pytest.raises(RecordError, match="time does not increase"):
-        make_record(time=np.zeros(120))
-
-
-@pytest.mark.parametrize("kept", [0, 100, 0.5, -1])
-def test_truncated_file_is_one_clear_error(tmp_path, make_record, kept):
-    path = tmp_path / "experiment.nc"
-    write(path, make_record())
-    size = path.stat().st_size
-    os.truncate(path, int(kept * size) if isinstance(kept, float) else kept % size)
-    with pytest.raises(RecordError, match=r"experiment\.nc is truncated or not a netCDF file"):
-        read(path)
-
-
-def test_what_a_file_lacks_or_damages_is_named(tmp_path, make_record):
+def test_what_a_file_lacks_or_damages_is_named(tmp_path):
     with pytest.raises(RecordError, match="there is no file"):
         read(tmp_path / "nothing.nc")
     path = tmp_path / "experiment.nc"
@@ -139,12 +100,16 @@ def test_what_a_file_lacks_or_damages_is_named(tmp_path, make_record):
         file["reference_position"][3, 1] = np.nan
     with pytest.raises(RecordError, match="reference_position is not finite in 1 frames, the first is frame 3"):
         read(path)
+    for kept in (path.stat().st_size - 1, path.stat().st_size // 2, 100, 0):
+        os.truncate(path, kept)
+        with pytest.raises(RecordError, match=r"experiment\.nc is truncated or not a netCDF file"):
+            read(path)
     write(path, make_record().drop_vars(["command", "measured_ok"]))
     with pytest.raises(RecordError, match="lacks measured_ok, command"):
         read(path)
 
 
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, make_record):
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "experiment.nc"
     write(path, make_record())
     before = path.read_bytes()
@@ -163,15 +128,12 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, make_
         write_half()
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["experiment.nc"]
-
-
-def test_a_written_file_has_the_usual_rights(tmp_path):
     write_text(tmp_path / "folder" / "a.txt", "x")
     (tmp_path / "b.txt").write_text("x")
-    assert (tmp_path / "folder" / "a.txt").stat().st_mode == (tmp_path / "b.txt").stat().st_mode
+    assert (tmp_path / "folder" / "a.txt").stat().st_mode == (tmp_path / "b.txt").stat().st_mode, "the usual rights"
 
 
-def test_runs_share_a_file_and_keep_their_order(tmp_path, make_record, make_truth):
+def test_runs_share_a_file_and_keep_their_order(tmp_path):
     path = tmp_path / "validation.nc"
     write_runs(path, [(make_record(seed=n), make_truth(values=(n, 0.0))) for n in range(2)])
     assert [record.attrs["seed"] for record in read_runs(path)] == [0, 1]

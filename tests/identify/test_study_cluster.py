@@ -11,13 +11,14 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import dask
 import numpy as np
+import psutil
 import pytest
 from distributed import KilledWorker
 
@@ -86,36 +87,26 @@ def test_result_that_died_with_its_worker_is_waited_for_and_noted_once():
     assert client.sent == [[0], [1], [2]]
 
 
-def test_result_that_died_with_the_last_worker_ends_the_study_in_one_line(monkeypatch):
-    monkeypatch.setattr(dask_cluster, "WORKERLESS_SECONDS", 0.05)
-    with pytest.raises(StudyError, match=r"^no Dask worker for 0.05 s; the same command goes on from here$"):
-        computed(Client(lambda *_: iter(lambda: LOST, None), workers=0), 1)
-
-
-def test_scheduler_that_does_not_answer_ends_the_study_in_one_line(monkeypatch):
-    client = Client(lambda numbers, _: [found(numbers)])
-
+def test_last_worker_or_a_scheduler_that_does_not_answer_ends_the_study_in_one_line(monkeypatch):
     def no_answer(callback_timeout):
         raise TimeoutError(f"timed out after {callback_timeout} s")
 
-    monkeypatch.setattr(client, "nthreads", no_answer)
+    monkeypatch.setattr(dask_cluster, "WORKERLESS_SECONDS", 0.05)
+    with pytest.raises(StudyError, match=r"^no Dask worker for 0.05 s; the same command goes on from here$"):
+        computed(Client(lambda *_: iter(lambda: LOST, None), workers=0), 1)
+    client = Client(lambda numbers, _: [found(numbers)])
+    client.nthreads = no_answer
     with pytest.raises(StudyError, match=r"^the Dask scheduler is gone; .* timed out after \d+ s$"):
         computed(client, 1)
 
 
 def test_row_is_blamed_for_the_second_death_of_its_worker_and_not_for_the_first():
-    deaths = {0: 1, 1: 9}
-    client = Client(lambda numbers, time: [DIED if time <= deaths.get(numbers[0], 0) else found(numbers)])
-    errors = computed(client, 3)
-    assert client.sent == [[0], [1], [2], [1], [0]]
-    assert (errors[0], errors[2]) == ("", "")
-    assert errors[1].startswith("KilledWorker: ")
-
-
-def test_row_that_is_the_only_one_is_tried_again_too():
-    client = Client(lambda numbers, time: [DIED if time == 1 else found(numbers)])
-    assert computed(client, 1) == {0: ""}
-    assert client.sent == [[0], [0]]
+    for rows, deaths, sent in ((3, {0: 1, 1: 9}, [[0], [1], [2], [1], [0]]), (1, {0: 1}, [[0], [0]])):
+        client = Client(lambda sent, time, deaths=deaths: [DIED if time <= deaths.get(sent[0], 0) else found(sent)])
+        errors = computed(client, rows)
+        assert client.sent == sent
+        assert [number for number, error in errors.items() if error] == [1] * (rows > 1)
+        assert all(error.startswith("KilledWorker: ") for error in errors.values() if error)
 
 
 # Real processes.
@@ -299,25 +290,19 @@ def command(tmp_path):
         one.communicate()
 
 
-def in_group(leader):
-    """Processes of a session that live, by the leader's number."""
+def in_session(leader):
+    """Command lines of the living processes of a session, by the leader's number."""
     found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = stat.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(fields[3]) == leader and fields[0] != "Z":
-            found.append(stat.parent.name)
+    for one in psutil.process_iter():
+        with suppress(psutil.NoSuchProcess, ProcessLookupError):
+            if os.getsid(one.pid) == leader and one.status() != psutil.STATUS_ZOMBIE:
+                found.append(" ".join(one.cmdline()))
     return found
 
 
 def starts_workers(command):
     """Whether processes of workers are there; they need seconds until they compute."""
-    try:
-        return any("spawn_main" in Path(f"/proc/{one}/cmdline").read_text() for one in in_group(command.pid))
-    except OSError:
-        return False
+    return any("spawn_main" in line for line in in_session(command.pid))
 
 
 def interrupted(running, folder):
@@ -327,7 +312,7 @@ def interrupted(running, folder):
     kept = journal(folder)
     assert error == f"stopped: {len(kept)} of 120 rows are done and kept; the same command goes on from there\n"
     assert running.returncode == 130
-    wait_for(lambda: not in_group(running.pid), "workers outlive the interrupted command")
+    wait_for(lambda: not in_session(running.pid), "workers outlive the interrupted command")
     return kept
 
 
@@ -336,7 +321,7 @@ def test_killed_command_loses_nothing_finished_and_computes_nothing_twice(comman
     running, folder, log = command(workers=2)
     running.kill()
     running.wait()
-    wait_for(lambda: not in_group(running.pid), "workers outlive the killed command")
+    wait_for(lambda: not in_session(running.pid), "workers outlive the killed command")
     kept = journal(folder)
     assert 30 <= len(kept) < 120
     outcome = run_study(study(log=str(log)), folder, SilentProgress())

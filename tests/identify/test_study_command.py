@@ -29,20 +29,14 @@ sensor.camera.dark_noise = [13.0, 26.0]
 @pytest.fixture
 def mine(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    return write(tmp_path)
+    (tmp_path / "mine.toml").write_text(TEXT)
+    return tmp_path / "mine.toml"
 
 
 @pytest.fixture
 def undrawn(monkeypatch):
     """No figures: they take longer than the rows."""
     monkeypatch.setattr(summary, "write", lambda *_: {"theory": []})
-
-
-def write(folder, text=TEXT):
-    folder.mkdir(exist_ok=True)
-    path = folder / "mine.toml"
-    path.write_text(text)
-    return path
 
 
 def test_study_leaves_its_files_and_says_where(mine, tmp_path, capsys):
@@ -58,24 +52,22 @@ def test_study_leaves_its_files_and_says_where(mine, tmp_path, capsys):
     assert "rows/s" in shown.err
 
 
-def test_repeats_are_added_in_the_same_folder(mine, tmp_path, undrawn, capsys):
+def test_repeats_are_added_in_the_same_folder_and_quiet_says_nothing(mine, undrawn, capsys):
+    """Brackets in the name of the folder are shown as they are."""
     for more, says in (
         ([], "4 rows; "),
         (["--repeats", 3], "6 rows, 4 of them from before; "),
         ([], "4 rows, 4 of them from before (2 more, of further repeats, are kept); "),
     ):
-        assert command("study", mine, "--workers", 0, *more) == 0
-        assert says in capsys.readouterr().out
-        frame, study = read_table(tmp_path / "runs" / "study-mine" / "study.parquet")
+        assert command("study", mine, "--workers", 0, "--out", "a[bold]", *more) == 0
+        shown = capsys.readouterr().out
+        assert says in shown
+        assert "study.parquet: a[bold]\n" in shown
+        frame, study = read_table("a[bold]/study.parquet")
         assert len(frame) == 2 * study.repeats
-    assert command("study", mine, "--repeats", 0) == 2
-
-
-def test_quiet_says_nothing_and_brackets_in_names_are_shown_as_they_are(mine, undrawn, capsys):
     assert command("study", mine, "--workers", 0, "--quiet", "--out", "a[bold]") == 0
     assert capsys.readouterr() == ("", "")
-    assert command("study", mine, "--workers", 0, "--out", "a[bold]") == 0
-    assert "study.parquet: a[bold]\n" in capsys.readouterr().out
+    assert command("study", mine, "--repeats", 0) == 2
 
 
 @pytest.mark.parametrize(
@@ -89,17 +81,17 @@ def test_quiet_says_nothing_and_brackets_in_names_are_shown_as_they_are(mine, un
     ],
 )
 def test_rows_or_laws_that_fail_make_an_exit_status_of_their_own(
-    tmp_path, monkeypatch, capsys, fails, figure, exponent, status, says
+    mine, monkeypatch, capsys, fails, figure, exponent, status, says
 ):
     """One figure is the standard deviation of 1,000 normal numbers whatever the factor, the other hardly known."""
     monkeypatch.setattr(summary, "draw", lambda *_: None)
     theory = f'[[theory]]\nfigure = "{figure}"\nfactor = "sensor.camera.dark_noise"\nexponent = {exponent}\n'
-    path = write(tmp_path, TEXT.replace("repeats = 2", "repeats = 4") + f"fails = {fails}\n" + theory)
-    assert command("study", path, "--workers", 0, "--out", tmp_path / "a") == status
+    mine.write_text(TEXT.replace("repeats = 2", "repeats = 4") + f"fails = {fails}\n" + theory)
+    assert command("study", mine, "--workers", 0, "--out", "a") == status
     shown = capsys.readouterr()
     assert shown.out.startswith("undecided: error_um" if figure == "error_um" else ("passed: ", "failed: "))
     assert says in shown.err
-    frame, _ = read_table(tmp_path / "a" / "study.parquet")
+    frame, _ = read_table("a/study.parquet")
     assert frame.index[frame["error"] != ""].tolist() == fails
 
 
@@ -113,13 +105,10 @@ def test_interrupted_study_says_how_far_it_came_and_how_to_go_on(mine, monkeypat
     assert error == "stopped: 2 of 4 rows are done and kept; the same command goes on from there\n"
 
 
-def test_list_names_every_built_in_study_with_its_rows(capsys):
+def test_studies_are_listed_with_their_rows_and_kinds_with_options_figures_and_what_they_read(capsys):
     assert command("study", "--list") == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines() if line]
     assert {(name, f"{load_study(name).rows:,}") for name in STUDIES.names()} <= {tuple(line[:2]) for line in lines}
-
-
-def test_kinds_are_listed_with_their_options_figures_and_what_they_read(capsys):
     assert command("study", "--kinds") == 0
     shown = capsys.readouterr().out
     lines = [line.split() for line in shown.splitlines() if line]
@@ -133,56 +122,41 @@ def test_kinds_are_listed_with_their_options_figures_and_what_they_read(capsys):
     assert ["options.stretch_s", "0.5", "s"] in [line[:3] for line in lines]
 
 
-def test_ten_million_rows_are_refused_at_once_and_many_are_run_where_confirmed(
-    mine, tmp_path, undrawn, capsys, monkeypatch
-):
-    values = ", ".join(map(str, range(1, 11)))
+def test_ten_million_rows_are_refused_at_once_and_many_are_run_where_confirmed(mine, undrawn, capsys, monkeypatch):
     keys = ("dsnu", "dark_noise", "black_level", "gain", "full_well", "electrons_at_white")
-    factors = "\n".join(f"sensor.camera.{name} = [{values}]" for name in keys)
-    path = write(tmp_path / "runs", f'name = "mine"\nkind = "{KIND}"\nrepeats = 10\n[factors]\n{factors}\n')
-    assert command("study", path, "--out", tmp_path / "a") == 1
+    factors = "\n".join(f"sensor.camera.{name} = {[*range(1, 11)]}" for name in keys)
+    Path("many.toml").write_text(f'name = "many"\nkind = "{KIND}"\nrepeats = 10\n[factors]\n{factors}\n')
+    assert command("study", "many.toml", "--out", "a") == 1
     assert "10,000,000 rows; to run more than 100,000, say --yes" in one_line(capsys.readouterr().err)
-    assert not (tmp_path / "a").exists()
+    assert not Path("a").exists()
     monkeypatch.setattr(study_command, "MANY_ROWS", 3)
     assert command("study", mine, "--workers", 0, "--quiet") == 1
     assert command("study", mine, "--workers", 0, "--quiet", "--yes") == 0
 
 
-@pytest.fixture
-def no_scheduler(mine, monkeypatch, capsys):
-    """A function that expects the one line that no scheduler answers at an address, and nothing left behind."""
-    monkeypatch.setattr(dask_cluster, "CONNECT_SECONDS", 1)
+@pytest.fixture(params=[b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\xff" * 30, b""])
+def another_program(request):
+    """The address of a program that says these words, or nothing, to whoever comes; and what is said of it."""
 
-    def expect(address, why=""):
+    def answer():
+        with suppress(OSError):
+            while request.param:
+                connection, _ = server.accept()
+                connection.sendall(10 * request.param)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=answer, daemon=True).start()
+        yield f"tcp://127.0.0.1:{server.getsockname()[1]}", "another protocol" if request.param else "says nothing"
+
+
+def test_where_no_scheduler_answers_there_is_one_line_and_nothing_left(mine, another_program, monkeypatch, capsys):
+    monkeypatch.setattr(dask_cluster, "CONNECT_SECONDS", 1)
+    for address, why in (another_program, ("tcp://127.0.0.1:1", ""), ("nonsense", "")):
         assert command("study", mine, "--scheduler", address) == 1
         error = one_line(capsys.readouterr().err)
         assert f"no Dask scheduler answers at {address}" in error
         assert why in error
         assert not Path("runs").exists()
-
-    return expect
-
-
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense", "foo://host:1"])
-def test_unreachable_scheduler_is_one_line(no_scheduler, address):
-    no_scheduler(address)
-
-
-@pytest.mark.parametrize("words", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"SSH-2.0-OpenSSH_9.2\r\n", b"\xff" * 30, b""])
-def test_another_program_at_the_address_is_no_scheduler(no_scheduler, words):
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        if words:
-            threading.Thread(target=answering, args=(server, words), daemon=True).start()
-        why = "what listens there speaks another protocol" if words else "what listens there says nothing"
-        no_scheduler(f"tcp://127.0.0.1:{server.getsockname()[1]}", why)
-
-
-def answering(server, words):
-    """Say the words to whoever comes, until the server is closed."""
-    with suppress(OSError):
-        while True:
-            connection, _ = server.accept()
-            connection.sendall(10 * words)
 
 
 def test_a_study_that_cannot_go_on_where_it_was_begun_keeps_its_folder(mine, undrawn, capsys):

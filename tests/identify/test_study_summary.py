@@ -68,12 +68,18 @@ def of_point(frame, factors):
     return frame[np.logical_and.reduce([frame[path] == value for path, value in factors.items()])]
 
 
-def test_band_of_the_mean_is_students():
+def test_statistics_of_a_point_are_numpys_its_bands_students_and_a_bootstraps():
     values = np.random.default_rng(0).gamma(2.0, size=12)
     found = point_statistics(values)
     assert (found.mean, found.std) == (pytest.approx(np.mean(values)), pytest.approx(np.std(values, ddof=1)))
     assert found.rms == pytest.approx(np.sqrt(np.mean(values**2)))
     assert found.mean_band == pytest.approx(tuple(stats.ttest_1samp(values, 0.0).confidence_interval(0.95)))
+    many = np.sqrt(np.random.default_rng(2).chisquare(12, 300) / 12)
+    oracle = stats.bootstrap((many,), lambda v, axis: np.sqrt(np.mean(v**2, axis=axis)), rng=0).confidence_interval
+    np.testing.assert_allclose(point_statistics(many).rms_band, oracle, rtol=0.005)
+    alone, zeros = point_statistics(np.array([3.0])), point_statistics(np.zeros(5))
+    assert (alone.std, alone.mean_band, alone.rms_band) == (None, None, None)
+    assert zeros.mean_band == zeros.rms_band == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -90,21 +96,8 @@ def test_band_of_the_rms_covers_it_as_often_as_it_says(count, freedom, least, mo
     assert stats.binom.ppf(0.001, trials, least) <= covered <= stats.binom.ppf(0.999, trials, most)
 
 
-def test_band_of_the_rms_agrees_with_a_bootstrap_of_many_rows():
-    values = np.sqrt(np.random.default_rng(2).chisquare(12, 300) / 12)
-    oracle = stats.bootstrap((values,), lambda v, axis: np.sqrt(np.mean(v**2, axis=axis)), rng=0).confidence_interval
-    np.testing.assert_allclose(point_statistics(values).rms_band, oracle, rtol=0.005)
-
-
-def test_one_row_has_no_band_and_zeros_have_one_of_no_width():
-    alone = point_statistics(np.array([3.0]))
-    assert (alone.std, alone.mean_band, alone.rms_band) == (None, None, None)
-    zeros = point_statistics(np.zeros(5))
-    assert zeros.mean_band == zeros.rms_band == (0.0, 0.0)
-
-
-def test_points_hold_the_statistics_of_their_rows_and_none_of_the_failed(written):
-    frame, entry, _ = written
+def test_points_and_laws_are_those_of_the_rows_that_worked_and_the_failed_are_counted_and_named(written):
+    frame, entry, folder = written
     assert len(entry["points"]) == 6
     for point in entry["points"]:
         rows, figure = of_point(frame[frame["error"] == ""], point["factors"]), point["figures"][POSITION]
@@ -112,28 +105,19 @@ def test_points_hold_the_statistics_of_their_rows_and_none_of_the_failed(written
         assert figure["mean"] == pytest.approx(rows[POSITION].mean())
         assert figure["rms"] == pytest.approx(np.sqrt((rows[POSITION] ** 2).mean()))
         assert figure["rms_band"][0] < figure["rms"] < figure["rms_band"][1]
-
-
-def test_failed_rows_are_counted_and_named(written):
-    _, entry, folder = written
     assert entry["rows"] == {"planned": 48, "done": 45, "failed": 3, "missing": 0}
     assert entry["failures"]["reasons"] == {"LostError: only 1 stickers": 2, "LostError: only 0 stickers": 1}
     assert [one["row"] for one in entry["failures"]["first"]] == [4, 7, 9]
-    text = (folder / "summary.md").read_text()
-    for words in ("45 rows done, 3 failed, 0 missing", "2 x LostError: only 1 stickers", "The first: 4, 7, 9."):
-        assert words in text
-
-
-def test_json_holds_the_laws_with_numbers_and_units(written):
-    folder = written[2]
     stored = json.loads((folder / "summary.json").read_text())
     law = stored["theory"][0]
     assert (law["verdict"], law["rows"]) == ("passed", 45)
     assert law["low"] < 1.0 < law["high"]
-    assert stored["units"][DARK] == "electrons"
-    assert stored["units"][POSITION] == "um"
+    assert (stored["units"][DARK], stored["units"][POSITION]) == ("electrons", "um")
     assert stored["confidence"] == {"bands": 0.95, "laws": 0.99}
-    assert "| position_rms_um ~ sensor.camera.dark_noise ^ 1 | 1 |" in (folder / "summary.md").read_text()
+    text = (folder / "summary.md").read_text()
+    for words in ("45 rows done, 3 failed, 0 missing", "2 x LostError: only 1 stickers", "The first: 4, 7, 9."):
+        assert words in text
+    assert "| position_rms_um ~ sensor.camera.dark_noise ^ 1 | 1 |" in text
 
 
 def test_figures_show_each_factor_two_as_a_map_and_the_laws(written):
@@ -155,20 +139,19 @@ def test_long_title_stays_within_the_figure_of_a_single_law():
     assert title.y0 > figure.axes[0].title.get_window_extent().y1
 
 
-def test_single_repeat_has_no_band_and_says_so(tmp_path, undrawn):
-    study = made_study(repeats=1)
-    entry = summary.write(tmp_path, study, made_table(study))
+def test_what_a_study_lacks_is_said(tmp_path, undrawn):
+    """Bands of a single repeat; rows that worked; rows at all; units of a kind of one's own."""
+    single, whole = made_study(repeats=1), made_study(kind="my_rows:count")
+    entry = summary.write(tmp_path, single, made_table(single))
     assert entry["points"][0]["figures"][POSITION]["rms_band"] is None
     assert "With a single repeat there is no band" in (tmp_path / "summary.md").read_text()
-
-
-def test_study_of_which_nothing_worked_or_much_is_missing_says_so(tmp_path, undrawn):
-    study = made_study(repeats=1)
-    entry = summary.write(tmp_path / "a", study, made_table(study, failed=range(study.rows)))
+    entry = summary.write(tmp_path, single, made_table(single, failed=range(single.rows)))
     assert (entry["points"], entry["theory"][0]["verdict"]) == ([], "undecided")
-    assert "0 rows done, 6 failed" in (tmp_path / "a" / "summary.md").read_text()
-    study = made_study()
-    assert summary.write(tmp_path / "b", study, made_table(study).head(20))["rows"]["missing"] == 28
+    assert "0 rows done, 6 failed" in (tmp_path / "summary.md").read_text()
+    entry = summary.write(tmp_path, whole, made_table(whole).head(20))
+    assert entry["rows"]["missing"] == 28
+    assert set(entry["units"]) == {DARK, BASELINE}
+    assert entry["points"][0]["figures"][ORIENTATION]["rows"] == 4
 
 
 def test_figure_that_some_rows_do_not_have_is_that_of_the_others(tmp_path):
@@ -186,16 +169,7 @@ def test_figure_that_some_rows_do_not_have_is_that_of_the_others(tmp_path):
     assert not any("nan" in path.read_text().lower() for path in (tmp_path / "summary.json", tmp_path / "summary.md"))
 
 
-def test_power_of_a_text_is_undecided_and_the_figures_are_drawn_without_it(tmp_path):
-    study = made_study(
-        factors={DARK: [10.0], METHOD: ["registration", "planes"]},
-        theory=[Law(figure=POSITION, factor=METHOD, exponent=1.0)],
-    )
-    assert summary.write(tmp_path, study, made_table(study))["theory"][0]["verdict"] == "undecided"
-    assert (tmp_path / "figures" / f"by_{METHOD}.png").exists()
-
-
-def test_law_against_a_figure_needs_no_factor(tmp_path):
+def test_law_against_a_figure_needs_no_factor_and_one_of_a_texts_power_is_undecided_and_not_drawn(tmp_path):
     def figures(_, rng):
         sight = rng.uniform(1.0, 4.0)
         return {"sight_m": sight, POSITION: sight**2 * np.sqrt(rng.chisquare(12) / 12)}
@@ -203,27 +177,21 @@ def test_law_against_a_figure_needs_no_factor(tmp_path):
     study = made_study(factors={}, repeats=60, theory=[Law(figure=POSITION, factor="sight_m", exponent=2.0)])
     assert summary.write(tmp_path, study, made_table(study, figures=figures))["theory"][0]["verdict"] == "passed"
     assert (tmp_path / "figures" / "laws.png").exists()
+    factors = {DARK: [10.0], METHOD: ["registration", "planes"]}
+    study = made_study(factors=factors, theory=[Law(figure=POSITION, factor=METHOD, exponent=1.0)])
+    assert summary.write(tmp_path, study, made_table(study))["theory"][0]["verdict"] == "undecided"
+    assert (tmp_path / "figures" / f"by_{METHOD}.png").exists()
 
 
-def test_random_sample_is_summarised_as_a_whole_and_checked(tmp_path):
+def test_random_sample_is_summarised_as_a_whole_and_its_points_stand_in_order_with_digits_to_read(tmp_path):
     study = made_study(sample=200, repeats=1, factors={DARK: Range(low=10.0, high=40.0), BASELINE: [0.5, 1.0]})
     entry = summary.write(tmp_path, study, made_table(study))
     assert [point["factors"] for point in entry["points"]] == [{}]
     assert entry["points"][0]["figures"][POSITION]["rows"] == 200
     assert entry["theory"][0]["verdict"] == "passed"
     assert (tmp_path / "figures" / f"by_{DARK}.png").exists()
-
-
-def test_points_of_a_sample_stand_in_order_with_digits_to_read(tmp_path, undrawn):
     study = made_study(sample=3, repeats=2, factors={DARK: Range(low=10.0, high=40.0)}, theory=[])
     frame = made_table(study).assign(**{DARK: [31.23456789012345, 12.0, 25.5] * 2})
     summary.write(tmp_path, study, frame)
     lines = (tmp_path / "summary.md").read_text().splitlines()
     assert [line.split("|")[1].strip() for line in lines[-3:]] == ["12", "25.5", "31.2346"]
-
-
-def test_kind_of_ones_own_has_no_units_but_a_summary(tmp_path, undrawn):
-    study = made_study(kind="my_rows:count")
-    entry = summary.write(tmp_path, study, made_table(study))
-    assert set(entry["units"]) == {DARK, BASELINE}
-    assert entry["points"][0]["figures"][ORIENTATION]["rows"] == 8

@@ -4,9 +4,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import cumulative_simpson
 
-from dynamics import load_robot
 from identify.errors import TrajectoryError
 from identify.trajectory import FourierTrajectory, check_travel, random_trajectory
+from tests.identify.synthetic import rss6
 
 HOME = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
 
@@ -52,27 +52,14 @@ def test_amplitude_fills_the_box(seed):
     np.testing.assert_allclose(largest, [0.01] * 3 + [0.04] * 3, rtol=1e-3)
 
 
-def test_period_is_that_of_the_fundamental():
-    trajectory = random_one(4)
-    t = np.linspace(0, 10, 50)
+def test_a_trajectory_has_its_fundamentals_period_and_its_seeds_frozen_coefficients():
+    trajectory, t = random_one(4), np.linspace(0, 10, 50)
     np.testing.assert_allclose(trajectory.pose(t + 10), trajectory.pose(t), atol=1e-12)
-
-
-def test_same_seed_same_trajectory_other_seed_another():
-    np.testing.assert_array_equal(random_one(5).sine, random_one(5).sine)
-    assert not np.allclose(random_one(5).sine, random_one(6).sine)
-
-
-def test_shapes_of_one_time_and_of_many():
-    trajectory = random_one(0)
-    assert trajectory.pose(0.3).shape == (6,)
-    assert trajectory.pose(np.zeros(7)).shape == (7, 6)
-    assert trajectory.pose_acceleration(np.zeros(7)).shape == (7, 6)
-
-
-def test_coefficients_are_frozen():
+    np.testing.assert_array_equal(random_one(4).sine, trajectory.sine)
+    assert not np.allclose(random_one(5).sine, trajectory.sine)
+    assert (trajectory.pose(0.3).shape, trajectory.pose_acceleration(np.zeros(7)).shape) == ((6,), (7, 6))
     with pytest.raises(ValueError, match="read-only"):
-        random_one(0).sine[0, 0] = 1.0
+        trajectory.sine[0, 0] = 1.0
 
 
 def test_wrong_shapes_and_too_few_harmonics_are_refused():
@@ -84,30 +71,16 @@ def test_wrong_shapes_and_too_few_harmonics_are_refused():
         random_one(0, harmonics=1)
 
 
-@pytest.fixture(scope="module")
-def robot():
-    return load_robot("rss6")
-
-
-def turning_one_crank(robot, crank, angle):
-    """One harmonic of 1 Hz that is at t = 0.25 s where this crank alone is turned by `angle` [rad]."""
-    pose = robot.forward_kinematics(np.where(np.arange(6) == crank, angle, 0.0))
-    return FourierTrajectory(1.0, (2 * np.pi * (pose - HOME))[:, None], np.zeros((6, 1)), HOME)
-
-
-def test_travel_names_time_leg_angle_and_limit(robot):
-    trajectory = turning_one_crank(robot, 1, 0.3)
+def test_travel_is_the_largest_angle_and_refused_with_time_leg_angle_and_limit_or_what_is_out_of_reach():
+    """One harmonic of 1 Hz that is at t = 0.25 s where the second crank alone is turned by 0.3 rad; and 1 m in x."""
+    robot, times = rss6(), np.arange(5) / 16
+    turned = robot.forward_kinematics(np.array([0.0, 0.3, 0.0, 0.0, 0.0, 0.0])) - HOME
+    one_crank, far = (
+        FourierTrajectory(1.0, 2 * np.pi * np.reshape(way, (6, 1)), np.zeros((6, 1)), HOME)
+        for way in (turned, [1.0, 0, 0, 0, 0, 0])
+    )
+    assert check_travel(robot, one_crank, times) == pytest.approx(0.3, abs=1e-9)
     with pytest.raises(TrajectoryError, match=r"theta\| in rad of leg 2 of rss6 is 0\.3 at t = 0\.25 s, limit 0\.2948"):
-        check_travel(robot, trajectory, np.arange(5) / 16, margin_rad=0.7)
-
-
-def test_travel_inside_the_limit_returns_the_largest_angle(robot):
-    assert check_travel(robot, turning_one_crank(robot, 1, 0.3), np.arange(5) / 16) == pytest.approx(0.3, abs=1e-9)
-
-
-def test_pose_out_of_reach_keeps_the_robots_evidence(robot):
-    sine = np.zeros((6, 1))
-    sine[0, 0] = 2 * np.pi  # x = 1 m sin(2 pi t), further than a crank of 0.06 m brings the platform
-    far = FourierTrajectory(1.0, sine, np.zeros((6, 1)), HOME)
+        check_travel(robot, one_crank, times, margin_rad=0.7)
     with pytest.raises(TrajectoryError, match=r"reach margin of leg \d of rss6 is -.* must be > 0"):
-        check_travel(robot, far, np.arange(5) / 16)
+        check_travel(robot, far, times)
