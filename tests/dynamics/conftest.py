@@ -139,6 +139,11 @@ def motion(robot: dynamics.Robot) -> Motion:
     return Motion(robot.home_pose, BOX * rng.uniform(0.5, 1, 6), rng.uniform(4, 9, 6), rng.uniform(0, 6, 6))
 
 
+def at_rest(pose: np.ndarray, frames: int) -> closed_loop.Reference:
+    """A reference that stays at a pose (6,)."""
+    return closed_loop.Reference(np.tile(pose, (frames, 1)), np.zeros((frames, 6)))
+
+
 @dataclass(frozen=True)
 class Loop:
     """Closed-loop runs of one robot: references, settings and parameters (67,) that serve where no others are given."""

@@ -12,7 +12,7 @@ import pytest
 from dynamics import closed_loop, compilation, robot_file, simulate_batch
 from dynamics import robot as robot_module
 from dynamics.errors import DynamicsError, SimulationError
-from tests.dynamics.conftest import assert_same
+from tests.dynamics.conftest import assert_same, at_rest
 
 PERIOD = 1 / 60
 TIMINGS = {
@@ -173,9 +173,9 @@ def test_a_controller_is_asked_with_copies_where_the_frame_was_measured(robot, l
 def test_run_starts_in_equilibrium(robot, loop):
     """With the reference at rest, away from home, nothing moves and the torque holds the weight exactly."""
     pose = robot.home_pose + np.array([0.005, -0.004, 0.006, 0.02, -0.01, 0.03])
-    poses = np.tile(pose, (60, 1))
-    run = loop.run(closed_loop.Reference(poses, 0 * poses))
-    np.testing.assert_allclose(run.pose, poses, atol=1e-14)
+    reference = at_rest(pose, 60)
+    run = loop.run(reference)
+    np.testing.assert_allclose(run.pose, reference.poses, atol=1e-14)
     weight = robot.static_torque(pose, loop.parameters[:64])
     np.testing.assert_allclose(run.torque, np.tile(weight, (60, 1)), atol=1e-11)
 

@@ -10,7 +10,7 @@ from scipy.optimize import fsolve
 from dynamics import closed_loop
 from dynamics.closed_loop import FrictionLaw, JointElasticity
 from dynamics.parameters import COULOMB, PARAMETER_NAMES
-from tests.dynamics.conftest import assert_same
+from tests.dynamics.conftest import assert_same, at_rest
 
 GRAVITY = 9.81
 CRANK_IZZ = [PARAMETER_NAMES.index(f"crank{leg}.Izz") for leg in range(1, 7)]
@@ -65,7 +65,7 @@ def test_a_load_sinks_to_the_pose_of_least_energy(loop, robot, frictionless, leg
     start = closed_loop.equilibrium(robot, stiff_loop, pose, settings.servo, elasticity=SOFT)
     loaded = stiff_loop.copy()
     loaded[0] += 8.0
-    reference = closed_loop.Reference(np.tile(pose, (300, 1)), np.zeros((300, 6)))
+    reference = at_rest(pose, 300)
     commands = np.tile(start.commands[0], (300, 1))
     run = loop.run(reference, settings, loaded, start=start, commands=commands)
     np.testing.assert_allclose(run.motor_angle[-1], commands[0], atol=1e-8)
@@ -81,7 +81,7 @@ def test_the_equilibrium_is_the_pose_of_least_energy_and_stays(loop, robot, fric
     start = closed_loop.equilibrium(robot, frictionless, pose, settings.servo, elasticity=SOFT)
     least = _least_energy(pose + 1e-5, start.motor_angle, SOFT.stiffness, frictionless[:64], robot, legs_at)
     np.testing.assert_allclose(least, pose, atol=1e-8)
-    reference = closed_loop.Reference(np.tile(pose, (20, 1)), np.zeros((20, 6)))
+    reference = at_rest(pose, 20)
     run = loop.run(reference, settings, frictionless)
     np.testing.assert_allclose(run.pose, reference.poses, atol=1e-13)
 
@@ -141,12 +141,3 @@ def test_both_paths_stick_and_slip_alike(loop, make_elastic, friction):
     ours, plain = (loop.run(rest, settings, start=start, compiled=compiled) for compiled in (True, False))
     assert_same(ours, plain, 1e-11)
     assert ours.events > 3
-
-
-def test_a_run_from_the_state_of_another_repeats_its_rest(loop, make_elastic):
-    reference, settings = loop.reference(30), make_elastic(SOFT)
-    run = loop.run(reference, settings)
-    rest = closed_loop.Reference(reference.poses[17:], reference.rates[17:])
-    again = loop.run(rest, settings, start=run.state_at(17))
-    np.testing.assert_array_equal(again.pose, run.pose[17:])
-    np.testing.assert_array_equal(again.motor_rate, run.motor_rate[17:])

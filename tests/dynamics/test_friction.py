@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from dynamics import closed_loop
 from dynamics.closed_loop.motion import Command, State
 from dynamics.closed_loop.problem import LENGTH, FrictionLaw
 from dynamics.closed_loop.stick_slip import StickSlipMotion
 from dynamics.rigid_body import equation_of_motion as model
-from tests.dynamics.conftest import BOX
+from tests.dynamics.conftest import BOX, at_rest
 
 MASS, STIFFNESS, COULOMB = 0.8, 20.0, 1.0
 FREQUENCY = np.sqrt(STIFFNESS / MASS)
@@ -208,12 +207,11 @@ def test_platform_stays_below_breakaway_and_moves_when_the_integrator_reaches_it
     """A minute with joint 3 loaded up to 0.6 of its dry friction: the pose does not change by one bit, no event. With
     lp d + li d t growing, it holds until that reaches f_c, to the frame; the other joints stay stuck."""
     lp, li, _ = identified[64:]
-    poses = np.tile(robot.home_pose, (3600, 1))
-    reference = closed_loop.Reference(poses, 0 * poses)
+    reference = at_rest(robot.home_pose, 3600)
     below, beyond = (loop.run(reference, commands=np.tile(d * np.eye(6)[2], (3600, 1))) for d in (3e-5, 1e-4))
     load = np.abs(below.torque[:, 2] - below.torque[0, 2]).max() + lp * 3e-5
     assert 0.5 < load / identified[54] < 0.8
-    np.testing.assert_array_equal(below.pose, poses)
+    np.testing.assert_array_equal(below.pose, reference.poses)
     np.testing.assert_array_equal(below.pose_rate, 0)
     assert below.events == 0
     # The jump of the first command also acts through U_dot, but during frame 0 only and below breakaway.

@@ -100,15 +100,18 @@ def _moved(start, direction):
     return replace(start, **changes)
 
 
-@pytest.mark.parametrize("timing", TIMINGS)
+@pytest.mark.parametrize("timing", [*TIMINGS, "elastic joints"])
 def test_a_run_from_the_state_of_another_repeats_its_rest(loop, timing):
     """Bit by bit: the state is complete. Joints stick at some of these frames, and commands are on their way."""
-    reference, settings = loop.reference(45), loop.settings(**TIMINGS[timing])
+    reference, settings, names = loop.reference(45), loop.settings(**TIMINGS.get(timing, {"steps": 80})), RECORDS
+    if timing == "elastic joints":
+        settings = replace(settings, elasticity=closed_loop.JointElasticity(500.0, 3e-4, 0.02))
+        names = (*RECORDS, "motor_angle", "motor_rate")
     run = loop.run(reference, settings)
     assert run.state_at(0) is run.start
     for frame in (0, 3, FRAME, 33):
         rest = loop.run(_from(reference, frame), settings, start=run.state_at(frame))
-        for name in RECORDS:
+        for name in names:
             np.testing.assert_array_equal(getattr(rest, name), getattr(run, name)[frame:], err_msg=name)
 
 
