@@ -1,11 +1,22 @@
-"""Sensors for the tests: with real lenses and other changes of their file, taught without any error."""
+"""Sensors with real lenses and other changes of their file, taught without error; ellipses in windows; statistics."""
+
+from dataclasses import replace
 
 import numpy as np
+import pytest
+from scipy.stats import chi2
 
 import cmmsim
+from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import apply, invert, pose_to_transform
+from cmmsim.imaging.exposure import SUPERSAMPLING
+from cmmsim.radiometry.noise import CameraNoise
+
+CAMERA = PinholeCamera(2300.0, 1023.5, 767.5, 2048, 1536)
+NOISE = CameraNoise(electrons_at_white=1600.0, gain=0.13, dark_noise=26.0, full_well=1800.0, black_level=16.0)
 
 LEFT = {"focal_px": [2295.0, 2301.5], "centre_px": [1017.2, 771.9], "distortion": [-0.11, 0.07, 4e-4, -3e-4, 0.0]}
 RIGHT = {"focal_px": [2306.0, 2304.0], "centre_px": [1030.1, 760.4]}
@@ -58,17 +69,54 @@ def corners_about(sensor, pose, size):
     return np.rint(expected_centres(sensor, pose) - 0.5 * (size - 1)).astype(int)
 
 
+def centre_errors(sensor, pose, supersampling=SUPERSAMPLING, size=16):
+    """Fitted minus expected ellipse centres (36, 2) px from unrounded noise-free windows."""
+    corners, noise = corners_about(sensor, pose, size), replace(sensor.noise, enabled=False)
+    grey = noise.mean_grey(sensor.camera.radiance(placed_at(sensor, pose), corners, size, supersampling))
+    grey = replace(sensor.observer, noise=noise).evenly_lit(grey, corners)
+    flat, psf_px = corners.reshape(-1, 2), sensor.optics.psf_px
+    fits = fit_ellipses(grey.reshape(-1, size, size), flat, noise, size - 2, psf_px=psf_px)
+    assert fits.good.all()
+    return fits.centres - expected_centres(sensor, pose).reshape(-1, 2)
+
+
 def pose_errors(sensor, poses, **look):
     """Errors (n, 6) of the poses measured near the true ones, um and urad, and the measurements."""
     found = [sensor.estimator.measure(sensor.look(pose, **look), camera_from(sensor, pose))[0] for pose in poses]
     return 1e6 * (np.array([m.pose for m in found]) - poses), found
 
 
+def squares(errors, covariances):
+    """Squared errors (...,) in units of their covariances."""
+    return np.einsum("...i,...ij,...j->...", errors, np.linalg.inv(covariances), errors)
+
+
 def squared_error(measured, pose):
     """In units of the stated covariance: chi-square with six degrees of freedom."""
-    error = measured.pose - pose
-    return error @ np.linalg.solve(measured.covariance, error)
+    return squares(measured.pose - pose, measured.covariance)
 
 
 def squared_errors(found, poses):
     return np.array([squared_error(m, pose) for m, pose in zip(found, poses, strict=True)])
+
+
+def require_true(squared, freedom=6):
+    """The mean of independent chi-square numbers lies where it does but for 27 in 10,000 times (three deviations)."""
+    low, high = chi2.ppf([0.00135, 0.99865], freedom * np.size(squared)) / np.size(squared)
+    assert low < np.mean(squared) < high, (low, np.mean(squared), high)
+
+
+def refused(call, message, kind=cmmsim.CmmError):
+    """What is wrong is said in one short line."""
+    with pytest.raises(kind, match=message) as error:
+        call()
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 500
+
+
+def random_ellipses(rng, count, size, radii=(3.8, 2.4)):
+    """Centres (count, 2) within 1 px of the middle of windows of ``size`` px, and shapes (count, 2, 2), turned at
+    random."""
+    angle = rng.uniform(0.0, np.pi, count)
+    turn = np.stack([np.stack([np.cos(angle), -np.sin(angle)], -1), np.stack([np.sin(angle), np.cos(angle)], -1)], 1)
+    return 0.5 * (size - 1) + rng.uniform(-1.0, 1.0, (count, 2)), turn @ np.diag(radii) @ turn.transpose(0, 2, 1)

@@ -21,7 +21,7 @@ from cmmsim.acceptance.moving_bar import bar_run, relative_covariance, relative_
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import rig_from_file
 from cmmsim.geometry.pose import apply, rotation_exp, transform_to_pose
-from cmmsim.pose_estimation.estimator import Measurement
+from cmmsim.pose_estimation.estimator import lost_measurement
 
 FILE = read_sensor_file("ctrack780")
 SILENT = FILE.model_copy(update={"camera": FILE.camera.model_copy(update={"noise": False})})
@@ -84,16 +84,15 @@ def test_lengths_and_their_deviations_by_hand():
 
 
 def pose_measurement(transform, covariance=None):
-    return Measurement(
-        transform_to_pose(transform),
-        np.eye(6) if covariance is None else covariance,
-        np.zeros((0, 3)),
-        np.zeros((0, 3, 3)),
-        np.zeros((0, 2)),
-        np.zeros((0, 2)),
-        np.array([], dtype=str),
-        True,
+    covariance = np.eye(6) if covariance is None else covariance
+    return replace(
+        lost_measurement("made up"), pose=transform_to_pose(transform), covariance=covariance, ok=True, reason=""
     )
+
+
+def errors_along(under_test, volume, line):
+    sensor = under_test.facing(length_artefact(line), 1)
+    return [length.error for length in measure_line(sensor, volume, line, 1)]
 
 
 def test_relative_error_of_known_poses():
@@ -109,17 +108,14 @@ def test_relative_error_of_known_poses():
 
 def test_relative_covariance_against_sampling():
     """Poses with drawn errors: the spread of the relative pose is the predicted one."""
-    rng = np.random.default_rng(5)
-    first, second = np.eye(4), np.eye(4)
+    rng, first, along = np.random.default_rng(5), np.eye(4), np.eye(4)
     first[:3, :3], first[:3, 3] = rotation_exp(np.array([0.2, 0.4, -0.3])), [0.1, 0.2, 1.4]
-    second[:3, :3] = first[:3, :3]
-    second[:3, 3] = first[:3, 3] + first[:3, :3] @ [0.3, 0.0, 0.0]
+    along[0, 3] = 0.3
     root = np.diag([1e-5, 2e-5, 3e-5, 1e-4, 2e-4, 3e-4]) @ (np.eye(6) + 0.3 * rng.standard_normal((6, 6)))
-    poses = [transform_to_pose(t) for t in (first, second)]
-    measured = [pose_measurement(t, root @ root.T) for t in (first, second)]
+    measured = [pose_measurement(transform, root @ root.T) for transform in (first, first @ along)]
     draws = []
     for _ in range(2000):
-        drawn = [replace(m, pose=pose + root @ rng.standard_normal(6)) for m, pose in zip(measured, poses, strict=True)]
+        drawn = [replace(m, pose=m.pose + root @ rng.standard_normal(6)) for m in measured]
         draws.append(relative_error(*drawn)[0])
     whitened = np.linalg.solve(np.linalg.cholesky(relative_covariance(*measured)), np.array(draws).T)
     np.testing.assert_allclose(np.cov(whitened), np.eye(6), atol=0.15)
@@ -169,21 +165,12 @@ def test_a_run_that_loses_the_bar_is_given_up(volume):
 
 def test_same_seed_same_numbers(volume):
     line = seven_lines(volume)[4]
-    runs = [
-        [
-            length.error
-            for length in measure_line(
-                SensorUnderTest(FILE, seed, "analytic").facing(length_artefact(line), 1), volume, line, 1
-            )
-        ]
-        for seed in (0, 0, 1)
-    ]
-    assert runs[0] == runs[1]
-    assert runs[0] != runs[2]
+    first, same, other = (errors_along(SensorUnderTest(FILE, seed, "analytic"), volume, line) for seed in (0, 0, 1))
+    assert first == same != other
 
 
-@pytest.mark.parametrize("latency", [0.0142])
-def test_latency_of_the_sensor_file_is_found_from_images(volume, latency):
+def test_latency_of_the_sensor_file_is_found_from_images(volume):
+    latency = 0.0142
     timing = FILE.timing.model_copy(update={"latency": latency})
     under_test = SensorUnderTest(FILE.model_copy(update={"timing": timing}), 0, "analytic")
     found = latency_test(under_test, volume, frames=60)

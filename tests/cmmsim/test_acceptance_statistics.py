@@ -9,12 +9,19 @@ from cmmsim.acceptance import PUBLISHED, estimate_latency, interval_of_mean, sum
 from cmmsim.acceptance.statistics import published
 
 
-def test_statistics_of_known_values():
-    """1 to 100: mean 50.5, mean square 101 * 201 / 6, largest 100."""
+def test_statistics_of_known_values_and_of_none():
+    """1 to 100: mean 50.5, mean square 101 * 201 / 6, largest 100; Student's t with two values: 12.706 times half of
+    their distance."""
     found = summarise(np.arange(1.0, 101.0), np.random.default_rng(0))
     assert (found.count, found.mean, found.maximum) == (100, 50.5, 100.0)
     assert found.rms == pytest.approx(np.sqrt(101 * 201 / 6))
     assert found.p95 == pytest.approx(95.05)
+    assert interval_of_mean(np.array([1.0, 3.0])) == pytest.approx((2.0 - 12.7062, 2.0 + 12.7062), rel=1e-5)
+    with pytest.raises(cmmsim.ShapeError, match="two values"):
+        interval_of_mean(np.array([1.0]))
+    for values in (np.zeros(0), np.array([1.0, np.nan]), np.zeros((2, 2))):
+        with pytest.raises(cmmsim.ShapeError, match="finite values"):
+            summarise(values, np.random.default_rng(0))
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say():
@@ -39,20 +46,6 @@ def test_blocks_widen_the_interval_of_dependent_values():
         widths.append(high - low)
     assert widths[1] == pytest.approx(widths[0] / np.sqrt(10.0), rel=0.15)
     assert widths[2] == pytest.approx(widths[0], rel=0.25)
-
-
-def test_interval_of_a_mean():
-    """Student's t with two values: 12.706 times half of their distance."""
-    low, high = interval_of_mean(np.array([1.0, 3.0]))
-    assert (low, high) == pytest.approx((2.0 - 12.7062, 2.0 + 12.7062), rel=1e-5)
-    with pytest.raises(cmmsim.ShapeError, match="two values"):
-        interval_of_mean(np.array([1.0]))
-
-
-@pytest.mark.parametrize("values", [np.zeros(0), np.array([1.0, np.nan]), np.zeros((2, 2))])
-def test_statistics_refuse_what_has_none(values):
-    with pytest.raises(cmmsim.ShapeError, match="finite values"):
-        summarise(values, np.random.default_rng(0))
 
 
 def ellipse(times):

@@ -9,6 +9,7 @@ import pytest
 import cmmsim
 from cmmsim.calibration import (
     Board,
+    BoardView,
     CalibrationError,
     CalibrationOptions,
     PairView,
@@ -26,9 +27,8 @@ from cmmsim.geometry.pose import apply, rotation_log
 from cmmsim.geometry.stereo_rig import StereoRig, toed_in_rig
 from cmmsim.imaging.analytic import ANALYTIC
 from cmmsim.imaging.pyrender_renderer import PYRENDER
-from cmmsim.radiometry.noise import CameraNoise
+from tests.cmmsim.sensors import NOISE
 
-NOISE = CameraNoise(1600.0, 0.13, 26.0, 1800.0, 16.0)
 DOTS = Board(kind="dots", columns=9, rows=7, spacing=0.05, radius=0.0125)
 ASYMMETRIC = Board(kind="asymmetric_dots", columns=4, rows=9, spacing=0.04, radius=0.014)
 CHESSBOARD = Board(kind="chessboard", columns=8, rows=6, spacing=0.05)
@@ -102,24 +102,17 @@ def views_of(frames, board):
 # --- the board in images
 
 
-@pytest.mark.parametrize("board", [DOTS, ASYMMETRIC, DOTS.model_copy(update={"dark": False})])
-def test_dots_are_found_to_hundredths_of_a_pixel(board):
-    errors = pixel_errors(PERFECT, board, *rendered(PERFECT, board, 2))
-    assert np.sqrt(np.mean(errors**2)) < 0.02
-    assert np.abs(errors.mean(axis=0)).max() < 0.004
-
-
-def test_blur_costs_little_because_it_is_fitted():
-    """Fits of sharp ellipses would be off by 0.05 px rms."""
-    errors = pixel_errors(PERFECT, DOTS, *rendered(PERFECT, DOTS, 1, optics=Optics(psf_px=0.8)))
-    assert np.sqrt(np.mean(errors**2)) < 0.02
-    assert np.abs(errors.mean(axis=0)).max() < 0.004
-
-
-@pytest.mark.slow
-def test_dots_are_found_as_well_behind_bending_lenses():
-    poses, frames = rendered(BENT, DOTS, 10, seed=3, optics=Optics(psf_px=0.4))
-    errors = pixel_errors(BENT, DOTS, poses[:2], frames[:2])
+@pytest.mark.parametrize(
+    ("rig", "board", "count", "seed", "psf_px"),
+    [
+        *((PERFECT, board, 2, 0, 0.0) for board in (DOTS, ASYMMETRIC, DOTS.model_copy(update={"dark": False}))),
+        (PERFECT, DOTS, 1, 0, 0.8),  # fits of sharp ellipses would be off by 0.05 px rms
+        pytest.param(BENT, DOTS, 10, 3, 0.4, marks=pytest.mark.slow),
+    ],
+)
+def test_dots_are_found_to_hundredths_of_a_pixel(rig, board, count, seed, psf_px):
+    poses, frames = rendered(rig, board, count, seed, optics=Optics(psf_px=psf_px))
+    errors = pixel_errors(rig, board, poses[:2], frames[:2])
     assert np.sqrt(np.mean(errors**2)) < 0.02
     assert np.abs(errors.mean(axis=0)).max() < 0.004
 
@@ -161,12 +154,9 @@ def test_no_board_is_a_reason_and_not_an_error():
     assert find_board(half, DOTS) == "no dots of 9 x 7 found"
 
 
-def test_chessboard_needs_pyrender():
+def test_boards_that_cannot_be_drawn_are_refused():
     with pytest.raises(CalibrationError, match="take the renderer pyrender, or a dot board"):
         rendered(PERFECT, CHESSBOARD, 1)
-
-
-def test_board_too_large_for_the_rig_is_refused():
     with pytest.raises(CalibrationError, match=r"shows the whole board of 2\.5 x 2 m"):
         board_poses(PERFECT, DOTS.model_copy(update={"spacing": 0.25}), 1, np.random.default_rng(0))
 
@@ -174,28 +164,24 @@ def test_board_too_large_for_the_rig_is_refused():
 # --- from images to cameras
 
 
-@pytest.fixture(scope="module")
-def dot_views():
-    _, frames = rendered(PERFECT, DOTS, 8, seed=3)
-    return views_of(frames, DOTS)
+@pytest.mark.parametrize(
+    ("rig", "board", "count", "seed", "renderer", "psf_px", "sigma_px"),
+    [
+        (PERFECT, DOTS, 8, 3, ANALYTIC, 0.0, 0.02),
+        pytest.param(BENT, DOTS, 10, 3, ANALYTIC, 0.4, 0.02, marks=pytest.mark.slow),
+        pytest.param(BENT, CHESSBOARD, 12, 8, PYRENDER, 0.4, 0.1, marks=pytest.mark.thorough),
+    ],
+)
+def test_rendered_boards_give_the_true_cameras(rig, board, count, seed, renderer, psf_px, sigma_px):
+    _, frames = rendered(rig, board, count, seed, renderer, Optics(psf_px=psf_px))
+    found = calibrate(board, views_of(frames, board), (800, 600))
+    assert len(found.used) == count
+    assert np.abs(normalised_errors(found, rig)).max() < 4.0
+    assert found.adjustment.sigma_px < sigma_px
 
 
-def test_rendered_dots_give_the_true_cameras(dot_views):
-    found = calibrate(DOTS, dot_views, (800, 600))
-    assert len(found.used) == 8
-    assert np.abs(normalised_errors(found, PERFECT)).max() < 4.0
-    assert found.adjustment.sigma_px < 0.02
-
-
-@pytest.mark.slow
-def test_rendered_dots_give_the_true_cameras_and_lenses():
-    found = calibrate(DOTS, views_of(rendered(BENT, DOTS, 10, seed=3, optics=Optics(psf_px=0.4))[1], DOTS), (800, 600))
-    assert len(found.used) == 10
-    assert np.abs(normalised_errors(found, BENT)).max() < 4.0
-
-
-def test_calibrated_sensor_file_is_one(dot_views, tmp_path):
-    found = calibrate(DOTS, dot_views, (800, 600))
+def test_calibrated_sensor_file_is_one(tmp_path):
+    found = calibrate(DOTS, views_of(rendered(PERFECT, DOTS, 8, seed=3)[1], DOTS), (800, 600))
     with pytest.raises(CalibrationError, match="800 x 600 px, those of the sensor file ctrack780 2048 x 1536"):
         sensor_template("ctrack780", tmp_path).filled(found)
     text = sensor_text("ctrack780").replace("width = 2048", "width = 800").replace("height = 1536", "height = 600")
@@ -218,9 +204,7 @@ def test_eccentricity_correction_removes_the_bias_of_large_dots():
     pairs = []
     for k, pose in enumerate(board_poses(BENT, board, 12, rng)):
         sides = [
-            cmmsim.calibration.BoardView(
-                np.arange(42), expected_pixels(c, m @ pose, board) + rng.normal(0, 0.005, (42, 2))
-            )
+            BoardView(np.arange(42), expected_pixels(c, m @ pose, board) + rng.normal(0, 0.005, (42, 2)))
             for c, m in zip(BENT.cameras, BENT.from_camera, strict=True)
         ]
         pairs.append(PairView(f"{k}", *sides))
@@ -280,10 +264,3 @@ def test_photograph_like_images_give_the_true_cameras(board, renderer, count):
     assert len(found.rejected) <= 3
     assert np.abs(normalised_errors(found, BENT)).max() < 5.0
     assert found.adjustment.sigma_px < 0.15
-
-
-@pytest.mark.thorough
-def test_rendered_chessboard_gives_the_true_cameras():
-    _, frames = rendered(BENT, CHESSBOARD, 12, seed=8, renderer=PYRENDER, optics=Optics(psf_px=0.4))
-    views = views_of(frames, CHESSBOARD)
-    assert np.abs(normalised_errors(calibrate(CHESSBOARD, views, (800, 600)), BENT)).max() < 4.0

@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 import cmmsim
 from cmmsim.radiometry.noise import CameraNoise, draw_pattern
-from tests.cmmsim.sensors import TWELVE_BIT, exact, squared_errors
+from tests.cmmsim.sensors import NOISE, TWELVE_BIT, exact, require_true, squared_errors
 
 GAIN, DARK_NOISE, WHITE, BLACK = 0.13, 26.0, 1600.0, 16.0
 CORNERS = np.array([[[200 + 400 * i, 150 + 300 * j] for i in range(4) for j in range(4)]] * 2)
@@ -109,7 +109,7 @@ def test_bit_depth_and_saturation(bits):
 
 def test_averaging_reduces_what_changes_but_not_the_pattern():
     """The variance of averaged exposures over many patterns, sampled, is as stated."""
-    noise = CameraNoise(WHITE, GAIN, DARK_NOISE, 1e6, BLACK, prnu=0.02, dsnu=10.0, frames=25)
+    noise = replace(NOISE, full_well=1e6, prnu=0.02, dsnu=10.0, frames=25)
     radiance, rng = np.full((200, 200), 0.6, dtype=np.float32), np.random.default_rng(1)
     pattern = draw_pattern(radiance.shape, noise.prnu, noise.dsnu, rng)
     grey = noise.mean_of_exposures(radiance, rng, 25, pattern)
@@ -120,4 +120,4 @@ def test_twelve_bits_measure_as_well_as_eight():
     sensor = exact("perfect", TWELVE_BIT)
     found = [sensor.measure(sensor.home) for _ in range(8)]
     assert all(len(m.target_ids) == 18 for m in found)
-    assert 3.0 < squared_errors(found, [sensor.home] * 8).mean() < 10.0  # 6 expected of 8 draws
+    require_true(squared_errors(found, [sensor.home] * 8))

@@ -11,7 +11,7 @@ from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import triangulate
 from cmmsim.pose_estimation.consistency import FEWEST, LARGEST_MISFIT, consistent, outline_misfits, place_misfits
 from cmmsim.pose_estimation.observation import DetectionSettings, Observer, Outlines, StickerObservation
-from tests.cmmsim.ellipses import NOISE
+from tests.cmmsim.sensors import NOISE
 from tests.cmmsim.test_covariance import BODY, CAMERA_FROM_BASE, FILE, RIG, pixel_covariances
 
 RADIUS = 0.003
@@ -50,26 +50,18 @@ def test_place_misfits_are_chi_square(stickers):
         assert kstest(np.array(found)[:, k], "chi2", args=(3,)).pvalue > 1e-4
 
 
-def test_displaced_sticker_is_left_out():
-    seen = observed(np.random.default_rng(2), range(18), shift_px=0.5)
+@pytest.mark.parametrize(("seed", "wrong"), [(2, {"shift_px": 0.5}), (3, {"shrink_px": 0.1})])
+def test_displaced_or_misshapen_sticker_is_left_out(seed, wrong):
+    seen = observed(np.random.default_rng(seed), range(18), **wrong)
     used, _ = consistent(seen, OBSERVER, BODY, BODY.nominal)
     np.testing.assert_array_equal(used.index, range(1, 18))
 
 
-def test_misshapen_sticker_is_left_out():
-    seen = observed(np.random.default_rng(3), range(18), shrink_px=0.1)
-    used, _ = consistent(seen, OBSERVER, BODY, BODY.nominal)
-    np.testing.assert_array_equal(used.index, range(1, 18))
-
-
-def test_four_stickers_of_which_one_is_wrong_are_refused():
-    with pytest.raises(LostError, match=r"4 visible stickers contradict each other, 3 are left .* squared misfit"):
-        consistent(observed(np.random.default_rng(4), [0, 5, 7, 12], shift_px=1.0), OBSERVER, BODY, BODY.nominal)
-
-
-def test_three_stickers_are_refused():
+def test_three_stickers_are_refused_and_four_of_which_one_is_wrong():
     with pytest.raises(LostError, match=f"3 visible stickers, at least {FEWEST} are needed"):
         consistent(observed(np.random.default_rng(5), [0, 7, 12]), OBSERVER, BODY, BODY.nominal)
+    with pytest.raises(LostError, match=r"4 visible stickers contradict each other, 3 are left .* squared misfit"):
+        consistent(observed(np.random.default_rng(4), [0, 5, 7, 12], shift_px=1.0), OBSERVER, BODY, BODY.nominal)
 
 
 def test_good_stickers_are_kept():

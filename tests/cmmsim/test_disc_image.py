@@ -10,8 +10,7 @@ from scipy.special import ndtr
 import cmmsim
 from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import fit_ellipses
-from cmmsim.geometry import disc_kernels
-from cmmsim.geometry.camera import Distortion, PinholeCamera
+from cmmsim.geometry.camera import Distortion
 from cmmsim.geometry.disc_image import (
     SHAPE_BASIS,
     bending,
@@ -19,16 +18,13 @@ from cmmsim.geometry.disc_image import (
     coverage,
     eccentricity,
     project_discs,
-    symmetric_root,
 )
 from cmmsim.geometry.pose import apply, invert, pose_to_transform
 from cmmsim.pose_estimation.observation import DetectionSettings, Observer
-from cmmsim.radiometry.noise import CameraNoise
 from tests.cmmsim import plain_coverage
-from tests.cmmsim.ellipses import random_ellipses
+from tests.cmmsim.sensors import CAMERA, NOISE, random_ellipses
 
-CAMERA = PinholeCamera(2300.0, 1023.5, 767.5, 2048, 1536)
-NOISE_FREE = CameraNoise(1600.0, 0.13, 26.0, 1800.0, 16.0, enabled=False)
+NOISE_FREE = replace(NOISE, enabled=False)
 BENT = Distortion(-0.12, 0.03, 1e-3, -7e-4, -4e-3)
 CENTRE = np.array([0.62, 0.42, 1.8])  # seen near the corner of the image
 RADIUS, LINES = 0.0075, 100  # m: a radius of some 9.6 px
@@ -61,17 +57,10 @@ def test_ellipse_of_a_disc_holds_its_projected_rim():
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     radii = rng.uniform(0.002, 0.03, 30)
     pixels, shapes = project_discs(CAMERA, centres, normals, radii)
+    np.testing.assert_array_equal(shapes, shapes.swapaxes(1, 2))
     for centre, normal, radius, middle, shape in zip(centres, normals, radii, pixels, shapes, strict=True):
         rim = CAMERA.project(centre + radius * circle(normal, 50))[0]
         np.testing.assert_allclose(np.linalg.norm(np.linalg.solve(shape, (rim - middle).T), axis=0), 1.0, atol=1e-9)
-
-
-def test_symmetric_root():
-    half = np.random.default_rng(8).normal(size=(5, 2, 2))
-    matrices = half @ half.swapaxes(1, 2)
-    roots = symmetric_root(matrices)
-    np.testing.assert_allclose(roots @ roots, matrices, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(roots, roots.swapaxes(1, 2))
 
 
 def test_eccentricity_is_that_of_the_conic_through_the_projected_rim():
@@ -197,17 +186,6 @@ def test_coverage_is_that_of_plain_numpy(radii):
         np.testing.assert_allclose(found, expected, atol=2e-12)
 
 
-@pytest.mark.parametrize("psf_px", [0.2, 0.5, 1.5])
-def test_blurred_coverage_is_that_of_plain_numpy(psf_px):
-    centres, shapes = random_ellipses(np.random.default_rng(1), 20, 16)
-    for found, expected in zip(
-        coverage(centres, shapes, 16, psf_px),
-        plain_coverage.blurred_coverage(centres, shapes, 16, psf_px),
-        strict=True,
-    ):
-        np.testing.assert_allclose(found, expected, atol=1e-7)
-
-
 def integrated(centre, shape, psf_px, rings=120, rays=240):
     """Light of each pixel by quadrature over the whole disc in polar coordinates; (20, 20)."""
     node, weight = np.polynomial.legendre.leggauss(rings)
@@ -219,12 +197,17 @@ def integrated(centre, shape, psf_px, rings=120, rays=240):
     return (y * area) @ x.T
 
 
-@pytest.mark.parametrize("psf_px", [0.3, 0.5, 1.0, 2.0])
-def test_shares_match_brute_force_integration(psf_px):
+@pytest.mark.parametrize(
+    ("psf_px", "limit"), [(0.2, 1e-7), (0.3, 1e-7), (0.5, 1e-7), (1.0, 1e-6), (1.5, 1e-7), (2.0, 1e-7)]
+)
+def test_blurred_shares_and_their_derivatives_match_brute_force_integration(psf_px, limit):
     centres, shapes = random_ellipses(np.random.default_rng(0), 3, 20)
-    shares, _ = coverage(centres, shapes, 20, psf_px)
-    for centre, shape, share in zip(centres, shapes, shares, strict=True):
+    for centre, shape, share, slopes in zip(centres, shapes, *coverage(centres, shapes, 20, psf_px), strict=True):
         np.testing.assert_allclose(share, integrated(centre, shape, psf_px), atol=2e-7)
+        for k, unit in enumerate(2e-5 * np.eye(5)):
+            turn = np.tensordot(unit[2:], SHAPE_BASIS, 1)
+            ahead, behind = (integrated(centre + s * unit[:2], shape + s * turn, psf_px) for s in (1.0, -1.0))
+            np.testing.assert_allclose(slopes[..., k], (ahead - behind) / 4e-5, rtol=0.0, atol=limit)
 
 
 @pytest.mark.parametrize("psf_px", [0.05, 0.4, 1.0])
@@ -245,22 +228,3 @@ def test_derivatives_match_finite_differences(psf_px, step, limit):
         turn = np.tensordot(unit[2:], SHAPE_BASIS, 1)
         ahead, behind = (coverage(centres + s * unit[:2], shapes + s * turn, 18, psf_px)[0] for s in (1.0, -1.0))
         np.testing.assert_allclose(derivatives[..., k], (ahead - behind) / (2.0 * step), atol=limit)
-
-
-def test_kernels_compute_the_same_uncompiled():
-    centres, shapes = random_ellipses(np.random.default_rng(4), 1, 16)
-    for kernel, more in ((disc_kernels.cover_window, ()), (disc_kernels.blur_window, (0.6,))):
-        results = []
-        for function in (kernel, kernel.py_func):
-            shares, derivatives = np.empty((16, 16)), np.empty((16, 16, 5))
-            function(*centres[0], shapes[0], *more, shares, derivatives)
-            results.append(np.dstack([shares, derivatives]))
-        np.testing.assert_allclose(*results, atol=1e-13)
-    m = np.linalg.inv(shapes[0])
-    for x, y in ((0.2, 0.1), (3.0, 1.0), (2.2, -2.0), (9.0, 9.0)):
-        np.testing.assert_allclose(
-            disc_kernels.cover_pixel(x, y, m), disc_kernels.cover_pixel.py_func(x, y, m), atol=1e-14
-        )
-    sides = np.random.default_rng(5).normal(size=(200, 4))
-    for side in sides:
-        np.testing.assert_allclose(disc_kernels.side_share(*side), disc_kernels.side_share.py_func(*side), atol=1e-14)

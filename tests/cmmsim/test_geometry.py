@@ -10,18 +10,13 @@ from scipy.spatial.transform import Rotation
 from cmmsim.errors import LostError
 from cmmsim.geometry import point_kernels
 from cmmsim.geometry import pose as p
-from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.plane_frame import fit_plane, frame_from_planes, frame_of_points
 from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import toed_in_rig, triangulate
+from tests.cmmsim.sensors import CAMERA
 
 ANGLE = st.floats(-1.4, 1.4)
-CAMERA = PinholeCamera(2300.0, 1023.5, 767.5, 2048, 1536)
-
-
-@pytest.fixture
-def rig():
-    return toed_in_rig(CAMERA, 1.0, np.array([1.44, 0.0, 1.28]), np.array([0.3, 0.0, 0.18]))
+RIG, CAMERA_FROM_BASE = toed_in_rig(CAMERA, 1.0, np.array([1.44, 0.0, 1.28]), np.array([0.3, 0.0, 0.18]))
 
 
 @given(ANGLE, ANGLE, ANGLE)
@@ -55,14 +50,13 @@ def test_euler_rates_match_finite_differences():
         np.testing.assert_allclose(turn.as_rotvec() / 2e-6, matrix[:, k], atol=1e-7)
 
 
-def test_noise_free_triangulation_returns_the_points(rig):
-    stereo, camera_from_base = rig
+def test_noise_free_triangulation_returns_the_points():
     points = np.random.default_rng(1).uniform([0.0, -0.2, 0.1], [0.6, 0.2, 0.4], (50, 3))
-    in_camera = p.apply(camera_from_base, points)
-    pixels, valid = stereo.project(in_camera)
+    in_camera = p.apply(CAMERA_FROM_BASE, points)
+    pixels, valid = RIG.project(in_camera)
     assert valid.all()
     spread = np.broadcast_to(1e-4 * np.eye(2), (50, 2, 2))
-    found = triangulate(stereo, pixels[0], pixels[1], spread, spread)
+    found = triangulate(RIG, *pixels, spread, spread)
     assert np.abs(found.points - in_camera).max() < 1e-11
     assert found.ray_gap.max() < 1e-12
 
@@ -92,18 +86,6 @@ def test_plane_frame_of_exact_points():
     np.testing.assert_allclose(frame, camera_from_body @ own, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("points", "message"),
-    [
-        (np.eye(3)[:2], "plane B: 2 visible stickers, at least 3 needed"),
-        (np.outer(np.arange(4.0), [1.0, 2.0, 3.0]), "plane B: its 4 visible stickers lie on one line"),
-    ],
-)
-def test_plane_of_too_few_stickers_is_lost(points, message):
-    with pytest.raises(LostError, match=message):
-        fit_plane(points, np.broadcast_to(np.eye(3), (len(points), 3, 3)), np.array([0.0, 0.0, 1.0]), "B")
-
-
 @settings(max_examples=50)
 @given(st.integers(0, 10_000), st.integers(3, 18))
 def test_registration_finds_a_known_transform(seed, count):
@@ -119,32 +101,24 @@ def test_registration_finds_a_known_transform(seed, count):
     np.testing.assert_allclose(found.transform[:3, 3], shift, atol=1e-9)
 
 
-@pytest.mark.parametrize("count", [2, 5])
-def test_registration_of_a_line_is_lost(count):
-    line = np.outer(np.arange(float(count)), [0.1, 0.05, 0.0])
-    with pytest.raises(LostError, match=f"{count} visible stickers"):
-        register(line, line, np.broadcast_to(np.eye(3), (count, 3, 3)))
-
-
 @pytest.fixture(scope="module")
 def seen():
-    """A rig, and noisy pixels (2, n, 2) of points with their covariances (2, n, 2, 2)."""
+    """Noisy pixels (2, n, 2) of points with their covariances (2, n, 2, 2)."""
     rng = np.random.default_rng(0)
-    rig = toed_in_rig(CAMERA, 1.0, np.array([1.44, 0.0, 1.28]), np.array([0.3, 0.0, 0.18]))[0]
     points = rng.uniform([0.3, -0.2, 1.3], [0.7, 0.2, 1.7], (12, 3))
     half = rng.normal(size=(2, 12, 2, 2))
     covariances = 1e-4 * (half @ half.transpose(0, 1, 3, 2) + np.eye(2))
-    return rig, rig.project(points)[0] + 0.02 * rng.normal(size=(2, 12, 2)), covariances
+    return RIG.project(points)[0] + 0.02 * rng.normal(size=(2, 12, 2)), covariances
 
 
 def test_points_explain_their_pixels_best(seen):
-    rig, pixels, covariances = seen
-    found = triangulate(rig, *pixels, *covariances)
+    pixels, covariances = seen
+    found = triangulate(RIG, *pixels, *covariances)
     roots = np.linalg.inv(np.linalg.cholesky(covariances))
     for n in range(pixels.shape[1]):
 
         def whitened(point, n=n):
-            return np.einsum("kij,kj->ki", roots[:, n], rig.project(point[None])[0][:, 0] - pixels[:, n]).ravel()
+            return np.einsum("kij,kj->ki", roots[:, n], RIG.project(point[None])[0][:, 0] - pixels[:, n]).ravel()
 
         best = least_squares(whitened, found.points[n] + 1e-4, x_scale=1e-3, xtol=1e-15, ftol=1e-15, gtol=1e-15)
         np.testing.assert_allclose(found.points[n], best.x, atol=2e-9)
@@ -153,8 +127,8 @@ def test_points_explain_their_pixels_best(seen):
 
 
 def test_transform_explains_the_points_best(seen):
-    rig, pixels, covariances = seen
-    target = triangulate(rig, *pixels, *covariances)
+    pixels, covariances = seen
+    target = triangulate(RIG, *pixels, *covariances)
     source = target.points @ p.rotation_exp(np.array([0.4, -0.8, 0.3])) + [0.1, 0.2, -0.3]
     source = source + 2e-5 * np.random.default_rng(1).normal(size=source.shape)
     found = register(source, target.points, target.covariances)
@@ -171,30 +145,32 @@ def test_transform_explains_the_points_best(seen):
     np.testing.assert_allclose(found.misfit, (whitened(np.zeros(6)).reshape(-1, 3) ** 2).sum(axis=1), rtol=1e-9)
 
 
-def test_kernels_compute_the_same_uncompiled(seen):
-    rig, pixels, covariances = seen
-    observed, weights = pixels.transpose(1, 0, 2).copy(), np.linalg.inv(covariances.transpose(1, 0, 2, 3))
-    start = triangulate(rig, *pixels, *covariances).points + 1e-4
-    results = []
-    for function in (point_kernels.refine_points, point_kernels.refine_points.py_func):
-        points, spread, gaps = start.copy(), np.empty((12, 3, 3)), np.empty(12)
-        function(np.stack(rig.projection_matrices), observed, weights, 2, points, spread, gaps)
-        results.append(np.concatenate([points.ravel(), spread.ravel(), gaps]))
-    np.testing.assert_allclose(*results, rtol=1e-9)
-
-
 def test_small_linear_algebra_is_that_of_lapack():
     rng = np.random.default_rng(6)
     half, right = rng.normal(size=(9, 7)), rng.normal(size=7)
-    k = point_kernels
-    for factor, solve, invert in (
-        (k.factor, k.solve_factored, k.invert_factored),
-        (k.factor.py_func, k.solve_factored.py_func, k.invert_factored.py_func),
-    ):
-        lower, found, inverse = half.T @ half, right.copy(), np.empty((2, 2))
-        factor(lower)
-        solve(lower, found)
-        invert(lower, inverse)
-        np.testing.assert_allclose(inverse, np.linalg.inv(half.T @ half)[:2, :2], rtol=1e-9)
-        np.testing.assert_allclose(np.tril(lower), np.linalg.cholesky(half.T @ half), rtol=1e-9)
-        np.testing.assert_allclose(found, np.linalg.solve(half.T @ half, right), rtol=1e-9)
+    matrix, inverse = half.T @ half, np.empty((2, 2))
+    lower, found = matrix.copy(), right.copy()
+    point_kernels.factor(lower)
+    point_kernels.solve_factored(lower, found)
+    point_kernels.invert_factored(lower, inverse)
+    np.testing.assert_allclose(inverse, np.linalg.inv(matrix)[:2, :2], rtol=1e-9)
+    np.testing.assert_allclose(np.tril(lower), np.linalg.cholesky(matrix), rtol=1e-9)
+    np.testing.assert_allclose(found, np.linalg.solve(matrix, right), rtol=1e-9)
+
+
+LINE, EACH = np.outer(np.arange(5.0), [0.1, 0.05, 0.0]), np.tile(np.eye(3), (5, 1, 1))
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("fit", "message"),
+    [
+        (lambda: fit_plane(LINE[:2], EACH[:2], UP, "B"), "plane B: 2 visible stickers, at least 3 needed"),
+        (lambda: fit_plane(LINE, EACH, UP, "B"), "plane B: its 5 visible stickers lie on one line"),
+        (lambda: register(LINE[:2], LINE[:2], EACH[:2]), "2 visible stickers"),
+        (lambda: register(LINE, LINE, EACH), "5 visible stickers"),
+    ],
+)
+def test_too_few_points_and_those_on_a_line_are_lost(fit, message):
+    with pytest.raises(LostError, match=message):
+        fit()

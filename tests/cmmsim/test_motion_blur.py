@@ -8,9 +8,9 @@ from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.geometry.disc_image import coverage
 from cmmsim.imaging.exposure import LARGEST_STEP_PX, exposed_windows, sub_frame_poses
 from cmmsim.imaging.formation import ImageFormation, Side
-from tests.cmmsim.ellipses import NOISE, random_ellipses
 from tests.cmmsim.sensors import (
     CROPPED,
+    NOISE,
     NOISE_FREE,
     TWELVE_BIT,
     corners_about,
@@ -19,6 +19,8 @@ from tests.cmmsim.sensors import (
     placed_at,
     pose_errors,
     poses_about_home,
+    random_ellipses,
+    require_true,
     squared_error,
 )
 
@@ -121,7 +123,7 @@ def test_tracked_frames_of_a_moving_platform_keep_their_covariance(speed):
             if not np.array_equal(pose, path[0]):
                 squared.append(squared_error(m, pose))
     assert len(squared) == 64
-    assert 4.5 < np.mean(squared) < 7.5  # the mean of 64 scatters by 0.43
+    require_true(squared)
 
 
 @pytest.mark.slow
@@ -136,7 +138,8 @@ def test_a_platform_that_has_stopped_is_not_taken_for_moving():
             m = sensor.measure(pose)
             assert len(m.target_ids) >= 17
             squared.append(squared_error(m, pose))
-    assert 3.5 < np.mean(squared) < 8.5  # the mean of 24 scatters by 0.7
+    assert len(squared) == 24
+    require_true(squared)
 
 
 def test_whole_image_is_blurred_as_its_windows_are():
@@ -184,12 +187,5 @@ def test_windows_over_an_exposure_show_what_drawing_every_window_at_every_moment
     np.testing.assert_allclose(largest, np.max(every, axis=0), atol=1e-6)
     assert np.any(np.ptp(every, axis=0) > 0.5)
     assert sum(drawn) < 0.5 * len(moments) * len(tiles())
-
-
-def test_one_moment_is_drawn_once():
-    sensor = exact()
-    (bodies,) = moments_of(sensor, 1)
-    formation, camera = sensor.camera.formation, sensor.rig.left
-    expected = formation.windows([Side(camera, bodies, tiles())], TILE, 2, shade=False)[0]
-    for found in exposed_windows(formation, camera, [bodies], tiles(), TILE, 2):
-        np.testing.assert_array_equal(found, expected)
+    for found in exposed_windows(formation, camera, moments[:1], tiles(), TILE, 2, 1):
+        np.testing.assert_array_equal(found, every[0])

@@ -71,16 +71,12 @@ def test_what_may_hide_something_is_drawn_by_depth(patches):
     assert not found.filled.any()
 
 
-def test_another_body_before_the_window_needs_depths():
+def test_another_body_before_the_window_and_a_sticker_turned_away_need_depths():
     views = looking_down([(493, 393), (560, 393)], others=[pose_to_transform([0.0, 0.0, 0.6, 0.0, 0.0, 0.0])])
     found = laid([stack(), box(), box((0.02, 0.02, 0.02))], views, [0, 0, 1])
     assert found.solid.tolist() == [-1, 1]
-
-
-def test_sticker_turned_away_from_the_camera_needs_depths():
-    side = stack(normal=UP)
-    assert laid([side, box()], looking_down([(493, 393)], turned=0.0)).solid.tolist() == [1]
-    assert laid([side, box()], looking_down([(493, 393)], turned=np.pi)).solid.tolist() == [-1]
+    for turned, solid in ((0.0, 1), (np.pi, -1)):
+        assert laid([stack(), box()], looking_down([(493, 393)], turned=turned)).solid.tolist() == [solid]
 
 
 @pytest.mark.rendering
@@ -152,13 +148,6 @@ def test_reaching_patches_are_those_whose_corners_span_the_window():
     assert 0.02 < found.mean() < 0.9
 
 
-def parts(sample):
-    """Meshes' vertices, triangles and levels of the sticker's plane and of the ring's."""
-    mesh = disc_mesh(DiscStack((RING, STICKER)), sample)
-    upper = mesh.faces.max(axis=1) < len(mesh.vertices) - GROUND_SIDES
-    return mesh, mesh.faces[upper], mesh.faces[~upper]
-
-
 def integrals(mesh, faces, values):
     """Integral over triangles of a value that is linear on each, and of its product with the place (3,)."""
     corners, at = mesh.vertices[faces], values[faces]
@@ -168,22 +157,18 @@ def integrals(mesh, faces, values):
 
 
 @pytest.mark.parametrize("sample", SAMPLES)
-def test_soft_sticker_sends_the_light_of_the_disc_from_its_centre(sample):
-    mesh, upper, _ = parts(sample)
-    light, moment = integrals(mesh, upper, mesh.levels - RING.level)
+def test_soft_sticker_falls_off_over_the_stated_samples_and_sends_the_light_of_the_disc_from_its_centre(sample):
+    mesh = disc_mesh(DiscStack((RING, STICKER)), sample)
+    is_upper = mesh.faces.max(axis=1) < len(mesh.vertices) - GROUND_SIDES
+    light, moment = integrals(mesh, mesh.faces[is_upper], mesh.levels - RING.level)
     assert light == pytest.approx((STICKER.level - RING.level) * np.pi * STICKER.radius**2, rel=1e-12)
     np.testing.assert_allclose(moment / light, STICKER.centre, atol=1e-12)
-
-
-@pytest.mark.parametrize("sample", SAMPLES)
-def test_rim_falls_off_over_the_stated_samples_in_the_sticker_s_plane(sample):
-    mesh, upper, lower = parts(sample)
-    vertices = mesh.vertices[np.unique(upper)] - STICKER.centre
-    np.testing.assert_allclose(vertices @ NORMAL, 0.0, atol=1e-15)
-    radius, bright = np.linalg.norm(vertices, axis=1), mesh.levels[np.unique(upper)] == STICKER.level
+    upper, lower = np.unique(mesh.faces[is_upper]), np.unique(mesh.faces[~is_upper])
+    np.testing.assert_allclose((mesh.vertices[upper] - STICKER.centre) @ NORMAL, 0.0, atol=1e-15)
+    np.testing.assert_allclose((mesh.vertices[lower] - RING.centre) @ NORMAL, 0.0, atol=1e-15)
+    radius, bright = np.linalg.norm(mesh.vertices[upper] - STICKER.centre, axis=1), mesh.levels[upper] == STICKER.level
     assert radius[~bright].mean() - radius[bright].mean() == pytest.approx(RIM_SAMPLES * sample, rel=0.02)
-    np.testing.assert_allclose((mesh.vertices[np.unique(lower)] - RING.centre) @ NORMAL, 0.0, atol=1e-15)
-    assert (mesh.levels[np.unique(lower)] == RING.level).all()
+    assert (mesh.levels[lower] == RING.level).all()
 
 
 @pytest.mark.parametrize("sample", SAMPLES)

@@ -10,16 +10,9 @@ from cmmsim.files.sensor_file import read_sensor_file, sensor_text
 from cmmsim.files.setup import rig_from_file
 from cmmsim.geometry.camera import Distortion
 from cmmsim.geometry.pose import apply, rotation_exp
-from tests.cmmsim.sensors import LEFT, RIGHT
+from tests.cmmsim.sensors import LEFT, RIGHT, refused
 
 BESIDE = {"translation": [-0.91, 0.01, 0.33], "rotation_vector": [0.02, -0.66, -0.01]}
-
-
-def refused(changes, message):
-    with pytest.raises(cmmsim.CmmError, match=message) as error:
-        cmmsim.load_sensor("ctrack780", changes=changes)
-    assert "\n" not in str(error.value)
-    assert len(str(error.value)) < 500
 
 
 @pytest.mark.parametrize(
@@ -37,7 +30,7 @@ def refused(changes, message):
         ({"renderer": "blender"}, "renderer: unknown renderer 'blender': valid are analytic, auto, pyrender, or m"),
         # what contradicts itself
         ({"camera.black_level": 256.0}, "camera: .*black_level 256 must lie below .* 255"),
-        ({"lens.psf_px": 0.01}, "lens: .*psf_px 0.01 must be 0 or at least 0.1 px"),
+        ({"lens.psf_px": 0.0999}, "lens: .*psf_px 0.0999 must be 0 or at least 0.1 px"),
         ({"timing.latency": 0.01, "timing.latency_jitter": 0.02}, "timing: latency_jitter 0.02 s is larger than lat"),
         ({"timing.exposure": 0.02}, "timing: exposure 0.02 s is longer than a frame of 60 Hz, 0.01667 s$"),
         ({"stickers.placement": [0.002, 0.001]}, r"placement \[0.002, 0.001\] m is the smallest and the largest"),
@@ -59,12 +52,7 @@ def refused(changes, message):
     ],
 )
 def test_what_is_wrong_is_named_in_one_line(changes, message):
-    refused(changes, message)
-
-
-@pytest.mark.parametrize("psf", [0.05, 0.0999, -1.0, np.nan, np.inf])
-def test_a_point_spread_that_cannot_be_drawn_is_refused(psf):
-    refused({"lens.psf_px": psf}, "psf_px")
+    refused(lambda: cmmsim.load_sensor("ctrack780", changes=changes), message)
 
 
 @pytest.mark.parametrize(
@@ -77,9 +65,7 @@ def test_a_point_spread_that_cannot_be_drawn_is_refused(psf):
 )
 def test_a_file_that_is_no_toml_is_refused(tmp_path, content, message):
     (tmp_path / "mine.toml").write_bytes(content)
-    with pytest.raises(cmmsim.SensorFileError, match=message) as error:
-        cmmsim.load_sensor(tmp_path / "mine.toml")
-    assert "\n" not in str(error.value)
+    refused(lambda: cmmsim.load_sensor(tmp_path / "mine.toml"), message, cmmsim.SensorFileError)
 
 
 @pytest.mark.parametrize(

@@ -11,19 +11,14 @@ from cmmsim.visibility import expected_covariance, sight_lines
 HOME = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
 
 
-def test_all_stickers_are_visible_at_home_and_few_with_the_platform_turned_away():
+def test_all_stickers_are_visible_at_home_and_few_with_the_platform_turned_away_or_beyond_the_image():
     sight = sight_lines("ctrack780")
     assert sight.visible(HOME).all()
     away = sight.visible(HOME + np.array([0, 0, 0, 0, 0, np.pi / 2]))
     assert not away.all()
     assert not sight.visible(HOME + np.array([0, 0, 0, 0, np.pi, 0]))[sight.platform.plane_index == 0].any()
-
-
-def test_stickers_beyond_the_image_are_not_visible():
-    sight = sight_lines("ctrack780")
     narrow = replace(sight.rig, left=replace(sight.rig.left, focal_px=12 * sight.rig.left.focal_px))
-    seen = replace(sight, rig=narrow).visible(HOME)
-    assert seen.sum() < len(seen)
+    assert not replace(sight, rig=narrow).visible(HOME).all()
 
 
 @pytest.mark.parametrize("method", ["registration", "planes"])
