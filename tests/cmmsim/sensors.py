@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import binom, chi2
 
 import cmmsim
 from cmmsim.detection.ellipse_fit import fit_ellipses
@@ -104,6 +104,12 @@ def require_true(squared, freedom=6):
     """The mean of independent chi-square numbers lies where it does but for 27 in 10,000 times (three deviations)."""
     low, high = chi2.ppf([0.00135, 0.99865], freedom * np.size(squared)) / np.size(squared)
     assert low < np.mean(squared) < high, (low, np.mean(squared), high)
+
+
+def require_regions(squared, freedom=6):
+    """The 95 % regions hold as many of independent chi-square numbers as 99 of 100 such series let them."""
+    low, high = binom.interval(0.99, len(squared), 0.95)
+    assert low <= np.sum(squared < chi2.ppf(0.95, freedom)) <= high, np.mean(squared < chi2.ppf(0.95, freedom))
 
 
 def refused(call, message, kind=cmmsim.CmmError):

@@ -6,7 +6,7 @@ drawn anew for each view, which moves both images.
 
 import numpy as np
 import pytest
-from scipy.stats import binom, chi2
+from scipy.stats import binom
 
 from cmmsim.calibration import PairView, calibrate
 from cmmsim.calibration.adjustment import adjust, free_directions
@@ -14,7 +14,7 @@ from cmmsim.calibration.board import Board
 from cmmsim.calibration.detection import BoardView
 from cmmsim.calibration.shared_errors import CHANCE, shared_errors
 from cmmsim.calibration.sightings import sightings_of
-from tests.cmmsim.sensors import require_true, squares
+from tests.cmmsim.sensors import require_regions, require_true, squares
 from tests.cmmsim.test_calibration_adjustment import (
     LEFT,
     RIGHT,
@@ -102,8 +102,7 @@ def test_covariance_of_independent_errors_is_true_and_left_as_it_is(runs):
     errors, covariances, independent, solved = repeated("independent", runs, 8)
     squared, deviations = squares(errors, covariances), np.sqrt(np.einsum("nii->ni", covariances))
     require_true(squared, 24)
-    low, high = binom.interval(0.9999, runs, 0.95)
-    assert low <= np.sum(squared < chi2.ppf(0.95, 24)) <= high
+    require_regions(squared, 24)
     assert 0.92 < np.mean(np.abs(errors) < 1.96 * deviations) < 0.975
     assert np.abs(errors.mean(axis=0) / (errors.std(axis=0) / np.sqrt(runs))).max() < 4.0
     assert np.mean([s.sigma_px for s in solved]) == pytest.approx(NOISE, rel=0.01)

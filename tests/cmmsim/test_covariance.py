@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scipy.stats import binom
 
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import marked_body
@@ -11,7 +10,7 @@ from cmmsim.geometry.pose import apply, compose_covariance, pose_covariance, pos
 from cmmsim.geometry.stereo_rig import toed_in_rig, triangulate
 from cmmsim.pose_estimation.estimator import by_planes, by_registration
 from cmmsim.pose_estimation.observation import StickerObservation
-from tests.cmmsim.sensors import CAMERA, require_true, squares
+from tests.cmmsim.sensors import CAMERA, require_regions, require_true, squares
 
 FILE = read_sensor_file("ctrack780")
 BODY = marked_body("platform", FILE.platform)
@@ -77,8 +76,7 @@ def test_pose_covariance(pose, method, count):
     errors, covariances = np.array(errors), np.array(covariances)
     squared = squares(errors, covariances)
     require_true(squared)
-    low, high = binom.interval(0.9999, count, 0.95)
-    assert low <= np.sum(squared < 12.592) <= high  # the 95 % region of chi-square with six degrees of freedom
+    require_regions(squared)
     assert np.abs(errors.mean(axis=0) / (errors.std(axis=0) / np.sqrt(count))).max() < 4.5  # no bias
 
 

@@ -79,10 +79,3 @@ def test_beyond_the_fold_nothing_is_found_and_nothing_is_nan():
     assert camera.shows(pixels).all()
     np.testing.assert_array_equal(valid, [True, False])
     assert Distortion(k1=0.1).fold_radius == np.inf
-
-
-def test_a_perfect_lens_takes_the_plain_path():
-    camera = PinholeCamera(2300.0, 1023.5, 767.5, 2048, 1536)
-    pixels = np.random.default_rng(4).uniform(0.0, 1500.0, (5, 2))
-    assert camera.ideal is camera
-    assert camera.undistort(pixels)[0] is pixels
