@@ -5,7 +5,8 @@ import pytest
 
 from cmmsim.detection import ellipse_fit, fit_kernels
 from cmmsim.detection.detector import FitLimits
-from cmmsim.detection.ellipse_fit import CORE_SHARE, RING_REACH, SMALLEST_START_PX, fit_ellipses
+from cmmsim.detection.ellipse_fit import RING_REACH, fit_ellipses
+from cmmsim.detection.fit_kernels import CORE_SHARE, SMALLEST_START_PX
 from cmmsim.geometry.disc_image import coverage
 from tests.cmmsim import plain_coverage
 from tests.cmmsim.sensors import NOISE, random_ellipses, require_true, squares
@@ -65,7 +66,7 @@ def test_the_fit_takes_the_steps_of_plain_numpy(monkeypatch, radii):
     close = {"atol": 1e-9, "rtol": 1e-9}
     np.testing.assert_allclose(fits.centres, p[:, :2] + corners, **close)
     np.testing.assert_allclose(fits.shapes, p[:, [2, 3, 3, 4]].reshape(-1, 2, 2), **close)
-    np.testing.assert_allclose(np.stack([fits.contrast, fits.ground, fits.misfit]), [*p[:, 5:].T, misfits], **close)
+    np.testing.assert_allclose(np.stack([fits.contrast, fits.ground, fits.misfits]), [*p[:, 5:].T, misfits], **close)
     np.testing.assert_allclose(fits.covariances, covariances[:, :2, :2], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(fits.shape_covariances, covariances[:, 2:5, 2:5], rtol=1e-9, atol=1e-12)
 
