@@ -157,13 +157,8 @@ def random_ellipses(
     camera = PinholeCamera(focal_px, middle, middle, size, size)
     away = rng.uniform(-0.5, 0.5, (count, 2))
     side = rng.uniform(0.0, 2.0 * np.pi, count)
-    normals = np.column_stack(
-        [
-            np.sin(condition.tilt) * np.cos(side),
-            np.sin(condition.tilt) * np.sin(side),
-            np.full(count, -np.cos(condition.tilt)),
-        ]
-    )
+    sine, cosine = np.sin(condition.tilt), np.cos(condition.tilt)
+    normals = np.column_stack([sine * np.cos(side), sine * np.sin(side), np.full(count, -cosine)])
     places = np.column_stack([away / focal_px, np.ones(count)])  # at depth 1: only ratios matter
     return project_discs(camera, places, normals, np.full(count, condition.radius_px / focal_px))
 

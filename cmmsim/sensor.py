@@ -194,7 +194,7 @@ class Sensor:
             require_kind(mesh, trimesh.Trimesh, f"body {name!r} must be a trimesh.Trimesh")
         level = self._file.stickers.obstacle_level / 255.0
         self._obstacles.update({name: solid_mesh(mesh, level) for name, mesh in meshes.items()})
-        self._build_again()
+        self.__dict__.pop("camera", None)  # it is built anew before the next picture
 
     def shift_camera(self, side: int, shift_px: tuple[float, float]) -> None:
         """Move the true principal point of one camera (0 left, 1 right) by (x, y) px; the estimator is not told.
@@ -205,7 +205,7 @@ class Sensor:
             raise UnknownOptionError("side", side, ("0 (left)", "1 (right)"))
         x, y = finite_array(shift_px, (2,), "a shift of a camera is two finite numbers, px").tolist()
         self._true_rig = self._true_rig.shifted(side, (x, y))
-        self._build_again()
+        self.__dict__.pop("camera", None)  # it is built anew before the next picture
 
     def look(
         self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
@@ -254,10 +254,6 @@ class Sensor:
     @cached_property
     def _renderer(self) -> Renderer:
         return choose_renderer(self._asked_renderer)
-
-    def _build_again(self) -> None:
-        """The camera is built anew before the next picture."""
-        self.__dict__.pop("camera", None)
 
     @cached_property
     def camera(self) -> VirtualStereoCamera:

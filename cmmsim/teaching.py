@@ -222,12 +222,8 @@ class WindowSizes:
 
     def plan(self) -> TeachingPlan:
         """Teaching with windows that have grown alike."""
-        plan = TeachingPlan()
-        sizes = {
-            name: 2 * round(0.5 * self.growth * getattr(plan, name))
-            for name in ("base_window", "first_window", "platform_window")
-        }
-        return replace(plan, **sizes)
+        plan, names = TeachingPlan(), ("base_window", "first_window", "platform_window")
+        return replace(plan, **{name: 2 * round(0.5 * self.growth * getattr(plan, name)) for name in names})
 
 
 def window_sizes(target_px: float, largest_px: float, psf_px: float, blurred: bool) -> WindowSizes:

@@ -47,10 +47,7 @@ class SightLines:
             move = from_base @ base_from_platform
             places, normals = apply(move, self.platform.nominal), self.platform.sticker_normals @ move[:3, :3].T
             pixels, ahead = camera.project(places)
-            inside = np.all(
-                (pixels >= EDGE_PX) & (pixels <= (camera.width - 1 - EDGE_PX, camera.height - 1 - EDGE_PX)), axis=1
-            )
-            seen &= ahead & inside & faces_camera(places, normals)
+            seen &= ahead & camera.shows(pixels, EDGE_PX) & faces_camera(places, normals)
         return seen
 
 

@@ -15,11 +15,10 @@ from numpy.typing import ArrayLike
 from cmmsim.errors import AcceptanceError, LostError
 from cmmsim.files.schema import Body, HalfSpace, Planes, Platform, Rig, SensorFile, StickerPlane
 from cmmsim.files.setup import MarkedBody, rig_from_file
-from cmmsim.geometry.pose import Array, invert, rigid
+from cmmsim.geometry.pose import Array, frozen, invert, rigid
 from cmmsim.imaging.pyrender_renderer import require_opengl
 from cmmsim.imaging.renderer import choose_renderer
 from cmmsim.pose_estimation.estimator import PoseEstimator
-from cmmsim.pose_estimation.observation import StickerObservation
 from cmmsim.pose_estimation.taught import Taught
 from cmmsim.radiometry.images import StereoImages
 from cmmsim.sensor import Sensor
@@ -32,8 +31,7 @@ END = 0.020  # m: the board goes on beyond the outermost stickers
 OUT_OF_SIGHT = 100.0  # m behind the cameras
 LENGTH = 0.300  # m between the origins of the rigid bar's ends, which lie on its x axis
 HALF_LENGTH, HALF_WIDTH = 0.5 * LENGTH + 0.065, HALF_RIDGE + SIDE
-END_FROM_END = rigid(np.eye(3), (LENGTH, 0.0, 0.0))  # first_from_second, what is true of the ends
-END_FROM_END.setflags(write=False)
+END_FROM_END = frozen(rigid(np.eye(3), (LENGTH, 0.0, 0.0)))  # first_from_second, what is true of the ends
 
 StickerRow = tuple[ArrayLike, ArrayLike]
 """Stickers of one side: along (n,) m from the middle of the artefact, and across (n,) m from the middle line of side A,
@@ -175,9 +173,3 @@ def locate(estimator: PoseEstimator, images: StereoImages) -> Array:
         return estimator.locate(images)
     except LostError as error:
         raise AcceptanceError(f"the {estimator.platform.name} is not found in the images: {error}") from error
-
-
-def observe_stickers(estimator: PoseEstimator, images: StereoImages, expected: Array) -> StickerObservation:
-    """Points of the stickers near an expected camera_from_body (4,4): nothing of the layout enters the points."""
-    body = estimator.platform
-    return estimator.observe(images, expected, body.nominal, body.sticker_normals)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cmmsim.acceptance.artefacts import SensorUnderTest, board, estimator_of, locate, observe_stickers
+from cmmsim.acceptance.artefacts import SensorUnderTest, board, estimator_of, locate
 from cmmsim.acceptance.volume import MeasuringLine, MeasuringVolume, seven_lines
 from cmmsim.errors import AcceptanceError
 from cmmsim.files.schema import Platform
@@ -110,15 +110,16 @@ def length_test(
 def measure_line(sensor: Sensor, volume: MeasuringVolume, line: MeasuringLine, exposures: int) -> list[MeasuredLength]:
     """The lengths of one line, whose artefact the sensor faces, from ``exposures`` pictures."""
     pose = volume.pose(line.direction, 0.5 * (line.start + line.end))
-    estimator = estimator_of(sensor, sensor.platform)
+    body = sensor.platform
+    estimator = estimator_of(sensor, body)
     expected = locate(estimator, sensor.look(pose))
     count = 1 + len(line.lengths)  # the row comes first among the stickers
     values, stds = np.empty((exposures, len(line.lengths))), np.empty((exposures, len(line.lengths)))
     for k in range(exposures):
-        seen = observe_stickers(estimator, sensor.look(pose), expected)
+        seen = estimator.observe(sensor.look(pose), expected, body.nominal, body.sticker_normals)
         missing = np.setdiff1d(np.arange(count), seen.index)
         if len(missing):
-            names = ", ".join(sensor.platform.sticker_ids[missing])
+            names = ", ".join(body.sticker_ids[missing])
             raise AcceptanceError(f"line {line.name}: stickers {names} are not measured by both cameras")
         values[k], stds[k] = lengths_from_first(seen.points[:count], seen.covariances[:count])
     return [

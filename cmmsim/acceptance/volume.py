@@ -16,19 +16,17 @@ import numpy as np
 from cmmsim.errors import AcceptanceError
 from cmmsim.files.schema import Rig
 from cmmsim.files.setup import rig_from_file
-from cmmsim.geometry.pose import Array, apply, invert, rigid, transform_to_pose
+from cmmsim.geometry.pose import Array, apply, frozen, invert, rigid, transform_to_pose
 from cmmsim.geometry.stereo_rig import StereoRig
 
 MARGIN_PX = 40.0  # the corners stay this far inside the images: room for the width of the artefacts
 LARGEST_SHARE = 0.8  # the front face stays beyond a fifth of the way from the baseline to the target
 SMALLEST_SIZE = 0.1  # m; below, the stickers of an artefact do not find room
-CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
-CORNERS.setflags(write=False)
+CORNERS = frozen(list(product((-0.5, 0.5), repeat=3)))
 FEWEST_LINES, FEWEST_LENGTHS = 7, 5
 LONGEST_SHARE = 2.0 / 3.0  # of the volume's space diagonal
 USED_SHARE = 0.9  # of a line between the sides of the volume; the rest is room for the ends of the artefact
-LENGTH_SHARES = np.array([0.19, 0.41, 0.6, 0.82, 1.0])  # test lengths of a line, of its longest
-LENGTH_SHARES.setflags(write=False)
+LENGTH_SHARES = frozen([0.19, 0.41, 0.6, 0.82, 1.0])  # test lengths of a line, of its longest
 LINES = {  # their ends in half sides of the volume
     "space 1": ((-1, -1, -1), (1, 1, 1)),
     "space 2": ((1, -1, -1), (-1, 1, 1)),
@@ -137,9 +135,7 @@ def _unseen(rig: StereoRig, camera_from_volume: Array, size: Array, distance: fl
     points = apply(camera_from_volume, corners)
     pixels, valid = rig.project(points)
     for camera, name, spots, ahead in zip(rig.cameras, ("left", "right"), pixels, valid, strict=True):
-        inside = ahead & np.all(
-            (spots >= MARGIN_PX) & (spots <= (camera.width - 1 - MARGIN_PX, camera.height - 1 - MARGIN_PX)), axis=1
-        )
+        inside = ahead & camera.shows(spots, MARGIN_PX)
         if not inside.all():
             k = int(np.flatnonzero(~inside)[0])
             corner = ", ".join(f"{1e3 * v:+.0f}" for v in corners[k])

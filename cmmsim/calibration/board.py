@@ -11,9 +11,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
-from cmmsim.checks import checked, parsed, read_text
+from cmmsim.checks import Section, checked, parsed, read_text
 from cmmsim.errors import CalibrationError
 from cmmsim.geometry.pose import Array
 
@@ -21,7 +21,7 @@ Length = Annotated[float, Field(gt=0.0, le=100.0)]
 Count = Annotated[int, Field(ge=3, le=200)]
 
 
-class Board(BaseModel):
+class Board(Section):
     """A flat board.
 
     kind        "chessboard", "dots" (rows and columns at right angles) or "asymmetric_dots" (every other row shifted)
@@ -32,7 +32,7 @@ class Board(BaseModel):
     dark        whether dots are darker than the board (dots and asymmetric_dots only)
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+    model_config = ConfigDict(strict=True)
 
     kind: Literal["chessboard", "dots", "asymmetric_dots"]
     columns: Count

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cmmsim.calibration.board import Board
 from cmmsim.errors import CalibrationError
 from cmmsim.geometry.camera import Optics, PinholeCamera
-from cmmsim.geometry.pose import Array, apply, invert, rigid, rotation_exp
+from cmmsim.geometry.pose import Array, apply, frozen, invert, rigid, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.formation import ImageFormation, Side
 from cmmsim.imaging.renderer import Drawable, Renderer
@@ -24,8 +24,7 @@ MARGIN = 1.0  # of the spacing: rim of the plate beyond its outermost points; a 
 RIM = 0.35  # of the spacing: bright rim beyond the outer squares of a chessboard
 THICKNESS = 0.008  # m
 BRIGHT, DARK = 0.86, 0.06  # share of white light sent back
-FRONT = np.array([0.0, 0.0, -1.0])  # the front looks against the board's z axis
-FRONT.setflags(write=False)
+FRONT = frozen([0.0, 0.0, -1.0])  # the front looks against the board's z axis
 # Its poses
 LARGEST_TILT = 0.75  # rad between the board's normal and the view from the middle of the baseline
 DEPTH_RANGE = (0.8, 1.2)  # of the depth at which the optical axes come nearest

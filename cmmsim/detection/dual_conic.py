@@ -20,7 +20,6 @@ radius 3.8 px, 0.007 at 2.5 and 0.002 at 10. This bias is no part of the covaria
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from cmmsim.detection.detector import DetectedCentres, Detector, SpotWindows, no_centres
@@ -45,7 +44,7 @@ def detect_by_dual_conic(given: SpotWindows) -> DetectedCentres:
     normal[~determined] = np.eye(5)
     dual = np.linalg.solve(normal, -np.einsum("inyx,nyx->ni", basis, lines.c**2)[..., None])[..., 0]
     centres = 0.5 * dual[:, 3:] * lines.unit_px[:, None] + spots.centroids
-    jacobian = _centre_by_pixels(spots, lines, basis, normal, dual)
+    jacobian = _centre_by_pixels(lines, basis, normal, dual)
     variance = given.noise.variance(spots.windows)
     covariances = np.einsum("niyx,njyx,nyx->nij", jacobian, jacobian, variance)
     squared = _squared_shape(dual) * lines.unit_px[:, None, None] ** 2
@@ -58,10 +57,11 @@ DUAL_CONIC = Detector("dual_conic", detect_by_dual_conic, 0.004, EDGE_PX)
 
 
 class _EdgeLines:
-    """Lines (a, b, c), each (n, h, h), from the centroids and in units of unit_px (n,); x, y of the pixels."""
+    """Lines (a, b, c), each (n, h, h), from the centroids and in units of unit_px (n,); x, y of the pixels; scale
+    (n, h, h): one over the contrast where a line counts, within the dark ring with all neighbours in the window."""
 
-    def __init__(self, a: Array, b: Array, x: Array, y: Array, unit_px: Array) -> None:
-        self.a, self.b, self.x, self.y, self.unit_px = a, b, x, y, unit_px
+    def __init__(self, a: Array, b: Array, x: Array, y: Array, unit_px: Array, scale: Array) -> None:
+        self.a, self.b, self.x, self.y, self.unit_px, self.scale = a, b, x, y, unit_px, scale
         self.c = -(a * x + b * y)
 
 
@@ -71,17 +71,12 @@ def _edge_lines(spots: BrightSpots) -> _EdgeLines:
     ticks = np.arange(spots.windows.shape[1], dtype=float)
     x = (ticks - spots.centroids[:, :1])[:, None, :] / radius[:, None, None]
     y = (ticks - spots.centroids[:, 1:])[:, :, None] / radius[:, None, None]
-    scale = _counted(spots) / np.maximum(spots.contrast, 1.0)[:, None, None]
-    a = _filtered(spots.windows, SLOPE, SMOOTHING) * scale
-    b = _filtered(spots.windows, SMOOTHING, SLOPE) * scale
-    return _EdgeLines(a, b, x, y, radius)
-
-
-def _counted(spots: BrightSpots) -> NDArray[np.bool_]:
-    """Pixels whose lines count: within the dark ring, with all neighbours in the window."""
     counted = spots.within.copy()
     counted[:, [0, -1]] = counted[:, :, [0, -1]] = False
-    return counted
+    scale = counted / np.maximum(spots.contrast, 1.0)[:, None, None]
+    a = _filtered(spots.windows, SLOPE, SMOOTHING) * scale
+    b = _filtered(spots.windows, SMOOTHING, SLOPE) * scale
+    return _EdgeLines(a, b, x, y, radius, scale)
 
 
 def _filtered(values: Array, along_x: tuple[float, ...], along_y: tuple[float, ...], adjoint: bool = False) -> Array:
@@ -91,12 +86,11 @@ def _filtered(values: Array, along_x: tuple[float, ...], along_y: tuple[float, .
     return ndimage.correlate1d(across, along_y[::turn], axis=1, mode="constant")
 
 
-def _centre_by_pixels(spots: BrightSpots, lines: _EdgeLines, basis: Array, normal: Array, dual: Array) -> Array:
+def _centre_by_pixels(lines: _EdgeLines, basis: Array, normal: Array, dual: Array) -> Array:
     """Derivative (n, 2, h, h) of the centres by each grey value, px."""
     a, b, c, x, y, zero = lines.a, lines.b, lines.c, lines.x, lines.y, np.zeros_like(lines.a)
     rows = np.linalg.inv(normal)[:, 3:]  # of D and E
     residual = np.einsum("ni,inyx->nyx", dual, basis) + c * c
-    scale = _counted(spots) / np.maximum(spots.contrast, 1.0)[:, None, None]
     total = np.zeros((len(a), 2, *a.shape[1:]))
     for by_line, c_by, kernels in (
         (np.stack([2.0 * a, b, zero, c - a * x, -b * x]), -x, (SLOPE, SMOOTHING)),
@@ -105,7 +99,7 @@ def _centre_by_pixels(spots: BrightSpots, lines: _EdgeLines, basis: Array, norma
         residual_by = np.einsum("ni,inyx->nyx", dual, by_line) + 2.0 * c * c_by
         change = -np.einsum("nki,inyx->nkyx", rows, by_line * residual + basis * residual_by)
         for k in range(2):
-            total[:, k] += _filtered(change[:, k] * scale, *kernels, adjoint=True)
+            total[:, k] += _filtered(change[:, k] * lines.scale, *kernels, adjoint=True)
     return 0.5 * lines.unit_px[:, None, None, None] * total
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, SpotWindows
 from cmmsim.geometry.disc_image import require_psf
-from cmmsim.geometry.pose import Array
+from cmmsim.geometry.pose import Array, frozen
 from cmmsim.radiometry.noise import CameraNoise
 
 RING_REACH = 2.4  # pixels beyond this many sticker radii may lie outside the dark ring and are left out
@@ -129,10 +129,8 @@ def _in_two_threads(fit: Callable[[slice], None], count: int) -> None:
     other.join()
 
 
-_LARGEST_STEP = np.array([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0])
-_LARGEST_STEP.setflags(write=False)
-_GREYS = np.arange(-64.0, 512.0, 0.25)  # at these of 255 the noise variance is tabulated
-_GREYS.setflags(write=False)
+_LARGEST_STEP = frozen([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0])
+_GREYS = frozen(np.arange(-64.0, 512.0, 0.25))  # at these of 255 the noise variance is tabulated
 
 
 def largest_misfits(limits: FitLimits, noise: CameraNoise, contrast: Array, ground: Array) -> Array:

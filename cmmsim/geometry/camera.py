@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from cmmsim.checks import finite_array
 from cmmsim.errors import CmmError
-from cmmsim.geometry.pose import Array
+from cmmsim.geometry.pose import Array, frozen
 
 NDArrayBool = NDArray[np.bool_]
 CONVERGED = 1e-12  # largest distance, in normalised coordinates, between a point and the image of its inverse
@@ -148,12 +148,12 @@ class PinholeCamera:
     @cached_property
     def focal_lengths(self) -> Array:
         """Focal lengths (2,) along x and y, px."""
-        return _constant(self.focal_px, self.focal_px * self.aspect)
+        return frozen([self.focal_px, self.focal_px * self.aspect])
 
     @cached_property
     def centre(self) -> Array:
         """Principal point (2,), px."""
-        return _constant(self.centre_x_px, self.centre_y_px)
+        return frozen([self.centre_x_px, self.centre_y_px])
 
     @property
     def matrix(self) -> Array:
@@ -177,9 +177,9 @@ class PinholeCamera:
             ahead &= holds
         return pixels, ahead & self.shows(pixels)
 
-    def shows(self, pixels: Array) -> NDArrayBool:
-        """Whether pixels (..., 2) lie inside the image."""
-        return np.all((pixels > -0.5) & (pixels < (self.width - 0.5, self.height - 0.5)), axis=-1)
+    def shows(self, pixels: Array, margin: float = -0.5) -> NDArrayBool:
+        """Whether pixels (..., 2) lie inside the image, more than ``margin`` px from its outermost pixels' middles."""
+        return np.all((pixels > margin) & (pixels < (self.width - 1 - margin, self.height - 1 - margin)), axis=-1)
 
     def distort(self, ideal: Array) -> tuple[Array, NDArrayBool]:
         """Pixels (..., 2) of the image for ideal pixels (..., 2), and whether the distortion model holds there."""
@@ -202,12 +202,6 @@ class PinholeCamera:
         """Derivative (..., 2, 2) of the image's pixels by the ideal ones (..., 2)."""
         focal = self.focal_lengths
         return self.distortion.jacobian((ideal - self.centre) / focal) * focal[:, None] / focal
-
-
-def _constant(*values: float) -> Array:
-    array = np.array(values)
-    array.setflags(write=False)
-    return array
 
 
 @dataclass(frozen=True)

@@ -45,13 +45,12 @@ import numpy as np
 
 from cmmsim.errors import CmmError
 from cmmsim.geometry.camera import PinholeCamera
-from cmmsim.geometry.pose import Array, apply
+from cmmsim.geometry.pose import Array, apply, frozen
 from cmmsim.geometry.stereo_rig import StereoRig
 
 RIM_POINTS = 24  # of a bent ellipse, over which its fit is integrated
 NARROWEST_PX = 0.05  # standard deviation of a point spread that can be followed
-SHAPE_BASIS = np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
-SHAPE_BASIS.setflags(write=False)
+SHAPE_BASIS = frozen([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]]])
 
 
 def project_discs(camera: PinholeCamera, centres: Array, normals: Array, radii: Array) -> tuple[Array, Array]:

@@ -14,37 +14,30 @@ from cmmsim.compiled import Array, compiled
 
 
 @compiled
-def project_disc(
-    centre: Array, normal: Array, radius: float, focal: Array, principal: Array, middle: Array, shape: Array
-) -> None:
-    """Ellipse of a disc: ``middle`` (2,) px and ``shape`` (2,2) px, the root of a matrix M:
-    (M + d I) / sqrt(trace M + 2 d), d² = det M."""
-    depth = centre[2] ** 2 - radius**2 * (1.0 - normal[2] ** 2)
-    at = np.empty(2)
-    for i in range(2):
-        at[i] = (centre[i] * centre[2] + radius**2 * normal[i] * normal[2]) / depth
-        middle[i] = focal[i] * at[i] + principal[i]
-    for i in range(2):
-        for j in range(2):
-            across = 1.0 if i == j else 0.0
-            dual = (centre[i] * centre[j] - radius**2 * (across - normal[i] * normal[j])) / depth
-            shape[i, j] = focal[i] * focal[j] * (at[i] * at[j] - dual)
-    d = math.sqrt(shape[0, 0] * shape[1, 1] - shape[0, 1] ** 2)
-    scale = math.sqrt(shape[0, 0] + shape[1, 1] + 2.0 * d)
-    shape[0, 0] += d
-    shape[1, 1] += d
-    for i in range(2):
-        for j in range(2):
-            shape[i, j] /= scale
-
-
-@compiled
 def project_all(
     centres: Array, normals: Array, radii: Array, focal: Array, principal: Array, middles: Array, shapes: Array
 ) -> None:
-    """``project_disc`` for n discs: centres (n,3), normals (n,3), radii (n,), middles (n,2), shapes (n,2,2)."""
+    """Ellipses of n discs with centres (n,3), normals (n,3) and radii (n,): ``middles`` (n,2) px and ``shapes`` (n,2,2)
+    px, the root of a matrix M: (M + d I) / sqrt(trace M + 2 d), d² = det M."""
+    at = np.empty(2)
     for n in range(len(centres)):
-        project_disc(centres[n], normals[n], radii[n], focal, principal, middles[n], shapes[n])
+        centre, normal, radius, middle, shape = centres[n], normals[n], radii[n], middles[n], shapes[n]
+        depth = centre[2] ** 2 - radius**2 * (1.0 - normal[2] ** 2)
+        for i in range(2):
+            at[i] = (centre[i] * centre[2] + radius**2 * normal[i] * normal[2]) / depth
+            middle[i] = focal[i] * at[i] + principal[i]
+        for i in range(2):
+            for j in range(2):
+                across = 1.0 if i == j else 0.0
+                dual = (centre[i] * centre[j] - radius**2 * (across - normal[i] * normal[j])) / depth
+                shape[i, j] = focal[i] * focal[j] * (at[i] * at[j] - dual)
+        d = math.sqrt(shape[0, 0] * shape[1, 1] - shape[0, 1] ** 2)
+        scale = math.sqrt(shape[0, 0] + shape[1, 1] + 2.0 * d)
+        shape[0, 0] += d
+        shape[1, 1] += d
+        for i in range(2):
+            for j in range(2):
+                shape[i, j] /= scale
 
 
 @compiled
@@ -83,19 +76,6 @@ def probe_discs(centres: Array, normals: Array, radii: Array, probes: Array) -> 
 
 
 @compiled
-def inside_part(start2: float, dot: float, step2: float) -> tuple[float, float]:
-    """Where the side start + t step, t in [0, 1], enters and leaves the unit disc (equal when it stays outside).
-
-    Given |start|², start . step and |step|².
-    """
-    discriminant = dot * dot - step2 * (start2 - 1.0)
-    root = math.sqrt(max(discriminant, 0.0))
-    enter = min(max((-dot - root) / step2, 0.0), 1.0)
-    leave = min(max((-dot + root) / step2, 0.0), 1.0)
-    return enter, leave
-
-
-@compiled
 def side_share(start_x: float, start_y: float, step_x: float, step_y: float) -> tuple[float, float, float]:
     """Twice the signed area, in disc units, between the disc's centre and one side: its part inside gives a triangle,
     the parts outside give sectors. Also where the side enters and leaves the disc."""
@@ -103,7 +83,8 @@ def side_share(start_x: float, start_y: float, step_x: float, step_y: float) -> 
     step2 = step_x * step_x + step_y * step_y
     dot = start_x * step_x + start_y * step_y
     cross = start_x * step_y - start_y * step_x
-    enter, leave = inside_part(start2, dot, step2)
+    root = math.sqrt(max(dot * dot - step2 * (start2 - 1.0), 0.0))
+    enter, leave = min(max((-dot - root) / step2, 0.0), 1.0), min(max((-dot + root) / step2, 0.0), 1.0)
     if enter == leave:  # outside: one sector
         return math.atan2(cross, start2 + dot), enter, leave
     area = (leave - enter) * cross

@@ -20,6 +20,13 @@ RIGID = 1e-6
 """By how much entries of what is given as a rigid transform may be off one: single precision passes."""
 
 
+def frozen(values: ArrayLike) -> Array:
+    """Values as an array of its own that cannot be changed."""
+    array = np.array(values, dtype=float)
+    array.setflags(write=False)
+    return array
+
+
 def checked_pose(pose: ArrayLike) -> Array:
     """The pose (6,) as an array of its own. Raises ShapeError when it is not six finite numbers."""
     return finite_array(pose, (6,), "a pose is six finite numbers [x y z alpha beta gamma]")

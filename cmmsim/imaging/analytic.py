@@ -9,7 +9,6 @@ lines; in a pixel with the edges of two layers the covered shares are taken as i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
@@ -22,59 +21,9 @@ from cmmsim.imaging.renderer import NEAR, Drawable, Renderer, View, same_exposur
 from cmmsim.imaging.scene import ConvexSolid, DiscStack, Mesh
 
 if TYPE_CHECKING:
-    from cmmsim.imaging.kernels import Solids
+    from cmmsim.imaging.kernels import Discs, Solids
 
 PROBES = 8  # points on a disc's rim, asked with its middle whether a solid hides them
-
-
-@dataclass(frozen=True)
-class DiscsInView:
-    """Discs turned towards one camera, far to near and outer before inner.
-
-    centres (m,2) and shapes (m,2,2) of their ellipses, px; reach (m,2) half extents along x and y, px; levels (m,);
-    owners (m,) body index; probes (m,k,3) points of each in camera axes, m.
-    """
-
-    centres: Array
-    shapes: Array
-    reach: Array
-    levels: Array
-    owners: NDArray[np.int_]
-    probes: Array
-
-
-class DiscTable:
-    """All discs of a drawable in the axes of their bodies."""
-
-    def __init__(self, drawable: Drawable) -> None:
-        rows = [
-            (disc, body)
-            for patch, body in zip(drawable.patches, drawable.body_index, strict=True)
-            if isinstance(patch, DiscStack)
-            for disc in patch.discs
-        ]
-        self._places = np.array([d.centre for d, _ in rows]).reshape(-1, 3)
-        self._normals = np.array([d.normal for d, _ in rows]).reshape(-1, 3)
-        self._radii = np.array([d.radius for d, _ in rows])
-        self._levels = np.array([d.level for d, _ in rows])
-        self._owners = np.array([body for _, body in rows], dtype=int)
-
-    def seen(self, view: View) -> DiscsInView:
-        """The discs that face a view's camera."""
-        from cmmsim.geometry.disc_kernels import place_discs, probe_discs
-
-        centres, normals = np.empty_like(self._places), np.empty_like(self._places)
-        place_discs(view.camera_from_bodies, self._owners, self._places, self._normals, centres, normals)
-        facing = (np.einsum("ni,ni->n", centres, normals) < 0.0) & (centres[:, 2] - self._radii > NEAR)
-        kept = np.flatnonzero(facing)
-        kept = kept[np.lexsort((-self._radii[kept], -np.round(centres[kept, 2], 3)))]
-        centres, normals, radii = centres[kept], normals[kept], self._radii[kept]
-        pixels, shapes = project_discs(view.camera, centres, normals, radii)
-        probes = np.empty((len(kept), PROBES + 1, 3))
-        probe_discs(centres, normals, radii, probes)
-        return DiscsInView(
-            pixels, shapes, np.linalg.norm(shapes, axis=2), self._levels[kept], self._owners[kept], probes
-        )
 
 
 def draw_windows(
@@ -95,31 +44,53 @@ ANALYTIC = Renderer("analytic", draw_windows)
 
 
 class _AnalyticScene:
-    """Discs and solids of a drawable."""
+    """Discs, in the axes of their bodies, and solids of a drawable."""
 
     def __init__(self, drawable: Drawable) -> None:
+        rows = [
+            (disc, body)
+            for patch, body in zip(drawable.patches, drawable.body_index, strict=True)
+            if isinstance(patch, DiscStack)
+            for disc in patch.discs
+        ]
+        self._places = np.array([d.centre for d, _ in rows]).reshape(-1, 3)
+        self._normals = np.array([d.normal for d, _ in rows]).reshape(-1, 3)
+        self._radii = np.array([d.radius for d, _ in rows])
+        self._disc_levels = np.array([d.level for d, _ in rows])
+        self._owners = np.array([body for _, body in rows], dtype=int)
         solids = {k: p for k, p in enumerate(drawable.patches) if isinstance(p, Mesh)}
-        self._discs = DiscTable(drawable)
         self._solids = [ConvexSolid(mesh.vertices) for mesh in solids.values()]
         self._bodies = drawable.body_index[list(solids)]
         self._levels = [float(mesh.levels[0]) for mesh in solids.values()]
 
     def draw(self, images: NDArray[np.float32], views: Sequence[View], group: list[int], lines: int) -> None:
         """Draw the views ``group``, which share a camera and an exposure, into ``images`` (n, h, w)."""
-        from cmmsim.imaging.kernels import Discs, lay_layers  # compiles, so it is loaded where it is first needed
+        from cmmsim.imaging.kernels import lay_layers  # compiles, so it is loaded where it is first needed
 
         view = views[group[0]]
-        seen = self._discs.seen(view)
-        hidden_by = self._hiding(view, seen)
-        discs = Discs(
-            seen.centres,
-            seen.shapes,
-            seen.reach,
-            seen.levels,
-            np.stack(list(hidden_by.values()), axis=1) if hidden_by else np.zeros((len(seen.levels), 0), dtype=bool),
-        )
+        discs, hiding = self._discs(view)
         corners = np.array([views[k].corner for k in group], dtype=float)
-        lay_layers(images, np.array(group), corners, self._outlined(view, list(hidden_by)), lines, discs)
+        lay_layers(images, np.array(group), corners, self._outlined(view, hiding), lines, discs)
+
+    def _discs(self, view: View) -> tuple[Discs, list[int]]:
+        """The discs turned towards a view's camera, far to near and outer before inner; and the solids before them."""
+        from cmmsim.geometry.disc_kernels import place_discs, probe_discs
+        from cmmsim.imaging.kernels import Discs
+
+        centres, normals = np.empty_like(self._places), np.empty_like(self._places)
+        place_discs(view.camera_from_bodies, self._owners, self._places, self._normals, centres, normals)
+        facing = (np.einsum("ni,ni->n", centres, normals) < 0.0) & (centres[:, 2] - self._radii > NEAR)
+        kept = np.flatnonzero(facing)
+        kept = kept[np.lexsort((-self._radii[kept], -np.round(centres[kept, 2], 3)))]
+        centres, normals, radii = centres[kept], normals[kept], self._radii[kept]
+        pixels, shapes = project_discs(view.camera, centres, normals, radii)
+        probes = np.empty((len(kept), PROBES + 1, 3))
+        probe_discs(centres, normals, radii, probes)
+        hidden_by = self._hiding(view, probes, self._owners[kept])
+        nowhere = np.zeros((len(kept), 0), dtype=bool)
+        behind = np.stack(list(hidden_by.values()), axis=1) if hidden_by else nowhere
+        extents = np.linalg.norm(shapes, axis=2)
+        return Discs(pixels, shapes, extents, self._disc_levels[kept], behind), list(hidden_by)
 
     def _outlined(self, view: View, hiding: list[int]) -> Solids:
         """The solids in view from far to near; ``hiding``: those whose cover is kept, in the order of their slots."""
@@ -138,14 +109,14 @@ class _AnalyticScene:
             np.array([hiding.index(k) if k in hiding else -1 for k in shown], dtype=int),
         )
 
-    def _hiding(self, view: View, seen: DiscsInView) -> dict[int, NDArray[np.bool_]]:
-        """Solids that stand before one of a disc's probed points, and before which discs (m,)."""
+    def _hiding(self, view: View, probes: Array, owners: NDArray[np.int_]) -> dict[int, NDArray[np.bool_]]:
+        """Solids that stand before one of the discs' ``probes`` (m,k,3), and before which (m,) of other bodies."""
         hiding = {}
         for k, (solid, body) in enumerate(zip(self._solids, self._bodies, strict=True)):
             move = view.camera_from_bodies[body]
             if move[2, 3] < -NEAR:
                 continue
-            behind = solid.hides(move, seen.probes).any(axis=1) & (seen.owners != body)
+            behind = solid.hides(move, probes).any(axis=1) & (owners != body)
             if behind.any():
                 hiding[k] = behind
         return hiding

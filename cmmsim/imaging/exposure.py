@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cmmsim.errors import CmmError
 from cmmsim.geometry.camera import PinholeCamera
-from cmmsim.geometry.pose import Array, apply, pose_to_transform
+from cmmsim.geometry.pose import Array, apply, pose_to_transform, rigid
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.formation import ImageFormation, Side
 from cmmsim.imaging.renderer import View
@@ -105,7 +105,10 @@ def whole_image(
         fine = exposed_windows(formation, camera, moments, corners, size, supersampling)[0]
         for (x, y), window in zip(corners, fine, strict=True):
             image[y : y + size, x : x + size] = window
-    return image if formation.optics.vignetting == 0.0 else image * _illumination(formation, camera)
+    if formation.optics.vignetting == 0.0:
+        return image
+    pixels = np.stack(np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), axis=-1)
+    return image * formation.optics.illumination(camera, pixels).astype(np.float32)
 
 
 def _coarse(
@@ -140,12 +143,6 @@ def _spots(bright: NDArray[np.bool_], fixed_size: bool) -> tuple[NDArray[np.int_
     size = min(size, *bright.shape)
     highest = np.array(bright.shape[::-1]) - size
     return np.clip(np.rint(centres[1:][keep]).astype(int) - size // 2, 0, highest), size
-
-
-def _illumination(formation: ImageFormation, camera: PinholeCamera) -> NDArray[np.float32]:
-    """Relative illumination (height, width) of the whole image."""
-    pixels = np.stack(np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), axis=-1)
-    return formation.optics.illumination(camera, pixels).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -206,10 +203,6 @@ class VirtualStereoCamera:
         """Mean radiance (height, width) of one whole image over the moments of an exposure."""
         return whole_image(self.formation, self.rig.cameras[side], moments, supersampling)
 
-    def patterns(self) -> Sequence[FixedPattern | None]:
-        """What differs from pixel to pixel of the left and of the right camera; None where nothing does."""
-        return self._patterns if self.noise.has_pattern else (None, None)
-
     def centre_error_px(self, quality: Quality) -> float:
         """What drawing leaves in a sticker's centre, px rms."""
         return self.formation.centre_error_px(self.rig.cameras, quality.supersampling)
@@ -219,7 +212,10 @@ class VirtualStereoCamera:
         return [move @ self.camera_from_base for move in self.rig.from_camera]
 
     @cached_property
-    def _patterns(self) -> Sequence[FixedPattern]:
+    def patterns(self) -> Sequence[FixedPattern | None]:
+        """What differs from pixel to pixel of the left and of the right camera; None where nothing does."""
+        if not self.noise.has_pattern:
+            return None, None
         return [
             draw_pattern(
                 (camera.height, camera.width),
@@ -232,8 +228,7 @@ class VirtualStereoCamera:
 
     def _placed(self, base_from_platform: Array, obstacles: Mapping[str, Array]) -> list[Array]:
         """camera_from_body (b,4,4) of all bodies for the left and the right camera."""
-        absent = np.diag([1.0, 1.0, 1.0, 1.0])
-        absent[2, 3] = -1e3  # an obstacle without a place stands far behind both cameras
+        absent = rigid(np.eye(3), (0.0, 0.0, -1e3))  # an obstacle without a place stands far behind both cameras
         return [
             np.stack(
                 [c @ p for p in (base_from_platform, np.eye(4))]
@@ -283,7 +278,7 @@ class LiveImages:
                     self._rng,
                     pattern,
                 )
-                for side, pattern in enumerate(self._camera.patterns())
+                for side, pattern in enumerate(self._camera.patterns)
             )
         )
 
@@ -300,5 +295,5 @@ class LiveImages:
         return self._camera.noise.mean_of_exposures(radiance, self._rng, self._quality.exposures, pattern)
 
     def _pattern(self, corners: NDArray[np.int_], size: int) -> FixedPattern | None:
-        cut = [p.windows(at, size) for p, at in zip(self._camera.patterns(), corners, strict=True) if p is not None]
+        cut = [p.windows(at, size) for p, at in zip(self._camera.patterns, corners, strict=True) if p is not None]
         return FixedPattern(np.stack([c.sensitivity for c in cut]), np.stack([c.offset for c in cut])) if cut else None

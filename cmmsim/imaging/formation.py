@@ -21,11 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.geometry.camera import Optics, PinholeCamera
-from cmmsim.geometry.pose import Array
+from cmmsim.geometry.pose import Array, frozen
 from cmmsim.imaging.renderer import Drawable, Renderer, View
 
-_QUADRATIC = np.array([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])  # from values at -1, 0, 1
-_QUADRATIC.setflags(write=False)
+_QUADRATIC = frozen([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])  # from values at -1, 0, 1
 # Fine pixels along each side of a pixel: the point spread smooths what resampling leaves, without it edges need more.
 SUB_PIXELS, SHARP_SUB_PIXELS = 6, 12
 SIDE_STEP = 4  # px: sides of drawn windows are multiples, so that few frame buffers serve all

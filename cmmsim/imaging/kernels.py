@@ -260,32 +260,27 @@ def lay_layers(images: Array, group: Array, corners: Array, solids: Solids, line
 
 
 @compiled
-def hides(eye: Array, point: Array, normals: Array, offsets: Array, touching: float) -> bool:
-    """Whether the convex solid normal . x + offset <= 0 stands between an eye (3,) and a point (3,) in its axes."""
-    enter, leave = -np.inf, np.inf
-    for k in range(len(normals)):
-        distance, closing = -offsets[k], 0.0
-        for i in range(3):
-            distance -= normals[k, i] * eye[i]
-            closing += normals[k, i] * (point[i] - eye[i])
-        if closing < 0.0:
-            enter = max(enter, distance / closing)
-        elif closing > 0.0:
-            leave = min(leave, distance / closing)
-        elif distance < 0.0:
-            return False
-    return enter < leave and leave > 0.0 and enter < 1.0 - touching
-
-
-@compiled
 def hidden_points(
     body_from_camera: Array, points: Array, normals: Array, offsets: Array, touching: float, hidden: Array
 ) -> None:
-    """``hides`` for points (n,3) in camera axes, into ``hidden`` (n,)."""
+    """Fill ``hidden`` (n,): whether the convex solid normal . x + offset <= 0, in its axes, stands between the camera
+    and points (n,3) in camera axes."""
     eye, point = np.empty(3), np.empty(3)
     for n in range(len(points)):
         for i in range(3):
             point[i] = eye[i] = body_from_camera[i, 3]
             for j in range(3):
                 point[i] += body_from_camera[i, j] * points[n, j]
-        hidden[n] = hides(eye, point, normals, offsets, touching)
+        enter, leave, beside = -np.inf, np.inf, False
+        for k in range(len(normals)):
+            distance, closing = -offsets[k], 0.0
+            for i in range(3):
+                distance -= normals[k, i] * eye[i]
+                closing += normals[k, i] * (point[i] - eye[i])
+            if closing < 0.0:
+                enter = max(enter, distance / closing)
+            elif closing > 0.0:
+                leave = min(leave, distance / closing)
+            else:
+                beside = beside or distance < 0.0
+        hidden[n] = not beside and enter < leave and leave > 0.0 and enter < 1.0 - touching

@@ -18,7 +18,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from cmmsim.geometry.pose import Array
+from cmmsim.geometry.pose import Array, frozen
 from cmmsim.imaging.renderer import FAR, NEAR, Drawable, View, window_bounds
 from cmmsim.imaging.scene import ConvexSolid, Disc, DiscStack, Mesh
 
@@ -28,8 +28,7 @@ FEWEST_SIDES, GROUND_SIDES = 16, 16
 RIM_PX = 0.5  # around a window that the solid must fill, too: far more than rounding
 CLEARANCE = 1e-6  # m by which a disc must lie over its solid
 FLATTEST = 1e-6  # volume of a solid over that of a cube as long; a flatter one fills no window
-OUTWARDS = np.array([-1.0, -1.0, 1.0, 1.0])
-OUTWARDS.setflags(write=False)
+OUTWARDS = frozen([-1.0, -1.0, 1.0, 1.0])
 CORNERS = [[0, 1], [2, 1], [0, 3], [2, 3]]  # of bounds: lowest x, y and highest x, y
 
 

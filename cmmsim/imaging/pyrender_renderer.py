@@ -135,7 +135,9 @@ class _Atlas:
         places = [((k % columns) * cell[0], (k // columns) * cell[1], *cell) for k in range(len(views))]
         self._clear(np.where(laid.filled, solids.levels[laid.solid], background), places, bool((laid.solid < 0).any()))
         self._program._bind()
-        matrices, per_piece = self._matrices(views), -(-rows // PIECES) * columns
+        moves = np.array([view.camera_from_bodies for view in views])
+        clip_from_bodies = (projections(views)[:, None] @ moves).astype(np.float32)
+        per_piece = -(-rows // PIECES) * columns
         shown: list[list[int]] = [[] for _ in views]
         for k, p in np.argwhere(reaching).tolist():
             shown[k].append(p)
@@ -143,7 +145,7 @@ class _Atlas:
             if k and k % per_piece == 0:
                 self._gl.glFlush()
             self._viewport(*place)
-            (self._draw_by_depth if laid.solid[k] < 0 else self._lay)(drawable, shown[k], patches, matrices[k])
+            (self._draw_by_depth if laid.solid[k] < 0 else self._lay)(drawable, shown[k], patches, clip_from_bodies[k])
         self._gl.glBindVertexArray(0)
         return frame_buffer.read()
 
@@ -186,12 +188,6 @@ class _Atlas:
                 gl.glClear(gl.GL_COLOR_BUFFER_BIT)
             gl.glDisable(gl.GL_SCISSOR_TEST)
 
-    @staticmethod
-    def _matrices(views: Sequence[View]) -> NDArray[np.float32]:
-        """Clip-from-body matrices (n views, bodies, 4, 4)."""
-        moves = np.array([view.camera_from_bodies for view in views])
-        return (projections(views)[:, None] @ moves).astype(np.float32)
-
     def _uploaded(self, drawable: Drawable, samples: float) -> tuple[list[_Patch], LaidSolids]:
         """The patches in OpenGL's memory, their discs made for ``samples`` drawn pixels a radian."""
         known = self._known.get(drawable)
@@ -201,12 +197,11 @@ class _Atlas:
             made = [
                 disc_mesh(p, drawable.distance / samples) if isinstance(p, DiscStack) else p for p in drawable.patches
             ]
-            known.patches[samples] = [self._patch(mesh) for mesh in made]
+            known.patches[samples] = [
+                _Patch(self._upload(m)._vaid, m.faces.size, ctypes.c_void_p(m.faces.size * np.uint32().itemsize))
+                for m in made
+            ]
         return known.patches[samples], known.solids
-
-    def _patch(self, mesh: Mesh) -> _Patch:
-        indices = mesh.faces.size
-        return _Patch(self._upload(mesh)._vaid, indices, ctypes.c_void_p(indices * np.dtype(np.uint32).itemsize))
 
     def _upload(self, mesh: Mesh) -> Any:
         grey = np.repeat(mesh.levels[:, None], 3, axis=1)

@@ -133,13 +133,13 @@ class PoseEstimator(Observer):
             found, count = self._found(ellipses, limits)
         except LostError:
             return self._found(ellipses, streaks)[0]
-        if count < ENOUGH * len(self.taught.platform_places):
-            try:
-                longer, more = self._found(ellipses, streaks)
-            except LostError:
-                return found
-            return longer if more > count else found
-        return found
+        if count >= ENOUGH * len(self.taught.platform_places):
+            return found
+        try:
+            longer, more = self._found(ellipses, streaks)
+        except LostError:
+            return found
+        return longer if more > count else found
 
     def measure(
         self, images: StereoImages, expected: Array, swept: tuple[Array, Array] | None = None
