@@ -267,13 +267,4 @@ def exactly_taught(file: SensorFile) -> Taught:
         placed_stickers(marked_body(name, section), file.stickers, stream)
         for stream, (name, section) in enumerate((("platform", file.platform), ("base", file.base)))
     )
-    return Taught(
-        file.name,
-        invert(camera_from_base),
-        np.zeros((6, 6)),
-        platform,
-        np.zeros((len(platform), 3, 3)),
-        np.zeros((6, 6)),
-        base,
-        setup_of(file),
-    )
+    return Taught.without_error(file.name, invert(camera_from_base), platform, base, setup_of(file))

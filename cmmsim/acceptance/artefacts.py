@@ -154,16 +154,8 @@ def estimator_of(sensor: Sensor, body: MarkedBody, base_from_camera: Array | Non
 
     Poses are in the camera frame unless the place of the base is given.
     """
-    count = len(body.nominal)
-    taught = Taught(
-        sensor.name,
-        np.eye(4) if base_from_camera is None else base_from_camera,
-        np.zeros((6, 6)),
-        body.nominal.copy(),
-        np.zeros((count, 3, 3)),
-        np.zeros((6, 6)),
-        np.zeros((0, 3)),
-    )
+    place = np.eye(4) if base_from_camera is None else base_from_camera
+    taught = Taught.without_error(sensor.name, place, body.nominal.copy(), np.zeros((0, 3)))
     return PoseEstimator(sensor.rig, sensor.noise, sensor.settings, body, taught)
 
 

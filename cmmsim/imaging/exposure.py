@@ -75,9 +75,8 @@ def exposed_windows(
     def draw(bodies: Array, which: NDArray[np.bool_]) -> NDArray[np.float32]:
         if not which.any():
             return np.empty((0, size, size), dtype=np.float32)
-        return formation.windows([Side(camera, bodies, corners[which])], size, supersampling, sub_pixels, shade=False)[
-            0
-        ]
+        sides = [Side(camera, bodies, corners[which])]
+        return formation.windows(sides, size, supersampling, sub_pixels, shade=False)[0]
 
     mean = np.full((len(corners), size, size), formation.background, dtype=np.float32)
     mean[drawn_once] = draw(moments[0], drawn_once)
@@ -216,15 +215,10 @@ class VirtualStereoCamera:
         """What differs from pixel to pixel of the left and of the right camera; None where nothing does."""
         if not self.noise.has_pattern:
             return None, None
-        return [
-            draw_pattern(
-                (camera.height, camera.width),
-                self.noise.prnu,
-                self.noise.dsnu,
-                np.random.default_rng([self.pattern_seed, side]),
-            )
-            for side, camera in enumerate(self.rig.cameras)
-        ]
+        rngs = [np.random.default_rng([self.pattern_seed, side]) for side in range(2)]
+        shapes = [(camera.height, camera.width) for camera in self.rig.cameras]
+        prnu, dsnu = self.noise.prnu, self.noise.dsnu
+        return [draw_pattern(shape, prnu, dsnu, rng) for shape, rng in zip(shapes, rngs, strict=True)]
 
     def _placed(self, base_from_platform: Array, obstacles: Mapping[str, Array]) -> list[Array]:
         """camera_from_body (b,4,4) of all bodies for the left and the right camera."""
@@ -247,12 +241,7 @@ class VirtualStereoCamera:
                 if body == 0 and isinstance(patch, DiscStack)
             ]
         )
-        return np.stack(
-            [
-                camera.project(apply(c @ pose_to_transform(pose), places))[0]
-                for camera, c in zip(self.rig.cameras, self._from_base, strict=True)
-            ]
-        )
+        return self.rig.project(apply(self.camera_from_base @ pose_to_transform(pose), places))[0]
 
 
 class LiveImages:
@@ -269,18 +258,12 @@ class LiveImages:
 
     def full(self) -> StereoFrame:
         """Both whole images."""
-        return StereoFrame(
-            *(
-                self._camera.noise.expose(
-                    self._camera.whole_exposure(
-                        side, [placed[side] for placed in self._moments], self._quality.supersampling
-                    ),
-                    self._rng,
-                    pattern,
-                )
-                for side, pattern in enumerate(self._camera.patterns)
-            )
-        )
+        images = []
+        for side, pattern in enumerate(self._camera.patterns):
+            moments = [placed[side] for placed in self._moments]
+            radiance = self._camera.whole_exposure(side, moments, self._quality.supersampling)
+            images.append(self._camera.noise.expose(radiance, self._rng, pattern))
+        return StereoFrame(*images)
 
     def windows(self, corners: NDArray[np.int_], size: int) -> Windows:
         """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) as (x, y)."""

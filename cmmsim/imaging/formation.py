@@ -129,14 +129,9 @@ class ImageFormation:
         fine_size = (size + 2 * margin) * sub_pixels
         nodes = [_shown_places(s.camera, s.corners, size, margin, fine_size) for s in sides]
         first, drawn_size = _drawn_parts(nodes)
-        drawn = self._drawn(
-            [
-                (_finer(s.camera.ideal, sub_pixels), s.bodies, at * sub_pixels)
-                for s, at in zip(sides, first, strict=True)
-            ],
-            drawn_size * sub_pixels,
-            -(-supersampling // sub_pixels),
-        )
+        cameras = [_finer(side.camera.ideal, sub_pixels) for side in sides]
+        finer = [(c, s.bodies, at * sub_pixels) for c, s, at in zip(cameras, sides, first, strict=True)]
+        drawn = self._drawn(finer, drawn_size * sub_pixels, -(-supersampling // sub_pixels))
         response = pixel_response(self.optics.psf_px, size, margin, sub_pixels)
         bent = [
             _bent(side, windows, (places - at[:, None, None] + 0.5) * sub_pixels - 0.5, fine_size)

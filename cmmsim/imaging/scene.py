@@ -83,13 +83,9 @@ class DiscStack:
     @property
     def bounds(self) -> Array:
         """Smallest and largest coordinates (2,3), m."""
-        reach = [d.radius * np.sqrt(np.maximum(1.0 - d.normal**2, 0.0)) for d in self.discs]
-        return np.stack(
-            [
-                np.min([d.centre - r for d, r in zip(self.discs, reach, strict=True)], axis=0),
-                np.max([d.centre + r for d, r in zip(self.discs, reach, strict=True)], axis=0),
-            ]
-        )
+        centres = np.array([d.centre for d in self.discs])
+        reach = np.array([d.radius * np.sqrt(np.maximum(1.0 - d.normal**2, 0.0)) for d in self.discs])
+        return np.stack([(centres - reach).min(axis=0), (centres + reach).max(axis=0)])
 
 
 @dataclass(frozen=True)

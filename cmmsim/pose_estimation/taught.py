@@ -56,6 +56,14 @@ class Taught:
             if isinstance(value := getattr(self, name), np.ndarray):
                 value.setflags(write=False)
 
+    @classmethod
+    def without_error(
+        cls, sensor_name: str, base_from_camera: Array, platform_places: Array, base_places: Array, setup: str = ""
+    ) -> Taught:
+        """What is known exactly, as by a certificate: all covariances are zero."""
+        exact, places = np.zeros((6, 6)), np.zeros((len(platform_places), 3, 3))
+        return cls(sensor_name, base_from_camera, exact, platform_places, places, exact, base_places, setup)
+
     def __repr__(self) -> str:
         stickers = f"{len(self.platform_places)} stickers of the platform, {len(self.base_places)} of the base"
         return f"Taught({self.sensor_name!r}, {stickers})"
