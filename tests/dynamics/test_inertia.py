@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dynamics.engines.mjcf import mjcf_text
@@ -58,6 +58,7 @@ def test_effect_is_measured_all_over_the_travel(robot):
     assert pose.shape == twist.shape == torque.shape == (300, 6)
 
 
+@settings(deadline=None)
 @given(st.lists(moments, min_size=52, max_size=52))
 def test_changed_inertias_are_physical_and_keep_what_the_motion_feels(numbers):
     given_ = np.array(numbers)
