@@ -39,9 +39,7 @@ if TYPE_CHECKING:
     from identify.validation.unseen import unseen_errors as unseen_errors
 
 _HOME = {
-    "Scenario": "identify.scenario",
-    "load_scenario": "identify.scenario",
-    "scenario_names": "identify.scenario",
+    **dict.fromkeys(("Scenario", "load_scenario", "scenario_names"), "identify.scenario"),
     "run_experiment": "identify.experiment.run",
     "build_record": "identify.record.recording",
     "ScaleAnchor": "identify.estimation.scale_anchor",

@@ -52,7 +52,7 @@ def filtered_derivatives(
     The filtered samples are interpolated by a quintic spline, which is then differentiated; towards both ends the
     derivatives are less exact, so leave the first and last few samples out of a fit.
 
-    Raises FilterError: as :func:`zero_phase_filter`.
+    Raises FilterError: as `zero_phase_filter`.
     """
     smooth = zero_phase_filter(samples, rate_hz, cutoff_hz, order)
     return smooth, *spline_derivatives(smooth, rate_hz)

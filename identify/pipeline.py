@@ -152,7 +152,8 @@ def validate(folder: Path, progress: Progress, workers: int | None = None, taugh
     runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, workers, progress)
     recording.write_runs(run_folder.validation, [(unseen.record, unseen.truth) for unseen in runs])
     records = [files.experiment, *(run.record for run in runs)]
-    model_poses = [_model_poses(robot, scenario, models, seen) for seen in records]
+    references = [recorded_reference(seen) for seen in records]
+    model_poses = [[model_run(robot, scenario, values, reference) for values in models] for reference in references]
     predictions = predicted_runs(robot, scenario, records[1:], models[1], files.covariance, trajectories.seed, progress)
     deviations = [None, *(prediction.std for prediction in predictions)]
     drawn = [
@@ -235,12 +236,6 @@ def _identified_models(run_folder: RunFolder, result: dict[str, Any]) -> list[Ar
     except RecordError as error:
         again = f"run `cmmsim identify --out {run_folder.path}` again"
         raise RecordError(f"{run_folder.result}: {error}; {again}") from None
-
-
-def _model_poses(robot: Robot, scenario: Scenario, models: list[Array], record: xr.Dataset) -> list[Array]:
-    """What each model does on the reference of a record."""
-    reference = recorded_reference(record)
-    return [model_run(robot, scenario, parameters, reference) for parameters in models]
 
 
 def _add_seconds(run_folder: RunFolder, **seconds: float) -> None:

@@ -58,7 +58,7 @@ class Noting:
 
 @contextmanager
 def noted() -> Iterator[Noting]:
-    """Ctrl-C is noted in the block, for :func:`raise_noted`; in a block inside another, for both."""
+    """Ctrl-C is noted in the block, for `raise_noted`; in a block inside another, for both."""
     old = signal.getsignal(signal.SIGINT)
     noting = old if isinstance(old, Noting) else Noting()
     if not _is_ours():
@@ -72,7 +72,7 @@ def noted() -> Iterator[Noting]:
 
 
 def raise_noted() -> None:
-    """Raise KeyboardInterrupt once more if there was one since :func:`noted`; call it before long work begins."""
+    """Raise KeyboardInterrupt once more if there was one since `noted`; call it before long work begins."""
     handler = signal.getsignal(signal.SIGINT)
     if isinstance(handler, Noting) and handler.came:
         raise KeyboardInterrupt

@@ -173,7 +173,7 @@ def save_trajectories(path: Path | str, trajectories: TrajectorySet) -> None:
 
 
 def load_trajectories(path: Path | str) -> TrajectorySet:
-    """Read what :func:`save_trajectories` wrote.
+    """Read what `save_trajectories` wrote.
 
     Raises TrajectoryError: the file cannot be read, is of another format or incomplete.
     """

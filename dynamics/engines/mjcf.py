@@ -215,8 +215,6 @@ def _numbers(values: ArrayLike) -> str:
 
 
 # What the exported robot looks like: geoms without mass or contact, so that a viewer shows a 6-RSS robot.
-
-
 CRANK_RADIUS, LINK_RADIUS, BALL_RADIUS = 0.010, 0.006, 0.009
 PLATE_THICKNESS = 0.012
 COLOURS = {

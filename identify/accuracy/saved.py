@@ -97,10 +97,6 @@ FORMAT, SCHEMA = "cmmsim accuracy", 1
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
-
-
 def _machine() -> dict[str, str]:
     return {"system": platform.platform(), "processor": platform.machine(), "cores": str(os.cpu_count())}
 
@@ -120,7 +116,7 @@ class SavedSession:
     format: str = FORMAT
     schema: int = SCHEMA
     name: str
-    created: str = field(default_factory=_now)
+    created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
     machine: dict[str, str] = field(default_factory=_machine)
     versions: dict[str, str] = field(default_factory=_versions)
     seed: int

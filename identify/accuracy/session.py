@@ -202,7 +202,7 @@ class AccuracySession:
         except AccuracyError as error:
             self._fail(session, str(error))
         else:
-            self._remark(f"saved: {_shown(path)}")
+            self._remark(f"saved: {path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path}")
 
     def _tell(self, session: pytest.Session, text: str, guarded: bool) -> None:
         """Say what the comparison found; fail over it if it is guarded and --accuracy-fail asks for that."""
@@ -218,7 +218,3 @@ class AccuracySession:
         self._remark(text, bad=True)
         if session.exitstatus == pytest.ExitCode.OK:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
-
-
-def _shown(path: Path) -> str:
-    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)

@@ -58,13 +58,15 @@ class Segment:
 
     def simulate(self, parameters: Array, state: Array, sensitivities: bool = False) -> ClosedLoopRun:
         """The model's run from a state (18,); the first segment starts in equilibrium. Raises LoopFailure."""
-        run = self.run
+        run, (pose, rate, integral) = self.run, state.reshape(3, 6)
+        before = run.logged[max(0, self.first - MAX_DELAY_FRAMES - 2) : self.first]
+        start = StartState(pose, rate, integral, np.zeros(6), before, pose) if self.first else None
         return simulate(
             run.robot,
             parameters + run.payload,
             self.reference,
             run.settings,
-            start=self._start(state) if self.first else None,
+            start=start,
             sensitivities=sensitivities,
             start_sensitivities=sensitivities,
             commands=run.logged[self.first : self.last + 1],
@@ -75,11 +77,6 @@ class Segment:
         count = self.last - self.first + self.ends_the_run
         rows = values[:count][self.run.ok[self.first : self.first + count]]
         return np.einsum("ij,nj...->ni...", self.run.whitener, rows).reshape(-1, *values.shape[2:])
-
-    def _start(self, state: Array) -> StartState:
-        before = self.run.logged[max(0, self.first - MAX_DELAY_FRAMES - 2) : self.first]
-        pose, rate, integral = state.reshape(3, 6)
-        return StartState(pose, rate, integral, np.zeros(6), before, pose)
 
 
 def segments(run: RecordedRun) -> list[Segment]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dynamics.parameters import unit_of
 from identify.arrays import Array
-from identify.estimation.covariance import Pair, correlation_matrix, strongest_pairs
+from identify.estimation.covariance import correlation_matrix, strongest_pairs
 from identify.estimation.explanation import Misfit, Whiteness
 from identify.estimation.identifiability import Conditioning, GroupEstimates
 from identify.estimation.scale_anchor import ScaleAnchor
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 STRONGEST = 10
-"""Correlations that a result lists."""
+"""Correlations that a result lists, of the parameters that are identified."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,9 @@ class IdentificationResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Estimates with their uncertainty, for a JSON file; the true values, where known, are for others to add."""
-        anchor, whiteness = self.scale_anchor, self.whiteness
+        anchor, whiteness, identified = self.scale_anchor, self.whiteness, np.flatnonzero(self.identifiable)
+        correlations = correlation_matrix(self.covariance[np.ix_(identified, identified)])
+        pairs = strongest_pairs(correlations, [self.names[k] for k in identified], STRONGEST)
         return {
             "scale_anchor": anchor.name,
             "scale_anchor_value": anchor.value,
@@ -108,7 +110,7 @@ class IdentificationResult:
             **{name: getattr(self, name) for name in ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")},
             "whiteness": {"p_value": whiteness.p_value, "p_values": dict(zip(POSE, whiteness.p_values, strict=True))},
             "conditioning": asdict(self.conditioning),
-            "strongest_correlations": [asdict(pair) for pair in self._strongest_correlations()],
+            "strongest_correlations": [asdict(pair) for pair in pairs],
             "warnings": list(self.warnings),
             "base_rank": self.base_rank,
             "parameters": {name: self._parameter(k) for k, name in enumerate(self.names)},
@@ -140,9 +142,3 @@ class IdentificationResult:
             "interval": self.group_intervals[k].tolist(),
             "identifiable": bool(groups.identifiable[k]),
         }
-
-    def _strongest_correlations(self) -> list[Pair]:
-        """The strongest among the parameters that are identified."""
-        identified = np.flatnonzero(self.identifiable)
-        correlations = correlation_matrix(self.covariance[np.ix_(identified, identified)])
-        return strongest_pairs(correlations, [self.names[k] for k in identified], STRONGEST)

@@ -18,7 +18,7 @@ import xarray as xr
 from dynamics.parameters import unit_of
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.files.dataset import shown
+from identify.files.dataset import as_number, shown
 from identify.loop_parameters import NAMES, index_of
 
 MEASURED_PARAMETER = {"platform_mass": "platform.mass", "joint_gain": "joint_pid.lp"}
@@ -82,7 +82,7 @@ def read_anchor(record: xr.Dataset) -> ScaleAnchor:
 def _positive(record: xr.Dataset, attribute: str) -> float:
     """A record's attribute that must be a finite number > 0."""
     value = record.attrs.get(attribute)
-    number = float(value) if isinstance(value, int | float | np.number) and not isinstance(value, bool) else np.nan
+    number = as_number(value)
     if not 0 < number < np.inf:
         anchor = record.attrs["scale_anchor"]
         measured = MEASURED_PARAMETER[anchor]

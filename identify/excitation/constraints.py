@@ -135,6 +135,10 @@ class Worst:
     who: str
     time_s: float
 
+    def excess(self) -> float:
+        """The share used, infinite where a leg is out of reach."""
+        return np.inf if np.isnan(self.share) else self.share
+
     def __str__(self) -> str:
         who = f" of {self.who}" if self.who else ""
         return f"{self.name}{who} is {self.value:.4g}{self.unit} at t = {self.time_s:.3f} s, limit {self.limit:.4g}" + (
@@ -212,7 +216,7 @@ class MotionConstraints:
         found = self.worst(trajectory, times)
         broken = [w for w in found if not w.share <= 1 + tolerance]
         if broken:
-            raise TrajectoryError(f"the trajectory is not admissible: {max(broken, key=_excess)}")
+            raise TrajectoryError(f"the trajectory is not admissible: {max(broken, key=Worst.excess)}")
         return found
 
 
@@ -226,7 +230,3 @@ def check_periods(scenario: Scenario) -> None:
             f"excitation.fundamental_hz = {settings.fundamental_hz:g} Hz; excitation.method = {settings.method!r} "
             "needs a whole number of periods, at least 1"
         )
-
-
-def _excess(worst: Worst) -> float:
-    return np.inf if np.isnan(worst.share) else worst.share

@@ -73,7 +73,7 @@ class SearchProblem:
             middle = (inside + outside) / 2
             inside, outside = (middle, outside) if self.is_admissible(middle * z) else (inside, middle)
             if outside < 1e-3:
-                worst = max(self.worst(middle * z), key=lambda w: np.inf if np.isnan(w.share) else w.share)
+                worst = max(self.worst(middle * z), key=Worst.excess)
                 raise TrajectoryError(f"no start is admissible, not even close to home: {worst}")
         return inside * z
 

@@ -16,7 +16,7 @@ import xarray as xr
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.experiment.truth import true_parameters
-from identify.files.dataset import Variables, check_finite, check_variables, described_dataset, read_group, write_groups
+from identify.files.dataset import Variables, check_finite, check_variables, described_dataset, read_group
 from identify.scenario import Timing
 
 VARIABLES: Variables = {
@@ -97,11 +97,6 @@ def frame_mean(
     mean = torque.copy()
     np.subtract.at(mean, nearest[within], (excess[:, None] * jump)[within])
     return np.asarray(mean, dtype=float)
-
-
-def write_channels(path: Path, channels: xr.Dataset) -> None:
-    """Write the channels, whole or not at all."""
-    write_groups(path, {"": channels})
 
 
 def read_channels(path: Path) -> xr.Dataset:

@@ -27,7 +27,7 @@ from identify.scenario import Scenario
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """The true robot in its loop, made once by :func:`build_plant`.
+    """The true robot in its loop, made once by `build_plant`.
 
     nominal: the robot that servo and estimator know; robot: the true one, the same object where there is no geometry
     error; parameters (67,): the true ones; settings: of its loop, whose joints may be elastic.

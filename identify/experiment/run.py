@@ -59,7 +59,8 @@ def run_experiment(
     sensor = taught_sensor(scenario, plant.nominal, seed, progress)
     with progress.stage("record", scenario.timing.frames(scenario.excitation.duration_s)) as advance:
         experiment = excitation_run(plant, sensor, trajectories.excitation, seed, advance, payload)
-    target = Path(path) if path else _default_path(scenario, seed, payload)
+    kept = Path(platformdirs.user_cache_dir("cmmsim")) / "records"
+    target = Path(path or kept / f"{scenario.name}-{seed}{'-payload' if payload else ''}.nc")
     target.parent.mkdir(parents=True, exist_ok=True)
     recording.write(target, experiment.record, experiment.truth)
     return experiment.record.assign_attrs(path=str(target))
@@ -152,8 +153,3 @@ def _record(plant: Plant, reference: Reference, run: ClosedLoopRun, eye: SensorI
     )
     store_robot(record, plant.nominal)
     return record.assign_attrs(sensor_seconds=eye.seconds, lost_frames="; ".join(eye.lost[:20]))
-
-
-def _default_path(scenario: Scenario, seed: int, payload: bool) -> Path:
-    name = f"{scenario.name}-{seed}{'-payload' if payload else ''}.nc"
-    return Path(platformdirs.user_cache_dir("cmmsim")) / "records" / name

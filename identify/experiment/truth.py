@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.files.dataset import Variables, check_finite, check_variables, described_dataset, pose_array, read_group
+from identify.files.dataset import Variables, check_finite, check_variables, described_dataset, pose_parts, read_group
 from identify.record.recording import TRUTH_GROUP, run_names
 
 VARIABLES: Variables = {
@@ -45,11 +45,9 @@ def build_truth(
 
     Raises RecordError: wrong shapes, or numbers that are not finite.
     """
-    true_pose = pose_array(pose, "pose")
     truth = described_dataset(
         {
-            "position": true_pose[:, :3],
-            "orientation": true_pose[:, 3:],
+            **pose_parts(pose, "pose", "position", "orientation"),
             "joint_angle": np.asarray(joint_angle, dtype=float),
             "joint_velocity": np.asarray(joint_velocity, dtype=float),
             "joint_torque": np.asarray(joint_torque, dtype=float),
@@ -74,10 +72,7 @@ def read_truth(path: Path | str, run: str = "") -> xr.Dataset:
 
 
 def read_truth_runs(path: Path | str) -> list[xr.Dataset]:
-    """Read the truth of all runs of a file in their order.
-
-    Raises RecordError: as :func:`read_truth`, or no runs in the file.
-    """
+    """Read the truth of all runs of a file in their order. Raises RecordError: as `read_truth`, or no runs in it."""
     return [read_truth(path, name) for name in run_names(path)]
 
 

@@ -49,7 +49,7 @@ def read_group(path: Path | str, group: str = "") -> xr.Dataset:
 def group_names(path: Path | str) -> list[str]:
     """Names of all groups, nested ones as ``run01/truth``.
 
-    Raises RecordError: no such file, or not a whole netCDF file.
+    Raises RecordError: no such file, or no whole netCDF file.
     """
     if not Path(path).is_file():
         raise RecordError(f"there is no file {path}")
@@ -94,12 +94,12 @@ LABELS: dict[str, list[Any]] = {
 }
 
 
-def pose_array(values: ArrayLike, name: str) -> Array:
-    """Array (N, 6) of floats. Raises RecordError: another shape."""
+def pose_parts(values: ArrayLike, name: str, position: str, orientation: str) -> dict[str, Array]:
+    """Position and orientation (N, 3) of poses (N, 6), by the names of both. Raises RecordError: another shape."""
     array = np.asarray(values, dtype=float)
     if array.ndim != 2 or array.shape[1] != 6:
         raise RecordError(f"{name} has shape {array.shape}, expected (N, 6)")
-    return array
+    return {position: array[:, :3], orientation: array[:, 3:]}
 
 
 def described_dataset(values: dict[str, Any], time: ArrayLike, variables: Variables, **labels: list[str]) -> xr.Dataset:
@@ -141,10 +141,7 @@ def check_variables(data: xr.Dataset, variables: Variables, source: str) -> None
 
 
 def check_finite(values: Array, name: str, source: str) -> None:
-    """Refuse values that are not finite.
-
-    Raises RecordError: naming the variable and how many of its values are wrong.
-    """
+    """Refuse values that are not finite. Raises RecordError, naming the variable and how many are wrong."""
     bad = int(np.count_nonzero(~np.isfinite(values)))
     if bad:
         raise RecordError(f"{source}: {bad} of {values.size} values of {name} are not finite numbers")
@@ -163,6 +160,11 @@ def shown(value: object) -> str:
 def plain(value: object) -> object:
     """The value; a number of numpy, as netCDF gives it, as a plain one."""
     return value.item() if isinstance(value, np.generic) else value
+
+
+def as_number(value: object) -> float:
+    """An attribute's value that is a number and no truth value; NaN for anything else."""
+    return float(value) if isinstance(value, int | float | np.number) and not isinstance(value, bool) else np.nan
 
 
 VARIABLE = "covariance"

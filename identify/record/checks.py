@@ -12,7 +12,7 @@ from dynamics import Robot
 from dynamics.closed_loop import Reference
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.files.dataset import POSE, shown
+from identify.files.dataset import POSE, as_number, shown
 from identify.filtering import SPLINE_DEGREE, padding_samples
 from identify.record.provenance import check_robot, recorded_scenario
 from identify.record.recording import check_record, poses
@@ -65,8 +65,7 @@ def check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
 def _check_stated_rate(record: xr.Dataset, rate_hz: float) -> None:
     """A frame rate that the record states beside its scenario must be that of the scenario [Hz]."""
     stated = record.attrs.get("frame_rate_hz", rate_hz)
-    number = isinstance(stated, int | float | np.number) and not isinstance(stated, bool)
-    if not number or not abs(stated - rate_hz) <= ROUNDING * rate_hz:
+    if not abs(as_number(stated) - rate_hz) <= ROUNDING * rate_hz:
         raise EstimationError(
             f"the record contradicts itself: its attribute frame_rate_hz is {shown(stated)}, and timing.frame_rate_hz "
             f"of its attribute scenario is {rate_hz:g}"

@@ -10,7 +10,7 @@ import xarray as xr
 
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.files.dataset import shown
+from identify.files.dataset import as_number, shown
 from identify.loop_parameters import NAMES, index_of
 from identify.scenario.sections import check_load_std, check_moments
 
@@ -62,6 +62,7 @@ def recorded_payload(record: xr.Dataset) -> tuple[Array, Array]:
 
 def _not_negative(name: str, value: object, unit: str) -> float:
     """An attribute's value, a finite number >= 0."""
-    if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.number) or not 0 <= value < 1e6:
+    number = as_number(value)
+    if not 0 <= number < 1e6:
         raise RecordError(f"the record's attribute {name} is {shown(value)}, must be a number >= 0 in {unit}")
-    return float(value)
+    return number

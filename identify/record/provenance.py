@@ -128,30 +128,11 @@ class RunFiles:
     def __init__(self, folder: RunFolder) -> None:
         self.folder = folder
 
-    @cached_property
-    def experiment(self) -> xr.Dataset:
-        """The record of the excitation."""
-        return read(self.folder.experiment)
-
-    @cached_property
-    def payload(self) -> xr.Dataset:
-        """That of the same run under a known load."""
-        return read(self.folder.payload)
-
-    @cached_property
-    def covariance(self) -> Array:
-        """Covariance (67, 67) of the estimates."""
-        return read_covariance(self.folder.covariance, NAMES)
-
-    @cached_property
-    def validation(self) -> list[xr.Dataset]:
-        """The records of the unseen runs."""
-        return read_runs(self.folder.validation)
-
-    @cached_property
-    def model(self) -> Mapping[str, xr.Dataset]:
-        """What the models do, by the run's name."""
-        return read_model_runs(self.folder.model)
+    experiment = cached_property(lambda self: read(self.folder.experiment))
+    payload = cached_property(lambda self: read(self.folder.payload))  # of the same run under a known load
+    covariance = cached_property(lambda self: read_covariance(self.folder.covariance, NAMES))  # of the estimates
+    validation = cached_property(lambda self: read_runs(self.folder.validation))
+    model = cached_property(lambda self: read_model_runs(self.folder.model))  # by the run's name
 
     def content(self, name: str) -> Any:
         """What a file holds, by its name, as ``experiment.nc``."""

@@ -1,6 +1,6 @@
 """What the experimenter sees of a run, as an xarray dataset in netCDF, and what models do on the same motion.
 
-A record is the main group of its file. The truth stands in a group of its own (:mod:`identify.experiment.truth`), so
+A record is the main group of its file. The truth stands in a group of its own (`identify.experiment.truth`), so
 that an estimator that reads a record cannot see it. Several runs share a file as the groups ``run01``, ``run01/truth``,
 ``run02``, ...; model runs (``model.nc``) are the groups ``excitation``, ``run01``, ``run02``, ...
 """
@@ -22,7 +22,7 @@ from identify.files.dataset import (
     check_variables,
     described_dataset,
     group_names,
-    pose_array,
+    pose_parts,
     read_group,
     write_groups,
 )
@@ -78,16 +78,11 @@ def build_record(
     Raises RecordError: wrong shapes, numbers that are not finite where a measurement was not lost, or a `measured_ok`
     that is neither 1 nor 0.
     """
-    reference, rate = pose_array(reference_pose, "reference_pose"), pose_array(reference_rate, "reference_rate")
-    measured = pose_array(measured_pose, "measured_pose")
     record = described_dataset(
         {
-            "reference_position": reference[:, :3],
-            "reference_orientation": reference[:, 3:],
-            "reference_velocity": rate[:, :3],
-            "reference_orientation_rate": rate[:, 3:],
-            "measured_position": measured[:, :3],
-            "measured_orientation": measured[:, 3:],
+            **pose_parts(reference_pose, "reference_pose", "reference_position", "reference_orientation"),
+            **pose_parts(reference_rate, "reference_rate", "reference_velocity", "reference_orientation_rate"),
+            **pose_parts(measured_pose, "measured_pose", "measured_position", "measured_orientation"),
             "measured_covariance": np.asarray(measured_covariance, dtype=float),
             "measured_ok": np.asarray(measured_ok, dtype=np.int8),
             "command": np.asarray(command, dtype=float),
@@ -134,7 +129,7 @@ def write_runs(path: Path | str, runs: Sequence[tuple[xr.Dataset, xr.Dataset | N
 def read_runs(path: Path | str) -> list[xr.Dataset]:
     """Read the records of all runs of a file in their order, checked.
 
-    Raises RecordError: as :func:`read`, or no runs in the file.
+    Raises RecordError: as `read`, or no runs in it.
     """
     return [read(path, name) for name in run_names(path)]
 
@@ -218,17 +213,11 @@ def build_model_run(
     std (N, 6): predicted deviations of the plant from the identified model, where they were predicted.
     Raises RecordError: wrong shapes.
     """
-    initial, identified = pose_array(initial_pose, "initial_pose"), pose_array(identified_pose, "identified_pose")
-    values = {
-        "initial_position": initial[:, :3],
-        "initial_orientation": initial[:, 3:],
-        "identified_position": identified[:, :3],
-        "identified_orientation": identified[:, 3:],
-    }
+    values = pose_parts(initial_pose, "initial_pose", "initial_position", "initial_orientation")
+    values |= pose_parts(identified_pose, "identified_pose", "identified_position", "identified_orientation")
     variables = MODEL_VARIABLES
     if std is not None:
-        predicted = pose_array(std, "std")
-        values |= {"std_position": predicted[:, :3], "std_orientation": predicted[:, 3:]}
+        values |= pose_parts(std, "std", "std_position", "std_orientation")
         variables = MODEL_VARIABLES | PREDICTED
     finite = {name: np.where(np.isfinite(v), v, np.nan) for name, v in values.items()}
     return described_dataset(finite, time, variables)

@@ -7,6 +7,7 @@ from typing import Any
 
 import jinja2
 import numpy as np
+import plotly.offline
 import xarray as xr
 
 from identify.arrays import Array
@@ -155,7 +156,7 @@ def render(data: ReportData) -> str:
         title=f"Identification run: scenario {data.result.get('scenario')}, seed {data.result.get('seed')}",
         goals=check_goals(data.result),
         sections=[build(data) for build in SECTIONS],
-        plotly=report_plots.plotly_javascript(),
+        plotly=plotly.offline.get_plotlyjs(),  # the whole of it, so that the report opens offline
     )
 
 

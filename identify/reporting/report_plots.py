@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import plotly.graph_objects as go
-import plotly.offline
 from plotly.subplots import make_subplots
 
 from identify.arrays import Array
@@ -24,11 +23,6 @@ from identify.reporting.figures import (
 from identify.reporting.goals import VALIDATION_UM, VALIDATION_URAD
 
 AXIS_COLOURS = (BLUE, "#ff7f0e", GREEN)
-
-
-def plotly_javascript() -> str:
-    """The whole of plotly's JavaScript, to stand once in the report so that it opens offline."""
-    return str(plotly.offline.get_plotlyjs())
 
 
 def trajectory_plot(time: Array, poses: Array) -> str:

@@ -255,7 +255,8 @@ def _percent(parameter: dict[str, Any]) -> str:
 def print_identification(result: dict[str, Any], path: Path) -> None:
     """What is identified, how well the model explains the record, the time it took, and where all of it is."""
     identification = result["identification"]
-    counts = [f"{_identified(identification.get(kind, {}))} {kind}" for kind in ("parameters", "groups")]
+    entries = {kind: identification.get(kind, {}).values() for kind in ("parameters", "groups")}
+    counts = [f"{sum(bool(one['identifiable']) for one in of)} of {len(of)} {kind}" for kind, of in entries.items()]
     seconds = result["seconds"].get("identify")
     typer.echo(f"identified: {' and '.join(counts)}, in {number(seconds)} s")
     goals = explanation_goals(result)
@@ -275,7 +276,3 @@ def print_goals(result: dict[str, Any], report: Path) -> None:
         if not goal.passed:
             typer.echo(f"missed: {goal.name}: {goal.detail}")
     typer.echo(f"report: {report}")
-
-
-def _identified(entries: dict[str, Any]) -> str:
-    return f"{sum(bool(entry['identifiable']) for entry in entries.values())} of {len(entries)}"

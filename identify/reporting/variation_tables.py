@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from dynamics.parameters import unit_of
+from dynamics.parameters import COULOMB_NAMES, JOINT_PID_NAMES, VISCOUS_NAMES, unit_of
 from identify.reporting.tables import Table, number
 from identify.validation.variation import Variation
 
@@ -25,21 +25,9 @@ PAPER_PERCENT = {
     "link4.mass": 19.1,
     "link5.mass": 10.1,
     "link6.mass": 12.9,
-    "joint1.coulomb": 15.9,
-    "joint1.viscous": 11.7,
-    "joint2.coulomb": 21.4,
-    "joint2.viscous": 13.9,
-    "joint3.coulomb": 9.0,
-    "joint3.viscous": 16.4,
-    "joint4.coulomb": 17.8,
-    "joint4.viscous": 15.2,
-    "joint5.coulomb": 15.1,
-    "joint5.viscous": 21.8,
-    "joint6.coulomb": 23.4,
-    "joint6.viscous": 13.0,
-    "joint_pid.lp": 2.82,
-    "joint_pid.li": 0.44,
-    "joint_pid.ld": 3.7,
+    **dict(zip(COULOMB_NAMES, (15.9, 21.4, 9.0, 17.8, 15.1, 23.4), strict=True)),
+    **dict(zip(VISCOUS_NAMES, (11.7, 13.9, 16.4, 15.2, 21.8, 13.0), strict=True)),
+    **dict(zip(JOINT_PID_NAMES, (2.82, 0.44, 3.7), strict=True)),
 }
 """Table 5, as far as its rows can be told apart (in our copy a cell is missing in its left column) and as far as these
 parameters can be identified at all."""

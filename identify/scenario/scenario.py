@@ -27,7 +27,7 @@ from identify.scenario.timing import IN_FILE, Timing, by_dotted_key, completed, 
 
 
 class Scenario(Section):
-    """A whole synthetic experiment; load one with :func:`load_scenario`."""
+    """A whole synthetic experiment; load one with `load_scenario`."""
 
     name: str = Field(description="short name, used for folders", pattern=r"^[\w.-]+$")
     description: str = ""

@@ -219,14 +219,11 @@ def _leaves(model: type[BaseModel], prefix: str) -> dict[str, FieldInfo]:
     """Fields that are no sections, by dotted path."""
     found: dict[str, FieldInfo] = {}
     for name, field in model.model_fields.items():
-        inner = next((a for a in (field.annotation, *get_args(field.annotation)) if _is_model(a)), None)
+        kinds = (field.annotation, *get_args(field.annotation))
+        inner = next((a for a in kinds if isinstance(a, type) and issubclass(a, BaseModel)), None)
         listed = getattr(field.annotation, "__origin__", None) is list
         found |= {f"{prefix}{name}": field} if inner is None or listed else _leaves(inner, f"{prefix}{name}.")
     return found
-
-
-def _is_model(annotation: Any) -> bool:
-    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
 def _nearest(name: str, known: Collection[str]) -> str:

@@ -66,7 +66,7 @@ def _serial(setup: Setup, batches: "Batches") -> Iterator[list[Finished]]:
 def run_study(study: Study, folder: Path, progress: Progress, workers: Workers = in_this_process) -> Outcome:
     """Run a study in its folder, or go on with it there; the same study gives the same figures whatever the workers.
 
-    Raises StudyError: see :func:`identify.studies.design.prepare` and :func:`identify.studies.store.open_folder`; the
+    Raises StudyError: see `identify.studies.design.prepare` and `identify.studies.store.open_folder`; the
     disk is full; the workers are lost. Finished rows are kept, and the same call goes on from there. Raises
     StudyInterrupted: Ctrl-C, likewise.
     """

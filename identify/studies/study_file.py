@@ -9,18 +9,15 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from identify.errors import StudyError
 from identify.scenario.scenario import SCENARIOS
+from identify.scenario.sections import Section
 from identify.scenario.settings_file import SettingsFiles, one_line
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class Law(_Table):
+class Law(Section):
     """A law: one of three statements about the rms of a figure over rows, with all other factors held where they are.
 
     exponent: it grows with a numeric factor as ``factor ** exponent``; equals: it is that of another figure;
@@ -71,7 +68,7 @@ class Law(_Table):
         return f"{value} ± {self.tolerance:g}" if self.tolerance else value
 
 
-class Range(_Table):
+class Range(Section):
     """A factor of a random sample, drawn evenly between two bounds or evenly between their logarithms."""
 
     low: float
@@ -92,8 +89,8 @@ class Range(_Table):
         return [int(bound) if bound.is_integer() else bound for bound in (self.low, self.high)]
 
 
-class Study(_Table):
-    """A whole study; load one with :func:`load_study`."""
+class Study(Section):
+    """A whole study; load one with `load_study`."""
 
     name: str = Field(description="short name, used for folders", pattern=r"^[\w.-]+$")
     title: str = Field("", description="what the study asks")
@@ -154,7 +151,7 @@ def load_study(name_or_path: str | Path) -> Study:
     """Load a built-in study by name, or one from a TOML file, from whose folder its paths start.
 
     Raises StudyError: no such study (with the built-in names), no TOML, or wrong content; the keys of factors and
-    changes are checked by :mod:`identify.studies.design`.
+    changes are checked by `identify.studies.design`.
     """
     return STUDIES.load(name_or_path)
 

@@ -151,14 +151,10 @@ def _table(study: Study, points: Points, shown: list[str]) -> list[str]:
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for values, figures in points[:LONGEST]:
         count = max((one.rows for one in figures.values()), default=0)
-        cells = [_value(values[path]) for path in factors] + [str(count), *(_cell(figures.get(name)) for name in shown)]
+        cells = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in values.values()]
+        cells += [str(count), *(_cell(figures.get(name)) for name in shown)]
         lines.append(f"| {' | '.join(cells)} |")
     return lines + ([f"\n{len(points) - LONGEST} more points stand in `{JSON}`."] if len(points) > LONGEST else [])
-
-
-def _value(value: Any) -> str:
-    """A factor's value; a drawn number with as many digits as a reader wants."""
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _cell(one: Statistics | None) -> str:

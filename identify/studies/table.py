@@ -135,7 +135,7 @@ def write_table(path: Path, frame: pd.DataFrame, entry: dict[str, Any]) -> None:
 def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
     """A study's table and the study, of its `study.parquet`.
 
-    Raises StudyError: no such file, no Parquet, or not of a study.
+    Raises StudyError: no such file, or no table of a study.
     """
     entry = study_in(Path(path))
     if entry is None:
@@ -182,7 +182,7 @@ def to_xarray(frame: pd.DataFrame, study: Study) -> xr.Dataset:
 
 
 def write_view(path: Path, frame: pd.DataFrame, study: Study) -> None:
-    """Write the view of :func:`to_xarray` as netCDF, whole or not at all; `xarray.open_dataset` reads it.
+    """Write the view of `to_xarray` as netCDF, whole or not at all; `xarray.open_dataset` reads it.
 
     A "/" in a name is a group there, so it is written as "_per_".
 

@@ -27,8 +27,9 @@ from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identifiability import IDENTIFIABLE_SHARE, group_estimates, identifiability
 from identify.estimation.identification import output_error_problem
 from identify.estimators.estimator import Estimate, Estimator, Evidence, joint_channels
-from identify.experiment.joint_instruments import JointInstruments, measure_joints, read_channels, write_channels
+from identify.experiment.joint_instruments import JointInstruments, measure_joints, read_channels
 from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
+from identify.files.dataset import write_groups
 from identify.files.run_folder import rms_figures, rms_row
 from identify.loop_parameters import NAMES
 from identify.progress import Progress
@@ -55,10 +56,6 @@ class Examination:
         """Relative errors (k,) of the base parameters that the record shows."""
         true = self.combinations @ self.true[:64]
         return np.asarray((self.combinations @ parameters[:64] - true) / np.abs(true), dtype=float)
-
-    def gain_errors(self, parameters: Array) -> Array:
-        """Relative errors (3,) of lp, li, ld."""
-        return np.asarray(parameters[64:] / self.true[64:] - 1, dtype=float)
 
     def pose_distance(self, parameters: Array) -> tuple[float, float]:
         """RMS of the worst axis and run, um and urad; NaN where the model's loop is unstable, or an estimator gives
@@ -112,7 +109,7 @@ def compare_on_run(
     draws = np.random.default_rng(stream_seed(int(record.attrs["seed"]), LATENCY, 0))
     latencies = scenario.timing.drawn_latencies(record.sizes["time"], draws)
     rng, channels = mixed_generator(INSTRUMENTS, seed), folder.path / "instruments.nc"
-    write_channels(channels, measure_joints(record, truth, scenario.timing, instruments, rng, latencies))
+    write_groups(channels, {"": measure_joints(record, truth, scenario.timing, instruments, rng, latencies)})
     known = true_parameters(truth)
     true = np.array([known[name] for name in NAMES])
     problem = output_error_problem([record], load_robot(scenario.robot), scenario)
@@ -160,7 +157,7 @@ def _score(name: str, estimator: Estimator, evidence: Evidence, asked: Examinati
     except (EstimationError, DynamicsError) as error:
         nothing = (np.nan, np.nan, np.nan, np.nan, np.nan, np.nan)
         return Score(name, estimator.title, estimator.uses, *nothing, 0, 0, f"failed: {error}")
-    groups, gains = asked.group_errors(found.parameters), asked.gain_errors(found.parameters)
+    groups, gains = asked.group_errors(found.parameters), found.parameters[64:] / asked.true[64:] - 1
     position_um, orientation_urad = asked.pose_distance(found.parameters)
     return Score(
         name=name,

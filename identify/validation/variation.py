@@ -79,7 +79,7 @@ class Variation:
 
 
 def variation(results: Sequence[IdentificationResult]) -> Variation:
-    """Variation of the estimates of several identifications of one robot.
+    """Variation of estimates from several identifications of one robot.
 
     Raises EstimationError with fewer than three.
     """

@@ -88,10 +88,7 @@ def prepare(
 
 
 def parse_volume(text: str) -> np.ndarray:
-    """Sides (3,) [m] of a volume written as ``0.6`` (a cube) or ``0.7x0.6x0.6``.
-
-    Raises AcceptanceError: anything else.
-    """
+    """Sides (3,) [m] of a volume written ``0.6`` (a cube) or ``0.7x0.6x0.6``. Raises AcceptanceError: anything else."""
     try:
         sides = np.array([float(part) for part in text.lower().split("x")])
     except ValueError:

@@ -143,7 +143,7 @@ def test_bad_input_is_one_line_and_status_one(calls, capfd, tmp_path, monkeypatc
 
 def test_new_folder_may_be_absent_or_empty(tmp_path):
     assert not new_run_folder(tmp_path / "absent").path.exists()
-    assert new_run_folder(tmp_path) == RunFolder(tmp_path)
+    assert new_run_folder(tmp_path).path == tmp_path
 
 
 @pytest.mark.parametrize(

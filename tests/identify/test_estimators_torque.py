@@ -24,7 +24,6 @@ from identify.experiment.joint_instruments import (
     frame_mean,
     measure_joints,
     read_channels,
-    write_channels,
 )
 from identify.files.dataset import write_groups
 from identify.loop_parameters import NAMES
@@ -212,7 +211,7 @@ def test_the_encoder_rounds_and_the_channels_are_seeded(short):
 def test_channels_survive_the_file_and_bad_ones_are_named(short, tmp_path):
     record, _, measured = short
     channels, path = measured(JointInstruments()), tmp_path / "instruments.nc"
-    write_channels(path, channels)
+    write_groups(path, {"": channels})
     assert read_channels(path).equals(channels)
     assert joint_channels(read_channels(path), record).torque_std == 0.02
     with pytest.raises(RecordError, match=r"120 frames up to .* the record 60"):

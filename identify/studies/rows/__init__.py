@@ -44,11 +44,9 @@ def _own(name: str, function: Callable[..., Any]) -> Kind:
             signature.bind(*range(count))
         except TypeError:
             continue
-        return Kind(name, function) if count == 3 else Kind(name, _without_options(function), takes_options=False)
+        if count == 3:
+            return Kind(name, function)
+        return Kind(name, lambda scenario, seed, _: function(scenario, seed), takes_options=False)
     raise StudyError(
         f"kind {name!r} takes {signature}; a row's function takes (scenario, seed) or (scenario, seed, options)"
     )
-
-
-def _without_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda scenario, seed, _: function(scenario, seed)

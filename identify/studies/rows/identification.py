@@ -115,17 +115,13 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Identific
         run_plant(plant, sensor, trajectory, scenario.validation.duration_s, number, run)
         for run, trajectory in enumerate(trajectories.validation, start=1)
     ]
-    errors = np.concatenate([_model_errors(robot, scenario, result.estimate, one) for one in unseen])
+    references = [recorded_reference(one.record) for one in unseen]
+    models = [model_run(robot, scenario, result.estimate, reference) for reference in references]
+    errors = np.concatenate(models) - np.concatenate([true_poses(one.truth) for one in unseen])
     return (
         _record_figures(experiment)
         | _parameter_figures(result, truth)
-        | prediction_figures(
-            robot,
-            scenario,
-            (result.estimate, result.covariance),
-            truth,
-            [recorded_reference(one.record) for one in unseen],
-        )
+        | prediction_figures(robot, scenario, (result.estimate, result.covariance), truth, references)
         | {"unseen_position_rms_um": rms_um(errors[:, :3]), "unseen_orientation_rms_urad": rms_um(errors[:, 3:])}
     )
 
@@ -179,11 +175,6 @@ def prediction_figures(
         "prediction_rms_um": 1e6 * float(np.sqrt(np.mean(squares))),
         "stated_prediction_rms_um": 1e6 * float(np.sqrt(np.mean(stated))),
     }
-
-
-def _model_errors(robot: Robot, scenario: Scenario, parameters: Array, unseen: Experiment) -> Array:
-    """Poses (N, 6) of the identified model less the true ones."""
-    return model_run(robot, scenario, parameters, recorded_reference(unseen.record)) - true_poses(unseen.truth)
 
 
 def _drawn(scenario: Scenario) -> DrawnSensor:

@@ -6,11 +6,12 @@ from functools import reduce
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from cmmsim.files import read_sensor_file
 from identify.errors import StudyError
 from identify.scenario import Scenario
+from identify.scenario.sections import Section
 from identify.scenario.settings_file import one_line
 from identify.scenario.timing import IN_FILE
 from identify.studies.study_file import Range, Study
@@ -158,10 +159,8 @@ class Column:
     main: bool = False
 
 
-class RowOptions(BaseModel):
+class RowOptions(Section):
     """Options of a kind; unknown names and wrong values are refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
 @dataclass(frozen=True)
