@@ -144,10 +144,7 @@ def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
 
 
 def study_in(path: Path) -> dict[str, Any] | None:
-    """The resolved study that a table is of; None where there is no such file.
-
-    Raises StudyError: no Parquet, or not of a study.
-    """
+    """The resolved study that a table is of; None where there is no file. Raises StudyError: no table of a study."""
     if not path.exists():
         return None
     try:
