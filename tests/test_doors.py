@@ -37,21 +37,14 @@ def python(*arguments, cwd, path=()):
     )
 
 
-def test_help_begins_with_everything_that_identify_offers():
-    assert [name for name in identify.__all__ if not re.search(rf"\b{name}\b", identify.__doc__)] == []
-    assert len(identify.__all__) <= 15
-
-
-def test_a_signature_can_be_read():
-    """Types stand in it by their names: spelled out, `ArrayLike` alone takes 200 characters."""
-    functions = [getattr(identify, name) for name in identify.__all__ if name.islower()]
-    assert max(len(str(inspect.signature(function))) for function in functions) < 400
-
-
-def test_every_name_that_identify_offers_can_be_had():
-    """They are imported on first use: a wrong home would show to the user only."""
-    assert all(getattr(identify, name).__name__ == name for name in identify.__all__)
-    assert set(identify.__all__) < set(dir(identify))
+def test_every_name_that_identify_offers_is_in_its_help_can_be_had_and_has_a_signature_that_can_be_read():
+    """Types stand in signatures by their names: spelled out, `ArrayLike` alone takes 200 characters."""
+    offered = {name: getattr(identify, name) for name in identify.__all__}
+    assert [name for name in offered if not re.search(rf"\b{name}\b", identify.__doc__)] == []
+    assert len(offered) <= 15
+    assert max(len(str(inspect.signature(value))) for name, value in offered.items() if name.islower()) < 400
+    assert all(value.__name__ == name for name, value in offered.items())
+    assert set(offered) < set(dir(identify))
     with pytest.raises(AttributeError, match="no attribute 'estimate'; it has IdentifyError, Scenario, "):
         _ = identify.estimate
 

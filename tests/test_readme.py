@@ -32,29 +32,18 @@ def kept(name):
     return load_result(ROOT / ".readme" / f"{name}.json")
 
 
-@pytest.fixture(scope="module")
-def result():
-    return kept("result")
-
-
-def test_the_tables_are_those_of_the_quoted_run(result):
+def test_the_tables_are_those_of_a_run_of_the_paper_scenario_that_meets_every_goal():
+    result = kept("result")
     assert goals_table(result).markdown().strip() in README
     assert excitation_error_table(result).markdown().strip() in README
-
-
-def test_the_quoted_run_is_the_paper_scenario_and_meets_every_goal(result):
     assert result["scenario"] == "paper"
     assert len(result["validation"]) == 10
     assert [goal for goal in check_goals(result) if not goal.passed] == []
 
 
-@pytest.fixture(scope="module")
-def dynamics_figures():
-    return kept("dynamics")
-
-
-def test_the_table_of_the_dynamics_is_the_measured_one(dynamics_figures):
-    found, versions = dynamics_figures["figures"], dynamics_figures["versions"]
+def test_the_table_of_the_dynamics_is_the_measured_one_and_reaches_the_goals():
+    measured = kept("dynamics")
+    found, versions = measured["figures"], measured["versions"]
     rows = {
         "forward dynamics against Pinocchio's closed chain, relative": f"{found['pinocchio_relative_difference']:.0e}",
         "the paper's figure-7 loop against MuJoCo (`cmmsim verify-model`), steady": (
@@ -74,8 +63,16 @@ def test_the_table_of_the_dynamics_is_the_measured_one(dynamics_figures):
     }
     wanted = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
     assert wanted in README, f"the README wants these rows:\n{wanted}"
-    said = f"measured {dynamics_figures['date']} with Pinocchio {versions['pin']} and MuJoCo {versions['mujoco']}"
+    said = f"measured {measured['date']} with Pinocchio {versions['pin']} and MuJoCo {versions['mujoco']}"
     assert said in SAID, f"the README wants: {said}"
+    assert found["pinocchio_relative_difference"] <= 1e-9
+    assert found["mujoco_position_steady_um"] <= 10
+    assert found["mujoco_angle_steady_urad"] <= 20
+    assert min(found["forward_dynamics_over_pinocchio"], found["forward_dynamics_over_mj_step"]) >= 8
+    assert found["times_real_time"] >= 300
+    assert found["sensitivities_plain_runs"] <= 15
+    assert found["two_cores_gain"] >= 1.8
+    assert found["first_compilation_s"] <= 20
 
 
 def test_the_sensors_speed_is_the_measured_one():
@@ -114,24 +111,9 @@ def test_the_long_proofs_last_ended_as_quoted():
     assert min(reached) == 25 or f"From {min(reached)} of 25 starting guesses" in SAID, min(reached)
 
 
-def test_the_dynamics_reach_their_goals(dynamics_figures):
-    found = dynamics_figures["figures"]
-    assert found["pinocchio_relative_difference"] <= 1e-9
-    assert found["mujoco_position_steady_um"] <= 10
-    assert found["mujoco_angle_steady_urad"] <= 20
-    assert min(found["forward_dynamics_over_pinocchio"], found["forward_dynamics_over_mj_step"]) >= 8
-    assert found["times_real_time"] >= 300
-    assert found["sensitivities_plain_runs"] <= 15
-    assert found["two_cores_gain"] >= 1.8
-    assert found["first_compilation_s"] <= 20
-
-
-def test_the_table_of_accuracy_is_the_saved_one():
+def test_the_table_of_accuracy_is_the_saved_one_and_the_estimators_are_counted():
     wanted = markdown_table(read_saved(ROOT / ".readme" / "accuracy.json").figures)
     assert wanted.strip() in README, f"the README wants this table:\n{wanted}"
-
-
-def test_it_counts_the_estimators():
     numbers = {"eight": 8, "nine": 9, "ten": 10, "eleven": 11}
     said = re.search(r"`cmmsim estimators [^`]+` runs (\w+) estimators", SAID)
     assert said
@@ -182,12 +164,14 @@ def test_its_sample_identifies_from_a_record_of_ones_own():
     assert np.all(np.abs(result.estimate - truth())[52:] < 4 * result.std[52:])
 
 
-@pytest.mark.parametrize("text", [README, CONTRIBUTING], ids=["README", "CONTRIBUTING"])
-def test_every_file_and_command_that_is_named_exists(text):
+def test_every_file_and_command_that_is_named_exists_and_ci_calls_the_command_of_the_readme():
+    text, command = README + CONTRIBUTING, "sh .ci/setup && sh .ci/test"
     for target in re.findall(r"\]\(([^)#]+)", text):
         assert target.startswith("http") or (ROOT / target).exists(), target
     for path in re.findall(r"`(?:sh )?((?:cmmsim|dynamics|identify|tests|\.ci|\.readme)/[\w./]*)`", text):
         assert (ROOT / path).exists() or path == "tests/FILE.py", path
+    assert command in README
+    assert command in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     commands = {command.name or command.callback.__name__.replace("_", "-") for command in app.registered_commands}
     for name in set(re.findall(r"`(?:\.venv/bin/)?cmmsim ([a-z][a-z-]+)", text)):
         assert name in commands | {group.name for group in app.registered_groups}, name
@@ -201,9 +185,3 @@ def test_contributors_find_the_file_and_the_line_where_something_new_goes():
     assert [folder + file for folder, file in shown if not (ROOT / folder / file).exists()] == []
     for name, file in entered:
         assert re.search(rf"^ *{name}\b.*[:=]", (ROOT / file).read_text(encoding="utf-8"), re.MULTILINE), (name, file)
-
-
-def test_ci_calls_the_test_command_of_the_readme():
-    command = "sh .ci/setup && sh .ci/test"
-    assert command in README
-    assert command in (ROOT / ".ci" / "run").read_text(encoding="utf-8")

@@ -92,12 +92,8 @@ def test_a_sample_whose_interval_holds_the_limit_is_undecided(project):
 def test_saved_figures_are_json_that_says_where_they_come_from_and_become_a_markdown_table(project, saved, capsys):
     project(START, *SAVE, "--accuracy-seed", "3", "--junit-xml", "report.xml").assert_outcomes(passed=3)
     content = json.loads(saved.read_text())
-    assert (content["format"], content["schema"], content["name"], content["seed"]) == (
-        "cmmsim accuracy",
-        1,
-        "before",
-        3,
-    )
+    said = {"format": "cmmsim accuracy", "schema": 1, "name": "before", "seed": 3}
+    assert {name: content[name] for name in said} == said
     assert {"cmmsim", "numpy", "python"} <= set(content["versions"])
     assert set(content["machine"]) == {"system", "processor", "cores"}
     first, _, bias, _ = content["figures"]
@@ -173,28 +169,18 @@ def test_a_figure_beyond_its_limit_is_not_saved_though_its_test_may_fail(project
     assert saved.exists()
 
 
-def test_the_folder_can_be_chosen(project, pytester):
+def test_the_folder_can_be_chosen_and_one_that_is_lost_meanwhile_fails_the_session_in_one_line(project, pytester):
     project(START, *SAVE, "--accuracy-dir", "kept/figures").assert_outcomes(passed=3)
     assert [path.name for path in (pytester.path / "kept" / "figures").iterdir()] == ["before.json"]
     assert project(START, "--accuracy-compare", "before", "--accuracy-dir", "kept/figures").ret == 0
-
-
-def test_a_folder_that_is_lost_meanwhile_fails_the_session_in_one_line(project):
     done = project(START + "\ndef test_z(): open('.accuracy', 'w').close()", *SAVE)
     assert done.ret == 1
     done.stdout.fnmatch_lines(["*.accuracy/before.json cannot be written: *"])
 
 
 def test_it_lives_beside_pytest_benchmark(project, pytester):
-    done = project(
-        """
-        def test_both(accuracy, benchmark):
-            accuracy.record("sum", benchmark(sum, [1.0, 2.0]), limit=3.0)
-        """,
-        "--benchmark-min-rounds=1",
-        "--benchmark-max-time=0.01",
-        "--accuracy-save=now",
-    )
+    body = "def test_both(accuracy, benchmark): accuracy.record('sum', benchmark(sum, [1.0, 2.0]), limit=3.0)"
+    done = project(body, "--benchmark-min-rounds=1", "--benchmark-max-time=0.01", "--accuracy-save=now")
     done.assert_outcomes(passed=1)
     done.stdout.fnmatch_lines(["  sum *3*≤ 3*", "*benchmark: 1 tests*"])
     assert (pytester.path / ".accuracy" / "now.json").exists()
@@ -225,9 +211,7 @@ def test_with_xdist_the_table_and_the_file_are_the_same(project, pytester):
     [
         (["--accuracy-compare", "befor"], "no accuracy figures are saved as 'befor' in *.accuracy; saved are: before"),
         (["--accuracy-save", "../x"], "'../x' is no name for saved figures: up to 100 letters, digits, *"),
-        (["--accuracy-save", "x" * 300], "'xxx*' is no name for saved figures: up to 100 letters, digits, *"),
         (["--accuracy-save", "full.json"], "'full.json' is no name for saved figures: 'full' makes that file"),
-        (["--accuracy-save", "x", "--accuracy-dir", "test_mine.py"], "/*/x.json cannot be written: Not a directory"),
         (["--accuracy-save", "x", "--accuracy-dir", "/proc/none"], "/proc/none/x.json cannot be written: *"),
         (["--accuracy-save", "x", "--accuracy-dir", "y" * 300], "/*/x.json cannot be written: File name too long"),
         (["--accuracy-fail", "0.1"], "--accuracy-fail needs --accuracy-compare NAME: worse than what?"),

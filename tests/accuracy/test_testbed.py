@@ -75,18 +75,15 @@ def test_what_does_not_exist_is_one_line_with_the_valid_names(project):
     done.stdout.fnmatch_lines([f"E  *{says}" for says in WRONG_MARKERS.values()])
 
 
-@pytest.mark.parametrize(
-    ("option", "says"),
-    [
+def test_options_are_checked_though_no_test_uses_them(project):
+    for option, says in (
         ("--accuracy-scenario", "scenario 'nosuch' is neither built in (paper, quick) nor a file"),
         ("--accuracy-robot", "unknown robot `nosuch`; built-in robots: rss6; *"),
         ("--accuracy-sensor", "unknown sensor 'nosuch': neither a built-in name (ctrack780, ctrack780_29hz) nor *"),
-    ],
-)
-def test_options_are_checked_though_no_test_uses_them(project, option, says):
-    done = project("def test_it(): pass", option, "nosuch")
-    assert done.ret == pytest.ExitCode.USAGE_ERROR
-    done.stderr.fnmatch_lines([f"ERROR: {option}: {says}"])
+    ):
+        done = project("def test_it(): pass", option, "nosuch")
+        assert done.ret == pytest.ExitCode.USAGE_ERROR
+        done.stderr.fnmatch_lines([f"ERROR: {option}: {says}"])
 
 
 def test_starting_pytest_imports_nothing_heavy(pytester):

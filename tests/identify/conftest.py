@@ -11,7 +11,7 @@ from identify.files.run_folder import RunFolder, rms_figures, save_result
 from identify.loop_parameters import NAMES
 from identify.record.recording import build_model_run, build_record, write, write_model_runs, write_runs
 from identify.scenario import load_scenario
-from tests.identify.synthetic import recorded_run_folder
+from tests.identify.synthetic import recorded_run_folder, rss6
 
 HOME = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
 
@@ -113,6 +113,11 @@ def parameter(initial, true, estimate, std, identifiable=True):
         "interval": interval,
         "identifiable": identifiable,
     }
+
+
+@pytest.fixture(scope="session")
+def robot():
+    return rss6()
 
 
 @pytest.fixture(scope="session")

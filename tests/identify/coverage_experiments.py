@@ -69,12 +69,9 @@ def quantities(rows: list[dict]) -> dict[str, dict]:
 def _block(scenario, trajectory, numbers: range) -> list[dict]:
     """Rows of experiments with one teaching."""
     sensor = taught_sensor(scenario, rss6(), numbers[0] // BLOCK * BLOCK, SilentProgress())
-    return [_row(scenario, trajectory, sensor, number) for number in numbers]
-
-
-def _row(scenario, trajectory, sensor, number: int) -> dict:
-    record = excitation_run(build_plant(scenario, rss6()), sensor, trajectory, number).record
-    return row_of(number, identify(record, rss6(), scenario))
+    plant = build_plant(scenario, rss6())
+    records = ((number, excitation_run(plant, sensor, trajectory, number).record) for number in numbers)
+    return [row_of(number, identify(record, rss6(), scenario)) for number, record in records]
 
 
 def row_of(number: int, result) -> dict:
@@ -89,19 +86,12 @@ def row_of(number: int, result) -> dict:
 
 
 def _quantities(result) -> Iterator[tuple[str, float, float, bool, bool]]:
-    true = truth()
-    for k, name in enumerate(result.names):
-        error, std = result.estimate[k] - true[k], result.std[k]
-        inside = _holds(result.intervals[k], true[k])
-        yield name, error / std, std / abs(true[k]), bool(result.identifiable[k]), inside
     groups = result.groups
-    for k, expression in enumerate(groups.expressions):
-        if np.count_nonzero(groups.combinations[k]) > 1:
-            value = groups.combinations[k] @ true[:64]
-            error, std = groups.estimate[k] - value, groups.std[k]
-            inside = _holds(result.group_intervals[k], value)
-            yield expression, error / std, std / abs(value), bool(groups.identifiable[k]), inside
-
-
-def _holds(interval, value) -> bool:
-    return bool(interval[0] <= value <= interval[1])
+    several = np.count_nonzero(groups.combinations, axis=1) > 1
+    parameters = (result.names, truth(), result.intervals, np.ones(67, dtype=bool))
+    combined = (groups.expressions, groups.combinations @ truth()[:64], result.group_intervals, several)
+    for found, (names, true, intervals, counted) in ((result, parameters), (groups, combined)):
+        for k in np.flatnonzero(counted):
+            error, std, (low, high) = found.estimate[k] - true[k], found.std[k], intervals[k]
+            inside = bool(low <= true[k] <= high)
+            yield names[k], error / std, std / abs(true[k]), bool(found.identifiable[k]), inside

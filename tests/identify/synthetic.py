@@ -12,9 +12,7 @@ from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.estimators.estimator import Evidence, joint_channels
 from identify.experiment.joint_instruments import JointInstruments, measure_joints
 from identify.experiment.plant import build_plant
-from identify.experiment.truth import build_truth
 from identify.files.run_folder import RunFolder
-from identify.loop_parameters import NAMES
 from identify.record.provenance import store_robot
 from identify.record.recording import build_record, write
 from identify.scenario import load_scenario
@@ -80,16 +78,7 @@ PERFECT = JointInstruments(0.0, 0.0, 0.0)
 
 def truth_of(run):
     """The truth group of a run of the plant."""
-    jacobian = rss6().pose_jacobian(run.pose)
-    return build_truth(
-        time=run.time,
-        pose=run.pose,
-        joint_angle=rss6().inverse_kinematics(run.pose),
-        joint_velocity=np.einsum("nij,nj->ni", jacobian, run.pose_rate),
-        joint_torque=run.torque,
-        parameter_names=list(NAMES),
-        parameters=truth(),
-    )
+    return build_plant(quick(), rss6()).truth(run)
 
 
 def evidence(seed, noise=1.0, instruments=None, scenario=None):
@@ -106,6 +95,10 @@ def unseen(seeds=(7, 8)):
     """(record, truth) of noise-free runs of the plant on trajectories that no estimator has seen."""
     runs = [run_plant(quick(), 0, np.zeros(6), trajectory_seed=seed, duration_s=5.0) for seed in seeds]
     return [(record, truth_of(run)) for record, run in runs]
+
+
+def silent(n=1):
+    """Progress of a search that nobody follows."""
 
 
 class Stages:

@@ -6,11 +6,9 @@ from importlib import resources
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from dynamics import load_robot
 from dynamics.parameters import PARAMETER_NAMES
-from identify.commands.app import app
 from identify.errors import EstimationError
 from identify.estimation.base_parameters import (
     angle_to_singular_vectors,
@@ -19,6 +17,7 @@ from identify.estimation.base_parameters import (
     rank_by_threshold,
     structural_regressor,
 )
+from tests.identify.commands import command
 from tests.identify.synthetic import rss6
 
 
@@ -27,24 +26,11 @@ def found():
     return base_parameters(structural_regressor(rss6()))
 
 
-def leaning(folder):
-    """The reference robot on a slope: its crank axes are no longer vertical."""
-    text = resources.files("dynamics").joinpath("robots", "rss6.toml").read_text()
-    assert "gravity = [0.0, 0.0, -9.81]" in text
-    path = folder / "leaning.toml"
-    path.write_text(text.replace("gravity = [0.0, 0.0, -9.81]", "gravity = [4.0, 0.0, -8.9575]"))
-    return load_robot(path)
-
-
-def random_motion(robot, rng, n=20):
-    pose = robot.home_pose + rng.uniform(-1, 1, (n, 6)) * np.repeat([0.008, 0.03], 3)
-    return pose, rng.normal(size=(n, 6)) * np.repeat([0.1, 0.5], 3), rng.normal(size=(n, 6))
-
-
 def test_the_base_parameters_alone_decide_the_torque(found):
     """Parameters with equal base parameters have equal torques; a moved base parameter moves them."""
     robot, rng = rss6(), np.random.default_rng(3)
-    motion = random_motion(robot, rng)
+    pose = robot.home_pose + rng.uniform(-1, 1, (20, 6)) * np.repeat([0.008, 0.03], 3)
+    motion = pose, rng.normal(size=(20, 6)) * np.repeat([0.1, 0.5], 3), rng.normal(size=(20, 6))
     nominal = robot.parameter_sets["identified"].dynamic
     kernel = np.linalg.svd(found.combinations)[2][found.rank :]
     change = kernel.T @ rng.normal(size=len(kernel))
@@ -81,7 +67,11 @@ def test_the_angle_to_the_singular_vectors_is_that_by_which_a_group_is_wrong():
 @pytest.mark.slow
 def test_gravity_across_the_crank_axes_separates_mass_from_inertia(found, tmp_path):
     """On a slope a crank's weight turns it, so its mass is no longer tied to its inertia."""
-    matrix = structural_regressor(leaning(tmp_path))
+    text = resources.files("dynamics").joinpath("robots", "rss6.toml").read_text()
+    assert "gravity = [0.0, 0.0, -9.81]" in text
+    path = tmp_path / "leaning.toml"
+    path.write_text(text.replace("gravity = [0.0, 0.0, -9.81]", "gravity = [4.0, 0.0, -8.9575]"))
+    matrix = structural_regressor(load_robot(path))
     sloped = base_parameters(matrix)
     assert sloped.rank == rank_by_singular_values(matrix) > found.rank
     row = sloped.combinations[sloped.pivots.index(PARAMETER_NAMES.index("crank2.Izz"))]
@@ -101,23 +91,20 @@ def test_groups_do_not_depend_on_the_motions(found):
     assert np.allclose(again.combinations, found.combinations, atol=1e-9)
 
 
-def test_the_papers_threshold_depends_on_the_units():
+def test_the_papers_threshold_depends_on_the_units_and_no_motion_shows_no_parameter():
     matrix = structural_regressor(rss6())
     assert rank_by_threshold(matrix, 1e-3) == 37
     assert rank_by_threshold(matrix / 1e6, 1e-3) < 37
-
-
-def test_no_motion_shows_no_parameter():
     with pytest.raises(EstimationError, match="excites no parameter"):
         base_parameters(np.zeros((12, 64)))
 
 
-def test_the_command_prints_and_writes_the_groups(tmp_path):
+def test_the_command_prints_and_writes_the_groups(tmp_path, capsys):
     file = tmp_path / "groups.json"
-    done = CliRunner().invoke(app, ["base-parameters", "rss6", "--out", str(file)])
-    assert done.exit_code == 0, done.output
-    assert "crank1.Izz + 0.0009 crank1.mass" in done.output
-    assert "the same groups from singular vectors: largest angle between what both span" in done.output
+    assert command("base-parameters", "rss6", "--out", file) == 0
+    shown = capsys.readouterr().out
+    assert "crank1.Izz + 0.0009 crank1.mass" in shown
+    assert "the same groups from singular vectors: largest angle between what both span" in shown
     written = json.loads(file.read_text())
     assert written["rank"] == written["rank_by_singular_values"] == len(written["groups"]) == 37
     assert written["angle_to_singular_vectors_rad"] < 1e-9

@@ -11,16 +11,8 @@ import pytest
 import cmmsim
 from tests.identify.commands import command, one_line
 
-SENSOR = (
-    resources.files("cmmsim")
-    .joinpath("files", "sensors", "ctrack780.toml")
-    .read_text(encoding="utf-8")
-    .replace("width = 2048", "width = 640")
-    .replace("height = 1536", "height = 480")
-    .replace("focal_px = 2300.0", "focal_px = 720.0")
-    .replace('name = "ctrack780"', 'name = "small"')
-    .replace('renderer = "auto"', "")
-)
+SENSOR = resources.files("cmmsim").joinpath("files", "sensors", "ctrack780.toml").read_text(encoding="utf-8")
+SMALLER = {"2048": "640", "1536": "480", "2300.0": "720.0", '"ctrack780"': '"small"'}
 SLOW = 'name = "slow"\nbased_on = "small.toml"\n[timing]\nframe_rate = 29.0\n[rig]\nbaseline = 1.0\n'
 BOARD = 'kind = "dots"\ncolumns = 7\nrows = 6\nspacing = 0.07\nradius = 0.0175\n'
 
@@ -28,17 +20,23 @@ BOARD = 'kind = "dots"\ncolumns = 7\nrows = 6\nspacing = 0.07\nradius = 0.0175\n
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrate")
-    (folder / "small.toml").write_text('renderer = "analytic"\n' + SENSOR)
+    small = 'renderer = "analytic"\n' + SENSOR
+    for old, new in SMALLER.items():
+        small = small.replace(f" = {old}", f" = {new}")
+    (folder / "small.toml").write_text(small)
     (folder / "slow.toml").write_text(SLOW)
     (folder / "board.toml").write_text(BOARD)
-    options = ("--sensor", folder / "small.toml", "--board", folder / "board.toml", "--out", folder / "pictures")
-    assert command("calibrate", "--render", 8, *options, "--quiet") == 0
+    assert command("calibrate", *rendering(folder, 8), "--out", folder / "pictures", "--quiet") == 0
     return folder
 
 
 def arguments(folder):
     made = folder / "pictures"
     return made / "left", made / "right", "--board", made / "board.toml"
+
+
+def rendering(folder, pairs=1):
+    return "--render", pairs, "--sensor", folder / "small.toml", "--board", folder / "board.toml"
 
 
 def test_command_calibrates_what_it_rendered_into_a_sensor_file_found_from_where_it_is_written(
@@ -64,8 +62,8 @@ def test_command_calibrates_what_it_rendered_into_a_sensor_file_found_from_where
         ("right_from_left.tx_m", truth.right_from_left[0, 3]),
     ):
         assert abs(found[name]["estimate"] - value) < 4.0 * found[name]["std"], name
-    covariance = np.array(result["covariance"]["matrix"])
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [p["std"] for p in found.values()])
+    stated = np.sqrt(np.diag(result["covariance"]["matrix"]))
+    np.testing.assert_allclose(stated, [p["std"] for p in found.values()])
     rig = tomllib.loads((out / "rig.toml").read_text())["rig"]
     assert rig["left"]["focal_px"] == [found["left.fx_px"]["estimate"], found["left.fy_px"]["estimate"]]
     assert tomllib.loads((out / "sensor.toml").read_text())["timing"] == {"frame_rate": 29.0}
@@ -100,15 +98,13 @@ def test_options_reach_a_calibration_whose_cameras_no_sensor_can_have(pictures, 
 
 
 def test_rendering_again_gives_the_same_complete_set(pictures, tmp_path):
-    made, again = pictures / "pictures", tmp_path / "again"
-    options = ("--sensor", pictures / "small.toml", "--board", pictures / "board.toml", "--quiet")
+    made = pictures / "pictures"
     for out in ("a", "b"):
-        assert command("calibrate", "--render", 1, *options, "--seed", 5, "--out", again / out) == 0
+        assert command("calibrate", *rendering(pictures), "--quiet", "--seed", 5, "--out", tmp_path / out) == 0
     assert sorted(path.name for path in made.iterdir()) == ["board.toml", "left", "right"]
     for side in ("left", "right"):
         assert sorted(path.name for path in (made / side).iterdir()) == [f"{k:03d}.png" for k in range(8)]
-        first, second = ((again / out / side / "000.png").read_bytes() for out in "ab")
-        assert first == second
+        assert len({(tmp_path / out / side / "000.png").read_bytes() for out in "ab"}) == 1
 
 
 @pytest.mark.parametrize(
@@ -116,7 +112,6 @@ def test_rendering_again_gives_the_same_complete_set(pictures, tmp_path):
     [
         (lambda a: [a[0]], "missing RIGHT, --board FILE; cmmsim calibrate --help shows examples"),
         (lambda a: ["nowhere", *a[1:]], "no folder nowhere"),
-        (lambda a: [*a[:3], "none.toml"], "cannot read board file none.toml"),
         (lambda a: [*a, "--distortion", "fisheye"], "unknown distortion 'fisheye': valid are brown5, none, radial2"),
         (lambda a: [*a, "--sensor", "ctrack"], "unknown sensor 'ctrack'"),
         (lambda a: [*a, "--sensor", "ctrack780"], "640 x 480 px, those of the sensor file ctrack780 2048 x 1536"),
@@ -162,15 +157,7 @@ def test_stopped_rendering_leaves_nothing(pictures, tmp_path, monkeypatch, capfd
     if there:
         out.mkdir()
     monkeypatch.setattr(cv2, "imwrite", stopped)
-    options = ("--sensor", pictures / "small.toml", "--board", pictures / "board.toml", "--out", out)
-    assert command("calibrate", "--render", 1, *options) == 130
+    assert command("calibrate", *rendering(pictures), "--out", out) == 130
     assert capfd.readouterr().err.endswith("aborted\n")
     assert list(tmp_path.iterdir()) == ([out] if there else [])
     assert not there or not list(out.iterdir())
-
-
-def test_help_teaches_the_board_file(capfd):
-    assert command("calibrate", "--help") == 0
-    said = capfd.readouterr().out
-    assert "asymmetric_dots" in said
-    assert "--render 20" in said

@@ -182,6 +182,8 @@ def test_help_teaches_and_the_command_starts_in_a_process_of_its_own_and_waits_f
         (["--help"], "identify --out mine --set identification.method=command_driven"),
         (["run", "--help"], "paper, quick"),
         (["identify", "--help"], "stays in scenario.toml"),
+        (["acceptance", "--help"], "cmmsim acceptance mine.toml"),
+        (["calibrate", "--help"], "asymmetric_dots"),
     ):
         assert command(*words) == 0
         assert shown in capsys.readouterr().out

@@ -20,44 +20,39 @@ from tests.identify.synthetic import SHORT, rss6
 DRIVEN = {"identification.method": "command_driven"}
 
 
-@pytest.fixture
-def run(recorded_folder):
-    return recorded_folder
-
-
-def test_a_setting_acts_and_is_kept_for_the_next_stages_and_the_reader(run):
-    pipeline.identify(run.path, SilentProgress(), DRIVEN)
-    kept, result = load_scenario(run.scenario), load_result(run.result)
+def test_a_setting_acts_and_is_kept_for_the_next_stages_and_the_reader(recorded_folder):
+    pipeline.identify(recorded_folder.path, SilentProgress(), DRIVEN)
+    kept, result = load_scenario(recorded_folder.scenario), load_result(recorded_folder.result)
     assert kept == SHORT.with_overrides(DRIVEN)
     assert result["settings"]["identification.method"] == "command_driven"
-    expected = identify(read(run.experiment), rss6(), SHORT.with_overrides(DRIVEN))
+    expected = identify(read(recorded_folder.experiment), rss6(), SHORT.with_overrides(DRIVEN))
     np.testing.assert_array_equal(parameter_vector(result["identification"], "estimate"), expected.estimate)
     assert result["identification"]["searches"] == ["command_driven"]
-    table = changed_settings_table(result, read(run.experiment).attrs["scenario"])
+    table = changed_settings_table(result, read(recorded_folder.experiment).attrs["scenario"])
     assert table.rows == (("identification.method", "command_driven", "closed_loop"),)
-    pipeline.identify(run.path, SilentProgress())
-    assert load_result(run.result)["identification"]["searches"] == ["command_driven"]
+    pipeline.identify(recorded_folder.path, SilentProgress())
+    assert load_result(recorded_folder.result)["identification"]["searches"] == ["command_driven"]
 
 
-def test_without_settings_the_scenario_is_left_as_it_is(run):
-    run.scenario.write_text("# mine\n" + SHORT.to_toml(), encoding="utf-8")
-    pipeline.identify(run.path, SilentProgress())
-    assert run.scenario.read_text(encoding="utf-8").startswith("# mine\n")
-    result = load_result(run.result)
+def test_without_settings_the_scenario_is_left_as_it_is(recorded_folder):
+    recorded_folder.scenario.write_text("# mine\n" + SHORT.to_toml(), encoding="utf-8")
+    pipeline.identify(recorded_folder.path, SilentProgress())
+    assert recorded_folder.scenario.read_text(encoding="utf-8").startswith("# mine\n")
+    result = load_result(recorded_folder.result)
     assert result["settings"] == estimator_settings(SHORT)
     assert changed_settings_table(result, SHORT.to_toml()).rows == ()
     assert changed_settings_table({}, "").rows == ()
 
 
-def test_an_identification_that_fails_leaves_scenario_and_result(run):
-    before = run.scenario.read_text(encoding="utf-8")
+def test_an_identification_that_fails_leaves_scenario_and_result(recorded_folder):
+    before = recorded_folder.scenario.read_text(encoding="utf-8")
     with pytest.raises(ScenarioError, match="robot rss6 has no parameter set 'nobody'; it has identified"):
-        pipeline.identify(run.path, SilentProgress(), {"model.start_parameters": "nobody"})
-    assert run.scenario.read_text(encoding="utf-8") == before
-    assert not run.result.exists()
+        pipeline.identify(recorded_folder.path, SilentProgress(), {"model.start_parameters": "nobody"})
+    assert recorded_folder.scenario.read_text(encoding="utf-8") == before
+    assert not recorded_folder.result.exists()
 
 
-def test_what_the_record_was_made_with_is_refused_in_one_line(run, capfd):
+def test_what_the_record_was_made_with_is_refused_in_one_line(recorded_folder, capfd):
     for setting in (
         {"timing.latency_s": 0.01},
         {"plant.steps_per_frame": 4},
@@ -68,21 +63,18 @@ def test_what_the_record_was_made_with_is_refused_in_one_line(run, capfd):
     ):
         with pytest.raises(ScenarioError, match=f"'{next(iter(setting))}' cannot be set for an identification"):
             with_estimator_settings(SHORT, setting)
-    assert command("identify", "--out", run.path, "--set", "identification.scale_anchor=prior") == 1
+    assert command("identify", "--out", recorded_folder.path, "--set", "identification.scale_anchor=prior") == 1
     said = one_line(capfd.readouterr().err)
     assert "'identification.scale_anchor' cannot be set for an identification" in said
     assert "allowed: identification.*, model.*, filter.*, except identification.scale_anchor and" in said
-    assert not run.result.exists()
+    assert not recorded_folder.result.exists()
 
 
-def test_a_wrong_name_or_value_is_refused_as_in_a_scenario():
+def test_a_wrong_name_or_value_is_refused_as_in_a_scenario_and_every_setting_of_the_sections_is_listed():
     with pytest.raises(ScenarioError, match=r"valid names in \[identification\]: method, scale_anchor"):
         with_estimator_settings(SHORT, {"identification.methode": "closed_loop"})
     with pytest.raises(ScenarioError, match="model: friction = 'stribeck' with static_ratio = None"):
         with_estimator_settings(SHORT, {"model.friction": "stribeck"})
-
-
-def test_every_setting_of_the_sections_is_listed():
     listed = {key.partition(".")[0] for key in estimator_settings(SHORT)}
     assert listed == set(SECTIONS) < set(Scenario.model_fields)
 

@@ -13,7 +13,7 @@ from identify.progress import SilentProgress
 from identify.record import recording
 from identify.validation.estimator_comparison import START, compare, estimators_figure, examination
 from tests.identify.commands import command, one_line
-from tests.identify.synthetic import evidence, quick, run_plant, truth, truth_of, unseen
+from tests.identify.synthetic import evidence, quick, recorded_run_folder, run_plant, truth, unseen
 
 
 @pytest.fixture(scope="module")
@@ -31,17 +31,13 @@ def score(seen, asked, parameters):
     return compare(seen, asked, {"fixed": fixed}, SilentProgress())[1]
 
 
-def test_the_truth_has_no_parameter_distance_and_only_the_integrators_pose_distance(seen, asked):
-    """Plant and model integrate with other steps: that is all that the true parameters leave."""
+def test_distances_are_relative_and_of_what_the_record_shows(seen, asked):
+    """3 % on everything is 3 % of every combination, and what no motion shows does not count. Plant and model integrate
+    with other steps: that is all that the true parameters leave."""
     exact = score(seen, asked, truth())
-    assert exact.group_distance == 0
-    assert exact.gain_distance == 0
+    assert exact.group_distance == exact.gain_distance == 0
     assert exact.position_um < 0.05
     assert exact.orientation_urad < 0.5
-
-
-def test_distances_are_relative_and_of_what_the_record_shows(seen, asked):
-    """3 % on everything is 3 % of every combination, and what no motion shows does not count."""
     assert 20 <= len(asked.combinations) <= 37
     off = score(seen, asked, 1.03 * truth())
     assert off.group_distance == pytest.approx(0.03, rel=1e-9)
@@ -86,9 +82,7 @@ def test_names_and_examinations_that_do_not_exist_are_refused(seen):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("run")
-    (path / "scenario.toml").write_text(quick().to_toml(), encoding="utf-8")
-    record, run = run_plant(quick(), 1)
-    recording.write(path / "experiment.nc", record, truth_of(run))
+    recorded_run_folder(path, quick(), run_plant(quick(), 1))
     recording.write_runs(path / "validation.nc", unseen((7,)))
     return path
 
@@ -126,8 +120,7 @@ def test_the_seed_decides_the_instruments(folder, capsys):
         assert call("--out", folder, "--only", "torque_ls", "--quiet", "--seed", seed, "--torque-noise", 0.1) == 0
         assert capsys.readouterr().out == ""
         channels.append(read_channels(folder / "instruments.nc"))
-    assert channels[0].equals(channels[1])
-    assert not channels[0].equals(channels[2])
+    assert [one.equals(channels[0]) for one in channels] == [True, True, False]
     assert channels[0].attrs["torque_noise_N_m"] == 0.1
 
 

@@ -56,13 +56,13 @@ def test_the_mean_torque_of_a_frame_is_that_of_the_motion(timing):
     problem = recorded_run(record, rss6(), scenario)
     latencies = np.full(len(run.torque), scenario.timing.latency_s)
     mean = frame_mean(run.torque, run.command, run.start.commands[-1], truth()[[64, 66]], scenario.timing, latencies)
-    left = {}
-    for name, torque in (("mean", mean), ("sample", run.torque)):
+
+    def left(torque):
         equations = torque_equations(problem, run.pose, torque, scenario)
-        dynamics = equations.kind < 6
-        left[name] = np.sqrt(np.mean(equations.residual(np.append(truth(), np.zeros(6)))[dynamics] ** 2))
-    assert left["mean"] < 1.5e-3
-    assert left["sample"] > 3 * left["mean"] or timing.get("timing.hold") == "linear"
+        return np.sqrt(np.mean(equations.residual(np.append(truth(), np.zeros(6)))[equations.kind < 6] ** 2))
+
+    assert left(mean) < 1.5e-3
+    assert left(run.torque) > 3 * left(mean) or timing.get("timing.hold") == "linear"
 
 
 def test_jumps_are_averaged_whenever_they_come():
@@ -86,11 +86,9 @@ def test_jumps_are_averaged_whenever_they_come():
 
 def test_without_noise_torque_gives_gains_and_coulomb_friction():
     """No anchor is told: the torque carries the scale. What is left are filter and sampling, below 2 %."""
-    seen = evidence(1, noise=1e-4, instruments=PERFECT)
-    estimate = weighted_least_squares(seen)
-    coulomb = slice(52, 58)
-    assert np.allclose(estimate.parameters[64:], truth()[64:], rtol=0.01), estimate.parameters[64:]
-    assert np.allclose(estimate.parameters[coulomb], truth()[coulomb], rtol=0.02), estimate.parameters[coulomb]
+    found = weighted_least_squares(evidence(1, noise=1e-4, instruments=PERFECT)).parameters
+    assert np.allclose(found[64:], truth()[64:], rtol=0.01), found[64:]
+    assert np.allclose(found[52:58], truth()[52:58], rtol=0.02), found[52:58]
 
 
 def test_noise_in_the_poses_biases_least_squares_and_not_the_instrumental_variables():
@@ -147,17 +145,14 @@ def test_truncated_tls_is_the_textbooks_where_all_errors_are_alike():
     assert np.linalg.norm(solution - truth_) < 0.5 * np.linalg.norm(plain - truth_)
 
 
-def test_tls_leaves_a_direction_that_nothing_shows():
+def test_tls_leaves_a_direction_that_nothing_shows_and_without_the_right_side_there_is_no_solution():
+    """A matrix whose smallest singular vector leaves the right side out says nothing of it."""
     rng = np.random.default_rng(2)
     matrix = np.column_stack([rng.standard_normal(300), 1e-6 * rng.standard_normal(300)])
     errors = 0.01 * rng.standard_normal((2, 300, 3)) * [1, 0, 1]
     solution, covariance = truncated_tls(matrix, 2 * matrix[:, 0], errors)
     assert solution == pytest.approx([2.0, 0.0], abs=1e-3)
     assert covariance[1, 1] == pytest.approx(1.0, rel=1e-3)
-
-
-def test_tls_errors_without_right_side_have_no_solution():
-    """A matrix whose smallest singular vector leaves the right side out says nothing of it."""
     matrix, right = np.array([[10.0, 0.0], [0.0, 10.0], [0.0, 0.0]]), np.array([0.0, 0.0, 100.0])
     errors = np.eye(3)[None] * np.array([1.0, 1.0, 1e-3])
     with pytest.raises(EstimationError, match="not generic"):
@@ -181,24 +176,23 @@ def test_the_nearest_admissible_unknowns_have_no_negative_parameter():
 
 
 def test_total_least_squares_and_the_encoder_route_agree_with_least_squares_where_noise_is_small():
-    """On a clean record all routes of the inverse dynamics tell the same gains, within 1 %."""
+    """On a clean record all routes of the inverse dynamics tell the same gains, within 1 %; angles that no pose has
+    tell none."""
     seen = evidence(1, noise=0.05, instruments=JointInstruments(1e-3, 0.0, 0.0))
-    routes = (weighted_least_squares, total_least_squares, instrumental_variables, encoder_route)
-    for route in routes:
+    for route in (weighted_least_squares, total_least_squares, instrumental_variables, encoder_route):
         estimate = route(seen)
         assert np.allclose(estimate.parameters[64:], truth()[64:], rtol=0.01), (route, estimate.parameters[64:])
         assert np.all(estimate.std > 0)
+    broken = replace(seen.channels, angle=np.full_like(seen.channels.angle, 2.0))
+    with pytest.raises(EstimationError, match="angles give no poses"):
+        encoder_route(replace(seen, channels=broken))
 
 
-def test_encoders_give_the_true_poses_through_forward_kinematics(short):
+def test_encoders_give_the_true_poses_but_for_rounding_and_the_channels_are_seeded(short):
     record, run, measured = short
     reference = recorded_run(record, rss6(), quick()).reference.poses
     poses = rss6().forward_kinematics(measured(PERFECT)["joint_angle"].values, reference)
     assert np.abs(poses - run.pose).max() < 1e-10
-
-
-def test_the_encoder_rounds_and_the_channels_are_seeded(short):
-    _, _, measured = short
     one, same, other = (measured(JointInstruments(0.05, 1e-4, 1e-3), seed) for seed in (1, 1, 2))
     assert one.equals(same)
     assert not np.array_equal(one["joint_torque"], other["joint_torque"])
@@ -226,13 +220,6 @@ def test_channels_survive_the_file_and_bad_ones_are_named(short, tmp_path):
             read_channels(path)
     with pytest.raises(ScenarioError, match=r"encoder_noise_rad is .*finite number >= 0"):
         JointInstruments(encoder_noise_rad=np.nan)
-
-
-def test_angles_that_no_pose_has_are_said():
-    seen = evidence(1)
-    broken = replace(seen.channels, angle=np.full_like(seen.channels.angle, 2.0))
-    with pytest.raises(EstimationError, match="angles give no poses"):
-        encoder_route(replace(seen, channels=broken))
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from identify.estimation.prior import StartingGuess, starting_guess
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.loop_parameters import NAMES
 from identify.record.recorded_run import recorded_run
-from tests.identify.synthetic import quick, rss6, run_plant, truth
+from tests.identify.synthetic import quick, rss6, run_plant, silent, truth
 
 STATED = 1e-11
 OFF = 0.15
@@ -38,8 +38,8 @@ def found(plant_steps, model_steps):
     guess = StartingGuess(start, starting_guess(rss6(), "initial", 1.0).std)
     anchor = ScaleAnchor("joint_gain", truth()[gain], 1e-9)
     problem = OutputErrorProblem((recorded_run(record, rss6(), scenario),), guess, anchor)
-    driven = search(problem.driven_by_commands(), start, scenario, lambda n=1: None)
-    solution = search(problem, driven.parameters, scenario, lambda n=1: None)
+    driven = search(problem.driven_by_commands(), start, scenario, silent)
+    solution = search(problem, driven.parameters, scenario, silent)
     return problem, solution, base_parameters(structural_regressor(rss6()))
 
 

@@ -19,15 +19,9 @@ from identify.excitation.motion import unknowns
 from identify.loop_parameters import NAMES, index_of, model_settings
 from identify.scenario import load_scenario
 from identify.trajectory import random_trajectory
-from tests.identify.synthetic import rss6
 
 SCENARIO = load_scenario("quick")
 SMALL = {"excitation.position_amplitude_m": 1e-4, "excitation.orientation_amplitude_rad": 4e-4}
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return rss6()
 
 
 @pytest.fixture(scope="module")
@@ -37,21 +31,21 @@ def known(robot):
 
 def drawn(robot, seed, scenario=SCENARIO):
     """Unknowns, and the z of a random trajectory."""
-    settings = scenario.excitation
-    free = unknowns(robot.home_pose, settings)
-    trajectory = random_trajectory(
-        np.random.default_rng(seed),
-        robot.home_pose,
-        settings.fundamental_hz,
-        settings.harmonics,
-        settings.position_amplitude_m,
-        settings.orientation_amplitude_rad,
-    )
+    of = scenario.excitation
+    free, size = unknowns(robot.home_pose, of), (of.position_amplitude_m, of.orientation_amplitude_rad)
+    rng = np.random.default_rng(seed)
+    trajectory = random_trajectory(rng, robot.home_pose, of.fundamental_hz, of.harmonics, *size)
     return free, free.of(trajectory), trajectory
 
 
+def simulated(robot, parameters, trajectory, scenario):
+    """Run of the whole scenario's duration, with sensitivities."""
+    reference = trajectory.reference(scenario.timing.frame_times(scenario.excitation.duration_s))
+    return simulate(robot, parameters, reference, model_settings(scenario), sensitivities=True)
+
+
 @pytest.mark.parametrize("harmonics_", [2, 5])
-def test_unknowns_and_trajectories_are_the_same_thing(robot, harmonics_):
+def test_unknowns_and_trajectories_are_the_same_thing_and_any_start_and_end_at_home_and_at_rest(robot, harmonics_):
     free, z, trajectory = drawn(robot, 1, SCENARIO.with_overrides({"excitation.harmonics": harmonics_}))
     assert z.shape == (12 * (harmonics_ - 1),)
     t = np.linspace(0, 10, 50)
@@ -59,10 +53,6 @@ def test_unknowns_and_trajectories_are_the_same_thing(robot, harmonics_):
     for basis, derivative in zip(free.basis(t), ("pose", "pose_rate", "pose_acceleration"), strict=True):
         moved = (z.reshape(6, -1) @ basis.T).T * free.box + (robot.home_pose if derivative == "pose" else 0)
         np.testing.assert_allclose(moved, getattr(trajectory, derivative)(t), atol=1e-14)
-
-
-def test_any_unknowns_start_and_end_at_home_and_at_rest(robot):
-    free, z, _ = drawn(robot, 2)
     trajectory = free.trajectory(np.random.default_rng(3).standard_normal(z.size))
     for t in (0.0, 10.0, 20.0):
         np.testing.assert_allclose(trajectory.pose(t), robot.home_pose, atol=1e-14)
@@ -70,13 +60,13 @@ def test_any_unknowns_start_and_end_at_home_and_at_rest(robot):
         np.testing.assert_allclose(trajectory.pose_acceleration(t), 0, atol=1e-13)
 
 
-@pytest.mark.parametrize(("duration_s", "sampled"), [(20.0, 20.0), (13.0, 13.0), (4.0, 4.0)])
-def test_index_is_the_geometric_mean_of_the_singular_values_that_are_not_zero(robot, duration_s, sampled):
+@pytest.mark.parametrize("duration_s", [20.0, 13.0, 4.0])
+def test_index_is_the_geometric_mean_of_the_singular_values_that_are_not_zero(robot, duration_s):
     """Equation 39 by a singular value decomposition of all 64 columns of the robot's own regressor, over what is
     played; of whole periods one is sampled, which is the same. No judgement hangs on what counts as zero: between the
-    two kinds lie more than six decades."""
+    two kinds lie more than six decades. Nor does it depend on the trajectory that sets the scale."""
     free, z, trajectory = drawn(robot, 4)
-    t = np.arange(0.05, sampled, 0.1)
+    t = np.arange(0.05, duration_s, 0.1)
     pose, rate, acceleration = trajectory.pose(t), trajectory.pose_rate(t), trajectory.pose_acceleration(t)
     stacked = robot.regressor(pose, robot.twist(pose, rate), robot.twist_dot(pose, rate, acceleration))
     singular = np.linalg.svd(stacked.reshape(-1, 64), compute_uv=False)
@@ -84,14 +74,9 @@ def test_index_is_the_geometric_mean_of_the_singular_values_that_are_not_zero(ro
     assert len(seen) == 37
     assert singular[36] / singular[37] > 1e6
     expected = np.exp(np.mean(np.log(seen))) / np.sqrt(len(t))
-    assert np.exp(float(log_observability(robot, free, duration_s, z)(z))) == pytest.approx(expected, rel=1e-7)
-
-
-def test_index_does_not_depend_on_the_trajectory_that_sets_the_scale(robot):
-    free, z, _ = drawn(robot, 5)
-    _, other, _ = drawn(robot, 6)
-    values = [float(log_observability(robot, free, 10.0, typical)(z)) for typical in (z, other)]
-    assert values[0] == pytest.approx(values[1], abs=1e-8)
+    found, scaled = (float(log_observability(robot, free, duration_s, of)(z)) for of in (z, drawn(robot, 6)[1]))
+    assert np.exp(found) == pytest.approx(expected, rel=1e-7)
+    assert scaled == pytest.approx(found, abs=1e-8)
 
 
 @pytest.mark.parametrize("criterion", ["observability", "information"])
@@ -115,29 +100,15 @@ def test_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
     free, z, trajectory = drawn(robot, 8, scenario)
     parameters = robot.parameter_sets["initial"].vector.copy()
     parameters[VISCOUS] = 0.5  # without friction the loop rings longer than a period
-    run = simulate(
-        robot,
-        parameters,
-        trajectory.reference(scenario.timing.frame_times(20.0)),
-        model_settings(scenario),
-        sensitivities=True,
-    )
+    run = simulated(robot, parameters, trajectory, scenario)
     s, t = harmonics(free), run.time[6000:]
     unknown = ca.MX.sym("z", z.size)
     spectrum = sensitivity_spectrum(robot, free, scenario, parameters, unknown)
     parts = np.array(ca.Function("spectrum", [unknown], [spectrum])(z)).reshape(67, len(s), 2, 6)
     waves = np.exp(np.outer(s, t))
     expected = np.einsum("pkj,kt->tjp", parts[:, :, 0] + 1j * parts[:, :, 1], waves).real
-    for name in (
-        "platform.mass",
-        "platform.Ixx",
-        "crank1.Izz",
-        "link2.mass",
-        "joint3.viscous",
-        "joint_pid.lp",
-        "joint_pid.li",
-        "joint_pid.ld",
-    ):
+    dynamic = ("platform.mass", "platform.Ixx", "crank1.Izz", "link2.mass", "joint3.viscous")
+    for name in (*dynamic, "joint_pid.lp", "joint_pid.li", "joint_pid.ld"):
         column = index_of(name)
         seen = run.pose_sensitivity[6000:, :, column]
         seen, linear = seen - seen.mean(axis=0), expected[:, :, column]
@@ -151,13 +122,7 @@ def test_information_is_the_determinant_of_rows_and_prior(robot, known, prior):
     values, std = robot.parameter_sets["initial"].vector.copy(), known.guess.std.copy()
     for name, (value, deviation) in prior.items():
         values[NAMES.index(name)], std[NAMES.index(name)] = value, deviation
-    run = simulate(
-        robot,
-        values,
-        trajectory.reference(SCENARIO.timing.frame_times(10.0)),
-        model_settings(SCENARIO),
-        sensitivities=True,
-    )
+    run = simulated(robot, values, trajectory, SCENARIO)
     eigenvalues, vectors = np.linalg.eigh(known.covariance)
     rows = (np.diag(eigenvalues**-0.5) @ vectors.T @ run.pose_sensitivity).reshape(-1, 67) * std
     anchor = np.zeros((1, 67))
@@ -170,15 +135,11 @@ def test_information_is_the_determinant_of_rows_and_prior(robot, known, prior):
     assert found == pytest.approx(expected, rel=1e-6)
 
 
-def test_longer_runs_inform_more(robot, known):
+def test_longer_runs_inform_more_and_an_unstable_starting_model_is_named(robot, known):
     _, _, trajectory = drawn(robot, 10)
     longer = SCENARIO.with_overrides({"excitation.duration_s": 20.0})
     once, twice = (log_information(robot, s, known, trajectory) for s in (SCENARIO, longer))
     assert 0.0 < twice - once < np.log(2) / 2 + 0.05
-
-
-def test_unstable_starting_model_is_named(robot, known):
     late = SCENARIO.with_overrides({"timing.frame_rate_hz": 30.0, "timing.latency_s": 0.05})
-    _, _, trajectory = drawn(robot, 11)
     with pytest.raises(TrajectoryError, match=r"no D-criterion: .*model\.start_parameters = 'initial' is unstable"):
         log_information(robot, late, known, trajectory)

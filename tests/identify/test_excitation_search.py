@@ -76,6 +76,8 @@ def test_seed_decides_what_is_found(method):
     a, b, c = (designed.__wrapped__(method, seed, generations=3) for seed in (0, 0, 1))
     np.testing.assert_array_equal(a.excitation.sine, b.excitation.sine)
     assert not np.allclose(a.excitation.sine, c.excitation.sine)
+    with pytest.raises(TrajectoryError, match=r"excitation\.candidates = 3: the evolutionary method needs at least 5"):
+        design_trajectories(rss6(), small(method="evolutionary", candidates=3), 0)
 
 
 @pytest.mark.slow
@@ -85,12 +87,9 @@ def test_search_by_information_finds_more_of_it():
     assert gradient.information > random.information
 
 
-def test_too_few_members_are_refused():
-    with pytest.raises(TrajectoryError, match=r"excitation\.candidates = 3: the evolutionary method needs at least 5"):
-        design_trajectories(rss6(), small(method="evolutionary", candidates=3), 0)
-
-
-def test_command_compares_and_leaves_its_files(one_start, tmp_path, capsys):
+def test_command_compares_and_leaves_its_files_and_none_where_it_is_interrupted(
+    one_start, tmp_path, capsys, monkeypatch
+):
     out = tmp_path / "compared"
     settings = ["excitation.harmonics=2", "excitation.candidates=5", "excitation.generations=2"]
     arguments = [part for text in settings for part in ("--set", text)]
@@ -103,15 +102,12 @@ def test_command_compares_and_leaves_its_files(one_start, tmp_path, capsys):
     assert "0.38 at the start, 1.345" in " ".join(shown.split())
     assert "gradient: share of each limit used: box" in shown
 
-
-def test_interrupted_comparison_leaves_no_file(tmp_path, monkeypatch):
-    def interrupted(*arguments):
+    def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("identify.excitation.comparison.compare_methods", interrupted)
-    out = tmp_path / "compared"
-    assert command("excite", "quick", "--compare", "--quiet", "--out", out) == 130
-    assert not out.exists() or not list(out.iterdir())
+    assert command("excite", "quick", "--compare", "--quiet", "--out", tmp_path / "other") == 130
+    assert not list((tmp_path / "other").glob("*"))
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ def test_scores_of_lasting_residuals_spread_as_it_says_and_four_times_as_far_as_
     assert 0.85 * spread < said < 1.05 * spread
 
 
-def test_of_chance_nothing_is_the_models():
+def test_of_chance_nothing_is_the_models_a_large_misfit_decides_and_a_small_one_blames_the_covariance():
     """One in a thousand of right models is above the limit; what is above belongs to the model only from there on."""
     inside, outside = Misfit(1.1, 1.0, 0.0325), Misfit(1.1, 1.0, 0.0320)
     assert (inside.significant, inside.share_of_model, inside.warnings()) == (False, 0.0, ())
@@ -55,9 +55,6 @@ def test_of_chance_nothing_is_the_models():
     assert "intervals are widened" in outside.warnings()[0]
     rng = np.random.default_rng(2)
     assert sum(misfit_of_white(rng.standard_normal((60, 6))).significant for _ in range(2000)) <= 10
-
-
-def test_a_large_misfit_decides_and_a_small_one_blames_the_covariance():
     assert Misfit(3.3, 1.05, 0.02).decides
     assert not Misfit(3.1, 1.05, 0.02).decides
     assert "nothing counts as identified" in Misfit(3.3, 1.05, 0.02).warnings()[0]
@@ -87,14 +84,11 @@ def test_the_probability_of_white_noise_is_uniform(lost):
     assert kstest(values, "uniform").pvalue > 1e-3
 
 
-def test_a_little_memory_is_seen():
+def test_a_little_memory_is_seen_and_too_few_frames_are_refused():
     """A correlation of 0.2 from frame to frame, in 600 frames of six components."""
     ok = np.ones(600, dtype=bool)
     assert all(whiteness(noise(np.random.default_rng(seed), memory=0.2), ok).suspicious for seed in range(20))
     found = whiteness(noise(np.random.default_rng(3), 20_000, 0.5), np.ones(20_000, dtype=bool)).autocorrelations
     assert np.allclose(found[:, :3], 0.5 ** np.arange(1, 4), atol=0.04)
-
-
-def test_too_few_frames_are_refused():
     with pytest.raises(EstimationError, match=r"40 good frames are too few to test 10 lags, 100"):
         whiteness(np.zeros((40, 6)), np.ones(40, dtype=bool))

@@ -38,16 +38,13 @@ def judged(guess, name, std):
 
 
 def test_the_record_must_halve_the_guess_and_leave_less_than_half_of_the_size():
-    """The guess of the platform's mass is 24 kg ± 100 %, then ± 10 %, then ± 1,000,000 %."""
+    """The guess of the platform's mass is 24 kg ± 100 %, then ± 10 %, then ± 1,000,000 %: from that, 0.146 ± 2.73 kg m2
+    is a large step and no knowledge."""
     for start_std, limit in ((1.0, 12.0), (0.1, 1.2), (1e4, 12.0)):
         guess = starting_guess(rss6(), "initial", start_std)
         assert judged(guess, "platform.mass", 0.999 * limit), start_std
         assert not judged(guess, "platform.mass", 1.001 * limit), start_std
-
-
-def test_a_vague_guess_makes_no_parameter_identified():
-    """0.146 ± 2.73 kg m2 is a large step from a guess of ± 1,000,000 %, and no knowledge."""
-    assert not judged(starting_guess(rss6(), "initial", 1e4), "platform.Ixx", 2.73)
+    assert not judged(guess, "platform.Ixx", 2.73)
 
 
 def test_friction_guessed_to_be_zero_has_a_tenth_of_the_holding_torque_as_its_size():
@@ -85,8 +82,10 @@ def resting(anchor):
     return {name for name, rests in zip(NAMES, found, strict=True) if rests}
 
 
-def test_links_and_inertias_in_sums_rest_on_the_guess_and_friction_and_gains_do_not():
+def test_links_and_inertias_in_sums_rest_on_the_guess_and_without_an_anchor_so_do_friction_and_gains():
+    assert resting(ScaleAnchor("prior")) == set(NAMES)
     named = resting(GAIN)
+    assert resting(ScaleAnchor("payload")) == named
     assert {f"link{k}.mass" for k in range(1, 7)} | {"platform.mass", "platform.Ixx", "crank1.Ixx"} <= named
     assert named.isdisjoint(NAMES[k] for k in JOINTS)
 
@@ -99,11 +98,6 @@ def test_a_weighed_platform_stands_alone_and_brings_izz_with_it():
     carried = [index_of(f"link{k}.mass") for k in range(1, 7)]
     np.testing.assert_allclose(inertia[carried], radius**2 * mass[carried], atol=1e-9)
     assert resting(GAIN) - resting(WEIGHED) == {"platform.mass", "platform.Izz"}
-
-
-def test_without_an_anchor_everything_rests_on_the_guess():
-    assert resting(ScaleAnchor("prior")) == set(NAMES)
-    assert resting(ScaleAnchor("payload")) == resting(GAIN)
 
 
 def test_what_rests_on_the_guess_can_change_with_no_pose_changing_and_nothing_else_can():
@@ -138,7 +132,7 @@ def three_unknowns(poses):
     return conditioning(poses, np.eye(3), base, StartingGuess(np.ones(3), np.ones(3)), np.ones(3))
 
 
-def test_condition_numbers_are_those_worked_out_by_hand():
+def test_condition_numbers_are_those_worked_out_by_hand_and_a_poor_one_is_a_warning():
     """Poses that show a - b with weight 8 and a + b - 2 gain with weight 0.5, and nothing of the common factor."""
     first, second = np.array([1.0, -1.0, 0.0]) / np.sqrt(2), np.array([1.0, 1.0, -2.0]) / np.sqrt(6)
     found = three_unknowns(8 * np.outer(first, first) + 0.5 * np.outer(second, second))
@@ -146,12 +140,7 @@ def test_condition_numbers_are_those_worked_out_by_hand():
     assert found.poses_alone == pytest.approx(16.0)
     assert (found.directions, found.unshown) == (2, 1)
     assert found.warnings() == ()
-
-
-def test_what_the_poses_show_of_nothing_but_the_guess_is_a_warning():
-    weak = np.array([1.0, 1.0, -2.0]) / np.sqrt(6)
-    strong = np.array([1.0, -1.0, 0.0]) / np.sqrt(2)
-    found = three_unknowns(2 * np.outer(strong, strong) + 0.1 / POOR * np.outer(weak, weak))
+    found = three_unknowns(2 * np.outer(first, first) + 0.1 / POOR * np.outer(second, second))
     assert found.poor
     assert "1 of 2 directions" in found.warnings()[0]
 

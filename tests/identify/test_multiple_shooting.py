@@ -13,7 +13,7 @@ from identify.estimation.multiple_shooting import STATES, MultipleShooting, end_
 from identify.estimation.output_error_search import output_error_searches, runnable_start, search, shoot
 from identify.estimation.prior import StartingGuess
 from identify.progress import SilentProgress
-from tests.identify.synthetic import SIGMA, Stages, quick, rss6, run_plant, truth
+from tests.identify.synthetic import SIGMA, Stages, quick, rss6, run_plant, silent, truth
 
 SMOOTHED = {
     f"{side}.{key}": value
@@ -22,28 +22,21 @@ SMOOTHED = {
 }
 
 
-def silent(n=1):
-    pass
-
-
 def recorded(duration_s, changes=None, **how):
     scenario = quick(**{"plant.steps_per_frame": 4} | (changes or {}))
     record, run = run_plant(scenario, seed=1, duration_s=duration_s, **how)
     return scenario, output_error_problem([record], rss6(), scenario).driven_by_commands(), run
 
 
-def started(scenario, problem, parameters):
-    chain = segments(problem.runs[0])
-    return MultipleShooting(problem, [chain], [measured_states(chain, parameters, scenario)])
+def states_of(run):
+    return np.hstack([run.pose, run.pose_rate, run.joint_integral])
 
 
 def test_segments_from_the_true_states_make_up_the_run():
     """Poses within segments and states at their ends are those of one uninterrupted run."""
     _, problem, run = recorded(3.0, sigma=1e-3 * SIGMA)
-    chain = segments(problem.runs[0])
-    edges = [0, 30, 60, 90, 119, 149, 179]
-    assert [(part.first, part.last) for part in chain] == list(pairwise(edges))
-    true = np.hstack([run.pose, run.pose_rate, run.joint_integral])
+    chain, true = segments(problem.runs[0]), states_of(run)
+    assert [(part.first, part.last) for part in chain] == list(pairwise([0, 30, 60, 90, 119, 149, 179]))
     for part in chain:
         one = part.simulate(truth(), true[part.first])
         assert np.allclose(one.pose, run.pose[part.first : part.last + 1], rtol=0, atol=1e-12)
@@ -55,8 +48,7 @@ def test_states_are_measured_to_what_the_filter_leaves():
     scenario, problem, run = recorded(5.0)
     chain = segments(problem.runs[0])
     states = measured_states(chain, truth(), scenario)
-    true = np.hstack([run.pose, run.pose_rate, run.joint_integral])[[part.first for part in chain]]
-    error = np.abs(states - true)[1:]
+    error = np.abs(states - states_of(run)[[part.first for part in chain]])[1:]
     assert np.all(error[:, :6] < 5 * SIGMA)
     assert np.all(error[:, 6:12] < 0.1 * np.abs(run.pose_rate).max(axis=0))
     assert np.all(error[:, 12:] < 2e-3)
@@ -86,7 +78,8 @@ def test_condensing_takes_the_step_of_the_whole_problem():
     scenario, problem, _ = recorded(2.0, SMOOTHED, lost=[30, 47])
     problem = replace(problem, guess=StartingGuess(truth(), 0.02 * truth()))
     start = truth() * np.random.default_rng(0).uniform(0.95, 1.05, 67)
-    shooting = started(scenario, problem, start)
+    chain = segments(problem.runs[0])
+    shooting = MultipleShooting(problem, [chain], [measured_states(chain, start, scenario)])
     states, inner = shooting.states[0].copy(), slice(1, None)
     size, count = len(start), states[inner].size
 
@@ -105,15 +98,8 @@ def test_condensing_takes_the_step_of_the_whole_problem():
     assert distance(step, expected[:size], problem.guess.std) < 3e-3
     shooting.linearise(start + step)
     moved = (shooting.states[0][inner] - states[inner]).ravel()
-    scale = np.tile(segments(problem.runs[0])[0].state_std, count // STATES)
+    scale = np.tile(chain[0].state_std, count // STATES)
     assert distance(moved, expected[size:], scale) < 3e-3
-
-
-def with_unstable_guess(problem):
-    """Parameters whose loop is unstable, and the problem that starts from them."""
-    unstable = problem.guess.values.copy()
-    unstable[64:] = [10.0, 24.0, 0.02]
-    return unstable, replace(problem, guess=replace(problem.guess, values=unstable))
 
 
 @pytest.mark.slow
@@ -123,7 +109,9 @@ def test_a_model_that_does_not_run_is_brought_to_the_optimum():
     scenario = quick()
     record, _ = run_plant(scenario, seed=1)
     problem = output_error_problem([record], rss6(), scenario)
-    unstable, problem = with_unstable_guess(problem)
+    unstable = problem.guess.values.copy()
+    unstable[64:] = [10.0, 24.0, 0.02]
+    problem = replace(problem, guess=replace(problem.guess, values=unstable))
     driven = problem.driven_by_commands()
     with pytest.raises(DynamicsError, match="unstable"):
         search(driven, unstable, scenario, silent)

@@ -61,31 +61,15 @@ def test_report_is_one_file_that_opens_offline_beside_readable_figures(run_folde
     assert min(image[..., :3].std() for image in drawn.values()) > 0.02
 
 
-def test_report_shows_goals_parameters_the_index_and_the_papers_numbers(data):
+def test_report_shows_goals_parameters_the_index_and_the_papers_numbers_and_names_what_is_missed(data, result):
     path = random_trajectory(np.random.default_rng(0), np.zeros(6), 0.1, 5, 0.01, 0.04)
     text = render(replace(data, trajectories=TrajectorySet(0, path, (path,), 0.5293, 0.4606, 0.4603)))
-    for shown in (
-        "All 8 goals are met.",
-        "whole run",
-        "joint1.coulomb",
-        "not identifiable",
-        "1260",
-        "1411",
-        "platform_mass",
-        "timing.frame_rate_hz",
-        "diverged",
-        "stopped by: tolerance",
-        "joint1.coulomb, joint_pid.lp",
-        "+0.9877",
-        "2.0e+11 of the poses alone",
-        "1 predicted std",
-        "0.461 of the first random candidate, 0.46 of the middle one, 0.529 of the trajectory that is used",
-        "from 0.38 to 1.345",
-    ):
-        assert shown in text, shown
-
-
-def test_report_names_what_is_missed_and_escapes_text(data, result):
+    chosen = "0.461 of the first random candidate, 0.46 of the middle one, 0.529 of the trajectory that is used"
+    correlated = ("joint1.coulomb, joint_pid.lp", "+0.9877", "2.0e+11 of the poses alone")
+    papers = ("1260", "1411", "from 0.38 to 1.345")
+    settings = ("platform_mass", "timing.frame_rate_hz", "stopped by: tolerance")
+    figures_ = ("All 8 goals are met.", "whole run", "not identifiable", "diverged", "1 predicted std")
+    assert [shown for shown in (chosen, *correlated, *papers, *settings, *figures_) if shown not in text] == []
     result["sensor"]["lost_frames"] = 2
     result["identification"]["stop_reason"] = "<b>cost & step</b>"
     text = render(replace(data, result=result))
@@ -102,7 +86,7 @@ def test_every_axis_has_a_unit_and_every_panel_its_letter(result):
     assert [axes.get_title()[:3] for axes in fit.axes[:6]] == ["(a)", "(b)", "(c)", "(d)", "(e)", "(f)"]
 
 
-def test_fit_figure_draws_what_it_is_given():
+def test_fit_figure_draws_what_it_is_given_and_predicted_deviations_as_a_band_of_two_about_zero():
     """Error panel of z: measured minus identified is 3 um everywhere, true minus identified 1 um."""
     figure = figures.fit_figure(Fit(TIME, ZERO + 3e-6, ZERO, initial=ZERO + 1e-3, truth=ZERO + 1e-6), "t")
     panel = figure.axes[8]
@@ -110,9 +94,6 @@ def test_fit_figure_draws_what_it_is_given():
     assert not panel.collections, "no band where nothing was predicted"
     assert "997 um → 3 um" in panel.get_title()
     assert [line.get_color() for line in figure.axes[2].lines] == [figures.BLACK, figures.GREEN, figures.BLUE]
-
-
-def test_predicted_deviations_are_a_band_of_two_about_zero():
     figure = figures.fit_figure(Fit(TIME, ZERO, ZERO, truth=ZERO, std=ZERO + 2e-6), "t")
     edges = figure.axes[8].collections[0].get_paths()[0].vertices[:, 1]
     assert (edges.min(), edges.max()) == pytest.approx((-4.0, 4.0))
@@ -153,14 +134,8 @@ def test_parameter_figure_shows_what_is_identifiable_with_its_interval(result):
     assert figures.relative_errors({"a": entry | {"interval": None}})[1:] == (-50.0, 0.0, 0.0)
 
 
-def test_missing_stage_is_named_with_the_command_that_does_it(run_folder):
-    run_folder.validation.unlink()
-    with pytest.raises(OutputFolderError, match=r"no validation\.nc; write it with: cmmsim validate --out"):
-        write_report(run_folder.path)
-    assert not run_folder.report.exists()
-
-
-def test_model_of_another_run_and_an_incomplete_result_are_refused(run_folder):
+def test_model_of_another_run_an_incomplete_result_and_a_missing_stage_are_refused(run_folder):
+    """With the command that does what is missing."""
     short = build_model_run(np.arange(5) / 60, np.zeros((5, 6)), np.zeros((5, 6)))
     write_model_runs(run_folder.model, short, [short, short])
     with pytest.raises(RecordError, match="excitation differs"):
@@ -168,3 +143,7 @@ def test_model_of_another_run_and_an_incomplete_result_are_refused(run_folder):
     save_result(run_folder.result, {"scenario": "quick"})
     with pytest.raises(RecordError, match=r"lacks .*before, after, seconds, sensor, .*; write .*cmmsim identify"):
         write_report(run_folder.path)
+    run_folder.validation.unlink()
+    with pytest.raises(OutputFolderError, match=r"no validation\.nc; write it with: cmmsim validate --out"):
+        write_report(run_folder.path)
+    assert not run_folder.report.exists()

@@ -16,47 +16,34 @@ def goals(result):
     return {goal.name: goal for goal in check_goals(result)}
 
 
-def test_rms_figures_are_in_um_and_urad_and_leave_lost_rows_out():
+def test_rms_figures_are_in_um_and_urad_and_a_model_that_diverged_has_none_however_well_it_began():
     errors = np.array([[3e-6, 0, 0, 1e-3, 0, 0], [np.nan] * 6, [-4e-6, 0, 0, 1e-3, 0, 0]])
     assert rms_row(rms_figures(errors, [True, False, True])) == pytest.approx([math.sqrt(12.5), 0, 0, 1000, 0, 0])
-
-
-def test_model_that_diverged_has_no_rms_however_well_it_began():
     errors = np.zeros((10, 6))
     errors[9] = np.inf
     assert all(math.isnan(v) for v in rms_row(rms_figures(errors)))
     assert all(math.isnan(v) for v in rms_row(rms_figures(errors, np.zeros(10, dtype=bool))))
 
 
-def test_result_file_is_standard_json_with_null_for_what_is_not_finite(tmp_path):
+def test_result_file_is_standard_json_with_null_for_what_is_not_finite_and_a_damaged_one_is_named(tmp_path):
     path = tmp_path / "result.json"
     save_result(path, {"a": np.float64(1.5), "b": [math.inf, np.nan], "c": np.arange(2), "d": {"e": np.bool_(True)}})
-
-    def refuse(name):
-        raise AssertionError(f"{name} is no standard JSON")
-
-    assert json.loads(path.read_text(), parse_constant=refuse) == {
-        "a": 1.5,
-        "b": [None, None],
-        "c": [0, 1],
-        "d": {"e": True},
-    }
+    plain = {"a": 1.5, "b": [None, None], "c": [0, 1], "d": {"e": True}}
+    assert json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} is no standard JSON")) == plain
     assert load_result(path)["a"] == 1.5
-
-
-def test_damaged_result_is_named(tmp_path):
     for text in ('{"a": ', "[1]", ""):
-        (tmp_path / "result.json").write_text(text)
+        path.write_text(text)
         with pytest.raises(RecordError, match=r"result\.json"):
-            load_result(tmp_path / "result.json")
+            load_result(path)
 
 
-def test_good_result_meets_every_goal(result):
+def test_good_result_meets_every_goal_and_one_without_validation_those_that_can_be_judged(result):
     assert len(goals(result)) == 8
     assert all(goal.passed for goal in goals(result).values())
     assert goals(result)["unseen position"].value == pytest.approx(1.8)
     assert goals(result)["sensor orientation"].value == 50.0
     assert goals(result)["misfit of the record"].value == pytest.approx(2.5)
+    assert check_goals({"scenario": "quick"}) == []
 
 
 @pytest.mark.parametrize(
@@ -92,28 +79,13 @@ def test_speed_stands_beside_the_goals_and_no_machine_misses_one(result):
     assert tables.goals_table(result).rows[-1][1] == "3500 s"
 
 
-def test_missed_parameter_is_named(result):
+def test_parameter_is_inside_by_five_percent_or_three_deviations_and_named_where_it_is_not(result):
+    for estimate, std in ((1.049, 0.0), (1.06, 0.021), (1.0, None)):
+        assert within_tolerance({"true": 1.0, "estimate": estimate, "std": std}) is True
+    for estimate, std in ((1.06, 0.0), (0.94, 0.019), (None, 0.1)):
+        assert within_tolerance({"true": 1.0, "estimate": estimate, "std": std}) is False
     result["identification"]["parameters"]["joint1.viscous"]["estimate"] = 0.3
     assert "joint1.viscous" in goals(result)["friction and PID outside"].detail
-
-
-@pytest.mark.parametrize(
-    ("estimate", "std", "inside"),
-    [
-        (1.049, 0.0, True),
-        (1.06, 0.0, False),
-        (1.06, 0.021, True),
-        (0.94, 0.019, False),
-        (1.0, None, True),
-        (None, 0.1, False),
-    ],
-)
-def test_parameter_is_inside_by_five_percent_or_three_deviations(estimate, std, inside):
-    assert within_tolerance({"true": 1.0, "estimate": estimate, "std": std}) is inside
-
-
-def test_goals_of_a_result_without_validation_are_those_that_can_be_judged():
-    assert check_goals({"scenario": "quick"}) == []
 
 
 def test_papers_figures_are_those_of_its_text():
@@ -134,11 +106,10 @@ def test_tables_show_our_numbers_beside_the_papers(result):
     assert validation.rows[0][:4] == ("1 true", "1", "1.4", "1.8")
     assert len(validation.rows) == 2 * 2 + 10
     assert tables.sensor_table(result).rows[0][:4] == ("120", "0", "70", "5")
-
-
-def test_starting_models_figures_stand_beside_the_identified_ones(result):
     result["validation"][0]["initial_true"] = {"position_rms_um": [None] * 3, "orientation_rms_urad": [None] * 3}
     assert tables.validation_table(result).rows[2] == ("1 starting model, true", *["diverged"] * 6)
+    lines = tables.goals_table(result).markdown().splitlines()
+    assert {line.count("|") for line in lines} == {6}, "a cell for each column"
 
 
 def test_parameter_that_is_not_identifiable_has_no_number(result):
@@ -146,8 +117,3 @@ def test_parameter_that_is_not_identifiable_has_no_number(result):
     assert rows["link1.Ixx"][4:] == ("-", "-", "-", "-", "not identifiable")
     assert rows["joint1.coulomb"][1:] == ("N m", "0", "0.104", "0.105", "0.001", "0.103 to 0.107", "+0.96", "")
     assert "link1.Ixx" not in {row[0] for row in tables.parameter_table(result, identifiable_only=True).rows}
-
-
-def test_markdown_has_one_cell_for_each_column(result):
-    lines = tables.goals_table(result).markdown().splitlines()
-    assert {line.count("|") for line in lines} == {6}

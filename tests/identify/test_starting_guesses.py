@@ -21,16 +21,12 @@ from identify.estimation.prior import StartingGuess, holding_torque, typical_siz
 from identify.estimation.warm_start import linear_warm_start
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
-from tests.identify.synthetic import rss6, run_plant, truth
+from tests.identify.synthetic import rss6, run_plant, silent, truth
 
 SMALLEST_FACTOR = 0.2
 
 SAME_COST, SAME_PARAMETERS = 0.1, 0.5
 """How far the same optimum may be away: in cost, and in standard deviations of any identified parameter."""
-
-
-def silent(n=1):
-    pass
 
 
 def drawn_guess(spread, seed):

@@ -16,13 +16,8 @@ from tests.identify.commands import command, one_line
 from tests.identify.synthetic import quick, run_plant
 
 IDENTIFIED = {
-    "platform.mass",
-    "platform.Ixx",
-    "platform.Iyy",
-    "platform.Izz",
-    "joint_pid.lp",
-    "joint_pid.li",
-    "joint_pid.ld",
+    *(f"platform.{name}" for name in ("mass", "Ixx", "Iyy", "Izz")),
+    *(f"joint_pid.{name}" for name in ("lp", "li", "ld")),
     *(f"link{leg}.mass" for leg in range(1, 7)),
     *(f"joint{leg}.{law}" for leg in range(1, 7) for law in ("coulomb", "viscous")),
 }
@@ -45,7 +40,7 @@ RESULTS = [
 ]
 
 
-def test_variation_is_the_standard_deviation_over_the_mean():
+def test_variation_is_the_standard_deviation_over_the_mean_and_its_table_stands_beside_the_papers():
     found = variation(RESULTS)
     assert found.variation[:2] == pytest.approx([0.1, 0.1 / 1.1])
     assert found.expected[0] == pytest.approx(np.sqrt((0.09 + 0.16 + 0.25) / 3) / 10)
@@ -54,10 +49,7 @@ def test_variation_is_the_standard_deviation_over_the_mean():
     assert found.worst == ("link1.mass", pytest.approx(0.1))
     assert repr(found) == "<Variation: 2 of 3 parameters identified in all 3 runs>"
     assert found.to_dataframe().loc["link1.mass", "variation"] == pytest.approx(0.1)
-
-
-def test_the_table_stands_beside_the_papers():
-    table = variation_table(variation(RESULTS))
+    table = variation_table(found)
     assert [row[0] for row in table.rows] == ["link1.mass", "joint1.coulomb"]
     assert table.rows[1][3:] == ("9.091", "9.091", "15.9")
     assert max(PAPER_PERCENT.values()) == PAPER_WORST_PERCENT

@@ -5,15 +5,9 @@ import json
 import numpy as np
 import pytest
 
-import dynamics
 from dynamics.errors import UnreachablePoseError
 from identify.verification import workspace_map
 from tests.identify.commands import command
-
-
-@pytest.fixture(scope="module")
-def robot():
-    return dynamics.load_robot("rss6")
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +33,9 @@ def test_maps_hold_what_each_pose_alone_gives(robot, mapped):
     assert np.isnan(plane.travel_share).any()
     assert 0.2 < plane.allowed.mean() < 0.9
 
+    # The reference robot is its own mirror image in the x-z plane: y -> -y at home's height and orientation.
+    np.testing.assert_allclose(plane.travel_share, plane.travel_share[::-1], atol=1e-9)
+
 
 def test_ranges_end_at_the_travel_limit(robot, mapped):
     """At the end of each range the largest angle is the limit, within the step of the search."""
@@ -46,12 +43,6 @@ def test_ranges_end_at_the_travel_limit(robot, mapped):
         for end in ends:
             largest = np.abs(robot.inverse_kinematics(robot.home_pose + end * np.eye(6)[axis])).max()
             assert robot.travel_limit - 0.01 < largest <= robot.travel_limit
-
-
-def test_mirrored_robot_has_mirrored_maps(mapped):
-    """The reference robot is its own mirror image in the x-z plane: y -> -y at home's height and orientation."""
-    share = mapped.planes[1].travel_share
-    np.testing.assert_allclose(share, share[::-1], atol=1e-9)
 
 
 def test_command_writes_numbers_and_figures(mapped, tmp_path, monkeypatch, capsys):
