@@ -6,12 +6,20 @@ import numpy.fft  # noqa: F401  before any project: NumPy cannot be loaded twice
 import pytest
 import scipy.special  # noqa: F401
 
-import cmmsim.sensor  # noqa: F401  nor what draws: pyrender closes the display of the first renderer with the second
+import cmmsim
 import identify.pipeline  # noqa: F401
 
 collect_ignore = ["guide"]  # an outsider's files: test_outside_project.py runs them as an outsider would
 
 QUICK = ("-p", "no:cacheprovider", "-p", "no:hypothesispytest")  # Hypothesis would be imported anew by each
+
+
+@pytest.fixture(scope="session", autouse=True)
+def loaded():
+    """What a sensor loads when it measures: pytester forgets what a project was first to import, and neither numba nor
+    OpenGL can be loaded twice."""
+    sensor = cmmsim.load_sensor("ctrack780", seed=0)
+    sensor.measure(sensor.home)
 
 
 @pytest.fixture
