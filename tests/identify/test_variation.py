@@ -111,7 +111,7 @@ def designed(folder, count, scenario, *settings, workers=2):
     return json.loads((folder / "variation.json").read_text(encoding="utf-8"))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_runs_are_designed_and_recorded_one_by_one_where_asked(tmp_path):
     entry = designed(tmp_path / "run", 3, "quick", "excitation.candidates=2", "excitation.duration_s=6", workers=1)
     assert (entry["runs"], entry["trajectories"]) == (3, "designed: random")
