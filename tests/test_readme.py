@@ -41,54 +41,48 @@ def test_the_tables_are_those_of_a_run_of_the_paper_scenario_that_meets_every_go
     assert [goal for goal in check_goals(result) if not goal.passed] == []
 
 
-def test_the_table_of_the_dynamics_is_the_measured_one_and_reaches_the_goals():
-    measured = kept("dynamics")
-    found, versions = measured["figures"], measured["versions"]
+def speeds(file, **packages):
+    """Figures that a file of benchmarks recorded; the README says when, and with which versions of what it names."""
+    content = kept("speeds")
+    entries = [content | entry for test, entry in content["tests"].items() if f"/{file}.py::" in test]
+    assert "failed" not in {entry["outcome"] for entry in entries}
+    versions = {package: version for entry in entries for package, version in entry["versions"].items()}
+    dates = " and ".join(sorted({entry["date"] for entry in entries}))
+    said = f"measured {dates} with {' and '.join(f'{name} {versions[package]}' for name, package in packages.items())}"
+    assert said in SAID, f"the README wants: {said}"
+    return {
+        name: value for entry in entries if entry["outcome"] == "passed" for name, value in entry["figures"].items()
+    }
+
+
+def test_the_tables_of_speed_are_the_measured_ones():
+    found = speeds("test_dynamics_speed", Pinocchio="pin", MuJoCo="mujoco")
     rows = {
         "forward dynamics against Pinocchio's closed chain, relative": f"{found['pinocchio_relative_difference']:.0e}",
-        "the paper's figure-7 loop against MuJoCo (`cmmsim verify-model`), steady": (
-            f"{found['mujoco_position_steady_um']:.1g} um, {found['mujoco_angle_steady_urad']:.1g} urad"
-        ),
         "forward dynamics (`dynamics.fast_forward_dynamics`) against `constraintDynamics`": (
             f"{found['forward_dynamics_over_pinocchio']:.1f} times faster"
         ),
         "forward dynamics against MuJoCo's `mj_step`": f"{found['forward_dynamics_over_mj_step']:.1f} times faster",
-        "closed loop with exact stick-slip friction, 60 Hz frames": f"{found['times_real_time']:.0f} times real time",
+        "closed loop with exact stick-slip friction, of order four, 60 Hz frames": (
+            f"{found['times_real_time']:.0f} times real time"
+        ),
         "all 67 sensitivities of a run": f"{found['sensitivities_plain_runs']:.1f} plain runs",
         "a batch of runs (`dynamics.simulate_batch`) on two cores": (
             f"{found['two_cores_gain']:.2f} times faster than on one"
         ),
         "compiling everything, at first use": f"{found['first_compilation_s']:.0f} s",
-        "order of the stick-slip integrator": f"{found['integrator_order']:.1f}",
     }
-    wanted = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
-    assert wanted in README, f"the README wants these rows:\n{wanted}"
-    said = f"measured {measured['date']} with Pinocchio {versions['pin']} and MuJoCo {versions['mujoco']}"
-    assert said in SAID, f"the README wants: {said}"
-    assert found["pinocchio_relative_difference"] <= 1e-9
-    assert found["mujoco_position_steady_um"] <= 10
-    assert found["mujoco_angle_steady_urad"] <= 20
-    assert min(found["forward_dynamics_over_pinocchio"], found["forward_dynamics_over_mj_step"]) >= 8
     assert found["times_real_time"] >= 300
-    assert found["sensitivities_plain_runs"] <= 15
-    assert found["two_cores_gain"] >= 1.8
     assert found["first_compilation_s"] <= 20
-
-
-def test_the_sensors_speed_is_the_measured_one():
-    measured = kept("sensor")
-    found, versions = measured["figures"], measured["versions"]
-    rows = [
-        f"| {title} | {found[f'analytic_{name}']:.0f} | {found[f'pyrender_{name}']:.0f} |"
-        for title, name in (
-            ("stereo frames a second, drawn and measured", "frames_a_second"),
-            ("times as fast as the straightforward pipeline", "times_straightforward"),
-        )
-    ]
-    assert "\n".join(rows) in README, f"the README wants these rows:\n{rows}"
-    opencv = versions["opencv-python-headless"]
-    said = f"measured {measured['date']} with OpenCV {opencv} and pyrender {versions['pyrender']}"
-    assert said in SAID, f"the README wants: {said}"
+    found = speeds("test_sensor_speed", OpenCV="opencv-python-headless", pyrender="pyrender")
+    for title, name in (
+        ("stereo frames a second, drawn and measured", "frames_a_second"),
+        ("times as fast as the straightforward pipeline", "times_straightforward"),
+    ):
+        rows[title] = f"{found[f'analytic_{name}']:.0f} | {found[f'pyrender_{name}']:.0f}"
+    wanted = [f"| {title} | {value} |" for title, value in rows.items()]
+    missing = [row for row in wanted if row not in README]
+    assert not missing, "the README wants these rows:\n" + "\n".join(missing)
 
 
 def test_the_long_proofs_last_ended_as_quoted():

@@ -5,17 +5,16 @@ import subprocess
 import sys
 import time
 
+import cv2
 import numpy as np
 import pytest
 
 import cmmsim
-import dynamics
-from cmmsim.geometry.pose import compose_covariance, pose_covariance, pose_to_transform, transform_to_pose
-from cmmsim.geometry.stereo_rig import triangulate
+from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
+from cmmsim.geometry.registration import rigid_start
 from cmmsim.imaging import pyrender_renderer as render
-from cmmsim.pose_estimation.estimator import METHODS, by_planes, by_registration
-from cmmsim.pose_estimation.observation import StickerObservation
-from tests.benchmarks.timing import OtherLoad, fastest, judge, resident_bytes
+from cmmsim.imaging.pyrender_meshes import disc_mesh
+from tests.benchmarks.timing import OtherLoad, judge, resident_bytes
 
 pytestmark = [pytest.mark.thorough, pytest.mark.rendering]
 TIMES_STRAIGHTFORWARD = {"analytic": 20.0, "pyrender": 8.0}
@@ -23,6 +22,9 @@ BATCH = 20
 MEMORY_FRAMES = {"analytic": 100_000, "pyrender": 20_000}
 KEPT = []  # what must live as long as OpenGL is used
 LARGEST_GROWTH = 4e6  # bytes; one renderer made anew takes 2 MB
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+NEAREST_PX = 6.0
+SAMPLE = 1e-4  # m: as finely as stickers are triangulated
 
 
 @pytest.fixture(scope="module")
@@ -52,14 +54,12 @@ def frame_seconds(sensor, poses):
     return spent
 
 
-def test_against_a_straightforward_pipeline(sensor, quote):
+def test_against_a_straightforward_pipeline(sensor, record_property):
     """Rounds alternate and the fastest of each counts. The other pipeline measures the same poses, only worse.
 
     20 times is the goal of the sensor and reached by the analytic renderer. Drawing finely with pyrender's meshes is
     bound by the software rasteriser: a frame takes a 22nd of the other's processor time, but less of it on both cores.
     """
-    from tests.benchmarks.straightforward_sensor import StraightforwardSensor
-
     other = StraightforwardSensor(sensor)
     KEPT.append(other)
     poses = path(sensor, 20 * BATCH)
@@ -70,48 +70,34 @@ def test_against_a_straightforward_pipeline(sensor, quote):
             ours = min(ours, frame_seconds(sensor, poses[start : start + BATCH]))
             for pose in poses[start : start + 3]:
                 began = time.perf_counter()
-                found, count = other.measure(pose, pose)
+                found, count = other.measure(pose)
                 theirs = min(theirs, time.perf_counter() - began)
                 assert count >= 12
                 errors.append(found - pose)
     assert np.abs(errors)[:, :3].max() < 1e-3
     ratio, goal = theirs / ours, TIMES_STRAIGHTFORWARD[sensor.renderer]
     figure = f"{ratio:.1f} times a straightforward pipeline ({1e3 * theirs:.0f} ms a frame) with {sensor.renderer}"
+    record_property(f"{sensor.renderer}_times_straightforward", ratio)
+    record_property(f"{sensor.renderer}_frames_a_second", 1.0 / ours)
     judge(ratio >= goal, f"{figure}, goal {goal:g}", load)
-    quote(**{f"{sensor.renderer}_times_straightforward": ratio, f"{sensor.renderer}_frames_a_second": 1.0 / ours})
 
 
 def test_memory_and_renderer_stay_over_many_frames(sensor, monkeypatch):
     """Memory in use after all frames is that after the first tenth, and nothing of OpenGL is made anew."""
-    frames = MEMORY_FRAMES[sensor.renderer]
-    made = count_renderers(monkeypatch) if sensor.renderer == "pyrender" else []
-    poses = path(sensor, 600)
+    import pyrender
+    from pyrender.renderer import Renderer
+
+    frames, poses = MEMORY_FRAMES[sensor.renderer], path(sensor, 600)
     for n in range(frames):
         if n == frames // 10:
-            made.clear()
+            for kind in (pyrender.OffscreenRenderer, Renderer, render._FrameBuffer):
+                monkeypatch.setattr(kind, "__init__", None)  # who makes another fails
             before = resident_bytes()
         assert sensor.measure(poses[n % len(poses)]).ok
     growth = resident_bytes() - before
     assert growth < LARGEST_GROWTH, f"{growth / 1e6:.1f} MB in {frames} frames"
-    assert made == []
     if sensor.renderer == "pyrender":
         assert render._shared_atlas.cache_info().misses == 1
-
-
-def count_renderers(monkeypatch):
-    """A list that gets the name of each renderer or frame buffer that is made."""
-    import pyrender
-    from pyrender.renderer import Renderer
-
-    made = []
-    for kind in (pyrender.OffscreenRenderer, Renderer, render._FrameBuffer):
-
-        def counted(self, *args, _kind=kind, _plain=kind.__init__, **kwargs):
-            made.append(_kind.__name__)
-            _plain(self, *args, **kwargs)
-
-        monkeypatch.setattr(kind, "__init__", counted)
-    return made
 
 
 def test_kernels_compile_only_once(tmp_path, taught, record_property):
@@ -135,41 +121,73 @@ def test_kernels_compile_only_once(tmp_path, taught, record_property):
     assert warm < 0.3 * cold
 
 
-@pytest.fixture(scope="module")
-def vision(taught):
-    """(method) -> a function that turns the matched pixels of one rendered frame into a pose and its covariance."""
-    sensor = cmmsim.load_sensor("ctrack780", seed=0, taught=taught)
-    seen = sensor.measure(sensor.home)
-    estimator = sensor.estimator
-    index = np.flatnonzero(np.isin(estimator.platform.sticker_ids, seen.target_ids))
-    np.testing.assert_array_equal(estimator.platform.sticker_ids[index], seen.target_ids)
-    spread = np.broadcast_to(0.01**2 * np.eye(2), (len(index), 2, 2))
-    camera_from_platform = np.linalg.inv(estimator.taught.base_from_camera) @ pose_to_transform(seen.pose)
-    towards = estimator.platform.normals @ camera_from_platform[:3, :3].T
+class StraightforwardSensor:
+    """What one writes first: whole images by pyrender, OpenCV's blob detector, nearest blobs, triangulatePoints, a fit.
 
-    def from_pixels(method):
-        stereo = triangulate(estimator.rig, seen.left_pixels, seen.right_pixels, spread, spread)
-        observed = StickerObservation(index, seen.left_pixels, seen.right_pixels, stereo.points, stereo.covariances)
-        if method == "planes":
-            transform, covariance, _ = by_planes(observed, estimator.platform, towards)
-        else:
-            transform, covariance, _ = by_registration(observed, estimator.taught.platform_places)
-        base_from_platform = estimator.taught.base_from_camera @ transform
-        spread_6 = compose_covariance(estimator.taught.base_from_camera, covariance)
-        return transform_to_pose(base_from_platform), pose_covariance(base_from_platform, spread_6)
+    Draws and measures the scene of a ``cmmsim.Sensor`` whose lenses are perfect.
 
-    np.testing.assert_allclose(from_pixels("registration")[0], seen.pose, atol=2e-4)
-    return from_pixels
+    Keep it as long as the process draws: pyrender closes the display for all when an OffscreenRenderer goes.
+    """
 
+    def __init__(self, sensor):
+        import pyrender
 
-@pytest.mark.parametrize("method", METHODS)
-def test_forward_kinematics_beside_the_pose_from_matched_pixels(vision, method, record_property):
-    """The paper's argument for the sensor is that forward kinematics is slow. Both are recorded, whoever wins."""
-    robot = dynamics.load_robot("rss6")
-    angles = robot.inverse_kinematics(robot.home_pose + 0.005)
-    rounds = {
-        "forward_kinematics_us": lambda: [robot.forward_kinematics(angles) for _ in range(100)],
-        "vision_us": lambda: [vision(method) for _ in range(100)],
-    }
-    for name, best in fastest(rounds, 5).items():
-        record_property(name, 1e4 * best)
+        self._sensor, self._rig = sensor, sensor.rig
+        self._renderer = pyrender.OffscreenRenderer(self._rig.left.width, self._rig.left.height)
+        self._scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 1.0))
+        self._bodies = [self._scene.add(pyrender.Mesh([self._primitive(body)])) for body in sensor._scene]
+        c = self._rig.left
+        camera = pyrender.IntrinsicsCamera(
+            c.focal_px, c.focal_px * c.aspect, c.centre_x_px + 0.5, c.centre_y_px + 0.5, 0.2, 10.0
+        )
+        self._camera = self._scene.add(camera)
+        settings = cv2.SimpleBlobDetector_Params()
+        settings.blobColor, settings.filterByArea, settings.minArea, settings.maxArea = 255, True, 10.0, 400.0
+        self._detector = cv2.SimpleBlobDetector_create(settings)
+
+    def measure(self, pose):
+        """Pose (6,) measured of the platform that stands at ``pose``, which also says which blob is which."""
+        base_from_platform, taught = pose_to_transform(pose), self._sensor.taught
+        self._scene.set_pose(self._bodies[0], base_from_platform)
+        places, camera_from_base = taught.platform_places, np.linalg.inv(taught.base_from_camera)
+        expected, _ = self._rig.project(apply(camera_from_base @ base_from_platform, places))
+        found = [self._nearest(self._blobs(move), at) for move, at in zip(self._rig.from_camera, expected, strict=True)]
+        seen = np.flatnonzero(np.isfinite(found[0][:, 0]) & np.isfinite(found[1][:, 0]))
+        first, second = self._rig.projection_matrices
+        points = cv2.triangulatePoints(first, second, found[0][seen].T, found[1][seen].T)
+        camera_from_platform = rigid_start(places[seen], (points[:3] / points[3]).T)
+        return transform_to_pose(taught.base_from_camera @ camera_from_platform), len(seen)
+
+    def _blobs(self, move):
+        from pyrender import RenderFlags
+
+        camera_from_base = move @ self._sensor._camera_from_base
+        self._scene.set_pose(self._camera, np.linalg.inv(OPENGL_FROM_OPENCV @ camera_from_base))
+        colour, _ = self._renderer.render(self._scene, RenderFlags.FLAT)
+        grey = np.ascontiguousarray(colour[:, :, 0])
+        return np.array([blob.pt for blob in self._detector.detect(grey)]).reshape(-1, 2)
+
+    @staticmethod
+    def _nearest(blobs, expected):
+        """The blob (n,2) next to each expected pixel (n,2), NaN where none is near."""
+        result = np.full(expected.shape, np.nan)
+        gaps = np.linalg.norm(expected[:, None] - blobs[None], axis=2)
+        near = np.flatnonzero(gaps.min(axis=1, initial=np.inf) < NEAREST_PX)
+        result[near] = blobs[gaps[near].argmin(axis=1)]
+        return result
+
+    @staticmethod
+    def _primitive(body):
+        """Solid and stickers of a body as one mesh."""
+        from pyrender import MetallicRoughnessMaterial, Primitive
+
+        patches = [body.solid, *(disc_mesh(sticker, SAMPLE) for sticker in body.stickers)]
+        starts = np.cumsum([0, *(len(p.vertices) for p in patches)])
+        grey = np.repeat(np.concatenate([p.levels for p in patches])[:, None], 3, axis=1)
+        return Primitive(
+            positions=np.concatenate([p.vertices for p in patches]).astype(np.float32),
+            indices=np.concatenate([p.faces + s for p, s in zip(patches, starts, strict=False)]).astype(np.uint32),
+            color_0=np.column_stack([grey, np.ones(len(grey))]).astype(np.float32),
+            mode=4,
+            material=MetallicRoughnessMaterial(baseColorFactor=(1.0, 1.0, 1.0, 1.0), doubleSided=True),
+        )

@@ -1,15 +1,12 @@
-"""A goal is judged by what was measured of the machine, and quoted figures are kept when all of them were measured."""
+"""A goal is judged by what was measured of the machine."""
 
-import json
 import os
 import subprocess
 import sys
 import time
-from unittest.mock import Mock
 
 import pytest
 
-from tests.benchmarks import conftest
 from tests.benchmarks.timing import FREE, CoreTime, OtherLoad, fastest, judge, second_core_gain
 
 
@@ -77,26 +74,3 @@ def test_goals_are_judged_on_a_free_machine_alone(monkeypatch, reached, others, 
     else:
         with pytest.raises(outcome, match=words):
             judge(reached, "ratio 7", load, disturbed)
-
-
-@pytest.mark.parametrize("name", conftest.QUOTED)
-@pytest.mark.parametrize(("left_out", "failed"), [(None, 0), (0, 0), (None, 1)])
-def test_quoted_figures_are_written_whole_or_the_file_stays(name, left_out, failed, tmp_path):
-    quoted, path, session = conftest.QUOTED[name], tmp_path / "figures.json", Mock(testsfailed=failed)
-    path.write_text("{}")
-    found = {figure: float(n) for n, figure in enumerate(quoted.figures) if n != left_out}
-    session.config.getoption = lambda option, **_: path if option == f"--{name}-figures" else None
-    session.config.stash = {conftest.measured: found | {"of_another_file": 1.0}}
-    reporter = session.config.pluginmanager.get_plugin()
-    reporter.stats = {"skipped": [Mock(longrepr=("file", 1, "Skipped: others took a core"))]}
-    conftest.pytest_sessionfinish(session)
-    entry, said = json.loads(path.read_text()), reporter.write_line.call_args.args[0]
-    if left_out is None and not failed:
-        assert entry["figures"] == found
-        assert set(entry["versions"]) == {"python", *quoted.packages}
-        assert "is written" in said
-    else:
-        assert entry == {}
-        missing = f"not measured: {quoted.figures[0]}" if left_out == 0 else "not measured"
-        for words in (f"{failed} tests failed", "others took a core", missing):
-            assert words in said

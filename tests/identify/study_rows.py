@@ -5,11 +5,13 @@ import os
 import signal
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
+from identify.progress import SilentProgress
 from identify.studies.store import JOURNAL
 
 KIND = "tests.identify.study_rows:row"
@@ -49,6 +51,25 @@ def row(scenario, seed, options):
         "rate_hz": scenario.timing.frame_rate_hz,
         **({options["also"]: 1.0} if "also" in options else {}),
     }
+
+
+class At(SilentProgress):
+    """Does something when so many rows are done, or each of so many."""
+
+    def __init__(self, action, *rows):
+        self._action, self._rows = action, rows
+
+    @contextmanager
+    def stage(self, name, total):
+        done = 0
+
+        def advance(n=1):
+            nonlocal done
+            if any(done < row <= done + n for row in self._rows):
+                self._action()
+            done += n
+
+        yield advance
 
 
 def journal(folder):

@@ -31,7 +31,7 @@ from identify.studies.design import Case, Finished
 from identify.studies.runner import Batches, run_study
 from identify.studies.store import JOURNAL
 from identify.studies.study_file import Study
-from tests.identify.study_rows import KIND, journal, same_numbers
+from tests.identify.study_rows import KIND, At, journal, same_numbers
 
 LOST = TimeoutError("its worker died with the result")
 DIED = KilledWorker("task", SimpleNamespace(address="tcp://a:1"), 0)
@@ -172,25 +172,6 @@ def cluster(folder, workers, before=ROOT):
             one.communicate()
 
 
-class At(SilentProgress):
-    """Does something when so many rows are done."""
-
-    def __init__(self, rows, action):
-        self._rows, self._action = rows, action
-
-    @contextmanager
-    def stage(self, name, total):
-        done = 0
-
-        def advance(n=1):
-            nonlocal done
-            if done < self._rows <= done + n:
-                self._action()
-            done += n
-
-        yield advance
-
-
 @pytest.fixture(scope="module")
 def serial(tmp_path_factory):
     """The table of the study, computed in this process."""
@@ -201,7 +182,7 @@ def serial(tmp_path_factory):
 def test_worker_killed_in_the_middle_changes_no_number_and_other_packages_are_one_warning(tmp_path, serial):
     log, there = tmp_path / "log", other_versions(tmp_path / "there", numpy="1.2.3", casadi="0.1")
     with cluster(tmp_path, 2, there) as (address, _, workers):
-        progress, workers_there = At(40, workers[0].kill), partial(running_cluster, address)
+        progress, workers_there = At(workers[0].kill, 40), partial(running_cluster, address)
         with pytest.warns(OtherVersionsWarning) as caught:
             outcome = run_study(study(log=str(log)), tmp_path / "a", progress, workers_there)
         assert workers[0].wait(10) == -signal.SIGKILL
@@ -219,7 +200,7 @@ def test_worker_killed_in_the_middle_changes_no_number_and_other_packages_are_on
 @pytest.mark.slow
 def test_lost_scheduler_is_one_line_and_the_study_goes_on_with_another(tmp_path, serial):
     with cluster(tmp_path, workers=1) as (address, scheduler, _), pytest.raises(StudyError) as caught:
-        run_study(study(), tmp_path / "a", At(30, scheduler.kill), partial(running_cluster, address))
+        run_study(study(), tmp_path / "a", At(scheduler.kill, 30), partial(running_cluster, address))
     assert "\n" not in str(caught.value)
     assert "scheduler is gone" in str(caught.value)
     kept = len(journal(tmp_path / "a"))
@@ -247,7 +228,7 @@ def test_worker_with_another_version_of_the_product_is_refused_at_the_start_and_
     refusal = rf"^worker tcp://\S+ has cmmsim 9\.8\.7, here is {here}; install \S[^\n]*$"
     with cluster(tmp_path, 1) as (address, _, workers):
         workers_there = partial(running_cluster, address)
-        come = At(1, lambda: workers.append(worker(address, tmp_path, there)))
+        come = At(lambda: workers.append(worker(address, tmp_path, there)), 1)
         with pytest.raises(StudyError, match=refusal):
             run_study(study(seconds=0.5), tmp_path / "a", come, workers_there)
         assert 1 <= len(journal(tmp_path / "a")) < 120
