@@ -20,6 +20,7 @@ from cmmsim.calibration import (
     render_pairs,
     sensor_template,
 )
+from cmmsim.calibration.detection import covered_radius
 from cmmsim.files.sensor_file import sensor_text
 from cmmsim.geometry.camera import Distortion, Optics, PinholeCamera
 from cmmsim.geometry.disc_image import centre_offset
@@ -159,6 +160,29 @@ def test_boards_that_cannot_be_drawn_are_refused():
         rendered(PERFECT, CHESSBOARD, 1)
     with pytest.raises(CalibrationError, match=r"shows the whole board of 2\.5 x 2 m"):
         board_poses(PERFECT, DOTS.model_copy(update={"spacing": 0.25}), 1, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(("rig", "board", "psf"), [(PERFECT, DOTS, 0.0), (BENT, DOTS, 1.0), (PERFECT, ASYMMETRIC, 0.4)])
+@pytest.mark.parametrize("claimed", [1.0, 1.4])
+def test_radius_of_dots_is_measured_whatever_the_board_file_says(rig, board, psf, claimed):
+    claim = board.model_copy(update={"radius": min(claimed * board.radius, 0.39 * board.nearest)})
+    _, frames = rendered(rig, board, 1, optics=Optics(psf_px=psf))
+    assert find_board(frames[0].left, claim).radius == pytest.approx(board.radius, rel=0.02)
+
+
+def test_far_too_small_a_radius_is_the_reason_given():
+    _, frames = rendered(PERFECT, DOTS, 1)
+    said = find_board(frames[0].left, DOTS.model_copy(update={"radius": 0.002}))
+    assert said == "only 0 of 63 points are sharp and whole, its dots measure 0.0125 m in radius, not 0.002"
+
+
+def test_area_covered_tells_the_radius_of_drawn_discs():
+    """Anti-aliased discs by the share of 8 x 8 samples in each pixel."""
+    centres = np.array([[30.2, 30.7], [90.4, 31.1], [60.0, 92.3]])
+    y, x = (np.mgrid[:960, :960] + 0.5) / 8 - 0.5
+    fine = np.max([np.hypot(x - cx, y - cy) < 11.0 for cx, cy in centres], axis=0)
+    image = (20 + 200 * fine.reshape(120, 8, 120, 8).mean(axis=(1, 3))).astype(np.uint8)
+    assert covered_radius(image, centres, np.tile(25.0 * np.eye(2), (3, 1, 1))) == pytest.approx(11 / 25, rel=0.01)
 
 
 # --- from images to cameras

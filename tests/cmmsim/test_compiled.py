@@ -18,35 +18,28 @@ PROBE = (
 
 
 def run_copy(folder, environment):
-    return subprocess.run(
-        [sys.executable, "-c", PROBE],
-        cwd=folder,
-        env={**os.environ, **environment},
-        check=True,
-        capture_output=True,
-        text=True,
-    ).stdout
+    run = {"cwd": folder, "env": os.environ | environment, "check": True, "capture_output": True, "text": True}
+    return float(subprocess.run([sys.executable, "-c", PROBE], **run).stdout)
 
 
 @pytest.fixture
 def copied(tmp_path):
     """A folder with a copy of the package, without any compiled kernel."""
-    shutil.copytree(
-        Path(cmmsim.__file__).parent, tmp_path / "install" / "cmmsim", ignore=shutil.ignore_patterns("__pycache__")
-    )
-    return tmp_path / "install"
+    install, no_cache = tmp_path / "install", shutil.ignore_patterns("__pycache__")
+    shutil.copytree(Path(cmmsim.__file__).parent, install / "cmmsim", ignore=no_cache)
+    return install
 
 
 @pytest.mark.slow
 def test_kernel_is_compiled_anew_when_one_that_it_calls_changes(copied):
-    before = float(run_copy(copied, {}))
+    before = run_copy(copied, {})
 
     def kept():
         return {p: p.stat().st_mtime_ns for p in (copied / "cmmsim").rglob("*.nbi")}
 
     first = kept()
     assert first
-    assert float(run_copy(copied, {})) == before
+    assert run_copy(copied, {}) == before
     assert kept() == first
     callee = copied / "cmmsim" / "detection" / "fit_kernels.py"  # any kernel counts, whether called or not
     callee.write_text(callee.read_text() + "\n")
@@ -61,12 +54,11 @@ def test_kernels_compile_where_the_package_cannot_be_written(copied, tmp_path):
         (copied / "cmmsim" / "geometry" / "__pycache__").write_text("")  # root may write anywhere, but not into a file
     else:
         (copied / "cmmsim" / "geometry").chmod(0o555)
-    home = {"HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": str(tmp_path / "home")}
-    assert float(run_copy(copied, home)) == pytest.approx(9.0 * np.pi)
-    assert list((tmp_path / "home").rglob("disc_kernels*.nbi"))
     (tmp_path / "nowhere").write_text("")
-    nowhere = {"HOME": str(tmp_path / "nowhere"), "XDG_CACHE_HOME": str(tmp_path / "nowhere")}
-    assert float(run_copy(copied, nowhere)) == pytest.approx(9.0 * np.pi)
+    for place in (tmp_path / "home", tmp_path / "nowhere"):
+        users = {"HOME": str(place), "XDG_CACHE_HOME": str(place)}
+        assert run_copy(copied, users) == pytest.approx(9.0 * np.pi)
+    assert list((tmp_path / "home").rglob("disc_kernels*.nbi"))
 
 
 def test_importing_the_package_does_not_import_the_compiler():

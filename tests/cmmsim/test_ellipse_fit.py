@@ -1,26 +1,29 @@
-"""The fit of ellipses against plain numpy and its statistical promise."""
+"""The fit of ellipses against plain numpy, and the Cramer-Rao bound against differentiated images and probabilities."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from cmmsim.detection import ellipse_fit, fit_kernels
+from cmmsim.detection.cramer_rao import cramer_rao_bound, grey_value_information
 from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import RING_REACH, fit_ellipses
 from cmmsim.detection.fit_kernels import CORE_SHARE, SMALLEST_START_PX
-from cmmsim.geometry.disc_image import coverage
-from tests.cmmsim import plain_coverage
-from tests.cmmsim.sensors import NOISE, random_ellipses, require_true, squares
+from cmmsim.geometry.disc_image import SHAPE_BASIS, coverage
+from tests.cmmsim.sensors import NOISE, random_ellipses
 
 SIZE, FIT = 16, 14
 LARGEST_STEP = np.array([1.0, 1.0, 0.8, 0.8, 0.8, 100.0, 40.0])
+FINE = replace(NOISE, bit_depth=12, gain=16.0 * NOISE.gain, black_level=256.0)  # the same noise in finer grey values
 
 
-def exposed(seed, count, radii=(3.8, 2.4), size=SIZE, psf_px=0.0):
-    """True centres and shapes, noisy windows, and where they are cut out."""
+def exposed(seed, count, radii=(3.8, 2.4)):
+    """Noisy windows of ellipses, and where they are cut out."""
     rng = np.random.default_rng(seed)
-    centres, shapes = random_ellipses(rng, count, size, radii)
-    radiance = (8.0 + 220.0 * coverage(centres, shapes, size, psf_px)[0]) / 255.0
-    return centres, shapes, NOISE.expose(radiance.astype(np.float32), rng), np.tile([1000, 700], (count, 1))
+    radiance = (8.0 + 220.0 * coverage(*random_ellipses(rng, count, SIZE, radii), SIZE)[0]) / 255.0
+    return NOISE.expose(radiance.astype(np.float32), rng), np.tile([1000, 700], (count, 1))
 
 
 def moments(window):
@@ -45,7 +48,7 @@ def plain_fit(window, iterations):
     away = np.indices(part.shape)[::-1].reshape(2, -1) - middle[:, None]
     in_ring = np.linalg.norm(np.linalg.solve(shape, away), axis=0) < RING_REACH
     for step in range(iterations + 1):
-        share, slopes = plain_coverage.coverage(p[None, :2], p[[2, 3, 3, 4]].reshape(1, 2, 2), FIT)
+        share, slopes = coverage(p[None, :2], p[[2, 3, 3, 4]].reshape(1, 2, 2), FIT)
         jacobian = np.column_stack([p[5] * slopes.reshape(-1, 5), share.ravel(), np.ones(share.size)])
         residuals = part.ravel() - p[6] - p[5] * share.ravel()
         weights = in_ring / NOISE.variance(part.ravel() - residuals)
@@ -60,7 +63,7 @@ def plain_fit(window, iterations):
 def test_the_fit_takes_the_steps_of_plain_numpy(monkeypatch, radii):
     """From the same start, over the same pixels; covariances and misfits are those of the normal equations."""
     monkeypatch.setattr(ellipse_fit, "CONVERGED_PX", 0.0)
-    _, _, windows, corners = exposed(2, 300, radii)
+    windows, corners = exposed(2, 300, radii)
     fits = fit_ellipses(windows, corners, NOISE, FIT, FitLimits(largest_misfit=np.inf), iterations=3)
     p, covariances, misfits = map(np.array, zip(*(plain_fit(w.astype(float), 3) for w in windows), strict=True))
     close = {"atol": 1e-9, "rtol": 1e-9}
@@ -74,7 +77,7 @@ def test_the_fit_takes_the_steps_of_plain_numpy(monkeypatch, radii):
 def test_the_fit_stops_no_earlier_than_the_noise_allows():
     """Against sixty steps: nearly all within a hundredth of a standard deviation; some one in a thousand windows creep,
     because the share of a pixel has kinks in its second derivatives."""
-    _, _, windows, corners = exposed(3, 1000)
+    windows, corners = exposed(3, 1000)
     ours, theirs = (fit_ellipses(windows, corners, NOISE, FIT, iterations=count) for count in (8, 60))
     gap, deviation = np.abs(ours.centres - theirs.centres).max(axis=1), np.sqrt(theirs.covariances[:, 0, 0])
     assert np.quantile(gap / deviation, 0.99) < 0.01
@@ -82,30 +85,9 @@ def test_the_fit_stops_no_earlier_than_the_noise_allows():
     np.testing.assert_allclose(ours.covariances[:, 0, 0], theirs.covariances[:, 0, 0], rtol=5e-3)
 
 
-@pytest.mark.parametrize(("psf_px", "size"), [(0.0, 18), (0.6, 20)])
-def test_fit_reaches_its_own_covariance_and_has_no_bias(psf_px, size):
-    centres, shapes, windows, corners = exposed(3, 3000, size=size, psf_px=psf_px)
-    fits = fit_ellipses(windows, corners, NOISE, size - 2, psf_px=psf_px)
-    error = fits.centres - corners - centres
-    assert fits.good.all()
-    require_true(squares(error, fits.covariances), 2)
-    assert np.abs(error.mean(axis=0)).max() < 4.0 * error.std() / np.sqrt(3000)
-    assert 0.005 < error.std() < 0.015  # px, "about 0.01 px"
-    shape_error = (fits.shapes - shapes)[:, [0, 0, 1], [0, 1, 1]]
-    assert np.abs(shape_error.mean(axis=0)).max() < 4.0 * shape_error.std() / np.sqrt(3000)
-
-
-def test_fit_of_noise_free_windows_is_exact():
-    centres, shapes = random_ellipses(np.random.default_rng(2), 40, 18)
-    radiance = ((8.0 + 220.0 * coverage(centres, shapes, 18)[0]) / 255.0).astype(np.float32)
-    fits = fit_ellipses(NOISE.mean_grey(radiance), np.zeros((40, 2), dtype=int), NOISE, 16)
-    assert fits.good.all()
-    assert np.abs(fits.centres - centres).max() < 1e-5  # float32 radiance
-
-
 def test_windows_fitted_together_are_those_fitted_alone():
     """A second thread takes half of many windows; which one fits a window changes nothing."""
-    _, _, windows, corners = exposed(5, 37)
+    windows, corners = exposed(5, 37)
     together = fit_ellipses(windows, corners, NOISE, FIT)
     for k in range(37):
         alone = fit_ellipses(windows[k : k + 1], corners[k : k + 1], NOISE, FIT)
@@ -115,7 +97,7 @@ def test_windows_fitted_together_are_those_fitted_alone():
 
 
 def test_windows_without_a_whole_ellipse_are_not_good_and_give_finite_numbers():
-    _, _, windows, corners = exposed(4, 4)
+    windows, corners = exposed(4, 4)
     windows[:, :, 8:] = windows.min()  # the last one stays half hidden
     windows[:3], windows[1], windows[2, 3, 3] = 0, 255, 255
     fits = fit_ellipses(windows, corners, NOISE, FIT)
@@ -129,3 +111,41 @@ def test_radii_are_kept_between_their_bounds():
     xx, xy, yy = fit_kernels.bound_radii(4.0, 1.5, 0.9, 0.5, 3.0)
     values, vectors = np.linalg.eigh(matrix)
     np.testing.assert_allclose([[xx, xy], [xy, yy]], vectors @ np.diag(np.clip(values, 0.5, 3.0)) @ vectors.T)
+
+
+@pytest.mark.parametrize(("noise", "scale", "psf_px"), [(NOISE, 1.0, 0.0), (NOISE, 1.0, 0.6), (FINE, 16.0, 0.0)])
+def test_bound_is_that_of_numerically_differentiated_images(noise, scale, psf_px):
+    """Fisher information of normal grey values with mean m and variance v(m), differentiated by all 7 unknowns."""
+    contrast, ground, step = scale * 180.0, scale * 22.0, 1e-5
+    for centre, shape in (
+        (np.array([6.31, 6.74]), np.array([[3.6, 0.5], [0.5, 2.4]])),
+        (np.array([6.5, 6.02]), 2.5 * np.eye(2)),
+    ):
+
+        def image(p):
+            share = coverage(p[None, :2], np.tensordot(p[2:5], SHAPE_BASIS, 1)[None], FIT, psf_px)[0]
+            return (p[6] + p[5] * share).ravel()
+
+        start = np.array([*centre, shape[0, 0], shape[0, 1], shape[1, 1], contrast, ground])
+        changes = [image(start + step * e) - image(start - step * e) for e in np.eye(7)]
+        jacobian = np.stack(changes, axis=1) / (2.0 * step)
+        variance = noise.variance(image(start))
+        information = 1.0 / variance + 0.5 * (noise.gain / variance) ** 2  # the variance grows by K a grey value
+        expected = np.linalg.inv(jacobian.T @ (information[:, None] * jacobian))[:2, :2]
+        bound = cramer_rao_bound(centre[None], shape[None], FIT, contrast, ground, noise, psf_px)[0]
+        np.testing.assert_allclose(bound, expected, rtol=1e-4, atol=1e-4 * expected.trace())
+
+
+def test_information_of_a_rounded_number_is_that_of_its_probabilities():
+    """Probabilities of all 256 grey values, differentiated numerically; with little noise rounding decides."""
+    for noise in (NOISE, replace(NOISE, electrons_at_white=5e4, gain=0.13 / 31, dark_noise=100.0, full_well=6e4)):
+        for mean in (22.0, 22.37, 22.5, 120.2, 254.9):
+
+            def probabilities(mean, noise=noise):
+                edges = np.concatenate([[-np.inf], np.arange(255) + 0.5, [np.inf]])
+                return np.diff(norm.cdf(edges, mean, np.sqrt(noise.variance(mean) - 1.0 / 12.0)))
+
+            slope = (probabilities(mean + 1e-4) - probabilities(mean - 1e-4)) / 2e-4
+            likely = probabilities(mean) > 1e-10
+            expected = np.sum(slope[likely] ** 2 / probabilities(mean)[likely])
+            assert grey_value_information(np.array([mean]), noise)[0] == pytest.approx(expected, rel=1e-4)

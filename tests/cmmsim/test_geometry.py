@@ -1,5 +1,6 @@
-"""Poses, cameras, triangulation, plane frames and registration against closed forms and scipy."""
+"""Poses, lenses, triangulation, plane frames and registration against closed forms, SciPy and OpenCV."""
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,8 +9,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from cmmsim.errors import LostError
-from cmmsim.geometry import point_kernels
 from cmmsim.geometry import pose as p
+from cmmsim.geometry.camera import Distortion, PinholeCamera
 from cmmsim.geometry.plane_frame import fit_plane, frame_from_planes, frame_of_points
 from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import toed_in_rig, triangulate
@@ -50,43 +51,22 @@ def test_euler_rates_match_finite_differences():
         np.testing.assert_allclose(turn.as_rotvec() / 2e-6, matrix[:, k], atol=1e-7)
 
 
-def test_noise_free_triangulation_returns_the_points():
-    points = np.random.default_rng(1).uniform([0.0, -0.2, 0.1], [0.6, 0.2, 0.4], (50, 3))
-    in_camera = p.apply(CAMERA_FROM_BASE, points)
-    pixels, valid = RIG.project(in_camera)
-    assert valid.all()
-    spread = np.broadcast_to(1e-4 * np.eye(2), (50, 2, 2))
-    found = triangulate(RIG, *pixels, spread, spread)
-    assert np.abs(found.points - in_camera).max() < 1e-11
-    assert found.ray_gap.max() < 1e-12
-
-
 def test_plane_frame_of_exact_points():
     """Three planes built from a known frame give it back, seen from anywhere."""
-    rng = np.random.default_rng(2)
-    normals = np.array([[0.0, 0.0, 1.0], [0.8, 0.5, 0.3], [0.8, -0.5, 0.2]])
+    normals, corner = np.array([[0.0, 0.0, 1.0], [0.8, 0.5, 0.3], [0.8, -0.5, 0.2]]), np.array([0.19, 0.02, 0.13])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    corner = np.array([0.19, 0.02, 0.13])
-    offsets = normals @ corner
-    own = frame_from_planes(normals, offsets)
+    own = frame_from_planes(normals, normals @ corner)
     np.testing.assert_allclose(own[:3, 3], corner, atol=1e-14)
     np.testing.assert_allclose(own[:3, 2], normals[0], atol=1e-14)
     np.testing.assert_allclose(normals[:2] @ own[:3, 0], 0.0, atol=1e-14)
-    points, index = [], np.repeat(np.arange(3), 5)
-    for normal in normals:
-        spread = rng.uniform(-0.1, 0.1, (5, 3))
-        points.append(corner + spread - np.outer(spread @ normal, normal))
-    camera_from_body = np.eye(4)
-    camera_from_body[:3, :3] = Rotation.from_rotvec([1.8, -0.9, 0.4]).as_matrix()
-    camera_from_body[:3, 3] = [0.1, -0.2, 1.7]
-    covariances = np.broadcast_to(1e-10 * np.eye(3), (15, 3, 3))
-    frame, _ = frame_of_points(
-        p.apply(camera_from_body, np.concatenate(points)), covariances, index, normals @ camera_from_body[:3, :3].T
-    )
-    np.testing.assert_allclose(frame, camera_from_body @ own, atol=1e-12)
+    plane, spread = np.repeat(np.arange(3), 5), np.random.default_rng(2).uniform(-0.1, 0.1, (15, 3))
+    points = corner + spread - np.einsum("ni,ni->n", spread, normals[plane])[:, None] * normals[plane]
+    moved, covariances = p.pose_to_transform([0.1, -0.2, 1.7, 1.8, -0.9, 0.4]), np.tile(1e-10 * np.eye(3), (15, 1, 1))
+    frame, _ = frame_of_points(p.apply(moved, points), covariances, plane, normals @ moved[:3, :3].T)
+    np.testing.assert_allclose(frame, moved @ own, atol=1e-12)
 
 
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)  # the first one may compile
 @given(st.integers(0, 10_000), st.integers(3, 18))
 def test_registration_finds_a_known_transform(seed, count):
     rng = np.random.default_rng(seed)
@@ -145,19 +125,6 @@ def test_transform_explains_the_points_best(seen):
     np.testing.assert_allclose(found.misfit, (whitened(np.zeros(6)).reshape(-1, 3) ** 2).sum(axis=1), rtol=1e-9)
 
 
-def test_small_linear_algebra_is_that_of_lapack():
-    rng = np.random.default_rng(6)
-    half, right = rng.normal(size=(9, 7)), rng.normal(size=7)
-    matrix, inverse = half.T @ half, np.empty((2, 2))
-    lower, found = matrix.copy(), right.copy()
-    point_kernels.factor(lower)
-    point_kernels.solve_factored(lower, found)
-    point_kernels.invert_factored(lower, inverse)
-    np.testing.assert_allclose(inverse, np.linalg.inv(matrix)[:2, :2], rtol=1e-9)
-    np.testing.assert_allclose(np.tril(lower), np.linalg.cholesky(matrix), rtol=1e-9)
-    np.testing.assert_allclose(found, np.linalg.solve(matrix, right), rtol=1e-9)
-
-
 LINE, EACH = np.outer(np.arange(5.0), [0.1, 0.05, 0.0]), np.tile(np.eye(3), (5, 1, 1))
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -174,3 +141,63 @@ UP = np.array([0.0, 0.0, 1.0])
 def test_too_few_points_and_those_on_a_line_are_lost(fit, message):
     with pytest.raises(LostError, match=message):
         fit()
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        pytest.param((-0.12, 0.03, 1e-3, -7e-4, -4e-3), id="barrel"),
+        pytest.param((0.15, 0.06, -8e-4, 5e-4, 0.02), id="cushion"),
+        pytest.param((-0.2, 0.25, 3e-4, 2e-4, -0.05), id="moustache"),
+    ],
+)
+def test_distorted_pixels_are_those_of_opencv_forth_and_back_with_the_jacobian_of_differences(lens):
+    camera = PinholeCamera(2300.0, 1020.0, 771.0, 2048, 1536, aspect=1.004, distortion=Distortion(*lens))
+    matrix, coefficients, rng = camera.matrix, np.array(lens), np.random.default_rng(1)
+    points = rng.uniform([-0.6, -0.45, 1.4], [0.6, 0.45, 2.2], (200, 3))
+    shown, inside = camera.project(points)
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, coefficients)
+    np.testing.assert_allclose(shown, expected.reshape(-1, 2), rtol=0.0, atol=1e-9)
+    assert inside.mean() > 0.5
+    pixels = rng.uniform(0.0, [2047.0, 1535.0], (300, 2))
+    ideal, found = camera.undistort(pixels)
+    assert found.all()
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-14)
+    undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # as OpenCV 4 calls it, and OpenCV 5
+    expected = undistort(pixels[:, None], matrix, coefficients, R=np.eye(3), P=matrix, criteria=criteria)
+    np.testing.assert_allclose(ideal, expected.reshape(-1, 2), rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(camera.distort(ideal)[0], pixels, rtol=0.0, atol=3e-9)  # 1e-12 focal lengths
+    for k, step in enumerate(1e-3 * np.eye(2)):
+        slope = (camera.distort(pixels + step)[0] - camera.distort(pixels - step)[0]) / 2e-3
+        np.testing.assert_allclose(camera.distortion_jacobian(pixels)[..., k], slope, atol=1e-8)
+
+
+@given(st.floats(-0.4, 0.4), st.floats(-0.3, 0.3), st.floats(-0.1, 0.1), st.floats(-3e-3, 3e-3), st.floats(-3e-3, 3e-3))
+def test_every_point_within_the_fold_is_found_again_and_no_other(k1, k2, k3, p1, p2):
+    lens = Distortion(k1, k2, p1, p2, k3)
+    angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    reach = min(0.97 * lens.fold_radius, 0.7)
+    points = np.concatenate([share * reach * circle for share in (0.0, 0.3, 0.8, 1.0)])
+    points = points[lens.holds(points)]
+    distorted = lens.distort(points)
+    found, ok = lens.undistort(distorted)
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(lens.distort(found)[ok], distorted[ok], rtol=0.0, atol=1e-12)
+    assert lens.holds(found)[ok].all()
+    assert ok[np.linalg.norm(points, axis=1) < 0.85 * reach].all()
+
+
+def test_beyond_the_fold_nothing_is_found_and_nothing_is_nan():
+    lens = Distortion(k1=-0.3)
+    assert lens.fold_radius == pytest.approx(np.sqrt(1.0 / 0.9))  # 1 + 3 k1 s = 0
+    farthest = lens.fold_radius * (1.0 - 0.3 * lens.fold_radius**2)
+    found, ok = lens.undistort(np.array([[0.99 * farthest, 0.0], [1.01 * farthest, 0.0], [40.0, -9.0]]))
+    np.testing.assert_array_equal(ok, [True, False, False])
+    assert np.isfinite(found).all()
+    camera = PinholeCamera(500.0, 1000.0, 700.0, 2048, 1536, distortion=lens)
+    points = np.array([[0.5, 0.0, 1.0], [1.2, 0.0, 1.0]])  # the second one folds back into the image
+    pixels, valid = camera.project(points)
+    assert camera.shows(pixels).all()
+    np.testing.assert_array_equal(valid, [True, False])
+    assert Distortion(k1=0.1).fold_radius == np.inf

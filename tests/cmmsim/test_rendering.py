@@ -8,12 +8,12 @@ import pytest
 import trimesh
 
 import cmmsim
+from cmmsim.geometry.disc_image import coverage
 from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.imaging import analytic, pyrender_renderer
 from cmmsim.imaging.exposure import SUPERSAMPLING
 from cmmsim.imaging.kernels import Discs, Solids, cover_by_polygon, lay_layers, polygon_holds
 from cmmsim.imaging.scene import ConvexSolid
-from tests.cmmsim import plain_coverage
 from tests.cmmsim.sensors import (
     CAMERA,
     centre_errors,
@@ -178,7 +178,7 @@ def test_layers_are_laid_as_plain_numpy_lays_them():
         half, np.array([0, 1]), np.array([[-1e3, -1e3, corner[0] + 7.25, 1e3]]), np.array([0.4]), np.array([0])
     )
     discs = Discs(centres + corner, shapes, np.linalg.norm(shapes, axis=2), levels, np.array([[False], [True]]))
-    shares = plain_coverage.coverage(centres, shapes, 16)[0]
+    shares = coverage(centres, shapes, 16)[0]
     cover = np.tile(np.clip(7.75 - np.arange(16), 0.0, 1.0), (16, 1))
     expected = 0.2 + cover * (0.4 - 0.2)
     for share, level in zip((shares[0], shares[1] * (1.0 - cover)), levels, strict=True):
