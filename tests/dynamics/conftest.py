@@ -170,6 +170,7 @@ class Loop:
         smoothing_velocity: float | None = None,
         steps: int = 4,
         friction: closed_loop.FrictionLaw | None = None,
+        elasticity: closed_loop.JointElasticity | None = None,
     ) -> closed_loop.LoopSettings:
         """The paper's servo gains; 60 Hz, no delay, zero hold, exact friction unless told otherwise."""
         name = "smoothed" if smoothing_velocity else "coulomb_viscous"
@@ -178,6 +179,7 @@ class Loop:
             closed_loop.FrameTiming(rate_hz, latency_s, hold),
             friction or closed_loop.FrictionLaw(name, smoothing_velocity),
             steps,
+            elasticity,
         )
 
     def run(
@@ -192,6 +194,14 @@ class Loop:
         parameters = self.parameters if parameters is None else parameters
         return closed_loop.simulate(self.robot, parameters, reference, settings or self.settings(), **options)
 
+    def half_way(
+        self, frames: int, frame: int, settings: closed_loop.LoopSettings
+    ) -> tuple[closed_loop.Reference, closed_loop.StartState]:
+        """The reference from a frame on, and the state that a run over all its frames has reached there."""
+        reference = self.reference(frames)
+        rest = closed_loop.Reference(reference.poses[frame:], reference.rates[frame:])
+        return rest, self.run(reference, settings).state_at(frame)
+
     def both(self, *arguments: object, **options: object) -> list[closed_loop.ClosedLoopRun]:
         """The same run compiled and plain."""
         return [self.run(*arguments, compiled=compiled, **options) for compiled in (True, False)]
@@ -204,7 +214,10 @@ def loop(robot: dynamics.Robot, identified: np.ndarray) -> Loop:
     return Loop(robot, identified)
 
 
-RECORDS = ("pose", "pose_rate", "torque", "command", "measured", "joint_integral", "servo_integral")
+RECORDS = (
+    *("pose", "pose_rate", "torque", "command", "measured", "joint_integral", "servo_integral"),
+    *("motor_angle", "motor_rate"),
+)
 
 
 def assert_same(compiled: closed_loop.ClosedLoopRun, plain: closed_loop.ClosedLoopRun, tolerance: float = 1e-9) -> None:
@@ -212,7 +225,7 @@ def assert_same(compiled: closed_loop.ClosedLoopRun, plain: closed_loop.ClosedLo
     assert compiled.events == plain.events
     for name in ("time", "measured_ok"):
         np.testing.assert_array_equal(getattr(compiled, name), getattr(plain, name), err_msg=name)
-    for name in (*RECORDS, "motor_angle", "motor_rate"):
+    for name in RECORDS:
         ours, other = getattr(compiled, name), getattr(plain, name)
         if other is not None:
             np.testing.assert_allclose(ours, other, atol=tolerance * np.nanmax(np.abs(other)), rtol=0, err_msg=name)

@@ -1,6 +1,4 @@
-"""Elastic joints against energy, against an ODE solver on the twist-space model, and against the rigid robot."""
-
-import dataclasses
+"""What the loop integrates, joints rigid or elastic, against energy and an ODE solver on the twist-space model."""
 
 import numpy as np
 import pytest
@@ -8,9 +6,9 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
 from dynamics import closed_loop
-from dynamics.closed_loop import FrictionLaw, JointElasticity
+from dynamics.closed_loop import JointElasticity
 from dynamics.parameters import COULOMB, PARAMETER_NAMES
-from tests.dynamics.conftest import assert_same, at_rest
+from tests.dynamics.conftest import at_rest
 
 GRAVITY = 9.81
 CRANK_IZZ = [PARAMETER_NAMES.index(f"crank{leg}.Izz") for leg in range(1, 7)]
@@ -24,14 +22,6 @@ def frictionless(identified):
     values[COULOMB] = 0.0
     values[CRANK_IZZ] = 6e-4
     return values
-
-
-@pytest.fixture
-def make_elastic(loop):
-    def make(elasticity, steps=80, **options):
-        return dataclasses.replace(loop.settings(steps=steps, **options), elasticity=elasticity)
-
-    return make
 
 
 def _potential(pose, motors, stiffness, parameters, robot, legs_at):
@@ -55,17 +45,21 @@ def _least_energy(start, *arguments):
     return start + scale * fsolve(slope, np.zeros(6), xtol=1e-10)
 
 
-def test_a_load_sinks_to_the_pose_of_least_energy(loop, robot, frictionless, legs_at, make_elastic):
-    """Motors held where they are, 8 kg put on the platform: after the vibration has died the sum of the energies of
-    gravity and springs is least; the cranks have given way by torque over stiffness."""
-    stiff_loop = frictionless.copy()
+def test_the_equilibrium_and_a_load_on_it_are_at_the_pose_of_least_energy(loop, robot, frictionless, legs_at):
+    """In equilibrium nothing moves. Motors held where they are, 8 kg put on the platform: after the vibration has died
+    the sum of the energies of gravity and springs is least; the cranks have given way by torque over stiffness."""
+    stiff_loop, settings = frictionless.copy(), loop.settings(steps=80, elasticity=SOFT)
     stiff_loop[64:] = 40.0, 200.0, 0.5
     pose = robot.home_pose + np.array([2e-3, -1e-3, 1e-3, 0.01, -0.005, 0.01])
-    settings = make_elastic(SOFT)
     start = closed_loop.equilibrium(robot, stiff_loop, pose, settings.servo, elasticity=SOFT)
+    least = _least_energy(pose + 1e-5, start.motor_angle, SOFT.stiffness, stiff_loop[:64], robot, legs_at)
+    np.testing.assert_allclose(least, pose, atol=1e-8)
+    reference = at_rest(pose, 300)
+    np.testing.assert_allclose(
+        loop.run(at_rest(pose, 20), settings, frictionless).pose, reference.poses[:20], atol=1e-13
+    )
     loaded = stiff_loop.copy()
     loaded[0] += 8.0
-    reference = at_rest(pose, 300)
     commands = np.tile(start.commands[0], (300, 1))
     run = loop.run(reference, settings, loaded, start=start, commands=commands)
     np.testing.assert_allclose(run.motor_angle[-1], commands[0], atol=1e-8)
@@ -76,39 +70,33 @@ def test_a_load_sinks_to_the_pose_of_least_energy(loop, robot, frictionless, leg
     np.testing.assert_allclose(given_way, robot.static_torque(run.pose[-1], loaded[:64]) / SOFT.stiffness, atol=1e-8)
 
 
-def test_the_equilibrium_is_the_pose_of_least_energy_and_stays(loop, robot, frictionless, legs_at, make_elastic):
-    settings, pose = make_elastic(SOFT), robot.home_pose
-    start = closed_loop.equilibrium(robot, frictionless, pose, settings.servo, elasticity=SOFT)
-    least = _least_energy(pose + 1e-5, start.motor_angle, SOFT.stiffness, frictionless[:64], robot, legs_at)
-    np.testing.assert_allclose(least, pose, atol=1e-8)
-    reference = at_rest(pose, 20)
-    run = loop.run(reference, settings, frictionless)
-    np.testing.assert_allclose(run.pose, reference.poses, atol=1e-13)
-
-
-def test_motion_is_that_of_the_twist_space_model_with_springs(loop, robot, frictionless, make_elastic):
-    """Three frames of moving commands against DOP853 on forward dynamics (eq. 40) with the springs as its actuators."""
-    el, frames = SOFT, 3
-    reference = loop.reference(frames)
-    settings = make_elastic(el, steps=200)
-    run = closed_loop.simulate(
-        robot, frictionless, reference, settings, commands=0.02 * np.sin(np.arange(frames))[:, None] * np.ones(6)
-    )
-    lp, li, ld = frictionless[64:]
-    carried, viscous = frictionless[:64].copy(), frictionless[58:64]
-    carried[CRANK_IZZ] -= el.motor_inertia
+@pytest.mark.parametrize("el", [SOFT, None], ids=["elastic", "rigid"])
+def test_motion_is_that_of_the_twist_space_model(loop, robot, identified, frictionless, el):
+    """Three frames of moving commands against DOP853 on forward dynamics (eq. 40) under joint PID (eq. 31): with the
+    springs as its actuators, or with smoothed dry friction in rigid joints."""
+    frames, smoothing = 3, None if el else 0.05
+    values = frictionless if el else identified
+    settings = loop.settings(steps=200, elasticity=el, smoothing_velocity=smoothing)
+    run = loop.run(frames, settings, values, commands=0.02 * np.sin(np.arange(frames))[:, None] * np.ones(6))
+    lp, li, ld = values[64:]
+    carried, coulomb, viscous = values[:64].copy(), values[COULOMB], values[58:64]
     carried[52:] = 0.0
+    if el:
+        carried[CRANK_IZZ] -= el.motor_inertia
 
     def slope(t, x, command, command_rate):
         pose, twist, motor, rate, integral = x.reshape(5, 6)
-        crank_rate = robot.joint_jacobian(pose) @ twist
-        spring = el.stiffness * (motor - robot.inverse_kinematics(pose)) + el.damping * (rate - crank_rate)
-        torque = lp * (command - motor) + ld * (command_rate - rate) + li * integral
+        crank, crank_rate = robot.inverse_kinematics(pose), robot.joint_jacobian(pose) @ twist
+        motor, rate = (motor, rate) if el else (crank, crank_rate)
+        torque = lp * (command - motor) + ld * (command_rate - rate) + li * integral - viscous * rate
+        torque -= 0 if el else coulomb * np.tanh(rate / smoothing)
+        spring = el.stiffness * (motor - crank) + el.damping * (rate - crank_rate) if el else torque
         motion = (robot.pose_rate(pose, twist), robot.forward_dynamics(pose, twist, spring, carried))
-        return np.concatenate([*motion, rate, (torque - viscous * rate - spring) / el.motor_inertia, command - motor])
+        return np.concatenate([*motion, rate, (torque - spring) / SOFT.motor_inertia, command - motor])
 
     start, before = run.start, run.start.commands[-1]
-    x = np.concatenate([start.pose, np.zeros(6), start.motor_angle, start.motor_rate, start.joint_integral])
+    motor, rest = (start.motor_angle if el else np.zeros(6)), np.zeros(6)
+    x = np.concatenate([start.pose, rest, motor, rest, start.joint_integral])
     for k in range(frames - 1):
         command = run.command[k]
         inputs = (command, (command - before) * 60.0)
@@ -117,27 +105,15 @@ def test_motion_is_that_of_the_twist_space_model_with_springs(loop, robot, frict
         pose, twist, motor, rate, _ = x.reshape(5, 6)
         np.testing.assert_allclose(run.pose[k + 1], pose, atol=1e-10)
         np.testing.assert_allclose(robot.twist(run.pose[k + 1], run.pose_rate[k + 1]), twist, atol=1e-8)
-        np.testing.assert_allclose(run.motor_angle[k + 1], motor, atol=1e-9)
-        np.testing.assert_allclose(run.motor_rate[k + 1], rate, atol=1e-6)
+        if el:
+            np.testing.assert_allclose(run.motor_angle[k + 1], motor, atol=1e-9)
+            np.testing.assert_allclose(run.motor_rate[k + 1], rate, atol=1e-6)
 
 
-def test_stiff_springs_give_the_rigid_run_to_first_order(loop, robot, frictionless, make_elastic):
+def test_stiff_springs_give_the_rigid_run_to_first_order(loop, frictionless):
     """The difference halves with the compliance: the order between stiffnesses of 1, 2 and 4e4 N m/rad is 1."""
-    reference = loop.reference(30)
-    rigid = closed_loop.simulate(robot, frictionless, reference, make_elastic(None))
-    misses = []
+    rigid, misses = loop.run(30, loop.settings(steps=80), frictionless), []
     for stiffness in (1e4, 2e4, 4e4):
-        settings = make_elastic(JointElasticity(stiffness, 3e-4, 0.02), steps=200)
-        misses.append(np.abs(loop.run(reference, settings, frictionless).pose - rigid.pose).max())
+        settings = loop.settings(steps=200, elasticity=JointElasticity(stiffness, 3e-4, 0.02))
+        misses.append(np.abs(loop.run(30, settings, frictionless).pose - rigid.pose).max())
     np.testing.assert_allclose(np.log2(misses[0] / np.array(misses[1:])), [1, 2], atol=0.02)
-
-
-@pytest.mark.parametrize("friction", [FrictionLaw(), FrictionLaw("stribeck", None, 1.5, 0.05)], ids=lambda f: f.name)
-def test_both_paths_stick_and_slip_alike(loop, make_elastic, friction):
-    reference = loop.reference(40)
-    settings = make_elastic(SOFT, steps=60, friction=friction, latency_s=1.3 / 60, hold="linear")
-    start = loop.run(reference, settings).state_at(32)
-    rest = closed_loop.Reference(reference.poses[32:], reference.rates[32:])
-    ours, plain = (loop.run(rest, settings, start=start, compiled=compiled) for compiled in (True, False))
-    assert_same(ours, plain, 1e-11)
-    assert ours.events > 3

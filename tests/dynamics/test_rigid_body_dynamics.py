@@ -6,21 +6,12 @@ import numpy as np
 import pytest
 
 from dynamics import fast_forward_dynamics
-from dynamics.rigid_body.equation_of_motion import motion_functions
 from tests.dynamics.conftest import METHODS, base_from_platform, derivative, link_axes
 
 
 @pytest.fixture(params=["initial", "identified"])
 def parameters(request, robot):
     return robot.parameter_sets[request.param].dynamic
-
-
-@pytest.fixture
-def round_links(robot):
-    """Table 2 with Ixx = Iyy in every link, so that the missing spin of the link's axes does not matter."""
-    values = robot.parameter_sets["identified"].dynamic.copy()
-    values[30:52:4] = values[29:52:4]
-    return values
 
 
 def test_mass_matrix_is_symmetric_and_positive_definite(robot, states, parameters):
@@ -109,29 +100,22 @@ def test_mass_matrix_gives_the_kinetic_energy_and_gravity_the_power_of_the_13_bo
         np.testing.assert_allclose(robot.gravity_wrench(pose_at(0), parameters) @ twist, power, rtol=1e-9)
 
 
-def _mass_rate(robot, motion, t, values):
-    return derivative(lambda d: robot.mass_matrix(motion.pose(t + d), values))
-
-
-def test_mass_rate_less_twice_coriolis_is_skew(robot, motion, round_links):
-    """M_dot - 2 C is skew-symmetric, M_dot by finite differences; so is its quadratic form zero."""
-    for t in np.linspace(0, 3, 7):
-        twist = robot.twist(motion.pose(t), motion.rate(t))
-        rate = _mass_rate(robot, motion, t, round_links)
-        skew = rate - 2 * robot.coriolis_matrix(motion.pose(t), twist, round_links)
-        assert abs(twist @ skew @ twist) < 1e-11
-        np.testing.assert_allclose(skew, -skew.T, atol=1e-9 * np.abs(rate).max())
-
-
 def test_links_without_spin_break_the_energy_balance_by_a_known_amount(robot, legs_at, motion, parameters):
     """A link that never spins (eq. 12) but keeps its x axis normal to the crank axis is no rigid body if Ixx != Iyy:
-    v^T (M_dot - 2 C) v is then 2 spin (Ixx - Iyy) omega_x omega_y, where spin is how fast the axes turn about z."""
-    for t in (0.2, 0.9):
+    v^T (M_dot - 2 C) v is then 2 spin (Ixx - Iyy) omega_x omega_y, where spin is how fast the axes turn about z. With
+    Ixx = Iyy in every link M_dot - 2 C is skew-symmetric. M_dot is taken by finite differences."""
+    round_links = parameters.copy()
+    round_links[30:52:4] = round_links[29:52:4]
+    for t in np.linspace(0, 3, 7):
         pose, twist = motion.pose(t), robot.twist(motion.pose(t), motion.rate(t))
-        skew = _mass_rate(robot, motion, t, parameters) - 2 * robot.coriolis_matrix(pose, twist, parameters)
         omega = _angular_velocity(lambda d, t=t: link_axes(robot.geometry, legs_at(motion.pose(t + d))))
-        expected = 2 * np.sum((parameters[29:52:4] - parameters[30:52:4]) * omega.prod(axis=1))
-        np.testing.assert_allclose(twist @ skew @ twist, expected, atol=2e-11)
+        for values in (parameters, round_links):
+            rate = derivative(lambda d, t=t, values=values: robot.mass_matrix(motion.pose(t + d), values))
+            skew = rate - 2 * robot.coriolis_matrix(pose, twist, values)
+            expected = 2 * np.sum((values[29:52:4] - values[30:52:4]) * omega.prod(axis=1))
+            np.testing.assert_allclose(twist @ skew @ twist, expected, atol=2e-11)
+        assert abs(twist @ skew @ twist) < 1e-11
+        np.testing.assert_allclose(skew, -skew.T, atol=1e-9 * np.abs(rate).max())
 
 
 def test_friction_follows_the_joint_velocity(robot, states, parameters):
@@ -151,23 +135,3 @@ def test_wrench_is_linear_in_the_parameters(robot, states):
     torque = robot.inverse_dynamics(*many, np.vstack([base, base + np.eye(64)]))
     wrenches = (torque[1:] - torque[0]) @ robot.joint_jacobian(pose)
     np.testing.assert_allclose(wrenches.T, robot.regressor(*motion), atol=1e-10)
-
-
-def test_equation_of_motion_in_pose_coordinates_is_the_wrench_balance(robot, states, identified):
-    """What the closed loop integrates, M, b, J_theta, J_theta_dot rate and theta, against `Robot` (twist coordinates,
-    6x6 Jacobians) and differences. Its derivatives are proved with those of whole runs, in test_sensitivities."""
-    functions = {function.name(): function for function in motion_functions(robot.geometry)}
-    frictionless = np.concatenate([identified[:52], np.zeros(12)])
-    for pose, twist, twist_dot in zip(states.pose[:6], states.twist, states.twist_dot, strict=False):
-        rate = robot.pose_rate(pose, twist)
-        values = functions["equation_of_motion"](pose, rate, identified[:52])
-        mass, bias, jacobian, drift, angle = (np.squeeze(np.asarray(value, dtype=float)) for value in values)
-        to_twist = np.column_stack([robot.twist(pose, e) for e in np.eye(6)])
-        np.testing.assert_allclose(mass, to_twist.T @ robot.mass_matrix(pose, frictionless) @ to_twist, atol=1e-12)
-        acceleration = np.linalg.solve(to_twist, twist_dot - robot.twist_dot(pose, rate, np.zeros(6)))
-        torque = robot.inverse_dynamics(pose, twist, twist_dot, frictionless)
-        np.testing.assert_allclose(mass @ acceleration + bias, jacobian.T @ torque, atol=1e-10)
-        np.testing.assert_allclose(jacobian, robot.pose_jacobian(pose), atol=1e-12)
-        np.testing.assert_allclose(angle, robot.inverse_kinematics(pose), atol=1e-14)
-        expected = derivative(lambda d, p=pose, r=rate: robot.pose_jacobian(p + d * r) @ r)
-        np.testing.assert_allclose(drift, expected, atol=1e-10)

@@ -7,20 +7,24 @@ import pytest
 
 from dynamics import closed_loop
 from dynamics.closed_loop import FrictionLaw
-from tests.dynamics.conftest import RECORDS, assert_same
+from tests.dynamics.conftest import RECORDS
 
-STRIBECK = FrictionLaw("stribeck", static_ratio=1.3, stribeck_velocity=0.1)
+LATE = {"latency_s": 1.3 / 60, "hold": "linear"}
 CASES = {
     "exact friction": ({}, range(67), 1e-6),
-    "linear hold, 1.3 frames of delay": ({"hold": "linear", "latency_s": 1.3 / 60}, range(2, 67, 3), 1e-6),
-    "Stribeck friction": ({"friction": STRIBECK}, range(1, 67, 3), 1e-6),
+    "logged commands": ({}, range(0, 67, 3), 1e-6),
+    "linear hold, 1.3 frames of delay": (LATE, range(2, 67, 3), 1e-6),
+    "Stribeck friction": ({"friction": FrictionLaw("stribeck", None, 1.3, 0.1)}, range(1, 67, 3), 1e-6),
     "smoothed friction": ({"smoothing_velocity": 0.05}, range(0, 67, 3), 1e-6),
     "exact friction, 16 steps": ({"steps": 16}, range(0, 67, 9), 1e-6),
     "exact friction, 2 steps": ({"steps": 2}, (0, 2, 3, 12), 1e-7),
+    "lost frames": ({"latency_s": 0.4 / 60}, range(52, 67, 7), 1e-6),
+    "jitter": ({}, (0, 52, 58, 64, 65), 1e-6),
+    "jitter, linear hold": (LATE, (0, 52, 58, 64, 65), 1e-6),
 }
 FRAME = 20  # of the reference: there four joints move and two stick
 ENTRIES = ("pose", "pose_rate", "joint_integral", "servo_integral")
-TIMINGS = {"no delay": {}, "1.3 frames, linear": {"latency_s": 1.3 / 60, "hold": "linear"}}
+TIMINGS = {"no delay": {}, "1.3 frames, linear": LATE}
 
 
 def _central(values, step):
@@ -50,23 +54,25 @@ def _assert_derivative(run, parameters, index, ours, tolerance):
     pytest.fail(f"parameter {index}: off by {np.array(misses)} of the largest sensitivity")
 
 
-@pytest.mark.parametrize(
-    ("case", "driven"), [*[(case, False) for case in CASES], pytest.param("exact friction", True, id="logged commands")]
-)
-def test_sensitivities_are_finite_differences_of_the_run(loop, case, driven):
+@pytest.mark.parametrize("case", CASES)
+def test_sensitivities_are_finite_differences_of_the_run(loop, case):
     """Within one pattern of events the poses are smooth in the parameters, and the sensitivities are their derivatives
     at the usual 4 steps a frame: steps that events cut are differentiated as they are computed."""
-    options, indices, tolerance = CASES[case]
-    reference, settings = loop.reference(45), loop.settings(**options)
-    commands = loop.run(reference, settings).command if driven else None
+    settings, reference, given = loop.settings(**CASES[case][0]), loop.reference(45), {}
+    if case == "logged commands":
+        given["commands"] = loop.run(reference, settings).command
+    if case == "lost frames":
+        given["lost"] = np.isin(np.arange(45), (0, 5, 9, 10))
+    if case.startswith("jitter"):
+        given["latencies"] = np.random.default_rng(3).uniform(0, 3.2 / 60, 45)
 
     def run(values, sensitivities=False):
-        return loop.run(reference, settings, values, commands=commands, sensitivities=sensitivities)
+        return loop.run(reference, settings, values, sensitivities=sensitivities, **given)
 
     base = run(loop.parameters, sensitivities=True)
     assert (base.events > 10) == (case != "smoothed friction")
-    for index in indices if not driven else range(0, 67, 3):
-        _assert_derivative(run, loop.parameters, index, base.pose_sensitivity[:, :, index], tolerance)
+    for index in CASES[case][1]:
+        _assert_derivative(run, loop.parameters, index, base.pose_sensitivity[:, :, index], CASES[case][2])
 
 
 def test_a_common_factor_of_all_parameters_cannot_be_seen(loop):
@@ -79,21 +85,6 @@ def test_a_common_factor_of_all_parameters_cannot_be_seen(loop):
     assert np.abs(along).max() < 1e-8 * np.abs(base.pose_sensitivity * loop.parameters).max()
 
 
-def _from(reference, frame):
-    return closed_loop.Reference(reference.poses[frame:], reference.rates[frame:])
-
-
-@pytest.fixture(scope="module")
-def half_way(loop):
-    """(frames, **settings) -> the rest of a reference, the settings, and the state that a run over it has reached."""
-
-    def make(frames=45, frame=FRAME, **options):
-        reference, settings = loop.reference(frames), loop.settings(**options)
-        return _from(reference, frame), settings, loop.run(reference, settings).state_at(frame)
-
-    return make
-
-
 def _moved(start, direction):
     """The start state, moved by a vector of its 24 entries."""
     changes = {name: getattr(start, name) + part for name, part in zip(ENTRIES, np.split(direction, 4), strict=True)}
@@ -103,15 +94,14 @@ def _moved(start, direction):
 @pytest.mark.parametrize("timing", [*TIMINGS, "elastic joints"])
 def test_a_run_from_the_state_of_another_repeats_its_rest(loop, timing):
     """Bit by bit: the state is complete. Joints stick at some of these frames, and commands are on their way."""
-    reference, settings, names = loop.reference(45), loop.settings(**TIMINGS.get(timing, {"steps": 80})), RECORDS
-    if timing == "elastic joints":
-        settings = replace(settings, elasticity=closed_loop.JointElasticity(500.0, 3e-4, 0.02))
-        names = (*RECORDS, "motor_angle", "motor_rate")
-    run = loop.run(reference, settings)
+    elastic = {"steps": 80, "elasticity": closed_loop.JointElasticity(500.0, 3e-4, 0.02)}
+    settings = loop.settings(**TIMINGS.get(timing, elastic))
+    run = loop.run(45, settings)
     assert run.state_at(0) is run.start
     for frame in (0, 3, FRAME, 33):
-        rest = loop.run(_from(reference, frame), settings, start=run.state_at(frame))
-        for name in names:
+        reference, start = loop.half_way(45, frame, settings)
+        rest = loop.run(reference, settings, start=start)
+        for name in RECORDS if timing == "elastic joints" else RECORDS[:-2]:
             np.testing.assert_array_equal(getattr(rest, name), getattr(run, name)[frame:], err_msg=name)
 
 
@@ -141,11 +131,12 @@ def _directions(robot, start):
 
 
 @pytest.mark.parametrize("timing", [*TIMINGS, "sticking"])
-def test_start_sensitivities_are_finite_differences_of_the_run(robot, loop, half_way, timing):
+def test_start_sensitivities_are_finite_differences_of_the_run(robot, loop, timing):
     """To 1e-6 of the largest, for every pose, integral and velocity of a joint that slips at the start. The velocity
     of one that sticks is lost after a path that grows with its square: extrapolating from two steps takes that kink
     out. It also cuts a step, which changes the error of the integrator: hence 16 steps a frame."""
-    reference, settings, start = half_way(**TIMINGS.get(timing, {"steps": 16}))
+    settings = loop.settings(**TIMINGS.get(timing, {"steps": 16}))
+    reference, start = loop.half_way(45, FRAME, settings)
     by_start = loop.run(reference, settings, start=start, start_sensitivities=True).start_sensitivity
 
     def difference(direction, step):
@@ -167,9 +158,10 @@ def test_start_sensitivities_are_finite_differences_of_the_run(robot, loop, half
 
 
 @pytest.mark.parametrize("timing", TIMINGS)
-def test_the_end_state_moves_with_start_and_parameters_as_runs_do(robot, loop, half_way, timing):
+def test_the_end_state_moves_with_start_and_parameters_as_runs_do(robot, loop, timing):
     """All 24 entries of the last frame's state, by finite differences of runs along the start and the parameters."""
-    reference, settings, start = half_way(**TIMINGS[timing])
+    settings = loop.settings(**TIMINGS[timing])
+    reference, start = loop.half_way(45, FRAME, settings)
 
     def end(move, change):
         run = loop.run(reference, settings, loop.parameters + change, start=_moved(start, move))
@@ -192,12 +184,3 @@ def test_the_end_state_moves_with_start_and_parameters_as_runs_do(robot, loop, h
             if misses[-1] <= 1e-6:
                 break
         assert min(misses) <= 1e-6, (move, change, misses)
-
-
-@pytest.mark.parametrize("timing", TIMINGS)
-def test_both_paths_give_the_same_from_a_start(loop, half_way, timing):
-    """Compiled and plain: poses, and the derivatives with respect to start and parameters, to 1e-9."""
-    reference, settings, start = half_way(FRAME + 12, **TIMINGS[timing])
-    ours, plain = loop.both(reference, settings, start=start, start_sensitivities=True)
-    assert_same(ours, plain)
-    assert ours.events > 3
