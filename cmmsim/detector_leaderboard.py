@@ -4,8 +4,6 @@ The discs are drawn exactly, their centres lie anywhere within a pixel and are k
 Error means distance from the ellipse's centre; eccentricity is another matter. Two ways that OpenCV offers run along.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -97,7 +95,7 @@ class Scene:
         """Standard deviation of a grey value half-way up the edge, as a share of the contrast."""
         return float(np.sqrt(self.noise.variance(np.array(self.ground + 0.5 * self.contrast)))) / self.contrast
 
-    def with_noise(self, share: float) -> Scene:
+    def with_noise(self, share: float) -> "Scene":
         """The same camera with more or less light and less or more gain, so that ``edge_noise`` is ``share``.
 
         Raises CmmError where rounding alone makes more noise.

@@ -1,7 +1,5 @@
 """Errors of the sensor package. Each message carries the evidence: the value, the limit, the valid names."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 

@@ -6,8 +6,6 @@ made without arguments and called like the function, or a ready ``Detector`` or 
 PYTHONPATH, so that other processes find it, too.
 """
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Mapping
 from dataclasses import fields

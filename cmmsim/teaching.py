@@ -13,8 +13,6 @@ nearest place of work, which is taken for a fifth nearer than the rig's target, 
 and platform at teaching.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 

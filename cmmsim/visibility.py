@@ -62,17 +62,13 @@ def sight_lines(name: str | Path, changes: Mapping[str, Any] | None = None) -> S
 
 
 def expected_covariance(
-    name: str | Path,
-    pose: ArrayLike,
-    method: str = "registration",
-    seed: int = 0,
-    changes: Mapping[str, Any] | None = None,
+    name: str | Path, pose: ArrayLike, method: str = "registration", changes: Mapping[str, Any] | None = None
 ) -> Array:
     """Covariance (6,6) that a sensor would state for a pose (6,), m and rad, from one exposure drawn without OpenGL.
 
     Taken as taught without error. Raises LostError where the stickers do not suffice, and what `load_sensor` raises.
     """
-    sensor, sight = load_sensor(name, seed, method, renderer="analytic", changes=changes), sight_lines(name, changes)
+    sensor, sight = load_sensor(name, 0, method, renderer="analytic", changes=changes), sight_lines(name, changes)
     base_from_platform = pose_to_transform(pose)
     expected = sight.camera_from_base @ base_from_platform
     seen = sensor.observer.observe(sensor.look(pose), expected, sight.platform.nominal, sight.platform.sticker_normals)

@@ -13,7 +13,7 @@ from dynamics.closed_loop import prepare
 from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
 from identify.estimation import identification
-from identify.excitation import design_trajectories
+from identify.excitation.design import design_trajectories
 from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import excitation_run, taught_sensor, teach, untaught_sensor
 from identify.experiment.sensor_in_loop import with_renderer

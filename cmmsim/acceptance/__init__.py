@@ -6,9 +6,9 @@ is true of them is used only to judge the result.
 
 from cmmsim.acceptance.artefacts import SensorUnderTest
 from cmmsim.acceptance.latency_test import Latency, LatencyTest, estimate_latency, latency_test
-from cmmsim.acceptance.length_test import LengthTest, MeasuredLength, length_test
-from cmmsim.acceptance.moving_bar import BarPath, BarRun, BarTest, bar_paths, bar_test
-from cmmsim.acceptance.statistics import PUBLISHED, PublishedFigure, Statistics, interval_of_mean, summarise
+from cmmsim.acceptance.length_test import LengthTest, length_test
+from cmmsim.acceptance.moving_bar import BarTest, bar_paths, bar_test
+from cmmsim.acceptance.statistics import PUBLISHED, Statistics, interval_of_mean, summarise
 from cmmsim.acceptance.volume import (
     MeasuringLine,
     MeasuringVolume,
@@ -22,16 +22,12 @@ from cmmsim.errors import AcceptanceError
 __all__ = [
     "PUBLISHED",
     "AcceptanceError",
-    "BarPath",
-    "BarRun",
     "BarTest",
     "Latency",
     "LatencyTest",
     "LengthTest",
-    "MeasuredLength",
     "MeasuringLine",
     "MeasuringVolume",
-    "PublishedFigure",
     "SensorUnderTest",
     "Statistics",
     "bar_paths",

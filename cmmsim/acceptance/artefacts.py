@@ -4,8 +4,6 @@ An artefact's frame has x along it, z out of its front side A and the origin in 
 slope away from A by SLOPE, so that all stickers are seen from the front.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import TypeVar
 

@@ -6,8 +6,6 @@ less the certified one, and its magnitude must stay within a limit. Sphere form 
 are flat stickers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

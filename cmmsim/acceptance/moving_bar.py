@@ -9,8 +9,6 @@ The sensor measures the poses of the clusters at both ends in the same exposure.
 certified; the difference to what was measured is the error, of a bar that stands and of one that moves.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -4,7 +4,6 @@ The way: a board description, pairs of image files, the board in each image, Ope
 adjustment of both cameras with its covariance.
 """
 
-from cmmsim.calibration.adjustment import DISTORTIONS
 from cmmsim.calibration.board import Board, read_board
 from cmmsim.calibration.calibrate import CalibrationOptions, calibrate
 from cmmsim.calibration.detection import BoardView, find_board
@@ -22,7 +21,6 @@ from cmmsim.calibration.sightings import ImagePair, PairView, pair_images, read_
 from cmmsim.errors import CalibrationError
 
 __all__ = [
-    "DISTORTIONS",
     "PARAMETER_NAMES",
     "Board",
     "BoardView",

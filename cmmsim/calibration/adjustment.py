@@ -9,8 +9,6 @@ and of right_from_left. All pixels count alike; their variance sigma² is estima
 sigma² N^-1 is the covariance of independent errors, enlarged where the points of a view share theirs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -84,7 +82,7 @@ class RigState:
         normals = self.left_from_boards[:, :3, 2]
         return float(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0)))
 
-    def moved(self, intrinsics: Array, right: Array, boards: Array) -> RigState:
+    def moved(self, intrinsics: Array, right: Array, boards: Array) -> "RigState":
         """The state after changes of the intrinsics (2,9), and small errors [dt, dphi] of right_from_left (6,) and of
         the boards (v,6)."""
         return RigState(

@@ -1,7 +1,5 @@
 """From the views of a board to both cameras: start, adjust, give up what does not fit, correct the dots' centres."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

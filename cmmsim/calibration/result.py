@@ -1,7 +1,5 @@
 """The result of a calibration: its figures, its text (TOML, JSON), and the sensor file whose cameras it replaces."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -19,8 +19,6 @@ the mean above.
 An error that all views share, such as one bend of the board, stays hidden from any comparison of views.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

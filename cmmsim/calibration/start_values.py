@@ -4,8 +4,6 @@ A symmetric board can be read in several orders (half a turn, quarter turns), an
 pictures of a pair must be read alike: the right camera then stands in the same place for all pairs, and only then.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -1,7 +1,5 @@
 """What the user should know before trusting a calibration, and what the pictures say against their board file."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -8,8 +8,6 @@ numbers, and no estimator is unbiased at each single place of a centre. So it is
 holds on average over places that are not known beforehand. With more noise the average changes nothing.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.special import ndtr
 

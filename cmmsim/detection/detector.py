@@ -1,7 +1,5 @@
 """The contract of all detectors of sticker centres: what they are given, what they hand back, and which is taken."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache

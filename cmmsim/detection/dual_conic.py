@@ -17,8 +17,6 @@ Gradients of a sharp edge are not exact: noise-free and tilted by 45 degrees, th
 radius 3.8 px, 0.007 at 2.5 and 0.002 at 10. This bias is no part of the covariance.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import ndimage
 

@@ -6,8 +6,6 @@ Gauss-Newton on the seven parameters [c_x, c_y, A_xx, A_xy, A_yy, contrast, grou
 variance at the fitted grey value. The inverse of the normal matrix is the covariance of the parameters.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -39,7 +37,7 @@ class EllipseFits(DetectedCentres):
     contrast: Array
     ground: Array
 
-    def within(self, limits: FitLimits, noise: CameraNoise) -> EllipseFits:
+    def within(self, limits: FitLimits, noise: CameraNoise) -> "EllipseFits":
         """The same fits, of which only those are still good that keep within limits."""
         good = self.good & (self.contrast >= limits.smallest_contrast)
         return replace(self, good=good & (self.misfits <= largest_misfits(limits, noise, self.contrast, self.ground)))

@@ -9,8 +9,6 @@ sharp, tilted by 45 degrees, it is about 0.01 px rms at radius 3.8 px, 0.013 at 
 0.6 px halves it. It is no part of the covariance.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

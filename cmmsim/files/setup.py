@@ -4,8 +4,6 @@ A rig is nominal and toed in, or as calibrated. A body carries its stickers on t
 exact, the sticker places only nominal, since a sticker sits up to about a millimetre beside its place.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +12,7 @@ from numpy.typing import NDArray
 from cmmsim.errors import SensorFileError, ShapeError, TeachingError
 from cmmsim.files.schema import Body, Calibrated, Rig, RightFromLeft, StickerPlane, unit
 from cmmsim.geometry.camera import Distortion, PinholeCamera
-from cmmsim.geometry.plane_frame import PLANE_NAMES, frame_from_planes
+from cmmsim.geometry.plane_frame import PLANE_NAMES
 from cmmsim.geometry.pose import Array, rigid, rotation_exp
 from cmmsim.geometry.stereo_rig import StereoRig, placed_rig, toed_in_rig
 
@@ -108,11 +106,6 @@ class MarkedBody:
     def sticker_normals(self) -> Array:
         """Outward normal (n,3) at each sticker."""
         return self.normals[self.plane_index]
-
-    @property
-    def body_from_planes(self) -> Array:
-        """The known transform (4,4) from the frame of planes A, B, C to the body's own frame."""
-        return frame_from_planes(self.normals, self.offsets)
 
 
 def marked_body(name: str, body: Body) -> MarkedBody:

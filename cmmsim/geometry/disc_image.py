@@ -37,8 +37,6 @@ Both are smooth and periodic in t, so the trapezoidal rule converges exponential
 point spread is wide.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

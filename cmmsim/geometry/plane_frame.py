@@ -4,8 +4,6 @@ Origin at the intersection of planes A, B and C, z along A's normal, x along the
 A plane is n . p = d with unit normal n.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Weighted rigid registration (paper eq. 27): the transform that carries known points onto measured ones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +7,7 @@ import numpy as np
 from cmmsim.errors import LostError
 from cmmsim.geometry.pose import Array, apply, rigid, rotation_exp
 
+STEPS = 2  # of Gauss-Newton after the unweighted start
 SMALLEST_SPREAD = 0.005  # m; points closer than this to one line do not determine a rotation
 
 
@@ -59,7 +58,7 @@ def require_spread(points: Array) -> None:
         )
 
 
-def register(source: Array, target: Array, covariances: Array, iterations: int = 2) -> Registration:
+def register(source: Array, target: Array, covariances: Array) -> Registration:
     """Maximum-likelihood transform with target = transform(source) + noise.
 
     Parameters: source (n,3) known points; target (n,3) measured points, m; covariances (n,3,3) of the measured ones.
@@ -72,7 +71,7 @@ def register(source: Array, target: Array, covariances: Array, iterations: int =
     weights = np.linalg.inv(covariances)
     source, target = np.ascontiguousarray(source, dtype=float), np.ascontiguousarray(target, dtype=float)
     covariance, change = np.empty((6, 6)), np.empty(6)
-    for _ in range(iterations):
+    for _ in range(STEPS):
         rigid_step(source, target, weights, transform, covariance, change)
         transform[:3, :3] = rotation_exp(change[3:]) @ transform[:3, :3]
         transform[:3, 3] += change[:3]

@@ -4,8 +4,6 @@ Most of the scene stands still during an exposure: a window that nothing reaches
 one that no moving body reaches is drawn once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -176,7 +174,7 @@ class VirtualStereoCamera:
         obstacles: Mapping[str, Array] | None = None,
         quality: Quality | None = None,
         pose_rate: Array | None = None,
-    ) -> LiveImages:
+    ) -> "LiveImages":
         """One exposure of the platform and of the obstacles at base_from_body (4,4) each.
 
         ``pose`` (6,) of the platform in the middle of the exposure, ``pose_rate`` (6,) its time derivative; obstacles
@@ -213,11 +211,11 @@ class VirtualStereoCamera:
     @cached_property
     def patterns(self) -> Sequence[FixedPattern | None]:
         """What differs from pixel to pixel of the left and of the right camera; None where nothing does."""
-        if not self.noise.has_pattern:
+        prnu, dsnu = self.noise.prnu, self.noise.dsnu
+        if not (self.noise.enabled and (prnu > 0.0 or dsnu > 0.0)):
             return None, None
         rngs = [np.random.default_rng([self.pattern_seed, side]) for side in range(2)]
         shapes = [(camera.height, camera.width) for camera in self.rig.cameras]
-        prnu, dsnu = self.noise.prnu, self.noise.dsnu
         return [draw_pattern(shape, prnu, dsnu, rng) for shape, rng in zip(shapes, rngs, strict=True)]
 
     def _placed(self, base_from_platform: Array, obstacles: Mapping[str, Array]) -> list[Array]:

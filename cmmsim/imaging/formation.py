@@ -11,8 +11,6 @@ Keys' cubic convolution, which reproduces quadratics, so that no edge is moved o
 Source: R. G. Keys, Cubic convolution interpolation for digital image processing, IEEE Trans. ASSP 29 (1981).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache

@@ -9,8 +9,6 @@ before the plane of a disc sees the disc, for all of the solid lies behind that 
 fills a window, its level is all that shows of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

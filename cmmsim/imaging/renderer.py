@@ -3,8 +3,6 @@
 A renderer draws windows of cameras with perfect lenses, of the patches that reach into each of them.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -15,8 +15,6 @@ wrong. Places are then judged against the residuals of the others, and the covar
 ratio), up to a limit.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 

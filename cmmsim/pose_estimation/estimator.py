@@ -12,7 +12,7 @@ from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import EllipseFits
 from cmmsim.errors import LostError, ShapeError, UnknownOptionError
 from cmmsim.files.setup import MarkedBody
-from cmmsim.geometry.plane_frame import frame_of_points
+from cmmsim.geometry.plane_frame import frame_from_planes, frame_of_points
 from cmmsim.geometry.pose import Array, compose_covariance, invert, pose_covariance, skew, transform_to_pose
 from cmmsim.geometry.registration import register
 from cmmsim.pose_estimation.consistency import consistent
@@ -66,9 +66,14 @@ class Measurement:
 
 def lost_measurement(reason: str) -> Measurement:
     """A measurement that holds no pose, and says why."""
-    pose, spread, names = np.full(6, np.nan), np.full((6, 6), np.nan), np.array([], dtype=str)
-    points, covariances, left, right = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 2)), np.zeros((0, 2))
-    return Measurement(pose, spread, points, covariances, left, right, names, False, reason)
+    return measurement_without_stickers(np.full(6, np.nan), np.full((6, 6), np.nan), reason)
+
+
+def measurement_without_stickers(pose: Array, covariance: Array, reason: str = "") -> Measurement:
+    """A pose (6,) and its covariance (6,6) that no sticker stands behind; the reason why there is none where NaN."""
+    points, covariances, pixels = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 2))
+    names = np.array([], dtype=str)
+    return Measurement(pose, covariance, points, covariances, pixels, pixels, names, not reason, reason)
 
 
 def by_registration(observation: StickerObservation, places: Array) -> Solution:
@@ -88,7 +93,7 @@ def by_planes(observation: StickerObservation, body: MarkedBody, towards: Array)
     frame, covariance = frame_of_points(
         observation.points, observation.covariances, body.plane_index[observation.index], towards
     )
-    planes_from_body = invert(body.body_from_planes)
+    planes_from_body = invert(frame_from_planes(body.normals, body.offsets))
     return frame @ planes_from_body, move_origin(frame, covariance, planes_from_body[:3, 3]), observation
 
 

@@ -6,8 +6,6 @@ the stickers is looked for: three stickers far from each other by their three mu
 pose, which is judged by how many stickers of the layout then have a point close by.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations

@@ -12,8 +12,6 @@ was found, and what is then missing of A A is added to d d' / 3, until d settles
 the middle of the exposure, for which a pose stands, is the same for both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

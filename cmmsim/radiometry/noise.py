@@ -5,8 +5,6 @@ turns electrons into grey values, which are clipped and rounded. Shot noise is d
 variance.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -44,7 +42,7 @@ class FixedPattern:
     sensitivity: NDArray[np.float32]
     offset: NDArray[np.float32]
 
-    def windows(self, corners: NDArray[np.int_], size: int) -> FixedPattern:
+    def windows(self, corners: NDArray[np.int_], size: int) -> "FixedPattern":
         """The pattern (k, size, size) in windows as of ``cut_windows``."""
         return FixedPattern(*(cut_windows(values, corners, size) for values in (self.sensitivity, self.offset)))
 
@@ -102,11 +100,6 @@ class CameraNoise:
     def image_type(self) -> np.dtype:
         """Type of the grey values."""
         return np.dtype(np.uint8 if self.bit_depth == 8 else np.uint16)
-
-    @property
-    def has_pattern(self) -> bool:
-        """Whether pixels differ from each other."""
-        return self.enabled and (self.prnu > 0.0 or self.dsnu > 0.0)
 
     def mean_grey(self, radiance: NDArray[np.floating]) -> NDArray[np.floating]:
         """Expected grey values of radiance 0 to 1."""

@@ -17,6 +17,7 @@ load shows the scale, one that is a percent heavier than stated makes all parame
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -186,15 +187,6 @@ def repeated_experiment(run: RecordedRun, parameters: Array, rng: np.random.Gene
     return simulate(run.robot, parameters + run.payload, run.reference, run.settings, lost=~run.ok, noise=noise)
 
 
-@dataclass(frozen=True)
-class Pair:
-    """Two quantities and the correlation of their estimates."""
-
-    first: str
-    second: str
-    correlation: float
-
-
 def correlation_matrix(covariance: Array) -> Array:
     """Correlations (n, n) of a covariance (n, n) with positive variances."""
     std = np.sqrt(np.diag(covariance))
@@ -203,8 +195,11 @@ def correlation_matrix(covariance: Array) -> Array:
     return correlations
 
 
-def strongest_pairs(correlations: Array, names: Sequence[str], count: int) -> list[Pair]:
-    """The `count` pairs with the largest correlations (n, n) in size, the largest first."""
+def strongest_pairs(correlations: Array, names: Sequence[str], count: int) -> list[dict[str, Any]]:
+    """The `count` pairs with the largest correlations (n, n) in size, the largest first: first, second, correlation."""
     rows, columns = np.triu_indices(len(names), 1)
     order = np.argsort(-np.abs(correlations[rows, columns]), kind="stable")[:count]
-    return [Pair(names[rows[k]], names[columns[k]], float(correlations[rows[k], columns[k]])) for k in order]
+    return [
+        {"first": names[i], "second": names[j], "correlation": float(correlations[i, j])}
+        for i, j in zip(rows[order], columns[order], strict=True)
+    ]

@@ -110,7 +110,7 @@ class IdentificationResult:
             **{name: getattr(self, name) for name in ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")},
             "whiteness": {"p_value": whiteness.p_value, "p_values": dict(zip(POSE, whiteness.p_values, strict=True))},
             "conditioning": asdict(self.conditioning),
-            "strongest_correlations": [asdict(pair) for pair in pairs],
+            "strongest_correlations": pairs,
             "warnings": list(self.warnings),
             "base_rank": self.base_rank,
             "parameters": {name: self._parameter(k) for k, name in enumerate(self.names)},

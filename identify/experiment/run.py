@@ -14,7 +14,7 @@ import cmmsim
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
 from identify.estimation.scale_anchor import measured_anchor, store_anchor
-from identify.excitation import design_trajectories
+from identify.excitation.design import design_trajectories
 from identify.experiment.plant import Plant, PlatformLoad, build_plant, drawn_load
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, make_sensor, with_renderer
 from identify.progress import Advance, Progress, SilentProgress

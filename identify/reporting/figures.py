@@ -101,7 +101,7 @@ def relative_errors(parameters: dict[str, dict[str, Any]]) -> RelativeErrors:
     )
 
 
-def excitation_figure(time: Array, poses: Array, title: str = "Exciting trajectory") -> Figure:
+def excitation_figure(time: Array, poses: Array) -> Figure:
     """Position and orientation of a trajectory: ``time`` (N,) [s], ``poses`` (N, 6) [m, rad]; like figure 11."""
     figure = Figure(figsize=(8, 6), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
@@ -112,7 +112,7 @@ def excitation_figure(time: Array, poses: Array, title: str = "Exciting trajecto
         axes.set_ylabel(label)
         axes.legend(loc="upper right")
         axes.grid(alpha=0.3)
-    upper.set_title(f"{title}\n(a) position")
+    upper.set_title("Exciting trajectory\n(a) position")
     lower.set_title("(b) orientation")
     lower.set_xlabel("time [s]")
     return figure

@@ -90,12 +90,10 @@ def _speed_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
     return rows
 
 
-def parameter_table(result: dict[str, Any], identifiable_only: bool = False) -> Table:
+def parameter_table(result: dict[str, Any]) -> Table:
     """Parameters, like table 2: starting guess, truth, estimate, standard deviation and interval."""
     rows = []
     for name, p in result["identification"]["parameters"].items():
-        if not p["identifiable"] and identifiable_only:
-            continue
         remark = (ON_GUESS if p.get("rests_on_prior") else "") if p["identifiable"] else NOT_SHOWN
         rows.append((name, unit_of(name), number(p["initial"]), number(p["true"]), *_shown(p), remark))
     anchor = result["identification"]["scale_anchor"]
@@ -194,19 +192,10 @@ def correlation_table(result: dict[str, Any]) -> Table:
 
 def sensor_table(result: dict[str, Any]) -> Table:
     """Measured pose against truth."""
-    sensor = result["sensor"]
-    return Table(
-        "Sensor: RMS of measured pose against truth",
-        ("frames", "lost", "stereo frames a second", *AXIS_HEADER),
-        (
-            (
-                str(sensor["frames"]),
-                str(sensor["lost_frames"]),
-                number(sensor.get("stereo_frames_per_second")),
-                *_rms(rms_row(sensor)),
-            ),
-        ),
-    )
+    sensor, header = result["sensor"], ("frames", "lost", "stereo frames a second", *AXIS_HEADER)
+    frames, lost, rate = sensor["frames"], sensor["lost_frames"], sensor.get("stereo_frames_per_second")
+    row = (str(frames), str(lost), number(rate), *_rms(rms_row(sensor)))
+    return Table("Sensor: RMS of measured pose against truth", header, (row,))
 
 
 def seconds_table(result: dict[str, Any]) -> Table:

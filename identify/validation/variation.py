@@ -27,7 +27,7 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.identification import identify
 from identify.estimation.result import IdentificationResult
-from identify.excitation import design_trajectories
+from identify.excitation.design import design_trajectories
 from identify.experiment.run import Experiment, taught_sensor
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import DESIGN, stream_seed

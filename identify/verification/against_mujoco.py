@@ -77,12 +77,7 @@ def verify(robot: Robot, progress: Progress | None = None) -> EngineRuns:
 
 
 def compare_engines(
-    robot: Robot,
-    model_parameters: Array,
-    mujoco_parameters: Array,
-    duration_s: float,
-    progress: Progress | None = None,
-    solver: MjcfSolver = SOLVER,
+    robot: Robot, model_parameters: Array, mujoco_parameters: Array, duration_s: float, progress: Progress | None = None
 ) -> EngineRuns:
     """Both engines on the exciting trajectory, each with its own parameters (67,): the 64 dynamic ones, lp, li, ld.
 
@@ -106,7 +101,7 @@ def compare_engines(
         model = closed_loop.simulate(robot, model_parameters, reference, settings, commands=commands)
         advance()
     # Table 1's inertias break the triangle inequality in ways that the motion does not feel
-    mjcf = mjcf_text(robot, mujoco_parameters[:64], allow_unphysical_inertia=True, solver=solver)
+    mjcf = mjcf_text(robot, mujoco_parameters[:64], allow_unphysical_inertia=True, solver=SOLVER)
     engine, rows = MujocoRobot(robot, mjcf), np.empty((len(time), 14))
     with progress.stage("MuJoCo", len(time)) as advance:
         for frame, row in enumerate(_mujoco_rows(robot, engine, mujoco_parameters, reference, commands)):

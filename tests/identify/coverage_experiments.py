@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from identify.estimation.identification import identify
-from identify.excitation import design_trajectories
+from identify.excitation.design import design_trajectories
 from identify.experiment.plant import build_plant
 from identify.experiment.run import excitation_run, taught_sensor
 from identify.progress import SilentProgress

@@ -9,9 +9,8 @@ import pytest
 from cmmsim.visibility import sight_lines
 from dynamics.workspace import measure
 from identify.errors import ScenarioError, TrajectoryError
-from identify.excitation import design_trajectories
 from identify.excitation.constraints import MotionConstraints, check_periods, required_stickers, within_sight
-from identify.excitation.design import motion_check, random_candidates, unseen_trajectories
+from identify.excitation.design import design_trajectories, motion_check, random_candidates, unseen_trajectories
 from identify.excitation.motion import unknowns
 from identify.scenario import load_scenario, scenario_from_toml
 from identify.trajectory import load_trajectories, random_trajectory, save_trajectories

@@ -11,10 +11,9 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from identify.errors import TrajectoryError
-from identify.excitation import design_trajectories
 from identify.excitation.comparison import compare_methods
 from identify.excitation.constraints import MotionConstraints
-from identify.excitation.design import search_problem
+from identify.excitation.design import design_trajectories, search_problem
 from identify.excitation.motion import sample_times
 from identify.excitation.search import climb
 from identify.progress import SilentProgress

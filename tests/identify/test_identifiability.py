@@ -161,5 +161,5 @@ def test_correlations_and_the_strongest_pairs():
     correlations = correlation_matrix(covariance)
     np.testing.assert_allclose(correlations, [[1, 0.9, 0], [0.9, 1, -0.1], [0, -0.1, 1]])
     pairs = strongest_pairs(correlations, ["a", "b", "c"], 2)
-    assert [(p.first, p.second) for p in pairs] == [("a", "b"), ("b", "c")]
-    assert [p.correlation for p in pairs] == pytest.approx([0.9, -0.1])
+    assert [(p["first"], p["second"]) for p in pairs] == [("a", "b"), ("b", "c")]
+    assert [p["correlation"] for p in pairs] == pytest.approx([0.9, -0.1])

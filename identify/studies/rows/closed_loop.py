@@ -18,7 +18,8 @@ from identify.experiment.truth import true_poses
 from identify.random_streams import stream_seed
 from identify.record import recording
 from identify.scenario import Scenario
-from identify.studies.rows.kind import NOISE_OFF, PATH, PICTURES, PLANT, Column, Kind, Reads, Row, RowOptions
+from identify.scenario.sections import Section
+from identify.studies.rows.kind import NOISE_OFF, PATH, PICTURES, PLANT, Column, Kind, Reads, Row
 from identify.studies.rows.sensor import POSE_COLUMNS, Teaching, pose_figures, rms_um
 
 EXPERIMENT, TRAJECTORY = 0, 1
@@ -33,7 +34,7 @@ COLUMNS = {
 }
 
 
-class ClosedLoopOptions(RowOptions):
+class ClosedLoopOptions(Section):
     """How the sensor was taught."""
 
     teaching: Teaching = Field("sensor", description="by the sensor itself, seeded by the row, or exact")

@@ -19,7 +19,7 @@ from dynamics.parameters import COULOMB_NAMES, JOINT_PID_NAMES, VISCOUS_NAMES
 from identify.arrays import Array
 from identify.estimation.identification import identify as identify_record
 from identify.estimation.result import IdentificationResult
-from identify.excitation import design_trajectories
+from identify.excitation.design import design_trajectories
 from identify.experiment.plant import build_plant
 from identify.experiment.run import Experiment, excitation_run, run_plant, taught_sensor
 from identify.experiment.truth import true_poses
@@ -28,7 +28,8 @@ from identify.progress import SilentProgress
 from identify.random_streams import stream_seed
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, scenario_from_toml
-from identify.studies.rows.kind import NOISE_OFF, PLANT, SENSOR, Column, Idle, Kind, Reads, Row, RowOptions, timing
+from identify.scenario.sections import Section
+from identify.studies.rows.kind import NOISE_OFF, PLANT, SENSOR, Column, Idle, Kind, Reads, Row, timing
 from identify.studies.rows.sensor import DrawnSensor, rms_um, stated_um
 from identify.trajectory import TrajectorySet
 from identify.validation.unseen import model_run
@@ -65,7 +66,7 @@ COLUMNS = {
 }
 
 
-class IdentificationOptions(RowOptions):
+class IdentificationOptions(Section):
     """How the record is made."""
 
     sensor: Literal["drawn", "images"] = Field("drawn", description="noise of the stated covariance, or images")

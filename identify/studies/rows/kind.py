@@ -159,10 +159,6 @@ class Column:
     main: bool = False
 
 
-class RowOptions(Section):
-    """Options of a kind; unknown names and wrong values are refused."""
-
-
 @dataclass(frozen=True)
 class Kind:
     """One kind of row. `compute(scenario, seed, options)` gives a row's figures by name: the same arguments the same
@@ -176,7 +172,7 @@ class Kind:
     compute: Callable[[Scenario, np.random.SeedSequence, Any], Mapping[str, float]]
     what: str = ""
     columns: Mapping[str, Column] = field(default_factory=dict)
-    options: type[RowOptions] | None = None
+    options: type[Section] | None = None
     reads: Reads | None = None
     takes_options: bool = True
 

@@ -15,7 +15,8 @@ from identify.errors import EstimationError
 from identify.excitation.design import drawn_trajectory
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
-from identify.studies.rows.kind import NOISE_OFF, PATH, PICTURES, Column, Kind, Reads, Row, RowOptions, timing
+from identify.scenario.sections import Section
+from identify.studies.rows.kind import NOISE_OFF, PATH, PICTURES, Column, Kind, Reads, Row, timing
 from identify.studies.rows.sensor import POSE_COLUMNS, RowSensor, Teaching, pose_figures, rms_um, row_sensor
 from identify.trajectory import FourierTrajectory
 
@@ -33,7 +34,7 @@ COLUMNS = {
 }
 
 
-class PathPoseOptions(RowOptions):
+class PathPoseOptions(Section):
     """How much a row looks at."""
 
     stretch_s: float = Field(0.5, gt=0, le=3600, description="time along the path, at least two frames")

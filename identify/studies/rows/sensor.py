@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 import cmmsim
 from cmmsim.files import SensorFile
-from cmmsim.pose_estimation.estimator import lost_measurement
+from cmmsim.pose_estimation.estimator import lost_measurement, measurement_without_stickers
 from cmmsim.teaching import exactly_taught
 from identify.arrays import Array
 from identify.experiment.sensor_in_loop import sensor_file
@@ -89,17 +89,7 @@ class DrawnSensor:
         noise, dropped = self._factor @ self._rng.standard_normal(6), self._rng.random() < self._dropout
         if dropped:
             return lost_measurement("dropped frame")
-        none = np.zeros((0, 2))
-        return cmmsim.Measurement(
-            np.asarray(pose, dtype=float) + noise,
-            self._covariance,
-            np.zeros((0, 3)),
-            np.zeros((0, 3, 3)),
-            none,
-            none,
-            np.array([], dtype=str),
-            True,
-        )
+        return measurement_without_stickers(np.asarray(pose, dtype=float) + noise, self._covariance)
 
 
 def rms_um(errors: Array) -> float:

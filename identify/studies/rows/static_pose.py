@@ -17,7 +17,8 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.random_streams import stream_seed
 from identify.scenario import Scenario
-from identify.studies.rows.kind import BOX, NOISE_OFF, PICTURES, Column, Idle, Kind, Reads, Row, RowOptions, timing
+from identify.scenario.sections import Section
+from identify.studies.rows.kind import BOX, NOISE_OFF, PICTURES, Column, Idle, Kind, Reads, Row, timing
 from identify.studies.rows.sensor import POSE_COLUMNS, RowSensor, Teaching, pose_figures, rms_um, row_sensor
 
 POSES, SENSOR, DROPOUT = 0, 1, 2
@@ -44,7 +45,7 @@ COLUMNS = {
 }
 
 
-class StaticPoseOptions(RowOptions):
+class StaticPoseOptions(Section):
     """How much a row looks at."""
 
     poses: int = Field(1, ge=1, le=10_000, description="poses drawn a row")
