@@ -1,5 +1,7 @@
 """Stickers of one body, observed near where they are expected: windows, detected centres, triangulation."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -49,7 +51,7 @@ class Outlines:
     shapes: Array
     covariances: Array
 
-    def selected(self, keep: NDArray[np.bool_]) -> "Outlines":
+    def selected(self, keep: NDArray[np.bool_]) -> Outlines:
         """Those of only some of the stickers."""
         return Outlines(self.shapes[:, keep], self.covariances[:, keep])
 
@@ -70,7 +72,7 @@ class StickerObservation:
     covariances: Array
     outlines: Outlines | None = None
 
-    def selected(self, keep: NDArray[np.bool_]) -> "StickerObservation":
+    def selected(self, keep: NDArray[np.bool_]) -> StickerObservation:
         """The observation with only some of its stickers."""
         return StickerObservation(
             self.index[keep],
@@ -109,7 +111,7 @@ class Observer:
         """
         return self.read(images, camera_from_body, places, normals).observed(swept)
 
-    def read(self, images: StereoImages, camera_from_body: Array, places: Array, normals: Array) -> "StickerWindows":
+    def read(self, images: StereoImages, camera_from_body: Array, places: Array, normals: Array) -> StickerWindows:
         """Read the windows of stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose."""
         centres = [apply(move @ camera_from_body, places) for move in self.rig.from_camera]
         turned = [normals @ (move @ camera_from_body)[:3, :3].T for move in self.rig.from_camera]
