@@ -23,7 +23,7 @@ from identify.scenario.sections import (
     Validation,
 )
 from identify.scenario.settings_file import SettingsFiles, to_toml
-from identify.scenario.timing import IN_FILE, Timing, completed, sensor_names
+from identify.scenario.timing import IN_FILE, Timing, by_dotted_key, completed, sensor_names
 
 
 class Scenario(Section):
@@ -60,9 +60,7 @@ class Scenario(Section):
     @field_validator("sensor_changes")
     @classmethod
     def _by_dotted_key(cls, changes: dict[str, Any]) -> dict[str, Any]:
-        from cmmsim.files import dotted  # late, as above
-
-        return dotted(changes)
+        return by_dotted_key(changes)
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Scenario":

@@ -116,3 +116,10 @@ def sensor_names() -> list[str]:
     from cmmsim.files import built_in_names
 
     return built_in_names()
+
+
+def by_dotted_key(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A scenario's ``[sensor_changes]``, also as tables in tables, by dotted key of the sensor's file."""
+    from cmmsim.files import dotted
+
+    return dotted(changes)
