@@ -106,8 +106,12 @@ def test_the_long_proofs_last_ended_as_quoted():
 
 
 def test_the_table_of_accuracy_is_the_saved_one_and_the_estimators_are_counted():
-    wanted = markdown_table(read_saved(ROOT / ".readme" / "accuracy.json").figures)
+    figures = read_saved(ROOT / ".readme" / "accuracy.json").figures
+    wanted = markdown_table(figures)
     assert wanted.strip() in README, f"the README wants this table:\n{wanted}"
+    found = {figure.name: figure.value for figure in figures}
+    assert found["the paper's loop against MuJoCo, position"] < 0.010
+    assert found["the paper's loop against MuJoCo, angle"] < 0.020
     numbers = {"eight": 8, "nine": 9, "ten": 10, "eleven": 11}
     said = re.search(r"`cmmsim estimators [^`]+` runs (\w+) estimators", SAID)
     assert said

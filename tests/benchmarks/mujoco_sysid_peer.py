@@ -13,8 +13,7 @@ from mujoco import rollout, sysid
 from mujoco.sysid import Parameter, ParameterDict, SignalType, TimeSeries
 
 from dynamics.engines.mjcf import MjcfSolver, mjcf_text
-from tests.benchmarks.servo_estimator import Estimate
-from tests.benchmarks.servo_experiment import RATE_HZ, TIMES, Measured, felt_commands, robot, servo_gains, table, truth
+from tests.benchmarks import servo_experiment as servo
 
 BOUNDS = 0.05, 5.0
 """Of each parameter, as shares of the truth; the optimizer wants finite ones."""
@@ -25,38 +24,40 @@ PLATFORM = slice(1, 8)
 
 def model_spec(integrator="implicitfast"):
     """rss6 as an editable model of MuJoCo, its motors turned into servos that damp the joints' rates."""
-    solver = MjcfSolver(timestep_s=1 / RATE_HZ, integrator=integrator)
+    solver = MjcfSolver(timestep_s=1 / servo.RATE_HZ, integrator=integrator)
     spec = mujoco.MjSpec.from_string(
-        mjcf_text(robot(), table()[:64], allow_unphysical_inertia=True, solver=solver, source="true parameters")
+        mjcf_text(
+            servo.robot(), servo.table()[:64], allow_unphysical_inertia=True, solver=solver, source="true parameters"
+        )
     )
-    lp, ld = servo_gains()
+    lp, ld = servo.servo_gains()
     for leg in range(1, 7):
-        servo = spec.actuator(f"motor{leg}")
-        servo.gainprm[0] = lp
-        servo.biastype = mujoco.mjtBias.mjBIAS_AFFINE
-        servo.biasprm[:3] = [0.0, -lp, -ld]
+        motor = spec.actuator(f"motor{leg}")
+        motor.gainprm[0] = lp
+        motor.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+        motor.biasprm[:3] = [0.0, -lp, -ld]
     return spec
 
 
 def simulated_poses(commands):
     """Poses (frames, 6) of the true robot in MuJoCo's simulation with the estimator's own settings."""
     model = model_spec().compile()
-    state, _ = rollout.rollout(model, mujoco.MjData(model), at_home(model), felt_commands(commands)[:-1])
+    state, _ = rollout.rollout(model, mujoco.MjData(model), at_home(model), servo.felt_commands(commands)[:-1])
     states = np.vstack([at_home(model), state[0]])[:, PLATFORM]
-    return Measured(states[:, :3], states[:, 3:]).pose
+    return servo.Measured(states[:, :3], states[:, 3:]).pose
 
 
 def estimate(commands, measured, guess, integrator="implicitfast"):
     """The 14 unknowns from commands (frames, 6), what was `Measured`, and a first guess (14,)."""
     spec, free = model_spec(integrator), unknowns(guess)
     seen = np.hstack([measured.position, measured.quaternion])
-    signal = TimeSeries.from_custom_map(TIMES, seen, [("platform_qpos", 7, SignalType.MjStateQPos)])
+    signal = TimeSeries.from_custom_map(servo.TIMES, seen, [("platform_qpos", 7, SignalType.MjStateQPos)])
     sequences = sysid.ModelSequences(
         "rss6",
         spec,
         "run",
         at_home(spec.compile()),
-        TimeSeries(TIMES, felt_commands(commands)),
+        TimeSeries(servo.TIMES, servo.felt_commands(commands)),
         signal,
         allow_missing_sensors=True,
     )
@@ -64,7 +65,7 @@ def estimate(commands, measured, guess, integrator="implicitfast"):
     began = time.perf_counter()
     found, result = sysid.optimize(initial_params=free, residual_fn=residual, verbose=False)
     _, half_widths = sysid.calculate_intervals(residual(result.x, found)[0], result.jac)
-    return Estimate(found.as_vector(), half_widths, time.perf_counter() - began)
+    return servo.Estimate(found.as_vector(), half_widths, time.perf_counter() - began)
 
 
 def at_home(model):
@@ -76,7 +77,7 @@ def at_home(model):
 
 def unknowns(guess):
     """The 14 unknowns as `mujoco.sysid` wants them, at a first guess (14,)."""
-    moments = table()[1:4].copy()
+    moments = servo.table()[1:4].copy()
 
     def mass(spec, found):
         spec.body("platform").mass = found.value[0]
@@ -92,7 +93,7 @@ def unknowns(guess):
 
     modifiers = [mass, inertia, *map(coulomb, range(1, 7)), *map(viscous, range(1, 7))]
     free = ParameterDict()
-    for place, (modifier, value) in enumerate(zip(modifiers, truth(), strict=True)):
+    for place, (modifier, value) in enumerate(zip(modifiers, servo.truth(), strict=True)):
         lower, upper = (share * value for share in BOUNDS)
         free.add(Parameter(f"p{place}", guess[place], lower, upper, modifier=modifier))
     return free

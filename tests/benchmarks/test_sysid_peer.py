@@ -14,8 +14,7 @@ import pytest
 from scipy.stats import binomtest
 
 from dynamics import compilation
-from tests.benchmarks.servo_estimator import ServoProblem, estimate, standard_deviations
-from tests.benchmarks.servo_experiment import designed_commands, measure, run, sine_commands, truth
+from tests.benchmarks import servo_experiment as servo
 from tests.benchmarks.timing import OtherLoad, judge
 
 pytestmark = pytest.mark.thorough
@@ -41,8 +40,8 @@ class Row:
     @classmethod
     def of(cls, estimates):
         values, half_widths = np.array([e.values for e in estimates]), np.array([e.half_widths for e in estimates])
-        off = np.abs(values - truth())
-        return cls(off / truth(), off <= half_widths, np.array([e.seconds for e in estimates]))
+        off = np.abs(values - servo.truth())
+        return cls(off / servo.truth(), off <= half_widths, np.array([e.seconds for e in estimates]))
 
     @property
     def error(self):
@@ -73,7 +72,7 @@ def coverage(covered):
 def commands():
     if compilation.find_compiler() is None:
         pytest.skip("needs a C compiler")
-    return {SINES: sine_commands(), DESIGN: designed_commands()}
+    return {SINES: servo.sine_commands(), DESIGN: servo.designed_commands()}
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +80,7 @@ def plants(commands):
     """(excitation, plant) -> true poses."""
     found = {}
     for name, driven in commands.items():
-        found[name, EXACT] = run(truth(), driven, steps=4).pose
+        found[name, EXACT] = servo.run(servo.truth(), driven, steps=4).pose
         found[name, MUJOCO] = peer.simulated_poses(driven)
     return found
 
@@ -89,16 +88,16 @@ def plants(commands):
 @pytest.fixture(scope="module")
 def rows(commands, plants):
     """(excitation, plant, tool) -> its row, and what others took of the machine; the tools take turns."""
-    found, guess = {}, GUESS * truth()
+    found, guess = {}, GUESS * servo.truth()
     with OtherLoad() as load:
         for (excitation, plant), poses in plants.items():
             driven, both = commands[excitation], {OURS: [], PEER: []}
             for seed in range(SEEDS):
-                seen = measure(poses, np.random.default_rng(seed))
-                both[OURS].append(estimate(driven, seen.pose, guess))
+                seen = servo.measure(poses, np.random.default_rng(seed))
+                both[OURS].append(servo.estimate(driven, seen.pose, guess))
                 both[PEER].append(peer.estimate(driven, seen, guess))
             found |= {(excitation, plant, tool): Row.of(estimates) for tool, estimates in both.items()}
-        seen = measure(plants[SINES, EXACT], np.random.default_rng(0))
+        seen = servo.measure(plants[SINES, EXACT], np.random.default_rng(0))
         found[SINES, EXACT, RK4] = Row.of([peer.estimate(commands[SINES], seen, guess, "RK4")])
     return found, load
 
@@ -108,8 +107,9 @@ def many(commands, plants):
     """(excitation) -> row of this package on the exact plant with many seeds."""
     found = {}
     for excitation, driven in commands.items():
-        seen = [measure(plants[excitation, EXACT], np.random.default_rng(seed)).pose for seed in range(COVERAGE_SEEDS)]
-        found[excitation] = Row.of([estimate(driven, poses, GUESS * truth()) for poses in seen])
+        rngs = map(np.random.default_rng, range(COVERAGE_SEEDS))
+        seen = [servo.measure(plants[excitation, EXACT], rng).pose for rng in rngs]
+        found[excitation] = Row.of([servo.estimate(driven, poses, GUESS * servo.truth()) for poses in seen])
     return found
 
 
@@ -157,7 +157,7 @@ def test_95_percent_intervals_cover_93_to_97_percent(many, record_property):
 @pytest.mark.parametrize("excitation", EXCITATIONS)
 def test_errors_are_those_of_the_cramer_rao_bound(excitation, commands, plants, many):
     """That of a normal estimate of the bound's variance, within three standard deviations of the sample's mean."""
-    _, factor, _ = ServoProblem(commands[excitation], plants[excitation, EXACT]).linearise(truth())
-    scaled = many[excitation].errors / (standard_deviations(factor) / truth())
+    _, factor, _ = servo.ServoProblem(commands[excitation], plants[excitation, EXACT]).linearise(servo.truth())
+    scaled = many[excitation].errors / (servo.standard_deviations(factor) / servo.truth())
     expected, spread = np.sqrt(2 / np.pi), np.sqrt(1 - 2 / np.pi)
     assert scaled.mean() == pytest.approx(expected, abs=3 * spread / np.sqrt(scaled.size))
