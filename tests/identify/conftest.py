@@ -1,56 +1,15 @@
-"""Small runs: one with known errors, finished; one with drawn noise, recorded."""
+"""A small finished run with known errors, the result that stands in it, and a recorded run."""
 
 import shutil
 
 import numpy as np
 import pytest
 
-from identify.experiment.truth import build_truth
 from identify.files.dataset import write_covariance
 from identify.files.run_folder import RunFolder, rms_figures, save_result
 from identify.loop_parameters import NAMES
-from identify.record.recording import build_model_run, build_record, write, write_model_runs, write_runs
-from identify.scenario import load_scenario
-from tests.identify.synthetic import recorded_run_folder, rss6
-
-HOME = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
-
-
-def make_record(samples=120, seed=0, **changes):
-    """A record of ``samples`` frames at 60 Hz with measurements 20 um and 80 urad off the reference."""
-    rng = np.random.default_rng(seed)
-    time = np.arange(samples) / 60.0
-    reference = HOME + 0.005 * np.sin(2 * np.pi * 0.5 * time)[:, None] * [1, 1, 1, 4, 4, 4]
-    sigma = np.repeat([20e-6, 80e-6], 3)
-    values = {
-        "time": time,
-        "reference_pose": reference,
-        "reference_rate": np.gradient(reference, time, axis=0),
-        "measured_pose": reference + sigma * rng.standard_normal((samples, 6)),
-        "measured_covariance": np.broadcast_to(np.diag(sigma**2), (samples, 6, 6)),
-        "measured_ok": np.ones(samples, dtype=bool),
-        "command": np.zeros((samples, 6)),
-        "scenario_toml": load_scenario("quick").to_toml(),
-        "robot": "rss6",
-        "seed": seed,
-        "frame_rate_hz": 60.0,
-    }
-    return build_record(**(values | changes))
-
-
-def make_truth(samples=120, names=("platform.mass", "joint1.coulomb"), values=(23.5, 0.104), **changes):
-    time = np.arange(samples) / 60.0
-    pose = HOME + 0.005 * np.sin(2 * np.pi * 0.5 * time)[:, None] * [1, 1, 1, 4, 4, 4]
-    given = {
-        "time": time,
-        "pose": pose,
-        "joint_angle": np.zeros((samples, 6)),
-        "joint_velocity": np.zeros((samples, 6)),
-        "joint_torque": np.zeros((samples, 6)),
-        "parameter_names": list(names),
-        "parameters": list(values),
-    }
-    return build_truth(**(given | changes))
+from identify.record.recording import build_model_run, write_model_runs, write_runs
+from tests.identify.synthetic import recorded_run_folder, rss6, short_run, truth_of
 
 
 def make_result():
@@ -123,23 +82,18 @@ def robot():
 @pytest.fixture(scope="session")
 def finished_run(tmp_path_factory):
     """A run up to the report, not to be changed; the starting model diverges on the first unseen trajectory."""
-    run = RunFolder(tmp_path_factory.mktemp("finished") / "run")
-    run.path.mkdir()
-    record, truth = make_record(), make_truth()
-    identified = np.hstack([truth["position"].values, truth["orientation"].values]) + 1e-6
-    initial = identified + 1e-4
+    run = recorded_run_folder(tmp_path_factory.mktemp("finished"))
+    record, plant = short_run()
+    identified, initial = plant.pose + 1e-6, plant.pose + 1e-4
     diverging = initial.copy()
     diverging[40:] = np.inf
-    write(run.experiment, record, truth)
-    write_runs(run.validation, [(make_record(seed=1), truth), (make_record(seed=2), truth)])
-    time = record["time"].values
-    std = np.full((len(time), 6), 2e-6)
-    models = [build_model_run(time, initial, identified)]
-    models += [build_model_run(time, p, identified, std) for p in (diverging, initial)]
-    write_model_runs(run.model, models[0], models[1:])
+    write_runs(run.validation, [(record, truth_of(plant))] * 2)
+    std = np.full_like(initial, 2e-6)
+    excitation = build_model_run(plant.time, initial, identified)
+    unseen = [build_model_run(plant.time, start, identified, std) for start in (diverging, initial)]
+    write_model_runs(run.model, excitation, unseen)
     write_covariance(run.covariance, NAMES, np.diag(np.linspace(1.0, 2.0, len(NAMES))) + 0.1)
     save_result(run.result, make_result())
-    run.scenario.write_text(load_scenario("quick").to_toml(), encoding="utf-8")
     return run
 
 

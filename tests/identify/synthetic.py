@@ -34,10 +34,12 @@ def trajectory(seed, size=1.0):
     return random_trajectory(np.random.default_rng(seed), rss6().home_pose, 0.1, 5, 0.010 * size, 0.04 * size)
 
 
-def run_plant(scenario, seed, sigma=SIGMA, lost=(), parameters=None, duration_s=10.0, trajectory_seed=0, size=1.0):
+def run_plant(
+    scenario, seed, sigma=SIGMA, lost=(), parameters=None, duration_s=10.0, trajectory_seed=0, size=1.0, **stated
+):
     """(record, run of the plant) with Gaussian noise of `sigma` (6,) and the frames `lost` not measured.
 
-    size: of the motion, as a share of the usual box.
+    size: of the motion, as a share of the usual box; stated: what `build_record` is given in place of what was.
     """
     rng = np.random.default_rng(seed)
     plant = build_plant(scenario, rss6())
@@ -52,19 +54,20 @@ def run_plant(scenario, seed, sigma=SIGMA, lost=(), parameters=None, duration_s=
     run = plant.run(reference, sensor)
     covariance = np.broadcast_to(np.diag(np.maximum(sigma, 1e-9) ** 2), (len(times), 6, 6)).copy()
     covariance[~run.measured_ok] = np.nan
-    record = build_record(
-        time=times,
-        reference_pose=reference.poses,
-        reference_rate=reference.rates,
-        measured_pose=run.measured,
-        measured_covariance=covariance,
-        measured_ok=run.measured_ok,
-        command=run.command,
-        scenario_toml=scenario.to_toml(),
-        robot="rss6",
-        seed=seed,
-        frame_rate_hz=scenario.timing.frame_rate_hz,
-    )
+    made = {
+        "time": times,
+        "reference_pose": reference.poses,
+        "reference_rate": reference.rates,
+        "measured_pose": run.measured,
+        "measured_covariance": covariance,
+        "measured_ok": run.measured_ok,
+        "command": run.command,
+        "scenario_toml": scenario.to_toml(),
+        "robot": "rss6",
+        "seed": seed,
+        "frame_rate_hz": scenario.timing.frame_rate_hz,
+    }
+    record = build_record(**(made | stated))
     store_anchor(record, ScaleAnchor("platform_mass", plant.parameters[0], 0.005))
     return record, run
 

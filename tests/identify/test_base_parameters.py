@@ -43,7 +43,7 @@ def test_the_base_parameters_alone_decide_the_torque(found):
         assert np.abs(robot.regressor(*motion) @ (row / (row @ row))).max() > 1e-3
 
 
-def test_rank_and_space_are_those_of_the_singular_values(found):
+def test_rank_and_space_are_those_of_the_singular_values_and_the_papers_threshold_depends_on_the_units(found):
     matrix = structural_regressor(rss6())
     lengths = np.linalg.norm(matrix, axis=0)
     scale = np.where(lengths > 0, lengths, 1.0)
@@ -51,6 +51,10 @@ def test_rank_and_space_are_those_of_the_singular_values(found):
     groups = found.combinations / scale  # both act on parameters times their column's length
     assert rank_by_singular_values(matrix) == found.rank == np.linalg.matrix_rank(groups) == 37
     assert np.abs(groups @ rows.T @ rows - groups).max() < 1e-9 * np.abs(groups).max()
+    assert rank_by_threshold(matrix, 1e-3) == 37
+    assert rank_by_threshold(matrix / 1e6, 1e-3) < 37
+    with pytest.raises(EstimationError, match="excites no parameter"):
+        base_parameters(np.zeros((12, 64)))
 
 
 def test_the_angle_to_the_singular_vectors_is_that_by_which_a_group_is_wrong():
@@ -78,25 +82,14 @@ def test_gravity_across_the_crank_axes_separates_mass_from_inertia(found, tmp_pa
     assert row[PARAMETER_NAMES.index("crank2.mass")] == 0.0
 
 
-def test_a_crank_turns_about_its_joint(found):
+def test_groups_do_not_depend_on_the_motions_and_a_crank_turns_about_its_joint(found):
     """A crank about a vertical axis shows its inertia about that axis: Izz + m (r / 2)², r = 60 mm."""
-    row = found.combinations[found.pivots.index(PARAMETER_NAMES.index("crank2.Izz"))]
-    assert row[PARAMETER_NAMES.index("crank2.mass")] == pytest.approx(0.03**2, rel=1e-9)
-    assert all(f"crank{k}.Ixx" in found.unseen and f"link{k}.Izz" in found.unseen for k in range(1, 7))
-
-
-def test_groups_do_not_depend_on_the_motions(found):
     again = base_parameters(structural_regressor(rss6(), motions=333, seed=11))
     assert again.pivots == found.pivots
     assert np.allclose(again.combinations, found.combinations, atol=1e-9)
-
-
-def test_the_papers_threshold_depends_on_the_units_and_no_motion_shows_no_parameter():
-    matrix = structural_regressor(rss6())
-    assert rank_by_threshold(matrix, 1e-3) == 37
-    assert rank_by_threshold(matrix / 1e6, 1e-3) < 37
-    with pytest.raises(EstimationError, match="excites no parameter"):
-        base_parameters(np.zeros((12, 64)))
+    row = found.combinations[found.pivots.index(PARAMETER_NAMES.index("crank2.Izz"))]
+    assert row[PARAMETER_NAMES.index("crank2.mass")] == pytest.approx(0.03**2, rel=1e-9)
+    assert all(f"crank{k}.Ixx" in found.unseen and f"link{k}.Izz" in found.unseen for k in range(1, 7))
 
 
 def test_the_command_prints_and_writes_the_groups(tmp_path, capsys):

@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 
 from dynamics.closed_loop import equilibrium, simulate
-from identify.errors import EstimationError, RecordError
+from identify.errors import EstimationError
 from identify.estimation.covariance import correlation_matrix, estimate_uncertainty
 from identify.estimation.identifiability import POOR
 from identify.estimation.identification import identify, output_error_problem
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
-from identify.estimation.warm_start import joint_balance, linear_warm_start
+from identify.estimation.warm_start import joint_balance
 from identify.experiment.plant import build_plant, drawn_load
 from identify.loop_parameters import NAMES, choose_parameters, model_settings
 from identify.record.payload import store_payload
 from identify.record.recorded_run import recorded_run
 from identify.scenario import load_scenario
 from identify.validation.unseen import predict_poses
-from tests.identify.coverage_experiments import check_coverage, row_of
 from tests.identify.synthetic import quick, rss6, run_plant, truth
+from tests.identify.test_interval_coverage import check_coverage, row_of
 
 FRICTION_AND_PID = [i for i, name in enumerate(NAMES) if name.startswith("joint")]
 
@@ -80,13 +80,6 @@ def test_warm_start_equation_holds_for_the_true_parameters(scenario):
     assert np.sqrt(np.mean(balance**2)) < 1e-3 * np.sqrt(np.mean((columns[:, 64:67] @ parameters[64:]) ** 2))
 
 
-def test_warm_start_is_ten_times_closer_than_the_starting_guess(scenario, record):
-    problem = output_error_problem([record], rss6(), scenario)
-    before = unseen_error(scenario, problem.guess.values)
-    after = unseen_error(scenario, linear_warm_start(problem, scenario))
-    assert np.all(after < before / 10), (before, after)
-
-
 @pytest.mark.slow
 def test_intervals_cover_as_often_as_they_say_and_friction_and_gains_are_found_without_bias(ensemble):
     """Each within what its standard deviation says, and their mean over all experiments within that of a mean.
@@ -106,14 +99,17 @@ def test_intervals_cover_as_often_as_they_say_and_friction_and_gains_are_found_w
 
 @pytest.mark.slow
 def test_the_error_on_unseen_motions_is_the_one_predicted(scenario, ensemble):
-    """To micrometres, also where frames were lost; and its square in units of what was predicted is one on average."""
-    ratios = []
+    """To micrometres, also where frames were lost; its square in units of what was predicted is one on average. With
+    exactly known parameters the plant strays by what the servo lets through of the noise alone."""
+    ratios, exact = [], []
     for unseen in range(12):
         result, rng = ensemble[unseen // 2][1], np.random.default_rng(unseen)
         record, plant = run_plant(scenario, seed=100 + unseen, trajectory_seed=50 + unseen, duration_s=5.0)
-        predicted = predict_poses(recorded_run(record, rss6(), scenario), result.estimate, result.covariance, rng)
-        ratios.append(predicted.normalised_squared_error(plant.pose))
+        run = recorded_run(record, rss6(), scenario)
+        for found, model in ((ratios, (result.estimate, result.covariance)), (exact, (truth(), np.zeros((67, 67))))):
+            found.append(predict_poses(run, *model, rng).normalised_squared_error(plant.pose))
     assert 0.8 < np.mean(ratios) < 1.2, ratios
+    assert np.mean(exact) == pytest.approx(1.0, abs=0.1), exact
     for experiment, limits in ((1, [3e-6, 15e-6]), (7, [5e-6, 25e-6])):
         assert np.all(unseen_error(scenario, ensemble[experiment][1].estimate) < np.repeat(limits, 3)), experiment
 
@@ -203,17 +199,6 @@ def test_two_records_tell_more_than_one(record, driven):
 
 
 @pytest.mark.slow
-def test_a_misfit_that_noise_does_not_explain_is_said(scenario):
-    """A plant with smoothed friction is not what the model believes: the residuals tell."""
-    other = quick(**{"plant.friction": "smoothed", "plant.smoothing_velocity_rad_s": 0.01, "plant.steps_per_frame": 16})
-    record, _ = run_plant(other, seed=1)
-    result = identify(record, rss6(), scenario.with_overrides({"identification.max_iterations": 4}))
-    assert "noise alone" in result.warnings[0]
-    assert "not white" in result.warnings[1]
-    assert result.whiteness.p_value < 1e-10
-
-
-@pytest.mark.slow
 def test_the_search_is_not_caught_by_the_stick_slip_minimum_near_the_warm_start(scenario):
     """From this record's warm start the closed-loop cost alone stalls at 1.33 times the noise."""
     record, _ = run_plant(scenario, seed=10, trajectory_seed=2)
@@ -248,34 +233,7 @@ def test_the_gradient_of_the_whole_cost_matches_finite_differences(scenario, rec
         assert 2 * gradient[index] == pytest.approx(slope, rel=5e-3), name
 
 
-def at(record, *frames):
-    """Which frames these are."""
-    return record["time"].isin(record["time"][list(frames)])
-
-
-@pytest.mark.parametrize(
-    ("spoil", "error", "says"),
-    [
-        (lambda r: r.assign_attrs(robot="other"), EstimationError, r"other.*rss6"),
-        (lambda r: r.assign_attrs(scale_anchor=None), RecordError, r"no scale anchor.*platform_mass"),
-        (lambda r: r.assign(measured_ok=r["measured_ok"] * ~at(r, *range(400))), EstimationError, "200 of 600 frames"),
-        (lambda r: r.isel(time=slice(0, 30)), EstimationError, r"30 frames .*at least .* are needed"),
-        (lambda r: r.drop_isel(time=range(100, 110)), EstimationError, r"frames 99 and 100 are 11.000 periods"),
-        (lambda r: r.assign(command=r["command"] * (r["joint"] != 3)), EstimationError, "command of joint 3 is 0 in"),
-        (lambda r: r.assign(measured_position=0 * r["measured_position"] + 1), EstimationError, "x is 1 in every f"),
-        (lambda r: r.assign(command=r["command"].where(~at(r, 50))), RecordError, "command is not finite in 1 f"),
-        (lambda r: r.assign(measured_covariance=0 * r["measured_covariance"]), EstimationError, "not positive def"),
-    ],
-    ids=["robot", "anchor", "dark", "short", "gap in time", "dead command", "constant pose", "NaN", "covariance"],
-)
-def test_records_that_cannot_carry_an_identification_are_named(scenario, record, spoil, error, says):
-    with pytest.raises(error, match=says):
-        identify(spoil(record), rss6(), scenario)
-
-
-def test_records_of_another_loop_are_refused_and_a_long_loss_is_flagged(scenario, record):
-    with pytest.raises(EstimationError, match=r"timing.frame_rate_hz = 60.0, the scenario says 30.0"):
-        identify(record, rss6(), quick(**{"timing.frame_rate_hz": 30.0}))
+def test_a_long_loss_is_flagged(scenario):
     record, _ = run_plant(scenario, seed=1, lost=range(200, 245))
     assert "45 frames in a row were lost from t = 3.33 s" in recorded_run(record, rss6(), scenario).warnings()[0]
     assert recorded_run(run_plant(scenario, seed=1, lost=[7, 9])[0], rss6(), scenario).warnings() == ()
@@ -319,6 +277,3 @@ def test_the_payload_anchor_needs_two_loads(scenario):
     records = loaded(scenario, seed=1)
     with pytest.raises(EstimationError, match=r"1 records have all the same load"):
         identify(records[:1], rss6(), scenario)
-    wrong = records[1].assign_attrs(payload_Ixx=-1.0)
-    with pytest.raises(RecordError, match=r"payload_Ixx is -1.0.*kg m2"):
-        identify([records[0], wrong], rss6(), scenario)

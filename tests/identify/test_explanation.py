@@ -1,10 +1,14 @@
 """Whether the model explains its record: misfits told from chance and brought into the intervals, and whiteness."""
 
+import warnings
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.stats import kstest
 
 from identify.errors import EstimationError
+from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white, whiteness
 from identify.estimation.identification import identify
 from tests.identify.synthetic import quick, rss6, run_plant
@@ -60,6 +64,36 @@ def test_of_chance_nothing_is_the_models_a_large_misfit_decides_and_a_small_one_
     assert "nothing counts as identified" in Misfit(3.3, 1.05, 0.02).warnings()[0]
     assert "too wide" in Misfit(0.8, 1.0, 0.03).warnings()[0]
     assert not Misfit(0.8, 1.0, 0.03).significant
+
+
+def test_of_information_that_no_computer_inverts_the_variances_are_right_and_positive_whatever_the_misfit():
+    """A linear problem J = U diag(s) V^T whose guess is known to one in each direction; its information spans 20 orders
+    of magnitude. A direction that only the guess shows is known as well as that says; no residual takes from that."""
+    rng, frames, size = np.random.default_rng(0), 40, 12
+    singular = np.logspace(10, -2, size)
+    left, right = (np.linalg.qr(rng.standard_normal((rows, size)))[0] for rows in (6 * frames, size))
+    jacobian, noise = (left * singular @ right.T).reshape(frames, 6, size), rng.standard_normal((frames, 6))
+
+    def found(scale):
+        run = SimpleNamespace(
+            residuals=lambda parameters: (scale * noise, jacobian),
+            driven=True,
+            ok=np.ones(frames, dtype=bool),
+            payload_std=np.zeros(size),
+        )
+        problem = SimpleNamespace(runs=(run,), known=lambda parameters: (np.zeros(size), np.eye(size)))
+        with warnings.catch_warnings(action="error"):
+            return estimate_uncertainty(problem, np.zeros(size), np.random.default_rng(0))
+
+    right_model, wrong_model = found(0.9), found(1e3)
+    assert not right_model.misfit.significant
+    assert np.linalg.cond(right_model.information + np.eye(size)) > 1e15
+    np.testing.assert_allclose(right_model.covariance, right / (1 + singular**2) @ right.T, rtol=1e-5, atol=1e-7)
+    assert wrong_model.misfit.decides
+    eigenvalues, unseen = np.linalg.eigvalsh(wrong_model.covariance), right[:, singular < 0.1]
+    assert eigenvalues[0] > -1e-9 * eigenvalues[-1]
+    assert np.all(np.diag(unseen.T @ wrong_model.covariance @ unseen) > 0.98)
+    assert np.all(np.diag(wrong_model.covariance) > 0)
 
 
 def test_frames_marked_as_lost_afterwards_leave_nothing_identified():

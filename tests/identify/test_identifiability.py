@@ -82,22 +82,16 @@ def resting(anchor):
     return {name for name, rests in zip(NAMES, found, strict=True) if rests}
 
 
-def test_links_and_inertias_in_sums_rest_on_the_guess_and_without_an_anchor_so_do_friction_and_gains():
-    assert resting(ScaleAnchor("prior")) == set(NAMES)
-    named = resting(GAIN)
-    assert resting(ScaleAnchor("payload")) == named
-    assert {f"link{k}.mass" for k in range(1, 7)} | {"platform.mass", "platform.Ixx", "crank1.Ixx"} <= named
-    assert named.isdisjoint(NAMES[k] for k in JOINTS)
-
-
-def test_a_weighed_platform_stands_alone_and_brings_izz_with_it():
+def test_with_no_anchor_all_rests_on_the_guess_and_a_weighed_platform_stands_alone_and_brings_izz_with_it():
     """Masses of links that the platform carries stand in its mass as in Izz over the squared radius of its joints."""
+    assert resting(ScaleAnchor("prior")) == set(NAMES)
+    assert resting(ScaleAnchor("payload")) == resting(GAIN)
+    assert resting(GAIN) - resting(WEIGHED) == {"platform.mass", "platform.Izz"}
     radius = np.linalg.norm(rss6().geometry.platform_joints[0, :2])
     base = base_parameters(structural_regressor(rss6()))
     mass, inertia = (base.combinations[base.pivots.index(index_of(f"platform.{kind}"))] for kind in ("mass", "Izz"))
     carried = [index_of(f"link{k}.mass") for k in range(1, 7)]
     np.testing.assert_allclose(inertia[carried], radius**2 * mass[carried], atol=1e-9)
-    assert resting(GAIN) - resting(WEIGHED) == {"platform.mass", "platform.Izz"}
 
 
 def test_what_rests_on_the_guess_can_change_with_no_pose_changing_and_nothing_else_can():
@@ -107,7 +101,9 @@ def test_what_rests_on_the_guess_can_change_with_no_pose_changing_and_nothing_el
     shown = np.concatenate([group_rows(base), gains, WEIGHED.row()[0]]) * truth()
     unseen = null_space(shown / np.linalg.norm(shown, axis=1, keepdims=True))
     change = unseen @ np.random.default_rng(0).standard_normal(unseen.shape[1])
-    assert {name for name, moved in zip(NAMES, change, strict=True) if abs(moved) > 1e-6} == resting(WEIGHED)
+    named = {name for name, moved in zip(NAMES, change, strict=True) if abs(moved) > 1e-6}
+    assert named == resting(WEIGHED)
+    assert {*(f"link{k}.mass" for k in range(1, 7)), "platform.Ixx", "crank1.Ixx"} <= named
     run = recorded_run(run_plant(quick(), seed=0, duration_s=3.0)[0], rss6(), quick())
     before, after = (run.model_poses(truth() * (1 + scale * change / np.abs(change).max())) for scale in (0.0, 0.3))
     assert np.abs(after - before).max() < 1e-9
@@ -126,9 +122,9 @@ def test_a_result_names_what_rests_on_the_guess_among_what_is_identified():
     assert {row[0] for row in rows if row[-1] == ON_GUESS} == named
 
 
-def three_unknowns(poses):
-    """Conditioning of two dynamic parameters, one group each, and one gain, all of size one with a guess of 1 ± 1."""
-    base = BaseParameters(("a", "b"), np.eye(2), (0, 1), (), (0.0, 1.0))
+def three_unknowns(poses, groups=((1.0, 0.0), (0.0, 1.0))):
+    """Conditioning of two dynamic parameters in groups and one gain, all of size one with a guess of 1 ± 1."""
+    base = BaseParameters(("a", "b"), np.array(groups), tuple(range(len(groups))), (), (0.0, 1.0))
     return conditioning(poses, np.eye(3), base, StartingGuess(np.ones(3), np.ones(3)), np.ones(3))
 
 
@@ -143,15 +139,10 @@ def test_condition_numbers_are_those_worked_out_by_hand_and_a_poor_one_is_a_warn
     found = three_unknowns(2 * np.outer(first, first) + 0.1 / POOR * np.outer(second, second))
     assert found.poor
     assert "1 of 2 directions" in found.warnings()[0]
-
-
-def test_a_group_counts_as_one_unknown():
-    """Two parameters that only act as a + 2 b: the information of the pair has rank one, that of the group is full."""
-    row = np.array([1.0, 2.0, 0.0])
-    gain = np.array([0.0, 0.0, 1.0])
-    base = BaseParameters(("a", "b"), np.array([[1.0, 2.0]]), (0,), (), (0.0, 1.0))
-    poses = 3.0 * np.outer(row - 3 * gain, row - 3 * gain)  # blind to a common factor of (a, b, gain) = (1, 1, 1)
-    found = conditioning(poses, np.eye(3), base, StartingGuess(np.ones(3), np.ones(3)), np.ones(3))
+    # Two parameters that only act as a + 2 b: the pair's information has rank one, that of the group is full. Poses are
+    # blind to a common factor of (a, b, gain) = (1, 1, 1).
+    only = np.array([1.0, 2.0, -3.0])
+    found = three_unknowns(3.0 * np.outer(only, only), groups=[[1.0, 2.0]])
     assert found.directions == 1
     assert found.poses_alone == pytest.approx(1.0)
 

@@ -148,7 +148,9 @@ def test_a_plant_that_the_model_cannot_be_is_said_and_judged(tmp_path, capfd):
     assert out == ""
     assert all(line.startswith("warning: ") for line in err.splitlines())
     assert "are not white" in err
-    assert "white residuals" in missed(load_result(run.result))
+    result = load_result(run.result)
+    assert "white residuals" in missed(result)
+    assert result["identification"]["noise_ratio"] > 1.05
 
 
 def test_without_opengl_the_analytic_renderer_draws_or_pyrender_stops_with_one_line_each(tmp_path):
@@ -171,9 +173,7 @@ def test_without_opengl_the_analytic_renderer_draws_or_pyrender_stops_with_one_l
     ("setting", "words"),
     [
         ("robot=rss7", ["rss7", "rss6"]),
-        ("sensor=ctrack79", ["ctrack79", "ctrack780"]),
         ("excitation.position_amplitude_m=0.2", ["leg"]),
-        ("excitation.travel_margin_rad=0.8", ["leg", "0.1948"]),
         ("plant.parameters=nobody", ["nobody", "identified", "initial"]),
         ("model.start_parameters=nobody", ["nobody", "identified", "initial"]),
     ],

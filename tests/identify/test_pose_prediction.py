@@ -9,7 +9,7 @@ from identify.errors import EstimationError
 from identify.progress import SilentProgress
 from identify.record.recorded_run import recorded_run
 from identify.reporting.run_result import prediction_entry
-from identify.validation.unseen import PosePrediction, predict_poses, predicted_runs
+from identify.validation.unseen import PosePrediction, predicted_runs
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth, truth_of
 
 
@@ -57,15 +57,3 @@ def test_a_motion_too_short_to_identify_from_can_be_predicted_and_what_cannot_be
         predicted(record, truth(), **{"servo.kp": 0.2})
     with pytest.raises(ParameterError, match=r"platform.mass = -23.5 kg is not allowed"):
         predicted(record, -truth())
-
-
-@pytest.mark.slow
-def test_exactly_known_parameters_leave_what_the_noise_does_through_the_servo():
-    """With the true parameters and no covariance the plant strays by the noise's share alone: twelve motions."""
-    scenario, ratios = quick(**{"plant.steps_per_frame": 4}), []
-    for seed in range(12):
-        record, plant = run_plant(scenario, seed=100 + seed, trajectory_seed=50 + seed, duration_s=5.0)
-        run = recorded_run(record, rss6(), scenario)
-        prediction = predict_poses(run, truth(), np.zeros((67, 67)), np.random.default_rng(seed))
-        ratios.append(prediction.normalised_squared_error(plant.pose))
-    assert np.mean(ratios) == pytest.approx(1.0, abs=0.1), ratios

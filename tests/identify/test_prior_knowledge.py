@@ -7,7 +7,6 @@ from identify.errors import EstimationError, RecordError, ScenarioError
 from identify.estimation.identification import identify
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor, store_anchor
 from identify.loop_parameters import NAMES, index_of
-from identify.scenario import load_scenario, scenario_from_toml
 from tests.identify.synthetic import quick, rss6, run_plant
 
 GAIN = NAMES.index("joint_pid.lp")
@@ -53,16 +52,6 @@ def test_what_no_model_has_cannot_be_expected_of_one(record):
         identify(record, rss6(), driven(joint_pid_li=(0.0, 1.0)))
     with pytest.raises(ScenarioError, match=r"known beforehand: platform.mass\): platform.mass = 0 kg is not"):
         identify(record, rss6(), driven(platform_mass=(0.0, 1.0)))
-
-
-def test_a_prior_survives_the_scenario_file_and_names_what_does_not_exist():
-    scenario = driven(link2_Izz=(3e-3, 1e-4))
-    assert scenario_from_toml(scenario.to_toml()) == scenario
-    with pytest.raises(ScenarioError, match=r"no parameter 'link7.Izz'; valid: mass, Ixx"):
-        driven(link7_Izz=(3e-3, 1e-4))
-    with pytest.raises(ScenarioError, match=r"prior.link2.Izz.std = 0.0"):
-        driven(link2_Izz=(3e-3, 0.0))
-    assert load_scenario("quick").identification.prior == {}
 
 
 def test_the_anchor_that_is_stored_is_read_and_a_weighing_is_one_equation_in_standard_deviations(record):

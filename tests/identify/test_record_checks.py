@@ -56,10 +56,6 @@ def one_triangle(record):
     return with_values(record, measured_covariance=covariance)
 
 
-def nan_in(record, name, frame):
-    return record.assign({name: record[name].where(record["time"] != record["time"][frame])})
-
-
 def without(record, *names):
     return record.drop_attrs(deep=False).assign_attrs({k: v for k, v in record.attrs.items() if k not in names})
 
@@ -70,21 +66,22 @@ def without(record, *names):
         (lambda r: r.isel(time=slice(0, 0)), RecordError, "the record has no time"),
         (lambda r: r.isel(time=slice(0, 1)), EstimationError, "1 frames .0.0167 s., at least 120 are needed"),
         (lambda r: r.assign_coords(time=r["time"].where(r["time"] > 1)), RecordError, "increase after frame 0"),
-        (lambda r: r.assign_coords(time=r["time"] * 1.01), EstimationError, r"1.010 periods of 60 Hz"),
-        (lambda r: nan_in(r, "measured_covariance", 7), RecordError, "covariance is not finite in 1 frames that count"),
-        (lambda r: nan_in(r, "command", 8), RecordError, "command is not finite in 1 frames, the first is frame 8"),
+        (lambda r: r.drop_isel(time=range(100, 110)), EstimationError, r"frames 99 and 100 are 11.000 periods"),
+        (lambda r: r.assign(measured_ok=r["measured_ok"] * (r["time"] > 1.5)), EstimationError, "29 of 120 frames"),
+        (lambda r: r.assign(command=r["command"].where(r["time"] > 0)), RecordError, "command is not finite in 1 f"),
+        (lambda r: r.assign(measured_covariance=0 * r["measured_covariance"]), EstimationError, "not positive def"),
         (one_triangle, EstimationError, r"in 1 frames: in frame 9 its entry .z, gamma. is 7.5e-11 and .gamma, z. is 0"),
         (lambda r: without(r, "scenario"), RecordError, r"no attribute scenario, .*to_toml\(\), .*build_record"),
         (lambda r: r.assign_attrs(scenario=7), RecordError, "attribute scenario is 7, must be TOML text"),
         (lambda r: r.assign_attrs(scenario="paper"), RecordError, "attribute scenario is not valid TOML"),
         (lambda r: r.assign_attrs(scenario="description = 'x'"), RecordError, "attribute scenario: name is missing"),
         (lambda r: r.assign_attrs(seed="abc"), RecordError, "attribute seed is 'abc', must be a whole number >= 0"),
-        (lambda r: r.assign_attrs(seed=True), RecordError, "attribute seed is True, must be"),
         (lambda r: r.assign_attrs(frame_rate_hz=30.0), EstimationError, "frame_rate_hz is 30.0, and timing.* is 60"),
         (standstill, EstimationError, "same pose in every frame: nothing was asked to move"),
         (alias, EstimationError, "the reference's x travels 0.01, .*harmonics above half of 60 Hz"),
         (lambda r: r.assign(reference_velocity=1e3 * r["reference_velocity"]), EstimationError, "not its derivative"),
-        (lambda r: r.assign(command=0 * r["command"]), EstimationError, "command of joint 1 is 0 in every frame"),
+        (lambda r: r.assign(command=r["command"] * (r["joint"] != 3)), EstimationError, "command of joint 3 is 0 in"),
+        (lambda r: r.assign(measured_position=0 * r["measured_position"] + 1), EstimationError, "x is 1 in every f"),
         (lambda r: r.assign(measured_position=1e3 * r["measured_position"]), DynamicsError, "cannot reach"),
     ],
 )
@@ -111,7 +108,7 @@ def test_a_load_that_no_body_has_is_refused_and_its_numbers_are_shown_as_plain_o
     assert recorded_payload(record.assign_attrs(load))[0].sum() == pytest.approx(8.08)
     with pytest.raises(RecordError, match=r"attribute payload_Ixx 100 > .*0.02 .*0.04"):
         recorded_payload(record.assign_attrs(load | {"payload_Ixx": 100.0}))
-    with pytest.raises(RecordError, match=r"attribute payload_mass is -8.0, must be"):
+    with pytest.raises(RecordError, match=r"attribute payload_mass is -8.0, must be .*kg"):
         recorded_payload(record.assign_attrs(load | {"payload_mass": np.float64(-8.0)}))
 
 
@@ -124,19 +121,6 @@ def test_what_a_record_need_not_have_is_no_fault(record):
     recorded_run(with_values(without(record, "frame_rate_hz"), **one_way), rss6(), SHORT)
     once = SHORT.with_overrides({"identification.method": "command_driven"})
     assert np.all(np.isfinite(identify(without(record, "seed"), rss6(), once).estimate))
-
-
-def test_commands_of_swapped_joints_leave_no_estimate_that_looks_good(record):
-    """The model cannot follow: it is said, and nothing is identified."""
-    settings = {"identification.method": "command_driven"}
-    good = identify(record, rss6(), SHORT.with_overrides(settings | {"identification.max_iterations": 30}))
-    swapped = with_values(record, command=record["command"].values[:, [1, 0, 2, 3, 4, 5]])
-    wrong = identify(swapped, rss6(), SHORT.with_overrides(settings | {"identification.max_iterations": 2}))
-    assert wrong.noise_ratio > 100
-    assert "the model or the stated covariance is wrong" in wrong.warnings[0]
-    assert good.identifiable.sum() > 10
-    assert not wrong.identifiable.any()
-    assert not wrong.groups.identifiable.any()
 
 
 def test_a_record_of_another_trajectory_is_refused_where_it_differs_most(record, recorded_folder):

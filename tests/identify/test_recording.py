@@ -11,9 +11,10 @@ from identify.errors import RecordError
 from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
 from identify.files.atomic import atomic_path, write_text
 from identify.files.dataset import group_names, write_groups
-from identify.record import recording
+from identify.loop_parameters import NAMES
 from identify.record.recording import (
     build_model_run,
+    check_record,
     poses,
     read,
     read_model_runs,
@@ -24,17 +25,31 @@ from identify.record.recording import (
     write_model_runs,
     write_runs,
 )
-from tests.identify.conftest import make_record, make_truth
+from tests.identify import synthetic
+from tests.identify.synthetic import SHORT, run_plant, short_run, truth_of
 
 
-def test_record_and_truth_read_back_identical_and_apart(tmp_path):
+@pytest.fixture(scope="module")
+def record():
+    return short_run()[0]
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return truth_of(short_run()[1])
+
+
+def test_record_and_truth_read_back_identical_and_apart(tmp_path, record, truth):
     """By us, by plain xarray and by plain HDF5; who reads the record does not see the truth."""
-    path = tmp_path / "experiment.nc"
-    record, truth = make_record(), make_truth()
+    path, run = tmp_path / "experiment.nc", short_run()[1]
+    np.testing.assert_array_equal(poses(record, "measured"), run.measured)
+    np.testing.assert_array_equal(true_poses(truth), run.pose)
+    with pytest.raises(RecordError, match="no initial_position and initial_orientation; it has reference_position"):
+        poses(record, "initial")
     write(path, record, truth)
     xr.testing.assert_identical(read(path), record)
     xr.testing.assert_identical(read_truth(path), truth)
-    assert true_parameters(read_truth(path)) == {"platform.mass": 23.5, "joint1.coulomb": 0.104}
+    assert true_parameters(read_truth(path)) == dict(zip(NAMES, synthetic.truth(), strict=True))
     assert not [name for name in read(path).variables if "true" in str(name) or "torque" in str(name)]
     assert all(v.attrs["units"] and v.attrs["long_name"] for data in (record, truth) for v in data.data_vars.values())
     assert (record.attrs["robot"], record.attrs["frame_rate_hz"]) == ("rss6", 60.0)
@@ -46,24 +61,19 @@ def test_record_and_truth_read_back_identical_and_apart(tmp_path):
         assert main["time"].attrs["units"] == "s"
         assert plain["joint_torque"].attrs["units"] == "N m"
     with h5py.File(path) as file:
-        np.testing.assert_array_equal(file["truth/parameter_value"], [23.5, 0.104])
+        np.testing.assert_array_equal(file["truth/parameter_value"], synthetic.truth())
         assert file["measured_position"].attrs["units"] == "m"
 
 
-def test_poses_are_the_arrays_that_were_given():
-    measured = np.arange(720.0).reshape(120, 6)
-    record = make_record(measured_pose=measured)
-    np.testing.assert_array_equal(poses(record, "measured"), measured)
-    np.testing.assert_array_equal(true_poses(make_truth(pose=measured)), measured)
-    with pytest.raises(RecordError, match="no initial_position and initial_orientation; it has reference_position"):
-        poses(record, "initial")
+def test_values_of_another_shape_that_are_not_finite_or_times_that_do_not_increase_are_named(record):
+    """Lost frames may be NaN, and only they; a frame was measured or lost and nothing else."""
 
+    def stated(**values):
+        return run_plant(SHORT, seed=1, duration_s=2.0, **values)[0]
 
-def test_values_of_another_shape_that_are_not_finite_or_times_that_do_not_increase_are_named():
-    """Lost frames may be NaN, and only they."""
-    measured, ok = np.zeros((120, 6)), np.ones(120, dtype=bool)
-    measured[7], ok[7] = np.nan, False
-    assert make_record(measured_pose=measured, measured_ok=ok)["measured_ok"].values.sum() == 119
+    measured, ok = np.zeros((120, 6)), np.ones(120)
+    measured[7], ok[7] = np.nan, 0
+    assert stated(measured_pose=measured, measured_ok=ok)["measured_ok"].values.sum() == 119
     for values, says in (
         ({"measured_pose": measured}, "is not finite in 1 frames that count as measured, the first is frame 7"),
         ({"command": np.full((120, 6), np.inf)}, "command"),
@@ -74,26 +84,22 @@ def test_values_of_another_shape_that_are_not_finite_or_times_that_do_not_increa
         ({"reference_pose": np.zeros((6, 120))}, "6"),
     ):
         with pytest.raises(RecordError, match=says):
-            make_record(**values)
-
-
-def test_a_frame_was_measured_or_lost_and_nothing_else():
-    record = make_record()
+            stated(**values)
     for frames, value, says in (
         ([3, 9, 11], -1.0, "it is -1.0 in frame 3 and wrong in 2 more"),
         ([0], np.nan, "it is nan in frame 0$"),
     ):
-        stated = record["measured_ok"].values.astype(float)
-        stated[frames] = value
+        flags = record["measured_ok"].values.astype(float)
+        flags[frames] = value
         with pytest.raises(RecordError, match=f"mine: measured_ok must be 1 or 0, {says}"):
-            recording.check_record(record.assign(measured_ok=("time", stated)), "mine")
+            check_record(record.assign(measured_ok=("time", flags)), "mine")
 
 
-def test_what_a_file_lacks_or_damages_is_named(tmp_path):
+def test_what_a_file_lacks_or_damages_is_named(tmp_path, record):
     with pytest.raises(RecordError, match="there is no file"):
         read(tmp_path / "nothing.nc")
     path = tmp_path / "experiment.nc"
-    write(path, make_record())
+    write(path, record)
     with pytest.raises(RecordError, match="no group 'truth'"):
         read_truth(path)
     with h5py.File(path, "r+") as file:
@@ -104,18 +110,18 @@ def test_what_a_file_lacks_or_damages_is_named(tmp_path):
         os.truncate(path, kept)
         with pytest.raises(RecordError, match=r"experiment\.nc is truncated or not a netCDF file"):
             read(path)
-    write(path, make_record().drop_vars(["command", "measured_ok"]))
+    write(path, record.drop_vars(["command", "measured_ok"]))
     with pytest.raises(RecordError, match="lacks measured_ok, command"):
         read(path)
 
 
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, record):
     path = tmp_path / "experiment.nc"
-    write(path, make_record())
+    write(path, record)
     before = path.read_bytes()
     bad = xr.Dataset({"x": ("n", np.array([object()], dtype=object))})
     with pytest.raises((TypeError, ValueError)):
-        write_groups(path, {"": make_record(), "truth": bad})
+        write_groups(path, {"": record, "truth": bad})
 
     def write_half():
         with atomic_path(path) as temporary:
@@ -133,18 +139,19 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
     assert (tmp_path / "folder" / "a.txt").stat().st_mode == (tmp_path / "b.txt").stat().st_mode, "the usual rights"
 
 
-def test_runs_share_a_file_and_keep_their_order(tmp_path):
+def test_runs_share_a_file_and_keep_their_order(tmp_path, record, truth):
     path = tmp_path / "validation.nc"
-    write_runs(path, [(make_record(seed=n), make_truth(values=(n, 0.0))) for n in range(2)])
-    assert [record.attrs["seed"] for record in read_runs(path)] == [0, 1]
-    assert [true_parameters(t)["platform.mass"] for t in read_truth_runs(path)] == [0, 1]
+    numbered = [truth.assign(parameter_value=n + 0 * truth["parameter_value"]) for n in (0, 1)]
+    write_runs(path, [(record.assign_attrs(seed=n), other) for n, other in enumerate(numbered)])
+    assert [one.attrs["seed"] for one in read_runs(path)] == [0, 1]
+    assert [true_parameters(one)["platform.mass"] for one in read_truth_runs(path)] == [0, 1]
     assert group_names(path) == ["run01", "run01/truth", "run02", "run02/truth"]
-    with xr.open_dataset(path, group="run02/truth") as truth:
-        assert truth.sizes["time"] == 120
+    with xr.open_dataset(path, group="run02/truth") as plain:
+        assert plain.sizes["time"] == 120
     many = [run_name(number) for number in (1, 9, 10, 99, 100)]
     write_groups(path, dict.fromkeys(reversed(many), xr.Dataset({"x": 1.0})))
     assert run_names(path) == many == ["run01", "run09", "run10", "run99", "run100"]
-    write(path, make_record())
+    write(path, record)
     with pytest.raises(RecordError, match="holds no runs"):
         read_runs(path)
 

@@ -69,6 +69,7 @@ def test_resolved_scenario_keeps_its_timing_whatever_the_sensor_file_says(tmp_pa
 def test_resolved_toml_names_every_value_and_reads_back_equal(name):
     scenario = load_scenario(name).with_overrides(
         {"description": 'quotes " and \\ and é', "plant.friction": "smoothed", "plant.smoothing_velocity_rad_s": 1e-3}
+        | {PRIOR: {"link2.Izz": {"value": 3e-3, "std": 1e-4}}}
     )
     text = scenario.to_toml()
     assert scenario_from_toml(text) == scenario
@@ -161,6 +162,7 @@ SENSOR = "sensor_changes.camera"
         ({PRIOR: {"foo": {"value": 1.0, "std": 0.1}}}, ["no parameter 'foo'", "or viscous of joint1 to joint6"]),
         ({PRIOR: {"platform": {"mass": {"value": 1.0, "std": 0.1}}}}, ["'platform'", '{"platform.…" = {value']),
         ({PRIOR: {"platform.mass": {"value": 1.0}}}, ["identification.prior.platform.mass.std is missing"]),
+        ({PRIOR: {"platform.mass": {"value": 1.0, "std": 0.0}}}, ["prior.platform.mass.std = 0.0"]),
         ({PRIOR: {"platform.mass": {"value": 1.0, "std": 0.1, "a": 1}}}, ["mass.a'", "platform.mass]: value, std"]),
         (PAYLOAD, ["anchor_std = 0.1: the anchor payload measures no parameter", "payload.mass_std_kg"]),
         ({"payload.Ixx_kg_m2": 100.0}, ["payload: Ixx_kg_m2 100 > Iyy_kg_m2 0.02 + Izz_kg_m2 0.04 kg m2"]),
