@@ -3,6 +3,7 @@
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
+from importlib import resources
 
 import numpy as np
 
@@ -98,6 +99,14 @@ def unseen(seeds=(7, 8)):
     """(record, truth) of noise-free runs of the plant on trajectories that no estimator has seen."""
     runs = [run_plant(quick(), 0, np.zeros(6), trajectory_seed=seed, duration_s=5.0) for seed in seeds]
     return [(record, truth_of(run)) for record, run in runs]
+
+
+def changed_robot_file(path, old, new):
+    """A file of the robot with one passage replaced; returns its path."""
+    text = resources.files("dynamics").joinpath("robots", "rss6.toml").read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    return path
 
 
 def silent(n=1):

@@ -130,7 +130,6 @@ def test_what_is_missing_or_unknown_is_said_before_anything_is_written(folder, t
     for arguments, says in (
         (("--out", tmp_path / "none"), "no run folder"),
         (("--out", tmp_path), "cmmsim validate"),
-        (("--out", folder, "--only", "magic"), "valid: closed_loop"),
         (("--out", folder, "--add", "magic:wand"), "'magic:wand' is no importable module:function"),
     ):
         assert call(*arguments) == 1

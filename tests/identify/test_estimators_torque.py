@@ -84,13 +84,6 @@ def test_jumps_are_averaged_whenever_they_come():
     assert np.abs(found[2:48, 0] - mean).max() < 5e-3
 
 
-def test_without_noise_torque_gives_gains_and_coulomb_friction():
-    """No anchor is told: the torque carries the scale. What is left are filter and sampling, below 2 %."""
-    found = weighted_least_squares(evidence(1, noise=1e-4, instruments=PERFECT)).parameters
-    assert np.allclose(found[64:], truth()[64:], rtol=0.01), found[64:]
-    assert np.allclose(found[52:58], truth()[52:58], rtol=0.02), found[52:58]
-
-
 def test_instruments_remove_the_attenuation_of_errors_in_variables():
     """Equations W x = tau whose columns have errors beside a signal of 1. Closed form: least squares shrinks every
     unknown by 1 / (1 + error^2); its instruments bring it back."""
@@ -156,13 +149,15 @@ def test_the_nearest_admissible_unknowns_have_no_negative_parameter():
 
 
 def test_total_least_squares_and_the_encoder_route_agree_with_least_squares_where_noise_is_small():
-    """On a clean record all routes of the inverse dynamics tell the same gains, within 1 %; angles that no pose has
-    tell none."""
+    """On a clean record all routes of the inverse dynamics tell the same gains, within 1 %, and Coulomb friction; no
+    anchor is told: the torque carries the scale. Angles that no pose has tell none."""
     seen = evidence(1, noise=0.05, instruments=JointInstruments(1e-3, 0.0, 0.0))
     for route in (weighted_least_squares, total_least_squares, instrumental_variables, encoder_route):
         estimate = route(seen)
         assert np.allclose(estimate.parameters[64:], truth()[64:], rtol=0.01), (route, estimate.parameters[64:])
         assert np.all(estimate.std > 0)
+    coulomb = weighted_least_squares(seen).parameters[52:58]
+    assert np.allclose(coulomb, truth()[52:58], rtol=0.02), coulomb
     broken = replace(seen.channels, angle=np.full_like(seen.channels.angle, 2.0))
     with pytest.raises(EstimationError, match="angles give no poses"):
         encoder_route(replace(seen, channels=broken))

@@ -1,5 +1,7 @@
-"""Files of a run: records, their truth and what models do, read back as written, whole or not at all."""
+"""Files of a run: records, their truth and what models do, read back as written, whole or not at all; and records as a
+user might bring them, spoilt in one thing each, or of another experiment or robot: refused by name."""
 
+import json
 import os
 
 import h5py
@@ -7,11 +9,21 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from identify.errors import RecordError
+from dynamics import load_robot
+from dynamics.errors import DynamicsError
+from identify import pipeline
+from identify.errors import EstimationError, RecordError
+from identify.estimation.identification import identify
 from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
 from identify.files.atomic import atomic_path, write_text
-from identify.files.dataset import group_names, write_groups
+from identify.files.dataset import group_names, write_covariance, write_groups
+from identify.files.run_folder import load_result, save_result
 from identify.loop_parameters import NAMES
+from identify.progress import SilentProgress
+from identify.record.checks import check_trajectory
+from identify.record.payload import recorded_payload
+from identify.record.provenance import check_robot
+from identify.record.recorded_run import recorded_run
 from identify.record.recording import (
     build_model_run,
     check_record,
@@ -25,8 +37,19 @@ from identify.record.recording import (
     write_model_runs,
     write_runs,
 )
+from identify.trajectory import load_trajectories
 from tests.identify import synthetic
-from tests.identify.synthetic import SHORT, run_plant, short_run, truth_of
+from tests.identify.synthetic import (
+    SHORT,
+    changed_robot_file,
+    quick,
+    recorded_run_folder,
+    rss6,
+    run_plant,
+    short_run,
+    trajectory,
+    truth_of,
+)
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +99,7 @@ def test_values_of_another_shape_that_are_not_finite_or_times_that_do_not_increa
     assert stated(measured_pose=measured, measured_ok=ok)["measured_ok"].values.sum() == 119
     for values, says in (
         ({"measured_pose": measured}, "is not finite in 1 frames that count as measured, the first is frame 7"),
-        ({"command": np.full((120, 6), np.inf)}, "command"),
-        ({"time": np.zeros(120)}, "time does not increase"),
+        ({"command": np.full((120, 6), np.inf)}, "command is not finite in 120 frames, the first is frame 0"),
         ({"command": np.zeros((120, 5))}, "120"),
         ({"measured_covariance": np.zeros((120, 6))}, "120"),
         ({"measured_ok": np.zeros(119)}, "119"),
@@ -165,3 +187,141 @@ def test_model_runs_read_back_and_a_diverged_model_is_nan(tmp_path):
     assert sorted(runs) == ["excitation", "run01"]
     np.testing.assert_array_equal(poses(runs["excitation"], "identified"), pose)
     np.testing.assert_array_equal(np.isnan(poses(runs["excitation"], "initial")).all(axis=1), [0, 0, 0, 1, 1])
+
+
+def with_values(record, **values):
+    return record.assign({name: (record[name].dims, array) for name, array in values.items()})
+
+
+def alias(record):
+    """A reference with 59 Hz in x, which looks like 1 Hz in 60 frames a second."""
+    t = record["time"].values
+    position, velocity = record["reference_position"].values.copy(), record["reference_velocity"].values.copy()
+    position[:, 0] = 0.005 * np.sin(2 * np.pi * 59 * t)
+    velocity[:, 0] = 0.005 * 2 * np.pi * 59 * np.cos(2 * np.pi * 59 * t)
+    return with_values(record, reference_position=position, reference_velocity=velocity)
+
+
+def standstill(record):
+    still = {name: np.zeros_like(record[name].values) for name in ("reference_velocity", "reference_orientation_rate")}
+    for name in ("reference_position", "reference_orientation"):
+        still[name] = np.repeat(record[name].values[:1], record.sizes["time"], axis=0)
+    return with_values(record, **still)
+
+
+def one_triangle(record):
+    """The covariance of z and gamma in one of its two places, in frame 9, after a frame that was lost."""
+    covariance = record["measured_covariance"].values.copy()
+    covariance[9, 2, 5] = 0.5 * np.sqrt(covariance[9, 2, 2] * covariance[9, 5, 5])
+    return with_values(record, measured_covariance=covariance)
+
+
+def without(record, *names):
+    return record.drop_attrs(deep=False).assign_attrs({k: v for k, v in record.attrs.items() if k not in names})
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "says"),
+    [
+        (lambda r: r.isel(time=slice(0, 0)), RecordError, "the record has no time"),
+        (lambda r: r.isel(time=slice(0, 1)), EstimationError, "1 frames .0.0167 s., at least 120 are needed"),
+        (lambda r: r.assign_coords(time=r["time"].where(r["time"] > 1)), RecordError, "increase after frame 0"),
+        (lambda r: r.drop_isel(time=range(100, 110)), EstimationError, r"frames 99 and 100 are 11.000 periods"),
+        (lambda r: r.assign(measured_ok=r["measured_ok"] * (r["time"] > 1.5)), EstimationError, "29 of 120 frames"),
+        (lambda r: r.assign(measured_covariance=0 * r["measured_covariance"]), EstimationError, "not positive def"),
+        (one_triangle, EstimationError, r"in 1 frames: in frame 9 its entry .z, gamma. is 7.5e-11 and .gamma, z. is 0"),
+        (lambda r: without(r, "scenario"), RecordError, r"no attribute scenario, .*to_toml\(\), .*build_record"),
+        (lambda r: r.assign_attrs(scenario=7), RecordError, "attribute scenario is 7, must be TOML text"),
+        (lambda r: r.assign_attrs(scenario="paper"), RecordError, "attribute scenario is not valid TOML"),
+        (lambda r: r.assign_attrs(scenario="description = 'x'"), RecordError, "attribute scenario: name is missing"),
+        (lambda r: r.assign_attrs(seed="abc"), RecordError, "attribute seed is 'abc', must be a whole number >= 0"),
+        (lambda r: r.assign_attrs(frame_rate_hz=30.0), EstimationError, "frame_rate_hz is 30.0, and timing.* is 60"),
+        (standstill, EstimationError, "same pose in every frame: nothing was asked to move"),
+        (alias, EstimationError, "the reference's x travels 0.01, .*harmonics above half of 60 Hz"),
+        (lambda r: r.assign(reference_velocity=1e3 * r["reference_velocity"]), EstimationError, "not its derivative"),
+        (lambda r: r.assign(command=r["command"] * (r["joint"] != 3)), EstimationError, "command of joint 3 is 0 in"),
+        (lambda r: r.assign(measured_position=0 * r["measured_position"] + 1), EstimationError, "x is 1 in every f"),
+        (lambda r: r.assign(measured_position=1e3 * r["measured_position"]), DynamicsError, "cannot reach"),
+    ],
+)
+def test_what_is_wrong_with_a_record_is_said(record, spoil, error, says):
+    with pytest.raises(error, match=says):
+        identify(spoil(record), rss6(), SHORT)
+
+
+def test_what_rounding_leaves_of_symmetry_is_no_fault(record):
+    """A covariance J C J^T of numbers of different size, computed in single precision."""
+    rng = np.random.default_rng(0)
+    units = np.repeat([1e-3, 1.0], 3)
+    jacobian = (units[:, None] * rng.normal(size=(6, 6))).astype(np.float32)
+    drawn = jacobian * np.float32(1e-5)
+    covariance = np.float32(drawn @ drawn.T).astype(float) * (1 + 1e-9 * rng.normal(size=(6, 6)))
+    assert np.abs(covariance - covariance.T).max() > 0
+    stated = np.broadcast_to(covariance, record["measured_covariance"].shape)
+    taken = recorded_run(with_values(record, measured_covariance=stated), rss6(), SHORT).covariance
+    np.testing.assert_allclose(taken, covariance)
+
+
+def test_a_load_that_no_body_has_is_refused_and_its_numbers_are_shown_as_plain_ones(record):
+    load = {"payload_mass": 8.0, "payload_Ixx": 0.02, "payload_Iyy": 0.02, "payload_Izz": 0.04}
+    assert recorded_payload(record.assign_attrs(load))[0].sum() == pytest.approx(8.08)
+    with pytest.raises(RecordError, match=r"attribute payload_Ixx 100 > .*0.02 .*0.04"):
+        recorded_payload(record.assign_attrs(load | {"payload_Ixx": 100.0}))
+    with pytest.raises(RecordError, match=r"attribute payload_mass is -8.0, must be .*kg"):
+        recorded_payload(record.assign_attrs(load | {"payload_mass": np.float64(-8.0)}))
+
+
+def test_what_a_record_need_not_have_is_no_fault(record):
+    """The frame rate of its scenario once more, more than one way to go; and, of a real robot, a seed."""
+    one_way = {
+        "reference_position": record["reference_position"].values * [1, 0, 0] + [0, 0, 0.2],
+        "reference_velocity": record["reference_velocity"].values * [1, 0, 0],
+    }
+    recorded_run(with_values(without(record, "frame_rate_hz"), **one_way), rss6(), SHORT)
+    once = SHORT.with_overrides({"identification.method": "command_driven"})
+    assert np.all(np.isfinite(identify(without(record, "seed"), rss6(), once).estimate))
+
+
+def test_a_record_of_another_trajectory_is_refused_where_it_differs_most(record, recorded_folder):
+    check_trajectory(record, trajectory(0), SHORT)
+    planned = load_trajectories(recorded_folder.trajectories).excitation
+    check_trajectory(read(recorded_folder.experiment), planned, SHORT)
+    gap = np.abs(trajectory(0).pose(record["time"].values) - trajectory(1).pose(record["time"].values))
+    frame, axis = np.unravel_index(gap.argmax(), gap.shape)
+    assert axis >= 3, "an angle differs most"
+    with pytest.raises(EstimationError, match=rf"differs by {gap.max():.3g} rad at t = {frame / 60:.2f} s"):
+        check_trajectory(record, trajectory(1), SHORT)
+    with pytest.raises(EstimationError, match=r"has 120 frames, and the scenario asks for 600 .*duration_s = 10 s"):
+        check_trajectory(record, trajectory(0), quick())
+
+
+def test_a_record_of_another_robot_is_refused_be_it_by_its_cranks_or_without_geometry_by_its_name(record, tmp_path):
+    path = changed_robot_file(tmp_path / "rss6.toml", "crank_length = 0.06\n", "crank_length = 0.062\n")
+    assert load_robot(path).name == "rss6"
+    with pytest.raises(EstimationError, match=r"crank_length was 0.06 when it was made, the robot file says 0.062"):
+        identify(record, load_robot(path), SHORT)
+    bare = without(record, "robot_geometry")
+    for one in (record, bare):
+        check_robot(one, rss6())
+    with pytest.raises(EstimationError, match="is of robot 'rss7', not of 'rss6'"):
+        check_robot(bare.assign_attrs(robot="rss7"), rss6())
+    for geometry, says in (("[1]", "no JSON object"), (json.dumps({"base_joints": [1]}), r"shape \(1,\), expected")):
+        with pytest.raises(RecordError, match=says):
+            check_robot(record.assign_attrs(robot_geometry=geometry), rss6())
+
+
+@pytest.mark.parametrize("stage", [pipeline.identify, pipeline.validate])
+def test_a_stage_refuses_a_record_that_is_not_of_its_folder(tmp_path, stage):
+    run = recorded_run_folder(tmp_path, chosen=trajectory(1))
+    write_covariance(run.covariance, NAMES, np.eye(len(NAMES)))
+    save_result(run.result, {})
+    with pytest.raises(EstimationError, match=rf"{run.experiment}: the record's reference is not the exciting"):
+        stage(run.path, SilentProgress())
+    assert load_result(run.result) == {}
+
+
+def test_a_run_too_short_to_identify_from_is_refused_before_anything_is_computed(tmp_path):
+    short = quick(**{"excitation.duration_s": 0.5})
+    with pytest.raises(EstimationError, match=r"duration_s gives 30 frames .0.5 s., at least 120 are needed"):
+        pipeline.excite(short, 0, tmp_path / "new", SilentProgress())
+    assert not (tmp_path / "new").exists()
