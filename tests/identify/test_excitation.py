@@ -1,5 +1,6 @@
 """The trajectories of a run: what they are, what is chosen, and what it has to keep by robot and sensor themselves."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -23,6 +24,7 @@ from identify.trajectory import (
     random_trajectory,
     save_trajectories,
 )
+from tests.identify.commands import refusal
 from tests.identify.synthetic import Stages, rss6
 
 HOME = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
@@ -69,17 +71,12 @@ def test_amplitude_fills_the_box(seed):
     np.testing.assert_allclose(largest, [0.01] * 3 + [0.04] * 3, rtol=1e-3)
 
 
-def test_a_trajectory_has_its_fundamentals_period_and_its_seeds_frozen_coefficients():
+def test_a_trajectory_has_its_fundamentals_period_and_frozen_coefficients_and_wrong_ones_are_refused():
     trajectory, t = random_one(4), np.linspace(0, 10, 50)
     np.testing.assert_allclose(trajectory.pose(t + 10), trajectory.pose(t), atol=1e-12)
-    np.testing.assert_array_equal(random_one(4).sine, trajectory.sine)
-    assert not np.allclose(random_one(5).sine, trajectory.sine)
     assert (trajectory.pose(0.3).shape, trajectory.pose_acceleration(np.zeros(7)).shape) == ((6,), (7, 6))
     with pytest.raises(ValueError, match="read-only"):
         trajectory.sine[0, 0] = 1.0
-
-
-def test_wrong_shapes_and_too_few_harmonics_are_refused():
     with pytest.raises(TrajectoryError, match=r"\(5, 2\)"):
         FourierTrajectory(0.1, np.zeros((5, 2)), np.zeros((6, 2)), HOME)
     with pytest.raises(TrajectoryError, match="finite"):
@@ -116,12 +113,11 @@ def designed(seed=3, **overrides):
     return design_trajectories(rss6(), quick(**overrides), seed)
 
 
-def test_best_candidate_is_chosen_and_a_run_too_short_to_show_every_parameter_has_no_index():
+def test_a_run_too_short_to_show_every_parameter_has_no_index():
     """Six poses give 36 equations for the 37 base parameters, seven give enough."""
     chosen, alone = designed(), designed(candidates=1)
-    assert chosen.observability_index >= chosen.median_index
     assert alone.observability_index == alone.first_index == pytest.approx(chosen.first_index, rel=1e-9)
-    assert chosen.observability_index > alone.observability_index
+    assert chosen.observability_index > max(alone.observability_index, chosen.median_index)
     assert designed(duration_s=0.6).observability_index == 0.0
     assert designed(duration_s=0.7).observability_index > 0.0
 
@@ -178,32 +174,22 @@ def test_worst_is_what_the_robot_says(robot, seed):
     assert (worst["travel"].who, worst["travel"].time_s) == (f"leg {leg + 1}", t[row])
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "message"),
-    [
+def test_broken_limit_is_named_with_leg_value_limit_and_time_and_no_feasible_start_with_the_reason(robot):
+    for key, value, message in (
         ("travel_margin_rad", 0.8, r"travel of leg \d is 0\.\d+ rad at t = \d+\.\d+ s, limit 0\.1948 rad"),
         ("max_joint_velocity_rad_s", 0.1, r"velocity of leg \d is 0\.\d+ rad/s at t = \d+\.\d+ s, limit 0\.1 rad/s"),
         ("position_amplitude_m", 0.005, r"box of [xyz] is 0\.01 m at t = \d+\.\d+ s, limit 0\.005 m"),
-    ],
-)
-def test_broken_limit_is_named_with_leg_value_limit_and_time(robot, key, value, message):
-    with pytest.raises(TrajectoryError, match=message):
-        MotionConstraints(robot, quick(**{key: value})).check(random_one(0), np.arange(400) / 40, 1e-3)
-
-
-@pytest.mark.parametrize(
-    ("overrides", "reason"),
-    [
+    ):
+        with pytest.raises(TrajectoryError, match=message):
+            MotionConstraints(robot, quick(**{key: value})).check(random_one(0), np.arange(400) / 40, 1e-3)
+    for overrides, reason in (
         ({"max_joint_velocity_rad_s": 0.01}, r"only 0 of 50 .*velocity of leg \d"),
         ({"position_amplitude_m": 0.06}, r"only 0 of 50 .*±0\.06 m.*leg \d"),
         ({"travel_margin_rad": 0.99, "method": "gradient"}, r"leg \d .*limit 0\.0048"),
         ({"travel_margin_rad": 1.0}, r"travel_margin_rad = 1 rad leaves nothing of the travel limit 0\.9948"),
-    ],
-)
-def test_no_feasible_start_is_one_line_with_the_reason(overrides, reason):
-    with pytest.raises(TrajectoryError, match=reason) as error:
-        designed(seed=0, candidates=1, **overrides)
-    assert "\n" not in str(error.value)
+    ):
+        scenario = quick(candidates=1, **overrides)
+        assert re.search(reason, refusal(TrajectoryError, design_trajectories, robot, scenario, 0))
 
 
 def test_run_that_cannot_end_at_rest_is_refused():
@@ -212,7 +198,7 @@ def test_run_that_cannot_end_at_rest_is_refused():
             check_periods(quick(duration_s=duration_s, method="gradient"))
 
 
-def test_a_criterion_of_ones_own_is_given_as_module_function(tmp_path, monkeypatch, robot):
+def test_the_best_candidate_is_chosen_by_a_criterion_of_ones_own(tmp_path, monkeypatch, robot):
     """Of all candidates the smallest is chosen by a function of the user's that is named nowhere else."""
     (tmp_path / "own_criterion.py").write_text(
         "import casadi as ca\n"

@@ -135,7 +135,6 @@ def test_scenario_is_that_of_a_file_and_what_is_none_is_named(tmp_path):
 
 PRIOR = "identification.prior"
 PAYLOAD = {"identification.scale_anchor": "payload", "identification.anchor_std": 0.1}
-SENSOR = "sensor_changes.camera"
 
 
 @pytest.mark.parametrize(
@@ -168,9 +167,8 @@ SENSOR = "sensor_changes.camera"
         ({"plant.friction": "smoothed"}, ["smoothing_velocity_rad_s"]),
         ({"plant.geometry_error_m": 2e-3}, ["plant.geometry_error_m = 0.002 [m]: input should be less than or equal"]),
         ({"timing.latency_s": -1.0, "servo.kq": 1.0}, ["timing.latency_s = -1.0 [s]", "servo.kq"]),  # all at once
-        ({f"{SENSOR}.drk_noise": 1.0}, ["camera.drk_noise", "dark_noise"]),
-        ({SENSOR: 1.0}, ["camera = 1.0 is a section", "dark_noise"]),
-        ({f"{SENSOR}.dark_noise": "much"}, ["camera.dark_noise", "'much'"]),
+        ({"sensor_changes.camera.drk_noise": 1.0}, ["camera.drk_noise", "dark_noise"]),
+        ({"sensor_changes.camera": 1.0}, ["camera = 1.0 is a section", "dark_noise"]),
         ({"sensor_changes.based_on": "ctrack780_29hz"}, ["based_on", "ctrack780_29hz", "another sensor"]),
     ],
 )
