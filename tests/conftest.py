@@ -15,6 +15,8 @@ import pytest
 from identify.accuracy.figure import PROPERTY
 from identify.files.atomic import write_text
 
+pytest_plugins = "pytester"
+
 # Two workers with two BLAS threads each on two cores are slower than two with one.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

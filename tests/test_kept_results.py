@@ -6,8 +6,6 @@ import platform
 
 import pytest
 
-pytest_plugins = "pytester"
-
 TESTS = """
 import pytest
 

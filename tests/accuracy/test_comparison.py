@@ -5,8 +5,6 @@ import json
 import numpy as np
 import pytest
 
-pytest_plugins = "pytester"
-
 BEFORE = """
 def test_sensor(accuracy):
     accuracy.record("bias", 0.002, unit="px", limit=0.003)

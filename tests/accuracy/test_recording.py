@@ -6,8 +6,6 @@ from scipy import stats
 
 from identify.accuracy.figure import mean_interval
 
-pytest_plugins = "pytester"
-
 
 def outcomes(project, calls):
     """Outcome of each call of the fixture in a test of its own: 'passed', or the lines of its failure."""

@@ -7,8 +7,6 @@ import pytest
 
 from identify.accuracy.__main__ import main
 
-pytest_plugins = "pytester"
-
 FIGURES = """
 def test_sensor(accuracy):
     accuracy.record("bias", {bias}, unit="px", limit=0.003)

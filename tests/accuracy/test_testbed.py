@@ -9,8 +9,6 @@ import cmmsim  # noqa: F401  loaded once, not by each project
 import dynamics  # noqa: F401
 from identify import Scenario  # noqa: F401
 
-pytest_plugins = "pytester"
-
 SEEDS = """
 @pytest.mark.parametrize("number", range(3))
 def test_it(accuracy, cmmsim_seed, number):
