@@ -65,25 +65,20 @@ if TYPE_CHECKING:
     from cmmsim.tracker import Tracker as Tracker
 
 _HOME = {
-    "load_sensor": "cmmsim.sensor",
-    "Sensor": "cmmsim.sensor",
+    **dict.fromkeys(("load_sensor", "Sensor"), "cmmsim.sensor"),
     "built_in_names": "cmmsim.files.sensor_file",
     "Measurement": "cmmsim.pose_estimation.estimator",
     "StereoFrame": "cmmsim.radiometry.images",
     "Taught": "cmmsim.pose_estimation.taught",
     "require_opengl": "cmmsim.imaging.pyrender_renderer",
-    "measure_frame": "cmmsim.pose_estimation.estimator",
-    "PoseEstimator": "cmmsim.pose_estimation.estimator",
+    **dict.fromkeys(("measure_frame", "PoseEstimator"), "cmmsim.pose_estimation.estimator"),
     "Tracker": "cmmsim.tracker",
-    "pose_to_transform": "cmmsim.geometry.pose",
-    "transform_to_pose": "cmmsim.geometry.pose",
+    **dict.fromkeys(("pose_to_transform", "transform_to_pose"), "cmmsim.geometry.pose"),
     "PinholeCamera": "cmmsim.geometry.camera",
     "StereoRig": "cmmsim.geometry.stereo_rig",
-    "rod": "cmmsim.imaging.scene",
-    "rod_transform": "cmmsim.imaging.scene",
+    **dict.fromkeys(("rod", "rod_transform"), "cmmsim.imaging.scene"),
     "FaultGenerator": "cmmsim.faults",
-    "Fault": "cmmsim.fault_images",
-    "FaultyImages": "cmmsim.fault_images",
+    **dict.fromkeys(("Fault", "FaultyImages"), "cmmsim.fault_images"),
     "fault_bodies": "cmmsim.faults",
 }
 

@@ -1,7 +1,5 @@
 """What users pass as arguments and in TOML files: taken as it is meant, or refused with what was got and wanted."""
 
-from __future__ import annotations
-
 import tomllib
 from copy import deepcopy
 from functools import lru_cache

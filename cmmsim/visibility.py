@@ -4,8 +4,6 @@ A sticker can be looked for when it lies in both images, a detection window away
 sees it at grazing incidence. What stands between it and a camera is not asked.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """From pairs of image files to what both cameras saw of the board, as the adjustment takes it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -123,7 +121,7 @@ class PairView:
             f"{name}: {side}" for name, side in zip(SIDES, self.sides, strict=True) if isinstance(side, str)
         )
 
-    def without(self, side: int, reason: str) -> PairView:
+    def without(self, side: int, reason: str) -> "PairView":
         """The pair with one side (0 left, 1 right) given up."""
         return replace(self, left=reason) if side == 0 else replace(self, right=reason)
 
@@ -163,7 +161,7 @@ class Sightings:
     point: NDArray[np.int_]
     pixels: Array
 
-    def shifted(self, by: Array) -> Sightings:
+    def shifted(self, by: Array) -> "Sightings":
         """The sightings with their pixels moved by (m, 2)."""
         return replace(self, pixels=self.pixels + by)
 

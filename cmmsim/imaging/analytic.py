@@ -6,8 +6,6 @@ against `pyrender`: solids are convex hulls, ordered by the depth of their middl
 lines; in a pixel with the edges of two layers the covered shares are taken as independent.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
@@ -72,7 +70,7 @@ class _AnalyticScene:
         corners = np.array([views[k].corner for k in group], dtype=float)
         lay_layers(images, np.array(group), corners, self._outlined(view, hiding), lines, discs)
 
-    def _discs(self, view: View) -> tuple[Discs, list[int]]:
+    def _discs(self, view: View) -> "tuple[Discs, list[int]]":
         """The discs turned towards a view's camera, far to near and outer before inner; and the solids before them."""
         from cmmsim.geometry.disc_kernels import place_discs, probe_discs
         from cmmsim.imaging.kernels import Discs
@@ -92,7 +90,7 @@ class _AnalyticScene:
         extents = np.linalg.norm(shapes, axis=2)
         return Discs(pixels, shapes, extents, self._disc_levels[kept], behind), list(hidden_by)
 
-    def _outlined(self, view: View, hiding: list[int]) -> Solids:
+    def _outlined(self, view: View, hiding: list[int]) -> "Solids":
         """The solids in view from far to near; ``hiding``: those whose cover is kept, in the order of their slots."""
         from cmmsim.imaging.kernels import Solids
 

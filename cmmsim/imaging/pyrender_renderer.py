@@ -10,8 +10,6 @@ its ground, see ``LaidSolids``.
 Pieces of the atlas are handed over as they are ready, so that OpenGL fills them while the next ones are prepared.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import weakref
@@ -63,7 +61,7 @@ def require_opengl() -> None:
 
 
 @lru_cache(maxsize=1)
-def _shared_atlas() -> _Atlas:
+def _shared_atlas() -> "_Atlas":
     """The one renderer of this process; making another would leak memory."""
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
@@ -215,7 +213,7 @@ class _Atlas:
         primitive._add_to_context()
         return primitive
 
-    def _frame_buffer(self, width: int, height: int) -> _FrameBuffer:
+    def _frame_buffer(self, width: int, height: int) -> "_FrameBuffer":
         if (width, height) not in self._frame_buffers:
             if len(self._frame_buffers) >= KEPT_FRAME_BUFFERS:
                 self._frame_buffers.pop(next(iter(self._frame_buffers))).delete()

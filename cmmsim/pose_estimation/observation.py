@@ -74,14 +74,8 @@ class StickerObservation:
 
     def selected(self, keep: NDArray[np.bool_]) -> StickerObservation:
         """The observation with only some of its stickers."""
-        return StickerObservation(
-            self.index[keep],
-            self.left_pixels[keep],
-            self.right_pixels[keep],
-            self.points[keep],
-            self.covariances[keep],
-            None if self.outlines is None else self.outlines.selected(keep),
-        )
+        kept = {name: values[keep] for name, values in vars(self).items() if name != "outlines"}
+        return StickerObservation(**kept, outlines=None if self.outlines is None else self.outlines.selected(keep))
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from identify.commands import new_folder
 from identify.commands.calibrate import CALIBRATE_HELP, calibrate
 from identify.commands.comparisons import compare_excitation, estimators, variation
 from identify.commands.robot import base_parameters, export, verify_model, workspace
@@ -118,9 +119,7 @@ app = typer.Typer(
 ScenarioArgument = Annotated[
     str, typer.Argument(help=f"Built-in scenario ({', '.join(scenario_names())}) or path of a TOML file.")
 ]
-NewFolder = Annotated[
-    Path | None, typer.Option("--out", help="Output folder, new or empty.", show_default="runs/SCENARIO-SEED")
-]
+NewFolder = Annotated[Path | None, new_folder("runs/SCENARIO-SEED")]
 RunFolderOption = Annotated[Path, typer.Option("--out", help="Folder of the run, as the stage before left it.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness: trajectories and sensor noise.")]
 Settings = Annotated[

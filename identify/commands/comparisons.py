@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from identify.commands import repeatable
 from identify.files.run_folder import RunFolder, save_files
 from identify.progress import Progress, print_table, terminal_progress
 from identify.scenario import Scenario, load_scenario
@@ -38,12 +39,10 @@ PAPER = "the paper, with its own robot and geometry: index 0.38 at the start, 1.
 def estimators(
     out: Annotated[Path, typer.Option("--out", help="Folder of a whole run: cmmsim run.")],
     only: Annotated[
-        list[str] | None,
-        typer.Option(help="Name of an estimator, or module:function of one's own; repeatable.", show_default="all"),
+        list[str] | None, repeatable("Name of an estimator, or module:function of one's own", "all")
     ] = None,
     add: Annotated[
-        list[str] | None,
-        typer.Option(help="Estimator of one's own beside these, as module:function; repeatable.", show_default="none"),
+        list[str] | None, repeatable("Estimator of one's own beside these, as module:function", "none")
     ] = None,
     torque_noise: Annotated[float, typer.Option(min=0, help="Standard deviation of a measured torque, N m.")] = 0.02,
     encoder_noise: Annotated[float, typer.Option(min=0, help="Standard deviation of a joint angle, rad.")] = 1e-5,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from identify.commands import new_folder
 from identify.errors import OutputFolderError, VerificationError
 from identify.files.atomic import write_text
 from identify.files.run_folder import new_run_folder, save_files, save_result
@@ -78,9 +79,7 @@ def _groups(found: "BaseParameters", singular: int, angle: float) -> dict[str, A
 
 def workspace(
     robot: RobotArgument = "rss6",
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Output folder, new or empty.", show_default="runs/workspace-ROBOT")
-    ] = None,
+    out: Annotated[Path | None, new_folder("runs/workspace-ROBOT")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Map travel, reach and conditioning around home: writes workspace.json, travel.png and conditioning.png."""
@@ -185,9 +184,7 @@ def _changes(robot: "Robot", parameters: "Array") -> list[str]:
 
 def verify_model(
     robot: RobotArgument = "rss6",
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Output folder, new or empty.", show_default="runs/verify-ROBOT")
-    ] = None,
+    out: Annotated[Path | None, new_folder("runs/verify-ROBOT")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Compare the model with MuJoCo in the paper's loop (figure 7): writes verification.json and figure8.png."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from identify.commands import new_folder, repeatable
 from identify.errors import VerificationError
 from identify.files.run_folder import new_run_folder, save_files
 from identify.progress import print_table, terminal_progress
@@ -25,10 +26,7 @@ DEFAULT_LIMIT_UM = 50.0  # published static limit of the C-Track 780
 
 def acceptance(
     sensor: SensorArgument = "ctrack780",
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Output folder, new or empty.", show_default="runs/acceptance-SENSOR-SEED"),
-    ] = None,
+    out: Annotated[Path | None, new_folder("runs/acceptance-SENSOR-SEED")] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of all sensor noise.")] = 0,
     renderer: Annotated[
         str | None, typer.Option(help="pyrender, analytic or auto.", show_default="what the sensor file says")
@@ -110,25 +108,15 @@ RADII_PX, NOISES_PERCENT, TILTS_DEG = (2.5, 5.0, 10.0), (0.2, 1.0, 5.0), (0.0, 3
 
 def detectors(
     sensor: Annotated[str, typer.Argument(help="Built-in sensor (ctrack780) or path of a TOML file.")] = "ctrack780",
-    radius: Annotated[
-        list[float] | None,
-        typer.Option(help="Long half axis of the disc, 1 to 50 px; repeatable.", show_default="2.5, 5, 10"),
-    ] = None,
+    radius: Annotated[list[float] | None, repeatable("Long half axis of the disc, 1 to 50 px", "2.5, 5, 10")] = None,
     noise: Annotated[
-        list[float] | None,
-        typer.Option(help="Noise half-way up the edge, % of the contrast; repeatable.", show_default="0.2, 1, 5"),
+        list[float] | None, repeatable("Noise half-way up the edge, % of the contrast", "0.2, 1, 5")
     ] = None,
-    tilt: Annotated[
-        list[float] | None, typer.Option(help="Tilt of the disc, degrees; repeatable.", show_default="0, 30, 60")
-    ] = None,
-    psf: Annotated[
-        list[float] | None, typer.Option(help="Sigma of the point spread, px; repeatable.", show_default="the sensor's")
-    ] = None,
+    tilt: Annotated[list[float] | None, repeatable("Tilt of the disc, degrees", "0, 30, 60")] = None,
+    psf: Annotated[list[float] | None, repeatable("Sigma of the point spread, px", "the sensor's")] = None,
     draws: Annotated[int, typer.Option(min=2, help="Discs drawn for each row of the table.")] = 400,
     seed: Annotated[int, typer.Option(min=0, help="Seed of places, directions and noise.")] = 0,
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Output folder, new or empty.", show_default="runs/detectors-SENSOR")
-    ] = None,
+    out: Annotated[Path | None, new_folder("runs/detectors-SENSOR")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no table.")] = False,
 ) -> None:
     """Compare the detectors of sticker centres with the Cramer-Rao bound: writes detectors.csv, .json and .png.

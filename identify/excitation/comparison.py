@@ -82,21 +82,11 @@ def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progr
             information = float(np.exp(log_information(robot, scenario, known, trajectory)))
         except TrajectoryError:
             information = None
-        entries.append(
-            Entry(
-                method,
-                trajectory,
-                float(np.exp(found.log_value)),
-                observability_index(index, found.z),
-                information,
-                seconds,
-                found.evaluations,
-                found.gradients,
-                found.iterations,
-                found.reason,
-                tuple(problem.constraints.worst(trajectory, times)),
-            )
-        )
+        value, observability = float(np.exp(found.log_value)), observability_index(index, found.z)
+        counts = found.evaluations, found.gradients, found.iterations
+        worst = tuple(problem.constraints.worst(trajectory, times))
+        entry = Entry(method, trajectory, value, observability, information, seconds, *counts, found.reason, worst)
+        entries.append(entry)
     return Comparison(settings.criterion, seed, count, prepared, tuple(entries))
 
 

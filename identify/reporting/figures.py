@@ -25,6 +25,17 @@ BAND = 2.0
 BAND_NAME = f"predicted ± {BAND:g} std"
 
 
+def panel_grid(count: int, width: float, height: float, above: float = 0.0, **shared: Any) -> tuple[Figure, list[Axes]]:
+    """A figure with so many panels of that size, inches, three beside each other, and room above them for a title."""
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(width * columns, above + height * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, **shared).ravel().tolist()
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    return figure, panels[:count]
+
+
 class Curve(NamedTuple):
     """Values (N,) over time in the unit of their panel, as dots or as a line."""
 

@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from identify.estimation.explanation import SIGNIFICANT, SUSPICIOUS
 from identify.files.run_folder import rms_row
 
@@ -51,14 +53,13 @@ def explanation_goals(result: dict[str, Any]) -> list[Goal]:
 
 
 def _validation(result: dict[str, Any]) -> list[Goal]:
-    rows = [rms_row(run["true"]) for run in result.get("validation", [])]
-    if not rows:
+    rows = np.array([rms_row(run["true"]) for run in result.get("validation", [])])
+    if not len(rows):
         return []
-    position, orientation = [v for row in rows for v in row[:3]], [v for row in rows for v in row[3:]]
     text = f"identified model against the true plant, {len(rows)} unseen trajectories"
     return [
-        Goal("unseen position", _worst(position), "<=", VALIDATION_UM, "um", text),
-        Goal("unseen orientation", _worst(orientation), "<=", VALIDATION_URAD, "urad", text),
+        Goal("unseen position", float(rows[:, :3].max()), "<=", VALIDATION_UM, "um", text),
+        Goal("unseen orientation", float(rows[:, 3:].max()), "<=", VALIDATION_URAD, "urad", text),
     ]
 
 
@@ -66,11 +67,11 @@ def _sensor(result: dict[str, Any]) -> list[Goal]:
     sensor = result.get("sensor")
     if not sensor:
         return []
-    row = rms_row(sensor)
+    row = np.array(rms_row(sensor))
     text = f"measured pose against truth, {sensor['frames']} frames"
     return [
-        Goal("sensor position", _worst(row[:3]), "<=", SENSOR_UM, "um", text),
-        Goal("sensor orientation", _worst(row[3:]), "<=", SENSOR_URAD, "urad", text),
+        Goal("sensor position", float(row[:3].max()), "<=", SENSOR_UM, "um", text),
+        Goal("sensor orientation", float(row[3:].max()), "<=", SENSOR_URAD, "urad", text),
         Goal("lost frames", float(sensor["lost_frames"]), "<=", 0.0, "", text),
     ]
 
@@ -96,7 +97,3 @@ def within_tolerance(parameter: dict[str, Any]) -> bool:
         return False
     error, std = abs(parameter["estimate"] - parameter["true"]), parameter["std"]
     return error <= PARAMETER_FRACTION * abs(parameter["true"]) or (std is not None and error <= PARAMETER_STDS * std)
-
-
-def _worst(values: list[float]) -> float:
-    return math.nan if any(math.isnan(value) for value in values) else max(values)

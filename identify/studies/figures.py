@@ -13,12 +13,15 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 
 from identify.arrays import Array
 from identify.files.atomic import write_figure
+from identify.reporting.figures import panel_grid
 from identify.studies.study_file import Law, Study
 from identify.studies.table import labelled
 from identify.studies.theory import BAND_CONFIDENCE as BANDS
 from identify.studies.theory import CONFIDENCE as LAWS
 from identify.studies.theory import Verdict, law_data, point_statistics, with_data
 
+PANEL = (5.0, 3.8)
+"""Size of a panel, inches."""
 LEAST_SPAN = 2.0
 """Smallest ratio of the ends of a logarithmic axis: small differences shall look small."""
 LETTERS_PER_INCH = 10.0
@@ -47,7 +50,7 @@ def draw(folder: Path, study: Study, done: pd.DataFrame, shown: list[str], verdi
 
 def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str]) -> Figure:
     """Rms of each figure against one factor with its band, a curve for each setting of the other factors."""
-    figure, panels = _panels(len(shown))
+    figure, panels = panel_grid(len(shown), *PANEL)
     others = [other for other in study.factors if other != path]
     for axes, name in zip(panels, shown, strict=True):
         have = done.dropna(subset=[name])
@@ -71,7 +74,7 @@ def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str])
 
 def map_figure(study: Study, done: pd.DataFrame, paths: tuple[str, str], shown: list[str]) -> Figure:
     """Rms of each figure over two factors, over all settings of the others."""
-    figure, panels = _panels(len(shown))
+    figure, panels = panel_grid(len(shown), *PANEL)
     for axes, name in zip(panels, shown, strict=True):
         squares = done.assign(square=done[name] ** 2)
         table = np.sqrt(squares.pivot_table("square", paths[0], paths[1], "mean", sort=False))
@@ -92,7 +95,7 @@ def map_figure(study: Study, done: pd.DataFrame, paths: tuple[str, str], shown: 
 
 def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]]) -> Figure:
     """What each law speaks of against its factor, on logarithmic axes, with the power that it states."""
-    figure, panels = _panels(len(laws))
+    figure, panels = panel_grid(len(laws), *PANEL)
     for axes, (law, verdict) in zip(panels, laws, strict=True):
         factor = str(law.factor)
         others = [path for path in study.factors if path != factor and factor in study.factors]
@@ -116,16 +119,6 @@ def _levels(study: Study, rows: pd.DataFrame, factor: str) -> pd.Series:
     if factor in study.factors or not study.factors:
         return rows[factor]
     return rows.groupby(list(study.factors))[factor].transform("mean")
-
-
-def _panels(count: int) -> tuple[Figure, list[Axes]]:
-    columns = min(count, 3)
-    rows = -(-count // columns)
-    figure = Figure(figsize=(5.0 * columns, 3.8 * rows), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel().tolist()
-    for axes in panels[count:]:
-        axes.set_visible(False)
-    return figure, panels[:count]
 
 
 def _title(figure: Figure, text: str) -> None:

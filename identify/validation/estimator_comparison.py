@@ -158,23 +158,8 @@ def _score(name: str, estimator: Estimator, evidence: Evidence, asked: Examinati
         nothing = (np.nan, np.nan, np.nan, np.nan, np.nan, np.nan)
         return Score(name, estimator.title, estimator.uses, *nothing, 0, 0, f"failed: {error}")
     groups, gains = asked.group_errors(found.parameters), found.parameters[64:] / asked.true[64:] - 1
-    position_um, orientation_urad = asked.pose_distance(found.parameters)
-    return Score(
-        name=name,
-        title=estimator.title,
-        uses=estimator.uses,
-        group_distance=_rms(groups),
-        group_median=float(np.median(np.abs(groups))),
-        gain_distance=_rms(gains),
-        position_um=position_um,
-        orientation_urad=orientation_urad,
-        seconds=found.seconds,
-        iterations=found.iterations,
-        evaluations=found.evaluations,
-        note=found.note,
-        parameters=found.parameters,
-        std=found.std,
-    )
+    distances = (_rms(groups), float(np.median(np.abs(groups))), _rms(gains), *asked.pose_distance(found.parameters))
+    return Score(name, estimator.title, estimator.uses, *distances, **vars(found))
 
 
 def _rms(values: Array) -> float:

@@ -16,6 +16,7 @@ from cmmsim.calibration import Calibration
 from cmmsim.calibration.sightings import SIDES
 from cmmsim.detector_leaderboard import Condition, Score
 from cmmsim.geometry.pose import apply, invert
+from identify.reporting.figures import panel_grid
 from identify.verification.acceptance import AcceptanceRun
 
 EDGES = [(a, b) for a in range(8) for b in range(a) if np.sum(CORNERS[a] != CORNERS[b]) == 1]
@@ -23,8 +24,6 @@ ARROW_SHARE = 0.06
 """Of the image width: length of an arrow for a residual of three sigma."""
 GRID = 25
 """Points along the width of the image at which distortion is drawn."""
-COLUMNS = 3
-"""Panels beside each other in the figure of the detectors."""
 
 
 def acceptance_figures(run: AcceptanceRun) -> dict[str, Figure]:
@@ -218,18 +217,13 @@ def _image_panels(found: Calibration, title: str) -> tuple[Figure, list[Axes]]:
 def detectors_figure(scores: Sequence[Score], at_work: Condition) -> Figure:
     """Rms error over noise, logarithmic; one panel for each radius, tilt and point spread, the working point first."""
     views = list(dict.fromkeys(_view(score.condition) for score in scores))
-    columns = min(COLUMNS, len(views))
-    rows = -(-len(views) // columns)
-    figure = Figure(figsize=(4.5 * columns, 0.8 + 3.2 * rows), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False, sharey=True).flat
-    for view, axes in zip(views, panels, strict=False):
+    figure, panels = panel_grid(len(views), 4.5, 3.2, above=0.8, sharey=True)
+    for view, axes in zip(views, panels, strict=True):
         _condition_panel(axes, [score for score in scores if _view(score.condition) == view])
         radius, tilt, psf = view
         work = "working point: " if view == _view(at_work) else ""
         seen = f"radius {radius:.3g} px, tilt {np.degrees(tilt):.0f}°, σ_psf {psf:.2g} px"
         axes.set_title(work + seen, fontsize="small")
-    for axes in list(panels):
-        axes.set_visible(False)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     figure.suptitle("Error of a sticker's centre in the image")
