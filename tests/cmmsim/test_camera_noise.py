@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 import cmmsim
 from cmmsim.radiometry.noise import CameraNoise, draw_pattern
-from tests.cmmsim.sensors import NOISE, TWELVE_BIT, exact, require_true, squared_errors
+from tests.cmmsim.sensors import NOISE, exact
 
 GAIN, DARK_NOISE, WHITE, BLACK = 0.13, 26.0, 1600.0, 16.0
 CORNERS = np.array([[[200 + 400 * i, 150 + 300 * j] for i in range(4) for j in range(4)]] * 2)
@@ -114,10 +114,3 @@ def test_averaging_reduces_what_changes_but_not_the_pattern():
     pattern = draw_pattern(radiance.shape, noise.prnu, noise.dsnu, rng)
     grey = noise.mean_of_exposures(radiance, rng, 25, pattern)
     assert grey.var() == pytest.approx(noise.variance(grey.mean()), rel=0.03)
-
-
-def test_twelve_bits_measure_as_well_as_eight():
-    sensor = exact("perfect", TWELVE_BIT)
-    found = [sensor.measure(sensor.home) for _ in range(10)]
-    assert all(len(m.target_ids) == 18 for m in found)
-    require_true(squared_errors(found, [sensor.home] * 10))

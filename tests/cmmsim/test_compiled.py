@@ -59,8 +59,3 @@ def test_kernels_compile_where_the_package_cannot_be_written(copied, tmp_path):
         users = {"HOME": str(place), "XDG_CACHE_HOME": str(place)}
         assert run_copy(copied, users) == pytest.approx(9.0 * np.pi)
     assert list((tmp_path / "home").rglob("disc_kernels*.nbi"))
-
-
-def test_importing_the_package_does_not_import_the_compiler():
-    code = "import sys, cmmsim; sys.exit('numba' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -114,34 +114,24 @@ def test_whole_frame_faults_are_lost_with_the_reason(sensor, kind):
         assert "needed" in m.reason or "two poses" in m.reason or "contradict" in m.reason, m.reason
 
 
-def jump(rng):
-    """Where the platform may be in the next frame: up to 10 mm and 40 mrad off in each coordinate."""
-    return rng.uniform(-1.0, 1.0, 6) * ([0.01] * 3 + [0.04] * 3)
-
-
 @pytest.mark.parametrize("renderer", ["analytic", pytest.param("pyrender", marks=PYRENDER)])
 def test_lost_frames_and_jumps_are_found_again(renderer):
-    """After ten lost frames, and after a jump, the very next good frame is measured with all stickers."""
+    """After ten lost frames, and after a jump of up to 10 mm and 40 mrad in each coordinate, the very next good frame
+    is measured with nearly all stickers."""
     rng, sensor = np.random.default_rng(4), before_boxes(renderer=renderer)
     tracker, faults = Tracker(sensor.estimator), FaultGenerator(sensor.estimator)
     pose = sensor.home
     assert tracker.measure(sensor.look(pose)).ok
-    for kind in ("black", "one_camera_dark"):
-        for _ in range(10):
+    for kind in ("black", "one_camera_dark", None, None, None, None):
+        for _ in range(10 if kind else 0):
             m = tracker.measure(FaultyImages(sensor.look(pose), faults.draw(kind, pose, rng), sensor.noise, rng))
             assert not m.ok
             assert "bright spots" in m.reason
-        pose = sensor.home + jump(rng)
-        require_right(tracker.measure(sensor.look(pose)), pose)
-    for _ in range(4):
-        pose = sensor.home + jump(rng)
-        require_right(tracker.measure(sensor.look(pose)), pose)
-
-
-def require_right(m, pose):
-    assert m.ok, m.reason
-    assert len(m.target_ids) >= 17
-    assert squared_error(m, pose) < WRONG
+        pose = sensor.home + rng.uniform(-1.0, 1.0, 6) * ([0.01] * 3 + [0.04] * 3)
+        m = tracker.measure(sensor.look(pose))
+        assert m.ok, m.reason
+        assert len(m.target_ids) >= 17
+        assert squared_error(m, pose) < WRONG
 
 
 def test_a_whole_frame_is_tracked_and_spoilt_like_one_that_is_drawn_as_far_as_it_is_read(sensor):

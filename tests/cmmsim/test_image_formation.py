@@ -8,7 +8,6 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 import cmmsim
-from cmmsim.geometry.camera import Optics, PinholeCamera
 from cmmsim.geometry.pose import apply
 from cmmsim.imaging.renderer import View
 from tests.cmmsim.sensors import (
@@ -28,6 +27,7 @@ from tests.cmmsim.sensors import (
 )
 
 FINE = 16
+BESIDE_THE_MIDDLE = {"rig.right": {"focal_px": [2300.0, 2300.0], "centre_px": [1100.0, 700.0]}}
 
 
 def finely_drawn(sensor, side, pose, corner, size):
@@ -48,7 +48,6 @@ def finely_drawn(sensor, side, pose, corner, size):
     ("lens", "renderer", "largest", "rms", "mean"),
     [
         *((lens, "analytic", 15e-4 if lens == "distorted" else 5e-4, 4e-4, 1e-4) for lens in LENSES),
-        pytest.param("perfect", "pyrender", 5e-3, 8e-4, 2e-4, marks=pytest.mark.rendering),
         pytest.param("all", "pyrender", 5e-3, 8e-4, 2e-4, marks=pytest.mark.rendering),
     ],
 )
@@ -98,38 +97,16 @@ def test_bent_images_show_what_opencv_says():
             assert np.sqrt((gap**2).mean()) < 0.001
 
 
-def test_a_perfect_lens_is_drawn_on_the_pixels():
-    sensor = exact()
-    formation, placed = sensor.camera.formation, placed_at(sensor, sensor.home)
-    corners = corners_about(sensor, sensor.home, 16)
-    views = [
-        View(camera, bodies, (int(x), int(y)), (16, 16))
-        for camera, bodies, side in zip(sensor.rig.cameras, placed, corners, strict=True)
-        for x, y in side
-    ]
-    drawn = formation.renderer.draw(formation.drawable, views, 6, 0.0).reshape(2, -1, 16, 16)
-    np.testing.assert_array_equal(sensor.camera.radiance(placed, corners, 16, 6), drawn)
-
-
-def test_vignetting_darkens_with_the_square_of_the_distance():
-    camera, optics = PinholeCamera(2300.0, 1100.0, 700.0, 2048, 1536), Optics(vignetting=0.4)
-    assert optics.illumination(camera, camera.centre) == 1.0
-    corners = np.array([[-0.5, -0.5], [-0.5, 1535.5], [2047.5, -0.5]])
-    found = optics.illumination(camera, corners)
-    assert found[1] == pytest.approx(0.6)  # the farthest
-    assert found.min() == found[1]
-    half_way = camera.centre + 0.5 * (corners[1] - camera.centre)
-    assert optics.illumination(camera, half_way) == pytest.approx(0.9)
-
-
-def test_vignetting_is_laid_over_windows_and_whole_images():
-    dark, bright = exact("darkened"), exact()
+def test_vignetting_darkens_windows_and_whole_images_with_the_square_of_the_distance():
+    """From the image's centre, the farthest corner most."""
+    dark, bright = (exact("perfect", {"lens.vignetting": share} | BESIDE_THE_MIDDLE) for share in (0.3, 0.0))
     placed = placed_at(dark, dark.home)
     corners = corners_about(dark, dark.home, 16)
     share = [s.camera.radiance(placed, corners, 16, 6) for s in (dark, bright)]
     whole = [s.camera.whole_exposure(1, [placed[1]], 6) for s in (dark, bright)]
     y, x = np.mgrid[:1536, :2048]
-    expected = 1.0 - 0.3 * ((x - 1023.5) ** 2 + (y - 767.5) ** 2) / (1024.0**2 + 768.0**2)
+    away = (x - 1100.0) ** 2 + (y - 700.0) ** 2
+    expected = 1.0 - 0.3 * away / (1100.5**2 + 835.5**2)
     np.testing.assert_allclose(whole[0], whole[1] * expected, atol=1e-6)
     for k, (x0, y0) in enumerate(corners[1]):
         np.testing.assert_allclose(share[0][1, k], share[1][1, k] * expected[y0 : y0 + 16, x0 : x0 + 16], atol=1e-6)
@@ -179,8 +156,8 @@ def test_covariance_is_true_through_all_effects(count):
 
 @pytest.mark.parametrize("lens", ["distorted", "all"])
 def test_pixels_and_points_of_a_measurement(lens):
-    """Pixels are those of the image as it is; points lie where the stickers are."""
-    sensor = exact(lens)
+    """Pixels are those of the image as it is, of 12 bit; points lie where the stickers are."""
+    sensor = exact(lens, TWELVE_BIT)
     pose = poses_about_home(sensor, 1)[0]
     truth = apply(camera_from(sensor, pose), sensor.truth.platform_places)
     _, (m,) = pose_errors(sensor, pose[None])
@@ -189,15 +166,3 @@ def test_pixels_and_points_of_a_measurement(lens):
     np.testing.assert_allclose(m.left_pixels, left, atol=0.06)
     np.testing.assert_allclose(m.right_pixels, right, atol=0.06)
     require_true(squares(m.points - truth, m.point_covariances), 3)
-
-
-@pytest.mark.slow
-def test_search_of_whole_images_through_all_effects():
-    """A first frame of 12 bit without prior; the same frame handed over as arrays."""
-    sensor = exact("all", TWELVE_BIT)
-    pose = poses_about_home(sensor, 1, seed=3)[0]
-    frame = sensor.capture(pose)
-    assert frame.left.dtype == np.uint16
-    m = cmmsim.measure_frame(frame, sensor.estimator)
-    assert m.ok, m.reason
-    assert np.all(np.abs(m.pose - pose) * 1e6 < [20, 20, 20, 100, 100, 100])

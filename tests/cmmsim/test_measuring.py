@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 import cmmsim
 from cmmsim.geometry.pose import apply, pose_to_transform
-from tests.cmmsim.sensors import CROPPED, camera_from, exact, squared_error, squared_errors
+from tests.cmmsim.sensors import CROPPED, camera_from, exact, squared_error
 
 pytestmark = pytest.mark.rendering
 
@@ -38,19 +38,6 @@ def test_first_frame_without_prior_finds_all_ids_in_images_drawn_as_far_as_read_
 
 
 @pytest.mark.slow
-def test_tracking_along_a_path_stays_within_the_limits(sensor, moving_path):
-    path = moving_path(300)
-    found = [sensor.measure(pose) for pose in path]
-    assert all(m.ok for m in found)
-    errors = np.array([m.pose for m in found]) - path
-    rms = np.sqrt((errors**2).mean(axis=0)) * 1e6
-    assert np.all(rms < [6, 6, 6, 40, 40, 40]), rms
-    constant = np.abs(errors.mean(axis=0)) * 1e6
-    assert np.all(constant < [2, 2, 2, 10, 10, 10]), constant
-    assert 5.4 < squared_errors(found, path).mean() < 7.0  # 6, plus the constant error of teaching
-
-
-@pytest.mark.slow
 def test_planes_and_registration_agree(taught):
     found = {}
     for method in ("registration", "planes"):
@@ -67,15 +54,12 @@ def test_planes_and_registration_agree(taught):
 
 
 def test_same_seed_same_numbers(taught, moving_path):
-    runs = []
-    for _ in range(2):
-        sensor = cmmsim.load_sensor("ctrack780", seed=5, taught=taught)
-        runs.append(np.array([sensor.measure(pose).pose for pose in moving_path(4)]))
-    np.testing.assert_array_equal(runs[0], runs[1])
-    sensor.start_run(6)
-    assert not np.array_equal(runs[0], [sensor.measure(pose).pose for pose in moving_path(4)])
-    sensor.start_run(5)
-    np.testing.assert_array_equal(runs[0], [sensor.measure(pose).pose for pose in moving_path(4)])
+    sensor, runs = cmmsim.load_sensor("ctrack780", seed=5, taught=taught), []
+    for seed in (None, 6, 5):
+        if seed is not None:
+            sensor.start_run(seed)
+        runs.append([sensor.measure(pose).pose.tolist() for pose in moving_path(4)])
+    assert runs[0] == runs[2] != runs[1]
 
 
 @pytest.mark.slow
@@ -112,6 +96,7 @@ def test_hidden_plane_is_lost_by_name_and_found_again(taught):
     m = sensor.measure(sensor.home, obstacles={"box": place})
     assert not m.ok
     assert np.isnan(m.pose).all()
+    assert len(m.points) == 0
     assert m.reason.startswith("plane B")
     assert "at least 3 needed" in m.reason
     assert sensor.measure(sensor.home).ok
@@ -127,31 +112,6 @@ def test_a_partly_hidden_platform_is_measured_with_what_is_left(renderer):
     assert 3 <= len(m.target_ids) < 18
     assert squared_error(m, sensor.home) < 40.0
     assert len(sensor.measure(sensor.home).target_ids) == 18
-
-
-def test_fully_hidden_platform_is_lost_with_a_reason():
-    sensor = exact("perfect", CROPPED, "pyrender")
-    place, mesh = box_before(sensor, np.array([0.05, 0.0, 0.27]), (0.05, 1.6, 1.2), share=0.3)
-    sensor.add_bodies({"wall": mesh})
-    assert sensor.measure(sensor.home).ok
-    for _ in range(2):  # once lost by the tracker, once by the search of the whole image
-        m = sensor.measure(sensor.home, obstacles={"wall": place})
-        assert not m.ok
-        assert m.reason
-        assert np.isnan(m.pose).all()
-        assert len(m.points) == 0
-    assert sensor.measure(sensor.home).ok
-
-
-def test_unrelated_poses_are_all_measured():
-    """A jump leaves the predicted windows: the whole images of that same frame are searched, and no pose is wrong."""
-    sensor, rng = exact("perfect", CROPPED, "pyrender"), np.random.default_rng(11)
-    for _ in range(15):
-        pose = sensor.home + rng.uniform(-1.0, 1.0, 6) * ([0.010] * 3 + [0.04] * 3)
-        m = sensor.measure(pose)
-        assert m.ok, m.reason
-        assert len(m.target_ids) >= 12
-        assert squared_error(m, pose) < 45.0
 
 
 @pytest.mark.slow

@@ -163,9 +163,8 @@ def test_a_renderer_of_one_s_own_draws_by_its_module_and_name():
     np.testing.assert_array_equal(sensor.measure(sensor.home).pose, usual.measure(usual.home).pose)
     assert sensor.renderer == name
     assert CALLS
-    for bad, message in (("nowhere:draw", "no importable module:name: No module"), (f"{__name__}:CAMERA", "called")):
-        with pytest.raises(cmmsim.CmmError, match=message):
-            exact(renderer=bad)
+    with pytest.raises(cmmsim.CmmError, match="called"):
+        exact(renderer=f"{__name__}:CAMERA")
 
 
 def test_layers_are_laid_as_plain_numpy_lays_them():

@@ -1,5 +1,7 @@
 """First frames of a platform in motion: what streaks tell of it, and poses whose covariance holds."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
@@ -9,7 +11,7 @@ from cmmsim.errors import LostError
 from cmmsim.geometry.pose import apply
 from cmmsim.pose_estimation.observation import LONGEST_SMEAR_PX
 from cmmsim.pose_estimation.streaks import find_streaks
-from tests.cmmsim.sensors import camera_from, exact, poses_about_home, squared_error
+from tests.cmmsim.sensors import TWELVE_BIT, camera_from, exact, poses_about_home, squared_error
 
 RATES = [
     [1.0, 0, 0, 0, 0, 0],
@@ -57,19 +59,15 @@ def require_chi_square(squared):
     assert kstest(squared, "chi2", args=(6,)).pvalue > 1e-4
 
 
-class PartlyHidden:
+def partly_hidden(images, count):
     """Images whose first stickers are half dark in the left one."""
 
-    def __init__(self, images, count):
-        self._images, self._count = images, count
-
-    def full(self):
-        return self._images.full()
-
-    def windows(self, corners, size):
-        grey = self._images.windows(corners, size).copy()
-        grey[0, : self._count, : size // 2] = grey[0, : self._count].min(axis=(1, 2), keepdims=True)
+    def windows(corners, size):
+        grey = images.windows(corners, size).copy()
+        grey[0, :count, : size // 2] = grey[0, :count].min(axis=(1, 2), keepdims=True)
         return grey
+
+    return SimpleNamespace(full=images.full, windows=windows)
 
 
 @pytest.mark.parametrize("rate", RATES)
@@ -86,8 +84,8 @@ def test_partly_hidden_stickers_are_no_streaks():
     sensor = exposed()
     rate = RATES[3]
     for pose in poses_about_home(sensor, 2):
-        assert streaks_of(sensor, PartlyHidden(sensor.look(pose), 3), pose) is None
-        moving = PartlyHidden(sensor.look(pose, pose_rate=rate), 3)
+        assert streaks_of(sensor, partly_hidden(sensor.look(pose), 3), pose) is None
+        moving = partly_hidden(sensor.look(pose, pose_rate=rate), 3)
         found = streaks_of(sensor, moving, pose)
         assert difference(movements(sensor, *found.swept), true_movements(sensor, pose, rate)) < 0.5
         measured = sensor.estimator.measure_anew(moving, camera_from(sensor, pose))[0]
@@ -123,30 +121,25 @@ def test_streaks_beyond_the_limit_are_lost_with_their_length():
         sensor.estimator.measure_anew(sensor.look(pose, pose_rate=rate), camera_from(sensor, pose))
 
 
-def test_first_frame_at_one_metre_a_second():
-    sensor = exposed()
-    measured = sensor.measure(sensor.home, pose_rate=RATES[1])
-    assert measured.ok, measured.reason
-    assert len(measured.target_ids) == 18
-    assert squared_error(measured, sensor.home) < chi2.isf(1e-4, 6)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("rate", RATES[1:4:2])
-def test_frames_after_the_first_one_at_one_metre_a_second(rate):
-    """Found anew while the first movement is known, then predicted."""
+@pytest.mark.parametrize(("rate", "fewest"), [(RATES[1], 18), (RATES[3], 17)])
+def test_first_frames_at_one_metre_a_second(rate, fewest):
+    """Found anew until the first movement is known, then predicted."""
     sensor = exposed()
     for time in np.arange(-1, 2) / 60.0:
         pose = sensor.home + time * np.array(rate)
         measured = sensor.measure(pose, pose_rate=rate)
-        assert measured.ok, measured.reason
+        assert len(measured.target_ids) >= fewest, measured.reason
         assert squared_error(measured, pose) < chi2.isf(1e-4, 6)
 
 
 @pytest.mark.slow
 def test_a_frame_from_elsewhere_is_measured_by_its_streaks():
-    sensor, rate = exposed(), RATES[3]
-    measured = cmmsim.measure_frame(sensor.capture(sensor.home, pose_rate=rate), sensor.estimator)
+    """Arrays of 12 bit, handed over without prior, through a real lens."""
+    sensor = exact("all", TWELVE_BIT | {"timing.exposure": 0.002})
+    frame = sensor.capture(sensor.home, pose_rate=RATES[3])
+    assert frame.left.dtype == np.uint16
+    measured = cmmsim.measure_frame(frame, sensor.estimator)
     assert measured.ok, measured.reason
     assert squared_error(measured, sensor.home) < chi2.isf(1e-4, 6)
 

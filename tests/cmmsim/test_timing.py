@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from cmmsim.acceptance import SensorUnderTest, common_volume, latency_test
 from cmmsim.files.schema import Timing
-from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.geometry.pose import pose_to_transform
 from cmmsim.pose_estimation.estimator import PoseEstimator, lost_measurement
 from cmmsim.tracker import Tracker
 from tests.cmmsim.sensors import CROPPED, exact
@@ -37,35 +36,16 @@ def test_latencies_are_a_clipped_normal_distribution(jitter):
     np.testing.assert_array_equal(steady, np.full(50, 0.020))
 
 
-def test_the_acceptance_test_of_latency_finds_the_jitter():
-    file = read_sensor_file("ctrack780")
-    timing = Timing(frame_rate=60.0, latency=0.014, latency_jitter=0.001)
-    under_test = SensorUnderTest(file.model_copy(update={"timing": timing}), 0, "analytic")
-    found = latency_test(under_test, common_volume(file.rig), frames=100).latency
-    assert found.mean == pytest.approx(0.014, abs=4e-4)
-    assert found.std == pytest.approx(0.001, rel=0.25)
-    assert found.resolution < 1e-4
-
-
-def test_frames_drop_out_as_often_as_stated_and_independently():
+def test_frames_drop_out_as_often_as_stated_independently_for_a_reason_and_with_the_same_seed_alike():
     sensor = dropping(0.3)
-    lost = np.array([not sensor.measure(sensor.home).ok for _ in range(200)])
-    low, high = stats.binom.interval(0.999, 200, 0.3)
-    assert low <= lost.sum() <= high
-    low, high = stats.binom.interval(0.999, 100, 0.3**2)
-    assert low <= (lost[::2] & lost[1::2]).sum() <= high
-
-
-def test_a_dropped_frame_says_so_and_the_same_seed_drops_the_same():
-    sensor = dropping(1.0)
-    measured = sensor.measure(sensor.home)
-    assert not measured.ok
-    assert "dropped frame" in measured.reason
-    patterns = []
-    for seed in (3, 3, 4):
-        sensor = dropping(0.5, seed)
-        patterns.append([sensor.measure(sensor.home).ok for _ in range(30)])
-    assert patterns[0] == patterns[1] != patterns[2]
+    found = [sensor.measure(sensor.home) for _ in range(200)]
+    lost = np.array([not m.ok for m in found])
+    assert all("dropped frame" in m.reason for m in found if not m.ok)
+    for dropped, probability in ((lost, 0.3), (lost[::2] & lost[1::2], 0.3**2)):
+        low, high = stats.binom.interval(0.999, len(dropped), probability)
+        assert low <= dropped.sum() <= high
+    again = [[not s.measure(s.home).ok for _ in range(30)] for s in (dropping(0.3), dropping(0.3, seed=4))]
+    assert again[0] == lost[:30].tolist() != again[1]
 
 
 def test_the_images_of_other_frames_are_the_same_with_and_without_dropout():
@@ -97,6 +77,9 @@ def test_the_prediction_goes_on_through_missed_frames():
     """A stand-in for the estimator: the platform moves 1 mm a frame, and the tracker says where it expects it."""
     expected, never = [], pytest.fail  # no image is looked at
 
+    def at(frame):
+        return pose_to_transform([1e-3 * frame, 0.0, 0.0, 0.0, 0.0, 0.0])
+
     class Estimator(PoseEstimator):
         settings = SimpleNamespace(exposed_share=0.0)
 
@@ -104,13 +87,12 @@ def test_the_prediction_goes_on_through_missed_frames():
             pass
 
         def locate(self, images):
-            return _at(images.number)
+            return at(images.number)
 
         def measure(self, images, predicted, swept=None):
             assert swept is None
             expected.append(predicted[0, 3])
-            good = lost_measurement("stands for a good one")
-            return good, _at(images.number)
+            return lost_measurement("stands for a good one"), at(images.number)
 
         measure_anew = measure
 
@@ -122,9 +104,3 @@ def test_the_prediction_goes_on_through_missed_frames():
         else:
             tracker.measure(SimpleNamespace(number=frame, full=never, windows=never))
     np.testing.assert_allclose(expected, np.array([0, 0, 2, 5, 7, 8]) * 1e-3, atol=1e-15)
-
-
-def _at(frame):
-    place = np.eye(4)
-    place[0, 3] = 1e-3 * frame
-    return place
