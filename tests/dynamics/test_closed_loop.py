@@ -10,10 +10,10 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from dynamics import closed_loop, compilation, robot_file, simulate_batch
-from dynamics import robot as robot_module
+from dynamics import closed_loop, simulate_batch
 from dynamics.errors import DynamicsError, SimulationError
-from tests.dynamics.conftest import assert_same, at_rest
+from dynamics.robot import with_geometry_error
+from tests.dynamics.conftest import Loop, assert_same, at_rest
 
 PERIOD, FRAMES = 1 / 60, 32
 LATE = {"latency_s": 1.3 * PERIOD, "hold": "linear"}
@@ -322,48 +322,25 @@ def test_a_batch_is_its_runs_in_order_for_any_number_of_workers(robot, loop):
         simulate_batch(robot, vectors, reference, settings, starts=starts)
 
 
-def _forget():
-    for cached in (compilation.find_compiler, compilation.can_compile, robot_module._functions):
-        cached.cache_clear()
-
-
-@pytest.fixture(params=["missing", "broken", "no folder"])
-def without_compiler(request, monkeypatch, tmp_path):
-    """A function that takes the compiler, its headers or the folder for its results away, and tells what is missed."""
-
-    def take_away():
-        if request.param == "missing":
-            monkeypatch.setenv("CC", "none-existing")
-        if request.param == "broken":
-            script = tmp_path / "cc"
-            script.write_text("#!/bin/sh\necho 'fatal error: math.h: No such file' >&2\nexit 1\n")
-            script.chmod(0o755)
-            monkeypatch.setenv("CC", str(script))
-            monkeypatch.setenv("CMMSIM_CACHE", str(tmp_path / "cache"))
-        if request.param == "no folder":
-            (tmp_path / "file").touch()
-            monkeypatch.setenv("CMMSIM_CACHE", str(tmp_path / "file" / "cache"))
-        _forget()
-        return {"missing": "no C compiler found", "broken": "math.h", "no folder": "CMMSIM_CACHE"}[request.param]
-
-    yield take_away
-    _forget()
-
-
-def test_everything_works_without_a_compiler_after_one_warning(robot, states, loop, without_compiler):
-    """Robot and loop fall back to CasADi's virtual machine with the same numbers, and say so in exactly one line."""
-    reference, settings = loop.reference(10), loop.settings()
-    compiled = robot.forward_dynamics(states.pose, states.twist, states.twist_dot), loop.run(reference, compiled=True)
-    missed = without_compiler()
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        fresh = robot_module.Robot(robot_file.read_robot_file("rss6"))
-        accelerations = fresh.forward_dynamics(states.pose, states.twist, states.twist_dot)
-        runs = [closed_loop.simulate(fresh, loop.parameters, reference, settings) for _ in range(2)]
-        with pytest.raises(SimulationError, match="compiled=True"):
-            closed_loop.simulate(fresh, loop.parameters, reference, settings, compiled=True)
-    assert [warning.category for warning in caught] == [compilation.CompilerWarning]
-    assert missed in str(caught[0].message)
-    assert "\n" not in str(caught[0].message)
-    np.testing.assert_allclose(accelerations, compiled[0], rtol=1e-10, atol=1e-12)
-    assert_same(compiled[1], runs[1])
+@pytest.mark.slow  # compiles the plant
+def test_the_servo_commands_with_the_kinematics_it_knows(loop, robot):
+    """Eq. 30 worked out from what was measured, with the nominal Jacobian by differences of its inverse kinematics;
+    both paths agree, a servo that knows the plant commands otherwise, and one that knows its robot as ever."""
+    plant = with_geometry_error(robot, 1e-4, np.random.default_rng(3))
+    reference, theirs = loop.reference(40), Loop(plant, loop.parameters)
+    run, plain = theirs.both(reference, sensor=lambda k, t, pose: pose, servo_robot=robot)
+    assert_same(run, plain)
+    assert run.events > 3
+    np.testing.assert_allclose(run.pose, plain.pose, atol=1e-13)
+    error = reference.poses - run.measured
+    before = np.vstack([run.start.last_measured, run.measured[:-1]])
+    rate_error = reference.rates - (run.measured - before) * 60.0
+    integral = run.start.servo_integral + np.cumsum(error / 60.0, axis=0)
+    demand = 0.3 * error + 0.001 * rate_error + 2.4 * integral
+    for k in range(12):
+        moved = robot.inverse_kinematics(run.measured[k] + 1e-6 * np.vstack([np.eye(6), -np.eye(6)]))
+        jacobian = (moved[:6] - moved[6:]).T / 2e-6
+        np.testing.assert_allclose(run.command[k], jacobian @ demand[k], atol=1e-8)
+    np.testing.assert_allclose(run.command[0], 0, atol=1e-12)  # the plant's cranks at home
+    assert np.abs(run.pose - theirs.run(reference, sensor=lambda k, t, pose: pose).pose).max() > 1e-7
+    np.testing.assert_array_equal(loop.run(reference, servo_robot=robot).pose, loop.run(reference).pose)

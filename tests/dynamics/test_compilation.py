@@ -1,17 +1,21 @@
-"""The cache of compiled code: content as key, whole files only, no recompiling."""
+"""The cache of compiled code: content as key, whole files only, no recompiling; and what happens without a compiler."""
 
 import ctypes
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
 import casadi as ca
+import numpy as np
 import pytest
 
-from dynamics import compilation, load_robot
-from dynamics.errors import DynamicsError
+from dynamics import closed_loop, compilation, load_robot, robot_file
+from dynamics import robot as robot_module
+from dynamics.errors import DynamicsError, SimulationError
+from tests.dynamics.conftest import assert_same
 
 SQUARE = """
 import casadi as ca
@@ -21,10 +25,8 @@ print(compilation.load_library("square", load_robot("rss6").geometry, lambda g: 
 """
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    if compilation.find_compiler() is None:
-        pytest.skip("needs a C compiler")
+@pytest.fixture
+def own_cache(loop, tmp_path, monkeypatch):
     monkeypatch.setenv("CMMSIM_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
@@ -76,12 +78,55 @@ def test_damaged_library_is_removed_and_named(own_cache):
     assert not damaged.exists()
 
 
-def test_compiler_may_have_arguments_of_its_own(monkeypatch):
+@pytest.fixture
+def forget():
+    """What was found out about compilers is forgotten where a test says so, and after it."""
+
+    def clear():
+        for cached in (compilation.find_compiler, compilation.can_compile, robot_module._functions):
+            cached.cache_clear()
+
+    yield clear
+    clear()
+
+
+def test_compiler_may_have_arguments_of_its_own(loop, monkeypatch, forget):
     """CC="gcc -pipe" is a program with an argument, as make understands it."""
     plain = compilation.find_compiler()
-    compilation.find_compiler.cache_clear()
+    forget()
     monkeypatch.setenv("CC", f"{plain[0]} -pipe")
-    try:
-        assert compilation.find_compiler() == (plain[0], "-pipe")
-    finally:
-        compilation.find_compiler.cache_clear()
+    assert compilation.find_compiler() == (plain[0], "-pipe")
+
+
+@pytest.mark.parametrize(
+    ("environment", "missed"),
+    [
+        ({"CC": "none-existing"}, "no C compiler found"),
+        ({"CC": "{}/cc", "CMMSIM_CACHE": "{}/cache"}, "math.h"),
+        ({"CMMSIM_CACHE": "{}/cc/no_folder"}, "CMMSIM_CACHE"),
+    ],
+)
+def test_everything_works_without_a_compiler_after_one_warning(
+    robot, states, loop, tmp_path, monkeypatch, forget, environment, missed
+):
+    """Compiler, its headers or the folder for its results taken away: robot and loop fall back to CasADi's virtual
+    machine with the same numbers, and say so in exactly one line."""
+    (tmp_path / "cc").write_text("#!/bin/sh\necho 'fatal error: math.h: No such file' >&2\nexit 1\n")
+    (tmp_path / "cc").chmod(0o755)
+    reference, settings, motion = loop.reference(10), loop.settings(), (states.pose, states.twist, states.twist_dot)
+    compiled = robot.forward_dynamics(*motion), loop.run(reference, compiled=True)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value.format(tmp_path))
+    forget()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fresh = robot_module.Robot(robot_file.read_robot_file("rss6"))
+        accelerations = fresh.forward_dynamics(*motion)
+        runs = [closed_loop.simulate(fresh, loop.parameters, reference, settings) for _ in range(2)]
+        with pytest.raises(SimulationError, match="compiled=True"):
+            closed_loop.simulate(fresh, loop.parameters, reference, settings, compiled=True)
+    assert [warning.category for warning in caught] == [compilation.CompilerWarning]
+    assert missed in str(caught[0].message)
+    assert "\n" not in str(caught[0].message)
+    np.testing.assert_allclose(accelerations, compiled[0], rtol=1e-10, atol=1e-12)
+    assert_same(compiled[1], runs[1])

@@ -1,9 +1,7 @@
 """The robot in other engines: Pinocchio, and MuJoCo by the exported MJCF; inertias that no body has."""
 
-import json
 import sys
 from dataclasses import replace
-from pathlib import Path
 from xml.etree import ElementTree as Xml
 
 import numpy as np
@@ -13,10 +11,9 @@ from scipy.spatial.transform import Rotation
 from dynamics.engines.mjcf import MjcfSolver, mjcf_text
 from dynamics.engines.mujoco_engine import MujocoMissingError, MujocoRobot
 from dynamics.inertia import physical_inertias
-from dynamics.parameters import BODY_NAMES, COULOMB, PARAMETER_NAMES, RIGID_BODY, VISCOUS
+from dynamics.parameters import BODY_NAMES, COULOMB, RIGID_BODY, VISCOUS
 from dynamics.robot import Robot
 from dynamics.robot_file import RobotDescription
-from tests.dynamics.conftest import link_axes
 
 
 @pytest.fixture
@@ -28,27 +25,21 @@ def exported(robot, parameters=None, **options):
     return MujocoRobot(robot, mjcf_text(robot, parameters, allow_unphysical_inertia=True, **options))
 
 
-def movable(robot, name):
-    """A parameter set whose export moves as the set itself does: the platform of Table 2 is no rigid body's."""
-    values = robot.parameter_sets[name].dynamic.copy()
-    values[3] = min(values[3], values[1] + values[2])
-    return values
+def as_exported(values):
+    """Parameters (64,) with the inertias that the export writes."""
+    changed = values.copy()
+    changed[RIGID_BODY] = physical_inertias(values, allow_changes=True).values.ravel()
+    return changed
 
 
-@pytest.fixture
-def physical(robot):
-    """Parameters of Table 2 with other numbers in every body, all of which rigid bodies can have."""
-    values = robot.parameter_sets["identified"].dynamic.copy()
-    rng = np.random.default_rng(2)
-    bodies = values[RIGID_BODY].reshape(-1, 4)
-    bodies[:, 1:] = bodies[:, 3:] * rng.uniform(0.6, 1.0, (13, 3))
-    return values
-
-
-def test_model_has_exactly_the_parameters_and_closed_loops_at_home(mujoco, robot, physical):
+def test_model_has_exactly_the_parameters_and_closed_loops_at_home(mujoco, robot, identified):
+    """Those of Table 2 with other numbers in every body, all of which rigid bodies can have."""
+    physical = identified[:64].copy()
+    bodies = physical[RIGID_BODY].reshape(-1, 4)
+    bodies[:, 1:] = bodies[:, 3:] * np.random.default_rng(2).uniform(0.6, 1.0, (13, 3))
     engine = MujocoRobot(robot, mjcf_text(robot, physical))
     model = engine.model
-    for body, row in zip(BODY_NAMES, physical[RIGID_BODY].reshape(-1, 4), strict=True):
+    for body, row in zip(BODY_NAMES, bodies, strict=True):
         assert model.body(body).mass[0] == row[0]
         np.testing.assert_array_equal(model.body(body).inertia, row[1:])
     for leg in range(6):
@@ -67,27 +58,13 @@ def test_model_has_exactly_the_parameters_and_closed_loops_at_home(mujoco, robot
     assert without.joint("joint1").damping[0] == physical[VISCOUS][0]
 
 
-def test_frames_of_cranks_and_links_are_those_of_the_conventions(mujoco, robot, states, legs_at):
-    engine = exported(robot)
-    for pose in states.pose[:10]:
-        engine.put(pose, np.zeros(6))
-        legs = legs_at(pose)
-        links = link_axes(robot.geometry, legs)
-        for leg in range(6):
-            crank, link = (engine.data.body(f"{name}{leg + 1}").xmat.reshape(3, 3) for name in ("crank", "link"))
-            np.testing.assert_allclose(crank[:, 2], robot.geometry.crank_axes[leg], atol=1e-12)
-            np.testing.assert_allclose(crank[:, 0], legs.crank[leg] / robot.geometry.crank_length, atol=1e-12)
-            np.testing.assert_allclose(link, links[leg], atol=1e-12)
-
-
 @pytest.mark.parametrize("name", ["initial", "identified"])
 def test_accelerations_differ_by_the_softness_of_the_loops_alone(mujoco, robot, states, name):
     """At rest, under random torques: 1 - impedance is the share of the loop forces that MuJoCo leaves out."""
-    values = movable(robot, name)
+    values = as_exported(robot.parameter_sets[name].dynamic)
     values[COULOMB] = 0.0
     torques = 5 * np.random.default_rng(5).standard_normal((30, 6))
-    rest = np.zeros((30, 6))
-    ours = robot.forward_dynamics(states.pose[:30], rest, torques, values)
+    ours = robot.forward_dynamics(states.pose[:30], np.zeros((30, 6)), torques, values)
     worst = {}
     for impedance in (0.999, 0.9999):
         engine, errors = exported(robot, values, solver=MjcfSolver(impedance=impedance)), []
@@ -100,21 +77,12 @@ def test_accelerations_differ_by_the_softness_of_the_loops_alone(mujoco, robot, 
     assert worst[0.999] / worst[0.9999] == pytest.approx(10, rel=0.1)
 
 
-def quoted_estimates():
-    """Estimates of the run that the README quotes, (64,)."""
-    result = json.loads((Path(__file__).parents[2] / ".readme" / "result.json").read_text())
-    return np.array([result["identification"]["parameters"][name]["estimate"] for name in PARAMETER_NAMES])
-
-
-@pytest.mark.parametrize("name", ["initial", "identified", "quoted"])
+@pytest.mark.parametrize("name", ["initial", "identified"])
 def test_reloaded_bodies_accelerate_as_the_robot_with_the_changed_parameters(mujoco, robot, states, name):
     """With MuJoCo's bodies in loops that are closed exactly (not by its springs), moving, with friction: to 1e-9."""
-    values = quoted_estimates() if name == "quoted" else robot.parameter_sets[name].dynamic
-    engine = exported(robot, values)
-    changed = values.copy()
-    changed[RIGID_BODY] = physical_inertias(values, allow_changes=True).values.ravel()
-    torques = 5 * np.random.default_rng(8).standard_normal((300, 6))
-    ours = robot.forward_dynamics(states.pose, states.twist, torques, changed)
+    values = robot.parameter_sets[name].dynamic
+    engine, torques = exported(robot, values), 5 * np.random.default_rng(8).standard_normal((300, 6))
+    ours = robot.forward_dynamics(states.pose, states.twist, torques, as_exported(values))
     for pose, twist, torque, acceleration in zip(states.pose, states.twist, torques, ours, strict=True):
         theirs = acceleration_in_rigid_loops(mujoco, engine, pose, twist, torque)
         assert np.abs(theirs - acceleration).max() <= 1e-9 * np.abs(acceleration).max()
@@ -210,22 +178,18 @@ def test_mujoco_accepts_what_was_changed(mujoco, robot):
         exported(robot, values)
 
 
-@pytest.mark.parametrize(
-    ("source", "written"),
-    [
+def test_file_is_valid_xml_whatever_the_source_and_the_robot_are_called(robot, tmp_path):
+    for source, written in (
         ("a--b---c & <d>-", "a- -b- - -c & <d>-"),
         ("nul\0 escape\x1b half\udc80 none\uffff", "nul? escape? half? none?"),
         ("Gr\u00f6\u00dfe \U0001f600\ttab", "Gr\u00f6\u00dfe \U0001f600\ttab"),
-    ],
-)
-def test_file_is_valid_xml_whatever_the_source_and_the_robot_are_called(robot, tmp_path, source, written):
-    named = Robot(RobotDescription(source, robot.geometry, robot.parameter_sets))
-    (tmp_path / "model.xml").write_text(
-        mjcf_text(named, allow_unphysical_inertia=True, source=source), encoding="utf-8"
-    )
-    root = Xml.parse(tmp_path / "model.xml", Xml.XMLParser(target=Xml.TreeBuilder(insert_comments=True))).getroot()
-    assert written in root[0].text
-    assert len(list(root.iter("body"))) == 13
+    ):
+        named = Robot(RobotDescription(source, robot.geometry, robot.parameter_sets))
+        text = mjcf_text(named, allow_unphysical_inertia=True, source=source)
+        (tmp_path / "model.xml").write_text(text, encoding="utf-8")
+        root = Xml.parse(tmp_path / "model.xml", Xml.XMLParser(target=Xml.TreeBuilder(insert_comments=True))).getroot()
+        assert written in root[0].text
+        assert len(list(root.iter("body"))) == 13
 
 
 def test_without_mujoco_one_line_names_the_extra(robot, monkeypatch):

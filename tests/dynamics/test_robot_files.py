@@ -1,4 +1,4 @@
-"""Robot files: `rss6` holds the robot that its construction describes, and what makes no robot is refused by name."""
+"""Robots from files, and robots whose joints are off their places: they are what they are said to be, or refused."""
 
 import itertools
 import pickle
@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import fsolve
+from scipy.stats import chi2
 
 import dynamics
 from dynamics.errors import RobotFileError
-from tests.dynamics.conftest import BOX
+from dynamics.robot import with_geometry_error
+from tests.dynamics.conftest import BOX, place_legs
 
 
 def test_the_file_holds_the_robot_of_radii_and_angles(robot):
@@ -119,3 +122,36 @@ def test_robot_files_that_make_no_robot(load_changed, old, new, message):
     """Unknown keys list the valid ones; places, counts, values and legs are named; the file is named first."""
     with pytest.raises(RobotFileError, match=rf"robot file .*changed.toml.*{message}"):
         load_changed({old: new})
+
+
+ERROR = 1e-4
+THETA = np.array([0.21, -0.14, 0.3, 0.05, -0.22, 0.11])
+
+
+def test_joint_centres_are_off_by_normal_errors_of_the_given_size_and_seed(robot):
+    """The squares of 40 robots' 36 errors over the variance are chi-square, their mean is zero."""
+    plants = [with_geometry_error(robot, ERROR, np.random.default_rng(k)).geometry for k in range(40)]
+    names = ("base_joints", "platform_joints")
+    errors = np.array([[getattr(plant, name) - getattr(robot.geometry, name) for name in names] for plant in plants])
+    assert errors.shape == (40, 2, 6, 3)
+    assert 1e-3 < chi2.cdf(np.sum(errors**2) / ERROR**2, errors.size) < 1 - 1e-3
+    assert abs(errors.mean()) < 3.3 * ERROR / np.sqrt(errors.size)
+    assert with_geometry_error(robot, ERROR, np.random.default_rng(3)).geometry == plants[3] != plants[4]
+    assert with_geometry_error(robot, 0.0, np.random.default_rng(3)) is robot
+
+
+def _gaps(pose, theta, geometry):
+    """|A - T| less the link length of every leg."""
+    legs = place_legs(geometry, pose, theta)
+    return np.linalg.norm(legs.joint - legs.tip, axis=1) - geometry.link_length
+
+
+def test_the_plant_closes_its_own_loops_at_home_and_elsewhere(robot, monkeypatch):
+    """Against MINPACK on the loops; the nominal robot with the same crank angles is elsewhere, by about the error."""
+    monkeypatch.setattr("dynamics.robot.load_library", lambda *_: None)  # one robot is not worth compiling
+    plant = with_geometry_error(robot, ERROR, np.random.default_rng(3))
+    np.testing.assert_allclose(_gaps(plant.home_pose, np.zeros(6), plant.geometry), 0, atol=1e-15)
+    pose = plant.forward_kinematics(THETA)
+    solved = fsolve(_gaps, plant.home_pose, args=(THETA, plant.geometry), xtol=1e-13)
+    np.testing.assert_allclose(pose, solved, atol=1e-12)
+    assert 0.1 * ERROR < np.abs(pose - robot.forward_kinematics(THETA))[:3].max() < 10 * ERROR

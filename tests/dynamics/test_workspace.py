@@ -9,15 +9,6 @@ from dynamics.errors import SingularPoseError, TravelError, UnreachablePoseError
 from tests.dynamics.conftest import place_legs
 
 
-def test_leverage_is_the_sine_between_crank_plane_and_link(robot, states, legs_at):
-    """|(w x l) . s| / (|w| |l|) from the joints' places."""
-    measures = workspace.measure(robot, states.pose)
-    for pose, leverage in zip(states.pose[:20], measures.leverage, strict=False):
-        legs = legs_at(pose)
-        sine = np.abs(np.cross(legs.crank, legs.joint - legs.tip)[:, 2]) / (0.06 * robot.geometry.link_length)
-        np.testing.assert_allclose(leverage, sine, atol=1e-12)
-
-
 def test_reach_margin_is_that_of_the_law_of_cosines(robot, states):
     """1 - cos^2 of the angle between crank and reach in each crank's plane, in reach and out of it."""
     g, poses = robot.geometry, np.vstack([states.pose[:20], robot.home_pose + 0.2 * np.eye(6)[0], robot.home_pose + 1])
@@ -30,13 +21,15 @@ def test_reach_margin_is_that_of_the_law_of_cosines(robot, states):
         np.testing.assert_allclose(margin, 1 - cosine**2, rtol=1e-12, atol=1e-12)
 
 
-def test_condition_of_the_platform_side_from_forces(robot, states, legs_at):
-    """The wrench of unit forces along the links, torques over 0.2 m, has that condition number (virtual work)."""
+def test_leverage_and_conditions_are_those_of_the_joints_places(robot, states, legs_at):
+    """Leverage is the sine between crank plane and link, |(w x l) . s| / (|w| |l|). The wrench of unit forces along the
+    links, torques over 0.2 m, has the platform side's condition number (virtual work)."""
     assert robot.geometry.characteristic_length == pytest.approx(0.2, abs=1e-12)
     measures = workspace.measure(robot, states.pose)
     for row, pose in enumerate(states.pose[:20]):
         legs = legs_at(pose)
         along = (legs.joint - legs.tip) / robot.geometry.link_length
+        np.testing.assert_allclose(measures.leverage[row], np.abs(np.cross(legs.crank, along)[:, 2]) / 0.06, atol=1e-12)
         wrench = np.hstack([along, np.cross(legs.joint - pose[:3], along) / 0.2])
         assert measures.platform_condition[row] == pytest.approx(np.linalg.cond(wrench), rel=1e-9)
         scaled = robot.joint_jacobian(pose) / [1, 1, 1, 0.2, 0.2, 0.2]

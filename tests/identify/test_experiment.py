@@ -135,7 +135,7 @@ def test_the_sensor_gets_the_scenarios_timing_and_latencies_jitter_as_it_says(se
 
 
 # Plants that no model of the estimator can be: what the switches do, and that the residuals tell. The dynamics of these
-# plants are proved in tests/dynamics/test_elastic_joints.py and test_geometry_error.py.
+# plants are proved in tests/dynamics/test_elastic_joints.py and test_closed_loop.py.
 
 ELASTIC = {"plant.joint_stiffness_N_m_rad": 1000.0}
 MISPLACED = {"plant.geometry_error_m": 1e-4}
