@@ -5,7 +5,7 @@ and the demand that six points of the links stay on six points of the platform. 
 robot gives; `closure` shows whether they close the chain.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -15,8 +15,7 @@ from tests.dynamics.conftest import base_from_platform, link_axes, place_legs
 SETTINGS = pin.ProximalSettings(1e-14, 0.0, 20)
 
 
-@dataclass(frozen=True)
-class ChainState:
+class ChainState(NamedTuple):
     """Configuration, velocity and generalised force of the chain, as Pinocchio orders them."""
 
     q: np.ndarray
@@ -81,9 +80,7 @@ class ClosedChain:
 
     def acceleration(self, state):
         """One call of `constraintDynamics`: generalised acceleration."""
-        return pin.constraintDynamics(
-            self.model, self.data, state.q, state.v, state.force, self.loops, self.loop_data, SETTINGS
-        )
+        return pin.constraintDynamics(self.model, self.data, *state, self.loops, self.loop_data, SETTINGS)
 
     def twist_dot(self, state):
         """Platform acceleration [h_ddot, omega_dot] (6,), base axes."""
@@ -94,12 +91,10 @@ class ClosedChain:
     def closure(self, state):
         """Largest gap (m) and gap velocity (m/s) of the 18 constraints: proves that the chain is set up closed."""
         pin.forwardKinematics(self.model, self.data, state.q, state.v)
-        gap, speed = 0.0, 0.0
-        for loop in self.loops:
-            ends = []
-            for joint, place in ((loop.joint1_id, loop.joint1_placement), (loop.joint2_id, loop.joint2_placement)):
-                at = self.data.oMi[joint].act(place)
-                ends.append((at.translation, at.rotation @ place.actInv(self.data.v[joint]).linear))
-            gap = max(gap, np.abs(ends[0][0] - ends[1][0]).max())
-            speed = max(speed, np.abs(ends[0][1] - ends[1][1]).max())
-        return gap, speed
+
+        def end(joint, place):
+            at = self.data.oMi[joint].act(place)
+            return np.array([at.translation, at.rotation @ place.actInv(self.data.v[joint]).linear])
+
+        gaps = [end(c.joint1_id, c.joint1_placement) - end(c.joint2_id, c.joint2_placement) for c in self.loops]
+        return np.abs(gaps).max(axis=(0, 2))

@@ -114,29 +114,17 @@ def derivative(function: Callable[[float], np.ndarray], h: float = 1e-3) -> np.n
     return sum(w * (function(n * h) - function(-n * h)) for n, w in weights.items()) / h
 
 
-@dataclass(frozen=True)
-class Motion:
-    """A smooth motion through the box, with its exact derivatives; amplitudes (6,), frequencies (6,) in rad/s."""
-
-    home: np.ndarray
-    amplitude: np.ndarray
-    frequency: np.ndarray
-    phase: np.ndarray
-
-    def pose(self, t: float) -> np.ndarray:
-        return self.home + self.amplitude * np.sin(self.frequency * t + self.phase)
-
-    def rate(self, t: float) -> np.ndarray:
-        return self.amplitude * self.frequency * np.cos(self.frequency * t + self.phase)
-
-    def acceleration(self, t: float) -> np.ndarray:
-        return -self.amplitude * self.frequency**2 * np.sin(self.frequency * t + self.phase)
-
-
 @pytest.fixture
-def motion(robot: dynamics.Robot) -> Motion:
+def motion(robot: dynamics.Robot) -> Callable[[float], np.ndarray]:
+    """Pose, its rate and its acceleration (3, 6) at a time of a smooth motion through the box."""
     rng = np.random.default_rng(11)
-    return Motion(robot.home_pose, BOX * rng.uniform(0.5, 1, 6), rng.uniform(4, 9, 6), rng.uniform(0, 6, 6))
+    amplitude, frequency, phase = BOX * rng.uniform(0.5, 1, 6), rng.uniform(4, 9, 6), rng.uniform(0, 6, 6)
+
+    def at(t: float) -> np.ndarray:
+        wave = amplitude * np.exp(1j * (frequency * t + phase))
+        return np.array([robot.home_pose + wave.imag, (frequency * wave).real, -(frequency**2 * wave).imag])
+
+    return at
 
 
 def at_rest(pose: np.ndarray, frames: int) -> closed_loop.Reference:

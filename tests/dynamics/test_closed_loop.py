@@ -64,16 +64,6 @@ def test_compiled_run_equals_plain_run(loop, case):
     assert (runs[1].events > 3) == (case != "smoothed")
 
 
-def test_a_lost_frame_holds_the_command_before_it(robot, loop):
-    """The first frame, single frames and two in a row."""
-    lost = {0, 5, 9, 10}
-    run = loop.run(24, loop.settings(latency_s=0.4 * PERIOD), sensor=_sensor(lost))
-    assert set(np.flatnonzero(~run.measured_ok)) == lost
-    assert np.isnan(run.measured[sorted(lost)]).all()
-    np.testing.assert_array_equal(run.command[[5, 9, 10]], run.command[[4, 8, 8]])
-    np.testing.assert_allclose(run.command[0], robot.inverse_kinematics(robot.home_pose), atol=1e-15)
-
-
 def _acting(t, arrivals, hold, commands):
     """Command (6,) that acts at a time t, and its U_dot: the definition, by a clock. Arrivals are those of `commands`,
     of which the first three were issued before the run."""
@@ -112,14 +102,19 @@ def test_each_command_acts_from_its_arrival_and_never_before_the_one_before_it(l
 
 
 @paths
-def test_lost_frames_and_noise_of_the_ideal_sensor_are_a_sensor_that_has_them(loop, compiled):
-    """Masks and rows do what a sensor that adds them and answers None does."""
-    settings, options = loop.settings(latency_s=0.4 * PERIOD), {"compiled": compiled}
-    noise, lost = 2e-5 * np.sin(np.arange(12)[:, None] + np.arange(6)), np.isin(np.arange(12), (0, 5))
-    asked = loop.run(12, settings, sensor=_sensor({0, 5}), **options)
-    drawn = loop.run(12, settings, noise=noise, lost=lost, **options)
+def test_a_lost_frame_holds_the_command_before_it_whether_a_sensor_lost_it_or_a_mask(loop, compiled):
+    """The first frame, single frames and two in a row; masks and rows of noise do what a sensor that adds them and
+    answers None does."""
+    lost, settings = np.isin(np.arange(24), (0, 5, 9, 10)), loop.settings(latency_s=0.4 * PERIOD)
+    noise = 2e-5 * np.sin(np.arange(24)[:, None] + np.arange(6))
+    asked = loop.run(24, settings, sensor=_sensor({0, 5, 9, 10}), compiled=compiled)
+    drawn = loop.run(24, settings, noise=noise, lost=lost, compiled=compiled)
     for name in ("pose", "measured", "measured_ok", "command"):
         np.testing.assert_array_equal(getattr(drawn, name), getattr(asked, name), err_msg=name)
+    np.testing.assert_array_equal(asked.measured_ok, ~lost)
+    assert np.isnan(asked.measured[lost]).all()
+    np.testing.assert_array_equal(asked.command[[5, 9, 10]], asked.command[[4, 8, 8]])
+    np.testing.assert_allclose(asked.command[0], loop.robot.inverse_kinematics(loop.robot.home_pose), atol=1e-15)
 
 
 @paths
@@ -324,23 +319,17 @@ def test_a_batch_is_its_runs_in_order_for_any_number_of_workers(robot, loop):
 
 @pytest.mark.slow  # compiles the plant
 def test_the_servo_commands_with_the_kinematics_it_knows(loop, robot):
-    """Eq. 30 worked out from what was measured, with the nominal Jacobian by differences of its inverse kinematics;
-    both paths agree, a servo that knows the plant commands otherwise, and one that knows its robot as ever."""
+    """As a user's servo with the nominal robot does, on both paths; one that knows the plant commands otherwise, and
+    one that knows its robot as ever."""
     plant = with_geometry_error(robot, 1e-4, np.random.default_rng(3))
     reference, theirs = loop.reference(40), Loop(plant, loop.parameters)
-    run, plain = theirs.both(reference, sensor=lambda k, t, pose: pose, servo_robot=robot)
+    run, plain = theirs.both(reference, sensor=_sensor(), servo_robot=robot)
     assert_same(run, plain)
     assert run.events > 3
     np.testing.assert_allclose(run.pose, plain.pose, atol=1e-13)
-    error = reference.poses - run.measured
-    before = np.vstack([run.start.last_measured, run.measured[:-1]])
-    rate_error = reference.rates - (run.measured - before) * 60.0
-    integral = run.start.servo_integral + np.cumsum(error / 60.0, axis=0)
-    demand = 0.3 * error + 0.001 * rate_error + 2.4 * integral
-    for k in range(12):
-        moved = robot.inverse_kinematics(run.measured[k] + 1e-6 * np.vstack([np.eye(6), -np.eye(6)]))
-        jacobian = (moved[:6] - moved[6:]).T / 2e-6
-        np.testing.assert_allclose(run.command[k], jacobian @ demand[k], atol=1e-8)
-    np.testing.assert_allclose(run.command[0], 0, atol=1e-12)  # the plant's cranks at home
-    assert np.abs(run.pose - theirs.run(reference, sensor=lambda k, t, pose: pose).pose).max() > 1e-7
+    servo = PaperServo(robot, loop.settings(), reference.poses[0])
+    np.testing.assert_allclose(
+        theirs.run(reference, sensor=_sensor(), controller=servo).command, run.command, atol=1e-11
+    )
+    assert np.abs(run.pose - theirs.run(reference, sensor=_sensor()).pose).max() > 1e-7
     np.testing.assert_array_equal(loop.run(reference, servo_robot=robot).pose, loop.run(reference).pose)

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
+from inspect import getsource
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -16,13 +17,6 @@ from dynamics import closed_loop, compilation, load_robot, robot_file
 from dynamics import robot as robot_module
 from dynamics.errors import DynamicsError, SimulationError
 from tests.dynamics.conftest import assert_same
-
-SQUARE = """
-import casadi as ca
-from dynamics import compilation, load_robot
-x = ca.SX.sym("x")
-print(compilation.load_library("square", load_robot("rss6").geometry, lambda g: [ca.Function("square", [x], [x * x])]))
-"""
 
 
 @pytest.fixture
@@ -36,23 +30,28 @@ def _square(geometry):
     return [ca.Function("square", [x], [x * x])]
 
 
+def compiled_square(name="square", geometry=None, build=_square):
+    return compilation.load_library(name, geometry or load_robot("rss6").geometry, build)
+
+
 def test_code_is_compiled_once_per_content(robot, own_cache):
     """The second request builds nothing; another geometry or name is another file."""
     build = Mock(side_effect=_square)
-    first = compilation.load_library("square", robot.geometry, build)
-    again = compilation.load_library("square", load_robot("rss6").geometry, build)
-    assert first == again
+    first = compiled_square(build=build)
+    assert compiled_square(build=build) == first
     build.assert_called_once()
     assert float(ca.external("square", str(first))(3.0)) == 9.0
     shorter = replace(robot.geometry, crank_length=0.061)
-    others = {compilation.load_library("square", shorter, build), compilation.load_library("cube", shorter, build)}
+    others = {compiled_square(geometry=shorter), compiled_square("cube", shorter)}
     assert len(others | {first}) == 3
     assert len(list(own_cache.iterdir())) == 3
 
 
 def test_two_processes_that_compile_at_once_get_one_whole_library(own_cache):
     """Both end well with the same file, and no temporary file is left behind."""
-    command, folder = [sys.executable, "-c", SQUARE], Path(__file__).parents[2]
+    load = "import casadi as ca\nfrom dynamics import compilation, load_robot\n"
+    code = "\n".join([load, getsource(_square), getsource(compiled_square), "print(compiled_square())"])
+    command, folder = [sys.executable, "-c", code], Path(__file__).parents[2]
     processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder) for _ in range(2)]
     paths = {process.communicate(timeout=60)[0].strip() for process in processes}
     assert [process.returncode for process in processes] == [0, 0]
@@ -60,11 +59,11 @@ def test_two_processes_that_compile_at_once_get_one_whole_library(own_cache):
     ctypes.CDLL(paths.pop())
 
 
-def test_code_the_compiler_refuses_is_an_error_with_its_words(robot, own_cache, monkeypatch):
+def test_code_the_compiler_refuses_is_an_error_with_its_words(own_cache, monkeypatch):
     """A working compiler that refuses the generated code is a defect, not a reason to be slow: no fallback, no file."""
     monkeypatch.setattr(compilation, "_source", lambda functions, driver: "int broken(")
     with pytest.raises(DynamicsError, match=r"failed on the generated code of the robot: .*error"):
-        compilation.load_library("square", robot.geometry, _square)
+        compiled_square()
     assert list(own_cache.iterdir()) == []
 
 

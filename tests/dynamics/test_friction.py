@@ -15,7 +15,6 @@ MASS, STIFFNESS, COULOMB = 0.8, 20.0, 1.0
 FREQUENCY = np.sqrt(STIFFNESS / MASS)
 BY_START = LENGTH + 1  # the column of the start position, behind those of the parameters and of the step
 STRIBECK = FrictionLaw("stribeck", static_ratio=1.5, stribeck_velocity=0.2)
-LAWS = [FrictionLaw(), FrictionLaw("smoothed", smoothing_velocity=0.1), STRIBECK]
 FIRST = np.eye(6)[0]
 
 
@@ -59,18 +58,6 @@ def _oscillator(t, x0, k=STIFFNESS, fc=COULOMB, mass=MASS):
     if abs(start) <= centre:
         return start
     return side * centre + (start - side * centre) * np.cos(t * np.sqrt(k / mass))
-
-
-def test_level_of_friction_has_its_slope_and_stribeck_goes_from_breakaway_to_coulomb():
-    """At rest the breakaway torque, far above the Stribeck velocity the Coulomb torque, and odd in the velocity."""
-    for law, direction in itertools.product(LAWS, (1.0, -1.0)):
-        v, side = direction * np.linspace(0.01, 1.0, 40), np.full(40, direction)
-        numeric = (law.dry_level(v + 1e-6, side) - law.dry_level(v - 1e-6, side)) / 2e-6
-        np.testing.assert_allclose(law.dry_slope(v, side), numeric, atol=1e-8, err_msg=law.name)
-    for velocity, level in ((0.0, 1.5), (0.2, 1 + 0.5 / np.e), (5.0, 1.0)):
-        for side in (1, -1):
-            found = STRIBECK.dry_level(np.array([side * velocity]), np.array([float(side)]))
-            assert found == pytest.approx(side * level)
 
 
 @pytest.mark.parametrize("half_swings", [0.4, 1.5, 2.6, 3.3, 8.0])

@@ -32,15 +32,14 @@ def test_joint_jacobian_is_the_derivative_along_a_screw_motion(robot, states):
 def test_twist_is_the_velocity_of_place_and_rotation_and_twist_dot_its_derivative(robot, motion):
     """Eq. 2: [omega]x = R_dot R^T with R differentiated numerically; eq. 38 against differences of that twist."""
     for t in np.linspace(0, 2, 9):
-        rotation = base_from_platform(motion.pose(t))
-        turning = derivative(lambda d, t=t: base_from_platform(motion.pose(t + d))) @ rotation.T
-        twist = robot.twist(motion.pose(t), motion.rate(t))
-        np.testing.assert_allclose(twist[:3], motion.rate(t)[:3], atol=1e-11)
+        pose, rate, acceleration = motion(t)
+        turning = derivative(lambda d, t=t: base_from_platform(motion(t + d)[0])) @ base_from_platform(pose).T
+        twist = robot.twist(pose, rate)
+        np.testing.assert_allclose(twist[:3], rate[:3], atol=1e-11)
         np.testing.assert_allclose(twist[3:], [turning[2, 1], turning[0, 2], turning[1, 0]], atol=1e-11)
-        np.testing.assert_allclose(robot.pose_rate(motion.pose(t), twist), motion.rate(t), atol=1e-14)
-        expected = derivative(lambda d, t=t: robot.twist(motion.pose(t + d), motion.rate(t + d)))
-        result = robot.twist_dot(motion.pose(t), motion.rate(t), motion.acceleration(t))
-        np.testing.assert_allclose(result, expected, atol=1e-8)
+        np.testing.assert_allclose(robot.pose_rate(pose, twist), rate, atol=1e-14)
+        expected = derivative(lambda d, t=t: robot.twist(*motion(t + d)[:2]))
+        np.testing.assert_allclose(robot.twist_dot(pose, rate, acceleration), expected, atol=1e-8)
 
 
 def followed_from_home(geometry, theta, steps=40):

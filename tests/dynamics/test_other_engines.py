@@ -93,10 +93,7 @@ def acceleration_in_rigid_loops(mujoco, engine, pose, twist, torque):
     engine.put(pose, twist)
     model, data = engine.model, engine.data
     mass, loops, drift = np.zeros((30, 30)), np.zeros((18, 30)), np.zeros((18, 30))
-    if int(mujoco.__version__.split(".")[0]) >= 4:
-        mujoco.mj_fullM(model, data, mass)
-    else:
-        mujoco.mj_fullM(model, mass, data.qM)
+    mujoco.mj_fullM(model, data, mass)
     for leg in range(6):
         rows = slice(3 * leg, 3 * leg + 3)
         for sign, name in ((1, f"link_end{leg + 1}"), (-1, f"platform_joint{leg + 1}")):

@@ -14,29 +14,27 @@ def parameters(request, robot):
     return robot.parameter_sets[request.param].dynamic
 
 
-def test_mass_matrix_is_symmetric_and_positive_definite(robot, states, parameters):
-    """At 100 random poses, with both parameter sets of the paper."""
-    mass = robot.mass_matrix(states.pose, parameters)
-    np.testing.assert_allclose(mass, mass.transpose(0, 2, 1), atol=1e-12)
-    assert np.linalg.eigvalsh(mass).min() > 0.1
-    assert len(robot.parameter_names) == len(robot.nominal_parameters) == 64
-    np.testing.assert_array_equal(
-        robot.mass_matrix(states.pose), robot.mass_matrix(states.pose, robot.parameter_sets["initial"].dynamic)
-    )
-
-
 def test_parts_regressor_and_inverse_dynamics_agree(robot, states, parameters):
     """M twist_dot + C twist + G + friction, from the paper's 6x6 Jacobians, equals Gamma Xi and J^T torque, formed
-    from the motion of the platform joints alone: two derivations of one wrench."""
+    from the motion of the platform joints alone: two derivations of one wrench, with other parameters at each state.
+    M is symmetric and positive definite; at rest there is no friction (sign(0) = 0)."""
     pose, twist, twist_dot = states.pose, states.twist, states.twist_dot
+    parameters = parameters * np.random.default_rng(6).uniform(0.5, 2, (len(pose), 64))
     mass, coriolis = robot.mass_matrix(pose, parameters), robot.coriolis_matrix(pose, twist, parameters)
+    np.testing.assert_allclose(mass, mass.transpose(0, 2, 1), atol=1e-12)
+    assert np.linalg.eigvalsh(mass).min() > 0.1
     parts = (mass @ twist_dot[..., None] + coriolis @ twist[..., None])[..., 0]
     parts += robot.gravity_wrench(pose, parameters) + robot.friction_wrench(pose, twist, parameters)
     scale = np.abs(parts).max()
-    np.testing.assert_allclose(robot.regressor(pose, twist, twist_dot) @ parameters, parts, atol=1e-12 * scale)
+    by_regressor = (robot.regressor(pose, twist, twist_dot) @ parameters[..., None])[..., 0]
+    np.testing.assert_allclose(by_regressor, parts, atol=1e-12 * scale)
     torque = robot.inverse_dynamics(pose, twist, twist_dot, parameters)
     wrench = (robot.joint_jacobian(pose).transpose(0, 2, 1) @ torque[..., None])[..., 0]
     np.testing.assert_allclose(wrench, parts, atol=1e-12 * scale)
+    np.testing.assert_array_equal(robot.friction_wrench(pose, 0 * twist, parameters), 0)
+    assert len(robot.parameter_names) == len(robot.nominal_parameters) == 64
+    defaults = robot.mass_matrix(pose, robot.parameter_sets["initial"].dynamic)
+    np.testing.assert_array_equal(robot.mass_matrix(pose), defaults)
 
 
 def test_forward_dynamics_inverts_inverse_dynamics(robot, states, parameters):
@@ -66,11 +64,6 @@ def test_batches_equal_single_calls(robot, states, parameters):
         assert none.shape == (0, *batch.shape[1:]), name
 
 
-def _centres(legs, pose):
-    """Centres of mass (13, 3) of platform, cranks and links."""
-    return np.vstack([pose[:3], legs.tip - legs.crank / 2, (legs.tip + legs.joint) / 2])
-
-
 def _angular_velocity(axes_at):
     """Of moving axes (..., 3, 3), columns in base axes, at time 0: (..., 3) in those axes."""
     turn = axes_at(0.0).swapaxes(-1, -2) @ derivative(axes_at)
@@ -83,21 +76,23 @@ def test_mass_matrix_gives_the_kinetic_energy_and_gravity_the_power_of_the_13_bo
     """1/2 v^T M v is the sum over platform, cranks and links, and G . v the rate of sum(m g z), with bodies moved by
     finite differences (1e-9 relative)."""
     masses = parameters[:52:4]
+
+    def centres(pose):
+        legs = legs_at(pose)
+        return np.vstack([pose[:3], legs.tip - legs.crank / 2, (legs.tip + legs.joint) / 2])
+
     for t in (0.1, 0.5, 1.3):
-
-        def pose_at(d, t=t):
-            return motion.pose(t + d)
-
-        speeds = derivative(lambda d, at=pose_at: _centres(legs_at(at(d)), at(d)))
-        platform = _angular_velocity(lambda d, at=pose_at: base_from_platform(at(d)))
-        cranks = derivative(lambda d, at=pose_at: robot.inverse_kinematics(at(d)))
-        links = _angular_velocity(lambda d, at=pose_at: link_axes(robot.geometry, legs_at(at(d))))
+        pose, rate, _ = motion(t)
+        speeds = derivative(lambda d, t=t: centres(motion(t + d)[0]))
+        platform = _angular_velocity(lambda d, t=t: base_from_platform(motion(t + d)[0]))
+        cranks = derivative(lambda d, t=t: robot.inverse_kinematics(motion(t + d)[0]))
+        links = _angular_velocity(lambda d, t=t: link_axes(robot.geometry, legs_at(motion(t + d)[0])))
         kinetic = masses @ np.sum(speeds**2, axis=1) + parameters[1:4] @ platform**2 + parameters[7:28:4] @ cranks**2
         kinetic += parameters[29:52:4] @ links[:, 0] ** 2 + parameters[30:52:4] @ links[:, 1] ** 2
-        twist = robot.twist(motion.pose(t), motion.rate(t))
-        np.testing.assert_allclose(twist @ robot.mass_matrix(pose_at(0), parameters) @ twist, kinetic, rtol=1e-9)
+        twist = robot.twist(pose, rate)
+        np.testing.assert_allclose(twist @ robot.mass_matrix(pose, parameters) @ twist, kinetic, rtol=1e-9)
         power = -masses @ speeds @ robot.geometry.gravity
-        np.testing.assert_allclose(robot.gravity_wrench(pose_at(0), parameters) @ twist, power, rtol=1e-9)
+        np.testing.assert_allclose(robot.gravity_wrench(pose, parameters) @ twist, power, rtol=1e-9)
 
 
 def test_links_without_spin_break_the_energy_balance_by_a_known_amount(robot, legs_at, motion, parameters):
@@ -107,31 +102,13 @@ def test_links_without_spin_break_the_energy_balance_by_a_known_amount(robot, le
     round_links = parameters.copy()
     round_links[30:52:4] = round_links[29:52:4]
     for t in np.linspace(0, 3, 7):
-        pose, twist = motion.pose(t), robot.twist(motion.pose(t), motion.rate(t))
-        omega = _angular_velocity(lambda d, t=t: link_axes(robot.geometry, legs_at(motion.pose(t + d))))
+        pose, rate, _ = motion(t)
+        twist = robot.twist(pose, rate)
+        omega = _angular_velocity(lambda d, t=t: link_axes(robot.geometry, legs_at(motion(t + d)[0])))
         for values in (parameters, round_links):
-            rate = derivative(lambda d, t=t, values=values: robot.mass_matrix(motion.pose(t + d), values))
-            skew = rate - 2 * robot.coriolis_matrix(pose, twist, values)
+            mass_rate = derivative(lambda d, t=t, values=values: robot.mass_matrix(motion(t + d)[0], values))
+            skew = mass_rate - 2 * robot.coriolis_matrix(pose, twist, values)
             expected = 2 * np.sum((values[29:52:4] - values[30:52:4]) * omega.prod(axis=1))
             np.testing.assert_allclose(twist @ skew @ twist, expected, atol=2e-11)
         assert abs(twist @ skew @ twist) < 1e-11
-        np.testing.assert_allclose(skew, -skew.T, atol=1e-9 * np.abs(rate).max())
-
-
-def test_friction_follows_the_joint_velocity(robot, states, parameters):
-    """Friction power is the sum of f_c |theta_dot| + f_v theta_dot^2, and friction vanishes at rest (sign(0) = 0)."""
-    theta_dot = (robot.joint_jacobian(states.pose) @ states.twist[..., None])[..., 0]
-    power = np.sum(robot.friction_wrench(states.pose, states.twist, parameters) * states.twist, axis=1)
-    expected = np.abs(theta_dot) @ parameters[52:58] + theta_dot**2 @ parameters[58:64]
-    np.testing.assert_allclose(power, expected, rtol=1e-11, atol=1e-13)
-    np.testing.assert_array_equal(robot.friction_wrench(states.pose, 0 * states.twist, parameters), 0)
-
-
-def test_wrench_is_linear_in_the_parameters(robot, states):
-    """Each column of the regressor is the wrench of one parameter alone: J^T times the torque of a unit change."""
-    motion = pose, *_ = states.pose[0], states.twist[0], states.twist_dot[0]
-    base = robot.nominal_parameters
-    many = [np.tile(entry, (65, 1)) for entry in motion]
-    torque = robot.inverse_dynamics(*many, np.vstack([base, base + np.eye(64)]))
-    wrenches = (torque[1:] - torque[0]) @ robot.joint_jacobian(pose)
-    np.testing.assert_allclose(wrenches.T, robot.regressor(*motion), atol=1e-10)
+        np.testing.assert_allclose(skew, -skew.T, atol=1e-9 * np.abs(mass_rate).max())
