@@ -58,16 +58,16 @@ class States:
     twist_dot: np.ndarray
 
 
-@pytest.fixture(scope="session")
-def states(robot: dynamics.Robot) -> States:
-    return random_states(robot, 300, seed=8)
-
-
 def random_states(robot: dynamics.Robot, count: int, seed: int) -> States:
     rng = np.random.default_rng(seed)
     scale = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
     pose = robot.home_pose + BOX * rng.uniform(-1, 1, (count, 6))
     return States(pose, scale * rng.standard_normal((count, 6)), 10 * scale * rng.standard_normal((count, 6)))
+
+
+@pytest.fixture(scope="session")
+def states(robot: dynamics.Robot) -> States:
+    return random_states(robot, 300, seed=8)
 
 
 def base_from_platform(pose: np.ndarray) -> np.ndarray:

@@ -152,23 +152,20 @@ def test_logged_commands_drive_and_what_is_measured_beside_them_steers_nothing(l
     np.testing.assert_array_equal(sensed.measured_ok, np.arange(20) != 2)
 
 
-class PaperServo:
+def _paper_servo(robot, settings, start):
     """Eq. 30, written down once more from the robot's public Jacobian; it starts as the loop's equilibrium does."""
+    gains, period = settings.servo, 1 / settings.timing.frame_rate_hz
+    before, before_at = start, -period
+    integral = np.linalg.solve(robot.pose_jacobian(start), robot.inverse_kinematics(start)) / gains.ki
 
-    def __init__(self, robot, settings, start):
-        self.robot, self.gains = robot, settings.servo
-        self.period = 1 / settings.timing.frame_rate_hz
-        self.before, self.before_at = start, -self.period
-        angles = robot.inverse_kinematics(start)
-        self.integral = np.linalg.solve(robot.pose_jacobian(start), angles) / self.gains.ki
+    def command(frame, t, measured, desired, desired_rate):
+        nonlocal before, before_at, integral
+        error, rate = desired - measured, (measured - before) / (t - before_at)
+        integral, before, before_at = integral + period * error, measured, t
+        demand = gains.kp * error + gains.kd * (desired_rate - rate) + gains.ki * integral
+        return robot.pose_jacobian(measured) @ demand
 
-    def __call__(self, frame, t, measured, desired, desired_rate):
-        error = desired - measured
-        self.integral = self.integral + self.period * error
-        rate = (measured - self.before) / (t - self.before_at)
-        self.before, self.before_at = measured, t
-        demand = self.gains.kp * error + self.gains.kd * (desired_rate - rate) + self.gains.ki * self.integral
-        return self.robot.pose_jacobian(measured) @ demand
+    return command
 
 
 @paths
@@ -176,7 +173,7 @@ class PaperServo:
 def test_the_servo_of_equation_30_written_by_a_user_runs_as_the_built_in_one(robot, loop, latency_s, compiled):
     """As a controller, with a sensor that errs and loses frames, late commands, against both paths."""
     settings, reference, sensor = loop.settings(latency_s=latency_s), loop.reference(24), _sensor({5, 6, 17})
-    own = loop.run(reference, settings, sensor=sensor, controller=PaperServo(robot, settings, reference.poses[0]))
+    own = loop.run(reference, settings, sensor=sensor, controller=_paper_servo(robot, settings, reference.poses[0]))
     built_in = loop.run(reference, settings, sensor=sensor, compiled=compiled)
     np.testing.assert_allclose(own.command, built_in.command, atol=1e-11)
     np.testing.assert_allclose(own.pose, built_in.pose, atol=1e-11)
@@ -212,16 +209,12 @@ def test_run_starts_in_equilibrium(robot, loop):
     np.testing.assert_allclose(run.torque, np.tile(weight, (60, 1)), atol=1e-11)
 
 
-def test_stable_where_the_paper_is(loop):
-    """Table 2 parameters at 29 Hz with one frame of delay follow the reference within 20 mm for 20 s."""
-    reference = loop.reference(580, 29.0, scale=0.5)
-    run = loop.run(reference, loop.settings(29.0, latency_s=1 / 29))
-    assert np.abs(run.pose - reference.poses)[:, :3].max() < 0.02
-
-
-def test_an_unstable_loop_names_frame_time_and_the_leg_that_leaves_its_reach(robot, loop):
-    """Table 1 at 29 Hz with one frame of delay: both paths say the same; at the frame before, all legs reach."""
-    settings, reference = loop.settings(29.0, latency_s=1 / 29), loop.reference(580, 29.0)
+def test_the_loop_is_stable_where_the_paper_is_or_names_frame_time_and_the_leg_that_leaves_its_reach(robot, loop):
+    """At 29 Hz with one frame of delay Table 2 follows for 20 s within 20 mm; Table 1 does not, as both paths say: at
+    the frame before, all legs reach."""
+    settings, reference = loop.settings(29.0, latency_s=1 / 29), loop.reference(580, 29.0, scale=0.5)
+    assert np.abs(loop.run(reference, settings).pose - reference.poses)[:, :3].max() < 0.02
+    reference = loop.reference(580, 29.0)
     unstable, messages = robot.parameter_sets["initial"].vector, []
     for compiled in (True, False):
         with pytest.raises(closed_loop.LoopFailure) as caught:
@@ -278,22 +271,9 @@ def test_a_singular_mass_matrix_is_said(loop, compiled):
         loop.run(10, parameters=parameters, compiled=compiled)
 
 
-def test_runs_in_threads_equal_runs_in_turn(loop):
-    """The compiled loop keeps no state between calls: sixteen runs on four threads give the same bits."""
-    sets = [loop.parameters * (1 + 0.001 * n * np.cos(np.arange(67))) for n in range(16)]
-
-    def run(values):
-        return loop.run(120, parameters=values, sensor=_sensor({4})).pose
-
-    expected = [run(values) for values in sets]
-    with ThreadPoolExecutor(4) as pool:
-        for ours, other in zip(pool.map(run, sets), expected, strict=True):
-            np.testing.assert_array_equal(ours, other)
-
-
 def test_a_batch_is_its_runs_in_order_for_any_number_of_workers(robot, loop):
     """Many vectors with one reference; one vector with many references, or with many starts, as multiple shooting
-    wants them."""
+    wants them. Runs with a sensor on four threads are those in turn: no run leaves anything behind for another."""
 
     def compare(runs, references, vectors, starts, **options):
         for run, reference, vector, start in zip(runs, references, vectors, starts, strict=True):
@@ -303,10 +283,14 @@ def test_a_batch_is_its_runs_in_order_for_any_number_of_workers(robot, loop):
         assert not np.array_equal(runs[0].pose, runs[1].pose)
 
     settings, reference, one = loop.settings(), loop.reference(30), loop.parameters
-    vectors = one * np.linspace(0.95, 1.05, 5)[:, None] ** np.arange(67)[None, :].clip(0, 1)
+    vectors = [one * (1 + 0.001 * n * np.cos(np.arange(67))) for n in range(16)]
     for workers in (1, 3):
-        runs = simulate_batch(robot, vectors, reference, settings, sensitivities=True, workers=workers)
-        compare(runs, [reference] * 5, vectors, [None] * 5, sensitivities=True)
+        runs = simulate_batch(robot, vectors[:5], reference, settings, sensitivities=True, workers=workers)
+        compare(runs, [reference] * 5, vectors[:5], [None] * 5, sensitivities=True)
+    sensor = _sensor({4})
+    with ThreadPoolExecutor(4) as pool:
+        runs = list(pool.map(lambda values: loop.run(120, parameters=values, sensor=sensor), vectors))
+    compare(runs, [120] * 16, vectors, [None] * 16, sensor=sensor)
     references = [loop.reference(20, scale=scale) for scale in (0.5, 1.0)]
     compare(simulate_batch(robot, one, references, settings), references, [one] * 2, [None] * 2)
     start = loop.run(reference).state_at(20)
@@ -314,7 +298,7 @@ def test_a_batch_is_its_runs_in_order_for_any_number_of_workers(robot, loop):
     runs = simulate_batch(robot, one, reference, settings, starts=starts, start_sensitivities=True)
     compare(runs, [reference] * 3, [one] * 3, starts, start_sensitivities=True)
     with pytest.raises(SimulationError, match="5 parameter vectors and 1 references and 3 start states"):
-        simulate_batch(robot, vectors, reference, settings, starts=starts)
+        simulate_batch(robot, vectors[:5], reference, settings, starts=starts)
 
 
 @pytest.mark.slow  # compiles the plant
@@ -327,7 +311,7 @@ def test_the_servo_commands_with_the_kinematics_it_knows(loop, robot):
     assert_same(run, plain)
     assert run.events > 3
     np.testing.assert_allclose(run.pose, plain.pose, atol=1e-13)
-    servo = PaperServo(robot, loop.settings(), reference.poses[0])
+    servo = _paper_servo(robot, loop.settings(), reference.poses[0])
     np.testing.assert_allclose(
         theirs.run(reference, sensor=_sensor(), controller=servo).command, run.command, atol=1e-11
     )

@@ -37,10 +37,7 @@ def test_the_file_holds_the_robot_of_radii_and_angles(robot):
 
 
 def test_the_stated_travel_covers_the_box(robot):
-    """Over the box +-10 mm, +-0.04 rad (its 64 corners and 5000 poses inside) no crank leaves +-0.803 rad.
-
-    The largest angle is that of a corner, 0.8029 rad.
-    """
+    """Over the box +-10 mm, +-0.04 rad (its 64 corners and 5000 poses inside) the largest angle is a corner's."""
     corners = np.array(list(itertools.product([-1, 1], repeat=6)))
     inside = np.random.default_rng(0).uniform(-1, 1, (5000, 6))
     theta = robot.inverse_kinematics(robot.home_pose + BOX * np.vstack([corners, inside]))
@@ -48,16 +45,11 @@ def test_the_stated_travel_covers_the_box(robot):
     assert np.abs(theta).argmax() < 64 * 6
 
 
-offsets = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(np.array)
-
-
 @settings(max_examples=100, deadline=None)
-@given(offset=offsets)
+@given(offset=st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(np.array))
 def test_legs_close_on_the_branch_of_home(robot, legs_at, offset):
-    """From T, built with the angles of the inverse kinematics, A lies one link length away, on the side it has at home.
-
-    The side is the sign of (w x l) . s, which vanishes only where crank and link are stretched or folded.
-    """
+    """From T, built with the angles of the inverse kinematics, A lies one link length away, on the side it has at home:
+    the sign of (w x l) . s, which vanishes only where crank and link are stretched or folded."""
     place, home = legs_at(robot.home_pose + 1.3 * BOX * offset), legs_at(robot.home_pose)
     link, home_link = place.joint - place.tip, home.joint - home.tip
     np.testing.assert_allclose(np.linalg.norm(link, axis=1), robot.geometry.link_length, rtol=1e-13)
@@ -104,7 +96,6 @@ def test_a_file_by_path_and_a_robot_sent_to_another_process_are_the_same_robot(l
         ("mass = 24.0, ", "mass = 24.0, weight = 1, ", "initial.platform: .*unknown key weight; valid: mass"),
         ('family = "rss6"', 'family = "delta"', "family: Input should be 'rss6'"),
         ("link_length = 0.30133373938841", "link_length = -0.3", "link_length must be positive and finite, got -0.3"),
-        ("link_length = 0.30133373938841", "link_length = nan", "link_length must be positive and finite, got nan"),
         ("link_length = 0.30133373938841", "link_length = 0.1", "leg 1 cannot reach the home pose: reach margin -"),
         ("link_length = 0.30133373938841", 'link_length = "long"', "legs.link_length: Input should be a valid number"),
         (f"    {FIRST_JOINT},\n", "", r"base_joints must be .*\(6, 3\), got shape \(5, 3\)"),
