@@ -1,4 +1,4 @@
-"""What a stranger meets first: the public names, their help and types, and what starts; each as one finds it."""
+"""What a stranger meets first: public names, their help and types, what starts, and rooms that import downwards."""
 
 import inspect
 import os
@@ -11,7 +11,9 @@ import pytest
 
 import identify
 
+PACKAGES = ("cmmsim", "dynamics", "identify")
 ROOT = Path(__file__).parents[1]
+SOURCES = {path: path.read_text("utf-8") for name in PACKAGES for path in (ROOT / name).rglob("*.py")}
 HEAVY = ("casadi", "cv2", "numba", "numpy", "pyrender", "scipy", "xarray")
 
 SCRIPT = """
@@ -82,3 +84,21 @@ def test_a_foreign_package_of_the_name_identify_is_named(tmp_path, rooms):
     assert command.returncode == 1
     assert command.stderr.startswith(f"error: {said}")
     assert command.stderr.count("\n") == 1
+
+
+def test_import_linter_keeps_every_contract():
+    """Sensor and robot know neither each other nor `identify`; estimators know neither sensor nor truth."""
+    from importlinter.cli import lint_imports
+
+    assert lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True) == 0
+
+
+@pytest.mark.parametrize(("room", "forbidden"), [("dynamics", "cv2|trimesh"), ("cmmsim", "casadi"), ("", r"\.")])
+def test_robots_draw_no_images_the_sensor_needs_no_casadi_and_no_file_imports_relatively(room, forbidden):
+    imports = re.compile(rf"^\s*(from|import) ({forbidden})", re.MULTILINE)
+    assert [path for path, text in SOURCES.items() if path.is_relative_to(ROOT / room) and imports.search(text)] == []
+
+
+def test_no_file_is_longer_than_a_reader_can_hold():
+    assert len(SOURCES) > 100
+    assert {path.name: n for path, text in SOURCES.items() if (n := len(text.splitlines())) > 400} == {}

@@ -1,4 +1,4 @@
-"""What the tests of the plugin share: projects of one file, run by pytest."""
+"""What the tests of the plugin share: projects of one file, run by pytest, and four figures of one."""
 
 import textwrap
 
@@ -11,6 +11,16 @@ import identify.pipeline  # noqa: F401
 
 collect_ignore = ["guide"]  # an outsider's files: test_outside_project.py runs them as an outsider would
 
+FIGURES = """
+def test_sensor(accuracy):
+    accuracy.record("bias", 0.002, unit="px", limit=0.003)
+    accuracy.record("seen", 0.98, limit=0.95, better="higher")
+
+@pytest.mark.parametrize("method", ["planes", "registration"])
+def test_pose(accuracy, method):
+    accuracy.sample("pose", 10 + np.random.default_rng(len(method)).normal(0, 1, 50), unit="um")
+"""
+SAVE, COMPARE = ("--accuracy-save", "before"), ("--accuracy-compare", "before")
 QUICK = ("-p", "no:cacheprovider", "-p", "no:hypothesispytest")  # Hypothesis would be imported anew by each
 
 

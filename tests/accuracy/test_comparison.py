@@ -5,22 +5,14 @@ import json
 import numpy as np
 import pytest
 
-BEFORE = """
-def test_sensor(accuracy):
-    accuracy.record("bias", 0.002, unit="px", limit=0.003)
-    accuracy.record("seen", 0.98, limit=0.95, better="higher")
+from tests.accuracy.conftest import COMPARE, FIGURES, SAVE
 
-@pytest.mark.parametrize("method", ["planes", "registration"])
-def test_pose(accuracy, method):
-    accuracy.record("pose", 10.0, unit="um")
-"""
-SAVE, COMPARE = ("--accuracy-save", "before"), ("--accuracy-compare", "before")
 GUARDS = ((), ("--accuracy-fail", "0.1"))
 
 
 def test_the_table_compares_with_saved_figures_and_tells_of_new_ones_and_of_another_seed(project):
-    project(BEFORE, *SAVE)
-    now = BEFORE.replace("0.002", "0.0025") + "\ndef test_new(accuracy): accuracy.record('new', 1.0)\n"
+    project(FIGURES, *SAVE)
+    now = FIGURES.replace("0.002", "0.0025") + "\ndef test_new(accuracy): accuracy.record('new', 1.0)\n"
     again = project(now, *COMPARE, "--accuracy-seed", "7")
     again.assert_outcomes(passed=4)
     cells = {line.split()[0]: line.split()[-2:] for line in again.outlines if line.startswith("  ")}
@@ -65,10 +57,10 @@ def test_the_session_fails_when_a_figure_got_worse_by_more_than_the_ratio(projec
         assert any(line.startswith("worse by more than") for line in guarded.outlines) == worse
 
 
-FEWER = BEFORE.replace('    accuracy.record("seen", 0.98', '    dict(name="seen", value=0.98')
-SKIPPED = BEFORE.replace("accuracy, method):", "accuracy, method):\n    if method == 'planes': pytest.skip('none')")
-MODULE = "pytest.skip('no library', allow_module_level=True)\n" + BEFORE
-RENAMED = BEFORE.replace("test_sensor", "test_other")
+FEWER = FIGURES.replace('    accuracy.record("seen", 0.98', '    dict(name="seen", value=0.98')
+SKIPPED = FIGURES.replace("accuracy, method):", "accuracy, method):\n    if method == 'planes': pytest.skip('none')")
+MODULE = "pytest.skip('no library', allow_module_level=True)\n" + FIGURES
+RENAMED = FIGURES.replace("test_sensor", "test_other")
 TESTS = ("test_pose[planes]: pose", "test_pose[registration]: pose", "test_sensor: bias, seen")
 ALL_SKIPPED = [f"{test} (the test was skipped)" for test in TESTS]
 
@@ -79,7 +71,7 @@ ALL_SKIPPED = [f"{test} (the test was skipped)" for test in TESTS]
         (SKIPPED, (), ALL_SKIPPED[:1], 1),
         (FEWER, (), ["test_sensor: seen (the test passed without)"], 1),
         (RENAMED, (), ["test_sensor: bias, seen (the test did not run)"], 0),
-        (BEFORE, ("-k", "planes or sensor"), ["test_pose[registration]: pose (the test did not run)"], 0),
+        (FIGURES, ("-k", "planes or sensor"), ["test_pose[registration]: pose (the test did not run)"], 0),
         (MODULE, (), ALL_SKIPPED, 1),
         pytest.param(SKIPPED, ("-n", "1", "--dist", "loadgroup"), ALL_SKIPPED[:1], 1, marks=pytest.mark.slow),
     ],
@@ -89,7 +81,7 @@ def test_figures_that_are_missing_are_named(project, pytester, body, options, mi
     """With --accuracy-fail a test that is there has to bring all its figures."""
     pytester.makepyfile(test_other="def test_it(): pass")
     grouped = "\npytestmark = pytest.mark.xdist_group('one')\n"
-    project(grouped + BEFORE, *SAVE)
+    project(grouped + FIGURES, *SAVE)
     for guard in GUARDS:
         done = project(grouped + body, *COMPARE, *guard, *options)
         lines = [line.removeprefix("  test_mine.py::") for line in done.outlines if line.startswith("  test_mine.py::")]

@@ -6,18 +6,7 @@ import numpy as np
 import pytest
 
 from identify.accuracy.__main__ import main
-
-FIGURES = """
-def test_sensor(accuracy):
-    accuracy.record("bias", {bias}, unit="px", limit=0.003)
-    accuracy.record("seen", 0.98, limit=0.95, better="higher")
-
-@pytest.mark.parametrize("method", ["planes", "registration"])
-def test_pose(accuracy, method):
-    accuracy.sample("pose", 10 + np.random.default_rng(len(method)).normal(0, 1, 50), unit="um")
-"""
-START = FIGURES.format(bias=0.002)
-SAVE = ("--accuracy-save", "before")
+from tests.accuracy.conftest import COMPARE, FIGURES, SAVE
 
 
 @pytest.fixture
@@ -35,7 +24,7 @@ def table(result):
 
 
 def test_the_table_shows_value_interval_unit_limit_and_margin(project):
-    lines = [line.split() for line in table(project(START))]
+    lines = [line.split() for line in table(project(FIGURES))]
     values = 10 + np.random.default_rng(len("planes")).normal(0, 1, 50)
     mean, reach = values.mean(), 2.00958 * values.std(ddof=1) / np.sqrt(50)  # Student, 49 degrees of freedom
     assert lines[0] == ["value", "95%", "interval", "unit", "limit", "margin"]
@@ -88,7 +77,7 @@ def test_a_sample_whose_interval_holds_the_limit_is_undecided(project):
 
 
 def test_saved_figures_are_json_that_says_where_they_come_from_and_become_a_markdown_table(project, saved, capsys):
-    project(START, *SAVE, "--accuracy-seed", "3", "--junit-xml", "report.xml").assert_outcomes(passed=3)
+    project(FIGURES, *SAVE, "--accuracy-seed", "3", "--junit-xml", "report.xml").assert_outcomes(passed=3)
     content = json.loads(saved.read_text())
     said = {"format": "cmmsim accuracy", "schema": 1, "name": "before", "seed": 3}
     assert {name: content[name] for name in said} == said
@@ -114,28 +103,40 @@ def test_saved_figures_are_json_that_says_where_they_come_from_and_become_a_mark
     assert main([]).startswith("usage: ")
 
 
+BEYOND = """
+@pytest.mark.xfail(strict={})
+def test_bad(accuracy): accuracy.record("r", 10, limit=2)
+
+def test_good(accuracy): accuracy.record("s", 1, limit=2)
+"""
+
+
 @pytest.mark.parametrize(
     ("body", "why"),
     [
         ("def test_bad(): assert False", "no figures were recorded"),
         ("def test_it(accuracy): accuracy.record('x', 3, limit=2)", "the session did not pass"),
-        (START + "\ndef test_z(): pytest.exit('enough')", "the session did not pass"),
+        (FIGURES + "\ndef test_z(): pytest.exit('enough')", "the session did not pass"),
+        (BEYOND.format(True), "beyond their limits are test_mine.py::test_bad: r"),
+        (BEYOND.format(False), "beyond their limits are test_mine.py::test_bad: r"),
     ],
-    ids=["none", "failed", "interrupted"],
+    ids=["none", "failed", "interrupted", "expected to fail", "allowed to fail"],
 )
-def test_a_session_that_fails_saves_nothing(project, saved, body, why):
-    project(body, *SAVE).stdout.fnmatch_lines([f"not saved as before: {why}"])
+def test_a_session_that_fails_or_has_a_figure_beyond_its_limit_saves_nothing(project, saved, body, why):
+    done = project(body, *SAVE)
+    assert done.ret != 0
+    done.stdout.fnmatch_lines([f"not saved as before: {why}"])
     assert not saved.parent.exists()
-    project(START, *SAVE)
+    project(FIGURES, *SAVE)
     whole = saved.read_bytes()
     project(body, *SAVE).stdout.fnmatch_lines([f"not saved as before: {why}"])
     assert saved.read_bytes() == whole
 
 
 def test_saving_never_loses_the_figures_of_another_session(project, saved):
-    project(START, *SAVE)
+    project(FIGURES, *SAVE)
     whole = saved.read_bytes()
-    done = project(START, *SAVE, "-k", "planes")
+    done = project(FIGURES, *SAVE, "-k", "planes")
     assert done.ret == 1
     done.stdout.fnmatch_lines(
         [
@@ -144,34 +145,17 @@ def test_saving_never_loses_the_figures_of_another_session(project, saved):
         ]
     )
     assert saved.read_bytes() == whole
-    more = FIGURES.format(bias=0.001) + "\ndef test_new(accuracy): accuracy.record('new', 1.0)\n"
+    more = FIGURES.replace("0.002", "0.001") + "\ndef test_new(accuracy): accuracy.record('new', 1.0)\n"
     assert project(more, *SAVE).ret == 0
     names = [(figure["name"], figure["value"]) for figure in json.loads(saved.read_text())["figures"]]
     assert {("bias", 0.001), ("seen", 0.98), ("new", 1.0)} < set(names)
 
 
-@pytest.mark.parametrize("strict", [False, True])
-def test_a_figure_beyond_its_limit_is_not_saved_though_its_test_may_fail(project, saved, strict):
-    bad = """
-    @pytest.mark.xfail(strict={})
-    def test_bad(accuracy): accuracy.record("r", 10, limit=2)
-
-    def test_good(accuracy): accuracy.record("s", 1, limit=2)
-    """
-    done = project(bad.format(strict), *SAVE)
-    done.assert_outcomes(passed=1, xfailed=1)
-    done.stdout.fnmatch_lines(["not saved as before: beyond their limits are test_mine.py::test_bad: r"])
-    assert done.ret == 1
-    assert not saved.parent.exists()
-    assert project(bad.replace("10,", "1,").format(False), *SAVE).ret == 0
-    assert saved.exists()
-
-
 def test_the_folder_can_be_chosen_and_one_that_is_lost_meanwhile_fails_the_session_in_one_line(project, pytester):
-    project(START, *SAVE, "--accuracy-dir", "kept/figures").assert_outcomes(passed=3)
+    project(FIGURES, *SAVE, "--accuracy-dir", "kept/figures").assert_outcomes(passed=3)
     assert [path.name for path in (pytester.path / "kept" / "figures").iterdir()] == ["before.json"]
-    assert project(START, "--accuracy-compare", "before", "--accuracy-dir", "kept/figures").ret == 0
-    done = project(START + "\ndef test_z(): open('.accuracy', 'w').close()", *SAVE)
+    assert project(FIGURES, *COMPARE, "--accuracy-dir", "kept/figures").ret == 0
+    done = project(FIGURES + "\ndef test_z(): open('.accuracy', 'w').close()", *SAVE)
     assert done.ret == 1
     done.stdout.fnmatch_lines(["*.accuracy/before.json cannot be written: *"])
 
@@ -186,7 +170,7 @@ def test_it_lives_beside_pytest_benchmark(project, pytester):
 
 @pytest.mark.slow
 def test_with_xdist_the_table_and_the_file_are_the_same(project, pytester):
-    body = START + (
+    body = FIGURES + (
         "\n@pytest.mark.xdist_group('one')\n"
         "@pytest.mark.parametrize('number', range(20))\n"
         "def test_many(accuracy, cmmsim_seed, number): accuracy.record('seed', cmmsim_seed)\n"
@@ -221,7 +205,7 @@ def test_with_xdist_the_table_and_the_file_are_the_same(project, pytester):
 def test_wrong_options_are_refused_before_any_test(project, saved, options, says):
     saved.parent.mkdir()
     saved.touch()
-    done = project(START, *options)
+    done = project(FIGURES, *options)
     assert done.ret == pytest.ExitCode.USAGE_ERROR
     done.stderr.fnmatch_lines([says if says.startswith("*") else f"ERROR: {says}"])
 
@@ -244,8 +228,8 @@ def test_wrong_options_are_refused_before_any_test(project, saved, options, says
 def test_a_file_that_is_none_is_one_line_and_is_not_replaced(project, saved, text, says):
     saved.parent.mkdir()
     saved.write_text(text)
-    for option in ("--accuracy-compare", "--accuracy-save"):
-        done = project(START, option, "before")
+    for options in (COMPARE, SAVE):
+        done = project(FIGURES, *options)
         assert done.ret == pytest.ExitCode.USAGE_ERROR
         done.stderr.fnmatch_lines([f"ERROR: *before.json*{says.replace('[', '[[]')}"])
     assert saved.read_text() == text
