@@ -24,6 +24,11 @@ SAVE, COMPARE = ("--accuracy-save", "before"), ("--accuracy-compare", "before")
 QUICK = ("-p", "no:cacheprovider", "-p", "no:hypothesispytest")  # Hypothesis would be imported anew by each
 
 
+def recording(calls):
+    """Body of tests that call `accuracy` once each."""
+    return "".join(f"def test_{n}(accuracy): accuracy.{call}\n" for n, call in enumerate(calls))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def loaded():
     """What a sensor loads when it measures: pytester forgets what a project was first to import, and neither numba nor

@@ -1,11 +1,12 @@
 """Figures beside saved ones: what got worse, what is held to less than it was or to nothing, and what is gone."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 
-from tests.accuracy.conftest import COMPARE, FIGURES, SAVE
+from tests.accuracy.conftest import COMPARE, FIGURES, SAVE, recording
 
 GUARDS = ((), ("--accuracy-fail", "0.1"))
 
@@ -23,38 +24,36 @@ def test_the_table_compares_with_saved_figures_and_tells_of_new_ones_and_of_anot
     again.stdout.fnmatch_lines(["before was saved with --accuracy-seed 0, this is 7"])
 
 
-SAMPLE = list(np.random.default_rng(0).normal(10, 1, 50).round(3))
+SAMPLE = f"np.array({list(np.random.default_rng(0).normal(10, 1, 50).round(3))})"
+CHANGES = [
+    ("record('x', 2.0)", "record('x', 2.0)", ""),
+    ("record('x', 2.0)", "record('x', 2.15)", "0"),
+    ("record('x', 2.0)", "record('x', 2.25)", "0, 0.1"),
+    ("record('x', 2.0)", "record('x', 1.0)", ""),
+    ("record('x', 1.0, better='higher')", "record('x', 0.8, better='higher')", "0, 0.1"),
+    ("record('x', 1.0, better='higher')", "record('x', 1.2, better='higher')", ""),
+    ("record('x', 0.0)", "record('x', 1e-9)", "0, 0.1"),  # the ratio of nothing is nothing
+    (f"sample('x', {SAMPLE})", f"sample('x', {SAMPLE} - 5)", ""),
+    # a shift of two standard errors of the difference is noise: the intervals overlap
+    (f"sample('x', {SAMPLE})", f"sample('x', {SAMPLE} + 0.3)", ""),
+    (f"sample('x', {SAMPLE})", f"sample('x', {SAMPLE} + 1.5)", "0"),
+    (f"sample('x', {SAMPLE})", f"sample('x', {SAMPLE} + 1.7)", "0, 0.1"),
+    ("record('x', 1.0, unit='mm')", "record('x', 1.0, unit='um')", "0, 0.1"),
+]
 
 
-@pytest.mark.parametrize(
-    ("before", "now", "ratio", "worse"),
-    [
-        ("record('x', 2.0)", "record('x', 2.0)", "0", False),
-        ("record('x', 2.0)", "record('x', 2.15)", "0.1", False),
-        ("record('x', 2.0)", "record('x', 2.25)", "0.1", True),
-        ("record('x', 2.0)", "record('x', 1.0)", "0", False),
-        ("record('x', 1.0, better='higher')", "record('x', 0.8, better='higher')", "0.1", True),
-        ("record('x', 1.0, better='higher')", "record('x', 1.2, better='higher')", "0.1", False),
-        ("record('x', 0.0)", "record('x', 1e-9)", "0.1", True),  # the ratio of nothing is nothing
-        (f"sample('x', {SAMPLE})", f"sample('x', np.array({SAMPLE}) - 5)", "0", False),
-        # a shift of two standard errors of the difference is noise: the intervals overlap
-        (f"sample('x', {SAMPLE})", f"sample('x', np.array({SAMPLE}) + 0.3)", "0", False),
-        (f"sample('x', {SAMPLE})", f"sample('x', np.array({SAMPLE}) + 1.5)", "0", True),
-        (f"sample('x', {SAMPLE})", f"sample('x', np.array({SAMPLE}) + 1.5)", "0.2", False),
-        ("record('x', 1.0, unit='mm')", "record('x', 1.0, unit='um')", "0.1", True),
-    ],
-)
-def test_the_session_fails_when_a_figure_got_worse_by_more_than_the_ratio(project, before, now, ratio, worse):
-    project(f"def test_it(accuracy): accuracy.{before}", *SAVE)
-    body = f"def test_it(accuracy): accuracy.{now}"
-    assert project(body, *COMPARE).ret == 0
-    guarded = project(body, *COMPARE, "--accuracy-fail", ratio)
-    guarded.assert_outcomes(passed=1)
-    assert guarded.ret == int(worse)
-    if "unit" in now:
-        guarded.stdout.fnmatch_lines(["*::test_it: x cannot be compared: unit is 'um', was 'mm'"])
-    else:
-        assert any(line.startswith("worse by more than") for line in guarded.outlines) == worse
+def test_the_session_fails_when_a_figure_got_worse_by_more_than_the_ratio(project):
+    before, now, worse = zip(*CHANGES, strict=True)
+    project(recording(before), *SAVE)
+    assert project(recording(now), *COMPARE).ret == 0
+    for ratio in ("0", "0.1"):
+        assert project(recording(before), *COMPARE, "--accuracy-fail", ratio).ret == 0
+        done = project(recording(now), *COMPARE, "--accuracy-fail", ratio)
+        done.assert_outcomes(passed=len(CHANGES))
+        assert done.ret == 1
+        done.stdout.fnmatch_lines(["*::test_11: x cannot be compared: unit is 'um', was 'mm'"])
+        told = re.findall(r"^(?:worse by more than .*)?test_mine.py::test_(\d+): x ", str(done.stdout), re.MULTILINE)
+        assert sorted(map(int, told)) == [n for n, ratios in enumerate(worse) if ratio in ratios.split(", ")]
 
 
 FEWER = FIGURES.replace('    accuracy.record("seen", 0.98', '    dict(name="seen", value=0.98')
@@ -92,29 +91,30 @@ def test_figures_that_are_missing_are_named(project, pytester, body, options, mi
 
 NUMBER, SIX = "record('r', 10, limit=20)", "sample('s', [1, 2, 3, 4, 5, 6])"
 WIDE = "sample('r', [1, 50, 2, 60], limit=20)"
+LIMITS = [
+    ("record('b', 1, 'px', 3)", "record('b', 1, 'px', 30)", "the limit of b is ≤ 30 px, was ≤ 3 px"),
+    ("record('b', 1, 'px', 3)", "record('b', 1, 'px')", "the limit of b is none, was ≤ 3 px"),
+    ("record('b', 1)", "record('b', 1, '', 3)", "the limit of b is ≤ 3, was none"),
+    (NUMBER, NUMBER, ""),
+    (SIX, "sample('s', [1, 2, 3, 4, 5, 6, 3.5])", ""),
+]
+EVIDENCE = [
+    (NUMBER, WIDE, "r is a sample of 4 values, was one number"),
+    (WIDE, NUMBER, "r is one number, was a sample of 4 values"),
+    (SIX, "sample('s', [1, 300])", "s is a sample of 2 values, was a sample of 6 values"),
+]
 
 
-@pytest.mark.parametrize(
-    ("before", "now", "says", "fails"),
-    [
-        ("record('b', 1, 'px', 3)", "record('b', 1, 'px', 30)", "the limit of b is ≤ 30 px, was ≤ 3 px", 0),
-        ("record('b', 1, 'px', 3)", "record('b', 1, 'px')", "the limit of b is none, was ≤ 3 px", 0),
-        ("record('b', 1)", "record('b', 1, '', 3)", "the limit of b is ≤ 3, was none", 0),
-        (NUMBER, WIDE, "r is a sample of 4 values, was one number", 1),
-        (WIDE, NUMBER, "r is one number, was a sample of 4 values", 1),
-        (SIX, "sample('s', [1, 300])", "s is a sample of 2 values, was a sample of 6 values", 1),
-        (SIX, "sample('s', [1, 2, 3, 4, 5, 6, 3.5])", "", 0),
-        (NUMBER, NUMBER, "", 0),
-    ],
-)
-def test_a_figure_held_to_another_limit_or_resting_on_less_is_told(project, before, now, says, fails):
+@pytest.mark.parametrize(("cases", "fails"), [(LIMITS, False), *(([case], True) for case in EVIDENCE)])
+def test_a_figure_held_to_another_limit_or_resting_on_less_is_told(project, cases, fails):
     """A wide interval overlaps any other, so nothing else would ever say that it got worse."""
-    project(f"def test_it(accuracy): accuracy.{before}", *SAVE)
+    before, now, says = zip(*cases, strict=True)
+    project(recording(before), *SAVE)
     for guard in GUARDS:
-        done = project(f"def test_it(accuracy): accuracy.{now}", *COMPARE, *guard)
-        done.assert_outcomes(passed=1)
+        done = project(recording(now), *COMPARE, *guard)
+        done.assert_outcomes(passed=len(cases))
         told = [line for line in done.outlines if ", was " in line]
-        assert told == ([f"test_mine.py::test_it: {says}"] if says else [])
+        assert told == [f"test_mine.py::test_{n}: {one}" for n, one in enumerate(says) if one]
         assert done.ret == int(bool(fails and guard))
 
 

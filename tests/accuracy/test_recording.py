@@ -5,11 +5,12 @@ import pytest
 from scipy import stats
 
 from identify.accuracy.figure import mean_interval
+from tests.accuracy.conftest import recording
 
 
 def outcomes(project, calls):
     """Outcome of each call of the fixture in a test of its own: 'passed', or the lines of its failure."""
-    done = project("".join(f"def test_{n}(accuracy): accuracy.{call}\n" for n, call in enumerate(calls)), "-rA")
+    done = project(recording(calls), "-rA")
     failed = {}
     for line in done.outlines:
         if line.startswith("____"):
