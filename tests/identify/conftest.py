@@ -99,7 +99,6 @@ def finished_run(tmp_path_factory):
 
 @pytest.fixture
 def run_folder(finished_run, tmp_path):
-    """A copy of the finished run."""
     return RunFolder(shutil.copytree(finished_run.path, tmp_path / "run"))
 
 

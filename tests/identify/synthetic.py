@@ -81,7 +81,6 @@ PERFECT = JointInstruments(0.0, 0.0, 0.0)
 
 
 def truth_of(run):
-    """The truth group of a run of the plant."""
     return build_plant(quick(), rss6()).truth(run)
 
 

@@ -119,7 +119,6 @@ def fitted(matrix, data, bounds, start) -> BoundedEstimate:
 
 
 def one_bounds(physical):
-    """Of 67 parameters whose guess is one."""
     return parameter_bounds(StartingGuess(np.ones(67), np.ones(67)), physical)
 
 

@@ -166,17 +166,14 @@ def driven(record):
     return scenario, identify(record, rss6(), scenario)
 
 
-def test_the_command_driven_model_explains_the_noise_fully(driven):
-    """It follows what the servo made of the noise: residuals are white."""
-    _, result = driven
-    assert abs(result.noise_ratio - 1) < 5 * np.sqrt(2 / (6 * 600))
-    assert_near_the_truth(result, 3.5)
-
-
-def test_the_scale_follows_the_anchor_and_the_plant_section_of_the_scenario_is_not_read(record, driven):
-    """Poses leave a common factor free: an anchor 10 % higher gives all friction and gains 10 % higher. Truth may not
-    leak: another plant in the scenario changes nothing."""
+def test_the_command_driven_model_explains_the_noise_fully_and_scales_with_the_anchor_and_no_plant_is_read(
+    record, driven
+):
+    """It follows what the servo made of the noise. Poses leave a common factor free: an anchor 10 %
+    higher gives all friction and gains 10 % higher. Truth may not leak: another plant changes nothing."""
     scenario, one = driven
+    assert abs(one.noise_ratio - 1) < 5 * np.sqrt(2 / (6 * 600))
+    assert_near_the_truth(one, 3.5)
     raised = record.assign_attrs(scale_anchor_value=1.1 * record.attrs["scale_anchor_value"])
     ratio = (identify(raised, rss6(), scenario).estimate / one.estimate)[FRICTION_AND_PID]
     assert np.allclose(ratio, 1.1, rtol=0.03), ratio
@@ -240,7 +237,6 @@ def loaded(scenario, seed):
 
 @pytest.mark.slow
 def test_a_known_payload_shows_the_scale(scenario):
-    """Two runs that differ by a known load identify friction and gains with no weighed platform."""
     result = identify(loaded(scenario, seed=1), rss6(), scenario)
     ratio = (result.estimate / truth())[FRICTION_AND_PID]
     assert abs(np.median(ratio) - 1) < 0.02, ratio

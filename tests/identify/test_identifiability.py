@@ -1,12 +1,24 @@
 """What is known beside the poses (guess, parameters that a scenario states, scale anchor), what counts as identified,
 what rests on the guess, and conditioning: worked out by hand, and named for the robot."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import null_space
 
+from dynamics import load_robot
+from dynamics.parameters import PARAMETER_NAMES
 from identify.errors import EstimationError, RecordError, ScenarioError
-from identify.estimation.base_parameters import BaseParameters, base_parameters, structural_regressor
+from identify.estimation.base_parameters import (
+    BaseParameters,
+    angle_to_singular_vectors,
+    base_parameters,
+    rank_by_singular_values,
+    rank_by_threshold,
+    structural_regressor,
+)
 from identify.estimation.covariance import correlation_matrix, strongest_pairs
 from identify.estimation.identifiability import (
     POOR,
@@ -23,11 +35,92 @@ from identify.estimation.scale_anchor import ScaleAnchor, read_anchor, store_anc
 from identify.loop_parameters import NAMES, index_of
 from identify.record.recorded_run import recorded_run
 from identify.reporting.tables import ON_GUESS, parameter_table
-from tests.identify.synthetic import quick, rss6, run_plant, truth
+from tests.identify.commands import command
+from tests.identify.synthetic import changed_robot_file, quick, rss6, run_plant, truth
 
 WEIGHED = ScaleAnchor("platform_mass", 23.5, 0.005)
 GAIN = ScaleAnchor("joint_gain", 10.5, 0.01)
 JOINTS = [k for k, name in enumerate(NAMES) if name.startswith("joint")]
+
+
+@pytest.fixture(scope="module")
+def base():
+    return base_parameters(structural_regressor(rss6()))
+
+
+def test_the_base_parameters_alone_decide_the_torque(base):
+    """Parameters with equal base parameters have equal torques; a moved base parameter moves them."""
+    robot, rng = rss6(), np.random.default_rng(3)
+    pose = robot.home_pose + rng.uniform(-1, 1, (20, 6)) * np.repeat([0.008, 0.03], 3)
+    motion = pose, rng.normal(size=(20, 6)) * np.repeat([0.1, 0.5], 3), rng.normal(size=(20, 6))
+    nominal = robot.parameter_sets["identified"].dynamic
+    kernel = np.linalg.svd(base.combinations)[2][base.rank :]
+    change = kernel.T @ rng.normal(size=len(kernel))
+    torque = robot.inverse_dynamics(*motion, nominal)
+    assert np.allclose(base.combinations @ change, 0, atol=1e-12)
+    assert np.abs(change).max() > 0.1
+    moved = robot.regressor(*motion) @ change
+    assert np.abs(moved).max() < 1e-10 * np.abs(torque).max()
+    for row in base.combinations:
+        assert np.abs(robot.regressor(*motion) @ (row / (row @ row))).max() > 1e-3
+
+
+def test_rank_and_space_are_those_of_the_singular_values_and_the_papers_threshold_depends_on_the_units(base):
+    matrix = structural_regressor(rss6())
+    lengths = np.linalg.norm(matrix, axis=0)
+    scale = np.where(lengths > 0, lengths, 1.0)
+    rows = np.linalg.svd(matrix / scale)[2][: base.rank]
+    groups = base.combinations / scale  # both act on parameters times their column's length
+    assert rank_by_singular_values(matrix) == base.rank == np.linalg.matrix_rank(groups) == 37
+    assert np.abs(groups @ rows.T @ rows - groups).max() < 1e-9 * np.abs(groups).max()
+    assert rank_by_threshold(matrix, 1e-3) == 37
+    assert rank_by_threshold(matrix / 1e6, 1e-3) < 37
+    with pytest.raises(EstimationError, match="excites no parameter"):
+        base_parameters(np.zeros((12, 64)))
+
+
+def test_the_angle_to_the_singular_vectors_is_that_by_which_a_group_is_wrong():
+    """Columns of length 3 and 4, and one that no motion shows: a group turned towards it by 0.1 rad."""
+    matrix = np.array([[3.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 0.0]])
+    right = base_parameters(matrix, ("crank1.Izz", "crank2.Izz", "crank3.Izz"))
+    assert angle_to_singular_vectors(matrix, right) < 1e-12
+    turned = right.combinations + np.array([[0.0, 0.0, np.tan(0.1) / 3.0], [0.0, 0.0, 0.0]])
+    assert angle_to_singular_vectors(matrix, replace(right, combinations=turned)) == pytest.approx(0.1, rel=1e-9)
+    one_less = replace(right, combinations=right.combinations[:1])
+    assert angle_to_singular_vectors(matrix, one_less) == pytest.approx(np.pi / 2)
+
+
+@pytest.mark.slow
+def test_gravity_across_the_crank_axes_separates_mass_from_inertia(base, tmp_path):
+    """On a slope a crank's weight turns it, so its mass is no longer tied to its inertia."""
+    level, leaning = "gravity = [0.0, 0.0, -9.81]", "gravity = [4.0, 0.0, -8.9575]"
+    matrix = structural_regressor(load_robot(changed_robot_file(tmp_path / "leaning.toml", level, leaning)))
+    sloped = base_parameters(matrix)
+    assert sloped.rank == rank_by_singular_values(matrix) > base.rank
+    row = sloped.combinations[sloped.pivots.index(PARAMETER_NAMES.index("crank2.Izz"))]
+    assert row[PARAMETER_NAMES.index("crank2.mass")] == 0.0
+
+
+def test_groups_do_not_depend_on_the_motions_and_a_crank_turns_about_its_joint(base):
+    """A crank about a vertical axis shows its inertia about that axis: Izz + m (r / 2)², r = 60 mm."""
+    again = base_parameters(structural_regressor(rss6(), motions=333, seed=11))
+    assert again.pivots == base.pivots
+    assert np.allclose(again.combinations, base.combinations, atol=1e-9)
+    row = base.combinations[base.pivots.index(PARAMETER_NAMES.index("crank2.Izz"))]
+    assert row[PARAMETER_NAMES.index("crank2.mass")] == pytest.approx(0.03**2, rel=1e-9)
+    assert all(f"crank{k}.Ixx" in base.unseen and f"link{k}.Izz" in base.unseen for k in range(1, 7))
+
+
+def test_the_command_prints_and_writes_the_groups(tmp_path, capsys):
+    file = tmp_path / "groups.json"
+    assert command("base-parameters", "rss6", "--out", file) == 0
+    shown = capsys.readouterr().out
+    assert "crank1.Izz + 0.0009 crank1.mass" in shown
+    assert "the same groups from singular vectors: largest angle between what both span" in shown
+    written = json.loads(file.read_text())
+    assert written["rank"] == written["rank_by_singular_values"] == len(written["groups"]) == 37
+    assert written["angle_to_singular_vectors_rad"] < 1e-9
+    assert written["groups"][-1]["name"] == "joint6.viscous"
 
 
 def unit(name):
@@ -68,43 +161,41 @@ def test_a_difference_of_masses_is_as_large_as_they_are():
 
 
 @pytest.mark.parametrize("factor", [-1.0, 0.0, 100.0])
-def test_the_estimate_does_not_decide(factor):
+def test_the_estimate_does_not_decide(base, factor):
     """Groups with members known to 20 % are identified however small, or large, chance makes their estimates."""
     guess = starting_guess(rss6(), "initial", 1.0)
-    criterion, base = identifiability(guess, rss6()), base_parameters(structural_regressor(rss6()))
+    criterion = identifiability(guess, rss6())
     covariance = np.diag((0.2 * criterion.sizes) ** 2)
     groups = group_estimates(base, guess, criterion, factor * truth(), covariance)
     assert groups.identifiable.all()
     assert not criterion.judge(group_rows(base), 9 * covariance).any()
 
 
-def resting(anchor):
+def resting(base, anchor):
     sizes = identifiability(starting_guess(rss6(), "initial", 1.0), rss6()).sizes
-    found = rests_on_prior(base_parameters(structural_regressor(rss6())), anchor, truth(), sizes)
+    found = rests_on_prior(base, anchor, truth(), sizes)
     return {name for name, rests in zip(NAMES, found, strict=True) if rests}
 
 
-def test_with_no_anchor_all_rests_on_the_guess_and_a_weighed_platform_stands_alone_and_brings_izz_with_it():
+def test_with_no_anchor_all_rests_on_the_guess_and_a_weighed_platform_stands_alone_and_brings_izz_with_it(base):
     """Masses of links that the platform carries stand in its mass as in Izz over the squared radius of its joints."""
-    assert resting(ScaleAnchor("prior")) == set(NAMES)
-    assert resting(ScaleAnchor("payload")) == resting(GAIN)
-    assert resting(GAIN) - resting(WEIGHED) == {"platform.mass", "platform.Izz"}
+    assert resting(base, ScaleAnchor("prior")) == set(NAMES)
+    assert resting(base, ScaleAnchor("payload")) == resting(base, GAIN)
+    assert resting(base, GAIN) - resting(base, WEIGHED) == {"platform.mass", "platform.Izz"}
     radius = np.linalg.norm(rss6().geometry.platform_joints[0, :2])
-    base = base_parameters(structural_regressor(rss6()))
     mass, inertia = (base.combinations[base.pivots.index(index_of(f"platform.{kind}"))] for kind in ("mass", "Izz"))
     carried = [index_of(f"link{k}.mass") for k in range(1, 7)]
     np.testing.assert_allclose(inertia[carried], radius**2 * mass[carried], atol=1e-9)
 
 
-def test_what_rests_on_the_guess_can_change_with_no_pose_changing_and_nothing_else_can():
+def test_what_rests_on_the_guess_can_change_with_no_pose_changing_and_nothing_else_can(base):
     """A large change along all that neither poses nor weighing show, run through the closed loop."""
-    base = base_parameters(structural_regressor(rss6()))
     gains = np.eye(len(NAMES))[64:]
     shown = np.concatenate([group_rows(base), gains, WEIGHED.row()[0]]) * truth()
     unseen = null_space(shown / np.linalg.norm(shown, axis=1, keepdims=True))
     change = unseen @ np.random.default_rng(0).standard_normal(unseen.shape[1])
     named = {name for name, moved in zip(NAMES, change, strict=True) if abs(moved) > 1e-6}
-    assert named == resting(WEIGHED)
+    assert named == resting(base, WEIGHED)
     assert {*(f"link{k}.mass" for k in range(1, 7)), "platform.Ixx", "crank1.Ixx"} <= named
     run = recorded_run(run_plant(quick(), seed=0, duration_s=3.0)[0], rss6(), quick())
     before, after = (run.model_poses(truth() * (1 + scale * change / np.abs(change).max())) for scale in (0.0, 0.3))
@@ -123,10 +214,10 @@ def driven(**known):
     return quick(**{"identification.method": "command_driven", "identification.prior": prior})
 
 
-def test_a_result_names_what_rests_on_the_guess_among_what_is_identified(record):
+def test_a_result_names_what_rests_on_the_guess_among_what_is_identified(base, record):
     result = identify(record, rss6(), driven())
     named = {name for name, rests in zip(NAMES, result.rests_on_prior, strict=True) if rests}
-    assert {"platform.Ixx", "platform.Iyy"} <= named < resting(WEIGHED)
+    assert {"platform.Ixx", "platform.Iyy"} <= named < resting(base, WEIGHED)
     assert not (result.rests_on_prior & ~result.identifiable).any()
     entries = result.to_dict()["parameters"]
     assert {name for name, entry in entries.items() if entry["rests_on_prior"]} == named

@@ -139,7 +139,6 @@ def test_planes_and_commands_identify_too(tmp_path, capfd):
 
 
 def test_a_plant_that_the_model_cannot_be_is_said_and_judged(tmp_path, capfd):
-    """Another friction law: identification does its work, warns though it is quiet, and misses white residuals."""
     wrong = {"plant.friction": "stribeck", "plant.static_ratio": 1.3, "plant.stribeck_velocity_rad_s": 0.05}
     scenario = quick(**wrong, **{"identification.method": "command_driven"})
     run = recorded_run_folder(tmp_path, scenario, run_plant(scenario, seed=0))
@@ -169,18 +168,15 @@ def test_without_opengl_the_analytic_renderer_draws_or_pyrender_stops_with_one_l
     assert load_scenario(str(out / "scenario.toml")).renderer == "analytic"
 
 
-@pytest.mark.parametrize(
-    ("setting", "words"),
-    [
+def test_what_cannot_be_run_is_one_line_before_any_file(tmp_path, capfd):
+    """The first line of what a stage finds on its way; what a scenario cannot be is proved in test_scenario.py."""
+    for setting, words in (
         ("robot=rss7", ["rss7", "rss6"]),
         ("excitation.position_amplitude_m=0.2", ["leg"]),
         ("plant.parameters=nobody", ["nobody", "identified", "initial"]),
         ("model.start_parameters=nobody", ["nobody", "identified", "initial"]),
-    ],
-)
-def test_what_cannot_be_run_is_one_line_before_any_file(setting, words, tmp_path, capfd):
-    """The first line of what a stage finds on its way; what a scenario cannot be is proved in test_scenario.py."""
-    assert command("run", "quick", "--quiet", "--set", setting, "--out", tmp_path / "out") == 1
-    error = one_line(capfd.readouterr().err)
-    assert all(word in error for word in words), error
-    assert not (tmp_path / "out").exists()
+    ):
+        assert command("run", "quick", "--quiet", "--set", setting, "--out", tmp_path / "out") == 1
+        error = one_line(capfd.readouterr().err)
+        assert all(word in error for word in words), error
+        assert not (tmp_path / "out").exists()

@@ -157,7 +157,6 @@ def states_of(run):
 
 
 def test_segments_from_the_true_states_make_up_the_run():
-    """Poses within segments and states at their ends are those of one uninterrupted run."""
     _, problem, run = driven(3.0, sigma=1e-3 * SIGMA)
     chain, true = segments(problem.runs[0]), states_of(run)
     assert [(part.first, part.last) for part in chain] == list(pairwise([0, 30, 60, 90, 119, 149, 179]))
