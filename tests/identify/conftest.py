@@ -64,14 +64,8 @@ def make_result():
 
 def parameter(initial, true, estimate, std, identifiable=True):
     interval = [max(estimate - 1.96 * std, 0.0), estimate + 1.96 * std] if identifiable else None
-    return {
-        "initial": initial,
-        "true": true,
-        "estimate": estimate,
-        "std": std,
-        "interval": interval,
-        "identifiable": identifiable,
-    }
+    names = ("initial", "true", "estimate", "std", "interval", "identifiable")
+    return dict(zip(names, (initial, true, estimate, std, interval, identifiable), strict=True))
 
 
 @pytest.fixture(scope="session")

@@ -173,39 +173,29 @@ def test_the_nearest_parameters_are_within_the_bounds_and_physical_ones_stay():
     assert np.array_equal(plain.nearest(initial), initial)
 
 
-def flat_platform():
-    """Parameters of bodies that can exist, the platform's Izz just below Ixx + Iyy, as of a plate."""
-    parameters = truth()
-    parameters[:52] = physical_inertias(parameters[:64], allow_changes=True).values.ravel()
-    parameters[NAMES.index("platform.Izz")] = 0.999 * parameters[1:3].sum()
-    return parameters
-
-
-def assert_spanned(plain, physical):
-    """Intervals with bounds hold the estimate and, where bodies can exist, what an interval without bounds holds: it is
-    predicted by a linearisation, to a fifth of a standard deviation of the estimate of the search without bounds."""
-    low, high = physical.intervals.T
-    known, slack = physical.identifiable, 0.2 * physical.std
-    assert np.all((low >= 0) & (low <= physical.estimate) & (physical.estimate <= high))
-    outer = plain.estimate + np.outer([-1.96, 1.96], physical.std)
-    assert np.all((low <= np.maximum(outer[0], 0) + slack)[known])
-    assert np.all((high >= outer[1] - slack)[known])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (2, 3))])
 def test_bodies_that_exist_are_identified_as_such(seed):
-    """With noise the plain search finds bodies that cannot exist; the other one does not, and fits as well."""
+    """With noise the plain search finds bodies that cannot exist; the other does not, and fits as well. Its intervals
+    hold what those without bounds hold, which a linearisation predicts to a fifth of a standard deviation."""
+    flat = truth()
+    flat[:52] = physical_inertias(flat[:64], allow_changes=True).values.ravel()
+    flat[NAMES.index("platform.Izz")] = 0.999 * flat[1:3].sum()  # just below Ixx + Iyy, as of a plate
     scenario = quick(**{"identification.method": "command_driven"})
     consistent = scenario.with_overrides({"identification.physical_consistency": True})
-    record, _ = run_plant(scenario, seed=seed, parameters=flat_platform())
+    record, _ = run_plant(scenario, seed=seed, parameters=flat)
     plain, physical = identify(record, rss6(), scenario), identify(record, rss6(), consistent)
     with pytest.raises(UnphysicalInertiaError):
         physical_inertias(plain.estimate[:64])
     physical_inertias(physical.estimate[:64])
     assert physical.active_bounds
     assert any("held at" in warning for warning in physical.warnings)
-    assert_spanned(plain, physical)
+    low, high = physical.intervals.T
+    known, slack = physical.identifiable, 0.2 * physical.std
+    assert np.all((low >= 0) & (low <= physical.estimate) & (physical.estimate <= high))
+    outer = plain.estimate + np.outer([-1.96, 1.96], physical.std)
+    assert np.all((low <= np.maximum(outer[0], 0) + slack)[known])
+    assert np.all((high >= outer[1] - slack)[known])
     assert physical.noise_ratio < plain.noise_ratio + 0.005
     assert load_scenario("paper").identification.physical_consistency is False
 
@@ -281,9 +271,7 @@ def test_intervals_end_at_the_bounds_and_hold_the_estimate_and_how_far_a_bound_m
     said = found.warnings()[0]
     assert f"platform.Izz <= Ixx + Iyy ({beyond:.2g})" in said
     assert "\n" not in said
-
-
-def test_where_no_bound_is_near_estimate_and_interval_are_the_usual_ones():
+    # Where no bound is near, estimate and interval are the usual ones.
     found, unbounded = body_fit(physical=False)
     assert not found.active_bounds
     assert np.allclose(found.unheld, unbounded, atol=1e-8)

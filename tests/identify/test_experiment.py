@@ -1,7 +1,5 @@
 """The experiment with images in the loop: what is recorded, lost and refused, and the sensor's timing in it.
-
-That images decide the pose (one camera shifted by 0.1 px) is proved in tests/cmmsim/test_measuring.py.
-"""
+That images decide the pose is proved in tests/cmmsim/test_measuring.py."""
 
 import json
 

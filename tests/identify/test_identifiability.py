@@ -140,9 +140,7 @@ def test_the_record_must_halve_the_guess_and_leave_less_than_half_of_the_size():
         assert judged(guess, "platform.mass", 0.999 * limit), start_std
         assert not judged(guess, "platform.mass", 1.001 * limit), start_std
     assert not judged(guess, "platform.Ixx", 2.73)
-
-
-def test_friction_guessed_to_be_zero_has_a_tenth_of_the_holding_torque_as_its_size():
+    # Friction that is guessed to be zero has a tenth of the holding torque as its size.
     guess = starting_guess(rss6(), "initial", 1.0)
     assert guess.values[index_of("joint1.coulomb")] == 0
     limit = 0.5 * 0.1 * holding_torque(rss6(), guess.values[:64])
@@ -267,27 +265,17 @@ def anchored(record, anchor):
     return bare
 
 
-def test_a_known_gain_fixes_the_scale_as_the_anchor_of_that_name_does(record):
+def test_a_known_gain_fixes_the_scale_as_its_anchor_does_and_of_what_no_motion_shows_only_the_prior_is_known(record):
     """Two routes to the same knowledge; the anchor stands beside the starting guess, the prior in its place."""
     by_anchor = identify(anchored(record, ScaleAnchor("joint_gain", 11.0, 0.02)), rss6(), driven())
     by_prior = identify(anchored(record, ScaleAnchor("prior")), rss6(), driven(joint_pid_lp=(11.0, 0.02)))
     assert by_prior.estimate[index_of("joint_pid.lp")] == pytest.approx(11.0, abs=0.04)
     assert np.all(np.abs(by_prior.estimate - by_anchor.estimate) < 0.05 * by_anchor.std)
     assert np.allclose(by_prior.std, by_anchor.std, rtol=1e-3)
-
-
-def test_of_what_no_motion_shows_the_prior_is_all_that_is_known(record):
     result, k = identify(record, rss6(), driven(link2_Izz=(3e-3, 1e-4))), NAMES.index("link2.Izz")
     assert result.estimate[k] == pytest.approx(3e-3, rel=1e-6)
     assert result.std[k] == pytest.approx(1e-4, rel=1e-6)
     assert not result.identifiable[k]
-
-
-def test_what_no_model_has_cannot_be_expected_of_one(record):
-    with pytest.raises(ScenarioError, match=r"set 'initial', known beforehand: joint_pid.li\): joint_pid.li is 0.0"):
-        identify(record, rss6(), driven(joint_pid_li=(0.0, 1.0)))
-    with pytest.raises(ScenarioError, match=r"known beforehand: platform.mass\): platform.mass = 0 kg is not"):
-        identify(record, rss6(), driven(platform_mass=(0.0, 1.0)))
 
 
 def test_the_anchor_that_is_stored_is_read_and_a_weighing_is_one_equation_in_standard_deviations(record):
@@ -308,7 +296,13 @@ def test_an_impossible_anchor_is_refused_with_its_value_limit_and_unit(record, a
         read_anchor(record.assign_attrs({attribute: bad}))
 
 
-def test_an_anchor_that_is_unknown_or_incomplete_and_what_is_no_robot_or_scenario_are_refused(record):
+def test_what_no_model_has_an_anchor_that_is_unknown_or_incomplete_and_what_is_no_robot_or_scenario_are_refused(
+    record,
+):
+    with pytest.raises(ScenarioError, match=r"set 'initial', known beforehand: joint_pid.li\): joint_pid.li is 0.0"):
+        identify(record, rss6(), driven(joint_pid_li=(0.0, 1.0)))
+    with pytest.raises(ScenarioError, match=r"known beforehand: platform.mass\): platform.mass = 0 kg is not"):
+        identify(record, rss6(), driven(platform_mass=(0.0, 1.0)))
     with pytest.raises(RecordError, match=r"no scale anchor .*found 'guess'; valid anchors: platform_mass"):
         identify(record.assign_attrs(scale_anchor="guess"), rss6(), quick())
     half = anchored(record, ScaleAnchor("payload")).assign_attrs(scale_anchor="joint_gain", scale_anchor_value=1.0)

@@ -39,17 +39,7 @@ from identify.record.recording import (
 )
 from identify.trajectory import load_trajectories
 from tests.identify import synthetic
-from tests.identify.synthetic import (
-    SHORT,
-    changed_robot_file,
-    quick,
-    recorded_run_folder,
-    rss6,
-    run_plant,
-    short_run,
-    trajectory,
-    truth_of,
-)
+from tests.identify.synthetic import SHORT, quick, rss6, run_plant, short_run, trajectory
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +49,7 @@ def record():
 
 @pytest.fixture(scope="module")
 def truth():
-    return truth_of(short_run()[1])
+    return synthetic.truth_of(short_run()[1])
 
 
 def test_record_and_truth_read_back_identical_and_apart(tmp_path, record, truth):
@@ -284,7 +274,7 @@ def test_a_record_of_another_trajectory_is_refused_where_it_differs_most(record,
 
 
 def test_a_record_of_another_robot_is_refused_be_it_by_its_cranks_or_without_geometry_by_its_name(record, tmp_path):
-    path = changed_robot_file(tmp_path / "rss6.toml", "crank_length = 0.06\n", "crank_length = 0.062\n")
+    path = synthetic.changed_robot_file(tmp_path / "rss6.toml", "crank_length = 0.06\n", "crank_length = 0.062\n")
     assert load_robot(path).name == "rss6"
     with pytest.raises(EstimationError, match=r"crank_length was 0.06 when it was made, the robot file says 0.062"):
         identify(record, load_robot(path), SHORT)
@@ -300,7 +290,7 @@ def test_a_record_of_another_robot_is_refused_be_it_by_its_cranks_or_without_geo
 
 @pytest.mark.parametrize("stage", [pipeline.identify, pipeline.validate])
 def test_a_stage_refuses_a_record_that_is_not_of_its_folder(tmp_path, stage):
-    run = recorded_run_folder(tmp_path, chosen=trajectory(1))
+    run = synthetic.recorded_run_folder(tmp_path, chosen=trajectory(1))
     write_covariance(run.covariance, NAMES, np.eye(len(NAMES)))
     save_result(run.result, {})
     with pytest.raises(EstimationError, match=rf"{run.experiment}: the record's reference is not the exciting"):

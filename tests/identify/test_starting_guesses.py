@@ -8,10 +8,9 @@ That prior moves with the guess, and with it the optimum, a little. So each sear
 under the same prior: the same optimum has the same cost, to 0.1; one standard deviation away in any direction it is
 higher by 1. And it has the same parameters: each one that the record identifies, to half a standard deviation.
 
-Without noise, with an ideal sensor and the plant's own friction law, that optimum is the truth: every base parameter
-comes back to 1e-6. The plant steps as the model does, and the sensor states 1e-11 m and rad: poses have some 1e-16 of
-rounding. The weak prior must then vanish beside the poses. The scale is known by the gain lp: a weighed platform would
-not do, because poses show its mass only in a sum with those of the links, which the prior has to divide.
+Without noise, where the plant steps as the model does, that optimum is the truth: beside poses of 1e-11 m and rad the
+weak prior must vanish. The scale is known by the gain lp: a weighed platform would not do, because poses show its mass
+only in a sum with those of the links, which the prior has to divide.
 
 From where the model does not run, multiple shooting brings it there: the segments of the right model make up its run.
 """
@@ -156,22 +155,16 @@ def states_of(run):
     return np.hstack([run.pose, run.pose_rate, run.joint_integral])
 
 
-def test_segments_from_the_true_states_make_up_the_run():
-    _, problem, run = driven(3.0, sigma=1e-3 * SIGMA)
+def test_segments_from_the_true_states_make_up_the_run_and_states_are_measured_to_what_the_filter_leaves():
+    """Poses to the sensor's noise, and the integral of the joint PID to 2 mrad s of the 0.2 that hold the robot."""
+    scenario, problem, run = driven(3.0)
     chain, true = segments(problem.runs[0]), states_of(run)
     assert [(part.first, part.last) for part in chain] == list(pairwise([0, 30, 60, 90, 119, 149, 179]))
     for part in chain:
         one = part.simulate(truth(), true[part.first])
         assert np.allclose(one.pose, run.pose[part.first : part.last + 1], rtol=0, atol=1e-12)
         assert np.allclose(end_state(one), true[part.last], rtol=0, atol=1e-9)
-
-
-def test_states_are_measured_to_what_the_filter_leaves():
-    """Poses to the sensor's noise, and the integral of the joint PID to 2 mrad s of the 0.2 that hold the robot."""
-    scenario, problem, run = driven(5.0)
-    chain = segments(problem.runs[0])
-    states = measured_states(chain, truth(), scenario)
-    error = np.abs(states - states_of(run)[[part.first for part in chain]])[1:]
+    error = np.abs(measured_states(chain, truth(), scenario) - true[[part.first for part in chain]])[1:]
     assert np.all(error[:, :6] < 5 * SIGMA)
     assert np.all(error[:, 6:12] < 0.1 * np.abs(run.pose_rate).max(axis=0))
     assert np.all(error[:, 12:] < 2e-3)
