@@ -98,7 +98,6 @@ def run_folder(finished_run, tmp_path):
 
 @pytest.fixture
 def recorded_folder(tmp_path):
-    """A folder as `cmmsim record` leaves it, of a short run with drawn noise."""
     return recorded_run_folder(tmp_path)
 
 

@@ -167,7 +167,6 @@ def test_longer_runs_inform_more_and_an_unstable_starting_model_is_named(robot, 
 
 @pytest.fixture
 def one_start(monkeypatch):
-    """Climbing from one start only."""
     monkeypatch.setattr("identify.excitation.search.STARTS", 1)
 
 

@@ -25,7 +25,6 @@ RMS = ("position_rms_um", "orientation_rms_urad")
 
 
 def cmmsim(*arguments, **environment):
-    """Run the command line in a process of its own."""
     command = [sys.executable, "-m", "identify", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, env={**os.environ, **environment}, check=False)
 

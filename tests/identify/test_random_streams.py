@@ -34,7 +34,6 @@ def test_no_two_streams_draw_the_same(seed):
 
 
 def test_numbers_are_those_of_every_version():
-    """A seed's figures are repeated only while the numbers of the streams stay."""
     names = [name for name in vars(random_streams) if name.isupper()]
     assert {name: getattr(random_streams, name) for name in names} == {
         "EXCITATION": 0, "UNSEEN": 1, "SEARCH": 2, "TEACHING": 2, "ANCHOR": 3, "NOISE": 4, "LATENCY": 5,

@@ -111,7 +111,6 @@ def found(plant_steps, model_steps):
 
 
 def relative_errors(solution, base):
-    """Of all groups, and of the gains."""
     groups = base.combinations @ solution.parameters[:64] / (base.combinations @ truth()[:64]) - 1
     return np.abs(groups), np.abs(solution.parameters[64:] / truth()[64:] - 1)
 
