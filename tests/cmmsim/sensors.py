@@ -31,6 +31,7 @@ LENSES = {
 NOISE_FREE = {"camera.noise": False}
 TWELVE_BIT = {"camera.bit_depth": 12, "camera.gain": 2.08, "camera.black_level": 256.0}
 CROPPED = {"rig.width": 800, "rig.height": 640, "rig.target": [0.02, 0.0, 0.29]}  # whole images six times smaller
+REACH = np.array([0.009] * 3 + [0.035] * 3)  # m, rad: of the poses
 
 
 def exact(lens="perfect", changes=None, renderer="analytic", seed=0, method="registration"):

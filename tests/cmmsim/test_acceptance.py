@@ -18,7 +18,7 @@ from cmmsim.acceptance import (
     summarise,
     volume_of_size,
 )
-from cmmsim.acceptance.artefacts import rigid_bar
+from cmmsim.acceptance.artefacts import bar_ends, rigid_bar
 from cmmsim.acceptance.latency_test import require_room
 from cmmsim.acceptance.moving_bar import SECONDS
 from cmmsim.acceptance.volume import CORNERS, MARGIN_PX, MeasuringLine
@@ -108,6 +108,13 @@ def test_broken_rules_are_named(volume):
     ):
         with pytest.raises(AcceptanceError, match=message):
             require_rules([*changed, *others], volume)
+
+
+def test_ends_of_the_bar_are_bodies_of_their_own():
+    for end in bar_ends(marked_body("bar", rigid_bar())):
+        assert len(end.nominal) == 6
+        on_planes = np.einsum("ni,ni->n", end.sticker_normals, end.nominal) - end.offsets[end.plane_index]
+        np.testing.assert_allclose(on_planes, 0.0, atol=1e-12)
 
 
 def test_bar_stays_in_the_volume_starts_at_rest_and_moves_at_its_rate(volume):

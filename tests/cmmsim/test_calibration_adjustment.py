@@ -152,20 +152,17 @@ def test_image_with_the_board_in_one_camera_still_helps_that_camera():
     assert np.abs((more.values - TRUTH) / more.std).max() < 4.0
 
 
-def without_any(pairs, reason):
-    return [p.without(0, reason).without(1, reason) for p in pairs]
-
-
 PLAIN, NONE = noisy_pairs(20), "no chessboard of 8 x 7 found"
+UNSEEN = [p.without(0, NONE).without(1, NONE) for p in PLAIN]
 MIXED = [PairView(a.name, a.left, b.right) for a, b in zip(PLAIN, noisy_pairs(13), strict=True)]
 
 
 @pytest.mark.parametrize(
     ("pairs", "least", "message"),
     [
-        (PLAIN[:2] + without_any(PLAIN[2:5], NONE), 3, r"2 of 5 pairs .* 3 needed; without it: 02.png \(both: no ch"),
+        (PLAIN[:2] + UNSEEN[2:5], 3, r"2 of 5 pairs .* 3 needed; without it: 02.png \(both: no ch"),
         (PLAIN[:5], 12, "12 needed"),
-        (without_any(PLAIN, NONE), 3, r"02.png \(both: no chessboard of 8 x 7 found\) and 9 more$"),
+        (UNSEEN, 3, r"02.png \(both: no chessboard of 8 x 7 found\) and 9 more$"),
         (
             [PairView(a.name, a.left, b.right) for a, b in zip(PLAIN, noisy_pairs(13), strict=True)],
             3,

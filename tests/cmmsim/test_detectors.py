@@ -161,7 +161,6 @@ def test_a_detector_of_one_s_own_measures_by_its_module_and_name():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("hough", "unknown detector 'hough': valid are dual_conic, grey_centroid, maximum_likelihood, or module:name"),
         ("nowhere:detect", "detector 'nowhere:detect' is no importable module:name: No module named 'nowhere'"),
         (f"{__name__}:missing", "has no attribute 'missing'; its folder must be on PYTHONPATH"),
         (f"{__name__}:SIZE", "is of type int, which cannot be called"),

@@ -16,14 +16,13 @@ from cmmsim.fault_images import DiscMark, Fault, FaultyImages, FillMark, GlintMa
 from cmmsim.faults import FaultGenerator, fault_bodies
 from cmmsim.radiometry.images import FrameImages, StereoFrame
 from cmmsim.tracker import Tracker
-from tests.cmmsim.sensors import CROPPED, NOISE, exact, squared_error
+from tests.cmmsim.sensors import CROPPED, NOISE, REACH, exact, squared_error
 
 FIVE_SIGMA = 5.733e-7  # two-sided, of a normal variable
 WRONG = chi2.isf(FIVE_SIGMA, 6)
 REGION = chi2.ppf(0.95, 6)
 LOSING = ("one_camera_dark", "one_camera_covered", "swapped", "black", "saturated")
 SPOILING = ("hidden", "half_hidden", "obstacles", "false_discs", "false_points", "glint", "merging", "several")
-REACH = np.array([0.009] * 3 + [0.035] * 3)  # m, rad: of the poses
 UNPREDICTED = np.array([3e-4] * 3 + [1e-3] * 3)  # m, rad: between two frames
 
 

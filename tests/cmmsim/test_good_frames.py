@@ -10,6 +10,7 @@ from cmmsim.imaging.exposure import VirtualStereoCamera
 from cmmsim.tracker import Tracker
 from tests.cmmsim.sensors import (
     CROPPED,
+    REACH,
     camera_from,
     exact,
     pose_errors,
@@ -21,7 +22,6 @@ from tests.cmmsim.sensors import (
 DRAWS = 100
 LEFT_OUT = 1e-3  # largest share of the stickers of good frames that may be left out
 GREY = 208.0  # values of white light above black
-REACH = np.array([0.009] * 3 + [0.035] * 3)  # m, rad: of the poses
 
 
 def little_noise(deviation):

@@ -18,11 +18,10 @@ from tests.cmmsim.sensors import CROPPED, camera_from, exact, squared_error
 pytestmark = pytest.mark.rendering
 
 
-def box_before(sensor, centre, size, share=0.25):
-    """A box (4,4) between the rig and a point of the base frame, and its mesh."""
-    towards = np.array([1.44, 0.0, 1.28]) - centre
+def box_before(centre, size):
+    """A box (4,4) just before a point of the base frame, towards the rig, and its mesh."""
     place = np.eye(4)
-    place[:3, 3] = centre + share * towards
+    place[:3, 3] = centre + 0.04 * (np.array([1.44, 0.0, 1.28]) - centre)
     return place, trimesh.creation.box(extents=size)
 
 
@@ -90,7 +89,7 @@ def test_hidden_plane_is_lost_by_name_and_found_again(taught):
     sensor = cmmsim.load_sensor("ctrack780", seed=1, taught=taught, method="planes")
     middle_of_b = sensor.platform.nominal[sensor.platform.plane_index == 1].mean(axis=0)
     centre = apply(pose_to_transform(sensor.home), middle_of_b)
-    place, mesh = box_before(sensor, centre, (0.02, 0.26, 0.12), share=0.04)
+    place, mesh = box_before(centre, (0.02, 0.26, 0.12))
     sensor.add_bodies({"box": mesh})
     assert sensor.measure(sensor.home).ok
     m = sensor.measure(sensor.home, obstacles={"box": place})
@@ -105,7 +104,7 @@ def test_hidden_plane_is_lost_by_name_and_found_again(taught):
 @pytest.mark.parametrize("renderer", ["analytic", "pyrender"])
 def test_a_partly_hidden_platform_is_measured_with_what_is_left(renderer):
     sensor = exact("perfect", CROPPED, renderer)
-    place, mesh = box_before(sensor, np.array([0.15, 0.12, 0.28]), (0.02, 0.15, 0.12), share=0.04)
+    place, mesh = box_before(np.array([0.15, 0.12, 0.28]), (0.02, 0.15, 0.12))
     sensor.add_bodies({"box": mesh})
     m = [sensor.measure(sensor.home, obstacles={"box": place}) for _ in range(3)][-1]
     assert m.ok

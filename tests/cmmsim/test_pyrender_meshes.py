@@ -1,5 +1,6 @@
 """What pyrender is given: triangulated stickers against their discs, and windows that are drawn without depths."""
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -8,6 +9,7 @@ from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import pose_to_transform
 from cmmsim.imaging import pyrender_renderer as render
 from cmmsim.imaging.exposure import SUPERSAMPLING
+from cmmsim.imaging.kernels import mean_of_cells
 from cmmsim.imaging.pyrender_meshes import GROUND_SIDES, LARGEST_SAG, RIM_SAMPLES, Laid, LaidSolids, disc_mesh
 from cmmsim.imaging.renderer import NEAR, Drawable, View, same_exposure
 from cmmsim.imaging.scene import Disc, DiscStack, rod, rod_transform, solid_mesh
@@ -107,6 +109,16 @@ def sticker_views(sensor, camera, rng):
     )
     pixels = camera.project(points)[0] - 7 + rng.integers(-4, 5, (len(points), 2))
     return [View(camera, bodies, (int(x), int(y)), (14, 14)) for x, y in pixels]
+
+
+@pytest.mark.parametrize("supersampling", [1, 2, 3, 9, 16])
+def test_cells_are_averaged_as_opencv_does(supersampling):
+    """To the last bit; the atlas may have cells left over."""
+    drawn = np.random.default_rng(0).integers(0, 256, (2 * 6 * supersampling, 3 * 5 * supersampling), dtype=np.uint8)
+    windows = np.empty((5, 6, 5), dtype=np.float32)
+    mean_of_cells(drawn, 3, supersampling, windows)
+    pooled = cv2.resize(drawn.astype(np.float32), (15, 12), interpolation=cv2.INTER_AREA) / np.float32(255.0)
+    np.testing.assert_array_equal(windows, pooled.reshape(2, 6, 3, 5).swapaxes(1, 2).reshape(-1, 6, 5)[:5])
 
 
 def test_reaching_patches_are_those_whose_corners_span_the_window():

@@ -43,7 +43,6 @@ def test_centres_of_pyrender_agree_with_their_projection(supersampling, limit):
     [
         ("perfect", SUPERSAMPLING, 10),
         pytest.param("perfect", SUPERSAMPLING, 40, marks=pytest.mark.slow),
-        pytest.param("perfect", 12, 40, marks=pytest.mark.slow),
         pytest.param("perfect", 16, 40, marks=pytest.mark.slow),
         pytest.param("distorted", SUPERSAMPLING, 10, marks=pytest.mark.slow),
         pytest.param("all", SUPERSAMPLING, 10, marks=pytest.mark.slow),

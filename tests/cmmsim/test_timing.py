@@ -62,17 +62,6 @@ def test_the_images_of_other_frames_are_the_same_with_and_without_dropout():
     assert not np.array_equal(grey[0], sensor.look(sensor.home).windows(corners, 16))
 
 
-def test_after_dropped_frames_the_moving_platform_is_measured_again_at_once(moving_path):
-    sensor, lost = dropping(0.4), 0
-    for pose in moving_path(60):
-        measured = sensor.measure(pose)
-        assert measured.ok or "dropped" in measured.reason
-        lost += not measured.ok
-        if measured.ok:
-            assert np.abs(measured.pose - pose)[:3].max() < 100e-6
-    assert lost > 10
-
-
 def test_the_prediction_goes_on_through_missed_frames():
     """A stand-in for the estimator: the platform moves 1 mm a frame, and the tracker says where it expects it."""
     expected, never = [], pytest.fail  # no image is looked at
