@@ -13,8 +13,16 @@ import pandas as pd
 
 from identify.progress import SilentProgress
 from identify.studies.store import JOURNAL
+from identify.studies.study_file import Study
 
 KIND = "tests.identify.study_rows:row"
+DARK, METHOD = "sensor.camera.dark_noise", "scenario.pose_method"
+
+
+def small_study(**entries):
+    """A study of 18 rows of this kind, or with other entries."""
+    factors = {DARK: [13.0, 26.0, 52.0], METHOD: ["registration", "planes"]}
+    return Study(**{"name": "mine", "kind": KIND, "factors": factors, "repeats": 3, "seed": 4} | entries)
 
 
 def row(scenario, seed, options):

@@ -1,4 +1,4 @@
-"""``cmmsim acceptance``: what it writes, what it prints, and what it refuses before it draws anything."""
+"""``cmmsim acceptance``: what it writes and prints."""
 
 import json
 from dataclasses import replace
@@ -9,43 +9,7 @@ import pytest
 from cmmsim.acceptance.moving_bar import SECONDS
 from identify.verification.acceptance import STANDARDS
 from identify.verification.acceptance_report import acceptance_markdown
-from tests.identify.commands import command, one_line
-
-
-@pytest.fixture
-def nothing_is_drawn(monkeypatch):
-    def drawn(*_):
-        raise AssertionError("the tests have begun")
-
-    monkeypatch.setattr("identify.verification.acceptance.do", drawn)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["ctrak"], "unknown sensor 'ctrak'"),
-        (["--renderer", "oil"], "unknown renderer 'oil': valid are analytic"),
-        (["--standard", "iso"], "unknown standard 'iso': valid are all, e3064, e3124, vdi"),
-        (["--limit-um", "nan"], "positive number of um, got nan"),
-        (["--volume", "1x2"], "volume '1x2' is neither"),
-        (["--volume", "nan"], "volume 'nan' is neither"),
-        (["--volume", "3"], "measuring volume 3000 x 3000 x 3000 mm is not wholly visible to both cameras"),
-        (["--volume", "0.6x0.3x0.3"], "two thirds"),
-        (["--volume", "0.3", "--standard", "e3064"], "the bar needs"),
-        (["--volume", "0.3", "--standard", "e3124"], "the body on its circle needs"),
-    ],
-)
-def test_bad_input_is_one_line_before_anything_is_drawn(nothing_is_drawn, tmp_path, capsys, arguments, message):
-    out = tmp_path / "out"
-    assert command("acceptance", *arguments, "--out", out) == 1
-    assert message in one_line(capsys.readouterr().err)
-    assert not out.exists()
-
-
-def test_folder_in_use_is_refused_before_anything_is_drawn(nothing_is_drawn, tmp_path, capsys):
-    (tmp_path / "file").write_text("x")
-    assert command("acceptance", "--renderer", "analytic", "--out", tmp_path) == 1
-    assert "is not empty" in one_line(capsys.readouterr().err)
+from tests.identify.commands import command
 
 
 @pytest.fixture(

@@ -13,9 +13,7 @@ import pytest
 
 import cmmsim
 from cmmsim.geometry.pose import apply, invert
-from identify.studies import summary
 from identify.studies.design import Design, prepare
-from identify.studies.rows import find_kind
 from identify.studies.rows.sensor import row_sensor
 from identify.studies.runner import compute
 from identify.studies.study_file import STUDIES, load_study
@@ -48,26 +46,18 @@ def test_study_can_be_run_and_says_why_its_laws_hold(name):
     prepare(study)
     assert study.title
     assert study.theory
-    figures = find_kind(study.kind).columns
-    for law in study.theory:
-        assert {law.figure, law.per or law.figure, law.equals or law.figure} <= set(figures)
-        assert law.factor is None or law.factor in {*study.factors, *figures}
-        assert law.order is None or law.order == study.factors[law.factor]
-        assert law.why
+    assert all(law.why for law in study.theory)
+    assert all(law.order in (None, study.factors.get(law.factor)) for law in study.theory)
 
 
 @pytest.mark.parametrize("name", SLOW)
-def test_few_rows_of_a_study_contradict_no_law(name, tmp_path):
+def test_few_rows_of_a_study_contradict_no_law(name):
     study, table = rows_of(name, REPEATS[name])
     assert not table["error"].any()
     pictures = table[table.columns.intersection(["captures", "frames"])[0]]
     assert not (table["lost_frames"] > 0.1 * pictures).any()
     found = check_laws(study, table)
     assert "failed" not in {one.verdict for one in found}, "\n".join(map(repr, found))
-    if name == "sticker_count":
-        entry = summary.write(tmp_path, study, table)
-        assert entry["rows"] == {"planned": study.rows, "done": study.rows, "failed": 0, "missing": 0}
-        assert (tmp_path / "figures" / "laws.png").exists()
 
 
 @pytest.mark.thorough

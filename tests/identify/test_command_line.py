@@ -1,16 +1,21 @@
-"""The command `cmmsim run` and its stages: what they pass on, say and refuse. The stages are replaced by notes."""
+"""The command `cmmsim`: what its stages, replaced by notes, pass on and say; what a terminal shows; what all refuse."""
 
+import io
+import shlex
 import subprocess
 import sys
+from contextlib import suppress
 from types import SimpleNamespace
 
 import pytest
+from rich.console import Console
 
 from cmmsim.errors import OpenGLMissingError
 from dynamics.errors import RobotFileError
 from identify.commands import app as command_line
 from identify.errors import RecordError, ScenarioError
-from identify.files.run_folder import RunFolder, load_result, new_run_folder, save_result
+from identify.files.run_folder import RunFolder, load_result, save_result
+from identify.progress import RichProgress, print_table
 from tests.identify.commands import command, one_line
 from tests.identify.conftest import make_result
 
@@ -22,15 +27,12 @@ def calls(monkeypatch):
     """The stages, replaced by notes of their calls; a run leaves a result, as the real one does."""
     made = []
 
-    def stage(name):
-        return lambda *arguments: made.append((name, *arguments))
-
     def run(scenario, seed, folder, *more):
         made.append(("run", scenario, seed, folder, *more))
         save_result(RunFolder(folder).result, warned(make_result()))
 
-    replaced = SimpleNamespace(run=run, excite=stage("excite"), **{name: stage(name) for name in STAGES})
-    monkeypatch.setattr(command_line, "_pipeline", lambda: replaced)
+    noted = {name: lambda *arguments, name=name: made.append((name, *arguments)) for name in STAGES}
+    monkeypatch.setattr(command_line, "_pipeline", lambda: SimpleNamespace(run=run, **noted))
     return made
 
 
@@ -70,35 +72,31 @@ def test_identify_says_whether_the_model_explains_the_record_and_warns_even_wher
         assert [text in out for text in said] == 4 * [not quiet]
 
 
-def test_a_run_of_a_wrong_plant_warns_and_names_the_goals_it_misses(calls, tmp_path, capfd):
-    assert command("run", "quick", "--out", tmp_path / "new") == 0
-    out, err = capfd.readouterr()
-    assert err == "warning: not white\nwarning: a b\n"
-    assert [line.split(":")[1] for line in out.splitlines() if line.startswith("missed: ")] == [
-        " misfit of the record",
-        " white residuals",
-    ]
-    assert "missed: misfit of the record: residuals 1.356 times the noise variance" in out
-
-
-def test_run_passes_scenario_seed_folder_and_workers(calls, tmp_path, monkeypatch):
+def test_run_passes_its_arguments_on_warns_of_a_wrong_plant_and_names_the_goals_missed(
+    calls, tmp_path, monkeypatch, capfd
+):
     monkeypatch.chdir(tmp_path)
     settings = ("--set", "timing.latency_s=0.01", "--set", "pose_method=planes")
     assert command("run", "quick", "--out", "mine", "--seed", 7, "--workers", 2, "--quiet", *settings) == 0
-    assert command("run", "--seed", 3, "--quiet") == 0
+    assert capfd.readouterr() == ("", "warning: not white\nwarning: a b\n")
+    assert command("run", "--seed", 3) == 0
     (name, scenario, seed, folder, _, workers), default = calls
     assert (name, seed, folder.as_posix(), workers) == ("run", 7, "mine", 2)
     assert (scenario.name, scenario.timing.latency_s, scenario.pose_method) == ("quick", 0.01, "planes")
     assert default[3].as_posix() == "runs/paper-3"
+    out, err = capfd.readouterr()
+    assert err == "warning: not white\nwarning: a b\n"
+    missed = [line.split(":")[1] for line in out.splitlines() if line.startswith("missed: ")]
+    assert missed == [" misfit of the record", " white residuals"]
+    assert "missed: misfit of the record: residuals 1.356 times the noise variance" in out
 
 
 def test_stages_read_the_folder_that_the_one_before_wrote_and_identify_takes_settings(calls, run_folder, capfd):
     for stage in STAGES:
         assert command(stage, "--out", run_folder.path, "--quiet") == 0
     assert [call[:2] for call in calls] == [(stage, run_folder.path) for stage in STAGES]
-    settings = ("identification.method=command_driven", 'identification.prior={"link1.mass"={value=1, std=0.1}}')
-    words = [word for setting in settings for word in ("--set", setting)]
-    assert command("identify", "--out", run_folder.path, "--quiet", *words) == 0
+    method, prior = "identification.method=command_driven", 'identification.prior={"link1.mass"={value=1, std=0.1}}'
+    assert command("identify", "--out", run_folder.path, "--quiet", "--set", method, "--set", prior) == 0
     assert calls[-1][3] == {
         "identification.method": "command_driven",
         "identification.prior": {"link1.mass": {"value": 1, "std": 0.1}},
@@ -119,48 +117,69 @@ def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_
 
 
 @pytest.mark.parametrize(
-    ("arguments", "evidence"),
+    ("words", "evidence"),
     [
-        (("run", "nope"), "neither built in (paper, quick)"),
-        (("run", "quick", "--set", "filter.cutoff_hz=60"), "Nyquist frequency 30 Hz"),
-        (("run", "quick", "--set", "filter.cutof_hz=60"), "valid names in [filter]: order, cutoff_hz"),
-        (("run", "quick", "--set", "filter"), "KEY=VALUE"),
-        (("record", "--out", "nowhere"), "no run folder nowhere"),
-        (("run", "quick", "--out", "mine"), "mine is not empty"),
-        (("run", "quick", "--out", "mine/text"), "mine/text is a file"),
-        (("run", "quick", "--out", "/proc/none/here"), "/proc/none/here cannot be made: /proc is not a folder"),
+        ("run nope", "neither built in (paper, quick)"),
+        ("run quick --set filter.cutof_hz=60", "valid names in [filter]: order, cutoff_hz"),
+        ("record --out nowhere", "no run folder nowhere"),
+        ("run quick --out mine", "mine is not empty"),
+        ("run quick --out mine/text", "mine/text is a file"),
+        ("run quick --out /proc/none/here", "/proc/none/here cannot be made: /proc is not a folder"),
+        ("acceptance ctrak", "unknown sensor 'ctrak'"),
+        ("acceptance --renderer oil", "unknown renderer 'oil': valid are analytic"),
+        ("acceptance --standard iso", "unknown standard 'iso': valid are all, e3064, e3124, vdi"),
+        ("acceptance --limit-um nan", "positive number of um, got nan"),
+        ("acceptance --volume 1x2", "volume '1x2' is neither"),
+        ("acceptance --volume nan", "volume 'nan' is neither"),
+        ("acceptance --volume 3", "measuring volume 3000 x 3000 x 3000 mm is not wholly visible to both cameras"),
+        ("acceptance --volume 0.3 --standard e3124", "the body on its circle needs"),
+        ("acceptance --renderer analytic --out mine", "mine is not empty"),
+        ("detectors --tilt 85", "tilt 85 degrees"),
+        ("calibrate mine --out new", "missing RIGHT, --board FILE; cmmsim calibrate --help shows examples"),
+        ("calibrate none mine --board mine/board.toml", "no folder none"),
+        ("calibrate mine mine --board b --distortion fisheye", "'fisheye': valid are brown5, none, radial2"),
+        ("calibrate mine mine --board b --sensor ctrack", "unknown sensor 'ctrack'"),
+        ("calibrate mine mine --board b --seed 0", "no random numbers without --render: leave out --seed"),
+        ("calibrate mine mine --render 3", "leave out LEFT and RIGHT"),
+        ("calibrate --render 1 --min-images 7 --fix-aspect", "nothing: leave out --fix-aspect and --min-images"),
+        ("workspace --out mine", "mine is not empty"),
+        ("workspace --out mine/text/here", "mine/text/here cannot be made"),
+        ("verify-model --out /proc/impossible", "cannot be made"),
+        ("verify-model --out new", "pip install '.[mujoco]'"),
+        ("verify-model nope", "unknown robot `nope`"),
+        ("export mjcf rss6", "crank1, crank2, crank3, crank4, crank5, crank6: Izz 0.000605 > Ixx 0.000229 + "),
+        ("export mjcf rss6 --parameters ''", "'' is neither a parameter set of robot rss6 (identified, in"),
+        ("export mjcf rss6 --allow-unphysical-inertia --out .", "cannot write ."),
+        ("study no_such_study", "pixel_noise"),
     ],
 )
-def test_bad_input_is_one_line_and_status_one(calls, capfd, tmp_path, monkeypatch, arguments, evidence):
+def test_bad_input_is_one_line_before_any_work_and_leaves_nothing(calls, capfd, tmp_path, monkeypatch, words, evidence):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    work = ("identify.verification.acceptance.do", "identify.verification.workspace_map.map_workspace")
+    for name in (*work, "cmmsim.detector_leaderboard.compete", "cmmsim.calibration.sightings.find_board"):
+        monkeypatch.setattr(name, lambda *_, **__: pytest.fail("has begun"))
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "text").touch()
-    assert command(*arguments) == 1
+    (tmp_path / "mine" / "board.toml").write_text('kind = "chessboard"\ncolumns = 7\nrows = 6\nspacing = 0.07\n')
+    assert command(*shlex.split(words), "--quiet") == 1
     assert evidence in one_line(capfd.readouterr().err)
     assert calls == []
-    assert [path.name for path in tmp_path.rglob("*")] == ["mine", "text"]
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["board.toml", "mine", "text"]
 
 
-def test_new_folder_may_be_absent_or_empty(tmp_path):
-    assert not new_run_folder(tmp_path / "absent").path.exists()
-    assert new_run_folder(tmp_path).path == tmp_path
-
-
-@pytest.mark.parametrize(
-    "error", [RecordError("a\nb"), RobotFileError("a\nb"), OpenGLMissingError(ImportError("a\nb"))], ids=type
-)
-def test_known_errors_of_every_package_are_one_line_and_others_keep_their_traceback(
-    capfd, monkeypatch, tmp_path, error
-):
+def test_known_errors_of_every_package_are_one_line_and_others_keep_their_traceback(capfd, monkeypatch, tmp_path):
     def fail(*_):
         raise errors.pop(0)
 
-    errors = [error, ZeroDivisionError("a defect")]
+    errors = [RecordError("a\nb"), RobotFileError("a\nb"), OpenGLMissingError(ImportError("a\nb")), ZeroDivisionError()]
     monkeypatch.setattr(command_line, "_pipeline", lambda: SimpleNamespace(run=fail))
-    assert command("run", "quick", "--out", tmp_path / "new", "--quiet") == 1
-    assert "a b" in one_line(capfd.readouterr().err)
-    with pytest.raises(ZeroDivisionError, match="a defect"):
-        command("run", "quick", "--out", tmp_path / "new", "--quiet")
+    words = ("run", "quick", "--out", tmp_path / "new", "--quiet")
+    for _ in errors[:3]:
+        assert command(*words) == 1
+        assert "a b" in one_line(capfd.readouterr().err)
+    with pytest.raises(ZeroDivisionError):
+        command(*words)
 
 
 def test_settings_are_toml_or_text_behind_a_key():
@@ -187,3 +206,41 @@ def test_help_teaches_and_the_command_starts_in_a_process_of_its_own_and_waits_f
     ):
         assert command(*words) == 0
         assert shown in capsys.readouterr().out
+
+
+def shown(terminal, fail=False, rate=""):
+    stream = io.StringIO()
+    console = Console(file=stream, force_terminal=terminal, width=100)
+    with suppress(RuntimeError), RichProgress(console, rate).stage("record", 4) as advance:
+        advance()
+        advance(n=2)
+        if fail:
+            raise RuntimeError("camera unplugged")
+    return stream.getvalue()
+
+
+def test_a_terminal_shows_a_bar_and_a_file_one_plain_line_a_stage_that_did_not_fail():
+    bar, line = shown(terminal=True), shown(terminal=False)
+    assert "3/4" in bar
+    assert "left" in bar
+    assert line.startswith("record: 3 of 4 in ")
+    assert line.count("\n") == 1
+    assert "\x1b" not in line
+    assert shown(terminal=False, fail=True) == ""
+    assert [" rows/s" in shown(terminal, rate="rows/s") for terminal in (True, False)] == [True, True]
+    assert "/s" not in bar + line
+
+
+def test_words_stand_left_numbers_right_brackets_stay_and_the_first_column_is_never_broken(capsys):
+    rows = [("joint1.coulomb", "0.12", "fixed"), ("lp [a]", "-1234.5", "from the [red]prior[/red] :smile:")]
+    print_table(("parameter", "std [um]", "remark"), rows, ("parameter", "remark"), "of [x]", "std of [y]")
+    title, header, rule, first, second, note = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    assert (title.strip(), note.strip(), set(rule)) == ("of [x]", "std of [y]", {"─"})
+    assert header == "parameter      std [um] remark"
+    assert first == "joint1.coulomb     0.12 fixed"
+    assert second == "lp [a]          -1234.5 from the [red]prior[/red] :smile:"
+    print_table(("study", "what it asks"), [("n" * 30, "how long " * 20)], ("study", "what it asks"))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2].startswith("n" * 30 + " how long")
+    assert max(map(len, lines)) <= 80
+    assert len(lines) > 5

@@ -20,7 +20,7 @@ from identify.loop_parameters import NAMES, index_of
 from identify.record.payload import store_payload
 from identify.record.recording import poses
 from identify.studies.rows.sensor import DrawnSensor
-from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, trajectory, truth
+from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, silent, trajectory, truth
 
 MASS, GAIN = index_of("platform.mass"), index_of("joint_pid.lp")
 JOINTS = [place for place, name in enumerate(NAMES) if name.startswith("joint")]
@@ -28,57 +28,46 @@ SHARE = 0.005
 """Relative standard deviation of the load's mass."""
 
 
-@pytest.fixture(scope="module")
-def scenario():
-    tight = {"identification.cost_tolerance": 1e-8, "identification.parameter_tolerance": 1e-5}
-    return quick(**tight, **{"identification.method": "command_driven", "payload.mass_std_kg": SHARE * 8.0})
+SCENARIO = quick(**{
+    "identification.cost_tolerance": 1e-8,
+    "identification.parameter_tolerance": 1e-5,
+    "identification.method": "command_driven",
+    "payload.mass_std_kg": SHARE * 8.0,
+})  # fmt: skip
+DRAWN = drawn_load(SCENARIO, np.random.default_rng(0))
+LOAD, STD = DRAWN.stated, DRAWN.std
+"""What the scenario's load adds to the parameters (67,), and its standard deviations (67,)."""
 
 
 @pytest.fixture(scope="module")
-def records(scenario):
+def records():
     """A bare record, and one under the scenario's load, as stated."""
-    load, std = stated_load(scenario)
-    bare, _ = run_plant(scenario, seed=1, duration_s=3.0)
-    heavy, _ = run_plant(scenario, seed=2, parameters=truth() + load, duration_s=3.0)
+    bare, _ = run_plant(SCENARIO, seed=1, duration_s=3.0)
+    heavy, _ = run_plant(SCENARIO, seed=2, parameters=truth() + LOAD, duration_s=3.0)
     store_anchor(bare, ScaleAnchor("payload"))
-    store_payload(heavy, load, std)
+    store_payload(heavy, LOAD, STD)
     return [bare, heavy]
 
 
-def stated_load(scenario):
-    """What the scenario's load adds to the parameters (67,), and its standard deviations (67,)."""
-    load = drawn_load(scenario, np.random.default_rng(0))
-    return load.stated, load.std
-
-
-def stating(records, scenario, *loads):
+def stating(records, *loads):
     """The problem of the bare record, and of the other one for each (load (67,), std (67,) or None) as stated."""
     restated = [records[1].copy() for _ in loads]
     for record, (load, std) in zip(restated, loads, strict=True):
         store_payload(record, load, std)
-    return output_error_problem([records[0], *restated], rss6(), scenario).driven_by_commands()
+    return output_error_problem([records[0], *restated], rss6(), SCENARIO).driven_by_commands()
 
 
 def covariance(problem, parameters):
     return estimate_uncertainty(problem, parameters, np.random.default_rng(0)).covariance
 
 
-@pytest.fixture(scope="module")
-def moved(records, scenario):
-    """Where the optimum lies (67,), and how far it moves where the load is stated a standard deviation too heavy."""
-    load, std = stated_load(scenario)
-    heavier, lighter = (
-        search(stating(records, scenario, (load + sign * std, None)), truth(), scenario, lambda n=1: None).parameters
-        for sign in (1, -1)
-    )
-    return (heavier + lighter) / 2, (heavier - lighter) / 2
-
-
-def test_the_intervals_allow_for_how_far_a_wrong_load_moves_the_estimate(records, scenario, moved):
+def test_the_intervals_allow_for_how_far_a_wrong_load_moves_the_estimate(records):
     """Covariance of friction and gains, with all their correlations; all members of the scale move together."""
-    at, shift = moved
-    load, std = stated_load(scenario)
-    known, weighed = (covariance(stating(records, scenario, (load, one)), at) for one in (None, std))
+    heavier, lighter = (  # where the optimum lies if the load is stated a standard deviation too heavy, or too light
+        search(stating(records, (LOAD + sign * STD, None)), truth(), SCENARIO, silent).parameters for sign in (1, -1)
+    )
+    at, shift = (heavier + lighter) / 2, (heavier - lighter) / 2
+    known, weighed = (covariance(stating(records, (LOAD, std)), at) for std in (None, STD))
     added, expected = (weighed - known)[np.ix_(JOINTS, JOINTS)], np.outer(shift[JOINTS], shift[JOINTS])
     assert np.abs(added - expected).max() < 0.02 * np.abs(expected).max()
     assert np.sqrt(np.diag(added)) == pytest.approx(np.abs(shift[JOINTS]), rel=0.02)
@@ -89,31 +78,30 @@ def test_the_intervals_allow_for_how_far_a_wrong_load_moves_the_estimate(records
     assert relative[1] > 1.4 * relative[0]
 
 
-def test_records_under_the_same_load_share_its_error_and_others_do_not(records, scenario):
+def test_records_under_the_same_load_share_its_error_and_others_do_not(records):
     """A second record under the load repeats its error; under another load, known as well, the errors average."""
-    load, std = stated_load(scenario)
 
     def added(other, deviation):
-        return covariance(stating(records, scenario, (load, deviation), (other, deviation)), truth())[GAIN, GAIN]
+        return covariance(stating(records, (LOAD, deviation), (other, deviation)), truth())[GAIN, GAIN]
 
-    exact = added(load, np.zeros(67))
-    same, apart = (added(other, std) - exact for other in (load, load * (1 + 1e-9)))
+    exact = added(LOAD, np.zeros(67))
+    same, apart = (added(other, STD) - exact for other in (LOAD, LOAD * (1 + 1e-9)))
     assert apart == pytest.approx(same / 2, rel=1e-3)
 
 
-def test_an_exactly_known_load_leaves_every_digit_as_it_was(records, scenario):
+def test_an_exactly_known_load_leaves_every_digit_as_it_was(records):
     """Stated with a deviation of zero, or with none, as records of before have it."""
-    stated = covariance(stating(records, scenario, (stated_load(scenario)[0], None)), truth())
-    silent = records[1].copy()
-    silent.attrs = {name: value for name, value in silent.attrs.items() if not name.endswith("_std")}
-    unsaid = output_error_problem([records[0], silent], rss6(), scenario).driven_by_commands()
+    stated = covariance(stating(records, (LOAD, None)), truth())
+    unsaid = records[1].copy()
+    unsaid.attrs = {name: value for name, value in unsaid.attrs.items() if not name.endswith("_std")}
+    unsaid = output_error_problem([records[0], unsaid], rss6(), SCENARIO).driven_by_commands()
     assert np.array_equal(covariance(unsaid, truth()), stated)
     exact = drawn_load(quick(), np.random.default_rng(0))
     assert np.array_equal(exact.true, exact.stated)
     assert not exact.std.any()
 
 
-def test_a_deviation_that_cannot_be_is_refused_and_none_makes_two_loads_of_one(records, scenario):
+def test_a_deviation_that_cannot_be_is_refused_and_none_makes_two_loads_of_one(records):
     bare, heavy = records
     again = heavy.assign_attrs(payload_mass_std=0.01)
     store_anchor(again, ScaleAnchor("payload"))
@@ -124,13 +112,13 @@ def test_a_deviation_that_cannot_be_is_refused_and_none_makes_two_loads_of_one(r
         ((again, heavy), EstimationError, "2 records have all the same load"),
     ):
         with pytest.raises(error, match=says):
-            identify(list(pair), rss6(), scenario)
+            identify(list(pair), rss6(), SCENARIO)
 
 
-def test_drawn_loads_spread_as_stated_and_are_never_negative(scenario):
+def test_drawn_loads_spread_as_stated_and_are_never_negative():
     """Mean and spread of many: of a weighed mass, and of one hardly known, which normal deviations would make none."""
     rng = np.random.default_rng(0)
-    masses = np.array([drawn_load(scenario, rng).true[MASS] for _ in range(2000)])
+    masses = np.array([drawn_load(SCENARIO, rng).true[MASS] for _ in range(2000)])
     assert masses.std() == pytest.approx(0.04, rel=0.07)
     assert masses.mean() == pytest.approx(8.0, abs=4 * 0.04 / np.sqrt(2000))
     vague = quick(**{"payload.mass_std_kg": 8.0, "payload.Izz_std_kg_m2": 0.04})
@@ -139,10 +127,10 @@ def test_drawn_loads_spread_as_stated_and_are_never_negative(scenario):
     assert np.flatnonzero(np.ptp(drawn, axis=0)).tolist() == [MASS, index_of("platform.Izz")]
 
 
-def test_an_experiment_states_the_load_and_keeps_the_drawn_one_in_its_truth(scenario):
+def test_an_experiment_states_the_load_and_keeps_the_drawn_one_in_its_truth():
     """A stream of its own: the bare run is the same to the last digit, and so is the noise of the loaded one."""
     sensor, short = DrawnSensor(np.diag(SIGMA**2)), {"excitation.duration_s": 1.0}
-    vague, exact = scenario.with_overrides(short), scenario.with_overrides(short | {"payload.mass_std_kg": 0.0})
+    vague, exact = SCENARIO.with_overrides(short), SCENARIO.with_overrides(short | {"payload.mass_std_kg": 0.0})
 
     def run(one, seed=0, payload=True):
         return excitation_run(build_plant(one, rss6()), sensor, trajectory(0), seed, payload=payload)
@@ -164,11 +152,11 @@ def test_an_experiment_states_the_load_and_keeps_the_drawn_one_in_its_truth(scen
 @pytest.mark.parametrize(
     "count", [pytest.param(4, marks=pytest.mark.slow), pytest.param(40, marks=pytest.mark.thorough)]
 )
-def test_gains_miss_the_truth_as_often_as_they_say_where_the_load_is_drawn(scenario, count):
+def test_gains_miss_the_truth_as_often_as_they_say_where_the_load_is_drawn(count):
     """Whole experiments, each with noise and a load of its own: errors of the gain in standard deviations have the
     variance one (99.8 % of chance); were the load called exact, twice the deviation and more."""
     sensor = DrawnSensor(np.diag(SIGMA**2))
-    weighed = scenario.with_overrides({"payload.mass_std_kg": 0.08, "identification.scale_anchor": "payload"})
+    weighed = SCENARIO.with_overrides({"payload.mass_std_kg": 0.08, "identification.scale_anchor": "payload"})
 
     plant = build_plant(weighed, rss6())
 

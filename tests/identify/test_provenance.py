@@ -17,19 +17,12 @@ from identify.reporting.run_result import parameter_vector
 from tests.identify.commands import command, one_line
 from tests.identify.synthetic import SHORT, short_run, truth
 
-READ_BY_REPORT = ("experiment.nc", "covariance.nc", "validation.nc", "model.nc")
-
 
 def moved(record):
     """One measured coordinate of one frame is a nanometre elsewhere."""
     position = record["measured_position"].copy(deep=True)
     position[17, 1] += 1e-9
     return record.assign(measured_position=position)
-
-
-@pytest.fixture(scope="module")
-def record():
-    return short_run()[0]
 
 
 def test_arrays_are_told_apart_by_name_shape_and_number_alone():
@@ -42,8 +35,9 @@ def test_arrays_are_told_apart_by_name_shape_and_number_alone():
         assert array_digest(others) != known
 
 
-def test_a_record_is_the_same_wherever_it_was_written_and_another_by_whatever_an_identification_reads(record, tmp_path):
+def test_a_record_is_the_same_wherever_it_was_written_and_another_by_whatever_an_identification_reads(tmp_path):
     """Nor does it matter which estimator its scenario named: the record was made without."""
+    record, _ = short_run()
     driven, stiffer = ({"identification.method": "command_driven"}, {"servo.kp": 0.31})
     scenarios = [SHORT.with_overrides(settings).to_toml() for settings in (driven, stiffer)]
     later = record.assign_attrs(created="later", record_seconds=3.0, title="mine", scenario=scenarios[0])
@@ -60,6 +54,10 @@ def other_experiment(run):
     write(run.experiment, moved(read(run.experiment)), read_truth(run.experiment))
 
 
+def other_covariance(run):
+    write_covariance(run.covariance, NAMES, 2 * np.eye(len(NAMES)))
+
+
 def other_validation(run):
     first, *more = read_runs(run.validation)
     write_runs(run.validation, [(one, read_truth(run.experiment)) for one in (moved(first), *more)])
@@ -71,25 +69,18 @@ def other_model(run):
     write_model_runs(run.model, excitation + 1e-9, list(runs.values()))
 
 
-def other_covariance(run):
-    write_covariance(run.covariance, NAMES, 2 * np.eye(len(NAMES)))
-
-
-OTHERS = [
-    (other_experiment, "experiment.nc", "of another record than experiment.nc", "identify"),
-    (other_covariance, "covariance.nc", "of another covariance.nc", "identify"),
-    (other_validation, "validation.nc", "of another validation.nc", "validate"),
-    (other_model, "model.nc", "of another model.nc", "validate"),
-]
-
-
 @pytest.mark.slow
 def test_a_report_takes_the_results_own_files_and_refuses_others_and_an_estimate_outside_its_interval(run_folder):
     bare = load_result(run_folder.result)
-    made_of = RunFiles(run_folder).digests(*READ_BY_REPORT)
+    made_of = RunFiles(run_folder).digests("experiment.nc", "covariance.nc", "validation.nc", "model.nc")
     save_result(run_folder.result, bare | {ENTRY: made_of})
     assert len(read_report_data(run_folder).validation) == 2
-    for replace, file, says, stage in OTHERS:
+    for replace, file, says, stage in (
+        (other_experiment, "experiment.nc", "of another record than experiment.nc", "identify"),
+        (other_covariance, "covariance.nc", "of another covariance.nc", "identify"),
+        (other_validation, "validation.nc", "of another validation.nc", "validate"),
+        (other_model, "model.nc", "of another model.nc", "validate"),
+    ):
         replace(run_folder)
         save_result(run_folder.result, bare | {ENTRY: {file: made_of[file]}})
         with pytest.raises(RecordError, match=f"json is {says}: run `cmmsim {stage} --out {run_folder.path}` again"):
@@ -106,75 +97,58 @@ def test_a_report_takes_the_results_own_files_and_refuses_others_and_an_estimate
         write_report(run_folder.path)
 
 
-def identified(run):
-    """The result as `identify` leaves it, with the true parameters."""
-    values = dict(zip(NAMES, truth(), strict=True))
-    parameters = {name: {"initial": value, "estimate": value} for name, value in values.items()}
-    write_covariance(run.covariance, NAMES, np.eye(len(NAMES)))
-    made_of = RunFiles(run).digests("experiment.nc", "covariance.nc")
-    result = {"seconds": {}, "before": {}, "after": {}, "identification": {"parameters": parameters}, ENTRY: made_of}
-    save_result(run.result, result)
-    return result
-
-
-def test_identification_states_what_it_read_and_wrote(recorded_folder, record):
+def test_identification_states_what_it_read_and_wrote(recorded_folder):
     pipeline.identify(recorded_folder.path, SilentProgress())
     made_of = load_result(recorded_folder.result)[ENTRY]
     assert made_of == RunFiles(recorded_folder).digests("experiment.nc", "covariance.nc")
-    assert made_of["experiment.nc"] == digest(record)
+    assert made_of["experiment.nc"] == digest(short_run()[0])
 
 
-def refused(run, name, capsys):
-    """The one line by which a stage refuses a run; it writes nothing."""
-    before = sorted(run.path.iterdir()), run.result.read_bytes()
-    assert command(name, "--out", run.path) == 1
-    assert (sorted(run.path.iterdir()), run.result.read_bytes()) == before
-    return one_line(capsys.readouterr().err)
+def entries(**changes):
+    """The true parameters as an identification has them, but for some; None: it lacks this one."""
+    values = dict(zip(NAMES, truth(), strict=True)) | {name.replace("__", "."): one for name, one in changes.items()}
+    return {"parameters": {name: {"initial": value, "estimate": value} for name, value in values.items()}}
 
 
-@pytest.mark.parametrize("replace", [other_experiment, other_covariance])
-def test_what_reads_a_run_anew_refuses_files_of_two_origins(recorded_folder, record, replace, capsys):
+def test_what_reads_a_run_anew_refuses_in_one_line_files_of_another_and_a_result_that_is_none(recorded_folder, capsys):
+    """And writes nothing."""
     run = recorded_folder
-    identified(run)
-    replace(run)
-    assert f"run `cmmsim identify --out {run.path}` again" in refused(run, "validate", capsys)
-    write_runs(run.validation, [(record, read_truth(run.experiment))] * 3)
-    for name, of, stage in (
+    write_covariance(run.covariance, NAMES, np.eye(len(NAMES)))
+    write_runs(run.validation, [(short_run()[0], read_truth(run.experiment))] * 3)
+    whole = {"seconds": {}, "before": {}, "after": {}, "identification": entries()}
+    made_of = (
+        ("validate", "experiment.nc", "identify"),
+        ("validate", "covariance.nc", "identify"),
         ("estimators", "experiment.nc", "identify"),
         ("estimators", "validation.nc", "validate"),
         ("variation", "validation.nc", "validate"),
+    )
+    for reader, result, says in (
+        *((reader, whole | {ENTRY: {of: ""}}, f"{of}: run `cmmsim {stage} --out") for reader, of, stage in made_of),
+        ("validate", whole | {"identification": entries(link3__mass=None)}, "there is no initial of link3.mass"),
+        ("validate", {}, "lacks identification, before, after, seconds; write it with: cmmsim identify"),
+        ("validate", whole | {ENTRY: 7}, "made_of must be digests"),
     ):
-        save_result(run.result, {ENTRY: {of: "of a run before"}})
-        assert f"{of}: run `cmmsim {stage} --out {run.path}` again" in refused(run, name, capsys)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "says"),
-    [
-        (lambda r: r.clear(), "lacks identification, before, after, seconds; write it with: cmmsim identify"),
-        (lambda r: r["identification"]["parameters"].pop("link3.mass"), "there is no initial of link3.mass"),
-        (lambda r: r.update(made_of=7), "made_of must be digests"),
-    ],
-    ids=["empty", "parameter gone", "no digests"],
-)
-def test_validation_refuses_a_result_that_is_none_in_one_line(recorded_folder, spoil, says, capsys):
-    result = identified(recorded_folder)
-    spoil(result)
-    save_result(recorded_folder.result, result)
-    error = refused(recorded_folder, "validate", capsys)
-    assert says in error
-    assert str(recorded_folder.result) in error
+        save_result(run.result, result)
+        before = sorted(run.path.iterdir()), run.result.read_bytes()
+        assert command(reader, "--out", run.path) == 1
+        assert (sorted(run.path.iterdir()), run.result.read_bytes()) == before
+        error = one_line(capsys.readouterr().err)
+        assert says in error
+        assert str(run.result) in error
 
 
 def test_parameters_of_a_result_that_no_model_has_are_named():
-    entries = {known: {"estimate": one} for known, one in zip(NAMES, truth(), strict=True)}
-    np.testing.assert_array_equal(parameter_vector({"parameters": entries}, "estimate"), truth())
-    for name, value, says in (
-        ("link3.mass", "1 kg", 'estimate of link3.mass is "1 kg", must be a finite number'),
-        ("platform.mass", -5, "estimate: platform.mass = -5 kg is not allowed"),
-        ("joint_pid.li", 0, "estimate: joint_pid.li"),
+    np.testing.assert_array_equal(parameter_vector(entries(), "estimate"), truth())
+    for identification, says in (
+        (entries(link3__mass="1 kg"), 'estimate of link3.mass is "1 kg", must be a finite number'),
+        (entries(link3__mass=True), "estimate of link3.mass is true, must be a finite number"),
+        (entries(link3__mass=float("nan")), "estimate of link3.mass is NaN, must be a finite number"),
+        (entries(link3__mass=10**400), "estimate of link3.mass is 10{59}, must be"),
+        (entries(platform__mass=-5), "estimate: platform.mass = -5 kg is not allowed"),
+        (entries(joint_pid__li=0), "estimate: joint_pid.li"),
+        ({"parameters": {}}, "no estimate of platform.mass, platform.Ixx, platform.Iyy and 64 more"),
+        ({"parameters": []}, r"no identification\.parameters"),
     ):
         with pytest.raises(RecordError, match=says):
-            parameter_vector({"parameters": entries | {name: {"estimate": value}}}, "estimate")
-    with pytest.raises(RecordError, match=r"no identification\.parameters"):
-        parameter_vector([], "estimate")
+            parameter_vector(identification, "estimate")

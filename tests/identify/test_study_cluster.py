@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import dask
 import numpy as np
@@ -30,32 +31,17 @@ from identify.studies.dask_cluster import DaskExecutor, local_cluster, running_c
 from identify.studies.design import Case, Finished
 from identify.studies.runner import Batches, run_study
 from identify.studies.store import JOURNAL
-from identify.studies.study_file import Study
-from tests.identify.study_rows import KIND, At, journal, same_numbers
+from tests.identify.study_rows import DARK, KIND, At, journal, same_numbers, small_study
 
 LOST = TimeoutError("its worker died with the result")
 DIED = KilledWorker("task", SimpleNamespace(address="tcp://a:1"), 0)
 
 
-class Future:
-    """A batch that is done at once, and whose result comes in the given steps: an error each, or what is found."""
-
-    def __init__(self, key, steps):
-        self.key, self._steps = key, steps
-
-    def add_done_callback(self, action):
-        action(self)
-
-    def result(self, timeout=None):
-        assert timeout is not None, "waits without a limit"
-        step = next(self._steps)
-        if isinstance(step, Exception):
-            raise step
-        return step
-
-
 class Client:
-    """A client of a cluster with so many workers; `steps(cases, time)`: results of a batch sent the so many-th time."""
+    """A client of a cluster with so many workers, whose batches are done at once.
+
+    steps(cases, time): results of a batch sent the so many-th time, one after the other: an error, or what is found.
+    """
 
     status = "running"
 
@@ -65,10 +51,13 @@ class Client:
     def submit(self, _, version, setup, cases, pure):
         numbers = [case.number for case in cases]
         self.sent.append(numbers)
-        return Future(len(self.sent), iter(self._steps(numbers, self.sent.count(numbers))))
+        result = Mock(side_effect=self._steps(numbers, self.sent.count(numbers)))
+        future = SimpleNamespace(key=len(self.sent), result=lambda timeout: timeout and result())
+        future.add_done_callback = lambda action: action(future)
+        return future
 
-    def nthreads(self, callback_timeout=None):
-        assert callback_timeout is not None, "waits without a limit"
+    def nthreads(self, callback_timeout):
+        assert callback_timeout, "waits without a limit"
         return dict.fromkeys(range(self._workers), 1)
 
 
@@ -88,15 +77,12 @@ def test_result_that_died_with_its_worker_is_waited_for_and_noted_once():
 
 
 def test_last_worker_or_a_scheduler_that_does_not_answer_ends_the_study_in_one_line(monkeypatch):
-    def no_answer(callback_timeout):
-        raise TimeoutError(f"timed out after {callback_timeout} s")
-
     monkeypatch.setattr(dask_cluster, "WORKERLESS_SECONDS", 0.05)
     with pytest.raises(StudyError, match=r"^no Dask worker for 0.05 s; the same command goes on from here$"):
         computed(Client(lambda *_: iter(lambda: LOST, None), workers=0), 1)
     client = Client(lambda numbers, _: [found(numbers)])
-    client.nthreads = no_answer
-    with pytest.raises(StudyError, match=r"^the Dask scheduler is gone; .* timed out after \d+ s$"):
+    client.nthreads = Mock(side_effect=TimeoutError("timed out"))
+    with pytest.raises(StudyError, match=r"^the Dask scheduler is gone; .* timed out$"):
         computed(client, 1)
 
 
@@ -113,25 +99,20 @@ def test_row_is_blamed_for_the_second_death_of_its_worker_and_not_for_the_first(
 
 
 ROOT = Path(__file__).parents[2]
-DARK = "sensor.camera.dark_noise"
 LEVELS = [13.0, 26.0, 52.0]
 PATIENCE = 120
 """Seconds for what takes a few on a free machine."""
 
 
 def study(**options):
-    options = {"seconds": 0.02} | options
-    return Study(name="mine", kind=KIND, factors={DARK: LEVELS}, repeats=40, seed=4, options=options)
+    return small_study(factors={DARK: LEVELS}, repeats=40, options={"seconds": 0.02} | options)
 
 
 def process(*arguments, before=ROOT):
     """A process of this Python, in a group of its own; what is in the folder `before` it finds first."""
-    environment = os.environ | {"PYTHONPATH": f"{before}:{ROOT}"}
-    command = [sys.executable, "-m", *map(str, arguments)]
-    pipe = subprocess.PIPE
-    return subprocess.Popen(
-        command, cwd=before, env=environment, start_new_session=True, stderr=pipe, stdout=pipe, text=True
-    )
+    command, environment = [sys.executable, "-m", *map(str, arguments)], os.environ | {"PYTHONPATH": f"{before}:{ROOT}"}
+    shown = {"stderr": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, cwd=before, env=environment, start_new_session=True, **shown)
 
 
 def worker(address, folder, before=ROOT):

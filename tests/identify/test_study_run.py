@@ -1,42 +1,36 @@
-"""Studies in one process: what an end in the middle leaves, how rows are added to a folder, and what it refuses.
-
-One study, one version: workers of a cluster are asked here as they answer; real ones are in `test_study_cluster`.
-"""
+"""Studies in one process: what an end in the middle leaves, how rows are added, what is refused, and their table."""
 
 import errno
 import fcntl
 import json
 import os
 import warnings
-from contextlib import contextmanager
+from contextlib import nullcontext
 from pathlib import Path
+from unittest.mock import Mock
 
+import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
+import xarray as xr
 
-from identify.errors import StudyError, StudyInterrupted
+from identify.errors import StudyError
 from identify.files.versions import OtherVersionsWarning, versions
 from identify.progress import SilentProgress
+from identify.scenario import load_scenario
 from identify.studies import runner
 from identify.studies.dask_cluster import check_workers
 from identify.studies.design import Case, Finished
 from identify.studies.runner import BATCH_SECONDS, LARGEST_BATCH, Batches, compute, run_study
-from identify.studies.store import JOURNAL, LOCK, STUDY, TABLE
-from identify.studies.study_file import Study
-from identify.studies.table import figure_names, read_table
+from identify.studies.store import JOURNAL, LOCK, STUDY, TABLE, VIEW
+from identify.studies.table import figure_names, read_table, tidy_table, to_xarray, write_view
 from tests.identify.commands import refusal
-from tests.identify.study_rows import KIND, journal, same_numbers
-
-DARK, METHOD = "sensor.camera.dark_noise", "scenario.pose_method"
-FACTORS = {DARK: [13.0, 26.0, 52.0], METHOD: ["registration", "planes"]}
+from tests.identify.study_rows import DARK, METHOD, journal, row, same_numbers, small_study
 
 
-def study(**entries):
-    return Study(**{"name": "mine", "kind": KIND, "factors": FACTORS, "repeats": 3, "seed": 4} | entries)
-
-
-def run(folder, chosen=None):
-    return run_study(chosen or study(), folder, SilentProgress())
+def run(folder, **entries):
+    return run_study(small_study(**entries), folder, SilentProgress())
 
 
 @pytest.fixture(scope="module")
@@ -46,26 +40,16 @@ def whole(tmp_path_factory):
     return folder, run(folder).frame
 
 
-def stopping_after(rows, error):
-    """Workers that compute so many rows, one a batch, and then fail."""
+def stop(folder, rows, error=KeyboardInterrupt, **entries):
+    """Run a study in a folder, one row a batch, until so many are done and Ctrl-C, or an error, comes; what is said."""
 
     def execute(setup, batches):
         for _ in range(rows):
             yield compute(setup, batches.take(1))
         raise error
 
-    @contextmanager
-    def workers():
-        yield execute
-
-    return workers
-
-
-def stop(folder, rows, chosen=None, error=None):
-    """Run a study in a folder until so many rows are done and Ctrl-C, or an error, comes; what is then raised."""
-    workers = stopping_after(rows, error or KeyboardInterrupt())
-    with pytest.raises(type(error) if error else StudyInterrupted) as caught:
-        run_study(chosen or study(), folder, SilentProgress(), workers)
+    with pytest.raises((StudyError, SystemError)) as caught:
+        run_study(small_study(**entries), folder, SilentProgress(), lambda: nullcontext(execute))
     return str(caught.value)
 
 
@@ -84,18 +68,21 @@ def test_batches_hold_every_row_once_and_a_quarter_second_of_work(row_seconds, w
     assert sizes[-1] <= max(1, 5000 // workers // 100)
 
 
-@pytest.mark.parametrize("error", [None, SystemError("crash")])
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [(KeyboardInterrupt, "stopped: 7 of 18 rows are done and kept"), (SystemError("crash"), "crash")],
+)
 def test_a_study_that_was_stopped_goes_on_where_it_was_and_one_that_is_done_computes_nothing(
-    whole, tmp_path, monkeypatch, error
+    whole, tmp_path, monkeypatch, error, said
 ):
-    chosen = study(options={"log": str(tmp_path / "log")})
-    assert stop(tmp_path / "a", 7, chosen, error) in ("stopped: 7 of 18 rows are done and kept", "crash")
-    outcome = run(tmp_path / "a", chosen)
+    options = {"log": str(tmp_path / "log")}
+    assert stop(tmp_path / "a", 7, error, options=options) == said
+    outcome = run(tmp_path / "a", options=options)
     assert outcome.found == 7
     same_numbers(outcome.frame, whole[1])
     assert sorted(map(int, (tmp_path / "log").read_text().split())) == list(range(18))
     monkeypatch.setattr(runner, "compute", None)
-    again = run(tmp_path / "a", chosen)
+    again = run(tmp_path / "a", options=options)
     assert (again.found, again.rows) == (18, 18)
     pd.testing.assert_frame_equal(again.frame, outcome.frame)
 
@@ -137,17 +124,15 @@ def test_full_disk_leaves_whole_lines_and_the_study_goes_on_later(whole, tmp_pat
     real, calls = os.pwrite, []
 
     def full(file, data, offset):
-        calls.append(len(data))
-        if len(calls) < 3:
-            return real(file, data, offset)
-        if len(calls) == 3 and part:
-            return real(file, data[:part], offset)
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        calls.append(data)
+        if len(calls) > 2 + (part > 0):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(file, data if len(calls) < 3 else data[:part], offset)
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "pwrite", full)
-        with pytest.raises(StudyError, match=r"rows.jsonl cannot be written: No space left on device; 2 rows are safe"):
-            run_study(study(), tmp_path, SilentProgress(), stopping_after(18, AssertionError()))
+        said = stop(tmp_path, 18)
+    assert "rows.jsonl cannot be written: No space left on device; 2 rows are safe" in said
     assert journal(tmp_path) == [0, 1]
     outcome = run(tmp_path)
     assert outcome.found == 2
@@ -155,7 +140,8 @@ def test_full_disk_leaves_whole_lines_and_the_study_goes_on_later(whole, tmp_pat
 
 
 def test_a_row_that_fails_exits_or_contradicts_itself_says_why_and_the_others_go_on(whole, tmp_path):
-    outcome = run(tmp_path / "a", study(options={"fails": [2, 11], "odd": 5, "exits": [7]}))
+    """Nor may a figure hide a column of the table."""
+    outcome = run(tmp_path / "a", options={"fails": [2, 11], "odd": 5, "exits": [7]})
     assert outcome.failures == [
         "row 2: ValueError: row 2 has no answer",
         "row 5: ArithmeticError: error_um is nan",
@@ -163,37 +149,31 @@ def test_a_row_that_fails_exits_or_contradicts_itself_says_why_and_the_others_go
         "row 11: ValueError: row 11 has no answer",
     ]
     failed = outcome.frame["error"] != ""
-    assert outcome.frame.loc[failed, figure_names(outcome.frame, study())].isna().all(axis=None)
+    assert outcome.frame.loc[failed, figure_names(outcome.frame, small_study())].isna().all(axis=None)
     same_numbers(outcome.frame[~failed], whole[1][~failed])
     together = {"scenario.filter.cutoff_hz": [10.0, 40.0], "scenario.timing.frame_rate_hz": [60.0, 100.0]}
-    frame = run(tmp_path / "b", study(factors=together)).frame
+    frame = run(tmp_path / "b", factors=together).frame
     assert ["Nyquist" in error for error in frame["error"]] == [False, False, True, False] * 3
-
-
-@pytest.mark.parametrize("name", ["row", "seconds", DARK])
-def test_a_figure_that_would_hide_a_column_is_an_error_of_the_row(tmp_path, name):
-    frame = run(tmp_path, study(options={"also": name}, repeats=1)).frame
-    assert set(frame["error"]) == {
-        f"ValueError: a figure must not be called {name!r}: the table has a column of this name"
-    }
+    for name in ("row", "seconds", DARK):
+        errors = run(tmp_path / name, options={"also": name}, repeats=1).frame["error"]
+        assert {*errors} == {f"ValueError: a figure must not be called {name!r}: the table has a column of this name"}
 
 
 def test_more_repeats_are_added_to_those_that_are_there(whole, tmp_path):
     """The same table as that of a study that had them from the start, and no row is computed twice; also in two
     steps, and of a sample, whose points stay."""
-    log, more = tmp_path / "log", {"repeats": 5}
-    chosen = study(options={"log": str(log)})
-    few = run(tmp_path / "a", chosen)
+    log = tmp_path / "log"
+    options = {"log": str(log)}
+    few = run(tmp_path / "a", options=options)
     same_numbers(few.frame, whole[1])
-    assert stop(tmp_path / "a", 2, chosen.model_copy(update=more)) == "stopped: 20 of 30 rows are done and kept"
-    many = run(tmp_path / "a", chosen.model_copy(update=more))
+    assert stop(tmp_path / "a", 2, options=options, repeats=5) == "stopped: 20 of 30 rows are done and kept"
+    many = run(tmp_path / "a", options=options, repeats=5)
     assert (few.rows, many.found, many.rows) == (18, 20, 30)
     assert sorted(map(int, log.read_text().split())) == list(range(30))
-    same_numbers(many.frame, run(tmp_path / "b", study(**more)).frame)
+    same_numbers(many.frame, run(tmp_path / "b", repeats=5).frame)
     assert read_table(tmp_path / "a" / TABLE)[1].repeats == 5
-    sampled = study(factors={DARK: {"low": 1.0, "high": 50.0}}, sample=4, repeats=1)
-    one = run(tmp_path / "c", sampled).frame
-    three = run(tmp_path / "c", sampled.model_copy(update={"repeats": 3})).frame
+    sampled = {"factors": {DARK: {"low": 1.0, "high": 50.0}}, "sample": 4}
+    one, three = (run(tmp_path / "c", **sampled, repeats=repeats).frame for repeats in (1, 3))
     same_numbers(three[:4], one)
     assert three[DARK].tolist() == 3 * one[DARK].tolist()
     assert len(set(three["seed_spawn_key"])) == 12
@@ -202,45 +182,42 @@ def test_more_repeats_are_added_to_those_that_are_there(whole, tmp_path):
 def test_fewer_repeats_leave_the_others_out_of_the_table_but_lose_none(whole, tmp_path):
     """Also of a study that was stopped, which so ends with the repeats that it has."""
     log = tmp_path / "log"
-    chosen = study(options={"log": str(log)})
-    stop(tmp_path / "a", 13, chosen)
-    two = run(tmp_path / "a", chosen.model_copy(update={"repeats": 2}))
+    options = {"log": str(log)}
+    stop(tmp_path / "a", 13, options=options)
+    two, three = (run(tmp_path / "a", options=options, repeats=repeats) for repeats in (2, 3))
     assert (two.found, two.rows, two.beyond) == (12, 12, 1)
     same_numbers(two.frame, whole[1][:12])
-    three = run(tmp_path / "a", chosen)
     assert (three.found, three.beyond) == (13, 0)
     same_numbers(three.frame, whole[1])
     assert sorted(map(int, log.read_text().split())) == list(range(18))
 
 
-def test_the_folder_of_another_study_or_of_another_sensor_file_is_refused(tmp_path):
-    mine = tmp_path / "mine.toml"
+def test_a_folder_or_a_table_of_another_study_or_of_another_sensor_file_is_refused(whole, tmp_path):
+    mine, folder, table = tmp_path / "mine.toml", tmp_path / "a", tmp_path / "b" / TABLE
     mine.write_text('name = "mine"\nbased_on = "ctrack780"\n')
     base = {"changes": {"scenario.sensor": str(mine)}}
-    folder = tmp_path / "a"
-    run(folder, study(**base))
-    before = (folder / JOURNAL).read_bytes()
-    for other, differs in (
-        ({"seed": 5, "repeats": 4}, "study.seed; name"),
-        ({"factors": {DARK: [1.0]}}, "study.factors."),
-        ({"factors": FACTORS | {DARK: [13.0, 26.0, 52.0, 99.0]}, "repeats": 4}, f"study.factors.{DARK}; name"),
-    ):
-        message = refusal(StudyError, run, folder, study(**base | other))
-        assert f"study.json is of another study, which differs in {differs}" in message
-    run(folder, study(title="another title", **base))
+
+    def refused(**entries):
+        return refusal(StudyError, lambda: run(folder, **base | entries))
+
+    run(folder, **base)
+    before, another = (folder / JOURNAL).read_bytes(), "study.json is of another study, which differs in study."
+    assert f"{another}seed; name" in refused(seed=5, repeats=4)
+    assert f"{another}factors." in refused(factors={DARK: [1.0]})
+    more = small_study().factors | {DARK: [13.0, 26.0, 52.0, 99.0]}
+    assert f"{another}factors.{DARK}; name" in refused(factors=more, repeats=4)
+    run(folder, title="another title", **base)
     mine.write_text('name = "mine"\nbased_on = "ctrack780"\n[lens]\npsf_px = 0.5\n')
-    assert "differs in sensor.lens.psf_px" in refusal(StudyError, run, folder, study(**base))
+    assert "differs in sensor.lens.psf_px" in refused()
     assert (folder / JOURNAL).read_bytes() == before
-
-
-def test_a_table_of_another_study_is_refused(whole, tmp_path):
-    (tmp_path / TABLE).write_bytes((whole[0] / TABLE).read_bytes())
-    message = refusal(StudyError, run, tmp_path, study(seed=5))
-    assert "study.parquet is of another study, which differs in study.seed" in message
-    pd.DataFrame({"x": [1.0]}).to_parquet(tmp_path / TABLE)
-    assert "study.parquet is no table of a study" in refusal(StudyError, run, tmp_path)
-    (tmp_path / TABLE).write_text("no table")
-    assert "study.parquet is no table of a study" in refusal(StudyError, run, tmp_path)
+    folder = table.parent
+    folder.mkdir()
+    table.write_bytes((whole[0] / TABLE).read_bytes())
+    assert "study.parquet is of another study, which differs in study.seed" in refused(seed=5, changes={})
+    pd.DataFrame({"x": [1.0]}).to_parquet(table)
+    assert "study.parquet is no table of a study" in refused()
+    table.write_text("no table")
+    assert "study.parquet is no table of a study" in refused()
 
 
 def test_folders_of_other_things_in_use_or_that_cannot_be_made_are_refused_and_left_alone(tmp_path):
@@ -255,12 +232,6 @@ def test_folders_of_other_things_in_use_or_that_cannot_be_made_are_refused_and_l
         fcntl.flock(other, fcntl.LOCK_EX)
         assert "in use by another process" in refusal(StudyError, run, tmp_path)
     assert run(tmp_path).found == 18
-
-
-def begun_by(folder, **changes):
-    """Say in the folder that other versions began it."""
-    entry = json.loads((folder / STUDY).read_text())
-    (folder / STUDY).write_text(json.dumps(entry | {"versions": entry["versions"] | changes}))
 
 
 def test_one_warning_names_each_other_version_once_with_how_many_workers_have_it():
@@ -278,22 +249,91 @@ def test_one_warning_names_each_other_version_once_with_how_many_workers_have_it
 
 
 def test_no_rows_are_added_to_those_of_another_version_and_with_a_warning_where_only_other_packages_changed(tmp_path):
-    few, more = study(repeats=1), study(repeats=2)
-    run(tmp_path, few)
-    begun_by(tmp_path, cmmsim="9.8.7")
+    def begun_by(**others):
+        entry = json.loads((tmp_path / STUDY).read_text())
+        (tmp_path / STUDY).write_text(json.dumps(entry | {"versions": entry["versions"] | others}))
+
+    run(tmp_path, repeats=1)
+    begun_by(cmmsim="9.8.7")
     kept = (tmp_path / JOURNAL).read_bytes()
     with pytest.raises(StudyError, match=r"has cmmsim 9\.8\.7, here is \S+; go on with that version"):
-        run(tmp_path, more)
+        run(tmp_path, repeats=2)
     assert (tmp_path / JOURNAL).read_bytes() == kept
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert run(tmp_path, few).found == 6
+        assert run(tmp_path, repeats=1).found == 6
         (tmp_path / JOURNAL).write_bytes(b"")
-        assert run(tmp_path, few).found == 0, "without rows it goes on whatever made it"
-    begun_by(tmp_path, scipy="0.1")
+        assert run(tmp_path, repeats=1).found == 0, "without rows it goes on whatever made it"
+    begun_by(scipy="0.1")
     with pytest.warns(OtherVersionsWarning, match=r"scipy 0\.1 \(.*\), here"):
-        run(tmp_path, more)
+        run(tmp_path, repeats=2)
     entry = json.loads((tmp_path / STUDY).read_text())
     assert entry.pop("versions") == versions() | {"scipy": "0.1"}
     (tmp_path / STUDY).write_text(json.dumps(entry))
-    assert run(tmp_path, study(repeats=3)).found == 12, "nor need it say what made it"
+    assert run(tmp_path).found == 12, "nor need it say what made it"
+
+
+def test_table_has_a_row_each_with_factors_seed_and_figures(whole):
+    """Each row can be computed again from what the table says of it."""
+    frame, paper = whole[1], load_scenario("paper")
+    before, figures = ["row", "repeat", "seed_entropy", "seed_spawn_key"], ["error_um", "spread_um", "rate_hz"]
+    assert list(frame.columns) == [*before, DARK, METHOD, *figures, "seconds", "error"]
+    assert frame["row"].tolist() == list(range(18))
+    for entry in frame.to_dict("records"):
+        seed = np.random.SeedSequence(int(entry["seed_entropy"]), spawn_key=(entry["seed_spawn_key"],))
+        scenario = paper.with_overrides({"sensor_changes.camera.dark_noise": entry[DARK]})
+        assert row(scenario, seed, {}) == {name: entry[name] for name in figures}
+
+
+def test_files_hold_the_study_and_its_table_and_the_figures_by_factor_and_repeat_as_xarray_reads_them(whole):
+    folder, table = whole
+    frame, found = read_table(str(folder / TABLE))
+    pd.testing.assert_frame_equal(frame, table)
+    assert found == small_study()
+    assert {"python", "cmmsim", "numpy"} <= {*json.loads(pq.read_schema(folder / TABLE).metadata[b"cmmsim.versions"])}
+    assert json.loads((folder / STUDY).read_text())["sensor"]["name"] == "ctrack780"
+    with xr.open_dataset(folder / VIEW) as view:
+        xr.testing.assert_identical(view.load(), to_xarray(frame, found))
+    assert dict(view.sizes) == {DARK: 3, METHOD: 2, "repeat": 3}
+    for entry in frame.to_dict("records"):
+        place = {DARK: entry[DARK], METHOD: entry[METHOD], "repeat": entry["repeat"]}
+        assert float(view["error_um"].sel(place)) == entry["error_um"]
+
+
+def made(figures=("position_rms_um",), **entries):
+    """A table and its study of two repeats; row n has n in each figure."""
+    study = small_study(**{"kind": "static_pose", "repeats": 2} | entries)
+    done = [Finished(number, dict.fromkeys(figures, float(number)), 0.5) for number in range(study.rows)]
+    return tidy_table(study, done), study
+
+
+def test_view_of_a_sample_has_points_with_the_factors_as_coordinates_and_all_carry_their_units():
+    factors = {DARK: {"low": 1.0, "high": 50.0}, "options.pair": [[1, 2], [3, 4]]}
+    frame, study = made(kind="my:row", factors=factors, sample=5, repeats=2)
+    view = to_xarray(frame, study)
+    assert dict(view.sizes) == {"point": 5, "repeat": 2}
+    assert view[DARK].values.tolist() == frame[DARK][:5].tolist()
+    assert set(frame["options.pair"]) <= {"[1, 2]", "[3, 4]"}
+    assert view["position_rms_um"].values.T.ravel().tolist() == list(range(10))
+    view = to_xarray(*made(figures=("position_rms_um", "stickers")))
+    units = {"position_rms_um": "um", "stickers": None, "seconds": "s", DARK: "electrons", METHOD: None, "repeat": None}
+    assert {name: view[name].attrs.get("units") for name in view.variables} == units
+
+
+@pytest.mark.parametrize("factors", [{}, {"options.fast": [True, False]}, {"options.pair": [[1, 2], [3]]}])
+def test_any_factor_and_any_name_of_a_figure_can_be_written(tmp_path, factors):
+    frame, study = made(figures=("rate_1/s", "größe m"), kind="my:row", factors=factors)
+    write_view(tmp_path / VIEW, frame, study)
+    with xr.open_dataset(tmp_path / VIEW) as found:
+        assert {*found.data_vars} == {"rate_1_per_s", "größe m", "seconds"}
+        assert sorted(found["rate_1_per_s"].values.ravel().tolist()) == list(range(study.rows))
+
+
+def test_full_disk_leaves_the_old_view_and_one_line(tmp_path, monkeypatch):
+    path = tmp_path / VIEW
+    path.write_text("old")
+    monkeypatch.setattr(xr.Dataset, "to_netcdf", Mock(side_effect=OSError(28, "No space left on device")))
+    with pytest.raises(StudyError, match=r"study\.nc cannot be written: No space left on device"):
+        write_view(path, *made())
+    assert path.read_text() == "old"
+    assert [one.name for one in tmp_path.iterdir()] == [VIEW]
