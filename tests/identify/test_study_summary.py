@@ -60,9 +60,9 @@ def made_table(study, failed=(), figures=None):
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     """Table of a study with three failed rows, and others without a position; what its summary returned; the folder."""
-    study, folder = made_study(), tmp_path_factory.mktemp("study")
+    study, folder = made_study(repeats=16), tmp_path_factory.mktemp("study")
     frame = made_table(study, failed=(4, 7, 9))
-    frame.loc[(frame["repeat"] > 5) | (frame[DARK] == 40.0), POSITION] = np.nan
+    frame.loc[(frame["repeat"] == 15) | ((frame[DARK] == 40.0) & (frame[BASELINE] == 1.0)), POSITION] = np.nan
     return frame, summary.write(folder, study, frame), folder
 
 
@@ -105,17 +105,17 @@ def test_points_and_laws_are_those_of_the_rows_that_have_the_figure_and_the_fail
             assert figure["mean"] == pytest.approx(values.mean())
             assert figure["rms"] == pytest.approx(np.sqrt((values**2).mean()))
             assert figure["rms_band"][0] < figure["rms"] < figure["rms_band"][1]
-    assert entry["rows"] == {"planned": 48, "done": 45, "failed": 3, "missing": 0}
+    assert entry["rows"] == {"planned": 96, "done": 93, "failed": 3, "missing": 0}
     assert entry["failures"]["reasons"] == {"LostError: only 1 stickers": 2, "LostError: only 0 stickers": 1}
     assert [one["row"] for one in entry["failures"]["first"]] == [4, 7, 9]
     stored, text = json.loads((folder / "summary.json").read_text()), (folder / "summary.md").read_text()
     assert "nan" not in f"{json.dumps(stored)} {text}".lower()
     law = stored["theory"][0]
-    assert (law["verdict"], law["rows"]) == ("passed", 22)
+    assert (law["verdict"], law["rows"]) == ("passed", 72)
     assert law["low"] < 1.0 < law["high"]
     assert (stored["units"][DARK], stored["units"][POSITION]) == ("electrons", "um")
     assert stored["confidence"] == {"bands": 0.95, "laws": 0.99}
-    for words in ("45 rows done, 3 failed, 0 missing", "2 x LostError: only 1 stickers", "The first: 4, 7, 9."):
+    for words in ("93 rows done, 3 failed, 0 missing", "2 x LostError: only 1 stickers", "The first: 4, 7, 9."):
         assert words in text
     assert "| position_rms_um ~ sensor.camera.dark_noise ^ 1 | 1 |" in text
 
