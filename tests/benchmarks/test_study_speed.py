@@ -25,7 +25,7 @@ from tests.benchmarks.timing import (
     second_core_gain,
     seconds,
 )
-from tests.identify.study_rows import At
+from tests.identify.study_rows import at
 
 pytestmark = pytest.mark.thorough
 
@@ -145,7 +145,7 @@ def test_memory_is_flat(two_cores, run, record_property, study, warm):
     """From the first fifth of the rows to the last: of this process, and of the largest worker."""
     found = []
     run(two_cores, warm)
-    run(two_cores, study, At(lambda: found.append(memory_mb()), study.rows // 5, study.rows))
+    run(two_cores, study, at(lambda: found.append(memory_mb()), study.rows // 5, study.rows))
     here, largest = np.subtract(*reversed(found))
     figure = f"{here:+.1f} MB here, {largest:+.1f} MB in the largest worker, over {study.rows * 4 // 5} rows"
     record_property("figure", figure)

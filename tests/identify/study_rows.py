@@ -5,13 +5,13 @@ import os
 import signal
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 
-from identify.progress import SilentProgress
 from identify.studies.store import JOURNAL
 from identify.studies.study_file import Study
 
@@ -61,23 +61,17 @@ def row(scenario, seed, options):
     }
 
 
-class At(SilentProgress):
-    """Does something when so many rows are done, or each of so many."""
+def at(action, *rows):
+    """Progress that does something when so many rows are done, or each of so many."""
+    done = 0
 
-    def __init__(self, action, *rows):
-        self._action, self._rows = action, rows
+    def advance(n=1):
+        nonlocal done
+        if any(done < row <= done + n for row in rows):
+            action()
+        done += n
 
-    @contextmanager
-    def stage(self, name, total):
-        done = 0
-
-        def advance(n=1):
-            nonlocal done
-            if any(done < row <= done + n for row in self._rows):
-                self._action()
-            done += n
-
-        yield advance
+    return SimpleNamespace(stage=lambda name, total: nullcontext(advance))
 
 
 def journal(folder):

@@ -34,8 +34,7 @@ DEPTH, DISPARITY = "point_depth_rms_um", "disparity_rms_px"
 def rows_of(name, repeats=None):
     """A study and the table of its rows, of all of them where no number of repeats is given."""
     study = load_study(name)
-    if repeats is not None:
-        study = study.model_copy(update={"repeats": repeats})
+    study = study.model_copy(update={"repeats": repeats or study.repeats})
     design = Design(study)
     return study, tidy_table(study, compute(prepare(study), [design.case(number) for number in range(len(design))]))
 

@@ -36,12 +36,6 @@ def calls(monkeypatch):
     return made
 
 
-@pytest.fixture
-def run_folder(run_folder):
-    run_folder.trajectories.write_text("{}")
-    return run_folder
-
-
 def warned(result):
     """The result of a plant that the model cannot be."""
     result["identification"] |= {

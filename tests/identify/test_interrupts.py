@@ -1,16 +1,14 @@
-"""Ctrl-C at a bad moment: held, noted, not heard by the processes of workers, and one line for the user."""
+"""Ctrl-C at a bad moment: held, noted, and one line for the user."""
 
 import signal
-import subprocess
 import sys
-import threading
 from types import SimpleNamespace
 
 import pytest
 
 from identify.errors import StudyInterrupted
 from identify.progress import SilentProgress
-from identify.runtime import deaf_offspring, held, honoured, noted, raise_noted
+from identify.runtime import held, honoured, noted, raise_noted
 from identify.studies.runner import run_study
 from tests.identify.commands import command
 from tests.identify.study_rows import DARK, journal, small_study
@@ -105,17 +103,3 @@ def test_ctrl_c_while_the_libraries_are_loaded_is_one_line(monkeypatch, capsys):
     monkeypatch.setattr(sys, "meta_path", [SimpleNamespace(find_spec=find_spec), *sys.meta_path])
     assert command("--help") == 130
     assert capsys.readouterr() == ("", "aborted\n")
-
-
-def test_processes_of_threads_that_are_started_deaf_do_not_hear_ctrl_c():
-    def start():
-        deaf = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))"
-        seen.append(subprocess.check_output([sys.executable, "-c", deaf], text=True))
-
-    seen = []
-    with deaf_offspring():
-        thread = threading.Thread(target=start)
-        thread.start()
-    thread.join()
-    start()
-    assert seen == ["True\n", "False\n"]

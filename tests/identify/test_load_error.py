@@ -96,9 +96,6 @@ def test_an_exactly_known_load_leaves_every_digit_as_it_was(records):
     unsaid.attrs = {name: value for name, value in unsaid.attrs.items() if not name.endswith("_std")}
     unsaid = output_error_problem([records[0], unsaid], rss6(), SCENARIO).driven_by_commands()
     assert np.array_equal(covariance(unsaid, truth()), stated)
-    exact = drawn_load(quick(), np.random.default_rng(0))
-    assert np.array_equal(exact.true, exact.stated)
-    assert not exact.std.any()
 
 
 def test_a_deviation_that_cannot_be_is_refused_and_none_makes_two_loads_of_one(records):
@@ -107,7 +104,6 @@ def test_a_deviation_that_cannot_be_is_refused_and_none_makes_two_loads_of_one(r
     store_anchor(again, ScaleAnchor("payload"))
     for pair, error, says in (
         ((bare, heavy.assign_attrs(payload_mass_std="0.04")), RecordError, "mass_std is '0.04', must be a number >= 0"),
-        ((bare, heavy.assign_attrs(payload_mass_std=9.0)), RecordError, "mass_std = 9 kg exceeds payload_mass = 8 kg"),
         ((bare.assign_attrs(payload_mass_std=0.04), heavy), RecordError, "payload_mass is None, must be a number >= 0"),
         ((again, heavy), EstimationError, "2 records have all the same load"),
     ):

@@ -1,11 +1,7 @@
-"""Studies on clusters: the same numbers as in one process, whoever dies in the middle; no row is blamed for one death.
-
-First with a client that plays Dask, then on real clusters of processes.
-"""
+"""Studies on clusters: the numbers of one process, whoever dies in the middle; no row is blamed for one death."""
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -31,77 +27,58 @@ from identify.studies.dask_cluster import DaskExecutor, local_cluster, running_c
 from identify.studies.design import Case, Finished
 from identify.studies.runner import Batches, run_study
 from identify.studies.store import JOURNAL
-from tests.identify.study_rows import DARK, KIND, At, journal, same_numbers, small_study
+from tests.identify.study_rows import DARK, KIND, at, journal, same_numbers, small_study
 
 LOST = TimeoutError("its worker died with the result")
 DIED = KilledWorker("task", SimpleNamespace(address="tcp://a:1"), 0)
-
-
-class Client:
-    """A client of a cluster with so many workers, whose batches are done at once.
-
-    steps(cases, time): results of a batch sent the so many-th time, one after the other: an error, or what is found.
-    """
-
-    status = "running"
-
-    def __init__(self, steps, workers=1):
-        self._steps, self._workers, self.sent = steps, workers, []
-
-    def submit(self, _, version, setup, cases, pure):
-        numbers = [case.number for case in cases]
-        self.sent.append(numbers)
-        result = Mock(side_effect=self._steps(numbers, self.sent.count(numbers)))
-        future = SimpleNamespace(key=len(self.sent), result=lambda timeout: timeout and result())
-        future.add_done_callback = lambda action: action(future)
-        return future
-
-    def nthreads(self, callback_timeout):
-        assert callback_timeout, "waits without a limit"
-        return dict.fromkeys(range(self._workers), 1)
+ROOT, LEVELS = Path(__file__).parents[2], [13.0, 26.0, 52.0]
+PATIENCE = 120
+"""Seconds for what takes a few on a free machine."""
 
 
 def found(numbers):
     return [Finished(number, {}, 0.0) for number in numbers]
 
 
-def computed(client, rows):
-    cases = (Case(number, 0, {}) for number in range(rows))
-    return {row.number: row.error for batch in DaskExecutor(client)(None, Batches(cases, rows)) for row in batch}
+def computed(steps, rows, **changes):
+    """Errors of rows by number, and the batches as sent, on a cluster of one worker that does a batch at once.
+
+    steps(numbers, time): results of a batch sent the so many-th time, one after the other: an error, or what is found.
+    """
+
+    def submit(_, version, setup, cases, pure):
+        sent.append([case.number for case in cases])
+        result = Mock(side_effect=steps(sent[-1], sent.count(sent[-1])))
+        future = SimpleNamespace(key=len(sent), result=lambda timeout: timeout and result())  # waits with a limit
+        future.add_done_callback = lambda action: action(future)
+        return future
+
+    sent, cases = [], (Case(number, 0, {}) for number in range(rows))
+    client = {"status": "running", "submit": submit, "nthreads": lambda callback_timeout: {"tcp://a:1": 1}}
+    batches = DaskExecutor(SimpleNamespace(**client | changes))(None, Batches(cases, rows))
+    return {row.number: row.error for batch in batches for row in batch}, sent
 
 
 def test_result_that_died_with_its_worker_is_waited_for_and_noted_once():
-    client = Client(lambda numbers, _: [LOST, LOST, found(numbers)])
-    assert computed(client, 3) == {0: "", 1: "", 2: ""}
-    assert client.sent == [[0], [1], [2]]
+    assert computed(lambda numbers, _: [LOST, LOST, found(numbers)], 3) == ({0: "", 1: "", 2: ""}, [[0], [1], [2]])
 
 
 def test_last_worker_or_a_scheduler_that_does_not_answer_ends_the_study_in_one_line(monkeypatch):
     monkeypatch.setattr(dask_cluster, "WORKERLESS_SECONDS", 0.05)
     with pytest.raises(StudyError, match=r"^no Dask worker for 0.05 s; the same command goes on from here$"):
-        computed(Client(lambda *_: iter(lambda: LOST, None), workers=0), 1)
-    client = Client(lambda numbers, _: [found(numbers)])
-    client.nthreads = Mock(side_effect=TimeoutError("timed out"))
+        computed(lambda *_: iter(lambda: LOST, None), 1, nthreads=lambda callback_timeout: {})
     with pytest.raises(StudyError, match=r"^the Dask scheduler is gone; .* timed out$"):
-        computed(client, 1)
+        computed(lambda numbers, _: [found(numbers)], 1, nthreads=Mock(side_effect=TimeoutError("timed out")))
 
 
 def test_row_is_blamed_for_the_second_death_of_its_worker_and_not_for_the_first():
-    for rows, deaths, sent in ((3, {0: 1, 1: 9}, [[0], [1], [2], [1], [0]]), (1, {0: 1}, [[0], [0]])):
-        client = Client(lambda sent, time, deaths=deaths: [DIED if time <= deaths.get(sent[0], 0) else found(sent)])
-        errors = computed(client, rows)
-        assert client.sent == sent
+    for rows, deaths, expected in ((3, {0: 1, 1: 9}, [[0], [1], [2], [1], [0]]), (1, {0: 1}, [[0], [0]])):
+        errors, sent = computed(
+            lambda sent, time, deaths=deaths: [DIED if time <= deaths.get(sent[0], 0) else found(sent)], rows
+        )
+        assert sent == expected
         assert [number for number, error in errors.items() if error] == [1] * (rows > 1)
         assert all(error.startswith("KilledWorker: ") for error in errors.values() if error)
-
-
-# Real processes.
-
-
-ROOT = Path(__file__).parents[2]
-LEVELS = [13.0, 26.0, 52.0]
-PATIENCE = 120
-"""Seconds for what takes a few on a free machine."""
 
 
 def study(**options):
@@ -162,9 +139,11 @@ def serial(tmp_path_factory):
 @pytest.mark.slow
 def test_worker_killed_in_the_middle_changes_no_number_and_other_packages_are_one_warning(tmp_path, serial):
     log, there = tmp_path / "log", other_versions(tmp_path / "there", numpy="1.2.3", casadi="0.1")
+    place = r"\(worker tcp://\S+( and 1 more)?\), here"
+    said = rf"numpy 1.2.3 {place} {np.__version__}; casadi 0.1 {place}"
     with cluster(tmp_path, 2, there) as (address, _, workers):
-        progress, workers_there = At(workers[0].kill, 40), partial(running_cluster, address)
-        with pytest.warns(OtherVersionsWarning) as caught:
+        progress, workers_there = at(workers[0].kill, 40), partial(running_cluster, address)
+        with pytest.warns(OtherVersionsWarning, match=said) as caught:
             outcome = run_study(study(log=str(log)), tmp_path / "a", progress, workers_there)
         assert workers[0].wait(10) == -signal.SIGKILL
         assert workers[1].poll() is None
@@ -172,16 +151,13 @@ def test_worker_killed_in_the_middle_changes_no_number_and_other_packages_are_on
     assert sorted(journal(tmp_path / "a")) == list(range(120))
     again = [number for number, times in Counter(log.read_text().split()).items() if times > 1]
     assert len(again) <= 3 * 15, "more than the batches that the dead worker had"
-    (text,) = [str(one.message) for one in caught]
-    place = r"\(worker tcp://\S+( and 1 more)?\), here"
-    assert re.search(rf"numpy 1.2.3 {place} {np.__version__}; casadi 0.1 {place}", text)
-    assert "scipy" not in text
+    assert len(caught) == 1
 
 
 @pytest.mark.slow
 def test_lost_scheduler_is_one_line_and_the_study_goes_on_with_another(tmp_path, serial):
     with cluster(tmp_path, workers=1) as (address, scheduler, _), pytest.raises(StudyError) as caught:
-        run_study(study(), tmp_path / "a", At(scheduler.kill, 30), partial(running_cluster, address))
+        run_study(study(), tmp_path / "a", at(scheduler.kill, 30), partial(running_cluster, address))
     assert "\n" not in str(caught.value)
     assert "scheduler is gone" in str(caught.value)
     kept = len(journal(tmp_path / "a"))
@@ -209,7 +185,7 @@ def test_worker_with_another_version_of_the_product_is_refused_at_the_start_and_
     refusal = rf"^worker tcp://\S+ has cmmsim 9\.8\.7, here is {here}; install \S[^\n]*$"
     with cluster(tmp_path, 1) as (address, _, workers):
         workers_there = partial(running_cluster, address)
-        come = At(lambda: workers.append(worker(address, tmp_path, there)), 1)
+        come = at(lambda: workers.append(worker(address, tmp_path, there)), 1)
         with pytest.raises(StudyError, match=refusal):
             run_study(study(seconds=0.5), tmp_path / "a", come, workers_there)
         assert 1 <= len(journal(tmp_path / "a")) < 120

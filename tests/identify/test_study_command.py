@@ -15,57 +15,36 @@ from identify.studies.table import read_table
 from tests.identify.commands import command, one_line
 from tests.identify.study_rows import KIND
 
-TEXT = f"""
-name = "mine"
-kind = "{KIND}"
-repeats = 2
-[factors]
-sensor.camera.dark_noise = [13.0, 26.0]
-[options]
-"""
-
 
 @pytest.fixture
 def mine(tmp_path, monkeypatch):
+    """The file of a small study in a folder of its own, whose figures are not drawn: they take longer than the rows."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.toml").write_text(TEXT)
-    return tmp_path / "mine.toml"
+    monkeypatch.setattr(summary, "draw", lambda *_: None)
+    path, factors = tmp_path / "mine.toml", "[factors]\nsensor.camera.dark_noise = [13.0, 26.0]"
+    path.write_text(f'name = "mine"\nkind = "{KIND}"\nrepeats = 2\n{factors}\n[options]\n')
+    return path
 
 
-@pytest.fixture
-def undrawn(monkeypatch):
-    """No figures: they take longer than the rows."""
-    monkeypatch.setattr(summary, "write", lambda *_: {"theory": []})
-
-
-def test_study_leaves_its_files_and_says_where(mine, tmp_path, capsys):
-    assert command("study", mine, "--workers", 0) == 0
-    folder = tmp_path / "runs" / "study-mine"
-    files = {"study.json", "rows.jsonl", "study.parquet", "study.nc", "summary.json", "summary.md"}
-    assert files <= {path.name for path in folder.iterdir()}
-    assert list((folder / "figures").glob("*.png"))
-    shown = capsys.readouterr()
-    assert "4 rows; " in shown.out
-    assert str(folder.relative_to(tmp_path)) in shown.out
-    assert "rows of mine: 4 of 4" in shown.err
-    assert "rows/s" in shown.err
-
-
-def test_repeats_are_added_in_the_same_folder_and_quiet_says_nothing(mine, undrawn, capsys):
+def test_study_leaves_its_files_adds_repeats_in_the_same_folder_and_says_nothing_where_it_is_quiet(mine, capsys):
     """Brackets in the name of the folder are shown as they are."""
-    for more, says in (
-        ([], "4 rows; "),
-        (["--repeats", 3], "6 rows, 4 of them from before; "),
-        ([], "4 rows, 4 of them from before (2 more, of further repeats, are kept); "),
+    for more, progress, says in (
+        ([], "rows of mine: 4 of 4", "4 rows; "),
+        (["--repeats", 3], "rows of mine: 2 of 2", "6 rows, 4 of them from before; "),
+        ([], "", "4 rows, 4 of them from before (2 more, of further repeats, are kept); "),
     ):
         assert command("study", mine, "--workers", 0, "--out", "a[bold]", *more) == 0
-        shown = capsys.readouterr().out
-        assert says in shown
-        assert "study.parquet: a[bold]\n" in shown
+        shown = capsys.readouterr()
+        assert says in shown.out
+        assert "study.parquet: a[bold]\n" in shown.out
+        assert progress in shown.err
+        assert ("rows/s" in shown.err) == bool(progress)
         frame, study = read_table("a[bold]/study.parquet")
         assert len(frame) == 2 * study.repeats
-    assert command("study", mine, "--workers", 0, "--quiet", "--out", "a[bold]") == 0
+    assert command("study", mine, "--workers", 0, "--quiet") == 0
     assert capsys.readouterr() == ("", "")
+    files = {"study.json", "rows.jsonl", "study.parquet", "study.nc", "summary.json", "summary.md"}
+    assert files <= {path.name for path in Path("runs/study-mine").iterdir()}
 
 
 @pytest.mark.parametrize(
@@ -78,13 +57,10 @@ def test_repeats_are_added_in_the_same_folder_and_quiet_says_nothing(mine, undra
         ([1], "spread_um", 9.0, study_command.SOME_ROWS_FAILED, "1 of 1 laws failed"),
     ],
 )
-def test_rows_or_laws_that_fail_make_an_exit_status_of_their_own(
-    mine, monkeypatch, capsys, fails, figure, exponent, status, says
-):
+def test_rows_or_laws_that_fail_make_an_exit_status_of_their_own(mine, capsys, fails, figure, exponent, status, says):
     """One figure is the standard deviation of 1,000 normal numbers whatever the factor, the other hardly known."""
-    monkeypatch.setattr(summary, "draw", lambda *_: None)
     theory = f'[[theory]]\nfigure = "{figure}"\nfactor = "sensor.camera.dark_noise"\nexponent = {exponent}\n'
-    mine.write_text(TEXT.replace("repeats = 2", "repeats = 4") + f"fails = {fails}\n" + theory)
+    mine.write_text(mine.read_text().replace("repeats = 2", "repeats = 4") + f"fails = {fails}\n" + theory)
     assert command("study", mine, "--workers", 0, "--out", "a") == status
     shown = capsys.readouterr()
     assert shown.out.startswith("undecided: error_um" if figure == "error_um" else ("passed: ", "failed: "))
@@ -110,7 +86,7 @@ def test_studies_are_listed_with_their_rows_and_kinds_with_options_figures_and_w
     assert ["options.stretch_s", "0.5", "s"] in [line[:3] for line in lines]
 
 
-def test_ten_million_rows_are_refused_at_once_and_many_are_run_where_confirmed(mine, undrawn, capsys, monkeypatch):
+def test_ten_million_rows_are_refused_at_once_and_many_are_run_where_confirmed(mine, capsys, monkeypatch):
     keys = ("dsnu", "dark_noise", "black_level", "gain", "full_well", "electrons_at_white")
     factors = "\n".join(f"sensor.camera.{name} = {[*range(1, 11)]}" for name in keys)
     Path("many.toml").write_text(f'name = "many"\nkind = "{KIND}"\nrepeats = 10\n[factors]\n{factors}\n')
@@ -138,7 +114,7 @@ def another_program(request):
 
 
 def test_where_no_scheduler_answers_there_is_one_line_and_nothing_left_or_what_was_there(
-    mine, undrawn, another_program, monkeypatch, capsys
+    mine, another_program, monkeypatch, capsys
 ):
     def unchanged(folder, *arguments):
         before = sorted(Path(folder).rglob("*"))
@@ -157,10 +133,11 @@ def test_where_no_scheduler_answers_there_is_one_line_and_nothing_left_or_what_w
     unchanged("runs", "--repeats", 3, "--scheduler", "nonsense")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "evidence"),
-    [((), "--list"), (("--scheduler", "tcp://a:1", "--workers", 2), "--workers"), (("--repeats", 0), "--repeats")],
-)
-def test_wrong_calls_are_refused_in_the_words_of_the_options(mine, capsys, arguments, evidence):
-    assert command("study", *([mine] if arguments else []), *arguments) == 2
-    assert evidence in capsys.readouterr().err
+def test_wrong_calls_are_refused_in_the_words_of_the_options(mine, capsys):
+    for words, evidence in (
+        ((), "--list"),
+        ((mine, "--scheduler", "tcp://a:1", "--workers", 2), "--workers"),
+        ((mine, "--repeats", 0), "--repeats"),
+    ):
+        assert command("study", *words) == 2
+        assert evidence in capsys.readouterr().err

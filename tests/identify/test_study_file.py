@@ -54,11 +54,8 @@ def test_changes_and_options_hold_in_every_row_and_factors_in_their_own():
     setup = prepare(chosen)
     for case in cases(chosen):
         scenario = setup.row_scenario(case)
-        assert scenario.sensor_changes == {
-            "rig.baseline": 0.8,
-            "camera.dark_noise": case.factors["sensor.camera.dark_noise"],
-        }
-        assert (scenario.filter.order, scenario.pose_method) == (4, case.factors["scenario.pose_method"])
+        assert scenario.sensor_changes == {"rig.baseline": 0.8, "camera.dark_noise": case.factors[DARK]}
+        assert (scenario.filter.order, scenario.pose_method) == (4, case.factors[METHOD])
         assert setup.row_options(case) == {"odd": 7, "seconds": case.factors["options.seconds"]}
 
 
@@ -66,14 +63,14 @@ def test_a_sample_is_spread_as_its_factors_say():
     """Against the distributions' own quantiles; 2,000 points put a share within 0.05 at better than 1e-4."""
     factors = {
         "sensor.rig.baseline": {"low": 0.5, "high": 2.0},
-        "sensor.camera.dark_noise": {"low": 1.0, "high": 100.0, "scale": "log"},
+        DARK: {"low": 1.0, "high": 100.0, "scale": "log"},
         "scenario.filter.order": {"low": 2, "high": 5},
-        "scenario.pose_method": ["registration", "planes"],
+        METHOD: ["registration", "planes"],
     }
     chosen = study(factors=factors, sample=2000)
     prepare(chosen)
-    drawn = [tuple(case.factors.values()) for case in cases(chosen)]
-    baseline, dark, order, method = (np.array(column) for column in zip(*drawn, strict=True))
+    columns = zip(*(case.factors.values() for case in cases(chosen)), strict=True)
+    baseline, dark, order, method = map(np.array, columns)
     assert ((baseline >= 0.5) & (baseline < 2.0)).all()
     assert np.mean(baseline < 1.25) == pytest.approx(0.5, abs=0.05)
     assert np.mean(dark < 10.0) == pytest.approx(0.5, abs=0.05)
@@ -211,9 +208,6 @@ def test_laws_of_what_a_kind_does_not_measure_or_a_study_does_not_vary_are_refus
     prepare(study(theory=[Law(**LAW | {"figure": "any_um"}), Law(**LAW | {"factor": "any_m"})]))
     message = refusal(StudyError, prepare, study(theory=[Law(**LAW | {"factor": "sensor.camera.drk_noise"})]))
     assert "the nearest are sensor.camera.dark_noise" in message
-
-
-# What a kind of row reads, against what acts on its rows, and studies that set what does nothing.
 
 
 KP, NOISE = "scenario.servo.kp", "sensor.camera.noise"

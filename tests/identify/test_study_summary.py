@@ -1,7 +1,4 @@
-"""Summaries of studies against numpy and scipy, and their laws against figures drawn with a known exponent or ratio.
-
-What failed is counted and named, and in no average; coverage is counted, not assumed.
-"""
+"""Summaries of studies against numpy and scipy, and laws against figures drawn with a known exponent or ratio."""
 
 import json
 from itertools import product
