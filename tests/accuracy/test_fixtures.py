@@ -4,9 +4,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import cmmsim  # noqa: F401  loaded once, not by each project
-import dynamics  # noqa: F401
-from identify import Scenario  # noqa: F401
 from identify.accuracy.figure import mean_interval
 from tests.accuracy.conftest import recording
 

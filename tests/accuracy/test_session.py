@@ -195,10 +195,8 @@ def test_with_xdist_the_table_and_the_file_are_the_same(project, pytester):
         (["--accuracy-save", "../x"], "'../x' is no name for saved figures: up to 100 letters, digits, *"),
         (["--accuracy-save", "full.json"], "'full.json' is no name for saved figures: 'full' makes that file"),
         (["--accuracy-save", "x", "--accuracy-dir", "/proc/none"], "/proc/none/x.json cannot be written: *"),
-        (["--accuracy-save", "x", "--accuracy-dir", "y" * 300], "/*/x.json cannot be written: File name too long"),
         (["--accuracy-fail", "0.1"], "--accuracy-fail needs --accuracy-compare NAME: worse than what?"),
         (["--accuracy-fail", "-1"], "*argument --accuracy-fail: RATIO is -1, must be 0 or more, such as 0.1 for 10 %"),
-        (["--accuracy-fail", "ten"], "*argument --accuracy-fail: invalid ratio value: 'ten'"),
         (["--accuracy-seed", "-1"], "*argument --accuracy-seed: the seed is -1, must be 0 or more"),
     ],
 )
@@ -210,17 +208,18 @@ def test_wrong_options_are_refused_before_any_test(project, saved, options, says
     done.stderr.fnmatch_lines([says if says.startswith("*") else f"ERROR: {says}"])
 
 
+SAVED = '{"format": "cmmsim accuracy", "schema": 1, "name": "x", "seed": 0'
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
         ("{", "cannot be read as JSON: *"),
         ("[1]", "holds no accuracy figures (no entry format = 'cmmsim accuracy')"),
-        ('{"benchmarks": []}', "holds no accuracy figures (no entry format = 'cmmsim accuracy')"),
-        ('{"format": "cmmsim accuracy", "schema": 2}', "has schema 2, this version reads 1"),
-        ('{"format": "cmmsim accuracy", "schema": 1, "name": "x", "seed": 0}', "figures: Field required *"),
+        (SAVED.replace("1", "2") + "}", "has schema 2, this version reads 1"),
+        (SAVED + "}", "figures: Field required *"),
         (
-            '{"format": "cmmsim accuracy", "schema": 1, "name": "x", "seed": 0, "figures": [{"test": "t", "name": "n", '
-            '"value": NaN, "unit": "", "better": "lower"}]}',
+            SAVED + ', "figures": [{"test": "t", "name": "n", "value": NaN, "unit": "", "better": "lower"}]}',
             "figures.0.value: Input should be a finite number (got nan)",
         ),
     ],
