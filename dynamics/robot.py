@@ -11,12 +11,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dynamics.checks import check_type, floats, real, row_text, rows, shown
-from dynamics.compilation import load_library, open_library
+from dynamics.compiled.machine_code import MachineFunction, compiled_functions
 from dynamics.errors import (
     DynamicsError,
     ParameterError,
@@ -25,12 +24,12 @@ from dynamics.errors import (
     SingularPoseError,
     UnreachablePoseError,
 )
-from dynamics.expressions import evaluate
 from dynamics.kinematics import forward_kinematics
 from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
 from dynamics.legs.rss_inverse_kinematics import home_angles
 from dynamics.parameters import PARAMETER_NAMES, check_parameters, check_ranges
-from dynamics.rigid_body.virtual_work import FUNCTION_NAMES, robot_functions
+from dynamics.rigid_body.equation_of_motion import motion_functions
+from dynamics.rigid_body.virtual_work import robot_functions
 from dynamics.robot_file import ParameterSet, RobotDescription, read_robot_file
 
 # Below this the solution of M a = f loses all digits; a healthy robot is near 1e2 (poses in m and rad).
@@ -179,8 +178,8 @@ class Robot:
         )
 
     @property
-    def functions(self) -> dict[str, ca.Function]:
-        """CasADi functions by name: compiled where a C compiler is at hand, else for CasADi's virtual machine."""
+    def functions(self) -> dict[str, MachineFunction]:
+        """Kinematics and dynamics by name, as machine code, compiled when first asked for."""
         return _functions(self.geometry)
 
     def _poses(self, pose: ArrayLike) -> np.ndarray:
@@ -213,21 +212,21 @@ class Robot:
         if len(set(batched) - {1}) > 1:
             shapes = ", ".join(str(argument.shape) for argument in arguments)
             raise ShapeError(f"{name}: batch lengths differ, shapes {shapes}")
-        values = evaluate(self.functions[name], *[np.atleast_2d(argument) for argument in arguments])[output]
+        values = self.functions[name](*[np.atleast_2d(argument) for argument in arguments])[output]
         if output == 0 and not np.isfinite(values).all():
             said = ", ".join(row_text(argument) for argument in arguments)
             raise SingularPoseError(f"{name} is not finite for {said}: singular pose or mass matrix")
         return values if batched else values[0]
 
 
+HOT = ("equation_of_motion", "motion_derivatives", "rate_map_derivative", "forward_dynamics")
+"""What inner loops evaluate."""
+
+
 @lru_cache(maxsize=16)
-def _functions(geometry: Rss6Geometry) -> dict[str, ca.Function]:
+def _functions(geometry: Rss6Geometry) -> dict[str, MachineFunction]:
     """One set for all robots of a geometry; not kept in the robot, so that robots can be pickled."""
-    library = load_library("functions", geometry, robot_functions)
-    if library is None:
-        return {function.name(): function for function in robot_functions(geometry)}
-    open_library(library)
-    return {name: ca.external(name, str(library)) for name in FUNCTION_NAMES}
+    return compiled_functions(geometry.digest, lambda: robot_functions(geometry) + motion_functions(geometry), HOT)
 
 
 def with_geometry_error(robot: Robot, std: float, rng: np.random.Generator) -> Robot:
@@ -265,18 +264,14 @@ def fast_forward_dynamics(robot: Robot, parameters: np.ndarray | None = None) ->
     `workspace.check_motion` says how near they are.
     """
     check_type("robot", robot, Robot, DynamicsError)
-    pose, twist, torque, result = np.zeros((4, 6))
-    fixed = check_parameters(robot.nominal_parameters if parameters is None else parameters).copy()
+    fixed = check_parameters(robot.nominal_parameters if parameters is None else parameters)
+    inputs, result = np.concatenate([np.zeros(18), fixed]), np.zeros(6)
     # Assigning to a memoryview costs half of assigning to an array, and refuses other shapes and types. The stubs of
-    # NumPy and CasADi do not know of that.
-    views: list[Any] = [memoryview(array.data) for array in (pose, twist, torque, fixed)]
+    # NumPy do not know of that.
+    views: list[Any] = [memoryview(part.data) for part in (inputs[0:6], inputs[6:12], inputs[12:18])]
+    pose_in, twist_in, torque_in = views
     values = memoryview(result.data)
-    buffer: Any
-    buffer, call = robot.functions["forward_dynamics"].buffer()
-    for index, view in enumerate(views):
-        buffer.set_arg(index, view)
-    buffer.set_res(0, values)
-    pose_in, twist_in, torque_in, _ = views
+    call = robot.functions["forward_dynamics"].bound_to(inputs, result)
 
     def forward_dynamics(at_pose: np.ndarray, at_twist: np.ndarray, at_torque: np.ndarray) -> np.ndarray:
         try:
@@ -293,8 +288,6 @@ def fast_forward_dynamics(robot: Robot, parameters: np.ndarray | None = None) ->
             )
         return result
 
-    # The buffer must live as long as the function that evaluates it.
-    forward_dynamics.buffer = buffer  # type: ignore[attr-defined]
     return forward_dynamics
 
 

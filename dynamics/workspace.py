@@ -24,7 +24,6 @@ from numpy.typing import ArrayLike
 
 from dynamics.checks import check_type, floats, real, row_text, rows
 from dynamics.errors import DynamicsError, ShapeError, SingularPoseError, TravelError, UnreachablePoseError
-from dynamics.expressions import evaluate
 from dynamics.robot import Robot
 
 LEAST_LEVERAGE = 0.05
@@ -103,8 +102,8 @@ def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
     """
     check_type("robot", robot, Robot, DynamicsError)
     poses = np.atleast_2d(rows("pose", pose, 6))
-    theta, margin = (part[..., 0] for part in evaluate(robot.functions["inverse_kinematics"], poses))
-    leverage, platform_rows = evaluate(robot.functions["singularity_measures"], poses)
+    theta, margin = (part[..., 0] for part in robot.functions["inverse_kinematics"](poses))
+    leverage, platform_rows = robot.functions["singularity_measures"](poses)
     margin[np.isnan(margin)] = -np.inf  # squares have overflowed
     unreachable = ~(margin > 0).all(axis=1)
     for values in (theta, leverage, platform_rows):

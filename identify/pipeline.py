@@ -9,13 +9,12 @@ import xarray as xr
 
 import cmmsim
 from dynamics import Robot, load_robot
-from dynamics.closed_loop import prepare
 from identify.arrays import Array
 from identify.errors import EstimationError, RecordError
 from identify.estimation import identification
 from identify.excitation.design import design_trajectories
 from identify.experiment.plant import Plant, build_plant
-from identify.experiment.run import excitation_run, taught_sensor, teach, untaught_sensor
+from identify.experiment.run import compile_robots, excitation_run, taught_sensor, teach, untaught_sensor
 from identify.experiment.sensor_in_loop import with_renderer
 from identify.experiment.truth import read_truth, true_parameters
 from identify.files.atomic import write_text
@@ -204,12 +203,7 @@ def _designed(plant: Plant, seed: int, progress: Progress) -> TrajectorySet:
     scenario, robot = plant.scenario, plant.nominal
     check_length(scenario.timing.frames(scenario.excitation.duration_s), scenario, "excitation.duration_s gives")
     check_parameter_set(robot, scenario.model.start_parameters)
-    with progress.stage("compile the robot", 4) as advance:
-        for one in (robot, plant.robot):
-            _ = one.functions
-            advance()
-            prepare(one)
-            advance()
+    compile_robots((robot, plant.robot), progress)
     plant.check()
     trajectories = design_trajectories(robot, scenario, seed, progress)
     _check_singularities(robot, scenario, trajectories)

@@ -4,8 +4,8 @@ Every frame the pose is measured, by the sensor that the caller passes or by an 
 command after the latency, and the command is held until the next. Unless a start is given the run starts at rest at the
 first reference pose, in equilibrium: integrators hold what keeps the robot there. One function serves plant and model.
 
-Two implementations, tested to be equal: compiled C (`compiled_loop`, folder `c`) and plain Python
-(`plain_loop`, with `servo`, `motion`, `stick_slip` and `sensitivity`).
+Written once, in the `*_kernels`, which numba compiles and which also run as the Python that they are; `execution` puts
+a run before them.
 """
 
 from dynamics.closed_loop.joints import FrictionLaw, JointElasticity

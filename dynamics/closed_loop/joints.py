@@ -12,10 +12,9 @@ Encoder, joint PID and friction sit at the motor. What turns with it is taken ou
 robot of the same parameters is the limit of stiff springs.
 """
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import ceil
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -25,10 +24,12 @@ from dynamics.legs.rss_geometry import LEGS
 from dynamics.parameters import BODY_NAMES, INERTIAL, RIGID_BODY, RIGID_BODY_NAMES, split_parameters
 from dynamics.robot import Robot
 
-MotionFunctions = Mapping[str, Callable[..., Any]]
-"""What the integrator evaluates, by the names of `rigid_body.equation_of_motion`."""
-
 LawName = Literal["coulomb_viscous", "smoothed", "stribeck"]
+
+FRICTION = np.dtype(
+    (np.record, [("law", "i8"), ("smoothing_velocity", "f8"), ("static_level", "f8"), ("stribeck_velocity", "f8")])
+)
+"""A friction law as kernels read it; the law by its place in `LawName`."""
 
 
 @dataclass(frozen=True)
@@ -72,22 +73,16 @@ class FrictionLaw:
         """Breakaway torque over Coulomb torque."""
         return self.static_ratio if self.static_ratio is not None else 1.0
 
-    def dry_level(self, velocity: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Dry friction over Coulomb torque of joints that slip towards direction (+1 or -1) at velocity, rad/s."""
-        if self.smoothing_velocity is not None:
-            return np.asarray(np.tanh(velocity / self.smoothing_velocity))
-        if self.stribeck_velocity is not None:
-            return direction * (1 + (self.static_level - 1) * np.exp(-((velocity / self.stribeck_velocity) ** 2)))
-        return np.asarray(direction, dtype=float)
+    @property
+    def slope_at_rest(self) -> float:
+        """Derivative of the dry part, over the Coulomb torque, with respect to the velocity at rest, s/rad."""
+        return 1 / self.smoothing_velocity if self.smoothing_velocity is not None else 0.0
 
-    def dry_slope(self, velocity: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Derivative of `dry_level` with respect to the velocity, s/rad."""
-        if self.smoothing_velocity is not None:
-            return (1 - np.tanh(velocity / self.smoothing_velocity) ** 2) / self.smoothing_velocity
-        if self.stribeck_velocity is not None:
-            ratio = velocity / self.stribeck_velocity
-            return -2 * direction * (self.static_level - 1) * ratio / self.stribeck_velocity * np.exp(-(ratio**2))
-        return np.zeros_like(velocity)
+    @property
+    def record(self) -> np.record:
+        """The law as kernels read it: see `motion_kernels`."""
+        constants = self.smoothing_velocity or 0.0, self.static_level, self.stribeck_velocity or 0.0
+        return np.array([(get_args(LawName).index(self.name), *constants)], FRICTION)[0]
 
 
 LARGEST_STEP = 1.0
@@ -133,7 +128,7 @@ class JointElasticity:
         per_inertia[:6, :6] = jacobian @ np.linalg.solve(carried, jacobian.T)
         per_inertia[6:, 6:] = np.eye(6) / self.motor_inertia
         _, coulomb, viscous, (lp, _, ld) = split_parameters(parameters)
-        dry = coulomb * friction.dry_slope(np.zeros(6), np.ones(6))
+        dry = coulomb * friction.slope_at_rest
         stiffness = _coupled(self.stiffness, np.full(6, lp))
         damping = _coupled(self.damping, ld + viscous + dry)
         motion = np.block([[np.zeros((12, 12)), np.eye(12)], [-per_inertia @ stiffness, -per_inertia @ damping]])
@@ -148,28 +143,6 @@ class JointElasticity:
                 f"motor inertia is {self.motor_inertia:g} kg m^2, must be below the {about_axis[least]:.3g} kg m^2 "
                 f"of crank {least + 1} about its axis, which it is a part of"
             )
-
-
-def elastic_functions(functions: MotionFunctions, elasticity: JointElasticity) -> MotionFunctions:
-    """The functions of a robot, with `equation_of_motion` in twelve coordinates: pose, motor angles.
-
-    With the motor angles as six more coordinates, and the motors as the joints that friction acts on, an elastic robot
-    is one more system M q_ddot + b = J^T (torque - friction). The plain twin of `elastic_joints.c`.
-    """
-
-    def equation_of_motion(pose: np.ndarray, rate: np.ndarray, rigid: np.ndarray) -> tuple[np.ndarray, ...]:
-        carried = elasticity.beyond_the_springs(rigid)
-        terms = functions["equation_of_motion"](pose[:6], rate[:6], carried)
-        mass, bias, jacobian, _, angle = (np.asarray(term, dtype=float) for term in terms)
-        motor, motor_rate = pose[6:, None], rate[6:, None]
-        wound = motor_rate - jacobian @ rate[:6, None]
-        spring = elasticity.stiffness * (motor - angle) + elasticity.damping * wound
-        whole = np.zeros((12, 12))
-        whole[:6, :6], whole[6:, 6:] = mass, elasticity.motor_inertia * np.eye(6)
-        at_motors = np.hstack([np.zeros((6, 6)), np.eye(6)])
-        return whole, np.vstack([bias - jacobian.T @ spring, spring]), at_motors, np.zeros((6, 1)), motor
-
-    return {**functions, "equation_of_motion": equation_of_motion}
 
 
 def _coupled(spring: float, at_motor: np.ndarray) -> np.ndarray:

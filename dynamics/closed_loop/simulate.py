@@ -11,7 +11,6 @@ from typing import TypeVar, cast
 import numpy as np
 
 from dynamics.checks import Shape, check_type, flag, floats, mask, shown, whole
-from dynamics.closed_loop import compiled_loop, plain_loop
 from dynamics.closed_loop.problem import (
     MAX_DELAY_FRAMES,
     PARAMETER_COUNT,
@@ -22,6 +21,7 @@ from dynamics.closed_loop.problem import (
     PoseSensor,
     RateSensor,
     Reference,
+    ServoGains,
     StartState,
     check_start_pose,
     checked_loop_parameters,
@@ -50,7 +50,7 @@ def simulate(
     latencies: np.ndarray | None = None,
     servo_robot: Robot | None = None,
     controller: Controller | None = None,
-    compiled: bool | None = None,
+    compiled: bool = True,
 ) -> ClosedLoopRun:
     """Run the closed loop for parameters (67,): the 64 dynamic ones, then lp, li, ld.
 
@@ -62,17 +62,17 @@ def simulate(
     latencies (frames,), s: of each frame's command, instead of the settings' for all; see `command_schedule`.
     servo_robot: the robot whose kinematics the servo knows, where that is another (no sensitivities then).
     controller: takes the place of the servo: (frame, time s, measured pose (6,), desired pose (6,), desired rate (6,))
-    -> joint command (6,), rad, at every frame that is measured; the run takes the plain path.
+    -> joint command (6,), rad, at every frame that is measured.
     lost (frames,) bool: frames at which the ideal sensor measures nothing, so that a model loses what its plant lost.
     noise (frames, 6), m and rad: added to the poses that the ideal sensor measures elsewhere.
-    compiled: None takes the compiled path when a C compiler is at hand; False forces the plain path.
+    compiled: False runs the same lines in plain Python, thousands of times slower.
     Raises LoopFailure when the robot leaves the reachable set (an unstable loop); and before the run
     UnreachablePoseError where reference or start do, ParameterError, SimulationError, SingularPoseError.
     """
     _check_kinds(robot, reference, settings, sensor, servo_robot, controller)
     start_sensitivities = flag("start_sensitivities", start_sensitivities, SimulationError)
     sensitivities = flag("sensitivities", sensitivities, SimulationError) or start_sensitivities
-    compiled = None if compiled is None else flag("compiled", compiled, SimulationError)
+    compiled = flag("compiled", compiled, SimulationError)
     _check_reach(robot, reference)
     frames, parameters = len(reference.poses), checked_loop_parameters(parameters)
     if start is None:
@@ -90,13 +90,13 @@ def simulate(
         sensitivities,
         start_sensitivities,
         commands=_checked_rows("commands", commands, frames),
-        lost=None if lost is None else mask("lost", lost, frames, SimulationError).astype(np.int8),
+        lost=None if lost is None else mask("lost", lost, frames, SimulationError),
         noise=_checked_rows("noise", noise, frames),
         latencies=None if latencies is None else _checked_latencies(latencies, frames, settings.timing),
         servo_robot=servo_robot or robot,
         controller=controller,
     )
-    _check_together(problem, servo_robot, compiled)
+    _check_together(problem, servo_robot)
     _check_elasticity(problem)
     return _run(problem, compiled)
 
@@ -117,7 +117,7 @@ def simulate_batch(
     A single vector (67,), reference or start serves all runs. Results are those of `simulate`, in order, and do not
     depend on `workers` (default: one a core). Raises what `simulate` raises, for the first run that fails.
     """
-    threads = len(os.sched_getaffinity(0)) if workers is None else whole("workers", workers, SimulationError, least=1)
+    threads = _cores() if workers is None else whole("workers", workers, SimulationError, least=1)
     shapes: tuple[Shape, Shape] = (PARAMETER_COUNT,), ("N", PARAMETER_COUNT)
     vectors = np.atleast_2d(floats("loop parameters", parameters, *shapes, error=SimulationError, finite=False))
     given = _listed("references", references, Reference)
@@ -143,21 +143,24 @@ def simulate_batch(
         return list(pool.map(one, range(count)))
 
 
-def prepare(robot: Robot) -> bool:
-    """Compile the loop of a robot if that has not been done; False where no C compiler is at hand."""
+def prepare(robot: Robot) -> None:
+    """Compile what a robot's runs need, if that has not been done: its functions and the loop (some seconds)."""
     check_type("robot", robot, Robot, SimulationError)
-    return compiled_loop.library(robot.geometry) is not None
+    reference = Reference(np.tile(robot.home_pose, (2, 1)), np.zeros((2, 6)))
+    settings = LoopSettings(ServoGains(0.0, 0.0, 0.0), FrameTiming(60.0))
+    simulate(robot, next(iter(robot.parameter_sets.values())).vector, reference, settings)
 
 
-def _run(problem: LoopProblem, compiled: bool | None) -> ClosedLoopRun:
-    """Take the compiled path or the plain one; a user's controller is called on the plain one."""
-    wanted = compiled is not False and problem.controller is None
-    library = compiled_loop.library(problem.robot.geometry) if wanted else None
-    if library is not None:
-        return compiled_loop.run(library, problem)
-    if compiled:
-        raise SimulationError("compiled=True, but no C compiler was found")
-    return plain_loop.run(problem.robot, problem)
+def _run(problem: LoopProblem, compiled: bool) -> ClosedLoopRun:
+    # Importing the kernels imports numba, which takes its time.
+    from dynamics.closed_loop.execution import run
+
+    return run(problem, compiled)
+
+
+def _cores() -> int:
+    """Cores that this process may use; where only Linux can say so, all of the machine."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _listed(name: str, given: Item | Sequence[Item], kind: type[Item]) -> list[Item]:
@@ -213,7 +216,7 @@ def _checked_latencies(latencies: object, frames: int, timing: FrameTiming) -> n
     return values
 
 
-def _check_together(problem: LoopProblem, servo_robot: Robot | None, compiled: bool | None) -> None:
+def _check_together(problem: LoopProblem, servo_robot: Robot | None) -> None:
     """Raise SimulationError for options of a run that exclude each other; servo_robot as the caller gave it."""
     sensed, controlled, derived = problem.sensor is not None, problem.controller is not None, problem.sensitivities
     refusals = {
@@ -226,7 +229,6 @@ def _check_together(problem: LoopProblem, servo_robot: Robot | None, compiled: b
         and problem.settings.elasticity is not None,
         "sensitivities are those of the servo: pass controller=None": controlled and derived,
         "commands take the place of any controller: pass controller=None": controlled and problem.commands is not None,
-        "a controller runs on the plain path: pass compiled=None or False": controlled and compiled,
     }
     for words, excluded in refusals.items():
         if excluded:

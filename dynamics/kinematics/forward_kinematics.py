@@ -7,12 +7,11 @@ word.
 
 from collections.abc import Mapping
 
-import casadi as ca
 import numpy as np
 
 from dynamics.checks import row_text
+from dynamics.compiled.machine_code import MachineFunction
 from dynamics.errors import ConvergenceError, ShapeError
-from dynamics.expressions import evaluate
 
 # Steps smaller than the first end the iteration; the second is what counts as solved, in rad.
 STEP_TOLERANCE = 1e-12
@@ -21,8 +20,8 @@ MAX_ITERATIONS = 50
 HALVINGS = 20
 
 
-Functions = Mapping[str, ca.Function]
-"""CasADi functions of a robot, of which `loop_closure` and `inverse_kinematics` are asked for."""
+Functions = Mapping[str, MachineFunction]
+"""Compiled functions of a robot, of which `loop_closure` and `inverse_kinematics` are asked for."""
 
 
 def solve(functions: Functions, theta: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -45,14 +44,14 @@ def search(functions: Functions, theta: np.ndarray, start: np.ndarray) -> tuple[
     A row is solved where all its residuals are below ANGLE_TOLERANCE; they are NaN where a leg cannot reach.
     """
     poses = _newton(functions, theta, np.array(start))
-    found = evaluate(functions["inverse_kinematics"], poses)[0][..., 0]
+    found = functions["inverse_kinematics"](poses)[0][..., 0]
     return poses, np.abs(theta - found)
 
 
 def _newton(functions: Functions, theta: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """Newton's iteration with step halving; rows leave it when their step or what it gains is nil."""
     active = np.arange(len(theta))
-    gaps, jacobians = evaluate(functions["loop_closure"], poses, theta)
+    gaps, jacobians = functions["loop_closure"](poses, theta)
     for _ in range(MAX_ITERATIONS):
         steps = -_solve_each(jacobians, gaps)[..., 0]
         trials, gaps, jacobians, better = _damped(functions, theta[active], poses[active], steps, gaps)
@@ -74,7 +73,7 @@ def _damped(
     small = np.abs(steps).max(axis=1) <= STEP_TOLERANCE
     for _ in range(HALVINGS):
         trials = poses + scale[:, None] * steps
-        new_gaps, jacobians = evaluate(functions["loop_closure"], trials, theta)
+        new_gaps, jacobians = functions["loop_closure"](trials, theta)
         better = (np.linalg.norm(new_gaps[..., 0], axis=1) < before) | small
         if better.all():
             break
@@ -97,7 +96,7 @@ def _check(functions: Functions, theta: np.ndarray, poses: np.ndarray, residual:
     if (residual < ANGLE_TOLERANCE).all():
         return
     row, leg = (int(value) for value in np.argwhere(~(residual < ANGLE_TOLERANCE))[0])
-    gap = np.abs(evaluate(functions["loop_closure"], poses[row : row + 1], theta[row : row + 1])[0]).max()
+    gap = np.abs(functions["loop_closure"](poses[row : row + 1], theta[row : row + 1])[0]).max()
     closed = gap < 1e-14
     why = "closes the legs with a crank beyond its dead point" if closed else f"leaves a gap of {gap:.3g} m^2"
     raise ConvergenceError(

@@ -25,24 +25,6 @@ from dynamics.legs.rss_inverse_kinematics import (
 )
 from dynamics.parameters import COULOMB, PARAMETER_NAMES, RIGID_BODY, VISCOUS
 
-FUNCTION_NAMES = (
-    "inverse_kinematics",
-    "loop_closure",
-    "singularity_measures",
-    "joint_jacobian",
-    "pose_jacobian",
-    "twist",
-    "twist_dot",
-    "pose_rate",
-    "mass_matrix",
-    "coriolis_matrix",
-    "gravity_wrench",
-    "friction_wrench",
-    "regressor",
-    "inverse_dynamics",
-    "forward_dynamics",
-)
-
 
 def rigid_body_regressor(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> ca.SX:
     """Columns of Gamma (6, 52) for the inertial parameters of platform, cranks and links (eq. 25)."""

@@ -29,6 +29,7 @@ trajectory, and its dynamic parameters are estimated from the record. Unseen tra
 
 \b
 Examples:
+  cmmsim warm-up                         compile robot and sensor now; no run waits for it later
   cmmsim run quick                       a one-minute run into runs/quick-0
   cmmsim run                             the paper's experiment into runs/paper-0
   cmmsim run paper --seed 7 --out mine   other noise and trajectories, into mine
@@ -202,6 +203,14 @@ def run(
     result = _warned(folder)
     if not quiet:
         _summary().print_goals(result, folder.report)
+
+
+@app.command()
+def warm_up(scenario: ScenarioArgument = "paper", settings: Settings = None, quiet: Quiet = False) -> None:
+    """Compile all that runs of a scenario need, once for this user: the runs that follow compile nothing."""
+    from identify.experiment.run import warm_up
+
+    warm_up(_scenario(scenario, settings), terminal_progress(quiet))
 
 
 @app.command()

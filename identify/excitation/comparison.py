@@ -58,9 +58,7 @@ def compare_methods(robot: Robot, scenario: Scenario, seed: int, progress: Progr
     """Search with every method. Raises what `design_trajectories` raises."""
     settings = scenario.excitation
     count = max(settings.candidates, FEWEST_MEMBERS)
-    with progress.stage("compile the robot", 2) as advance:
-        _ = robot.functions
-        advance()
+    with progress.stage("compile the robot", 1) as advance:
         prepare(robot)
         advance()
     began = time.perf_counter()

@@ -12,7 +12,7 @@ import xarray as xr
 
 import cmmsim
 from dynamics import Robot
-from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
+from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference, prepare
 from identify.estimation.scale_anchor import measured_anchor, store_anchor
 from identify.excitation.design import design_trajectories
 from identify.experiment.plant import Plant, PlatformLoad, build_plant, drawn_load
@@ -153,3 +153,38 @@ def _record(plant: Plant, reference: Reference, run: ClosedLoopRun, eye: SensorI
     )
     store_robot(record, plant.nominal)
     return record.assign_attrs(sensor_seconds=eye.seconds, lost_frames="; ".join(eye.lost[:20]))
+
+
+WARM_UP_FRAMES = 12
+
+
+def warm_up(scenario: Scenario, progress: Progress) -> None:
+    """Compile what runs of a scenario need, into the caches on disk, by teaching its sensor and following the platform
+    for some frames with each renderer. Raises what a run raises.
+    """
+    scenario = with_renderer(scenario)
+    plant = build_plant(scenario)
+    compile_robots((plant.nominal, plant.robot), progress)
+    for renderer in dict.fromkeys(("analytic", scenario.renderer)):
+        chosen = scenario.with_overrides({"renderer": renderer})
+        sensor = taught_sensor(chosen, plant.nominal, 0, progress)
+        with progress.stage(f"measure ({renderer})", WARM_UP_FRAMES) as advance:
+            eye = SensorInLoop(sensor, plant.robot, 0, advance)
+            plant.run(_nearby(plant.nominal, scenario.timing.frame_rate_hz), RateSensor(eye.measure))
+
+
+def compile_robots(robots: tuple[Robot, ...], progress: Progress) -> None:
+    """Compile robots and the loop around them, unless that has been done."""
+    with progress.stage("compile the robot", 2 * len(robots)) as advance:
+        for robot in robots:
+            _ = robot.functions
+            advance()
+            prepare(robot)
+            advance()
+
+
+def _nearby(robot: Robot, frame_rate_hz: float) -> Reference:
+    """A motion of some millimetres from home."""
+    rate = np.array([0.02, 0.0, 0.0, 0.0, 0.05, 0.0])
+    times = np.arange(WARM_UP_FRAMES)[:, None] / frame_rate_hz
+    return Reference(robot.home_pose + times * rate, np.tile(rate, (WARM_UP_FRAMES, 1)))

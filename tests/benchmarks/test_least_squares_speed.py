@@ -16,7 +16,7 @@ import pytest
 from scipy.optimize import OptimizeResult, least_squares
 
 import identify
-from dynamics import DynamicsError, compilation
+from dynamics import DynamicsError
 from identify.estimation.bounded_least_squares import StopCriteria, minimise
 from identify.estimation.bounds import parameter_bounds
 from identify.estimation.identification import output_error_problem
@@ -49,8 +49,6 @@ class Found:
 
 @pytest.fixture(scope="module")
 def scenario():
-    if compilation.find_compiler() is None:
-        pytest.skip("needs a C compiler")
     return identify.load_scenario("paper")
 
 

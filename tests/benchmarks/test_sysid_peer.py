@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from dynamics import compilation
 from tests.benchmarks import servo_experiment as servo
 from tests.benchmarks.timing import OtherLoad, judge
 
@@ -70,8 +69,6 @@ def coverage(covered):
 
 @pytest.fixture(scope="module")
 def commands():
-    if compilation.find_compiler() is None:
-        pytest.skip("needs a C compiler")
     return {SINES: servo.sine_commands(), DESIGN: servo.designed_commands()}
 
 

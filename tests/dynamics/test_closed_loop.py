@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 from dynamics import closed_loop, simulate_batch
+from dynamics.closed_loop.frame_kernels import begin, run_frames
 from dynamics.errors import DynamicsError, SimulationError
 from dynamics.robot import with_geometry_error
 from tests.dynamics.conftest import Loop, assert_same, at_rest
 
-PERIOD, FRAMES = 1 / 60, 32
+PERIOD, FRAMES, TWIN_FRAMES = 1 / 60, 32, 8
 LATE = {"latency_s": 1.3 * PERIOD, "hold": "linear"}
 JITTERED = PERIOD * np.random.default_rng(3).uniform(0.0, 3.2, FRAMES)
-SOFT = closed_loop.JointElasticity(stiffness=500.0, motor_inertia=3e-4, damping=0.02)
+SOFT = closed_loop.JointElasticity(stiffness=500.0, motor_inertia=7e-4, damping=0.02)
 STRIBECK = closed_loop.FrictionLaw("stribeck", static_ratio=1.5, stribeck_velocity=0.05)
 paths = pytest.mark.parametrize("compiled", [True, False], ids=["compiled", "plain"])
 
@@ -32,36 +33,40 @@ def _sensor(lost=(), bias=2e-5):
     return measure
 
 
+LOST, NOISE = np.isin(np.arange(24), (0, 5, 9, 10)), 2e-5 * np.sin(np.arange(24)[:, None] + np.arange(6))
 DERIVED = {"sensitivities": True}
+ELASTIC = {"elasticity": SOFT, "rate_hz": 240.0, "steps": 5, **LATE}
 TWINS = {
     "no delay": ({}, DERIVED),
     "half a frame": ({"latency_s": 0.5 * PERIOD}, DERIVED),
     "one frame": ({"latency_s": PERIOD}, DERIVED),
     "2.7 frames": ({"latency_s": 2.7 * PERIOD}, DERIVED),
     "linear": ({"hold": "linear"}, DERIVED),
-    "linear, jitter": (LATE, {"latencies": JITTERED, **DERIVED}),
-    "jitter": ({}, {"latencies": JITTERED, **DERIVED}),
-    "smoothed": ({"smoothing_velocity": 0.05, "steps": 8, **LATE}, DERIVED),
+    "linear, jitter": (LATE, {"latencies": JITTERED[:TWIN_FRAMES], **DERIVED}),
+    "jitter": ({}, {"latencies": JITTERED[:TWIN_FRAMES], **DERIVED}),
+    "smoothed": ({"smoothing_velocity": 0.05, "steps": 2, **LATE}, DERIVED),
     "stribeck": ({"friction": STRIBECK, **LATE}, DERIVED),
-    "logged commands": ({}, {"commands": 0.02 * np.sin(np.arange(FRAMES)[:, None] + np.arange(6)), **DERIVED}),
+    "logged commands": ({}, {"commands": 0.02 * np.sin(np.arange(TWIN_FRAMES)[:, None] + np.arange(6)), **DERIVED}),
     "lost frames": ({"latency_s": 0.4 * PERIOD}, {"sensor": _sensor({0, 5, 9, 10})}),
     "from a state": ({}, {"start_sensitivities": True}),
     "late, from a state": (LATE, {"start_sensitivities": True}),
-    "elastic, from a state": ({"elasticity": SOFT, "steps": 60, **LATE}, {}),
-    "elastic, Stribeck, from a state": ({"elasticity": SOFT, "steps": 60, "friction": STRIBECK, **LATE}, {}),
+    "elastic, from a state": (ELASTIC, {}),
+    "elastic, Stribeck, from a state": ({"friction": STRIBECK, **ELASTIC}, {}),
 }
 
 
 @pytest.mark.parametrize("case", TWINS)
 def test_compiled_run_equals_plain_run(loop, case):
-    """C and NumPy, written apart, agree in all records and sensitivities: to 1e-9, with elastic joints to 1e-11."""
-    settings, options = loop.settings(**TWINS[case][0]), dict(TWINS[case][1])
-    reference = loop.reference(FRAMES)
-    if case.endswith("from a state"):
-        reference, options["start"] = loop.half_way(40, 32 if settings.elasticity else 20, settings)
-    runs = loop.both(reference, settings, **options)
-    assert_same(*runs, 1e-11 if settings.elasticity else 1e-9)
-    assert (runs[1].events > 3) == (case != "smoothed")
+    """The same lines as machine code and as Python calls them: all records and sensitivities are equal bit for bit, but
+    for what hyperbolic functions round. Eight frames with events, from within a motion."""
+    settings, options = loop.settings(**{"steps": 1} | TWINS[case][0]), dict(TWINS[case][1])
+    reference = loop.reference(TWIN_FRAMES)
+    if "commands" not in options:  # those start in equilibrium, which moves with the parameters
+        reference, options["start"] = loop.half_way(20 + TWIN_FRAMES, 20, settings)
+    compiled, plain = loop.both(reference, settings, **options)
+    assert_same(compiled, plain, 1e-13)
+    assert (plain.events > 1) == (case != "smoothed")
+    assert len(begin.signatures) == len(run_frames.signatures) == 1  # kernels that serve runs of all kinds
 
 
 def _acting(t, arrivals, hold, commands):
@@ -73,15 +78,14 @@ def _acting(t, arrivals, hold, commands):
     return commands[newest] - short * rate, rate
 
 
-@paths
 @pytest.mark.parametrize("hold", ["zero", "linear"])
 @pytest.mark.parametrize("latencies", [JITTERED, np.full(FRAMES, 2 * PERIOD), None])
-def test_each_command_acts_from_its_arrival_and_never_before_the_one_before_it(loop, latencies, hold, compiled):
+def test_each_command_acts_from_its_arrival_and_never_before_the_one_before_it(loop, latencies, hold):
     """Commands so small that dry friction holds all joints: the joint PID integrates what acts, less a fixed angle."""
     usual, issued = 1.3 * PERIOD, PERIOD * np.arange(FRAMES)
     settings, reference = loop.settings(latency_s=usual, hold=hold), at_rest(loop.robot.home_pose, FRAMES)
     commands = 1e-4 * np.random.default_rng(8).normal(size=(FRAMES, 6))
-    run = loop.run(reference, settings, commands=commands, latencies=latencies, compiled=compiled)
+    run = loop.run(reference, settings, commands=commands, latencies=latencies)
     assert run.events == 0
     arrivals = issued + (usual if latencies is None else latencies)
     arrivals = np.maximum.accumulate(np.r_[-9, -9, usual - PERIOD, arrivals])
@@ -97,28 +101,25 @@ def test_each_command_acts_from_its_arrival_and_never_before_the_one_before_it(l
             for begin, end in itertools.pairwise(times)
         )
     if latencies is None:
-        same = loop.run(reference, settings, commands=run.command, latencies=np.full(FRAMES, usual), compiled=compiled)
+        same = loop.run(reference, settings, commands=run.command, latencies=np.full(FRAMES, usual))
         np.testing.assert_array_equal(same.joint_integral, run.joint_integral)
 
 
-@paths
-def test_a_lost_frame_holds_the_command_before_it_whether_a_sensor_lost_it_or_a_mask(loop, compiled):
+def test_a_lost_frame_holds_the_command_before_it_whether_a_sensor_lost_it_or_a_mask(loop):
     """The first frame, single frames and two in a row; masks and rows of noise do what a sensor that adds them and
     answers None does."""
-    lost, settings = np.isin(np.arange(24), (0, 5, 9, 10)), loop.settings(latency_s=0.4 * PERIOD)
-    noise = 2e-5 * np.sin(np.arange(24)[:, None] + np.arange(6))
-    asked = loop.run(24, settings, sensor=_sensor({0, 5, 9, 10}), compiled=compiled)
-    drawn = loop.run(24, settings, noise=noise, lost=lost, compiled=compiled)
+    settings = loop.settings(latency_s=0.4 * PERIOD)
+    asked = loop.run(24, settings, sensor=_sensor({0, 5, 9, 10}))
+    drawn = loop.run(24, settings, noise=NOISE, lost=LOST)
     for name in ("pose", "measured", "measured_ok", "command"):
         np.testing.assert_array_equal(getattr(drawn, name), getattr(asked, name), err_msg=name)
-    np.testing.assert_array_equal(asked.measured_ok, ~lost)
-    assert np.isnan(asked.measured[lost]).all()
+    np.testing.assert_array_equal(asked.measured_ok, ~LOST)
+    assert np.isnan(asked.measured[LOST]).all()
     np.testing.assert_array_equal(asked.command[[5, 9, 10]], asked.command[[4, 8, 8]])
     np.testing.assert_allclose(asked.command[0], loop.robot.inverse_kinematics(loop.robot.home_pose), atol=1e-15)
 
 
-@paths
-def test_a_sensor_is_asked_once_a_frame_for_the_true_pose_and_a_rate_sensor_gets_its_rate_too(loop, compiled):
+def test_a_sensor_is_asked_once_a_frame_for_the_true_pose_and_a_rate_sensor_gets_its_rate_too(loop):
     """A perfect one makes the run of the ideal one, bit by bit."""
     seen = []
 
@@ -126,10 +127,10 @@ def test_a_sensor_is_asked_once_a_frame_for_the_true_pose_and_a_rate_sensor_gets
         seen.append(true)
         return true[2]
 
-    ideal = loop.run(24, compiled=compiled)
+    ideal = loop.run(24)
     for sensor in (measure, closed_loop.RateSensor(measure)):
         seen.clear()
-        run = loop.run(24, sensor=sensor, compiled=compiled)
+        run = loop.run(24, sensor=sensor)
         records = (np.arange(24), np.arange(24) * (1 / 60), run.pose, run.pose_rate)
         for column, expected in zip(zip(*seen, strict=True), records, strict=sensor is not measure):
             np.testing.assert_array_equal(column, expected)
@@ -137,15 +138,13 @@ def test_a_sensor_is_asked_once_a_frame_for_the_true_pose_and_a_rate_sensor_gets
     assert np.abs(run.pose_rate).max() > 0.01
 
 
-@paths
-def test_logged_commands_drive_and_what_is_measured_beside_them_steers_nothing(loop, compiled):
+def test_logged_commands_drive_and_what_is_measured_beside_them_steers_nothing(loop):
     """The commands of a run repeat it bit by bit, whatever the servo's gains, sensors and lost frames."""
-    first = loop.run(20, compiled=compiled)
+    first = loop.run(20)
     plain = loop.settings()
     other = closed_loop.LoopSettings(closed_loop.ServoGains(9.0, 9.0, 9.0), plain.timing)
-    options = {"commands": first.command, "compiled": compiled}
-    np.testing.assert_array_equal(loop.run(20, other, **options).pose, first.pose)
-    sensed = loop.run(20, sensor=lambda frame, time, pose: None if frame == 2 else pose + 0.1, **options)
+    np.testing.assert_array_equal(loop.run(20, other, commands=first.command).pose, first.pose)
+    sensed = loop.run(20, sensor=lambda frame, time, pose: None if frame == 2 else pose + 0.1, commands=first.command)
     np.testing.assert_array_equal(sensed.pose, first.pose)
     np.testing.assert_array_equal(sensed.command, first.command)
     np.testing.assert_array_equal(np.delete(sensed.measured, 2, axis=0), np.delete(first.pose, 2, axis=0) + 0.1)
@@ -168,13 +167,14 @@ def _paper_servo(robot, settings, start):
     return command
 
 
-@paths
-@pytest.mark.parametrize("latency_s", [0.0, 0.025])
-def test_the_servo_of_equation_30_written_by_a_user_runs_as_the_built_in_one(robot, loop, latency_s, compiled):
-    """As a controller, with a sensor that errs and loses frames, late commands, against both paths."""
-    settings, reference, sensor = loop.settings(latency_s=latency_s), loop.reference(24), _sensor({5, 6, 17})
-    own = loop.run(reference, settings, sensor=sensor, controller=_paper_servo(robot, settings, reference.poses[0]))
-    built_in = loop.run(reference, settings, sensor=sensor, compiled=compiled)
+@pytest.mark.parametrize(
+    ("latency_s", "measured"), [(0.0, {"sensor": _sensor({5, 6, 17})}), (0.025, {"lost": LOST, "noise": NOISE})]
+)
+def test_the_servo_of_equation_30_written_by_a_user_runs_as_the_built_in_one(robot, loop, latency_s, measured):
+    """As a controller, with a sensor that errs and loses frames or with noise and a mask, and late commands."""
+    settings, reference = loop.settings(latency_s=latency_s), loop.reference(24)
+    own = loop.run(reference, settings, controller=_paper_servo(robot, settings, reference.poses[0]), **measured)
+    built_in = loop.run(reference, settings, **measured)
     np.testing.assert_allclose(own.command, built_in.command, atol=1e-11)
     np.testing.assert_allclose(own.pose, built_in.pose, atol=1e-11)
     assert np.abs(np.diff(own.command, axis=0)).max() > 1e-3
@@ -210,35 +210,35 @@ def test_run_starts_in_equilibrium(robot, loop):
 
 
 def test_the_loop_is_stable_where_the_paper_is_or_names_frame_time_and_the_leg_that_leaves_its_reach(robot, loop):
-    """At 29 Hz with one frame of delay Table 2 follows for 20 s within 20 mm; Table 1 does not, as both paths say: at
-    the frame before, all legs reach."""
+    """At 29 Hz with one frame of delay Table 2 follows for 20 s within 20 mm; Table 1 does not: at the frame
+    before, all legs reach."""
     settings, reference = loop.settings(29.0, latency_s=1 / 29), loop.reference(580, 29.0, scale=0.5)
     assert np.abs(loop.run(reference, settings).pose - reference.poses)[:, :3].max() < 0.02
     reference = loop.reference(580, 29.0)
-    unstable, messages = robot.parameter_sets["initial"].vector, []
-    for compiled in (True, False):
-        with pytest.raises(closed_loop.LoopFailure) as caught:
-            loop.run(reference, settings, unstable, compiled=compiled)
-        messages.append(str(caught.value))
+    unstable = robot.parameter_sets["initial"].vector
+    with pytest.raises(closed_loop.LoopFailure) as caught:
+        loop.run(reference, settings, unstable)
     frame = caught.value.frame
     assert 5 < frame < 580
-    assert messages[0] == messages[1]
     said = rf"stopped at frame {frame} \(t = .* s\): .*unstable\): leg [1-6] has the least reach margin, (\S+), must be"
-    margin = re.search(said, messages[0])
+    margin = re.search(said, str(caught.value))
     assert -0.5 < float(margin[1]) <= 0
     shorter = closed_loop.Reference(reference.poses[: frame + 1], reference.rates[: frame + 1])
     assert robot.reach_margin(loop.run(shorter, settings, unstable).pose[-1]).min() > 0
 
 
-@paths
+@pytest.mark.parametrize("asked", ["sensor", "controller"])
 @pytest.mark.parametrize("error", [ConnectionError("cable"), KeyboardInterrupt()], ids=["exception", "interrupt"])
-def test_errors_of_the_sensor_reach_the_caller_unchanged(loop, compiled, error):
-    """The very exception object that the sensor raised comes out, and the sensor is not called again."""
-    sensor = Mock(side_effect=[*loop.reference(7).poses, error])
+def test_errors_of_sensor_and_controller_reach_the_caller_unchanged(robot, loop, error, asked):
+    """The very exception object that was raised comes out, nobody is called again, and the next run is as ever."""
+    poses, before = loop.reference(7).poses, loop.run(20)
+    answers = poses if asked == "sensor" else robot.inverse_kinematics(poses)
+    failing = Mock(side_effect=[*answers, error])
     with pytest.raises(type(error)) as caught:
-        loop.run(20, sensor=sensor, compiled=compiled)
+        loop.run(20, **{asked: failing})
     assert caught.value is error
-    assert sensor.call_count == 8
+    assert failing.call_count == 8
+    assert_same(loop.run(20), before, 0.0)
 
 
 @paths
@@ -303,14 +303,13 @@ def test_a_batch_is_its_runs_in_order_for_any_number_of_workers(robot, loop):
 
 @pytest.mark.slow  # compiles the plant
 def test_the_servo_commands_with_the_kinematics_it_knows(loop, robot):
-    """As a user's servo with the nominal robot does, on both paths; one that knows the plant commands otherwise, and
-    one that knows its robot as ever."""
+    """As a user's servo with the nominal robot does, and as when plain; one that knows the plant commands otherwise,
+    and one that knows its robot as ever."""
     plant = with_geometry_error(robot, 1e-4, np.random.default_rng(3))
     reference, theirs = loop.reference(40), Loop(plant, loop.parameters)
-    run, plain = theirs.both(reference, sensor=_sensor(), servo_robot=robot)
-    assert_same(run, plain)
+    assert_same(*theirs.both(4, sensor=_sensor(), servo_robot=robot), 1e-13)
+    run = theirs.run(reference, sensor=_sensor(), servo_robot=robot)
     assert run.events > 3
-    np.testing.assert_allclose(run.pose, plain.pose, atol=1e-13)
     servo = _paper_servo(robot, loop.settings(), reference.poses[0])
     np.testing.assert_allclose(
         theirs.run(reference, sensor=_sensor(), controller=servo).command, run.command, atol=1e-11

@@ -1,10 +1,9 @@
-"""The cache of compiled code: content as key, whole files only, no recompiling; and what happens without a compiler."""
+"""Machine code against CasADi's virtual machine; its cache: content as key, whole files of our own only."""
 
-import ctypes
+import os
 import subprocess
 import sys
 import warnings
-from dataclasses import replace
 from inspect import getsource
 from pathlib import Path
 from unittest.mock import Mock
@@ -13,119 +12,144 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from dynamics import closed_loop, compilation, load_robot, robot_file
-from dynamics import robot as robot_module
-from dynamics.errors import DynamicsError, SimulationError
-from tests.dynamics.conftest import assert_same
+from dynamics.compiled.machine_code import compiled_functions
+from dynamics.compiled.object_files import CacheWarning, load_object
+from dynamics.compiled.translation import _CALLED, _MEANING, _NAMES
+from dynamics.errors import DynamicsError
+from dynamics.rigid_body.equation_of_motion import motion_functions
+from dynamics.rigid_body.virtual_work import robot_functions
+from tests.dynamics.conftest import BOX
+
+SPECIAL = (0.0, -0.0, 1.0, -1.0, 2.0, 3.0, 0.5, -2.5, 1e-310, 1e308, -1e308, np.inf, -np.inf, np.nan)
+X, Y = ca.SX.sym("x"), ca.SX.sym("y")
 
 
 @pytest.fixture
-def own_cache(loop, tmp_path, monkeypatch):
+def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("CMMSIM_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
 
-def _square(geometry):
-    x = ca.SX.sym("x")
+def _square():
+    x = ca.SX.sym("x", 2)
     return [ca.Function("square", [x], [x * x])]
 
 
-def compiled_square(name="square", geometry=None, build=_square):
-    return compilation.load_library(name, geometry or load_robot("rss6").geometry, build)
+def square(build=_square, content=b"square"):
+    """The compiled square's answer to (3, 4)."""
+    return compiled_functions(content, build)["square"](np.array([[3.0, 4.0]]))[0].ravel().tolist()
 
 
-def test_code_is_compiled_once_per_content(robot, own_cache):
-    """The second request builds nothing; another geometry or name is another file."""
-    build = Mock(side_effect=_square)
-    first = compiled_square(build=build)
-    assert compiled_square(build=build) == first
-    build.assert_called_once()
-    assert float(ca.external("square", str(first))(3.0)) == 9.0
-    shorter = replace(robot.geometry, crank_length=0.061)
-    others = {compiled_square(geometry=shorter), compiled_square("cube", shorter)}
-    assert len(others | {first}) == 3
-    assert len(list(own_cache.iterdir())) == 3
+def test_every_function_of_a_robot_is_that_of_the_virtual_machine(robot):
+    """All outputs, bit by bit, at a batch of random states with a single row of parameters."""
+    rng, names = np.random.default_rng(6), []
+    for function in robot_functions(robot.geometry) + motion_functions(robot.geometry):
+        pose = robot.home_pose + BOX * rng.uniform(-1, 1, (5, 6))
+        sizes = [function.nnz_in(k) for k in range(1, function.n_in())]
+        inputs = [pose, *[rng.normal(size=(5, size)) if size == 6 else rng.uniform(size=(1, size)) for size in sizes]]
+        found = robot.functions[function.name()](*inputs)
+        for row in range(5):
+            expected = function.call([ca.DM(part[row % len(part)]) for part in inputs])
+            for ours, theirs in zip(found, expected, strict=True):
+                np.testing.assert_array_equal(ours[row], theirs.full(), err_msg=function.name(), strict=True)
+        names.append(function.name())
+    assert sorted(robot.functions) == sorted(names)
 
 
-def test_two_processes_that_compile_at_once_get_one_whole_library(own_cache):
-    """Both end well with the same file, and no temporary file is left behind."""
-    load = "import casadi as ca\nfrom dynamics import compilation, load_robot\n"
-    code = "\n".join([load, getsource(_square), getsource(compiled_square), "print(compiled_square())"])
-    command, folder = [sys.executable, "-c", code], Path(__file__).parents[2]
-    processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder) for _ in range(2)]
-    paths = {process.communicate(timeout=60)[0].strip() for process in processes}
-    assert [process.returncode for process in processes] == [0, 0]
-    assert [str(path) for path in own_cache.iterdir()] == list(paths)
-    ctypes.CDLL(paths.pop())
-
-
-def test_code_the_compiler_refuses_is_an_error_with_its_words(own_cache, monkeypatch):
-    """A working compiler that refuses the generated code is a defect, not a reason to be slow: no fallback, no file."""
-    monkeypatch.setattr(compilation, "_source", lambda functions, driver: "int broken(")
-    with pytest.raises(DynamicsError, match=r"failed on the generated code of the robot: .*error"):
-        compiled_square()
-    assert list(own_cache.iterdir()) == []
-
-
-def test_damaged_library_is_removed_and_named(own_cache):
-    """A file cut short by a full disk does not stay in the way of the next run."""
-    own_cache.mkdir()
-    damaged = own_cache / "damaged.so"
-    damaged.write_bytes(b"\x7fELF cut short")
-    with pytest.raises(DynamicsError, match=r"damaged\.so could not be loaded and was removed"):
-        compilation.open_library(damaged)
-    assert not damaged.exists()
-
-
-@pytest.fixture
-def forget():
-    """What was found out about compilers is forgotten where a test says so, and after it."""
-
-    def clear():
-        for cached in (compilation.find_compiler, compilation.can_compile, robot_module._functions):
-            cached.cache_clear()
-
-    yield clear
-    clear()
-
-
-def test_compiler_may_have_arguments_of_its_own(loop, monkeypatch, forget):
-    """CC="gcc -pipe" is a program with an argument, as make understands it."""
-    plain = compilation.find_compiler()
-    forget()
-    monkeypatch.setenv("CC", f"{plain[0]} -pipe")
-    assert compilation.find_compiler() == (plain[0], "-pipe")
+@pytest.mark.parametrize("name", [*_MEANING, *_CALLED])
+def test_every_operation_is_that_of_the_virtual_machine_whatever_its_arguments(own_cache, name):
+    """Bit by bit, signs of zeros included, on all pairs of special and of random numbers."""
+    code = next(code for code, known in _NAMES.items() if known == name)
+    ways = [ca.Function("f", [X, Y], [f()]) for f in (lambda: ca.SX.binary(code, X, Y), lambda: X**2.7)]
+    function = next(f for f in ways if code in [f.instruction_id(k) for k in range(f.n_instructions())])
+    values = np.array([*SPECIAL, *np.random.default_rng(1).normal(size=6)])
+    x, y = (part.ravel() for part in np.meshgrid(values, values))
+    found = compiled_functions(name.encode(), lambda: [function])["f"](x[:, None], y[:, None])[0].ravel()
+    expected = function(ca.DM(x).T, ca.DM(y).T).full().ravel()
+    np.testing.assert_array_equal(found, expected)
+    numbers = ~np.isnan(expected)
+    np.testing.assert_array_equal(np.signbit(found[numbers]), np.signbit(expected[numbers]))
 
 
 @pytest.mark.parametrize(
-    ("environment", "missed"),
+    ("function", "words"),
     [
-        ({"CC": "none-existing"}, "no C compiler found"),
-        ({"CC": "{}/cc", "CMMSIM_CACHE": "{}/cache"}, "math.h"),
-        ({"CMMSIM_CACHE": "{}/cc/no_folder"}, "CMMSIM_CACHE"),
+        (ca.Function("odd", [X], [ca.erf(X)]), "odd: no machine code for the operation ERF; known: ACOS, ADD, "),
+        (ca.Function("odd", [ca.MX.sym("x")], [ca.MX(1.0)]), "only SX functions .*: odd is MXFunction"),
+        (ca.Function("odd", [X], [ca.diag(ca.vertcat(X, X))]), "only dense matrices .*: odd has one of 2x2,2nz"),
+        (ca.Function("odd", [ca.SX.sym("x", ca.Sparsity.upper(2))], [ca.SX(1.0)]), "odd has one of 2x2,3nz"),
     ],
 )
-def test_everything_works_without_a_compiler_after_one_warning(
-    robot, states, loop, tmp_path, monkeypatch, forget, environment, missed
-):
-    """Compiler, its headers or the folder for its results taken away: robot and loop fall back to CasADi's virtual
-    machine with the same numbers, and say so in exactly one line."""
-    (tmp_path / "cc").write_text("#!/bin/sh\necho 'fatal error: math.h: No such file' >&2\nexit 1\n")
-    (tmp_path / "cc").chmod(0o755)
-    reference, settings, motion = loop.reference(10), loop.settings(), (states.pose, states.twist, states.twist_dot)
-    compiled = robot.forward_dynamics(*motion), loop.run(reference, compiled=True)
-    for name, value in environment.items():
-        monkeypatch.setenv(name, value.format(tmp_path))
-    forget()
+def test_what_cannot_be_translated_is_named(own_cache, function, words):
+    with pytest.raises(DynamicsError, match=words):
+        compiled_functions(b"odd", lambda: [function])
+    assert not own_cache.exists()
+
+
+def test_code_is_compiled_once_per_content(own_cache):
+    """The second request builds nothing; other content is another file; nobody else may read or write them."""
+    build = Mock(side_effect=_square)
+    assert square(build) == square(build) == [9.0, 16.0]
+    build.assert_called_once()
+    square(content=b"other")
+    files = list(own_cache.iterdir())
+    assert len(files) == 2
+    assert {file.stat().st_mode & 0o777 for file in files} == {0o600}
+
+
+def test_two_processes_that_compile_at_once_leave_one_whole_file(own_cache):
+    """Both end well, and no temporary file is left behind."""
+    load = "import casadi as ca, numpy as np\nfrom dynamics.compiled.machine_code import compiled_functions\n"
+    command = [sys.executable, "-c", "\n".join([load, getsource(_square), getsource(square), "print(square())"])]
+    run = {"stdout": subprocess.PIPE, "text": True, "cwd": Path(__file__).parents[2]}
+    processes = [subprocess.Popen(command, **run) for _ in range(2)]
+    assert [process.communicate(timeout=60)[0] for process in processes] == ["[9.0, 16.0]\n"] * 2
+    (file,) = own_cache.iterdir()
+    assert load_object(file.stem)
+
+
+SPOILED = {
+    "cut": lambda file, other: file.write_bytes(file.read_bytes()[:-1]),
+    "empty": lambda file, other: file.write_bytes(b""),
+    "of another key": lambda file, other: file.write_bytes(other.read_bytes()),
+    "writable by a group": lambda file, other: file.chmod(0o620),
+    "writable by all": lambda file, other: file.chmod(0o666),
+}
+
+
+@pytest.mark.parametrize("way", SPOILED)
+def test_a_file_that_is_damaged_or_may_be_foreign_is_made_anew(own_cache, way):
+    build = Mock(side_effect=_square)
+    square()
+    (file,) = own_cache.iterdir()
+    square(content=b"other")
+    SPOILED[way](file, next(other for other in own_cache.iterdir() if other != file))
+    assert square(build) == square(build) == [9.0, 16.0]
+    build.assert_called_once()
+    assert file.stat().st_mode & 0o777 == 0o600
+
+
+def test_no_bit_of_a_file_may_change_nor_its_owner(own_cache, monkeypatch):
+    square()
+    (file,) = own_cache.iterdir()
+    whole, owner = file.read_bytes(), os.geteuid()
+    for place in range(len(whole)):
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        assert load_object(file.stem) is None
+    file.write_bytes(whole)
+    assert load_object(file.stem)
+    monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
+    assert load_object(file.stem) is None
+
+
+def test_everything_works_in_memory_after_one_warning_where_nothing_can_be_written(tmp_path, monkeypatch):
+    """Each function is compiled whenever it is asked for; that is said in one line, and only once."""
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("CMMSIM_CACHE", str(tmp_path / "file" / "no_folder"))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        fresh = robot_module.Robot(robot_file.read_robot_file("rss6"))
-        accelerations = fresh.forward_dynamics(*motion)
-        runs = [closed_loop.simulate(fresh, loop.parameters, reference, settings) for _ in range(2)]
-        with pytest.raises(SimulationError, match="compiled=True"):
-            closed_loop.simulate(fresh, loop.parameters, reference, settings, compiled=True)
-    assert [warning.category for warning in caught] == [compilation.CompilerWarning]
-    assert missed in str(caught[0].message)
-    assert "\n" not in str(caught[0].message)
-    np.testing.assert_allclose(accelerations, compiled[0], rtol=1e-10, atol=1e-12)
-    assert_same(compiled[1], runs[1])
+        assert square() == square(content=b"other") == [9.0, 16.0]
+    assert [warning.category for warning in caught] == [CacheWarning]
+    said = str(caught[0].message)
+    assert "\n" not in said
+    assert all(words in said for words in ("no_folder", "Not a directory", "CMMSIM_CACHE"))

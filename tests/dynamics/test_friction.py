@@ -1,52 +1,56 @@
 """Friction: its laws, closed forms of one joint, the choice of sticking joints, and what the whole robot does."""
 
 import itertools
+from types import SimpleNamespace
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from dynamics.closed_loop.motion import Command, State
-from dynamics.closed_loop.problem import LENGTH, FrictionLaw, StartState
-from dynamics.closed_loop.stick_slip import StickSlipMotion
+from dynamics.closed_loop import FrameTiming, FrictionLaw, LoopSettings, ServoGains, StartState
+from dynamics.closed_loop.execution import run
+from dynamics.closed_loop.problem import LoopProblem
+from dynamics.compiled.machine_code import compiled_functions
+from dynamics.expressions import function
 from tests.dynamics.conftest import BOX, at_rest
 
 MASS, STIFFNESS, COULOMB = 0.8, 20.0, 1.0
 FREQUENCY = np.sqrt(STIFFNESS / MASS)
-BY_START = LENGTH + 1  # the column of the start position, behind those of the parameters and of the step
+BY_START = 67  # the column of the start position, behind those of the parameters
 STRIBECK = FrictionLaw("stribeck", static_ratio=1.5, stribeck_velocity=0.2)
 FIRST = np.eye(6)[0]
 
 
-def _one_joint_functions():
+def _six_masses():
     """Six masses without coupling or gravity: theta = pose, M = rigid[0] times the unit matrix."""
-    zero, column = np.zeros((6, 6)), np.zeros((6, 1))
-
-    def columns(acceleration):
-        result = np.zeros((6, 52))
-        result[:, 0] = acceleration
-        return result
-
-    return {
-        "equation_of_motion": lambda q, v, rigid: (rigid[0] * np.eye(6), column, np.eye(6), column, q[:, None]),
-        "motion_derivatives": lambda q, v, a, torque, rigid: (zero, zero, columns(a), zero, zero),
-        "rate_map_derivative": lambda q, v: zero,
-    }
+    pose, rate, acceleration, torque = (ca.SX.sym(name, 6) for name in ("pose", "rate", "acceleration", "torque"))
+    rigid = ca.SX.sym("rigid", 52)
+    zero, unit, column = ca.SX(6, 6), ca.SX.eye(6), ca.SX(6, 1)
+    columns = ca.horzcat(acceleration, ca.SX(6, 51))
+    return [
+        function("equation_of_motion", [pose, rate, rigid], [rigid[0] * unit, column, unit, column, pose]),
+        function("motion_derivatives", [pose, rate, acceleration, torque, rigid], [zero, zero, columns, zero, zero]),
+        function("rate_map_derivative", [pose, rate], [zero]),
+    ]
 
 
-def _one_joint(x, time, steps, *, rate=0.0, end=0.0, speed=0.0, law=None, mode=0, derived=False):
-    """Position, velocity and mode of the first mass after a time, number of events, and derivatives (columns,) of the
-    position where wanted; it hangs on a spring whose other end starts at `end` and moves at a speed."""
-    parameters, rest, rows = np.zeros(67), np.zeros(6), np.zeros((6, LENGTH + 2))
+def _one_joint(x, time, steps, *, rate=0.0, end=0.0, speed=0.0, law=None, derived=False):
+    """Position and velocity of the first mass after a time, number of events, and derivatives (67 + 24,) of the
+    position where wanted; it hangs on a spring whose other end starts at `end` and moves at a speed: the loop's own
+    integrator, driven by a command over a single frame."""
+    parameters, rest = np.zeros(67), np.zeros(6)
     parameters[0], parameters[52:58], parameters[64] = MASS, COULOMB, STIFFNESS
-    tangent = State(np.outer(FIRST, np.arange(LENGTH + 2) == BY_START), rows, rows) if derived else None
-    motion = StickSlipMotion(_one_joint_functions(), parameters, law or FrictionLaw(), tangent)
-    motion.mode[0] = mode
-    pull = Command(end * FIRST, speed * FIRST, rest, rows, rows, rows)
-    state = motion.segment(State(x * FIRST, rate * FIRST, rest), pull, time, steps)
-    np.testing.assert_array_equal([state.pose[1:], state.rate[1:]], 0)
-    derivatives = motion.tangent.pose[0] if derived else None
-    return state.pose[0], state.rate[0], motion.mode[0], motion.events, derivatives
+    timing = FrameTiming(1 / time, hold="linear")
+    settings = LoopSettings(ServoGains(0.0, 0.0, 0.0), timing, law or FrictionLaw(), steps)
+    start = StartState(x * FIRST, rate * FIRST, rest, rest, end * FIRST[None], rest)
+    masses = SimpleNamespace(functions=compiled_functions(b"six masses", _six_masses))
+    pull = np.tile((end + speed * time) * FIRST, (2, 1))
+    fixed, none = (masses, parameters, at_rest(rest, 2), settings, start, None), (None,) * 3
+    found = run(LoopProblem(*fixed, derived, derived, pull, *none, servo_robot=masses))
+    np.testing.assert_array_equal([found.pose[1, 1:], found.pose_rate[1, 1:]], 0)
+    derivatives = np.append(found.pose_sensitivity[1, 0], found.start_sensitivity[1, 0]) if derived else None
+    return found.pose[1, 0], found.pose_rate[1, 0], found.events, derivatives
 
 
 def _oscillator(t, x0, k=STIFFNESS, fc=COULOMB, mass=MASS):
@@ -67,10 +71,10 @@ def test_one_joint_swings_and_comes_to_rest_as_in_closed_form(half_swings):
     still, with the sign of the last swing."""
     x0, time, h = 0.33, half_swings * np.pi / FREQUENCY, 1e-5
     steps = min(round(300 * half_swings), 1100)
-    position, rate, mode, _, derivatives = _one_joint(x0, time, steps, derived=True)
+    position, rate, _, derivatives = _one_joint(x0, time, steps, derived=True)
     np.testing.assert_allclose(position, _oscillator(time, x0), rtol=0, atol=1e-10)
     if half_swings > 3:  # x0 = 6.6 centres: at rest after three half swings
-        assert mode == rate == 0
+        assert rate == 0
     for column, name, value in ((64, "k", STIFFNESS), (52, "fc", COULOMB), (0, "mass", MASS), (BY_START, "x0", x0)):
         above, below = (_oscillator(time, **{"x0": x0, name: value + side * h}) for side in (1, -1))
         np.testing.assert_allclose(derivatives[column], (above - below) / (2 * h), atol=1e-8, err_msg=name)
@@ -81,7 +85,7 @@ def test_one_joint_breaks_away_when_the_spring_pulls_enough():
     more static friction it stays until its own level."""
     speed = 0.1
     breakaway = COULOMB / (STIFFNESS * speed)
-    position, *_, events, _ = _one_joint(0.0, 0.999 * breakaway, 7, speed=speed)
+    position, _, events, _ = _one_joint(0.0, 0.999 * breakaway, 7, speed=speed)
     assert position == events == 0
     after = 0.8 * np.pi / FREQUENCY
     position, rate, *_ = _one_joint(0.0, breakaway + after, 400, speed=speed)
@@ -96,7 +100,7 @@ def test_a_joint_that_stops_and_goes_on_within_one_step_is_noticed():
     """Velocity 0.04 - 2 t + 20 t^2 without friction's hold would dip below zero and be positive again at t = 0.1:
     one step over it finds both events, the stop and the breakaway, as fifty steps do."""
     pull = {"end": (COULOMB - 2 * MASS) / STIFFNESS, "speed": 40 * MASS / STIFFNESS}
-    (one, *_, events, _), (fifty, *_, others, _) = (_one_joint(0.0, 0.1, n, rate=0.04, mode=1, **pull) for n in (1, 50))
+    (one, _, events, _), (fifty, _, others, _) = (_one_joint(0.0, 0.1, n, rate=0.04, **pull) for n in (1, 50))
     assert events == others == 2
     np.testing.assert_allclose(one, fifty, atol=5e-6)  # without the events: 6e-4 off
 
@@ -119,10 +123,10 @@ def _first_half_swing(x0, time):
 @pytest.mark.parametrize("time", [0.1, 0.4, 2.0])
 def test_one_joint_under_stribeck_friction_moves_as_scipy_says(time):
     """Released from 0.11 m it swings once and stays: what is left pulls less than the breakaway torque."""
-    position, _, mode, *_ = _one_joint(0.11, time, round(800 * time), law=STRIBECK)
+    position, rate, *_ = _one_joint(0.11, time, round(800 * time), law=STRIBECK)
     expected, stopped = _first_half_swing(0.11, time)
     np.testing.assert_allclose(position, expected, atol=1e-8)
-    assert (mode == 0) == stopped
+    assert (rate == 0) == stopped
 
 
 def _friction_at_rest(mass, wrench, jacobian, limit):

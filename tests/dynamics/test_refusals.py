@@ -202,7 +202,6 @@ REFUSED = {
         (simulate, {"lost": FIVE[:, 0] > 0, "sensor": _ideal}, "lost is for the ideal sensor"),
         (simulate, {"noise": FIVE, "sensor": _ideal}, "noise is for the ideal sensor"),
         (simulate, {"commands": FIVE, "controller": _ideal}, "commands take the place of any controller"),
-        (simulate, {"compiled": True, "controller": _ideal}, "a controller runs on the plain path"),
         (simulate, {"settings": _elastic(1e-3)}, r"below the 0.000718 kg m\^2 of crank 2 about its axis"),
         (simulate, {"settings": _elastic(steps=20)}, r"is 20, must be >= \d+ .* stiffness of 500 N m/rad"),
         (simulate_batch, {"workers": 0}, "workers is 0, must be a whole number >= 1"),
@@ -261,14 +260,14 @@ def test_parameters_of_the_joint_pid_have_their_limits_and_a_start_what_its_run_
             state_at(frame)
 
 
-@pytest.mark.parametrize("compiled", [None, False])
-def test_answers_of_sensor_and_controller_are_six_numbers_or_name_the_frame(loop, compiled):
+def test_answers_of_sensor_and_controller_are_six_numbers_or_name_the_frame(robot, loop):
     """Never a lost frame; None is one of a sensor, and nothing of a controller."""
     with pytest.raises(SimulationError, match=r"what the pose sensor returned at frame 2.* is nan, must"):
-        loop.run(5, sensor=lambda frame, time, pose: pose * (np.nan if frame == 2 else 1), compiled=compiled)
+        loop.run(5, sensor=lambda frame, time, pose: pose * (np.nan if frame == 2 else 1))
     for answer, words in ((np.zeros((1, 6)), "shape"), (None, "must be numbers")):
-        with pytest.raises(SimulationError, match=rf"what the controller returned at frame 0.* {words}"):
-            loop.run(5, controller=lambda *_, answer=answer: answer)
+        answers = [*robot.inverse_kinematics(loop.reference(2).poses), answer]
+        with pytest.raises(SimulationError, match=rf"what the controller returned at frame 2.* {words}"):
+            loop.run(5, controller=lambda frame, *_, answers=answers: answers[frame])
 
 
 @pytest.mark.parametrize("frame", [0, 4])

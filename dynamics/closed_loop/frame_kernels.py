@@ -1,0 +1,197 @@
+"""The frames of a run: measuring, the visual servo of eq. 30, commands on their way to the joints, the record.
+
+The servo: U = J_theta [kp e + kd e_dot + ki integral(e)], the error e taken at the time of exposure. The pose rate is
+the difference of the last two good measurements (before the first: what the start names); the integral is the sum of
+the errors times the frame period. Lost frames leave both alone.
+"""
+
+import numpy as np
+
+from dynamics.closed_loop.linear_algebra_kernels import add_product, clear, copy, copy_rows, dot
+from dynamics.closed_loop.motion_kernels import MEASURED_OUT_OF_REACH, OK, all_finite
+from dynamics.closed_loop.sensitivity_kernels import velocity_by_pose
+from dynamics.closed_loop.stick_slip_kernels import NO_MARGIN, segment
+from dynamics.compiled.kernel import Array, Record, call, entry, invoke, kernel
+
+
+@kernel
+def begin(task: Record, now: Record, at: Record, d: Record, plan: Record) -> None:
+    """Modes and derivatives at frame 0. Joints slower than NO_MARGIN are at rest."""
+    size, count = len(at[0].bias), len(now.mode)
+    copy(now.state[:], at[0].state[:])
+    status = invoke(task.evaluate_terms, task, now, at[0], d, 0)  # where it fails, the first frame does and says so
+    for i in range(count):
+        velocity = at[0].velocity[i]
+        now.mode[i] = 0 if status != OK or abs(velocity) <= NO_MARGIN else 1 if velocity > 0 else -1
+    if task.sensitivities:
+        copy_rows(plan.start_integral_sensitivity, d.x[2 * size :], now.step_column)
+    if now.start_moves:
+        column = now.step_column + 1
+        for i in range(2 * size + count):
+            d.x[i, column + i] = 1.0
+        for i in range(size):
+            d.integral[i, column + 2 * size + count + i] = 1.0
+
+
+@kernel
+def keep_state(task: Record, now: Record, d: Record, record: Record, k: int) -> None:
+    """Write the state at a frame, before it is measured, into the record."""
+    size, count = len(now.servo_integral), len(now.mode)
+    for i in range(size):
+        record.pose[k, i] = now.state[i]
+        record.pose_rate[k, i] = now.state[size + i]
+        record.servo_integral[k, i] = now.servo_integral[i]
+    for i in range(count):
+        record.joint_integral[k, i] = now.state[2 * size + i]
+        if task.stiffness > 0:
+            record.motor_angle[k, i] = now.state[2 * size + count + i]
+            record.motor_rate[k, i] = now.state[2 * size + 2 * count + i]
+    if not task.sensitivities:
+        return
+    keep_rows(now, d.x[:size], record.pose_sensitivity[k], record.start_sensitivity[k])
+    if k + 1 == len(record.pose):
+        rows = len(d.x)
+        keep_rows(now, d.x[:], record.end_sensitivity[:rows], record.end_start_sensitivity[:rows])
+        keep_rows(now, d.integral[:], record.end_sensitivity[rows:], record.end_start_sensitivity[rows:])
+
+
+@kernel
+def keep_rows(now: Record, rows: Array, by_parameters: Array, by_start: Array) -> None:
+    """Write the columns of the parameters, and those of the start state if wanted."""
+    start = now.step_column + 1
+    copy_rows(rows, by_parameters, now.step_column)
+    copy_rows(rows[:, start:], by_start, now.width - start)
+
+
+@kernel
+def measure_ideally(now: Record, plan: Record, record: Record, k: int) -> None:
+    """What the ideal sensor says of the pose."""
+    record.measured_ok[k] = len(plan.lost) == 0 or not plan.lost[k]
+    for i in range(len(now.servo_integral)):
+        record.measured[k, i] = now.state[i] if record.measured_ok[k] else np.nan
+        if len(plan.noise) > 0:
+            record.measured[k, i] += plan.noise[k, i]
+
+
+@kernel
+def serve(task: Record, now: Record, d: Record, plan: Record, measured: Array, k: int) -> None:
+    """The servo's command at one good frame, and its derivatives."""
+    size = len(measured)
+    for i in range(size):
+        error = plan.reference[k, i] - measured[i]
+        rate = (measured[i] - now.last_measured[i]) / now.elapsed
+        now.servo_integral[i] += task.period * error
+        by_rate = task.kd * (plan.reference_rate[k, i] - rate)
+        now.demand[i] = task.kp * error + by_rate + task.ki * now.servo_integral[i]
+    jacobian = servo_jacobian(task, now, measured)
+    for i in range(len(now.mode)):
+        now.last_command[i] = dot(jacobian[i], now.demand[:])
+    if task.sensitivities:
+        serve_tangent(task, now, d, measured, jacobian)
+    copy(measured, now.last_measured[:])
+    now.elapsed = 0.0
+
+
+@kernel
+def servo_jacobian(task: Record, now: Record, measured: Array) -> Array:
+    """J_theta (n, m) of the robot that the servo knows, at a measured pose: often that where the motion is known."""
+    size, known = len(measured), now.known
+    same = known.valid and task.servo_motion == task.equation_of_motion
+    for j in range(size):
+        same = same and known.inputs[j] == measured[j]
+    if same:
+        return known.jacobian
+    copy(measured, now.served.inputs[:size])
+    call(task.servo_motion, now.served.inputs, now.served.mass)
+    return now.served.jacobian
+
+
+@kernel
+def serve_tangent(task: Record, now: Record, d: Record, measured: Array, jacobian: Array) -> None:
+    """Derivative of the command, given that of the measured pose."""
+    width = now.width
+    by_pose = velocity_by_pose(task, now, measured, now.demand[:])
+    for i in range(len(now.demand)):
+        for k in range(width):
+            moved = d.x[i, k]
+            d_rate = (moved - d.last_measured[i, k]) / now.elapsed
+            d.integral[i, k] -= task.period * moved
+            d.demand[i, k] = -task.kp * moved - task.kd * d_rate + task.ki * d.integral[i, k]
+            d.last_measured[i, k] = moved
+    clear(d.last_command[:], width)
+    add_product(1.0, jacobian, d.demand[:], d.last_command[:], width)
+    add_product(1.0, by_pose, d.last_measured[:], d.last_command[:], width)
+
+
+@kernel
+def issue_command(task: Record, now: Record, d: Record, plan: Record, record: Record, k: int) -> int:
+    """Measure, unless that has been done, and record the command that follows."""
+    if not task.measured:
+        measure_ideally(now, plan, record, k)
+    now.elapsed += task.period
+    if len(plan.commands) > 0:
+        copy(plan.commands[k], now.last_command[:])
+    elif record.measured_ok[k]:
+        serve(task, now, d, plan, record.measured[k], k)
+    copy(now.last_command[:], record.command[k])
+    if task.sensitivities:
+        copy_rows(d.last_command[:], d.issued[k % (len(d.issued) - 1)], now.width)
+    return OK if all_finite(record.command[k : k + 1]) else MEASURED_OUT_OF_REACH
+
+
+@kernel
+def command_number(plan: Record, record: Record, number: int) -> Array:
+    """A command by its number: from frame 0 on, and before that those of the start."""
+    if number >= 0:
+        return record.command[number]
+    return plan.start_commands[max(0, len(plan.start_commands) + number)]
+
+
+@kernel
+def apply_command(task: Record, now: Record, d: Record, plan: Record, record: Record, number: int, ramp: float) -> None:
+    """Let a command act, when a share of the way from the one before it is done: 1 is all of it."""
+    value, before = command_number(plan, record, number), command_number(plan, record, number - 1)
+    now.ramping = ramp < 1
+    for i in range(len(value)):
+        change = value[i] - before[i]
+        now.command_rate[i] = change / task.period
+        now.command[i] = before[i] + ramp * change if now.ramping else value[i]
+        now.command_slope[i] = now.command_rate[i] if now.ramping else 0.0
+    if not task.sensitivities:
+        return
+    rows = len(d.issued) - 1  # the last one stays zero: commands of the start are given
+    newer = d.issued[number % rows if number >= 0 else rows]
+    older = d.issued[(number - 1) % rows if number > 0 else rows]
+    for i in range(len(value)):
+        for k in range(now.width):
+            change = newer[i, k] - older[i, k]
+            d.command_rate[i, k] = change / task.period
+            d.command[i, k] = older[i, k] + ramp * change if now.ramping else newer[i, k]
+            d.command_slope[i, k] = d.command_rate[i, k] if now.ramping else 0.0
+
+
+@entry
+def run_frames(
+    task: Record, now: Record, at: Record, d: Record, plan: Record, record: Record, first: int, last: int
+) -> tuple[int, int]:
+    """Frames `first` to `last`, without it; the status, and the frame that it is of."""
+    frames = len(record.pose)
+    if first == 0:
+        begin(task, now, at, d, plan)
+    for k in range(first, last):
+        keep_state(task, now, d, record, k)
+        status = issue_command(task, now, d, plan, record, k)
+        if status != OK:
+            return status, k
+        for span in range(plan.first_span[k], plan.first_span[k + 1]):
+            apply_command(task, now, d, plan, record, plan.span_command[span], plan.span_ramp[span])
+            if span == plan.first_span[k]:
+                copy(now.state[:], at[0].state[:])
+                at[0].time = 0.0
+                status = invoke(task.evaluate_terms, task, now, at[0], d, 0)
+                copy(at[0].torque[:], record.torque[k])
+            if status == OK and k + 1 < frames:
+                status = segment(task, now, at, d, plan.span_duration[span], plan.span_steps[span])
+            if status != OK:
+                return status, k
+    return OK, last

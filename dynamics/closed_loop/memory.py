@@ -1,0 +1,126 @@
+"""What the kernels of the loop work on: records of fixed size, laid out for the joints, coordinates and parameters of a
+robot, and the arrays that a run reads and writes.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from dynamics.closed_loop.joints import FRICTION
+from dynamics.closed_loop.problem import MAX_DELAY_FRAMES
+
+
+class Plan(NamedTuple):
+    """What a run reads at its frames, one row each; no rows where that is not given. Spans: see `command_schedule`."""
+
+    reference: np.ndarray
+    reference_rate: np.ndarray
+    commands: np.ndarray
+    lost: np.ndarray
+    noise: np.ndarray
+    first_span: np.ndarray
+    span_command: np.ndarray
+    span_ramp: np.ndarray
+    span_duration: np.ndarray
+    span_steps: np.ndarray
+    start_commands: np.ndarray
+    start_integral_sensitivity: np.ndarray
+
+
+class Record(NamedTuple):
+    """What a run writes: see `ClosedLoopRun`; no rows where that is not asked for."""
+
+    pose: np.ndarray
+    pose_rate: np.ndarray
+    torque: np.ndarray
+    command: np.ndarray
+    measured: np.ndarray
+    joint_integral: np.ndarray
+    servo_integral: np.ndarray
+    measured_ok: np.ndarray
+    pose_sensitivity: np.ndarray
+    start_sensitivity: np.ndarray
+    end_sensitivity: np.ndarray
+    end_start_sensitivity: np.ndarray
+    motor_angle: np.ndarray
+    motor_rate: np.ndarray
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Numbers of joints, of coordinates of the platform, and of parameters of the rigid bodies."""
+
+    joints: int
+    coordinates: int
+    rigid: int
+
+    @property
+    def parameters(self) -> int:
+        """Rigid bodies, Coulomb and viscous friction of every joint, and the joint PID."""
+        return self.rigid + 2 * self.joints + 3
+
+    @property
+    def start(self) -> int:
+        """Entries of the start state: pose, pose rate, joint PID integral, servo integral."""
+        return 3 * self.coordinates + self.joints
+
+
+class Memory(NamedTuple):
+    """Room for one run. Its parts are records, described by `LAYOUT`, whose fields are arrays.
+
+    task: what does not change: addresses of machine code and kernels, laws, parameters, gains. now: where the
+    integrator stands. evaluations (5,): all that is known at the stages of a step and at its end; rows of stuck joints
+    in their order. tangent: derivatives, one row an unknown, one column for each parameter, one for the length of the
+    present step, and one for each entry of the start state.
+    """
+
+    task: Any
+    now: Any
+    evaluations: np.ndarray
+    tangent: Any
+
+
+LAYOUT = {
+    "task": "equation_of_motion! motion_derivatives! rate_map_derivative! servo_motion! evaluate_terms! evaluate! "
+    "decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! measured! lp li ld kp kd ki stiffness "
+    "damping motor_inertia period rigid:r coulomb:n viscous:n friction=friction",
+    "now": "known=known served=known derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
+    "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
+    "command_rate:n last_command:n impulse:n last_measured:m servo_integral:m demand:m change:m rest:m "
+    "pose_and_rate:M rate_map:nm",
+    # first what `equation_of_motion` and `motion_derivatives` return, in their order
+    "known": "mass:mm bias:m jacobian:nm bias_acceleration:n angle:n velocity:n factor:mm inputs:i valid!",
+    "derivatives": "by_pose:mm by_rate:mm columns:mr crank_by_pose:nm crank_by_rate:nm inputs:d",
+    "evaluation": "state:s slope:s time factor:mm bias:m jacobian:nm bias_acceleration:n angle:n velocity:n spring:n "
+    "error:n torque:n net_torque:n stick_force:n force:n response:nm compliance:nn stuck_factor:nn",
+    "tangent": "x:xw trial:xw k:4xw issued:cnw time:w length:w stage_time:w margin:w command:nw command_slope:nw "
+    "command_rate:nw last_command:nw velocity:nw torque:nw force:nw last_measured:mw integral:mw demand:mw moved:mw",
+}
+"""Fields of the records: a name with its dimensions by their letters (see `record_type`), one number without. `!` marks
+integers, `=` another record. Angle and velocity of elastic joints are those of the motors; the mass matrix is kept as
+its Cholesky factor; issued commands stay while they are on their way, the last one zero."""
+
+
+@lru_cache(maxsize=64)
+def record_type(name: str, sizes: Sizes) -> np.dtype:
+    """Layout of a record for a robot."""
+    n, m, r = sizes.joints, sizes.coordinates, sizes.rigid
+    length = {"n": n, "m": m, "r": r, "M": 2 * m, "s": 2 * m + 3 * n, "x": 2 * m + n, "4": 4, "i": 2 * m + r}
+    length |= {"d": 3 * m + n + r, "w": sizes.parameters + 1 + sizes.start, "c": MAX_DELAY_FRAMES + 3}
+    fields: list[Any] = []
+    for entry in LAYOUT[name].split():
+        field, _, inner = entry.partition("=")
+        if inner:
+            fields.append((field, FRICTION if inner == "friction" else record_type(inner, sizes)))
+            continue
+        field, _, shape = entry.rstrip("!").partition(":")
+        fields.append((field, "i8" if entry.endswith("!") else "f8", tuple(length[letter] for letter in shape)))
+    return np.dtype((np.record, fields))
+
+
+def empty_memory(sizes: Sizes) -> Memory:
+    """Room for one run."""
+    task, now, tangent = (np.zeros(1, record_type(name, sizes))[0] for name in ("task", "now", "tangent"))
+    return Memory(task, now, np.zeros(5, record_type("evaluation", sizes)), tangent)

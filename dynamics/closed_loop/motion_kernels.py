@@ -1,0 +1,285 @@
+"""The equation of motion at a state, for joints that slip one way (mode +1 or -1) or are stuck (0).
+
+Stuck joints carry the friction torque that keeps their acceleration zero. At rest, which joints stick is a
+box-constrained problem in the friction torques. Friction and elastic joints: see `joints`.
+"""
+
+import numpy as np
+
+from dynamics.closed_loop.linear_algebra_kernels import cholesky, copy, dot, fill, solve
+from dynamics.compiled.kernel import Array, Record, call, entry, invoke, kernel
+
+SMOOTHED, STRIBECK = 1, 2  # see `joints.LawName`
+OK, LEFT_REACH, SINGULAR_MASS, TOO_MANY_EVENTS, MEASURED_OUT_OF_REACH = range(5)
+
+
+@kernel
+def dry_level(friction: Record, velocity: float, mode: int) -> float:
+    """Dry friction over Coulomb torque of a joint that slips towards `mode` (+1 or -1) at a velocity, rad/s."""
+    if friction.law == SMOOTHED:
+        return np.tanh(velocity / friction.smoothing_velocity)
+    if friction.law == STRIBECK:
+        ratio = velocity / friction.stribeck_velocity
+        return mode * (1 + (friction.static_level - 1) * np.exp(-ratio * ratio))
+    return mode * 1.0
+
+
+@kernel
+def dry_slope(friction: Record, velocity: float, mode: int) -> float:
+    """Derivative of `dry_level` with respect to the velocity, s/rad."""
+    if friction.law == SMOOTHED:
+        dry = np.tanh(velocity / friction.smoothing_velocity)
+        return (1 - dry * dry) / friction.smoothing_velocity
+    if friction.law == STRIBECK:
+        ratio = velocity / friction.stribeck_velocity
+        fading = ratio / friction.stribeck_velocity * np.exp(-ratio * ratio)
+        return -2 * mode * (friction.static_level - 1) * fading
+    return 0.0
+
+
+@kernel
+def has_events(task: Record, joint: int) -> bool:
+    """Whether a joint can stick."""
+    return task.friction.law != SMOOTHED and task.coulomb[joint] > 0
+
+
+@kernel
+def breakaway(task: Record, joint: int) -> float:
+    """Largest torque, N m, that friction carries in a joint at rest."""
+    return task.friction.static_level * task.coulomb[joint]
+
+
+@kernel
+def slip_friction(task: Record, joint: int, velocity: float, mode: int) -> float:
+    """Friction torque, N m, of a joint that slips towards `mode`."""
+    return task.coulomb[joint] * dry_level(task.friction, velocity, mode) + task.viscous[joint] * velocity
+
+
+@kernel
+def wind_springs(task: Record, at: Record, motor: Array, motor_rate: Array) -> None:
+    """Torques of the springs; from here on the motors stand for the cranks in what joint PID and friction feel."""
+    for i in range(len(at.spring)):
+        wound, winding = motor[i] - at.angle[i], motor_rate[i] - at.velocity[i]
+        at.spring[i] = task.stiffness * wound + task.damping * winding
+        at.angle[i] = motor[i]
+        at.velocity[i] = motor_rate[i]
+
+
+@kernel
+def accelerate_motors(task: Record, at: Record, mode: Array, acceleration: Array) -> None:
+    """Accelerations (n,) of the motors; one that sticks gets the friction torque that keeps it at rest."""
+    for i in range(len(mode)):
+        left = at.net_torque[i] - at.spring[i]
+        acceleration[i] = left / task.motor_inertia if mode[i] != 0 else 0.0
+        if mode[i] == 0:
+            at.stick_force[i] = left
+            at.net_torque[i] -= left
+
+
+@kernel
+def decide_motor_modes(task: Record, at: Record, mode: Array, joints: Array) -> None:
+    """Motors at rest do not feel each other: each sticks where its friction can carry the torque that is left."""
+    for i in joints:
+        left = at.torque[i] - at.spring[i]
+        mode[i] = 0 if abs(left) < breakaway(task, i) else 1 if left >= 0 else -1
+
+
+@kernel
+def stuck_joints(now: Record) -> Array:
+    """The joints that stick."""
+    count = 0
+    for i in range(len(now.mode)):
+        if now.mode[i] == 0:
+            now.stuck[count] = i
+            count += 1
+    return now.stuck[:count]
+
+
+@kernel
+def all_finite(matrix: Array) -> bool:
+    """Whether no entry is infinite or NaN."""
+    finite = True
+    for row in matrix:
+        for value in row:
+            finite = finite and bool(np.isfinite(value))
+    return finite
+
+
+@kernel
+def know_motion(task: Record, known: Record, state: Array) -> int:
+    """The equation of motion at pose and rate, unless that is where it is known: steps and frames share their ends."""
+    size = len(known.bias)
+    same = known.valid
+    for j in range(2 * size):
+        same = same and known.inputs[j] == state[j]
+    if same:
+        return OK
+    copy(state[: 2 * size], known.inputs[: 2 * size])
+    call(task.equation_of_motion, known.inputs, known.mass)
+    known.valid = cholesky(known.mass, size, known.factor)
+    if not known.valid:
+        return SINGULAR_MASS if all_finite(known.mass) else LEFT_REACH
+    for i in range(len(known.angle)):
+        known.velocity[i] = dot(known.jacobian[i], state[size : 2 * size])
+    return OK
+
+
+@entry
+def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
+    """Everything at the state and time of an evaluation that does not depend on the modes."""
+    known, state = now.known, at.state
+    status = know_motion(task, known, at.state[:])
+    if status != OK:
+        return status
+    count, size = known.jacobian.shape
+    first = 2 * size
+    for i in range(size):
+        at.bias[i] = known.bias[i]
+        copy(known.factor[i], at.factor[i])
+    for i in range(count):
+        at.angle[i], at.velocity[i] = known.angle[i], known.velocity[i]
+        at.bias_acceleration[i] = known.bias_acceleration[i]
+        copy(known.jacobian[i], at.jacobian[i])
+    if task.stiffness > 0:
+        wind_springs(task, at, state[first + count : first + 2 * count], state[first + 2 * count :])
+    for i in range(count):
+        at.error[i] = now.command[i] + now.command_slope[i] * at.time - at.angle[i]
+        damped = task.ld * (now.command_rate[i] - at.velocity[i])
+        at.torque[i] = task.lp * at.error[i] + damped + task.li * state[first + i]
+    return OK
+
+
+@kernel
+def evaluate_compliance(at: Record, joints: Array) -> None:
+    """M^-1 J^T (n, m) and J M^-1 J^T (n, n) of some joints, in their order."""
+    size = len(at.bias)
+    for s in range(len(joints)):
+        copy(at.jacobian[joints[s]], at.response[s])
+        solve(at.factor, size, at.response[s])
+        for r in range(s + 1):
+            at.compliance[s, r] = dot(at.jacobian[joints[r]], at.response[s])
+            at.compliance[r, s] = at.compliance[s, r]
+
+
+@kernel
+def hold_compliance(at: Record, joints: Array) -> None:
+    """The compliance of some joints, and its Cholesky factor."""
+    evaluate_compliance(at, joints)
+    cholesky(at.compliance, len(joints), at.stuck_factor)
+
+
+@kernel
+def accelerate_freely(at: Record, torque: Array, acceleration: Array) -> None:
+    """Acceleration (m,) of the platform under joint torques (n,)."""
+    for j in range(len(at.bias)):
+        acceleration[j] = -at.bias[j]
+        for i in range(len(torque)):
+            acceleration[j] += at.jacobian[i, j] * torque[i]
+    solve(at.factor, len(at.bias), acceleration)
+
+
+@kernel
+def accelerate(task: Record, now: Record, at: Record) -> None:
+    """The slope of the state in the present modes; stuck joints get the torque that keeps them at rest."""
+    size, count = len(at.bias), len(at.angle)
+    acceleration = at.slope[size : 2 * size]
+    for i in range(count):
+        at.stick_force[i] = 0.0
+        at.net_torque[i] = at.torque[i]
+        if now.mode[i] != 0:
+            at.net_torque[i] -= slip_friction(task, i, at.velocity[i], now.mode[i])
+    copy(at.state[size : 2 * size], at.slope[:size])
+    copy(at.error[:], at.slope[2 * size : 2 * size + count])
+    if task.stiffness > 0:
+        copy(at.velocity[:], at.slope[2 * size + count : 2 * size + 2 * count])
+        accelerate_motors(task, at, now.mode, at.slope[2 * size + 2 * count :])
+        accelerate_freely(at, at.spring, acceleration)
+        return
+    accelerate_freely(at, at.net_torque, acceleration)
+    stuck = stuck_joints(now)
+    if len(stuck) > 0:
+        hold(at, stuck, acceleration)
+
+
+@kernel
+def hold(at: Record, stuck: Array, acceleration: Array) -> None:
+    """Give stuck joints the friction torque that keeps them at rest, and take its effect out of the acceleration."""
+    hold_compliance(at, stuck)
+    for s in range(len(stuck)):
+        at.force[s] = dot(at.jacobian[stuck[s]], acceleration) + at.bias_acceleration[stuck[s]]
+    solve(at.stuck_factor, len(stuck), at.force)
+    for s in range(len(stuck)):
+        at.stick_force[stuck[s]] = at.force[s]
+        at.net_torque[stuck[s]] -= at.force[s]
+        for j in range(len(acceleration)):
+            acceleration[j] -= at.response[s, j] * at.force[s]
+    if len(stuck) == len(acceleration):
+        fill(acceleration, 0.0)  # a robot that stands still stands still: rounding must not make it creep
+
+
+@entry
+def evaluate(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
+    """The whole evaluation at its state and time, in the present modes."""
+    status = invoke(task.evaluate_terms, task, now, at, d, 0)
+    if status == OK:
+        accelerate(task, now, at)
+    return status
+
+
+@kernel
+def follow_frictionless(task: Record, now: Record, at: Record) -> None:
+    """Joints without dry friction have no modes to break: they slip the way they move."""
+    for i in range(len(now.mode)):
+        if not has_events(task, i):
+            now.mode[i] = -1 if at.velocity[i] < 0 else 1
+
+
+@entry
+def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
+    """Which of the joints in mode 0, at rest, stick, and how the others start: projected Gauss-Seidel on friction."""
+    joints = stuck_joints(now)
+    if task.stiffness > 0:
+        decide_motor_modes(task, at, now.mode, joints)
+        return OK
+    if len(joints) == 0:
+        return OK
+    evaluate_compliance(at, joints)
+    for i in range(len(now.mode)):
+        at.net_torque[i] = at.torque[i]
+        if now.mode[i] != 0:
+            at.net_torque[i] -= slip_friction(task, i, at.velocity[i], now.mode[i])
+    size = len(at.bias)
+    free = at.slope[size : 2 * size]
+    accelerate_freely(at, at.net_torque, free)
+    fill(at.force[:], 0.0)
+    for _ in range(1000):
+        change = 0.0
+        for s in range(len(joints)):
+            push = dot(at.jacobian[joints[s]], free) + at.bias_acceleration[joints[s]]
+            for r in range(len(joints)):
+                push -= at.compliance[s, r] * at.force[r]
+            limit = breakaway(task, joints[s])
+            wanted = min(max(at.force[s] + push / at.compliance[s, s], -limit), limit)
+            change = max(change, abs(wanted - at.force[s]))
+            at.force[s] = wanted
+        if change < 1e-15:
+            break
+    for s in range(len(joints)):
+        sticks = abs(at.force[s]) < breakaway(task, joints[s])
+        now.mode[joints[s]] = 0 if sticks else 1 if at.force[s] >= 0 else -1
+    return OK
+
+
+@kernel
+def mode_margin(task: Record, now: Record, at: Record) -> tuple[float, int]:
+    """How far the modes are from being broken (>= 0 while they hold), and the joint that is closest (-1: none)."""
+    least, joint = 1.0, -1
+    for i in range(len(now.mode)):
+        if not has_events(task, i):
+            continue
+        margin = now.mode[i] * at.velocity[i]
+        if now.mode[i] == 0:
+            margin = 1 - abs(at.stick_force[i]) / breakaway(task, i)
+        if margin < least:
+            least, joint = margin, i
+    return least, joint

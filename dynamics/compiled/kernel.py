@@ -1,0 +1,115 @@
+"""Kernels: functions of numbers, arrays and records, compiled by numba on their first call, once, into a cache on disk.
+
+Modules called ``*_kernels`` hold them. They are imported where they are first needed: importing numba takes time.
+"""
+
+import ctypes
+import hashlib
+from collections.abc import Callable
+from functools import cache, lru_cache
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, typeof, types
+from numba.core.dispatcher import Dispatcher
+from numba.extending import intrinsic, overload
+
+Array = np.ndarray  # of any type and shape, which docstrings state
+Record = Any  # a numpy.record, whose fields are those of its type
+
+
+def kernel(function: Callable[..., Any]) -> Dispatcher:
+    """A kernel that only kernels call: compiled with each of them, without a door for Python."""
+    options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # which numba's stubs do not know
+    return njit(nogil=True, error_model="numpy", **options)(function)
+
+
+def entry(function: Callable[..., Any]) -> Dispatcher:
+    """A kernel that Python calls, or kernels by its address: kept beside the source, else in the user's cache."""
+    try:
+        compiled = njit(cache=True, nogil=True, error_model="numpy")(function)
+    except RuntimeError:  # no folder can be written to
+        return njit(nogil=True, error_model="numpy")(function)
+    if hasattr(compiled, "_cache"):
+        # numba asks only whether the function's own file has changed, but kernels call kernels of other files
+        compiled._cache._cache_file._source_stamp = _stamp()
+    return compiled
+
+
+_at_address: dict[int, Dispatcher] = {}
+
+
+def address(compiled: Dispatcher, *arguments: object) -> int:
+    """Where the machine code of an entry for such arguments is, for `invoke`; compiled if that has not been done.
+
+    A kernel that calls another contains it: those that many call are called by address, and compiled once.
+    """
+    kinds = tuple(map(typeof, arguments))
+    compiled.compile(kinds)
+    result: Any = compiled.overloads[kinds]
+    found = result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
+    _at_address[found] = compiled
+    return found
+
+
+def invoke(address: int, task: Any, now: Any, at: Any, d: Any, number: int) -> int:
+    """Call an entry by its address with four records and a number; returns its status."""
+    return plain(_at_address[int(address)])(task, now, at, d, number)
+
+
+@intrinsic
+def _invoke(context: Any, address: Any, task: Any, now: Any, at: Any, d: Any, number: Any) -> Any:
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        kind = ir.FunctionType(ir.IntType(64), [value.type for value in values[1:]])
+        return builder.call(builder.inttoptr(values[0], kind.as_pointer()), values[1:])
+
+    return types.int64(address, task, now, at, d, number), code
+
+
+@overload(invoke, strict=False)  # which would want the annotations to be equal, too
+def _compiled_invoke(address: Any, task: Any, now: Any, at: Any, d: Any, number: Any) -> Any:
+    compiled: Any = _invoke
+    return lambda address, task, now, at, d, number: compiled(address, task, now, at, d, number)
+
+
+@lru_cache(maxsize=1)
+def _stamp() -> str:
+    """Changes when any kernel changes."""
+    files = sorted(Path(__file__).parent.parent.rglob("*kernel*.py"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
+
+@cache
+def plain(compiled: Dispatcher) -> Callable[..., Any]:
+    """The same lines as an ordinary Python function, which calls other kernels as ordinary functions, too."""
+    source = compiled.py_func
+    names = {name: source.__globals__[name] for name in source.__code__.co_names if name in source.__globals__}
+    called = {name: plain(value) for name, value in names.items() if isinstance(value, Dispatcher)}
+    return FunctionType(source.__code__, source.__globals__ | called, source.__name__, source.__defaults__)
+
+
+def call(address: int, inputs: np.ndarray, outputs: np.ndarray) -> None:
+    """Call a `MachineFunction` by its address. What follows the first output in memory takes the others."""
+    single = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+    single(int(address))(inputs.ctypes.data, outputs.ctypes.data)
+
+
+@intrinsic
+def _call(context: Any, address: Any, inputs: Any, outputs: Any) -> Any:
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        arrays = zip(signature.args[1:], values[1:], strict=True)
+        pointers = [context.make_array(kind)(context, builder, value=value).data for kind, value in arrays]
+        kind = ir.FunctionType(ir.VoidType(), [pointer.type for pointer in pointers])
+        builder.call(builder.inttoptr(values[0], kind.as_pointer()), pointers)
+        return context.get_dummy_value()
+
+    return types.void(address, inputs, outputs), code
+
+
+@overload(call, strict=False)
+def _compiled_call(address: Any, inputs: Any, outputs: Any) -> Any:
+    compiled: Any = _call
+    return lambda address, inputs, outputs: compiled(address, inputs, outputs)

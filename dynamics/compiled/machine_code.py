@@ -1,0 +1,125 @@
+"""CasADi functions as machine code in this process: compiled by LLVM once, and kept in the user's cache folder."""
+
+import ctypes
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from functools import cache, partial
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import llvmlite
+import llvmlite.binding as llvm
+import numpy as np
+
+from dynamics.compiled.object_files import ObjectFile, load_object, save_object
+from dynamics.compiled.translation import llvm_text
+
+
+@dataclass(frozen=True)
+class MachineFunction:
+    """A compiled function: called with batches (N or 1, columns) of its arguments it returns all outputs (N, rows,
+    columns), NaN included. `address` is that of the code for a single call: see `translation`."""
+
+    inputs: list[int]
+    outputs: list[tuple[int, int]]
+    address: int
+    over_rows: Callable[[int, int, int], None]
+
+    def __call__(self, *batches: np.ndarray) -> list[np.ndarray]:
+        """All outputs (N, rows, columns) over batches (N or 1, columns) of the arguments, NaN included."""
+        count = max((len(batch) for batch in batches if len(batch) != 1), default=1)
+        given = np.empty((count, sum(self.inputs)))
+        for batch, size, end in zip(batches, self.inputs, np.cumsum(self.inputs), strict=True):
+            given[:, end - size : end] = batch
+        sizes = [rows * columns for rows, columns in self.outputs]
+        found = np.empty((count, sum(sizes)))
+        self.over_rows(count, given.ctypes.data, found.ctypes.data)
+        parts = np.split(found, np.cumsum(sizes)[:-1], axis=1)
+        return [part.reshape(count, *shape) for part, shape in zip(parts, self.outputs, strict=True)]
+
+    def bound_to(self, inputs: np.ndarray, outputs: np.ndarray) -> Callable[[], None]:
+        """The code for one set of inputs and outputs, which the caller keeps alive, as a function without arguments."""
+        single = ctypes.PYFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(self.address)
+        return partial(single, ctypes.c_void_p(inputs.ctypes.data), ctypes.c_void_p(outputs.ctypes.data))
+
+
+def compiled_functions(
+    content: bytes, build: Callable[[], list[ca.Function]], hot: Collection[str] = ()
+) -> dict[str, MachineFunction]:
+    """The functions that `build()` returns, by name; `content` is what they depend on besides this package.
+
+    hot: names of those that inner loops evaluate, to be optimised further.
+    Compiled on first use, some seconds, and kept in the cache folder. Raises DynamicsError for an operation that has no
+    translation.
+    """
+    key = _key(content)
+    compiled = load_object(key)
+    if compiled is None:
+        compiled = _compile(build(), hot)
+        save_object(key, compiled)
+    return _load(compiled)
+
+
+def _compile(functions: list[ca.Function], hot: Collection[str]) -> ObjectFile:
+    """LLVM's passes find pairs of equal operations; they gain a seventh in speed, for some tenths of a second each."""
+    module = llvm.parse_assembly(llvm_text(functions))
+    module.verify()
+    machine = _machine()
+    module.triple, module.data_layout = machine.triple, str(machine.target_data)
+    builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2))
+    for name in hot:
+        builder.getFunctionPassManager().run(module.get_function(name), builder)
+    shapes = {
+        f.name(): ([f.nnz_in(k) for k in range(f.n_in())], [f.size_out(k) for k in range(f.n_out())]) for f in functions
+    }
+    return ObjectFile(shapes, machine.emit_object(module))
+
+
+_engines: list[Any] = []  # the code lives as long as they do
+
+
+def _load(compiled: ObjectFile) -> dict[str, MachineFunction]:
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
+    engine.add_object_file(llvm.ObjectFileRef.from_data(compiled.code))
+    engine.finalize_object()
+    _engines.append(engine)
+    over_rows = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_void_p, ctypes.c_void_p)
+    return {
+        name: MachineFunction(
+            inputs,
+            [(rows, columns) for rows, columns in outputs],
+            engine.get_function_address(name),
+            over_rows(engine.get_function_address(f"{name}.rows")),
+        )
+        for name, (inputs, outputs) in compiled.functions.items()
+    }
+
+
+def _machine() -> llvm.TargetMachine:
+    """This processor. Nothing is fused or reordered: the same seed gives the same numbers on every one."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    target = llvm.Target.from_triple(llvm.get_process_triple())
+    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=_features(), opt=2, jit=True)
+
+
+@cache
+def _features() -> str:
+    return str(llvm.get_host_cpu_features().flatten())
+
+
+def _key(content: bytes) -> str:
+    digest = sha256(_package_digest() + content)
+    versions = (ca.CasadiMeta.version(), llvmlite.__version__, llvm.get_process_triple())
+    digest.update("|".join([*versions, llvm.get_host_cpu_name(), _features()]).encode())
+    return digest.hexdigest()[:24]
+
+
+@cache
+def _package_digest() -> bytes:
+    digest = sha256()
+    for file in sorted(Path(__file__).parent.parent.rglob("*.py")):
+        digest.update(file.name.encode() + file.read_bytes())
+    return digest.digest()
