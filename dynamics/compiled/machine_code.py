@@ -20,12 +20,14 @@ from dynamics.compiled.translation import llvm_text
 @dataclass(frozen=True)
 class MachineFunction:
     """A compiled function: called with batches (N or 1, columns) of its arguments it returns all outputs (N, rows,
-    columns), NaN included. `address` is that of the code for a single call: see `translation`."""
+    columns), NaN included. `address` is that of the code for a single call, see `translation`; it is valid as long as
+    the function lives."""
 
     inputs: list[int]
     outputs: list[tuple[int, int]]
     address: int
     over_rows: Callable[[int, int, int], None]
+    engine: Any  # whose end is that of the code
 
     def __call__(self, *batches: np.ndarray) -> list[np.ndarray]:
         """All outputs (N, rows, columns) over batches (N or 1, columns) of the arguments, NaN included."""
@@ -42,6 +44,7 @@ class MachineFunction:
     def bound_to(self, inputs: np.ndarray, outputs: np.ndarray) -> Callable[[], None]:
         """The code for one set of inputs and outputs, which the caller keeps alive, as a function without arguments."""
         single = ctypes.PYFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(self.address)
+        single.engine = self.engine  # type: ignore[attr-defined]
         return partial(single, ctypes.c_void_p(inputs.ctypes.data), ctypes.c_void_p(outputs.ctypes.data))
 
 
@@ -77,14 +80,10 @@ def _compile(functions: list[ca.Function], hot: Collection[str]) -> ObjectFile:
     return ObjectFile(shapes, machine.emit_object(module))
 
 
-_engines: list[Any] = []  # the code lives as long as they do
-
-
 def _load(compiled: ObjectFile) -> dict[str, MachineFunction]:
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
     engine.add_object_file(llvm.ObjectFileRef.from_data(compiled.code))
     engine.finalize_object()
-    _engines.append(engine)
     over_rows = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_void_p, ctypes.c_void_p)
     return {
         name: MachineFunction(
@@ -92,6 +91,7 @@ def _load(compiled: ObjectFile) -> dict[str, MachineFunction]:
             [(rows, columns) for rows, columns in outputs],
             engine.get_function_address(name),
             over_rows(engine.get_function_address(f"{name}.rows")),
+            engine,
         )
         for name, (inputs, outputs) in compiled.functions.items()
     }
