@@ -15,7 +15,7 @@ import numpy as np
 from llvmlite import ir
 from numba import njit, typeof, types
 from numba.core.dispatcher import Dispatcher
-from numba.extending import intrinsic, overload
+from numba.extending import intrinsic
 
 Array = np.ndarray  # of any type and shape, which docstrings state
 Record = Any  # a numpy.record, whose fields are those of its type
@@ -55,12 +55,6 @@ def address(compiled: Dispatcher, *arguments: object) -> int:
     return found
 
 
-def invoke(address: int, task: Any, now: Any, at: Any, d: Any, number: int) -> int:
-    """Call an entry by its address with four records and a number; returns its status."""
-    return plain(_at_address[int(address)])(task, now, at, d, number)
-
-
-@intrinsic
 def _invoke(context: Any, address: Any, task: Any, now: Any, at: Any, d: Any, number: Any) -> Any:
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         kind = ir.FunctionType(ir.IntType(64), [value.type for value in values[1:]])
@@ -69,10 +63,31 @@ def _invoke(context: Any, address: Any, task: Any, now: Any, at: Any, d: Any, nu
     return types.int64(address, task, now, at, d, number), code
 
 
-@overload(invoke, strict=False)  # which would want the annotations to be equal, too
-def _compiled_invoke(address: Any, task: Any, now: Any, at: Any, d: Any, number: Any) -> Any:
-    compiled: Any = _invoke
-    return lambda address, task, now, at, d, number: compiled(address, task, now, at, d, number)
+def _call(context: Any, address: Any, inputs: Any, outputs: Any) -> Any:
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        arrays = zip(signature.args[1:], values[1:], strict=True)
+        pointers = [context.make_array(kind)(context, builder, value=value).data for kind, value in arrays]
+        kind = ir.FunctionType(ir.VoidType(), [pointer.type for pointer in pointers])
+        builder.call(builder.inttoptr(values[0], kind.as_pointer()), pointers)
+        return context.get_dummy_value()
+
+    return types.void(address, inputs, outputs), code
+
+
+invoke: Any = intrinsic(_invoke)
+"""Calls an entry by its address with four records and a number; returns its status."""
+
+call: Any = intrinsic(_call)
+"""Calls a `MachineFunction` by its address with its inputs and outputs, which lie in memory one after the other."""
+
+
+def _invoke_plain(address: int, *arguments: Any) -> int:
+    return plain(_at_address[int(address)])(*arguments)
+
+
+def _call_plain(address: int, inputs: np.ndarray, outputs: np.ndarray) -> None:
+    single = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+    single(int(address))(inputs.ctypes.data, outputs.ctypes.data)
 
 
 @lru_cache(maxsize=1)
@@ -88,28 +103,5 @@ def plain(compiled: Dispatcher) -> Callable[..., Any]:
     source = compiled.py_func
     names = {name: source.__globals__[name] for name in source.__code__.co_names if name in source.__globals__}
     called = {name: plain(value) for name, value in names.items() if isinstance(value, Dispatcher)}
+    called |= {"invoke": _invoke_plain, "call": _call_plain}
     return FunctionType(source.__code__, source.__globals__ | called, source.__name__, source.__defaults__)
-
-
-def call(address: int, inputs: np.ndarray, outputs: np.ndarray) -> None:
-    """Call a `MachineFunction` by its address. What follows the first output in memory takes the others."""
-    single = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
-    single(int(address))(inputs.ctypes.data, outputs.ctypes.data)
-
-
-@intrinsic
-def _call(context: Any, address: Any, inputs: Any, outputs: Any) -> Any:
-    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        arrays = zip(signature.args[1:], values[1:], strict=True)
-        pointers = [context.make_array(kind)(context, builder, value=value).data for kind, value in arrays]
-        kind = ir.FunctionType(ir.VoidType(), [pointer.type for pointer in pointers])
-        builder.call(builder.inttoptr(values[0], kind.as_pointer()), pointers)
-        return context.get_dummy_value()
-
-    return types.void(address, inputs, outputs), code
-
-
-@overload(call, strict=False)
-def _compiled_call(address: Any, inputs: Any, outputs: Any) -> Any:
-    compiled: Any = _call
-    return lambda address, inputs, outputs: compiled(address, inputs, outputs)
