@@ -5,10 +5,10 @@ arrive together only the last acts. With the linear hold a command ramps from th
 stays; one that arrives before that ramp has ended starts where it would have ended.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
 from math import ceil, floor
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,16 +18,15 @@ Instant = tuple[int, float]
 """Frame, and time since that frame in s, less than a frame: so the spans of equal delays are equal in all frames."""
 
 
-@dataclass(frozen=True)
-class CommandSchedule:
+class CommandSchedule(NamedTuple):
     """Spans of time in which one command acts, none longer than to the end of its frame.
 
-    Those of frame k are first_span[k] to first_span[k + 1]; per span: command, the number of the frame that issued it
+    Those of frame k are first[k] to first[k + 1]; per span: command, the number of the frame that issued it
     (negative: before the start); ramp, the share of the way from the command before that is done as the span begins
     (1: all of it); duration, s; steps of integration.
     """
 
-    first_span: np.ndarray
+    first: np.ndarray
     command: np.ndarray
     ramp: np.ndarray
     duration: np.ndarray
@@ -60,10 +59,11 @@ def _schedule(
         command.append(oldest + newest)
         arrived = arrivals[newest]
         under_way = linear and begin < (arrived[0] + 1, arrived[1])
-        ramp.append(_between(arrived, begin, period) / period if under_way else 1.0)
+        since = (begin[0] - arrived[0]) * period + (begin[1] - arrived[1])
+        ramp.append(since / period if under_way else 1.0)
         duration.append(period - begin[1] if end[0] > begin[0] else end[1] - begin[1])
     return CommandSchedule(
-        first_span=_fixed(np.searchsorted([frame for frame, _ in begins], np.arange(frames + 1)), np.intc),
+        first=_fixed(np.searchsorted([frame for frame, _ in begins], np.arange(frames + 1)), np.intc),
         command=_fixed(command, np.intc),
         ramp=_fixed(ramp, float),
         duration=_fixed(duration, float),
@@ -75,10 +75,6 @@ def _delay(latency: float, period: float) -> Instant:
     """A latency, s, as whole frames and the rest in s, rounded so that what arrives together has equal instants."""
     whole = floor(latency / period + 1e-9)
     return whole, max(0.0, round(latency - whole * period, 13))
-
-
-def _between(first: Instant, second: Instant, period: float) -> float:
-    return (second[0] - first[0]) * period + (second[1] - first[1])
 
 
 def _fixed(values: object, kind: type) -> np.ndarray:

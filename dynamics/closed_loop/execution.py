@@ -4,143 +4,123 @@ The same lines run compiled and, as the oracle of that, plain. Sensors and contr
 kernels then do one frame at a time.
 """
 
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from dynamics.closed_loop import motion_kernels
+from dynamics.checks import floats
 from dynamics.closed_loop.command_schedule import command_schedule
-from dynamics.closed_loop.frame_kernels import run_frames
-from dynamics.closed_loop.memory import Plan, Record, Sizes, empty_memory
-from dynamics.closed_loop.motion_kernels import decide_modes, evaluate, evaluate_terms
-from dynamics.closed_loop.problem import (
+from dynamics.closed_loop.frame_kernels import measure_ideally, run_frames
+from dynamics.closed_loop.memory import Memory, Plan, empty_memory, empty_record
+from dynamics.closed_loop.motion_kernels import (
     LEFT_REACH,
     MEASURED_OUT_OF_REACH,
     SINGULAR_MASS,
-    LoopProblem,
-    measurement,
-    own_command,
+    TOO_MANY_EVENTS,
+    decide_modes,
+    evaluate,
+    evaluate_terms,
 )
-from dynamics.closed_loop.run import ClosedLoopRun, empty_run, failure
+from dynamics.closed_loop.problem import LoopProblem, RateSensor, Sizes
+from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
 from dynamics.closed_loop.sensitivity_kernels import slope_tangent, stop_tangent
 from dynamics.closed_loop.stick_slip_kernels import stop_joints
 from dynamics.compiled.kernel import address, plain
+from dynamics.compiled.machine_code import MachineFunction
+from dynamics.errors import SimulationError
 from dynamics.parameters import split_parameters
 
 FAILURES = {
-    motion_kernels.LEFT_REACH: LEFT_REACH,
-    motion_kernels.SINGULAR_MASS: SINGULAR_MASS,
-    motion_kernels.TOO_MANY_EVENTS: "more stick-slip events than a frame can hold",
-    motion_kernels.MEASURED_OUT_OF_REACH: MEASURED_OUT_OF_REACH,
+    LEFT_REACH: "the robot left the reachable set (the loop is unstable):",
+    SINGULAR_MASS: "the mass matrix is not positive definite: masses or inertias are zero or overflow",
+    TOO_MANY_EVENTS: "more stick-slip events than a frame can hold",
+    MEASURED_OUT_OF_REACH: "the measured pose is out of reach, so that the servo has no command; there",
 }
-CALLED = {
-    "evaluate_terms": evaluate_terms,
-    "evaluate": evaluate,
-    "decide_modes": decide_modes,
-    "stop_joints": stop_joints,
-    "slope_tangent": slope_tangent,
-    "stop_tangent": stop_tangent,
-}
-"""Kernels that are called by address, by the names of these."""
+CALLED = (evaluate_terms, evaluate, decide_modes, stop_joints, slope_tangent, stop_tangent)
+"""Kernels that are called by address, by their names."""
 
 
 def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
     """Do one run; see `closed_loop.simulate`."""
-    result, commands = empty_run(problem), _commands(problem)
-    sizes = _sizes(problem)
-    memory, plan, record = empty_memory(sizes), _plan(problem, commands), _record(result, sizes)
-    _fill_task(memory.task, problem, sizes)
-    _fill_now(memory.now, problem, sizes, memory.task.rigid)
-    frames = run_frames if compiled else np.errstate(all="ignore")(plain(run_frames))
+    memory, record, frames = empty_memory(problem.sizes), empty_record(problem), problem.frames
     asked = problem.sensor is not None or problem.controller is not None
-    for first, last in [(k, k + 1) for k in range(problem.frames)] if asked else [(0, problem.frames)]:
+    commands = problem.commands  # a controller's are written frame by frame, and take the place of the servo's, too
+    if commands is None:
+        commands = np.zeros((frames if problem.controller else 0, problem.sizes.joints))
+    plan = _plan(problem, commands)
+    own, known = problem.robot.functions, problem.servo_robot.functions  # held here: code that nobody holds is freed
+    _fill(memory, problem, own, known["equation_of_motion"])
+    do = run_frames if compiled else np.errstate(all="ignore")(plain(run_frames))
+    for first, last in [(k, k + 1) for k in range(frames)] if asked else [(0, frames)]:
         if asked:
-            _consult(problem, first, memory.now.state, result, commands)
-        status, frame = frames(*memory, plan, record, first, last)
+            _consult(problem, first, memory.now, plan, record, commands)
+        status, frame = do(*memory, plan, record, first, last)
         if status:
-            raise failure(FAILURES[status], frame, problem, memory.now.known.inputs[:6].copy(), result.measured)
-    return replace(result, events=int(memory.now.events))
+            raise _failure(problem, status, frame, memory, record)
+    found: dict[str, Any] = {name: array if array.size else None for name, array in record._asdict().items()}
+    time, events = np.arange(frames) * problem.period, int(memory.now.events)
+    return ClosedLoopRun(time=time, **found, events=events, start=problem.start)
 
 
-def _consult(problem: LoopProblem, frame: int, state: np.ndarray, result: ClosedLoopRun, commands: np.ndarray) -> None:
+def _consult(problem: LoopProblem, frame: int, now: Any, plan: Plan, record: Any, commands: np.ndarray) -> None:
     """Ask a user's own sensor what it measures at a frame, and the controller for a command."""
-    pose, rate = state[:6].copy(), state[6:12].copy()
-    measured: np.ndarray | None = pose
-    if problem.sensor is not None:
-        measured = measurement(problem.sensor, frame, frame * problem.period, pose, rate)
-    elif problem.lost is not None and problem.lost[frame]:
-        measured = None
-    elif problem.noise is not None:
-        measured = pose + problem.noise[frame]
-    result.measured_ok[frame] = measured is not None
-    result.measured[frame] = np.nan if measured is None else measured
+    sensor, size, time = problem.sensor, problem.sizes.coordinates, frame * problem.period
+    if sensor is None:
+        plain(measure_ideally)(now, plan, record, frame)
+    else:
+        pose, rate = now.state[:size].copy(), now.state[size : 2 * size].copy()
+        given = sensor.measure(frame, time, pose, rate) if isinstance(sensor, RateSensor) else sensor(frame, time, pose)
+        record.measured_ok[frame] = given is not None
+        what = f"what the pose sensor returned at frame {frame}"
+        record.measured[frame] = np.nan if given is None else floats(what, given, (size,), error=SimulationError)
     if problem.controller is None:
         return
     commands[frame] = commands[frame - 1] if frame else problem.start.commands[-1]
-    if measured is not None:
-        commands[frame] = own_command(problem.controller, problem, frame, measured)
+    if record.measured_ok[frame]:
+        desired = problem.reference.poses[frame], problem.reference.rates[frame]
+        command = problem.controller(frame, time, record.measured[frame].copy(), *desired)
+        what = f"what the controller returned at frame {frame}"
+        commands[frame] = floats(what, command, (problem.sizes.joints,), error=SimulationError)
 
 
-def _sizes(problem: LoopProblem) -> Sizes:
-    """Those of the robot's equation of motion."""
-    motion = problem.robot.functions["equation_of_motion"]
-    return Sizes(joints=motion.outputs[2][0], coordinates=motion.inputs[0], rigid=motion.inputs[2])
-
-
-def _commands(problem: LoopProblem) -> np.ndarray:
-    """Commands (frames, n) that take the place of the servo's, to be written by a controller; none: (0, n)."""
-    if problem.commands is not None:
-        return problem.commands
-    return np.zeros((problem.frames if problem.controller else 0, problem.start.commands.shape[1]))
+def _failure(problem: LoopProblem, status: int, frame: int, memory: Memory, record: Any) -> LoopFailure:
+    """The error of a run that ended early, with the leg to blame for a pose out of reach."""
+    said = f"closed loop stopped at frame {frame} (t = {frame * problem.period:.3f} s): {FAILURES[status]}"
+    if status in (LEFT_REACH, MEASURED_OUT_OF_REACH):
+        stopped = memory.now.known.inputs[: problem.sizes.coordinates]
+        margin = problem.robot.reach_margin(stopped if status == LEFT_REACH else record.measured[frame])
+        leg = int(np.argmin(margin))
+        said += f" leg {leg + 1} has the least reach margin, {margin[leg]:.3g}, must be > 0"
+    return LoopFailure(said, frame)
 
 
 def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
-    schedule, start = command_schedule(problem), problem.start
-    plan = Plan(
-        reference=problem.reference.poses,
-        reference_rate=problem.reference.rates,
-        commands=commands,
-        lost=np.zeros(0, bool) if problem.lost is None else problem.lost,
-        noise=np.zeros((0, 0)) if problem.noise is None else problem.noise,
-        first_span=schedule.first_span,
-        span_command=schedule.command,
-        span_ramp=schedule.ramp,
-        span_duration=schedule.duration,
-        span_steps=schedule.steps,
-        start_commands=start.commands,
-        start_integral_sensitivity=start.joint_integral_sensitivity,
-    )
-    return Plan(*map(_read_only, plan))
-
-
-def _read_only(array: np.ndarray) -> np.ndarray:
-    """A view: kernels are compiled for each kind of array that they are given, so all are of one."""
-    view = array.view()
-    view.flags.writeable = False
-    return view
-
-
-def _record(result: ClosedLoopRun, sizes: Sizes) -> Record:
-    """The arrays of a run; those that it is not asked for have no rows or columns."""
-    values = {name: getattr(result, name) for name in Record._fields}
-    absent = {name: np.zeros((0, 0)) for name in values} | {
-        "pose_sensitivity": np.zeros((0, 0, 0)),
-        "start_sensitivity": np.zeros((len(result.time), sizes.coordinates, 0)),
-        "end_start_sensitivity": np.zeros((sizes.start, 0)),
+    start = problem.start
+    given = {
+        "reference": problem.reference.poses,
+        "reference_rate": problem.reference.rates,
+        "commands": commands,
+        "lost": np.zeros(0, bool) if problem.lost is None else problem.lost,
+        "noise": np.zeros((0, 0)) if problem.noise is None else problem.noise,
+        "start_commands": start.commands,
+        "start_integral_sensitivity": start.joint_integral_sensitivity,
     }
-    return Record(**{name: absent[name] if value is None else value for name, value in values.items()})
+    views = {name: array.view() for name, array in given.items()}
+    for view in views.values():  # kernels are compiled for each kind of array that they are given, so all are of one
+        view.flags.writeable = False
+    return Plan(**views, spans=command_schedule(problem))
 
 
-def _fill_task(task: Any, problem: LoopProblem, sizes: Sizes) -> None:
-    """Machine code, laws, parameters and gains."""
-    settings, known = problem.settings, problem.servo_robot.functions
+def _fill(memory: Memory, problem: LoopProblem, own: dict[str, MachineFunction], servo_motion: MachineFunction) -> None:
+    """Machine code, laws, parameters and gains, and the state at the first frame."""
+    task, now, start, sizes = memory.task, memory.now, problem.start, problem.sizes
+    settings = problem.settings
     for name in ("equation_of_motion", "motion_derivatives", "rate_map_derivative"):
-        task[name] = problem.robot.functions[name].address
+        task[name] = own[name].address
     for name, found in _addresses(sizes).items():
         task[name] = found
-    task.servo_motion = known["equation_of_motion"].address
+    task.servo_motion = servo_motion.address
     rigid, task.coulomb, task.viscous, (task.lp, task.li, task.ld) = split_parameters(problem.parameters)
     task.kp, task.kd, task.ki = settings.servo.kp, settings.servo.kd, settings.servo.ki
     task.friction = settings.friction.record
@@ -152,19 +132,7 @@ def _fill_task(task: Any, problem: LoopProblem, sizes: Sizes) -> None:
         task.stiffness, task.damping = settings.elasticity.stiffness, settings.elasticity.damping
         task.motor_inertia = settings.elasticity.motor_inertia
     task.rigid = rigid
-
-
-@lru_cache(maxsize=16)
-def _addresses(sizes: Sizes) -> dict[str, int]:
-    """Of the kernels that kernels call by address."""
-    memory = empty_memory(sizes)
-    arguments = memory.task, memory.now, memory.evaluations[0], memory.tangent, 0
-    return {name: address(kernel, *arguments) for name, kernel in CALLED.items()}
-
-
-def _fill_now(now: Any, problem: LoopProblem, sizes: Sizes, rigid: np.ndarray) -> None:
-    """The state at the first frame."""
-    start, rest = problem.start, np.zeros(sizes.joints)
+    rest = np.zeros(sizes.joints)
     motor = [rest if part is None else part for part in (start.motor_angle, start.motor_rate)]
     now.state = np.concatenate([start.pose, start.pose_rate, start.joint_integral, *motor])
     now.servo_integral, now.last_measured = start.servo_integral, start.last_measured
@@ -173,3 +141,11 @@ def _fill_now(now: Any, problem: LoopProblem, sizes: Sizes, rigid: np.ndarray) -
         room.inputs[-sizes.rigid :] = rigid
     now.step_column, now.start_moves = sizes.parameters, problem.start_sensitivities
     now.width = sizes.parameters + 1 + (sizes.start if problem.start_sensitivities else 0)
+
+
+@lru_cache(maxsize=16)
+def _addresses(sizes: Sizes) -> dict[str, int]:
+    """Of the kernels that kernels call by address."""
+    memory = empty_memory(sizes)
+    arguments = memory.task, memory.now, memory.evaluations[0], memory.tangent, 0
+    return {kernel.py_func.__name__: address(kernel, *arguments) for kernel in CALLED}

@@ -75,35 +75,27 @@ def measure_ideally(now: Record, plan: Record, record: Record, k: int) -> None:
 
 @kernel
 def serve(task: Record, now: Record, d: Record, plan: Record, measured: Array, k: int) -> None:
-    """The servo's command at one good frame, and its derivatives."""
-    size = len(measured)
+    """The servo's command at one good frame, and its derivatives. The Jacobian that it knows, at the measured pose, is
+    often the one where the motion is known."""
+    size, known = len(measured), now.known
+    same = known.valid and task.servo_motion == task.equation_of_motion
     for i in range(size):
         error = plan.reference[k, i] - measured[i]
         rate = (measured[i] - now.last_measured[i]) / now.elapsed
         now.servo_integral[i] += task.period * error
         by_rate = task.kd * (plan.reference_rate[k, i] - rate)
         now.demand[i] = task.kp * error + by_rate + task.ki * now.servo_integral[i]
-    jacobian = servo_jacobian(task, now, measured)
+        same = same and known.inputs[i] == measured[i]
+    jacobian = known.jacobian if same else now.served.jacobian
+    if not same:
+        copy(measured, now.served.inputs[:size])
+        call(task.servo_motion, now.served.inputs, now.served.mass)
     for i in range(len(now.mode)):
         now.last_command[i] = dot(jacobian[i], now.demand[:])
     if task.sensitivities:
         serve_tangent(task, now, d, measured, jacobian)
     copy(measured, now.last_measured[:])
     now.elapsed = 0.0
-
-
-@kernel
-def servo_jacobian(task: Record, now: Record, measured: Array) -> Array:
-    """J_theta (n, m) of the robot that the servo knows, at a measured pose: often that where the motion is known."""
-    size, known = len(measured), now.known
-    same = known.valid and task.servo_motion == task.equation_of_motion
-    for j in range(size):
-        same = same and known.inputs[j] == measured[j]
-    if same:
-        return known.jacobian
-    copy(measured, now.served.inputs[:size])
-    call(task.servo_motion, now.served.inputs, now.served.mass)
-    return now.served.jacobian
 
 
 @kernel
@@ -175,7 +167,7 @@ def run_frames(
     task: Record, now: Record, at: Record, d: Record, plan: Record, record: Record, first: int, last: int
 ) -> tuple[int, int]:
     """Frames `first` to `last`, without it; the status, and the frame that it is of."""
-    frames = len(record.pose)
+    frames, spans = len(record.pose), plan.spans
     if first == 0:
         begin(task, now, at, d, plan)
     for k in range(first, last):
@@ -183,15 +175,15 @@ def run_frames(
         status = issue_command(task, now, d, plan, record, k)
         if status != OK:
             return status, k
-        for span in range(plan.first_span[k], plan.first_span[k + 1]):
-            apply_command(task, now, d, plan, record, plan.span_command[span], plan.span_ramp[span])
-            if span == plan.first_span[k]:
+        for span in range(spans.first[k], spans.first[k + 1]):
+            apply_command(task, now, d, plan, record, spans.command[span], spans.ramp[span])
+            if span == spans.first[k]:
                 copy(now.state[:], at[0].state[:])
                 at[0].time = 0.0
                 status = invoke(task.evaluate_terms, task, now, at[0], d, 0)
                 copy(at[0].torque[:], record.torque[k])
             if status == OK and k + 1 < frames:
-                status = segment(task, now, at, d, plan.span_duration[span], plan.span_steps[span])
+                status = segment(task, now, at, d, spans.duration[span], spans.steps[span])
             if status != OK:
                 return status, k
     return OK, last

@@ -21,7 +21,7 @@ import numpy as np
 from dynamics.checks import check_choice, real, shown
 from dynamics.errors import SimulationError
 from dynamics.legs.rss_geometry import LEGS
-from dynamics.parameters import BODY_NAMES, INERTIAL, RIGID_BODY, RIGID_BODY_NAMES, split_parameters
+from dynamics.parameters import BODY_NAMES, INERTIAL, RIGID_BODY, RIGID_BODY_NAMES, VISCOUS, split_parameters
 from dynamics.robot import Robot
 
 LawName = Literal["coulomb_viscous", "smoothed", "stribeck"]
@@ -64,24 +64,9 @@ class FrictionLaw:
             raise SimulationError(f"{constant} = {shown(value)} belongs to the law `{law}`, not to `{self.name}`")
 
     @property
-    def sticks(self) -> bool:
-        """Whether a joint at rest can carry a friction torque."""
-        return self.name != "smoothed"
-
-    @property
-    def static_level(self) -> float:
-        """Breakaway torque over Coulomb torque."""
-        return self.static_ratio if self.static_ratio is not None else 1.0
-
-    @property
-    def slope_at_rest(self) -> float:
-        """Derivative of the dry part, over the Coulomb torque, with respect to the velocity at rest, s/rad."""
-        return 1 / self.smoothing_velocity if self.smoothing_velocity is not None else 0.0
-
-    @property
     def record(self) -> np.record:
         """The law as kernels read it: see `motion_kernels`."""
-        constants = self.smoothing_velocity or 0.0, self.static_level, self.stribeck_velocity or 0.0
+        constants = self.smoothing_velocity or 0.0, self.static_ratio or 1.0, self.stribeck_velocity or 0.0
         return np.array([(get_args(LawName).index(self.name), *constants)], FRICTION)[0]
 
 
@@ -122,16 +107,18 @@ class JointElasticity:
         Raises SimulationError where the motors are more than the cranks' inertia.
         """
         self._check_motors(robot, parameters)
-        jacobian = robot.joint_jacobian(pose)
-        carried = robot.mass_matrix(pose, parameters[:64]) - self.motor_inertia * jacobian.T @ jacobian
-        per_inertia = np.zeros((12, 12))
-        per_inertia[:6, :6] = jacobian @ np.linalg.solve(carried, jacobian.T)
-        per_inertia[6:, 6:] = np.eye(6) / self.motor_inertia
+        jacobian, n = robot.joint_jacobian(pose), LEGS
+        carried = robot.mass_matrix(pose, parameters[: VISCOUS.stop]) - self.motor_inertia * jacobian.T @ jacobian
+        per_inertia = np.zeros((2 * n, 2 * n))
+        per_inertia[:n, :n] = jacobian @ np.linalg.solve(carried, jacobian.T)
+        per_inertia[n:, n:] = np.eye(n) / self.motor_inertia
         _, coulomb, viscous, (lp, _, ld) = split_parameters(parameters)
-        dry = coulomb * friction.slope_at_rest
-        stiffness = _coupled(self.stiffness, np.full(6, lp))
-        damping = _coupled(self.damping, ld + viscous + dry)
-        motion = np.block([[np.zeros((12, 12)), np.eye(12)], [-per_inertia @ stiffness, -per_inertia @ damping]])
+        slope = 1 / friction.smoothing_velocity if friction.smoothing_velocity else 0.0  # of dry friction, at rest
+        stiffness = _coupled(self.stiffness, np.full(n, lp))
+        damping = _coupled(self.damping, ld + viscous + coulomb * slope)
+        motion = np.block(
+            [[np.zeros((2 * n, 2 * n)), np.eye(2 * n)], [-per_inertia @ stiffness, -per_inertia @ damping]]
+        )
         return max(1, ceil(frame_period * float(np.abs(np.linalg.eigvals(motion)).max()) / LARGEST_STEP))
 
     def _check_motors(self, robot: Robot, parameters: np.ndarray) -> None:
@@ -147,5 +134,5 @@ class JointElasticity:
 
 def _coupled(spring: float, at_motor: np.ndarray) -> np.ndarray:
     """(12, 12): what a spring between every crank and its motor, and `at_motor` (6,) to the base, do to both."""
-    one = spring * np.eye(6)
+    one = spring * np.eye(len(at_motor))
     return np.block([[one, -one], [-one, one + np.diag(at_motor)]])

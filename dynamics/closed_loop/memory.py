@@ -2,69 +2,50 @@
 robot, and the arrays that a run reads and writes.
 """
 
-from dataclasses import dataclass
+import re
+from collections import namedtuple
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from dynamics.closed_loop.command_schedule import CommandSchedule
 from dynamics.closed_loop.joints import FRICTION
-from dynamics.closed_loop.problem import MAX_DELAY_FRAMES
+from dynamics.closed_loop.problem import MAX_DELAY_FRAMES, LoopProblem, Sizes
 
 
 class Plan(NamedTuple):
-    """What a run reads at its frames, one row each; no rows where that is not given. Spans: see `command_schedule`."""
+    """What a run reads at its frames, one row each; no rows where that is not given."""
 
     reference: np.ndarray
     reference_rate: np.ndarray
     commands: np.ndarray
     lost: np.ndarray
     noise: np.ndarray
-    first_span: np.ndarray
-    span_command: np.ndarray
-    span_ramp: np.ndarray
-    span_duration: np.ndarray
-    span_steps: np.ndarray
     start_commands: np.ndarray
     start_integral_sensitivity: np.ndarray
+    spans: CommandSchedule
 
 
-class Record(NamedTuple):
-    """What a run writes: see `ClosedLoopRun`; no rows where that is not asked for."""
+RECORDED = (
+    "pose:fm pose_rate:fm torque:fn command:fn measured:fm measured_ok:f joint_integral:fn servo_integral:fm "
+    "pose_sensitivity:fmp start_sensitivity:fms end_sensitivity:Sp end_start_sensitivity:Ss "
+    "motor_angle:en motor_rate:en"
+)
+"""What a run writes (see `ClosedLoopRun`), with its dimensions by their letters (see `empty_record`)."""
 
-    pose: np.ndarray
-    pose_rate: np.ndarray
-    torque: np.ndarray
-    command: np.ndarray
-    measured: np.ndarray
-    joint_integral: np.ndarray
-    servo_integral: np.ndarray
-    measured_ok: np.ndarray
-    pose_sensitivity: np.ndarray
-    start_sensitivity: np.ndarray
-    end_sensitivity: np.ndarray
-    end_start_sensitivity: np.ndarray
-    motor_angle: np.ndarray
-    motor_rate: np.ndarray
+Record: Any = namedtuple("Record", re.findall(r"(\w+):", RECORDED))  # type: ignore[misc]
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """Numbers of joints, of coordinates of the platform, and of parameters of the rigid bodies."""
-
-    joints: int
-    coordinates: int
-    rigid: int
-
-    @property
-    def parameters(self) -> int:
-        """Rigid bodies, Coulomb and viscous friction of every joint, and the joint PID."""
-        return self.rigid + 2 * self.joints + 3
-
-    @property
-    def start(self) -> int:
-        """Entries of the start state: pose, pose rate, joint PID integral, servo integral."""
-        return 3 * self.coordinates + self.joints
+def empty_record(problem: LoopProblem) -> Any:
+    """Room for what a run writes; what it is not asked for has no rows or no columns."""
+    sizes, frames = problem.sizes, problem.frames
+    length = {"f": frames, "n": sizes.joints, "m": sizes.coordinates, "S": sizes.start}
+    length["p"] = sizes.parameters if problem.sensitivities else 0
+    length["s"] = sizes.start if problem.start_sensitivities else 0
+    length["e"] = frames if problem.settings.elasticity else 0
+    shapes = [tuple(length[letter] for letter in letters) for letters in re.findall(r":(\w+)", RECORDED)]
+    return Record(*[np.zeros(shape, bool if len(shape) == 1 else float) for shape in shapes])
 
 
 class Memory(NamedTuple):

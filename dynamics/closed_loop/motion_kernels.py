@@ -56,35 +56,6 @@ def slip_friction(task: Record, joint: int, velocity: float, mode: int) -> float
 
 
 @kernel
-def wind_springs(task: Record, at: Record, motor: Array, motor_rate: Array) -> None:
-    """Torques of the springs; from here on the motors stand for the cranks in what joint PID and friction feel."""
-    for i in range(len(at.spring)):
-        wound, winding = motor[i] - at.angle[i], motor_rate[i] - at.velocity[i]
-        at.spring[i] = task.stiffness * wound + task.damping * winding
-        at.angle[i] = motor[i]
-        at.velocity[i] = motor_rate[i]
-
-
-@kernel
-def accelerate_motors(task: Record, at: Record, mode: Array, acceleration: Array) -> None:
-    """Accelerations (n,) of the motors; one that sticks gets the friction torque that keeps it at rest."""
-    for i in range(len(mode)):
-        left = at.net_torque[i] - at.spring[i]
-        acceleration[i] = left / task.motor_inertia if mode[i] != 0 else 0.0
-        if mode[i] == 0:
-            at.stick_force[i] = left
-            at.net_torque[i] -= left
-
-
-@kernel
-def decide_motor_modes(task: Record, at: Record, mode: Array, joints: Array) -> None:
-    """Motors at rest do not feel each other: each sticks where its friction can carry the torque that is left."""
-    for i in joints:
-        left = at.torque[i] - at.spring[i]
-        mode[i] = 0 if abs(left) < breakaway(task, i) else 1 if left >= 0 else -1
-
-
-@kernel
 def stuck_joints(now: Record) -> Array:
     """The joints that stick."""
     count = 0
@@ -140,9 +111,12 @@ def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> 
         at.angle[i], at.velocity[i] = known.angle[i], known.velocity[i]
         at.bias_acceleration[i] = known.bias_acceleration[i]
         copy(known.jacobian[i], at.jacobian[i])
-    if task.stiffness > 0:
-        wind_springs(task, at, state[first + count : first + 2 * count], state[first + 2 * count :])
     for i in range(count):
+        if task.stiffness > 0:  # from here on the motors stand for the cranks in what joint PID and friction feel
+            motor, motor_rate = state[first + count + i], state[first + 2 * count + i]
+            wound, winding = motor - at.angle[i], motor_rate - at.velocity[i]
+            at.spring[i] = task.stiffness * wound + task.damping * winding
+            at.angle[i], at.velocity[i] = motor, motor_rate
         at.error[i] = now.command[i] + now.command_slope[i] * at.time - at.angle[i]
         damped = task.ld * (now.command_rate[i] - at.velocity[i])
         at.torque[i] = task.lp * at.error[i] + damped + task.li * state[first + i]
@@ -150,8 +124,8 @@ def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> 
 
 
 @kernel
-def evaluate_compliance(at: Record, joints: Array) -> None:
-    """M^-1 J^T (n, m) and J M^-1 J^T (n, n) of some joints, in their order."""
+def hold_compliance(at: Record, joints: Array) -> None:
+    """M^-1 J^T (n, m) and J M^-1 J^T (n, n) of some joints, in their order, and the Cholesky factor of the latter."""
     size = len(at.bias)
     for s in range(len(joints)):
         copy(at.jacobian[joints[s]], at.response[s])
@@ -159,12 +133,6 @@ def evaluate_compliance(at: Record, joints: Array) -> None:
         for r in range(s + 1):
             at.compliance[s, r] = dot(at.jacobian[joints[r]], at.response[s])
             at.compliance[r, s] = at.compliance[s, r]
-
-
-@kernel
-def hold_compliance(at: Record, joints: Array) -> None:
-    """The compliance of some joints, and its Cholesky factor."""
-    evaluate_compliance(at, joints)
     cholesky(at.compliance, len(joints), at.stuck_factor)
 
 
@@ -192,18 +160,16 @@ def accelerate(task: Record, now: Record, at: Record) -> None:
     copy(at.error[:], at.slope[2 * size : 2 * size + count])
     if task.stiffness > 0:
         copy(at.velocity[:], at.slope[2 * size + count : 2 * size + 2 * count])
-        accelerate_motors(task, at, now.mode, at.slope[2 * size + 2 * count :])
+        for i in range(count):
+            left = at.net_torque[i] - at.spring[i]
+            at.slope[2 * size + 2 * count + i] = left / task.motor_inertia if now.mode[i] != 0 else 0.0
+            if now.mode[i] == 0:
+                at.stick_force[i] = left
+                at.net_torque[i] -= left
         accelerate_freely(at, at.spring, acceleration)
         return
     accelerate_freely(at, at.net_torque, acceleration)
     stuck = stuck_joints(now)
-    if len(stuck) > 0:
-        hold(at, stuck, acceleration)
-
-
-@kernel
-def hold(at: Record, stuck: Array, acceleration: Array) -> None:
-    """Give stuck joints the friction torque that keeps them at rest, and take its effect out of the acceleration."""
     hold_compliance(at, stuck)
     for s in range(len(stuck)):
         at.force[s] = dot(at.jacobian[stuck[s]], acceleration) + at.bias_acceleration[stuck[s]]
@@ -211,9 +177,9 @@ def hold(at: Record, stuck: Array, acceleration: Array) -> None:
     for s in range(len(stuck)):
         at.stick_force[stuck[s]] = at.force[s]
         at.net_torque[stuck[s]] -= at.force[s]
-        for j in range(len(acceleration)):
+        for j in range(size):
             acceleration[j] -= at.response[s, j] * at.force[s]
-    if len(stuck) == len(acceleration):
+    if len(stuck) == size:
         fill(acceleration, 0.0)  # a robot that stands still stands still: rounding must not make it creep
 
 
@@ -238,12 +204,13 @@ def follow_frictionless(task: Record, now: Record, at: Record) -> None:
 def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """Which of the joints in mode 0, at rest, stick, and how the others start: projected Gauss-Seidel on friction."""
     joints = stuck_joints(now)
-    if task.stiffness > 0:
-        decide_motor_modes(task, at, now.mode, joints)
+    if task.stiffness > 0:  # motors at rest do not feel each other
+        for i in joints:
+            left = at.torque[i] - at.spring[i]
+            now.mode[i] = 0 if abs(left) < breakaway(task, i) else 1 if left >= 0 else -1
+    if task.stiffness > 0 or len(joints) == 0:
         return OK
-    if len(joints) == 0:
-        return OK
-    evaluate_compliance(at, joints)
+    hold_compliance(at, joints)
     for i in range(len(now.mode)):
         at.net_torque[i] = at.torque[i]
         if now.mode[i] != 0:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -12,7 +13,8 @@ from dynamics.errors import SimulationError
 from dynamics.parameters import JOINT_PID_NAMES, PARAMETER_NAMES, check_parameters
 from dynamics.robot import Robot
 
-PARAMETER_COUNT = len(PARAMETER_NAMES) + 3
+DYNAMIC_COUNT = len(PARAMETER_NAMES)
+PARAMETER_COUNT = DYNAMIC_COUNT + len(JOINT_PID_NAMES)
 LENGTH = PARAMETER_COUNT  # sensitivities inside a run: the column of the length of the present step, then the start
 START_COUNT = 24  # pose, pose rate, joint PID integral, servo integral
 MAX_DELAY_FRAMES = 60
@@ -65,12 +67,14 @@ class FrameTiming:
     def __post_init__(self) -> None:
         real("frame rate", self.frame_rate_hz, SimulationError, above=0, unit=" Hz")
         real("latency", self.latency_s, SimulationError, unit=" s")
-        if not 0 <= self.latency_s * self.frame_rate_hz <= MAX_DELAY_FRAMES:
-            raise SimulationError(
-                f"latency is {self.latency_s} s, must be >= 0 and at most {MAX_DELAY_FRAMES} frames "
-                f"({MAX_DELAY_FRAMES / self.frame_rate_hz:.3g} s)"
-            )
+        self.check_latency("latency", self.latency_s)
         check_choice("hold", self.hold, get_args(Hold), SimulationError)
+
+    def check_latency(self, name: str, latency_s: float) -> None:
+        """Raise SimulationError for a latency that is negative or too many frames."""
+        if not 0 <= latency_s * self.frame_rate_hz <= MAX_DELAY_FRAMES:
+            limit = f"{MAX_DELAY_FRAMES} frames ({MAX_DELAY_FRAMES / self.frame_rate_hz:.3g} s)"
+            raise SimulationError(f"{name} is {latency_s} s, must be >= 0 and at most {limit}")
 
 
 @dataclass(frozen=True)
@@ -149,6 +153,25 @@ class StartState:
 
 
 @dataclass(frozen=True)
+class Sizes:
+    """Numbers of joints, of coordinates of the platform, and of parameters of the rigid bodies."""
+
+    joints: int
+    coordinates: int
+    rigid: int
+
+    @property
+    def parameters(self) -> int:
+        """Rigid bodies, Coulomb and viscous friction of every joint, and the joint PID."""
+        return self.rigid + 2 * self.joints + 3
+
+    @property
+    def start(self) -> int:
+        """Entries of the start state: pose, pose rate, joint PID integral, servo integral."""
+        return 3 * self.coordinates + self.joints
+
+
+@dataclass(frozen=True)
 class LoopProblem:
     """One run to be done, checked: what `closed_loop.simulate` was given, and the state it starts from."""
 
@@ -177,6 +200,12 @@ class LoopProblem:
         """Time between two frames, s."""
         return 1.0 / self.settings.timing.frame_rate_hz
 
+    @cached_property
+    def sizes(self) -> Sizes:
+        """Those of the robot's equation of motion."""
+        motion = self.robot.functions["equation_of_motion"]
+        return Sizes(joints=motion.outputs[2][0], coordinates=motion.inputs[0], rigid=motion.inputs[2])
+
 
 def measurement(
     sensor: PoseSensor | RateSensor, frame: int, time: float, pose: np.ndarray, rate: np.ndarray
@@ -201,17 +230,16 @@ def own_command(controller: Controller, problem: LoopProblem, frame: int, measur
 def checked_loop_parameters(parameters: object) -> np.ndarray:
     """The 64 dynamic parameters and lp, li, ld (67,). Raises SimulationError, or ParameterError for a dynamic one."""
     values = floats("loop parameters", parameters, (PARAMETER_COUNT,), error=SimulationError, finite=False)
-    check_parameters(values[:64])
-    lp, li, ld = JOINT_PID_NAMES
-    for name, value in ((lp, values[64]), (ld, values[66])):
-        real(name, value, SimulationError, least=0)
-    real(li, values[65], SimulationError, above=0)
+    check_parameters(values[:DYNAMIC_COUNT])
+    for name, value in zip(JOINT_PID_NAMES, values[DYNAMIC_COUNT:], strict=True):
+        least, above = (None, 0) if name == "joint_pid.li" else (0, None)
+        real(name, value, SimulationError, least=least, above=above)
     return values
 
 
 def check_start_pose(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> None:
     """Raise UnreachablePoseError or SingularPoseError for a pose (6,) from which no run can start."""
-    robot.static_torque(pose, parameters[:64])  # refuses a pose out of reach or singular, with the evidence
+    robot.static_torque(pose, parameters[:DYNAMIC_COUNT])  # refuses a pose out of reach or singular, with the evidence
     robot.pose_rate(pose, np.zeros(6))  # refuses Euler angles at their singularity
 
 
@@ -230,14 +258,13 @@ def equilibrium(
     check_type("robot", robot, Robot, SimulationError)
     check_type("servo", servo, ServoGains, SimulationError)
     parameters, pose = checked_loop_parameters(parameters), floats("pose", pose, (6,))
-    li, rest = parameters[65], np.zeros(6)
+    rest, (dynamic, (_, li, _)) = np.zeros(6), np.split(parameters, [DYNAMIC_COUNT])
     check_start_pose(robot, parameters, pose)
     angles = robot.inverse_kinematics(pose)
     torque_map = np.linalg.solve(robot.joint_jacobian(pose).T, robot.regressor(pose, rest, rest))
-    integral = torque_map @ parameters[:64] / li
-    sensitivity = np.zeros((6, PARAMETER_COUNT))
-    sensitivity[:, :64] = torque_map / li
-    sensitivity[:, 65] = -integral / li
+    integral = torque_map @ dynamic / li
+    zero = np.zeros((len(integral), 1))
+    sensitivity = np.hstack([torque_map / li, zero, -integral[:, None] / li, zero])  # by lp, li, ld in the end
     motors = {}
     if elasticity is not None:
         angles = angles + li * integral / elasticity.stiffness

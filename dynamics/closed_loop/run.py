@@ -5,20 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynamics.checks import whole
-from dynamics.closed_loop.problem import (
-    LEFT_REACH,
-    MAX_DELAY_FRAMES,
-    MEASURED_OUT_OF_REACH,
-    PARAMETER_COUNT,
-    START_COUNT,
-    LoopProblem,
-    StartState,
-)
+from dynamics.closed_loop.problem import MAX_DELAY_FRAMES, StartState
 from dynamics.errors import SimulationError
-from dynamics.robot import Robot
-
-RECORDS = ("pose", "pose_rate", "torque", "command", "measured", "joint_integral", "servo_integral")
-"""What a run keeps of every frame, (frames, 6) each."""
 
 
 @dataclass(frozen=True)
@@ -74,46 +62,9 @@ class ClosedLoopRun:
         )
 
 
-def empty_run(problem: LoopProblem) -> ClosedLoopRun:
-    """What a run is written into: zeros, and None for the derivatives that it is not asked for."""
-    frames = problem.frames
-    rows = dict(zip(RECORDS, np.zeros((len(RECORDS), frames, 6)), strict=True))
-    by_parameters, by_start = problem.sensitivities, problem.start_sensitivities
-    return ClosedLoopRun(
-        time=np.arange(frames) * problem.period,
-        **rows,
-        measured_ok=np.zeros(frames, dtype=bool),
-        pose_sensitivity=np.zeros((frames, 6, PARAMETER_COUNT)) if by_parameters else None,
-        start_sensitivity=np.zeros((frames, 6, START_COUNT)) if by_start else None,
-        end_sensitivity=np.zeros((START_COUNT, PARAMETER_COUNT)) if by_parameters else None,
-        end_start_sensitivity=np.zeros((START_COUNT, START_COUNT)) if by_start else None,
-        motor_angle=np.zeros((frames, 6)) if problem.settings.elasticity else None,
-        motor_rate=np.zeros((frames, 6)) if problem.settings.elasticity else None,
-        events=0,
-        start=problem.start,
-    )
-
-
 class LoopFailure(SimulationError):
     """A run that ended early; `frame` says where."""
 
     def __init__(self, message: str, frame: int) -> None:
         super().__init__(message)
         self.frame = frame
-
-
-def failure(reason: str, frame: int, problem: LoopProblem, pose: np.ndarray, measured: np.ndarray) -> LoopFailure:
-    """The error of a run that ended early, the same on both paths; pose (6,) where it stopped, measured (frames, 6)."""
-    when = f"frame {frame} (t = {frame * problem.period:.3f} s)"
-    evidence = ""
-    if reason == MEASURED_OUT_OF_REACH:
-        evidence = f"; there {_nearest_leg(problem.robot, measured[frame])}"
-    if reason == LEFT_REACH:
-        evidence = f": {_nearest_leg(problem.robot, pose)}"
-    return LoopFailure(f"closed loop stopped at {when}: {reason}{evidence}", frame)
-
-
-def _nearest_leg(robot: Robot, pose: np.ndarray) -> str:
-    margin = robot.reach_margin(pose)
-    leg = int(np.argmin(margin))
-    return f"leg {leg + 1} has the least reach margin, {margin[leg]:.3g}, must be > 0"

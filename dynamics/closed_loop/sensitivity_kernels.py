@@ -26,14 +26,14 @@ NO_APPROACH = 1e-9  # rad/s^2 or N m/s: an event so slow has no derivative
 
 @kernel
 def differentiate_motion(
-    task: Record, now: Record, known: Record, pose: Array, rate: Array, acceleration: Array, torque: Array
+    task: Record, now: Record, pose: Array, rate: Array, acceleration: Array, torque: Array
 ) -> None:
     """Derivatives of the equation of motion at fixed acceleration and net joint torque."""
-    size, count = len(pose), len(torque)
+    size, known = len(pose), now.derivatives
     copy(pose, known.inputs[:size])
     copy(rate, known.inputs[size : 2 * size])
     copy(acceleration, known.inputs[2 * size : 3 * size])
-    copy(torque, known.inputs[3 * size : 3 * size + count])
+    copy(torque, known.inputs[3 * size :])
     call(task.motion_derivatives, known.inputs, known.by_pose)
 
 
@@ -71,9 +71,7 @@ def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> i
     pose, rate = x[:size], x[size : 2 * size]
     d_acceleration, d_error = out[size : 2 * size], out[2 * size :]
     state = at.state
-    differentiate_motion(
-        task, now, known, state[:size], state[size : 2 * size], at.slope[size : 2 * size], at.net_torque[:]
-    )
+    differentiate_motion(task, now, state[:size], state[size : 2 * size], at.slope[size : 2 * size], at.net_torque[:])
     copy_rows(rate, out[:size], width)
     copy_rows(d.command[:], d_error, width)
     for i in range(count):
@@ -87,8 +85,7 @@ def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> i
     torque_tangent(task, now, at, d, x, d_error)
     clear(d_acceleration, width)
     for i in range(size):
-        for k in range(len(task.rigid)):
-            d_acceleration[i, k] = -known.columns[i, k]
+        add_row(-1.0, known.columns[i], d_acceleration[i], len(task.rigid))
     add_product(-1.0, known.by_pose, pose, d_acceleration, width)
     add_product(-1.0, known.by_rate, rate, d_acceleration, width)
     for i in range(count):
@@ -129,21 +126,6 @@ def tangent_moved(now: Record, at: Record, d: Record, stage: int, h: float, frac
 
 
 @kernel
-def runge_kutta_tangent(task: Record, now: Record, at: Record, d: Record, h: float) -> None:
-    """Sensitivities over the step whose stages are stored."""
-    for k in range(4):
-        if k == 0:
-            copy_rows(d.x[:], d.trial[:], now.width)
-        else:
-            tangent_moved(now, at, d, k - 1, h, FRACTION[k], d.trial[:])
-        copy(d.time[:], d.stage_time[:])
-        add_row(FRACTION[k], d.length[:], d.stage_time[:], now.width)
-        invoke(task.slope_tangent, task, now, at[k], d, k)
-    for k in range(4):
-        tangent_moved(now, at, d, k, h, WEIGHT[k], d.x[:])
-
-
-@kernel
 def velocity_by_pose(task: Record, now: Record, pose: Array, rate: Array) -> Array:
     """d(J_theta rate)/d(pose) (n, m)."""
     copy(pose, now.pose_and_rate[: len(pose)])
@@ -153,36 +135,30 @@ def velocity_by_pose(task: Record, now: Record, pose: Array, rate: Array) -> Arr
 
 
 @kernel
-def margin_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
-    """Derivative of the margin that vanishes at an event: of a velocity, or of what a stuck joint holds."""
-    size, width, joint = len(end.bias), now.width, mode_margin(task, now, end)[1]
+def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
+    """The event sets the length of the step that it cuts: margin(end of the step, its length) = 0. The margin is that
+    of a velocity, or of what a stuck joint holds."""
+    size, width, column, joint = len(end.bias), now.width, now.step_column, mode_margin(task, now, end)[1]
     fill(d.margin[:], 0.0)
     if now.mode[joint] != 0:
         by_pose = velocity_by_pose(task, now, end.state[:size], end.state[size : 2 * size])
         for j in range(size):
             add_row(by_pose[joint, j], d.x[j], d.margin[:], width)
             add_row(end.jacobian[joint, j], d.x[size + j], d.margin[:], width)
-        return
-    copy(d.time[:], d.stage_time[:])
-    d.stage_time[now.step_column] = 1.0
-    copy_rows(d.x[:], d.trial[:], width)
-    invoke(task.slope_tangent, task, now, end, d, 0)
-    add_row(1.0 if end.stick_force[joint] > 0 else -1.0, d.torque[joint], d.margin[:], width)
-    d.margin[len(task.rigid) + joint] -= task.friction.static_level
-
-
-@kernel
-def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
-    """The event sets the length of the step that it cuts: margin(end of the step, its length) = 0."""
-    margin_tangent(task, now, end, d)
-    column = now.step_column
+    else:
+        copy(d.time[:], d.stage_time[:])
+        d.stage_time[column] = 1.0
+        copy_rows(d.x[:], d.trial[:], width)
+        invoke(task.slope_tangent, task, now, end, d, 0)
+        add_row(1.0 if end.stick_force[joint] > 0 else -1.0, d.torque[joint], d.margin[:], width)
+        d.margin[len(task.rigid) + joint] -= task.friction.static_level
     approach = d.margin[column]
     fill(d.length[:], 0.0)
     if abs(approach) > NO_APPROACH:
-        add_row(-1 / approach, d.margin[:], d.length[:], now.width)
+        add_row(-1 / approach, d.margin[:], d.length[:], width)
     d.length[column] = 0.0
     for i in range(len(d.x)):
-        add_row(d.x[i, column], d.length[:], d.x[i], now.width)
+        add_row(d.x[i, column], d.length[:], d.x[i], width)
         d.x[i, column] = 0.0
 
 
@@ -196,7 +172,16 @@ def step_tangent(task: Record, now: Record, at: Record, d: Record, h: float, eve
     if not event:
         add_row(-1.0, d.time[:], d.length[:], now.width)
     now.length_moves = cut or now.time_moves
-    runge_kutta_tangent(task, now, at, d, h)
+    for k in range(4):
+        if k == 0:
+            copy_rows(d.x[:], d.trial[:], now.width)
+        else:
+            tangent_moved(now, at, d, k - 1, h, FRACTION[k], d.trial[:])
+        copy(d.time[:], d.stage_time[:])
+        add_row(FRACTION[k], d.length[:], d.stage_time[:], now.width)
+        invoke(task.slope_tangent, task, now, at[k], d, k)
+    for k in range(4):
+        tangent_moved(now, at, d, k, h, WEIGHT[k], d.x[:])
     if cut:
         length_tangent(task, now, at[END], d)
     add_row(1.0, d.length[:], d.time[:], now.width)
@@ -214,17 +199,14 @@ def stop_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> in
     fill(now.rest[:], 0.0)
     fill(now.impulse[:], 0.0)
     clear(d.moved[:], width)
-    differentiate_motion(task, now, known, now.state[:size], now.rest[:], now.rest[:], now.impulse[:])
-    for i in range(size):
-        for k in range(len(task.rigid)):
-            d.moved[i, k] = known.columns[i, k]
+    differentiate_motion(task, now, now.state[:size], now.rest[:], now.rest[:], now.impulse[:])
+    copy_rows(known.columns, d.moved[:], len(task.rigid))
     add_product(1.0, known.by_pose, pose, d.moved[:], width)
     for s in range(len(stuck)):
         now.impulse[stuck[s]] = -at.force[s]
-    differentiate_motion(task, now, known, now.state[:size], now.rest[:], now.change[:], now.impulse[:])
+    differentiate_motion(task, now, now.state[:size], now.rest[:], now.change[:], now.impulse[:])
     for i in range(size):
-        for k in range(len(task.rigid)):
-            d.moved[i, k] -= known.columns[i, k]  # the difference leaves out gravity
+        add_row(-1.0, known.columns[i], d.moved[i], len(task.rigid))  # the difference leaves out gravity
     add_product(-1.0, known.by_pose, pose, d.moved[:], width)
     solve_rows(at.factor, size, d.moved[:], width)
     for j in range(size):

@@ -12,7 +12,6 @@ import numpy as np
 
 from dynamics.checks import Shape, check_type, flag, floats, mask, shown, whole
 from dynamics.closed_loop.problem import (
-    MAX_DELAY_FRAMES,
     PARAMETER_COUNT,
     Controller,
     FrameTiming,
@@ -69,7 +68,15 @@ def simulate(
     Raises LoopFailure when the robot leaves the reachable set (an unstable loop); and before the run
     UnreachablePoseError where reference or start do, ParameterError, SimulationError, SingularPoseError.
     """
-    _check_kinds(robot, reference, settings, sensor, servo_robot, controller)
+    check_type("robot", robot, Robot, SimulationError)
+    check_type("reference", reference, Reference, SimulationError)
+    check_type("settings", settings, LoopSettings, SimulationError)
+    if servo_robot is not None:
+        check_type("servo_robot", servo_robot, Robot, SimulationError)
+    if sensor is not None and not callable(sensor) and not isinstance(sensor, RateSensor):
+        raise SimulationError(f"sensor must be a function of frame, time and pose, or None, got {shown(sensor)}")
+    if controller is not None and not callable(controller):
+        raise SimulationError(f"controller must be a function, or None for the servo, got {shown(controller)}")
     start_sensitivities = flag("start_sensitivities", start_sensitivities, SimulationError)
     sensitivities = flag("sensitivities", sensitivities, SimulationError) or start_sensitivities
     compiled = flag("compiled", compiled, SimulationError)
@@ -80,6 +87,10 @@ def simulate(
     else:
         check_type("start", start, StartState, SimulationError)
         check_start_pose(robot, parameters, start.pose)
+    if latencies is not None:
+        latencies = floats("latencies", latencies, (frames,), error=SimulationError)
+        for frame, latency in enumerate(latencies.tolist()):
+            settings.timing.check_latency(f"latency of frame {frame}", latency)
     problem = LoopProblem(
         robot,
         parameters,
@@ -92,13 +103,15 @@ def simulate(
         commands=_checked_rows("commands", commands, frames),
         lost=None if lost is None else mask("lost", lost, frames, SimulationError),
         noise=_checked_rows("noise", noise, frames),
-        latencies=None if latencies is None else _checked_latencies(latencies, frames, settings.timing),
+        latencies=latencies,
         servo_robot=servo_robot or robot,
         controller=controller,
     )
     _check_together(problem, servo_robot)
     _check_elasticity(problem)
-    return _run(problem, compiled)
+    from dynamics.closed_loop.execution import run  # imports numba, which takes its time
+
+    return run(problem, compiled)
 
 
 def simulate_batch(
@@ -151,13 +164,6 @@ def prepare(robot: Robot) -> None:
     simulate(robot, next(iter(robot.parameter_sets.values())).vector, reference, settings)
 
 
-def _run(problem: LoopProblem, compiled: bool) -> ClosedLoopRun:
-    # Importing the kernels imports numba, which takes its time.
-    from dynamics.closed_loop.execution import run
-
-    return run(problem, compiled)
-
-
 def _cores() -> int:
     """Cores that this process may use; where only Linux can say so, all of the machine."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -173,25 +179,6 @@ def _listed(name: str, given: Item | Sequence[Item], kind: type[Item]) -> list[I
     return items
 
 
-def _check_kinds(
-    robot: Robot,
-    reference: Reference,
-    settings: LoopSettings,
-    sensor: object,
-    servo_robot: Robot | None,
-    controller: object,
-) -> None:
-    """Raise SimulationError for parts of a run that are not what they are called."""
-    kinds = {"robot": (robot, Robot), "reference": (reference, Reference), "settings": (settings, LoopSettings)}
-    kinds |= {} if servo_robot is None else {"servo_robot": (servo_robot, Robot)}
-    for name, (value, kind) in kinds.items():
-        check_type(name, value, kind, SimulationError)
-    if sensor is not None and not callable(sensor) and not isinstance(sensor, RateSensor):
-        raise SimulationError(f"sensor must be a function of frame, time and pose, or None, got {shown(sensor)}")
-    if controller is not None and not callable(controller):
-        raise SimulationError(f"controller must be a function, or None for the servo, got {shown(controller)}")
-
-
 @lru_cache(maxsize=64)
 def _check_reach(robot: Robot, reference: Reference) -> None:
     """Raise UnreachablePoseError, naming frame and leg, for a pose out of a robot's reach; asked once for both."""
@@ -201,19 +188,6 @@ def _check_reach(robot: Robot, reference: Reference) -> None:
 def _checked_rows(name: str, rows: object, frames: int) -> np.ndarray | None:
     """Rows (frames, 6) as C doubles; None stays None. Raises SimulationError."""
     return None if rows is None else np.ascontiguousarray(floats(name, rows, (frames, 6), error=SimulationError))
-
-
-def _checked_latencies(latencies: object, frames: int, timing: FrameTiming) -> np.ndarray:
-    """Latency (frames,), s, of each frame's command. Raises SimulationError for one that no `FrameTiming` may have."""
-    values = floats("latencies", latencies, (frames,), error=SimulationError)
-    in_frames = values * timing.frame_rate_hz
-    wrong = np.flatnonzero((in_frames < 0) | (in_frames > MAX_DELAY_FRAMES))
-    if len(wrong):
-        raise SimulationError(
-            f"latency of frame {wrong[0]} is {values[wrong[0]]:g} s, must be >= 0 and at most "
-            f"{MAX_DELAY_FRAMES} frames ({MAX_DELAY_FRAMES / timing.frame_rate_hz:.3g} s)"
-        )
-    return values
 
 
 def _check_together(problem: LoopProblem, servo_robot: Robot | None) -> None:

@@ -57,13 +57,6 @@ def breaks_halfway(task: Record, now: Record, at: Record, d: Record, h: float) -
 
 
 @kernel
-def kept_share(margin: float, before: float) -> float:
-    """By how much to weigh down the end of the bracket that stayed, when the other end moved twice."""
-    share = 1 - margin / before
-    return share if share > 0 else 0.5
-
-
-@kernel
 def locate_event(task: Record, now: Record, at: Record, d: Record, h: float, margin: float) -> tuple[int, float, bool]:
     """The step in (0, h] at which the modes stop holding: regula falsi (Anderson-Bjorck) on the margin, here that at h.
 
@@ -94,14 +87,16 @@ def locate_event(task: Record, now: Record, at: Record, d: Record, h: float, mar
             return status, high, False
         tried = middle
         if margin <= 0:
-            if side < 0:
-                at_low *= kept_share(margin, at_high)
+            if side < 0:  # the other end of the bracket, which stayed twice, is weighed down
+                share = 1 - margin / at_high
+                at_low *= share if share > 0 else 0.5
             high, at_high, side = middle, margin, -1
             if margin == 0:
                 break
         else:
             if side > 0:
-                at_high *= kept_share(margin, at_low)
+                share = 1 - margin / at_low
+                at_high *= share if share > 0 else 0.5
             low, at_low, side = middle, margin, 1
     status = OK
     if high != tried:
@@ -118,10 +113,11 @@ def stop_joints(task: Record, now: Record, at: Record, d: Record, k: int) -> int
         for i in stuck:
             now.state[2 * size + 2 * len(now.mode) + i] = 0.0
         return OK
+    if len(stuck) == 0:
+        return OK
     if len(stuck) == size:
         fill(rate, 0.0)
         clear(d.x[size : 2 * size], now.width)
-    if len(stuck) == size or len(stuck) == 0:
         return OK
     hold_compliance(at, stuck)
     for s in range(len(stuck)):
@@ -166,8 +162,7 @@ def after_event(task: Record, now: Record, at: Record, d: Record, held: bool) ->
 @kernel
 def step(task: Record, now: Record, at: Record, d: Record, target: float) -> int:
     """One step to the time `target`, s, or to where the first mode before it ends."""
-    h = target - at[0].time
-    held, event = True, False
+    h, held = target - at[0].time, True
     status, margin = try_step(task, now, at, d, h)
     if status != OK:
         return status
