@@ -6,7 +6,7 @@ The paper calls the driven arm of a leg its wrench; here it is the crank.
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dynamics.checks import floats
+from dynamics.checks import Shape, floats
 from dynamics.errors import ParameterError
 from dynamics.legs.rss_geometry import LEGS
 
@@ -50,22 +50,19 @@ def split_parameters(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
     return values[RIGID_BODY], values[COULOMB], values[VISCOUS], values[VISCOUS.stop :]
 
 
-def check_parameters(values: ArrayLike) -> np.ndarray:
-    """Return values as a float array (64,); raise ParameterError on a wrong shape, NaN, or a negative entry."""
-    array = floats("parameters", values, (len(PARAMETER_NAMES),), error=ParameterError, finite=False)
-    check_ranges(array)
-    return array
+def check_parameters(values: ArrayLike, *, batch: bool = False) -> np.ndarray:
+    """The values as floats (64,), or (N, 64) where a batch may be.
 
-
-def check_ranges(parameters: np.ndarray) -> None:
-    """Raise ParameterError where one of parameters (64,) or (N, 64) is NaN, infinite, negative, or no platform mass.
-
-    The error names the parameter with its value, unit and limit, and its row in a batch.
+    Raises ParameterError for another shape, and for one that is NaN, infinite, negative, or no platform mass; it names
+    the parameter with its value, unit and limit, and its row in a batch.
     """
+    count = len(PARAMETER_NAMES)
+    shapes: list[Shape] = [(count,), ("N", count)]
+    parameters = floats("parameters", values, *shapes[: 1 + batch], error=ParameterError, finite=False)
     allowed = (parameters >= 0) & (parameters < np.inf)
     allowed[..., 0] &= parameters[..., 0] > 0
     if allowed.all():
-        return
+        return parameters
     place = tuple(int(index) for index in np.argwhere(~allowed)[0])
     name, limit = PARAMETER_NAMES[place[-1]], ">= 0" if place[-1] else "> 0"
     where = f" (row {place[0]})" if len(place) > 1 else ""

@@ -18,7 +18,6 @@ from dynamics.checks import check_type, floats, real, row_text, rows, shown
 from dynamics.compiled.machine_code import MachineFunction, compiled_functions
 from dynamics.errors import (
     DynamicsError,
-    ParameterError,
     RobotFileError,
     ShapeError,
     SingularPoseError,
@@ -27,7 +26,7 @@ from dynamics.errors import (
 from dynamics.kinematics import forward_kinematics
 from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
 from dynamics.legs.rss_inverse_kinematics import home_angles
-from dynamics.parameters import PARAMETER_NAMES, check_parameters, check_ranges
+from dynamics.parameters import PARAMETER_NAMES, check_parameters
 from dynamics.rigid_body.equation_of_motion import motion_functions
 from dynamics.rigid_body.virtual_work import robot_functions
 from dynamics.robot_file import ParameterSet, RobotDescription, read_robot_file
@@ -103,8 +102,8 @@ class Robot:
 
     def twist_dot(self, pose: ArrayLike, pose_rate: ArrayLike, pose_acceleration: ArrayLike) -> np.ndarray:
         """Twist rate (6,) of pose rates and accelerations (6,) (eq. 38)."""
-        arguments = (("pose", pose), ("pose_rate", pose_rate), ("pose_acceleration", pose_acceleration))
-        return self._call("twist_dot", *[rows(name, value, 6) for name, value in arguments])[..., 0]
+        motion = (rows("pose_rate", pose_rate, 6), rows("pose_acceleration", pose_acceleration, 6))
+        return self._call("twist_dot", rows("pose", pose, 6), *motion)[..., 0]
 
     def pose_rate(self, pose: ArrayLike, twist: ArrayLike) -> np.ndarray:
         """Pose rates (6,) of a twist (6,); the inverse of `twist`. Euler rates have no value at beta = +-pi/2."""
@@ -199,12 +198,7 @@ class Robot:
         return poses
 
     def _parameters(self, parameters: ArrayLike | None) -> np.ndarray:
-        if parameters is None:
-            return self.nominal_parameters
-        count = len(PARAMETER_NAMES)
-        values = floats("parameters", parameters, (count,), ("N", count), error=ParameterError, finite=False)
-        check_ranges(values)
-        return values
+        return self.nominal_parameters if parameters is None else check_parameters(parameters, batch=True)
 
     def _call(self, name: str, *arguments: np.ndarray, output: int = 0) -> np.ndarray:
         """Evaluate one function over the common batch: (rows, columns) or, with a batch, (N, rows, columns)."""
@@ -279,7 +273,10 @@ def fast_forward_dynamics(robot: Robot, parameters: np.ndarray | None = None) ->
             twist_in[:] = at_twist
             torque_in[:] = at_torque
         except (TypeError, ValueError):
-            raise _refusal(pose=at_pose, twist=at_twist, torque=at_torque) from None
+            for name, value in {"pose": at_pose, "twist": at_twist, "torque": at_torque}.items():
+                if floats(name, value, (6,), finite=False) is not value:
+                    raise ShapeError(f"{name} must be a float64 array of shape (6,), got {shown(value)}") from None
+            raise ShapeError("pose, twist, torque must be float64 arrays of shape (6,)") from None
         call()
         first = values[0]  # the mass matrix couples all entries: one that is not finite makes all of them so
         if not first - first == 0.0:
@@ -289,11 +286,3 @@ def fast_forward_dynamics(robot: Robot, parameters: np.ndarray | None = None) ->
         return result
 
     return forward_dynamics
-
-
-def _refusal(**inputs: Any) -> ShapeError:
-    """The error for inputs of which one is no float64 array (6,)."""
-    for name, value in inputs.items():
-        if floats(name, value, (6,), finite=False) is not value:
-            return ShapeError(f"{name} must be a float64 array of shape (6,), got {shown(value)}")
-    return ShapeError(f"{', '.join(inputs)} must be float64 arrays of shape (6,)")

@@ -57,7 +57,10 @@ def compiled_functions(
     Compiled on first use, some seconds, and kept in the cache folder. Raises DynamicsError for an operation that has no
     translation.
     """
-    key = _key(content)
+    digest = sha256(_package_digest() + content)
+    versions = (ca.CasadiMeta.version(), llvmlite.__version__, llvm.get_process_triple())
+    digest.update("|".join([*versions, llvm.get_host_cpu_name(), _features()]).encode())
+    key = digest.hexdigest()[:24]
     compiled = load_object(key)
     if compiled is None:
         compiled = _compile(build(), hot)
@@ -108,13 +111,6 @@ def _machine() -> llvm.TargetMachine:
 @cache
 def _features() -> str:
     return str(llvm.get_host_cpu_features().flatten())
-
-
-def _key(content: bytes) -> str:
-    digest = sha256(_package_digest() + content)
-    versions = (ca.CasadiMeta.version(), llvmlite.__version__, llvm.get_process_triple())
-    digest.update("|".join([*versions, llvm.get_host_cpu_name(), _features()]).encode())
-    return digest.hexdigest()[:24]
 
 
 @cache

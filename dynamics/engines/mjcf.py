@@ -101,7 +101,10 @@ def mjcf_text(
         friction = (values[COULOMB][leg] if coulomb else 0.0, values[VISCOUS][leg])
         _add_leg(world, robot, leg, frames, inertias, friction)
     _add_loops_and_motors(root)
-    _add_home(root, robot, frames)
+    coordinates = [*robot.home_pose[:3], *quaternion(frames.platform)]
+    for angle in frames.angle:
+        coordinates += [angle, 1.0, 0.0, 0.0, 0.0]
+    Xml.SubElement(Xml.SubElement(root, "keyframe"), "key", name="home", qpos=_numbers(coordinates))
     Xml.indent(root)
     return Xml.tostring(root, encoding="unicode") + "\n"
 
@@ -156,7 +159,11 @@ def _add_platform(world: Xml.Element, robot: Robot, inertias: BodyInertias) -> N
     _add_inertia(body, np.zeros(3), inertias.values[0])
     for leg, joint in enumerate(robot.geometry.platform_joints):
         Xml.SubElement(body, "site", name=f"platform_joint{leg + 1}", pos=_numbers(joint))
-    add_platform_looks(body, robot.geometry)
+    centre, radius = _disc(robot.geometry.platform_joints)
+    half = np.array([0.0, 0.0, PLATE_THICKNESS / 2])
+    _rod(body, "cylinder", centre - half, centre + half, radius, "plate")
+    for joint in robot.geometry.platform_joints:
+        _ball(body, _numbers(joint))
 
 
 def _add_leg(
@@ -174,14 +181,15 @@ def _add_leg(
     rubbing = {"frictionloss": _numbers(friction[0]), "damping": _numbers(friction[1])}
     Xml.SubElement(crank, "joint", name=f"joint{number}", type="hinge", axis="0 0 1", attrib=rubbing)
     _add_inertia(crank, np.array([geometry.crank_length / 2, 0, 0]), inertias.values[number])
-    add_crank_looks(crank, geometry)
+    _rod(crank, "capsule", [0, 0, 0], [geometry.crank_length, 0, 0], CRANK_RADIUS, "crank")
     relative = quaternion(frames.crank[leg].T @ frames.link[leg])
     tip = {"pos": _numbers([geometry.crank_length, 0, 0]), "quat": _numbers(relative)}
     link = Xml.SubElement(crank, "body", name=f"link{number}", attrib=tip)
     Xml.SubElement(link, "joint", name=f"tip{number}", type="ball")
     _add_inertia(link, np.array([0, 0, geometry.link_length / 2]), inertias.values[LEGS + number])
     Xml.SubElement(link, "site", name=f"link_end{number}", pos=_numbers([0, 0, geometry.link_length]))
-    add_link_looks(link, geometry)
+    _rod(link, "capsule", [0, 0, 0], [0, 0, geometry.link_length], LINK_RADIUS, "link")
+    _ball(link, "0 0 0")
 
 
 def _add_inertia(body: Xml.Element, centre: np.ndarray, inertia: np.ndarray) -> None:
@@ -194,14 +202,6 @@ def _add_loops_and_motors(root: Xml.Element) -> None:
         ends = {"site1": f"link_end{number}", "site2": f"platform_joint{number}"}
         Xml.SubElement(equality, "connect", name=f"loop{number}", attrib=ends)
         Xml.SubElement(actuator, "motor", name=f"motor{number}", joint=f"joint{number}")
-
-
-def _add_home(root: Xml.Element, robot: Robot, frames: BodyFrames) -> None:
-    coordinates = [*robot.home_pose[:3], *quaternion(frames.platform)]
-    for angle in frames.angle:
-        coordinates += [angle, 1.0, 0.0, 0.0, 0.0]
-    keyframe = Xml.SubElement(root, "keyframe")
-    Xml.SubElement(keyframe, "key", name="home", qpos=_numbers(coordinates))
 
 
 def _add_comment(parent: Xml.Element, text: str) -> None:
@@ -246,34 +246,18 @@ def add_base_looks(world: Xml.Element, geometry: Rss6Geometry) -> None:
         _rod(world, "cylinder", foot - 0.04 * axis, foot + 0.012 * axis, 0.022, "base")
 
 
-def add_platform_looks(body: Xml.Element, geometry: Rss6Geometry) -> None:
-    """A plate through the platform's joints and a ball on each."""
-    centre, radius = _disc(geometry.platform_joints)
-    half = np.array([0.0, 0.0, PLATE_THICKNESS / 2])
-    _rod(body, "cylinder", centre - half, centre + half, radius, "plate")
-    for joint in geometry.platform_joints:
-        Xml.SubElement(body, "geom", type="sphere", pos=_numbers(joint), size=_numbers(BALL_RADIUS), material="link")
-
-
-def add_crank_looks(body: Xml.Element, geometry: Rss6Geometry) -> None:
-    """A rod along x from the axis to the tip."""
-    _rod(body, "capsule", [0, 0, 0], [geometry.crank_length, 0, 0], CRANK_RADIUS, "crank")
-
-
-def add_link_looks(body: Xml.Element, geometry: Rss6Geometry) -> None:
-    """A rod along z from the tip to the platform, with a ball at the tip."""
-    _rod(body, "capsule", [0, 0, 0], [0, 0, geometry.link_length], LINK_RADIUS, "link")
-    Xml.SubElement(body, "geom", type="sphere", pos="0 0 0", size=_numbers(BALL_RADIUS), material="link")
-
-
 def _disc(points: np.ndarray) -> tuple[np.ndarray, float]:
     centre = points.mean(axis=0)
     return centre, float(np.linalg.norm(points - centre, axis=1).max())
 
 
 def _rod(parent: Xml.Element, kind: str, start: ArrayLike, end: ArrayLike, radius: float, material: str) -> None:
-    ends = np.concatenate([np.asarray(start, dtype=float), np.asarray(end, dtype=float)])
-    Xml.SubElement(parent, "geom", type=kind, fromto=_numbers(ends), size=_numbers(radius), material=material)
+    ends = _numbers(np.concatenate([start, end]))
+    Xml.SubElement(parent, "geom", type=kind, fromto=ends, size=_numbers(radius), material=material)
+
+
+def _ball(parent: Xml.Element, centre: str) -> None:
+    Xml.SubElement(parent, "geom", type="sphere", pos=centre, size=_numbers(BALL_RADIUS), material="link")
 
 
 @dataclass(frozen=True)
@@ -299,12 +283,3 @@ def body_frames(robot: Robot, pose: np.ndarray) -> BodyFrames:
     x = across / np.linalg.norm(across, axis=1, keepdims=True)
     link = np.stack([x, np.cross(z, x), z], axis=-1)
     return BodyFrames(angle, tip, joint, platform, geometry.crank_frames(angle), link)
-
-
-def link_angular_velocities(robot: Robot, frames: BodyFrames, pose: np.ndarray, twist: np.ndarray) -> np.ndarray:
-    """Angular velocities (6, 3) of the links in rad/s, base axes, without spin about their own axes (eq. 12)."""
-    axis, rate = robot.geometry.crank_axes, robot.joint_jacobian(pose) @ twist
-    link = frames.joint - frames.tip
-    tip_rate = rate[:, None] * np.cross(axis, robot.geometry.crank_length * frames.crank[:, :, 0])
-    link_rate = twist[:3] + np.cross(twist[3:], frames.joint - pose[:3]) - tip_rate
-    return np.cross(link, link_rate) / np.sum(link**2, axis=1, keepdims=True)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dynamics.checks import check_type, floats, real
-from dynamics.engines.mjcf import body_frames, link_angular_velocities, quaternion
+from dynamics.engines.mjcf import body_frames, quaternion
 from dynamics.errors import DynamicsError
 from dynamics.legs.rss_geometry import LEGS
 from dynamics.robot import Robot
@@ -101,12 +101,14 @@ class MujocoRobot:
         return max(spins)
 
     def put(self, pose: np.ndarray, twist: np.ndarray) -> None:
-        """Put all bodies where the robot has them at a pose (6,) moving with a twist (6,)."""
+        """Put all bodies where the robot has them at a pose (6,) with a twist (6,), no link spinning (eq. 12)."""
         pose, twist = floats("pose", pose, (6,)), floats("twist", twist, (6,))
         frames = body_frames(self._robot, pose)
-        link_omega = link_angular_velocities(self._robot, frames, pose, twist)
         rate = self._robot.joint_jacobian(pose) @ twist
-        data, axis = self.data, self._robot.geometry.crank_axes
+        data, axis, link = self.data, self._robot.geometry.crank_axes, frames.joint - frames.tip
+        tip_rate = rate[:, None] * np.cross(axis, self._robot.geometry.crank_length * frames.crank[:, :, 0])
+        link_rate = twist[:3] + np.cross(twist[3:], frames.joint - pose[:3]) - tip_rate
+        link_omega = np.cross(link, link_rate) / np.sum(link**2, axis=1, keepdims=True)
         self._mujoco.mj_resetData(self.model, data)
         data.qpos[:7] = [*pose[:3], *quaternion(frames.platform)]
         data.qvel[:6] = [*twist[:3], *(frames.platform.T @ twist[3:])]

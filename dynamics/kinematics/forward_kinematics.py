@@ -41,15 +41,10 @@ def solve(functions: Functions, theta: np.ndarray, start: np.ndarray) -> np.ndar
 def search(functions: Functions, theta: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Best poses (N, 6) for crank angles (N, 6) from starts (N, 6), and what the angles there lack of those, (N, 6).
 
-    A row is solved where all its residuals are below ANGLE_TOLERANCE; they are NaN where a leg cannot reach.
+    Newton's iteration with step halving; rows leave it when their step or what it gains is nil. A row is solved where
+    all its residuals are below ANGLE_TOLERANCE; they are NaN where a leg cannot reach.
     """
-    poses = _newton(functions, theta, np.array(start))
-    found = functions["inverse_kinematics"](poses)[0][..., 0]
-    return poses, np.abs(theta - found)
-
-
-def _newton(functions: Functions, theta: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Newton's iteration with step halving; rows leave it when their step or what it gains is nil."""
+    poses = np.array(start)
     active = np.arange(len(theta))
     gaps, jacobians = functions["loop_closure"](poses, theta)
     for _ in range(MAX_ITERATIONS):
@@ -60,7 +55,8 @@ def _newton(functions: Functions, theta: np.ndarray, poses: np.ndarray) -> np.nd
         active, gaps, jacobians = active[going], gaps[going], jacobians[going]
         if not len(active):
             break
-    return poses
+    found = functions["inverse_kinematics"](poses)[0][..., 0]
+    return poses, np.abs(theta - found)
 
 
 def _damped(

@@ -19,35 +19,27 @@ def rotation_matrix(angles: ca.SX) -> ca.SX:
     )
 
 
-def euler_rate_jacobian(angles: ca.SX) -> ca.SX:
-    """J_e (3, 3): angular velocity in base axes from Euler angle rates, omega = J_e phi_dot (eq. 2)."""
-    alpha, beta = angles[0], angles[1]
-    return ca.vertcat(
+def pose_rate_to_twist(pose: ca.SX) -> ca.SX:
+    """T (6, 6): twist [h_dot, omega] = T pose_dot; the block-diagonal matrix of eq. 29, with J_e of eq. 2."""
+    alpha, beta = pose[3], pose[4]
+    euler_rate_jacobian = ca.vertcat(
         ca.horzcat(1, 0, ca.sin(beta)),
         ca.horzcat(0, ca.cos(alpha), -ca.cos(beta) * ca.sin(alpha)),
         ca.horzcat(0, ca.sin(alpha), ca.cos(beta) * ca.cos(alpha)),
     )
+    return ca.diagcat(ca.SX.eye(3), euler_rate_jacobian)
 
 
-def euler_bias_acceleration(angles: ca.SX, rates: ca.SX) -> ca.SX:
-    """J_e_dot phi_dot (3,): the angular acceleration left when the Euler accelerations are zero (eq. 38)."""
-    ca_, cb, sa, sb = ca.cos(angles[0]), ca.cos(angles[1]), ca.sin(angles[0]), ca.sin(angles[1])
-    da, db, dg = rates[0], rates[1], rates[2]
+def twist_bias(pose: ca.SX, pose_rate: ca.SX) -> ca.SX:
+    """T_dot pose_dot (6,): what twist_dot holds when the pose acceleration is zero (eq. 38)."""
+    ca_, cb, sa, sb = ca.cos(pose[3]), ca.cos(pose[4]), ca.sin(pose[3]), ca.sin(pose[4])
+    da, db, dg = pose_rate[3], pose_rate[4], pose_rate[5]
     return ca.vertcat(
+        ca.SX.zeros(3),
         db * dg * cb,
         -ca_ * da * dg * cb + sa * (db * dg * sb - db * da),
         -sa * da * dg * cb + ca_ * (db * da - db * dg * sb),
     )
-
-
-def pose_rate_to_twist(pose: ca.SX) -> ca.SX:
-    """T (6, 6): twist [h_dot, omega] = T pose_dot; the block-diagonal matrix of eq. 29."""
-    return ca.diagcat(ca.SX.eye(3), euler_rate_jacobian(pose[3:6]))
-
-
-def twist_bias(pose: ca.SX, pose_rate: ca.SX) -> ca.SX:
-    """T_dot pose_dot (6,): what twist_dot holds when the pose acceleration is zero."""
-    return ca.vertcat(ca.SX.zeros(3), euler_bias_acceleration(pose[3:6], pose_rate[3:6]))
 
 
 def joint_motion(arm: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> tuple[ca.SX, ca.SX]:

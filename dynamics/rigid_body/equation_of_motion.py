@@ -8,8 +8,6 @@ Legs enter through the motion of their platform joints A only, so derivatives ar
 three vectors of length 3 and chained through dA/dq.
 """
 
-from dataclasses import dataclass
-
 import casadi as ca
 
 from dynamics.expressions import function, symmetric_from_lower
@@ -60,32 +58,24 @@ def motion_derivatives(geometry: Rss6Geometry) -> ca.Function:
     by_rate = ca.jacobian(platform @ rigid[0:4], rate)
     cranks, links, crank_by_pose, crank_by_rate = [], [], [], []
     for leg in range(LEGS):
-        local = _leg_derivatives(geometry, leg, joints, torque[leg], rigid)
+        local, net_force, force, crank = _leg_derivatives(geometry, leg, joints, torque[leg], rigid)
         gradient = joints.gradient[leg]
-        by_pose += gradient.T @ _by_pose(local.force, joints, leg) + joints.curvature(leg, local.net_force)
-        by_rate += gradient.T @ _by_rate(local.force, joints, leg)
-        crank_by_pose.append(_by_pose(local.crank, joints, leg))
-        crank_by_rate.append(_by_rate(local.crank, joints, leg))
-        cranks.append(gradient.T @ local.columns[:, 0:4])
-        links.append(gradient.T @ local.columns[:, 4:8])
+        by_pose += gradient.T @ _by_pose(force, joints, leg) + joints.curvature(leg, net_force)
+        by_rate += gradient.T @ _by_rate(force, joints, leg)
+        crank_by_pose.append(_by_pose(crank, joints, leg))
+        crank_by_rate.append(_by_rate(crank, joints, leg))
+        cranks.append(gradient.T @ local[:, 0:4])
+        links.append(gradient.T @ local[:, 4:8])
     columns = ca.horzcat(platform, *cranks, *links)
     outputs = [by_pose, by_rate, columns, ca.vertcat(*crank_by_pose), ca.vertcat(*crank_by_rate)]
     return function("motion_derivatives", [pose, rate, acceleration, torque, rigid], outputs)
 
 
-@dataclass(frozen=True)
-class _LegDerivatives:
-    """Derivatives with respect to position, velocity, acceleration of A: of the net force, and of theta_ddot."""
-
-    columns: ca.SX
-    net_force: ca.SX
-    force: tuple[ca.SX, ca.SX, ca.SX]
-    crank: tuple[ca.SX, ca.SX, ca.SX]
-
-
 def _leg_derivatives(
     geometry: Rss6Geometry, leg: int, joints: PlatformJointMotion, torque: ca.SX, rigid: ca.SX
-) -> _LegDerivatives:
+) -> tuple[ca.SX, ca.SX, list[ca.SX], list[ca.SX]]:
+    """Columns (3, 8), net force (3,), and derivatives of that force and of theta_ddot with respect to position,
+    velocity and acceleration of A."""
     inputs = [ca.SX.sym(name, 3) for name in ("position", "velocity", "acceleration")]
     vectors = leg_to(geometry, leg, inputs[0])
     motion = leg_motion(vectors, inputs[1], inputs[2])
@@ -107,10 +97,10 @@ def _leg_derivatives(
     ]
     values = [joints.position[leg], joints.velocity[leg], joints.acceleration[leg]]
     columns, force, *rows = ca.substitute(ca.cse(expressions), inputs, values)
-    return _LegDerivatives(columns, force, (rows[0], rows[1], rows[2]), (rows[3], rows[4], rows[5]))
+    return columns, force, rows[:3], rows[3:]
 
 
-def _by_pose(rows: tuple[ca.SX, ca.SX, ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
+def _by_pose(rows: list[ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
     by_position, by_velocity, by_acceleration = rows
     return (
         by_position @ joints.gradient[leg]
@@ -119,7 +109,7 @@ def _by_pose(rows: tuple[ca.SX, ca.SX, ca.SX], joints: PlatformJointMotion, leg:
     )
 
 
-def _by_rate(rows: tuple[ca.SX, ca.SX, ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
+def _by_rate(rows: list[ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
     _, by_velocity, by_acceleration = rows
     return by_velocity @ joints.gradient[leg] + 2 * by_acceleration @ joints.gradient_rate[leg]
 

@@ -50,11 +50,6 @@ def platform_columns(pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, gravity: ca.DM
     return ca.horzcat(mass, ca.vertcat(ca.SX.zeros(3, 3), ca.horzcat(*moments)))
 
 
-def friction_regressor(joint_jacobian: ca.SX, joint_velocity: ca.SX) -> ca.SX:
-    """Columns of Gamma (6, 12) for Coulomb, then viscous friction (eq. 24 without its stray second v_E)."""
-    return ca.horzcat(joint_jacobian.T @ ca.diag(ca.sign(joint_velocity)), joint_jacobian.T @ ca.diag(joint_velocity))
-
-
 def inertial_wrench(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, rigid: ca.SX) -> ca.SX:
     """M twist_dot + C twist + G (6,) for the 52 inertial parameters `rigid`: the regressor times them, without it."""
     gravity = ca.DM(geometry.gravity)
@@ -91,11 +86,6 @@ def coriolis_matrix(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, rigid: ca
         to_joint_rate = ca.horzcat(ca.SX.zeros(3, 3), -ca.skew(ca.cross(omega, arm)))
         total += to_joint.T @ (coriolis @ to_joint + mass @ to_joint_rate)
     return total
-
-
-def gravity_wrench(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
-    """G (6,) of eq. 23, N and N m: the wrench that holds the robot against gravity."""
-    return inertial_wrench(geometry, pose, ca.SX(6, 1), ca.SX(6, 1), rigid)
 
 
 def platform_mass(pose: ca.SX, platform: ca.SX) -> ca.SX:
@@ -137,16 +127,17 @@ def dynamic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
     friction = xi[COULOMB] * ca.sign(velocity) + xi[VISCOUS] * velocity
     inertial = inertial_wrench(geometry, pose, twist, twist_dot, rigid)
     bias = inertial_wrench(geometry, pose, twist, ca.SX.zeros(6), rigid)
+    holding = inertial_wrench(geometry, pose, ca.SX(6, 1), ca.SX(6, 1), rigid)
     mass = mass_matrix(geometry, pose, rigid)
     diagonal, upper, order = ca.ldl(mass)
     acceleration = ca.ldl_solve(jacobian.T @ (torque - friction) - bias, diagonal, upper, order)
-    regressor = ca.horzcat(
-        rigid_body_regressor(geometry, pose, twist, twist_dot), friction_regressor(jacobian, velocity)
-    )
+    # Coulomb, then viscous friction: eq. 24 without its stray second v_E.
+    rubbing = [jacobian.T @ ca.diag(ca.sign(velocity)), jacobian.T @ ca.diag(velocity)]
+    regressor = ca.horzcat(rigid_body_regressor(geometry, pose, twist, twist_dot), *rubbing)
     return [
         function("mass_matrix", [pose, xi], [mass]),
         function("coriolis_matrix", [pose, twist, xi], [coriolis_matrix(geometry, pose, twist, rigid)]),
-        function("gravity_wrench", [pose, xi], [gravity_wrench(geometry, pose, rigid)]),
+        function("gravity_wrench", [pose, xi], [holding]),
         function("friction_wrench", [pose, twist, xi], [jacobian.T @ friction]),
         function("regressor", [pose, twist, twist_dot], [regressor]),
         function("inverse_dynamics", [pose, twist, twist_dot, xi], [ca.solve(jacobian.T, inertial) + friction]),
@@ -155,5 +146,5 @@ def dynamic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
 
 
 def robot_functions(geometry: Rss6Geometry) -> list[ca.Function]:
-    """All that `Robot` evaluates; their names are FUNCTION_NAMES."""
+    """All that `Robot` evaluates."""
     return kinematic_functions(geometry) + dynamic_functions(geometry)
