@@ -26,7 +26,7 @@ from dynamics.closed_loop.problem import LoopProblem, RateSensor, Sizes
 from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
 from dynamics.closed_loop.sensitivity_kernels import slope_tangent, stop_tangent
 from dynamics.closed_loop.stick_slip_kernels import stop_joints
-from dynamics.compiled.kernel import address, plain
+from dynamics.compiled.kernel import address, chosen, plain
 from dynamics.compiled.machine_code import MachineFunction
 from dynamics.errors import SimulationError
 from dynamics.parameters import split_parameters
@@ -50,11 +50,15 @@ def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
         commands = np.zeros((frames if problem.controller else 0, problem.sizes.joints))
     plan = _plan(problem, commands)
     own, known = problem.robot.functions, problem.servo_robot.functions  # held here: code that nobody holds is freed
-    _fill(memory, problem, own, known["equation_of_motion"])
-    do = run_frames if compiled else np.errstate(all="ignore")(plain(run_frames))
+    _fill(memory, problem, own, known["equation_of_motion"], _addresses(problem.sizes, compiled))
+    do = chosen(run_frames, compiled)
     for first, last in [(k, k + 1) for k in range(frames)] if asked else [(0, frames)]:
         if asked:
-            _consult(problem, first, memory.now, plan, record, commands)
+            try:
+                _consult(problem, first, memory.now, plan, record, commands)
+            except Exception as error:
+                error.add_note(f"at frame {first} of the closed loop")
+                raise
         status, frame = do(*memory, plan, record, first, last)
         if status:
             raise _failure(problem, status, frame, memory, record)
@@ -101,7 +105,7 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
         "reference": problem.reference.poses,
         "reference_rate": problem.reference.rates,
         "commands": commands,
-        "lost": np.zeros(0, bool) if problem.lost is None else problem.lost,
+        "lost": np.zeros(0, bool) if problem.lost is None else np.ascontiguousarray(problem.lost),
         "noise": np.zeros((0, 0)) if problem.noise is None else problem.noise,
         "start_commands": start.commands,
         "start_integral_sensitivity": start.joint_integral_sensitivity,
@@ -112,13 +116,19 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
     return Plan(**views, spans=command_schedule(problem))
 
 
-def _fill(memory: Memory, problem: LoopProblem, own: dict[str, MachineFunction], servo_motion: MachineFunction) -> None:
+def _fill(
+    memory: Memory,
+    problem: LoopProblem,
+    own: dict[str, MachineFunction],
+    servo_motion: MachineFunction,
+    addresses: dict[str, int],
+) -> None:
     """Machine code, laws, parameters and gains, and the state at the first frame."""
     task, now, start, sizes = memory.task, memory.now, problem.start, problem.sizes
     settings = problem.settings
     for name in ("equation_of_motion", "motion_derivatives", "rate_map_derivative"):
         task[name] = own[name].address
-    for name, found in _addresses(sizes).items():
+    for name, found in addresses.items():
         task[name] = found
     task.servo_motion = servo_motion.address
     rigid, task.coulomb, task.viscous, (task.lp, task.li, task.ld) = split_parameters(problem.parameters)
@@ -144,8 +154,9 @@ def _fill(memory: Memory, problem: LoopProblem, own: dict[str, MachineFunction],
 
 
 @lru_cache(maxsize=16)
-def _addresses(sizes: Sizes) -> dict[str, int]:
+def _addresses(sizes: Sizes, compiled: bool) -> dict[str, int]:
     """Of the kernels that kernels call by address."""
     memory = empty_memory(sizes)
     arguments = memory.task, memory.now, memory.evaluations[0], memory.tangent, 0
-    return {kernel.py_func.__name__: address(kernel, *arguments) for kernel in CALLED}
+    lines = {kernel: getattr(kernel, "py_func", kernel) for kernel in CALLED}
+    return {line.__name__: address(kernel if compiled else line, *arguments) for kernel, line in lines.items()}

@@ -5,52 +5,86 @@ Modules called ``*_kernels`` hold them. They are imported where they are first n
 
 import ctypes
 import hashlib
+import pickle
 from collections.abc import Callable
 from functools import cache, lru_cache
 from pathlib import Path
 from types import FunctionType
 from typing import Any
 
+import numba
 import numpy as np
 from llvmlite import ir
 from numba import njit, typeof, types
+from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
+from numba.core.serialize import dumps
 from numba.extending import intrinsic
+
+from dynamics.compiled.object_files import load_object, save_object
 
 Array = np.ndarray  # of any type and shape, which docstrings state
 Record = Any  # a numpy.record, whose fields are those of its type
 
 
-def kernel(function: Callable[..., Any]) -> Dispatcher:
+def kernel(function: Callable[..., Any]) -> Any:
     """A kernel that only kernels call: compiled with each of them, without a door for Python."""
+    function.kernel = True  # type: ignore[attr-defined]
     options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # which numba's stubs do not know
     return njit(nogil=True, error_model="numpy", **options)(function)
 
 
-def entry(function: Callable[..., Any]) -> Dispatcher:
-    """A kernel that Python calls, or kernels by its address: kept beside the source, else in the user's cache."""
-    try:
-        compiled = njit(cache=True, nogil=True, error_model="numpy")(function)
-    except RuntimeError:  # no folder can be written to
-        return njit(nogil=True, error_model="numpy")(function)
-    if hasattr(compiled, "_cache"):
-        # numba asks only whether the function's own file has changed, but kernels call kernels of other files
-        compiled._cache._cache_file._source_stamp = _stamp()
+def entry(function: Callable[..., Any]) -> Any:
+    """A kernel that Python calls, or kernels by its address: kept in the user's cache with all that it calls."""
+    function.kernel = True  # type: ignore[attr-defined]
+    compiled: Any = njit(nogil=True, error_model="numpy")(function)
+    if hasattr(compiled, "py_func"):  # NUMBA_DISABLE_JIT leaves the function as it is
+        try:
+            compiled._cache = FunctionCache(function)
+        except RuntimeError:  # numba finds no folder of its own, which we do not need
+            return compiled
+        compiled._cache._cache_file = _KernelFiles(function.__qualname__)
     return compiled
 
 
-_at_address: dict[int, Dispatcher] = {}
+class _KernelFiles:
+    """Where numba keeps an entry: in our files, which nobody else can have written, each under its whole content's key.
+
+    numba's own files would be loaded whoever wrote them, and asked only whether the function's own file has changed.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def load(self, key: object) -> object | None:
+        """What was compiled for a signature on such a processor, if that is there."""
+        found = load_object(self._file(key))
+        return None if found is None else pickle.loads(found)
+
+    def save(self, key: object, data: object) -> None:
+        """Keep what was compiled."""
+        save_object(self._file(key), dumps(data))
+
+    def _file(self, key: object) -> str:
+        content = f"{self._name} {numba.__version__} {_stamp()} {key}"
+        return f"{hashlib.sha256(content.encode()).hexdigest()[:24]}.kernel"
 
 
-def address(compiled: Dispatcher, *arguments: object) -> int:
+_at_address: dict[int, Any] = {}
+
+
+def address(compiled: Any, *arguments: object) -> int:
     """Where the machine code of an entry for such arguments is, for `invoke`; compiled if that has not been done.
 
-    A kernel that calls another contains it: those that many call are called by address, and compiled once.
+    A kernel that calls another contains it: those that many call are called by address, and compiled once. One that is
+    not compiled, see `plain`, has a number that serves `invoke` alike.
     """
-    kinds = tuple(map(typeof, arguments))
-    compiled.compile(kinds)
-    result: Any = compiled.overloads[kinds]
-    found = result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
+    found = id(compiled)
+    if isinstance(compiled, Dispatcher):
+        kinds = tuple(map(typeof, arguments))
+        compiled.compile(kinds)
+        result: Any = compiled.overloads[kinds]
+        found = result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
     _at_address[found] = compiled
     return found
 
@@ -98,10 +132,20 @@ def _stamp() -> str:
 
 
 @cache
-def plain(compiled: Dispatcher) -> Callable[..., Any]:
+def plain(compiled: Any) -> Callable[..., Any]:
     """The same lines as an ordinary Python function, which calls other kernels as ordinary functions, too."""
-    source = compiled.py_func
+    source = getattr(compiled, "py_func", compiled)
     names = {name: source.__globals__[name] for name in source.__code__.co_names if name in source.__globals__}
-    called = {name: plain(value) for name, value in names.items() if isinstance(value, Dispatcher)}
+    lines = {name: getattr(value, "py_func", value) for name, value in names.items()}
+    kernels = [name for name, value in lines.items() if isinstance(value, FunctionType) and hasattr(value, "kernel")]
+    called: dict[str, Any] = {name: plain(names[name]) for name in kernels}
     called |= {"invoke": _invoke_plain, "call": _call_plain}
     return FunctionType(source.__code__, source.__globals__ | called, source.__name__, source.__defaults__)
+
+
+def chosen(kernel: Any, compiled: bool) -> Callable[..., Any]:
+    """A kernel as it is called from Python: compiled, or else, or where numba is switched off, its plain lines."""
+    if compiled and isinstance(kernel, Dispatcher):
+        return kernel
+    lines: Callable[..., Any] = np.errstate(all="ignore")(plain(kernel))  # compiled code does not warn either
+    return lines

@@ -1,6 +1,7 @@
 """CasADi functions as machine code in this process: compiled by LLVM once, and kept in the user's cache folder."""
 
 import ctypes
+import json
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cache, partial
@@ -13,7 +14,7 @@ import llvmlite
 import llvmlite.binding as llvm
 import numpy as np
 
-from dynamics.compiled.object_files import ObjectFile, load_object, save_object
+from dynamics.compiled.object_files import load_object, save_object
 from dynamics.compiled.translation import llvm_text
 
 
@@ -60,16 +61,18 @@ def compiled_functions(
     digest = sha256(_package_digest() + content)
     versions = (ca.CasadiMeta.version(), llvmlite.__version__, llvm.get_process_triple())
     digest.update("|".join([*versions, llvm.get_host_cpu_name(), _features()]).encode())
-    key = digest.hexdigest()[:24]
-    compiled = load_object(key)
+    name = f"{digest.hexdigest()[:24]}.robot"
+    compiled = load_object(name)
     if compiled is None:
         compiled = _compile(build(), hot)
-        save_object(key, compiled)
+        save_object(name, compiled)
     return _load(compiled)
 
 
-def _compile(functions: list[ca.Function], hot: Collection[str]) -> ObjectFile:
-    """LLVM's passes find pairs of equal operations; they gain a seventh in speed, for some tenths of a second each."""
+def _compile(functions: list[ca.Function], hot: Collection[str]) -> bytes:
+    """A line of JSON with the shapes of inputs and outputs of each function, and the code of all.
+
+    LLVM's passes find pairs of equal operations; they gain a seventh in speed, for some tenths of a second each."""
     module = llvm.parse_assembly(llvm_text(functions))
     module.verify()
     machine = _machine()
@@ -80,12 +83,13 @@ def _compile(functions: list[ca.Function], hot: Collection[str]) -> ObjectFile:
     shapes = {
         f.name(): ([f.nnz_in(k) for k in range(f.n_in())], [f.size_out(k) for k in range(f.n_out())]) for f in functions
     }
-    return ObjectFile(shapes, machine.emit_object(module))
+    return json.dumps(shapes).encode() + b"\n" + bytes(machine.emit_object(module))
 
 
-def _load(compiled: ObjectFile) -> dict[str, MachineFunction]:
+def _load(compiled: bytes) -> dict[str, MachineFunction]:
+    shapes, _, code = compiled.partition(b"\n")
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
-    engine.add_object_file(llvm.ObjectFileRef.from_data(compiled.code))
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     over_rows = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_void_p, ctypes.c_void_p)
     return {
@@ -96,7 +100,7 @@ def _load(compiled: ObjectFile) -> dict[str, MachineFunction]:
             over_rows(engine.get_function_address(f"{name}.rows")),
             engine,
         )
-        for name, (inputs, outputs) in compiled.functions.items()
+        for name, (inputs, outputs) in json.loads(shapes).items()
     }
 
 
@@ -116,6 +120,10 @@ def _features() -> str:
 @cache
 def _package_digest() -> bytes:
     digest = sha256()
-    for file in sorted(Path(__file__).parent.parent.rglob("*.py")):
+    package = Path(__file__).parent.parent
+    rooms = [package / "expressions.py", package / "parameters.py"]
+    for room in ("compiled", "legs", "kinematics", "rigid_body"):
+        rooms += sorted((package / room).glob("*.py"))
+    for file in rooms:
         digest.update(file.name.encode() + file.read_bytes())
     return digest.digest()

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from dynamics.compiled.kernel import entry
 from dynamics.compiled.machine_code import compiled_functions
 from dynamics.compiled.object_files import CacheWarning, load_object
 from dynamics.compiled.translation import _CALLED, _MEANING, _NAMES
@@ -105,7 +106,7 @@ def test_two_processes_that_compile_at_once_leave_one_whole_file(own_cache):
     processes = [subprocess.Popen(command, **run) for _ in range(2)]
     assert [process.communicate(timeout=60)[0] for process in processes] == ["[9.0, 16.0]\n"] * 2
     (file,) = own_cache.iterdir()
-    assert load_object(file.stem)
+    assert load_object(file.name)
 
 
 SPOILED = {
@@ -135,11 +136,42 @@ def test_no_bit_of_a_file_may_change_nor_its_owner(own_cache, monkeypatch):
     whole, owner = file.read_bytes(), os.geteuid()
     for place in range(len(whole)):
         file.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
-        assert load_object(file.stem) is None
+        assert load_object(file.name) is None
     file.write_bytes(whole)
-    assert load_object(file.stem)
+    assert load_object(file.name)
     monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
-    assert load_object(file.stem) is None
+    assert load_object(file.name) is None
+
+
+def _twice(x):
+    return 2 * x
+
+
+def test_kernels_are_kept_in_the_same_files(own_cache):
+    """Found again by another of the same lines; made anew where others could have written it."""
+    assert entry(_twice)(3) == 6
+    (file,) = own_cache.iterdir()
+    found = entry(_twice)
+    assert found(4) == 8
+    assert sum(found.stats.cache_hits.values()) == 1
+    file.chmod(0o666)
+    anew = entry(_twice)
+    assert anew(5) == 10
+    assert sum(anew.stats.cache_misses.values()) == 1
+    assert file.stat().st_mode & 0o777 == 0o600
+
+
+def test_where_numba_is_switched_off_the_plain_lines_run(loop):
+    code = (
+        "from tests.dynamics.conftest import Loop; import dynamics; robot = dynamics.load_robot('rss6');"
+        "run = Loop(robot, robot.parameter_sets['identified'].vector).run(3); print(run.pose[-1].tolist())"
+    )
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+    folder = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, cwd=folder, capture_output=True, text=True, check=True
+    )
+    assert eval(done.stdout) == loop.run(3).pose[-1].tolist()
 
 
 def test_everything_works_in_memory_after_one_warning_where_nothing_can_be_written(tmp_path, monkeypatch):

@@ -169,3 +169,20 @@ def test_what_cannot_be_run_is_one_line_before_any_file(tmp_path, capfd):
         error = one_line(capfd.readouterr().err)
         assert all(word in error for word in words), error
         assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.thorough
+def test_after_warm_up_a_run_compiles_nothing_and_finds_no_other_program(tmp_path):
+    """With empty caches, nothing on the path and the analytic renderer: no compiler and no OpenGL can be found."""
+    caches = {name: str(tmp_path / name) for name in ("CMMSIM_CACHE", "NUMBA_CACHE_DIR", "HOME")}
+    environment = {**caches, "PATH": "", "PYTHONPATH": os.environ.get("PYTHONPATH", "")}
+
+    def called(*arguments):
+        command = [sys.executable, "-m", "cmmsim", *arguments, "--set", "renderer=analytic", "--quiet"]
+        subprocess.run(command, env=environment, cwd=tmp_path, check=True)
+        files = [*(tmp_path / "CMMSIM_CACHE").rglob("*.*"), *(tmp_path / "NUMBA_CACHE_DIR").rglob("*.nb?")]
+        return {file: file.stat().st_mtime_ns for file in files}
+
+    compiled = called("warm-up", "quick")
+    assert {file.suffix for file in compiled} == {".robot", ".kernel", ".nbi", ".nbc"}
+    assert called("run", "quick", "--out", "run") == compiled
