@@ -165,6 +165,7 @@ def test_same_seed_same_numbers(volume):
     assert first == same != other
 
 
+@pytest.mark.slow
 def test_latency_and_jitter_of_the_sensor_file_are_found_from_images(volume):
     found = latency_test(under_test(changes={"timing.latency": 0.0142}), volume, frames=60)
     assert (found.lost, found.stated) == (0, 0.0142)

@@ -75,6 +75,7 @@ def require_honest(outcomes):
 PYRENDER = [pytest.mark.slow, pytest.mark.rendering]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("renderer", ["analytic", pytest.param("pyrender", marks=PYRENDER)])
 def test_no_wrong_pose_in_eighty_faults_and_what_spoils_little_is_measured(renderer):
     seed = {"analytic": 1, "pyrender": 5}[renderer]

@@ -55,7 +55,12 @@ TWINS = {
 }
 
 
-@pytest.mark.parametrize("case", TWINS)
+QUICK_TWINS = ("one frame", "lost frames", "from a state", "elastic, Stribeck, from a state")
+
+
+@pytest.mark.parametrize(
+    "case", [name if name in QUICK_TWINS else pytest.param(name, marks=pytest.mark.slow) for name in TWINS]
+)
 def test_compiled_run_equals_plain_run(loop, case):
     """The same lines as machine code and as Python calls them: all records and sensitivities are equal bit for bit, but
     for what hyperbolic functions round. Eight frames with events, from within a motion."""

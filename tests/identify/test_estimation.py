@@ -166,6 +166,7 @@ def driven(record):
     return scenario, identify(record, rss6(), scenario)
 
 
+@pytest.mark.slow
 def test_the_command_driven_model_explains_the_noise_fully_and_scales_with_the_anchor_and_no_plant_is_read(
     record, driven
 ):
@@ -200,6 +201,7 @@ def test_the_search_is_not_caught_by_the_stick_slip_minimum_near_the_warm_start(
     assert identify(record, rss6(), scenario).noise_ratio < 1.1
 
 
+@pytest.mark.slow
 def test_the_model_is_the_closed_loop_itself_and_the_gradient_of_the_whole_cost_is_that_of_finite_differences(
     scenario, record
 ):

@@ -108,6 +108,7 @@ def folder(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_the_command_prints_and_writes_its_table_with_an_estimator_of_ones_own(folder, capsys, tmp_path, monkeypatch):
     """A function of the evidence in a module of the user's, given by its name alone, has a row beside the others."""
     (tmp_path / "mine.py").write_text(

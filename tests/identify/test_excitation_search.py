@@ -199,6 +199,7 @@ def test_limits_hold_between_the_instants_of_the_search(one_start, method):
         assert worst["velocity"].share > 0.99
 
 
+@pytest.mark.slow
 def test_searches_beat_the_random_trajectories_they_begin_with(one_start):
     random, evolved, climbed = (designed(method) for method in ("random", "evolutionary", "gradient"))
     assert evolved.first_index == climbed.first_index == pytest.approx(random.first_index, rel=1e-8)
@@ -216,6 +217,7 @@ def test_seed_decides_what_is_found(method):
         design_trajectories(rss6(), small(method="evolutionary", candidates=3), 0)
 
 
+@pytest.mark.slow
 def test_command_compares_and_leaves_its_files_and_none_where_it_is_interrupted(
     one_start, tmp_path, capsys, monkeypatch
 ):

@@ -110,6 +110,7 @@ def entries(**changes):
     return {"parameters": {name: {"initial": value, "estimate": value} for name, value in values.items()}}
 
 
+@pytest.mark.slow
 def test_what_reads_a_run_anew_refuses_in_one_line_files_of_another_and_a_result_that_is_none(recorded_folder, capsys):
     """And writes nothing."""
     run = recorded_folder

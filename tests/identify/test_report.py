@@ -24,6 +24,7 @@ TIME, ZERO = np.arange(50) / 60, np.zeros((50, 6))
 NOISE = np.random.default_rng(0).normal(size=(50, 6))
 
 
+@pytest.mark.slow
 def test_report_is_one_file_that_opens_offline_beside_readable_figures(run_folder):
     path = write_report(run_folder.path)
     text = path.read_text(encoding="utf-8")
