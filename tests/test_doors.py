@@ -71,6 +71,7 @@ def test_a_type_checker_follows_the_installed_packages(tmp_path):
 
 
 @pytest.mark.parametrize("rooms", [[], ["errors.py", "scenario"]])
+@pytest.mark.slow
 def test_a_foreign_package_of_the_name_identify_is_named(tmp_path, rooms):
     """PyPI's, whose `__init__.py` is empty, lies in a folder before ours, or was installed over ours."""
     foreign = tmp_path / "identify"

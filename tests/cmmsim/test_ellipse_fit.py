@@ -114,6 +114,7 @@ def test_radii_are_kept_between_their_bounds():
 
 
 @pytest.mark.parametrize(("noise", "scale", "psf_px"), [(NOISE, 1.0, 0.0), (NOISE, 1.0, 0.6), (FINE, 16.0, 0.0)])
+@pytest.mark.slow
 def test_bound_is_that_of_numerically_differentiated_images(noise, scale, psf_px):
     """Fisher information of normal grey values with mean m and variance v(m), differentiated by all 7 unknowns."""
     contrast, ground, step = scale * 180.0, scale * 22.0, 1e-5

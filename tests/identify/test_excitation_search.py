@@ -114,6 +114,7 @@ def test_gradients_are_those_of_finite_differences(robot, known, criterion):
         assert gradient @ direction == pytest.approx(quotient, rel=1e-5, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
     """Small motion, no dry friction, 600 frames a second: the second period against the spectrum."""
     scenario = QUICK.with_overrides({**TINY, "timing.frame_rate_hz": 600.0, "excitation.duration_s": 20.0})

@@ -168,6 +168,7 @@ def test_maps_hold_what_each_pose_alone_gives_and_ranges_end_at_the_travel_limit
             assert robot.travel_limit - 0.01 < largest <= robot.travel_limit
 
 
+@pytest.mark.slow
 def test_command_writes_numbers_and_figures(mapped, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(workspace_map, "JOINT_SAMPLES", 500)
     monkeypatch.setattr(workspace_map, "map_workspace", lambda *_: mapped)

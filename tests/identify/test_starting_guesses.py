@@ -115,6 +115,7 @@ def relative_errors(solution, base):
     return np.abs(groups), np.abs(solution.parameters[64:] / truth()[64:] - 1)
 
 
+@pytest.mark.slow
 def test_every_base_parameter_and_gain_is_recovered_to_a_millionth():
     problem, solution, base = found(4, 4)
     groups, gains = relative_errors(solution, base)

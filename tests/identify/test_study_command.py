@@ -113,6 +113,7 @@ def another_program(request):
         yield f"tcp://127.0.0.1:{server.getsockname()[1]}", "another protocol" if request.param else "says nothing"
 
 
+@pytest.mark.slow
 def test_where_no_scheduler_answers_there_is_one_line_and_nothing_left_or_what_was_there(
     mine, another_program, monkeypatch, capsys
 ):
