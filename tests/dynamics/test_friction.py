@@ -1,6 +1,7 @@
 """Friction: its laws, closed forms of one joint, the choice of sticking joints, and what the whole robot does."""
 
 import itertools
+from inspect import getsource
 from types import SimpleNamespace
 
 import casadi as ca
@@ -44,7 +45,7 @@ def _one_joint(x, time, steps, *, rate=0.0, end=0.0, speed=0.0, law=None, derive
     timing = FrameTiming(1 / time, hold="linear")
     settings = LoopSettings(ServoGains(0.0, 0.0, 0.0), timing, law or FrictionLaw(), steps)
     start = StartState(x * FIRST, rate * FIRST, rest, rest, end * FIRST[None], rest)
-    masses = SimpleNamespace(functions=compiled_functions(b"six masses", _six_masses))
+    masses = SimpleNamespace(functions=compiled_functions(getsource(_six_masses).encode(), _six_masses))
     pull = np.tile((end + speed * time) * FIRST, (2, 1))
     fixed, none = (masses, parameters, at_rest(rest, 2), settings, start, None), (None,) * 3
     found = run(LoopProblem(*fixed, derived, derived, pull, *none, servo_robot=masses))
