@@ -44,16 +44,15 @@ CALLED = (evaluate_terms, evaluate, decide_modes, stop_joints, slope_tangent, st
 def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
     """Do one run; see `closed_loop.simulate`."""
     memory, record, frames = empty_memory(problem.sizes), empty_record(problem), problem.frames
-    asked = problem.sensor is not None or problem.controller is not None
     commands = problem.commands  # a controller's are written frame by frame, and take the place of the servo's, too
     if commands is None:
-        commands = np.zeros((frames if problem.controller else 0, problem.sizes.joints))
+        commands = np.zeros((0 if problem.controller is None else frames, problem.sizes.joints))
     plan = _plan(problem, commands)
     own, known = problem.robot.functions, problem.servo_robot.functions  # held here: code that nobody holds is freed
     _fill(memory, problem, own, known["equation_of_motion"], _addresses(problem.sizes, compiled))
     do = chosen(run_frames, compiled)
-    for first, last in [(k, k + 1) for k in range(frames)] if asked else [(0, frames)]:
-        if asked:
+    for first, last in [(k, k + 1) for k in range(frames)] if problem.asked else [(0, frames)]:
+        if problem.asked:
             try:
                 _consult(problem, first, memory.now, plan, record, commands)
             except Exception as error:
@@ -136,7 +135,7 @@ def _fill(
     task.friction = settings.friction.record
     task.period = problem.period
     task.sensitivities = problem.sensitivities
-    task.measured = problem.sensor is not None or problem.controller is not None
+    task.measured = problem.asked
     if settings.elasticity is not None:
         rigid = settings.elasticity.beyond_the_springs(rigid)
         task.stiffness, task.damping = settings.elasticity.stiffness, settings.elasticity.damping

@@ -15,13 +15,8 @@ from dynamics.robot import Robot
 
 DYNAMIC_COUNT = len(PARAMETER_NAMES)
 PARAMETER_COUNT = DYNAMIC_COUNT + len(JOINT_PID_NAMES)
-LENGTH = PARAMETER_COUNT  # sensitivities inside a run: the column of the length of the present step, then the start
-START_COUNT = 24  # pose, pose rate, joint PID integral, servo integral
 MAX_DELAY_FRAMES = 60
 MAX_STEPS_PER_FRAME = 10_000
-LEFT_REACH = "the robot left the reachable set (the loop is unstable)"
-MEASURED_OUT_OF_REACH = "the measured pose is out of reach, so that the servo has no command"
-SINGULAR_MASS = "the mass matrix is not positive definite: masses or inertias are zero or overflow"
 
 Hold = Literal["zero", "linear"]
 
@@ -200,31 +195,16 @@ class LoopProblem:
         """Time between two frames, s."""
         return 1.0 / self.settings.timing.frame_rate_hz
 
+    @property
+    def asked(self) -> bool:
+        """Whether a user's own sensor or controller is asked at every frame."""
+        return self.sensor is not None or self.controller is not None
+
     @cached_property
     def sizes(self) -> Sizes:
         """Those of the robot's equation of motion."""
         motion = self.robot.functions["equation_of_motion"]
         return Sizes(joints=motion.outputs[2][0], coordinates=motion.inputs[0], rigid=motion.inputs[2])
-
-
-def measurement(
-    sensor: PoseSensor | RateSensor, frame: int, time: float, pose: np.ndarray, rate: np.ndarray
-) -> np.ndarray | None:
-    """What a sensor returns, as (6,) floats or None for a lost measurement. Raises SimulationError otherwise."""
-    if isinstance(sensor, RateSensor):
-        measured = sensor.measure(frame, time, pose, rate)
-    else:
-        measured = sensor(frame, time, pose)
-    if measured is None:
-        return None
-    return floats(f"what the pose sensor returned at frame {frame}", measured, (6,), error=SimulationError)
-
-
-def own_command(controller: Controller, problem: LoopProblem, frame: int, measured: np.ndarray) -> np.ndarray:
-    """What a controller answers to a good measurement (6,), as (6,) floats. Raises SimulationError otherwise."""
-    reference = problem.reference
-    command = controller(frame, frame * problem.period, measured.copy(), reference.poses[frame], reference.rates[frame])
-    return np.array(floats(f"what the controller returned at frame {frame}", command, (6,), error=SimulationError))
 
 
 def checked_loop_parameters(parameters: object) -> np.ndarray:

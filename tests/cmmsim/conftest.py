@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import cmmsim
+from cmmsim.acceptance import MeasuringVolume, common_volume
+from cmmsim.files.sensor_file import read_sensor_file
 
 
 @pytest.fixture(scope="session")
@@ -16,6 +18,12 @@ def taught() -> cmmsim.Taught:
 def sensor(taught: cmmsim.Taught) -> cmmsim.Sensor:
     """The taught sensor, drawn by pyrender where OpenGL works."""
     return cmmsim.load_sensor("ctrack780", seed=0, taught=taught)
+
+
+@pytest.fixture(scope="session")
+def volume() -> MeasuringVolume:
+    """What both cameras of the built-in sensor see."""
+    return common_volume(read_sensor_file("ctrack780").rig)
 
 
 @pytest.fixture

@@ -29,11 +29,6 @@ from cmmsim.geometry.pose import apply, pose_to_transform
 RIG = read_sensor_file("ctrack780").rig
 
 
-@pytest.fixture(scope="module")
-def volume():
-    return common_volume(RIG)
-
-
 def test_volume_is_the_largest_that_both_cameras_see_along_their_axes(volume):
     """x goes right and y down in both images, and what is further away is smaller."""
     rig, camera_from_base = rig_from_file(RIG)

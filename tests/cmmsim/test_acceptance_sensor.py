@@ -10,7 +10,6 @@ from cmmsim.acceptance import (
     AcceptanceError,
     SensorUnderTest,
     bar_paths,
-    common_volume,
     latency_test,
     length_test,
     seven_lines,
@@ -25,11 +24,6 @@ from cmmsim.pose_estimation.estimator import lost_measurement
 from tests.cmmsim.sensors import NOISE_FREE
 
 RIG = read_sensor_file("ctrack780").rig
-
-
-@pytest.fixture(scope="module")
-def volume():
-    return common_volume(RIG)
 
 
 def under_test(seed=0, changes=None):
