@@ -16,12 +16,12 @@ import numba
 import numpy as np
 from llvmlite import ir
 from numba import njit, typeof, types
-from numba.core.caching import FunctionCache
+from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.extending import intrinsic
 
-from dynamics.compiled.object_files import load_object, save_object
+from dynamics.compiled.object_files import cache_folder, load_object, save_object
 
 Array = np.ndarray  # of any type and shape, which docstrings state
 Record = Any  # a numpy.record, whose fields are those of its type
@@ -38,35 +38,38 @@ def entry(function: Callable[..., Any]) -> Any:
     """A kernel that Python calls, or kernels by its address: kept in the user's cache with all that it calls."""
     function.kernel = True  # type: ignore[attr-defined]
     compiled: Any = njit(nogil=True, error_model="numpy")(function)
-    if hasattr(compiled, "py_func"):  # NUMBA_DISABLE_JIT leaves the function as it is
-        try:
-            compiled._cache = FunctionCache(function)
-        except RuntimeError:  # numba finds no folder of its own, which we do not need
-            return compiled
-        compiled._cache._cache_file = _KernelFiles(function.__qualname__)
+    if isinstance(compiled, Dispatcher):  # NUMBA_DISABLE_JIT leaves the function as it is
+        compiled._cache = _KernelCache(function)  # type: ignore[attr-defined]
     return compiled
 
 
-class _KernelFiles:
-    """Where numba keeps an entry: in our files, which nobody else can have written, each under its whole content's key.
+class _KernelCache:
+    """The cache of an entry, as numba asks for it: in our files, which nobody else can have written.
 
-    numba's own files would be loaded whoever wrote them, and asked only whether the function's own file has changed.
+    numba's own would load files whoever wrote them, want a folder besides ours, and ask only whether the function's own
+    file has changed.
     """
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._name = f"{function.__module__}.{function.__qualname__} {function.__code__.co_code.hex()}"
 
-    def load(self, key: object) -> object | None:
+    @property
+    def cache_path(self) -> str:
+        """Where it is kept."""
+        return str(cache_folder())
+
+    def load_overload(self, signature: object, context: Any) -> object | None:
         """What was compiled for a signature on such a processor, if that is there."""
-        found = load_object(self._file(key))
-        return None if found is None else pickle.loads(found)
+        context.refresh()
+        found = load_object(self._file(signature, context.codegen()))
+        return None if found is None else CompileResult._rebuild(context, *pickle.loads(found))
 
-    def save(self, key: object, data: object) -> None:
+    def save_overload(self, signature: object, result: Any) -> None:
         """Keep what was compiled."""
-        save_object(self._file(key), dumps(data))
+        save_object(self._file(signature, result.codegen), dumps(result._reduce()))
 
-    def _file(self, key: object) -> str:
-        content = f"{self._name} {numba.__version__} {_stamp()} {key}"
+    def _file(self, signature: object, codegen: Any) -> str:
+        content = f"{self._name} {numba.__version__} {_stamp()} {signature} {codegen.magic_tuple()}"
         return f"{hashlib.sha256(content.encode()).hexdigest()[:24]}.kernel"
 
 
