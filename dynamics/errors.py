@@ -21,8 +21,12 @@ class UnreachablePoseError(DynamicsError):
     """A pose that a leg cannot reach."""
 
 
+class ChartError(DynamicsError):
+    """A pose or a motion that a platform with fewer than six freedoms cannot have."""
+
+
 class TravelError(DynamicsError):
-    """A crank angle beyond the travel limit."""
+    """A joint coordinate beyond the travel limit."""
 
 
 class SingularPoseError(DynamicsError):

@@ -4,9 +4,9 @@ A rigid body has a positive mass, and no principal moment larger than the sum of
 Published tables break this (the cranks and links of the paper's Table 1 do), and multibody engines refuse such bodies.
 `physical_inertias` names them, or changes as little as possible, and where it can what the motion does not feel:
 
-- a crank turns about its own z alone, so Ixx and Iyy give way and Izz stays;
-- a link without spin does no work against Izz, so Izz gives way and Ixx and Iyy stay;
-- the platform feels all three, so they share the change equally (the nearest moments in the least-squares sense).
+- a body of which one moment does work, as the Izz of a crank that turns about its own z, keeps that;
+- one of which two do, as Ixx and Iyy of a link without spin, keeps those, and the third gives way;
+- where all three do, as the platform's, they share the change equally (the nearest moments in the least-squares sense).
 
 `acceleration_changes` measures at random states over the travel what that means for the robot's motion.
 """
@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynamics.errors import ParameterError
-from dynamics.legs.rss_geometry import LEGS
-from dynamics.parameters import BODY_NAMES, RIGID_BODY, check_parameters
+from dynamics.legs.leg import Body
+from dynamics.parameters import ParameterLayout
 from dynamics.robot import Robot
 from dynamics.workspace import measure
 
@@ -37,20 +37,20 @@ class UnphysicalInertiaError(ParameterError):
 
 @dataclass(frozen=True)
 class BodyInertias:
-    """Mass (kg) and principal moments Ixx, Iyy, Izz (kg m^2) of each body, (13, 4) in the order of `BODY_NAMES`, and
-    what was changed, in words by body (empty: nothing)."""
+    """Mass (kg) and principal moments Ixx, Iyy, Izz (kg m^2) of each body (bodies, 4), in the order of the
+    robot's layout, and what was changed, in words by body (empty: nothing)."""
 
     values: np.ndarray
     changes: dict[str, str]
 
 
-def physical_inertias(parameters: np.ndarray, allow_changes: bool = False) -> BodyInertias:
-    """Inertias of parameters (64,) that a multibody engine accepts.
+def physical_inertias(layout: ParameterLayout, parameters: np.ndarray, allow_changes: bool = False) -> BodyInertias:
+    """Inertias of a robot's parameters (p,) that a multibody engine accepts.
 
     Raises UnphysicalInertiaError, naming bodies and values, where one must be changed and `allow_changes` is False.
     """
-    given = np.array(parameters[: 4 * len(BODY_NAMES)], dtype=float).reshape(-1, 4)
-    broken = {body: fault for body, row in zip(BODY_NAMES, given, strict=True) if (fault := _fault(row))}
+    given = layout.bodies_of(np.array(parameters, dtype=float))
+    broken = {body: fault for body, row in zip(layout.bodies, given, strict=True) if (fault := _fault(row))}
     if broken and not allow_changes:
         raise UnphysicalInertiaError(
             f"no rigid body has these inertias [kg, kg m^2]: {'; '.join(grouped(broken))}; "
@@ -58,9 +58,9 @@ def physical_inertias(parameters: np.ndarray, allow_changes: bool = False) -> Bo
             "that engines accept"
         )
     values, changes = given.copy(), dict[str, str]()
-    for index, body in enumerate(BODY_NAMES):
+    for index, body in enumerate(layout.bodies):
         if body in broken:
-            values[index] = _repaired(body, given[index])
+            values[index] = _repaired(layout.kinds[index], given[index])
             changes[body] = _difference(given[index], values[index])
     return BodyInertias(values, changes)
 
@@ -92,38 +92,39 @@ def _fault(row: np.ndarray) -> str:
     return moments_fault(dict(zip(MOMENTS, row[1:].tolist(), strict=True)))
 
 
-def _repaired(body: str, row: np.ndarray) -> np.ndarray:
+def _repaired(body: Body, row: np.ndarray) -> np.ndarray:
     mass = max(row[0], SMALLEST)
     moments = np.maximum(row[1:], SMALLEST) / 4  # sums of three of the largest floats overflow
-    if body.startswith("crank"):
-        moments = _crank_moments(*moments)
-    elif body.startswith("link"):
-        moments = _link_moments(*moments)
+    working = [MOMENTS.index(name) for name in body.moments]
+    if len(working) in (1, 2):
+        idle = [entry for entry in range(3) if entry not in working]
+        change = _one_kept if len(working) == 1 else _two_kept
+        moments[[*idle, *working]] = change(*moments[idle], *moments[working])
     else:
         moments = _nearest_moments(moments)
-    return np.array([mass, *4 * np.array(moments)])
+    return np.array([mass, *4 * moments])
 
 
-def _crank_moments(x: float, y: float, z: float) -> list[float]:
-    if x + y < z:
-        half = (z - x - y) / 2 + ROUNDING * z
-        return [x + half, y + half, z]
-    return [min(x, (y + z) * (1 - ROUNDING)), min(y, (x + z) * (1 - ROUNDING)), z]
+def _one_kept(x: float, y: float, kept: float) -> list[float]:
+    if x + y < kept:
+        half = (kept - x - y) / 2 + ROUNDING * kept
+        return [x + half, y + half, kept]
+    return [min(x, (y + kept) * (1 - ROUNDING)), min(y, (x + kept) * (1 - ROUNDING)), kept]
 
 
-def _link_moments(x: float, y: float, z: float) -> list[float]:
+def _two_kept(z: float, x: float, y: float) -> list[float]:
     slack = ROUNDING * (x + y)
-    return [x, y, min(max(z, abs(x - y) + slack), x + y - slack)]
+    return [min(max(z, abs(x - y) + slack), x + y - slack), x, y]
 
 
-def _nearest_moments(moments: np.ndarray) -> list[float]:
+def _nearest_moments(moments: np.ndarray) -> np.ndarray:
     largest = int(np.argmax(moments))
     excess = 2 * moments[largest] - moments.sum()
     if excess > 0:
         share = excess / 3 + ROUNDING * moments[largest]
         moments = moments + share
         moments[largest] -= 2 * share
-    return [float(value) for value in moments]
+    return moments
 
 
 def _difference(before: np.ndarray, after: np.ndarray) -> str:
@@ -132,24 +133,25 @@ def _difference(before: np.ndarray, after: np.ndarray) -> str:
 
 
 STATES = 300
-CRANK_RATE_RAD_S, TORQUE_NM = 1.0, 3.0
-"""Standard deviations of crank rates, and of torques on top of those that hold the robot."""
+TRAVEL_RATE, TORQUE_SHARE = 1.0, 0.5
+"""Standard deviations of joint rates, travel limits a second, and of torques on top of those that hold the robot, of the
+largest of those."""
 
 
 def acceleration_changes(robot: Robot, parameters: np.ndarray, inertias: np.ndarray) -> dict[str, float]:
     """How much each changed body alters forward dynamics, by body: the largest |change| / |acceleration|.
 
-    `inertias` (13, 4) are masses and moments in the order of `BODY_NAMES`; bodies that have them already in the
-    parameters (64,) are left out. Linear and angular acceleration count separately, over the states of
+    `inertias` (bodies, 4) are masses and moments in the order of the layout; bodies that have them already in the
+    parameters (p,) are left out. Linear and angular acceleration count separately, over the states of
     `travel_states`. Raises ParameterError for parameters outside their range.
     """
-    own = check_parameters(parameters)
+    own, layout = robot.layout.check(parameters), robot.layout
     state = travel_states(robot, own)
     before = robot.forward_dynamics(*state, own).reshape(-1, 2, 3)
     effects = {}
-    for index, body in enumerate(BODY_NAMES):
+    for index, body in enumerate(layout.bodies):
         other = own.copy()
-        other[RIGID_BODY].reshape(-1, 4)[index] = inertias[index]
+        layout.bodies_of(other)[index] = inertias[index]
         if not np.array_equal(other, own):
             change = robot.forward_dynamics(*state, other).reshape(-1, 2, 3) - before
             effects[body] = float((np.linalg.norm(change, axis=2) / np.linalg.norm(before, axis=2)).max())
@@ -157,16 +159,18 @@ def acceleration_changes(robot: Robot, parameters: np.ndarray, inertias: np.ndar
 
 
 def travel_states(robot: Robot, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Random poses within the travel limit, twists and torques, (STATES, 6) each; always the same for a robot."""
-    rng = np.random.default_rng(0)
-    at_home = robot.pose_jacobian(robot.home_pose)
+    """Random poses within the travel limit and twists, (STATES, 6) each, and torques (STATES, n); always the same for a
+    robot."""
+    rng, free, joints = np.random.default_rng(0), robot.geometry.chart.basis, robot.layout.joints
+    at_home = robot.coordinate_jacobian(robot.home_pose)
     pose = np.empty((0, 6))
     while len(pose) < STATES:
         # The linear map from angles to poses leaves the reach far from home: the factor keeps some draws near it.
-        angles = robot.travel_limit * rng.uniform(0, 1, (STATES, 1)) * rng.uniform(-1, 1, (STATES, LEGS))
-        drawn = robot.home_pose + np.linalg.solve(at_home, angles.T).T
+        angles = robot.travel_limit * rng.uniform(0, 1, (STATES, 1)) * rng.uniform(-1, 1, (STATES, joints))
+        drawn = robot.home_pose + np.linalg.solve(at_home, angles.T).T @ free.T
         pose = np.concatenate([pose, drawn[measure(robot, drawn).travel_share <= 1]])
     pose = pose[:STATES]
-    rates = CRANK_RATE_RAD_S * rng.standard_normal((STATES, LEGS, 1))
-    twist = np.linalg.solve(robot.joint_jacobian(pose), rates)[..., 0]
-    return pose, twist, robot.static_torque(pose, parameters) + TORQUE_NM * rng.standard_normal((STATES, LEGS))
+    rates = TRAVEL_RATE * robot.travel_limit * rng.standard_normal((STATES, joints, 1))
+    twist = np.linalg.solve(robot.joint_jacobian(pose) @ free, rates)[..., 0] @ free.T
+    holding = robot.static_torque(pose, parameters)
+    return pose, twist, holding + TORQUE_SHARE * np.abs(holding).max() * rng.standard_normal((STATES, joints))

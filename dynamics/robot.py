@@ -6,7 +6,6 @@ Also a robot whose joints do not sit where the drawing says, and forward dynamic
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,22 +16,26 @@ from numpy.typing import ArrayLike
 from dynamics.checks import check_type, floats, real, row_text, rows, shown
 from dynamics.compiled.machine_code import MachineFunction, compiled_functions
 from dynamics.errors import (
+    ChartError,
     DynamicsError,
     RobotFileError,
     ShapeError,
     SingularPoseError,
     UnreachablePoseError,
 )
+from dynamics.geometry import RobotGeometry
 from dynamics.kinematics import forward_kinematics
-from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
-from dynamics.legs.rss_inverse_kinematics import home_angles
-from dynamics.parameters import PARAMETER_NAMES, check_parameters
+from dynamics.kinematics.chart import POSE_NAMES
+from dynamics.parameters import parameter_layout
 from dynamics.rigid_body.equation_of_motion import motion_functions
 from dynamics.rigid_body.virtual_work import robot_functions
 from dynamics.robot_file import ParameterSet, RobotDescription, read_robot_file
 
 # Below this the solution of M a = f loses all digits; a healthy robot is near 1e2 (poses in m and rad).
 CONDITION_LIMIT = 1e10
+
+# m or rad, and m/s or rad/s: a pose or a twist farther from what the chart allows contradicts it.
+CHART_TOLERANCE = 1e-9
 
 
 StateToAcceleration = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -44,13 +47,16 @@ def load_robot(name_or_path: str | Path) -> Robot:
 
 
 class Robot:
-    """Kinematics and virtual-work dynamics of one robot.
+    """Kinematics and virtual-work dynamics of one robot, with n joints, p dynamic parameters and m coordinates.
 
-    Poses (6,) are [x y z alpha beta gamma] of the platform in the base frame (eq. 1); twists [h_dot, omega] in base
-    axes; SI units and rad. Every method also takes batches with a leading axis (N, 6), and then returns one more axis.
-    `parameters` (64,) or (N, 64) follow `parameter_names`; None means `nominal_parameters`, the set `initial`.
+    Poses (6,) are [x y z alpha beta gamma] of the platform in the base frame (eq. 1), of every robot; twists
+    [h_dot, omega] in base axes; SI units and rad. What of a pose the platform can change are its coordinates (m,), see
+    `pose` and `coordinates`; joint coordinates (n,) are angles, or lengths where actuators slide (then N and N s/m take
+    the place of N m and N m s/rad). Every method also takes batches with a leading axis (N, 6), and then returns one
+    more axis. `parameters` (p,) or (N, p) follow `parameter_names`; None means `nominal_parameters`, the set `initial`.
     Methods raise ShapeError for wrong shapes or entries that are not finite, ParameterError for parameters outside
-    their range, UnreachablePoseError for a pose beyond a leg's reach, SingularPoseError where a Jacobian is singular.
+    their range, ChartError for a pose or a twist that the platform cannot have, UnreachablePoseError for a pose beyond
+    a leg's reach, SingularPoseError where a Jacobian is singular.
     """
 
     def __init__(self, description: RobotDescription) -> None:
@@ -58,7 +64,8 @@ class Robot:
         self.name = description.name
         self.geometry = description.geometry
         self.parameter_sets: dict[str, ParameterSet] = description.parameter_sets
-        self.parameter_names = PARAMETER_NAMES
+        self.layout = parameter_layout(self.geometry.legs)
+        self.parameter_names = self.layout.dynamic_names
         self.nominal_parameters = description.parameter_sets["initial"].dynamic
 
     def __repr__(self) -> str:
@@ -66,35 +73,57 @@ class Robot:
 
     @property
     def home_pose(self) -> np.ndarray:
-        """Pose (6,) with all crank angles zero."""
+        """Pose (6,) of the platform at home."""
         return self.geometry.home_pose
 
     @property
     def travel_limit(self) -> float:
-        """Largest crank angle magnitude allowed, rad."""
+        """Largest magnitude of a joint coordinate allowed, rad or m."""
         return self.geometry.travel_limit
 
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the actuated joints (n)."""
+        return self.layout.joint_names
+
+    @property
+    def coordinate_names(self) -> tuple[str, ...]:
+        """Names of the platform's coordinates (m)."""
+        return self.geometry.chart.coordinate_names
+
+    def pose(self, coordinates: ArrayLike) -> np.ndarray:
+        """Pose (6,) of coordinates (m,)."""
+        return self.geometry.chart.pose(rows("coordinates", coordinates, len(self.coordinate_names)))
+
+    def coordinates(self, pose: ArrayLike) -> np.ndarray:
+        """Coordinates (m,) of a pose (6,), such as a measured one; what the platform cannot change is left out."""
+        return self.geometry.chart.coordinates(rows("pose", pose, 6))
+
     def inverse_kinematics(self, pose: ArrayLike) -> np.ndarray:
-        """Crank angles (6,) in rad, in closed form (eq. 3 and 4)."""
+        """Joint coordinates (n,), rad or m, in closed form (eq. 3 and 4)."""
         pose = self._poses(pose)
         return self._call("inverse_kinematics", pose)[..., 0]
 
     def forward_kinematics(self, theta: ArrayLike, initial_pose: ArrayLike | None = None) -> np.ndarray:
-        """Pose (6,) of crank angles (6,) by Newton's method from `initial_pose` (home by default).
+        """Pose (6,) of joint coordinates (n,) by Newton's method from `initial_pose` (home by default).
 
-        Raises ConvergenceError, naming the residual, when no pose near the start has these angles.
+        Raises ConvergenceError, naming the residual, when no pose near the start has these coordinates.
         """
-        theta = rows("theta", theta, LEGS)
-        start = self.home_pose if initial_pose is None else rows("initial_pose", initial_pose, 6)
-        return forward_kinematics.solve(self.functions, theta, start)
+        theta = rows("theta", theta, self.layout.joints)
+        start = self.home_pose if initial_pose is None else self.charted(initial_pose, "initial_pose")
+        return forward_kinematics.solve(self.functions, self.geometry.chart, theta, start)
 
     def joint_jacobian(self, pose: ArrayLike) -> np.ndarray:
-        """J_ad (6, 6): theta_dot = J_ad twist (eq. 8)."""
+        """J_ad (n, 6): theta_dot = J_ad twist (eq. 8)."""
         return self._call("joint_jacobian", self._poses(pose))
 
     def pose_jacobian(self, pose: ArrayLike) -> np.ndarray:
-        """J_theta (6, 6): theta_dot = J_theta pose_dot (eq. 29)."""
+        """J_theta (n, 6): theta_dot = J_theta pose_dot (eq. 29)."""
         return self._call("pose_jacobian", self._poses(pose))
+
+    def coordinate_jacobian(self, pose: ArrayLike) -> np.ndarray:
+        """(n, m): the joint rates of the rates of the platform's coordinates."""
+        return self.pose_jacobian(pose) @ self.geometry.chart.basis
 
     def twist(self, pose: ArrayLike, pose_rate: ArrayLike) -> np.ndarray:
         """Twist (6,) of pose rates (6,) (eq. 2)."""
@@ -119,7 +148,7 @@ class Robot:
 
     def coriolis_matrix(self, pose: ArrayLike, twist: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
         """C (6, 6) of eq. 23."""
-        twist = rows("twist", twist, 6)
+        twist = self._twists("twist", twist)
         return self._call("coriolis_matrix", self._poses(pose), twist, self._parameters(parameters))
 
     def gravity_wrench(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
@@ -128,44 +157,47 @@ class Robot:
 
     def friction_wrench(self, pose: ArrayLike, twist: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
         """tau_f (6,) of eq. 24, N and N m, with the exact sign function (zero at rest)."""
-        twist = rows("twist", twist, 6)
+        twist = self._twists("twist", twist)
         return self._call("friction_wrench", self._poses(pose), twist, self._parameters(parameters))[..., 0]
 
     def regressor(self, pose: ArrayLike, twist: ArrayLike, twist_dot: ArrayLike) -> np.ndarray:
-        """Gamma (6, 64): tau_g = Gamma parameters (eq. 25)."""
-        return self._call("regressor", self._poses(pose), rows("twist", twist, 6), rows("twist_dot", twist_dot, 6))
+        """Gamma (6, p): tau_g = Gamma parameters (eq. 25)."""
+        return self._call(
+            "regressor", self._poses(pose), self._twists("twist", twist), self._twists("twist_dot", twist_dot)
+        )
 
     def inverse_dynamics(
         self, pose: ArrayLike, twist: ArrayLike, twist_dot: ArrayLike, parameters: ArrayLike | None = None
     ) -> np.ndarray:
-        """Actuator torques (6,), N m, of a motion (eq. 17 and 23)."""
-        motion = (rows("twist", twist, 6), rows("twist_dot", twist_dot, 6))
+        """Actuator torques or forces (n,), N m or N, of a motion (eq. 17 and 23)."""
+        motion = (self._twists("twist", twist), self._twists("twist_dot", twist_dot))
         return self._call("inverse_dynamics", self._regular(pose), *motion, self._parameters(parameters))[..., 0]
 
     def forward_dynamics(
         self, pose: ArrayLike, twist: ArrayLike, torque: ArrayLike, parameters: ArrayLike | None = None
     ) -> np.ndarray:
-        """twist_dot (6,) under actuator torques (6,), with the exact sign function in the friction (eq. 40)."""
-        state = (self._regular(pose), rows("twist", twist, 6), rows("torque", torque, 6))
+        """twist_dot (6,) under actuator torques (n,), with the exact sign function in the friction (eq. 40)."""
+        state = (self._regular(pose), self._twists("twist", twist), rows("torque", torque, self.layout.joints))
         return self._call("forward_dynamics", *state, self._parameters(parameters))[..., 0]
 
     def static_torque(self, pose: ArrayLike, parameters: ArrayLike | None = None) -> np.ndarray:
-        """Actuator torques (6,), N m, that hold the robot at rest without help from friction."""
+        """Actuator torques or forces (n,), N m or N, that hold the robot at rest without help from friction."""
         poses = rows("pose", pose, 6)
         rest = np.zeros_like(poses)
         return self.inverse_dynamics(poses, rest, rest, parameters)
 
     def reach_margin(self, pose: ArrayLike) -> np.ndarray:
-        """sin^2 of the angle between each crank and its direction of reach (6,), dimensionless; negative beyond it.
+        """How far each leg is from the end of its reach (n,), dimensionless and at most 1; negative beyond it.
 
-        It falls without limit as the leg's target moves away, and is -inf where squares overflow.
+        For a crank, sin^2 of the angle between it and its direction of reach. It falls without limit as the leg's
+        target moves away, and is -inf where squares overflow.
         """
-        margin = self._call("inverse_kinematics", rows("pose", pose, 6), output=1)[..., 0]
+        margin = self._call("inverse_kinematics", self.charted(pose), output=1)[..., 0]
         return np.where(np.isnan(margin), -np.inf, margin)
 
     def check_reach(self, pose: ArrayLike, name: str = "pose", row: str = "row") -> None:
         """Raise UnreachablePoseError, naming leg and pose, where a leg cannot reach; `name` and `row` are its words."""
-        poses = np.atleast_2d(rows(name, pose, 6))
+        poses = np.atleast_2d(self.charted(pose, name))
         margin = self.reach_margin(poses)
         if (margin > 0).all():
             return
@@ -186,9 +218,33 @@ class Robot:
         self.check_reach(poses)
         return poses
 
+    def charted(self, pose: ArrayLike, name: str = "pose") -> np.ndarray:
+        """The poses (6,) or (N, 6), if the platform can have them. Raises ChartError, or ShapeError."""
+        poses = rows(name, pose, 6)
+        self._check_chart(name, poses, self.geometry.chart.forbidden(poses))
+        return poses
+
+    def _twists(self, name: str, value: ArrayLike) -> np.ndarray:
+        twists, free = rows(name, value, 6), self.geometry.chart.basis
+        self._check_chart(name, twists, twists - twists @ free @ free.T)
+        return twists
+
+    def _check_chart(self, name: str, given: np.ndarray, forbidden: np.ndarray) -> None:
+        """Raise ChartError where rows hold what the platform of this robot cannot do."""
+        if np.abs(forbidden).max(initial=0.0) <= CHART_TOLERANCE:
+            return
+        chart, entry = self.geometry.chart, int(np.argmax(np.abs(np.atleast_2d(forbidden)).max(axis=0)))
+        row = int(np.argmax(np.abs(np.atleast_2d(forbidden)[:, entry])))
+        raise ChartError(
+            f"the platform of {self.name} moves in {', '.join(chart.coordinate_names)} only: {name} "
+            f"{row_text(np.atleast_2d(given)[row])} is {np.atleast_2d(forbidden)[row, entry]:.3g} off in "
+            f"{POSE_NAMES[entry]}"
+        )
+
     def _regular(self, pose: ArrayLike) -> np.ndarray:
         poses = self._poses(pose)
-        condition = np.atleast_1d(np.linalg.cond(self._call("joint_jacobian", poses)))
+        jacobian = self._call("joint_jacobian", poses) @ self.geometry.chart.basis
+        condition = np.atleast_1d(np.linalg.cond(jacobian))
         if not (condition < CONDITION_LIMIT).all():
             index = int(np.argmax(~(condition < CONDITION_LIMIT)))
             raise SingularPoseError(
@@ -198,7 +254,7 @@ class Robot:
         return poses
 
     def _parameters(self, parameters: ArrayLike | None) -> np.ndarray:
-        return self.nominal_parameters if parameters is None else check_parameters(parameters, batch=True)
+        return self.nominal_parameters if parameters is None else self.layout.check(parameters, batch=True)
 
     def _call(self, name: str, *arguments: np.ndarray, output: int = 0) -> np.ndarray:
         """Evaluate one function over the common batch: (rows, columns) or, with a batch, (N, rows, columns)."""
@@ -218,7 +274,7 @@ HOT = ("equation_of_motion", "motion_derivatives", "rate_map_derivative", "forwa
 
 
 @lru_cache(maxsize=16)
-def _functions(geometry: Rss6Geometry) -> dict[str, MachineFunction]:
+def _functions(geometry: RobotGeometry) -> dict[str, MachineFunction]:
     """One set for all robots of a geometry; not kept in the robot, so that robots can be pickled."""
     return compiled_functions(geometry.digest, lambda: robot_functions(geometry) + motion_functions(geometry), HOT)
 
@@ -226,31 +282,28 @@ def _functions(geometry: Rss6Geometry) -> dict[str, MachineFunction]:
 def with_geometry_error(robot: Robot, std: float, rng: np.random.Generator) -> Robot:
     """The robot with every coordinate of its base joints B and platform joints A off by a normal error of `std`, m.
 
-    Crank and link lengths and the crank axes stay. The cranks are set to zero at the home pose as those of a real
-    robot are, so home keeps its crank angles. An error of zero gives the robot itself; the same state of `rng` gives
-    the same robot. Raises RobotFileError for a negative error, and where a leg does not reach the home pose any more.
+    Lengths and axes stay. Joint coordinates are set to zero at the home pose as those of a real robot are, so home keeps
+    them where they are zero there. An error of zero gives the robot itself; the same state of `rng` gives the same
+    robot. Raises RobotFileError for a negative error, and where a leg does not reach the home pose any more.
     """
     check_type("robot", robot, Robot, RobotFileError)
     if real("geometry error", std, RobotFileError, least=0, unit=" m") == 0:
         return robot
-    base, platform = std * rng.standard_normal((2, LEGS, 3))
-    nominal = robot.geometry
-    moved = replace(nominal, base_joints=nominal.base_joints + base, platform_joints=nominal.platform_joints + platform)
+    base, platform = std * rng.standard_normal((2, robot.layout.joints, 3))
     try:
-        angles = home_angles(moved)
+        geometry = robot.geometry.displaced(base, platform)
     except RobotFileError as error:
         raise RobotFileError(f"with joints off by {std:g} m: {error}") from error
-    geometry = replace(moved, crank_zero_directions=moved.crank_frames(angles)[:, :, 0])
     return Robot(RobotDescription(robot.name, geometry, robot.parameter_sets))
 
 
 def fast_forward_dynamics(robot: Robot, parameters: np.ndarray | None = None) -> StateToAcceleration:
-    """A function of pose (6,), twist (6,), torque (6,) that returns twist_dot (6,), as `Robot.forward_dynamics`.
+    """A function of pose (6,), twist (6,), torque (n,) that returns twist_dot (6,), as `Robot.forward_dynamics`.
 
-    Parameters (64,) are fixed and checked once; None means the robot's nominal ones. Some 80 times faster than the
+    Parameters (p,) are fixed and checked once; None means the robot's nominal ones. Some 80 times faster than the
     robot's own method, which checks shapes, reach and conditioning on every call. The array returned is the function's
     own and is overwritten by the next call (copy it to keep it); so the function is not thread safe.
-    It raises ShapeError unless its inputs are float64 arrays of shape (6,), and SingularPoseError where the
+    It raises ShapeError unless its inputs are float64 arrays of these shapes, and SingularPoseError where the
     result is not finite: a leg out of reach, a singular mass matrix, or NaN in the input.
 
     Where J_a2 alone is singular (the platform moves with all cranks locked) eq. 40 still holds, since M is regular:
@@ -258,11 +311,12 @@ def fast_forward_dynamics(robot: Robot, parameters: np.ndarray | None = None) ->
     `workspace.check_motion` says how near they are.
     """
     check_type("robot", robot, Robot, DynamicsError)
-    fixed = check_parameters(robot.nominal_parameters if parameters is None else parameters)
-    inputs, result = np.concatenate([np.zeros(18), fixed]), np.zeros(6)
+    fixed = robot.layout.check(robot.nominal_parameters if parameters is None else parameters)
+    joints = robot.layout.joints
+    inputs, result = np.concatenate([np.zeros(12 + joints), fixed]), np.zeros(6)
     # Assigning to a memoryview costs half of assigning to an array, and refuses other shapes and types. The stubs of
     # NumPy do not know of that.
-    views: list[Any] = [memoryview(part.data) for part in (inputs[0:6], inputs[6:12], inputs[12:18])]
+    views: list[Any] = [memoryview(part.data) for part in (inputs[0:6], inputs[6:12], inputs[12 : 12 + joints])]
     pose_in, twist_in, torque_in = views
     values = memoryview(result.data)
     call = robot.functions["forward_dynamics"].bound_to(inputs, result)
@@ -273,10 +327,11 @@ def fast_forward_dynamics(robot: Robot, parameters: np.ndarray | None = None) ->
             twist_in[:] = at_twist
             torque_in[:] = at_torque
         except (TypeError, ValueError):
-            for name, value in {"pose": at_pose, "twist": at_twist, "torque": at_torque}.items():
-                if floats(name, value, (6,), finite=False) is not value:
-                    raise ShapeError(f"{name} must be a float64 array of shape (6,), got {shown(value)}") from None
-            raise ShapeError("pose, twist, torque must be float64 arrays of shape (6,)") from None
+            given = {"pose": (at_pose, 6), "twist": (at_twist, 6), "torque": (at_torque, joints)}
+            for name, (value, size) in given.items():
+                if floats(name, value, (size,), finite=False) is not value:
+                    raise ShapeError(f"{name} must be a float64 array of shape ({size},), got {shown(value)}") from None
+            raise ShapeError(f"pose and twist (6,) and torque ({joints},) must be float64 arrays") from None
         call()
         first = values[0]  # the mass matrix couples all entries: one that is not finite makes all of them so
         if not first - first == 0.0:

@@ -5,18 +5,35 @@ from dataclasses import dataclass
 from importlib import resources
 from os import PathLike
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from dynamics.checks import shown
 from dynamics.errors import DynamicsError, RobotFileError
-from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
-from dynamics.legs.rss_inverse_kinematics import home_angles
-from dynamics.parameters import check_parameters
+from dynamics.geometry import RobotGeometry
+from dynamics.kinematics.chart import FREEDOMS, Chart
+from dynamics.legs import KINDS, AnyLeg
+from dynamics.legs.leg import INERTIAL
+from dynamics.parameters import JOINT_PID, ParameterLayout, parameter_layout
 
 _PerLeg = float | list[float]
+
+
+class Family(NamedTuple):
+    """Robots whose legs are all of one kind: that, their number, and the chart of the platform."""
+
+    kind: str
+    legs: int
+    chart: str
+
+
+FAMILIES = {
+    "rss6": Family("rss", 6, "free"),
+    "delta3": Family("parallelogram", 3, "translation"),
+    "rrr3": Family("rrr", 3, "planar"),
+}
 
 
 class _Strict(BaseModel):
@@ -31,61 +48,113 @@ class _Strict(BaseModel):
         return values
 
 
-class _Legs(_Strict):
-    crank_length: float
-    link_length: float
-    base_joints: list[list[float]]
-    platform_joints: list[list[float]]
-    crank_axes: list[list[float]]
-    crank_zero_directions: list[list[float]]
+class Inertia(_Strict):
+    """Mass, kg, and moments about the body's own axes through its centre of mass, kg m^2: one value, or one a leg."""
 
-
-class _Inertia(_Strict):
     mass: _PerLeg
     Ixx: _PerLeg
     Iyy: _PerLeg
     Izz: _PerLeg
 
 
-class _Friction(_Strict):
+class Friction(_Strict):
+    """Dry friction, N m or N, and viscous friction, N m s/rad or N s/m, of the joints: one value, or one a leg."""
+
     coulomb: _PerLeg
     viscous: _PerLeg
 
 
-class _JointPid(_Strict):
+class JointPid(_Strict):
+    """Gains of the joint PID, which all joints share; `unit`, where it is given, is that of lp, and is checked."""
+
     lp: float
     li: float
     ld: float
+    unit: Literal["N m/rad", "N/m"] | None = None
 
 
-class _ParameterSet(_Strict):
-    platform: _Inertia
-    crank: _Inertia
-    link: _Inertia
-    joint: _Friction
-    joint_pid: _JointPid
+class Parameters(BaseModel):
+    """A set of parameters: platform, joints and gains, and a table for each kind of body that the legs have."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+    __pydantic_extra__: dict[str, Inertia] = Field(init=False)
+
+    platform: Inertia
+    joint: Friction
+    joint_pid: JointPid
 
 
-class _RobotFile(_Strict):
-    name: str
-    family: Literal["rss6"]
-    home_pose: list[float]
-    travel_limit: float
-    gravity: list[float]
-    legs: _Legs
-    parameters: dict[str, _ParameterSet]
+class RobotFile(_Strict):
+    """A parallel robot. Lengths in m, angles in rad, masses in kg; poses are [x y z alpha beta gamma]."""
+
+    name: str = Field(description="its name, in records and reports")
+    family: str | None = Field(None, description=f"one of {', '.join(FAMILIES)}: names kind of legs and chart")
+    chart: str | None = Field(
+        None, description=f"freedoms of the platform, where no family says: {', '.join(FREEDOMS)}"
+    )
+    home_pose: list[float] = Field(description="pose of the platform at home, m and rad")
+    travel_limit: float = Field(description="largest magnitude of a joint coordinate, rad or m")
+    gravity: list[float] = Field([0.0, 0.0, -9.81], description="m/s^2, base axes")
+    legs: list[Annotated[AnyLeg, Field(discriminator="type")]] = Field(
+        description="a table for each leg; with a family also one table with a value, or a list with one a leg, a key"
+    )
+    parameters: dict[str, Parameters] = Field(description="named sets; `initial` is what identification starts from")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_family(cls, values: Any) -> Any:
+        """Legs one by one, each with its kind, where the file names a family."""
+        name = values.get("family") if isinstance(values, dict) else None
+        if not isinstance(values, dict) or "legs" not in values:
+            return values
+        if name is None:
+            if isinstance(values["legs"], dict):
+                raise ValueError("legs: a file without family needs one table [[legs]] for each leg, with its type")
+            return values
+        if name not in FAMILIES:
+            raise ValueError(f"family: unknown `{name}`; valid: {', '.join(FAMILIES)}")
+        family, legs = FAMILIES[name], values["legs"]
+        if isinstance(legs, dict):
+            legs = _legs_of_columns(legs, family)
+        if isinstance(legs, list):
+            legs = [{"type": family.kind} | leg if isinstance(leg, dict) else leg for leg in legs]
+        return values | {"legs": legs, "chart": values.get("chart") or family.chart}
+
+
+def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, Any]]:
+    """One table a leg of one table with columns: a value for all legs, or a list with one a leg."""
+    fields = {_plural(name): name for name in KINDS[family.kind].model_fields}
+    legs: list[dict[str, Any]] = [{} for _ in range(family.legs)]
+    for key, value in columns.items():
+        name = key if key in fields.values() else fields.get(key)
+        if name is None:
+            raise ValueError(f"legs: unknown key {key}; valid: {', '.join(fields)}")
+        vector = KINDS[family.kind].model_fields[name].annotation is np.ndarray
+        each = isinstance(value, list) and (not vector or bool(value) and isinstance(value[0], list))
+        if each and len(value) != family.legs:
+            raise ValueError(f"legs.{key} needs one value or {family.legs} values, got {len(value)}")
+        for number, leg in enumerate(legs):
+            leg[name] = value[number] if each else value
+    return legs
+
+
+def _plural(name: str) -> str:
+    if name.endswith("axis"):
+        return name.removesuffix("axis") + "axes"
+    return name + "s" if name.endswith(("joint", "direction")) else name
 
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """One named set: dynamic parameters (64,) in the order of `PARAMETER_NAMES`, and joint PID [lp, li, ld] (3,)."""
+    """One named set: dynamic parameters (p,) in the order of the robot's `parameter_names`, and joint PID [lp, li, ld]
+    (3,)."""
 
     dynamic: np.ndarray
     joint_pid: np.ndarray
 
     @property
     def vector(self) -> np.ndarray:
-        """All 67 values: the dynamic parameters, then lp, li, ld."""
+        """All values: the dynamic parameters, then lp, li, ld."""
         return np.concatenate([self.dynamic, self.joint_pid])
 
 
@@ -94,7 +163,7 @@ class RobotDescription:
     """What a robot file holds: name, geometry and named parameter sets."""
 
     name: str
-    geometry: Rss6Geometry
+    geometry: RobotGeometry
     parameter_sets: dict[str, ParameterSet]
 
 
@@ -112,14 +181,15 @@ def read_robot_file(name_or_path: str | Path) -> RobotDescription:
     """
     source, text = _read_text(name_or_path)
     try:
-        content = _RobotFile.model_validate(tomllib.loads(text))
+        content = RobotFile.model_validate(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
         raise RobotFileError(f"robot file {source} is not valid TOML: {error}") from error
     except ValidationError as error:
         raise RobotFileError(f"robot file {source}: {_one_line(error)}") from error
     try:
         geometry = _geometry(content)
-        sets = {name: _parameter_set(name, values) for name, values in content.parameters.items()}
+        layout = parameter_layout(geometry.legs)
+        sets = {name: _parameter_set(name, values, layout) for name, values in content.parameters.items()}
     except DynamicsError as error:
         raise RobotFileError(f"robot file {source}: {error}") from error
     if "initial" not in sets:
@@ -127,24 +197,15 @@ def read_robot_file(name_or_path: str | Path) -> RobotDescription:
     return RobotDescription(content.name, geometry, sets)
 
 
-def _geometry(content: _RobotFile) -> Rss6Geometry:
-    geometry = Rss6Geometry(
-        **{name: _vectors(name, value) for name, value in content.legs.model_dump().items() if isinstance(value, list)},
-        crank_length=content.legs.crank_length,
-        link_length=content.legs.link_length,
-        home_pose=np.array(content.home_pose),
-        travel_limit=content.travel_limit,
-        gravity=np.array(content.gravity),
-    )
-    home_angles(geometry)  # refuses a home pose out of reach
-    return geometry
-
-
-def _vectors(name: str, rows: list[list[float]]) -> np.ndarray:
-    for leg, row in enumerate(rows):
-        if len(row) != 3:
-            raise RobotFileError(f"legs.{name} of leg {leg + 1} needs 3 numbers, got {len(row)}")
-    return np.array(rows)
+def _geometry(content: RobotFile) -> RobotGeometry:
+    if len(content.home_pose) != 6:
+        raise RobotFileError(f"home_pose needs 6 numbers, got {len(content.home_pose)}")
+    if content.chart is None:
+        raise RobotFileError(f"a file without family needs a chart; valid: {', '.join(FREEDOMS)}")
+    if content.chart not in FREEDOMS:
+        raise RobotFileError(f"unknown chart `{content.chart}`; valid: {', '.join(FREEDOMS)}")
+    chart = Chart(content.chart, tuple(content.home_pose))
+    return RobotGeometry(tuple(content.legs), chart, content.travel_limit, np.array(content.gravity))
 
 
 def _read_text(name_or_path: str | Path) -> tuple[str, str]:
@@ -171,21 +232,32 @@ def _one_line(error: ValidationError) -> str:
     return "; ".join(lines)
 
 
-def _parameter_set(name: str, values: _ParameterSet) -> ParameterSet:
-    def per_leg(key: str, value: _PerLeg) -> list[float]:
-        expanded = value if isinstance(value, list) else [value] * LEGS
-        if len(expanded) != LEGS:
-            raise RobotFileError(f"parameters.{name}.{key} needs one value or {LEGS} values, got {len(expanded)}")
+def _parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> ParameterSet:
+    def per_leg(key: str, value: _PerLeg, count: int) -> list[float]:
+        expanded = value if isinstance(value, list) else [value] * count
+        if len(expanded) != count:
+            raise RobotFileError(f"parameters.{name}.{key} needs one value or {count} values, got {len(expanded)}")
         return expanded
 
-    platform = [float(value) for value in values.platform.model_dump().values()]
-    bodies: list[float] = []
-    for body in ("crank", "link"):
-        columns = [per_leg(f"{body}.{key}", value) for key, value in getattr(values, body).model_dump().items()]
-        bodies += np.array(columns).T.ravel().tolist()
-    friction = per_leg("joint.coulomb", values.joint.coulomb) + per_leg("joint.viscous", values.joint.viscous)
-    dynamic = check_parameters(np.array(platform + bodies + friction))
-    joint_pid = np.array([values.joint_pid.lp, values.joint_pid.li, values.joint_pid.ld])
+    kinds = [kind.name for kind in layout.kinds]
+    given = {"platform": values.platform, **(values.model_extra or {})}
+    if set(given) != set(kinds):
+        wrong = sorted(set(given) ^ set(kinds))
+        valid = ", ".join([*dict.fromkeys(kinds), "joint", "joint_pid"])
+        raise RobotFileError(f"parameters.{name}: {', '.join(wrong)} unknown or missing; it needs {valid}")
+    rigid = np.empty((len(kinds), len(INERTIAL)))
+    for kind, inertia in given.items():
+        rows = [row for row, name_of in enumerate(kinds) if name_of == kind]
+        rigid[rows] = np.transpose([per_leg(f"{kind}.{k}", v, len(rows)) for k, v in inertia.model_dump().items()])
+    friction = [per_leg(f"joint.{key}", value, layout.joints) for key, value in values.joint.model_dump().items()]
+    dynamic = layout.check(np.concatenate([rigid.ravel(), *friction]))
+    unit = values.joint_pid.unit
+    if unit not in (None, layout.unit("joint_pid.lp")):
+        raise RobotFileError(
+            f"parameters.{name}.joint_pid.lp = {values.joint_pid.lp:g} is in {unit}, but the actuators "
+            f"{'slide' if layout.prismatic else 'turn'}: their gains are in {layout.unit('joint_pid.lp')}"
+        )
+    joint_pid = np.array([getattr(values.joint_pid, gain) for gain in JOINT_PID])
     for array in (dynamic, joint_pid):
         array.setflags(write=False)
     return ParameterSet(dynamic, joint_pid)

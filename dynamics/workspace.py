@@ -1,16 +1,16 @@
 """May the robot move so? How far poses are from its limits: travel, reach, and its two kinds of singularity.
 
-- Travel: |theta| against the travel limit.
-- Reach: the reach margin of a leg is sin^2 of the angle between its crank and the direction to its platform joint in
-  the crank's plane; at 0 the leg is stretched or folded.
-- Actuator side (J_a1): the leverage |(w x l) . s| / (|w| |l|) of a crank on its link, in 0..1. It vanishes together
-  with the reach margin: the crank then moves the platform no more.
-- Platform side (J_a2): the condition number of J_a2 with its rows divided by the link length and its last three
-  columns by the characteristic length, so that all entries are plain numbers. At infinity the platform moves with all
-  cranks locked.
+- Travel: the magnitude of each joint coordinate against the travel limit.
+- Reach: the reach margin of a leg; of one with a crank, sin^2 of the angle between that and the direction to the platform
+  joint in the crank's plane. At 0 the leg is stretched or folded.
+- Actuator side (J_a1): the leverage of an actuator on its leg, in 0..1; of a crank |(w x l) . s| / (|w| |l|). Where it
+  vanishes, for cranks together with the reach margin, the actuator moves the platform no more.
+- Platform side (J_a2): the condition number of J_a2 for the motions that the platform can make, its rows of unit vectors
+  along the legs' forces and its angular columns divided by the characteristic length, so that all entries are plain
+  numbers. At infinity the platform moves with all actuators locked.
 
 The characteristic length is the RMS distance of the platform joints from the platform origin (0.2 m for rss6). As
-CasADi expressions, for a search that keeps their limits, they are `legs.rss_inverse_kinematics.singularity_measures`.
+CasADi expressions, for a search that keeps their limits, they are `rigid_body.jacobians.singularity_measures`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from dynamics.errors import DynamicsError, ShapeError, SingularPoseError, Travel
 from dynamics.robot import Robot
 
 LEAST_LEVERAGE = 0.05
-"""Below it a crank's torque is multiplied by more than 20 along its link; rss6 keeps above 0.09 within its travel."""
+"""Below it an actuator's force is multiplied by more than 20 along its leg; rss6 keeps above 0.09 within its travel."""
 
 MOST_CONDITION = 20.0
 """Limit of the condition numbers for `check_motion`; rss6 keeps below 5 (J_a2) and 10 (J_ad) within its travel."""
@@ -37,8 +37,8 @@ MOST_CONDITION = 20.0
 class WorkspaceMeasures:
     """Measures of N poses; NaN where and only where a leg cannot reach, except for the reach margins.
 
-    theta (N, 6), rad; reach_margin (N, 6), negative out of reach; leverage (N, 6), of J_a1; platform_rows (N, 6, 6),
-    J_a2 without unit; travel_limit, rad.
+    theta (N, n), rad or m; reach_margin (N, n), negative out of reach; leverage (N, n), of J_a1; platform_rows
+    (N, n, n), J_a2 without unit; travel_limit, rad or m.
     """
 
     theta: np.ndarray
@@ -69,13 +69,13 @@ class WorkspaceMeasures:
 
     @property
     def travel_share(self) -> np.ndarray:
-        """Largest |theta| of the six cranks over the travel limit (N,)."""
+        """Largest joint coordinate over the travel limit (N,)."""
         return np.asarray(np.abs(self.theta).max(axis=1) / self.travel_limit)
 
 
 @dataclass(frozen=True)
 class Extreme:
-    """Where a motion comes nearest to a limit: value, limit, row, time [s] (NaN if none was given), and leg 1..6
+    """Where a motion comes nearest to a limit: value, limit, row, time [s] (NaN if none was given), and leg 1..n
     (None where it concerns all)."""
 
     value: float
@@ -87,7 +87,7 @@ class Extreme:
 
 @dataclass(frozen=True)
 class MotionExtremes:
-    """The worst of a motion: reach margin, travel |theta| in rad, leverage of J_a1, condition of scaled J_a2."""
+    """The worst of a motion: reach margin, travel |theta| in rad or m, leverage of J_a1, condition of scaled J_a2."""
 
     reach: Extreme
     travel: Extreme
@@ -101,7 +101,7 @@ def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
     Raises ShapeError for another shape or for entries that are not finite.
     """
     check_type("robot", robot, Robot, DynamicsError)
-    poses = np.atleast_2d(rows("pose", pose, 6))
+    poses = np.atleast_2d(robot.charted(pose))
     theta, margin = (part[..., 0] for part in robot.functions["inverse_kinematics"](poses))
     leverage, platform_rows = robot.functions["singularity_measures"](poses)
     margin[np.isnan(margin)] = -np.inf  # squares have overflowed
@@ -123,14 +123,14 @@ def check_motion(
     """The worst of a motion sampled as poses (N, 6) at times (N,) in s, N >= 1, if all of it is within the limits.
 
     Raises, with time (or row), leg, value and limit: UnreachablePoseError; TravelError beyond the travel limit less
-    `travel_margin` (rad); SingularPoseError for a leverage below `least_leverage` (J_a1) or a condition number of the
+    `travel_margin` (rad or m); SingularPoseError for a leverage below `least_leverage` (J_a1) or a condition number of the
     scaled J_a2 above `most_condition`; ShapeError for poses or times of the wrong shape, or times that do not increase.
     """
     poses = np.atleast_2d(rows("pose", pose, 6))
     if not len(poses):
         raise ShapeError("a motion needs at least one pose, got none")
     moments = np.full(len(poses), np.nan) if times is None else _increasing(times, len(poses))
-    travel_margin = real("travel_margin", travel_margin, TravelError, least=0, unit=" rad")
+    travel_margin = real("travel_margin", travel_margin, TravelError, least=0)
     least_leverage = real("least_leverage", least_leverage, DynamicsError, least=0)
     most_condition = real("most_condition", most_condition, DynamicsError, least=1)
     measures = measure(robot, poses)
@@ -151,7 +151,13 @@ def check_motion(
     reach = extreme(measures.reach_margin, 0.0, np.argmin)
     check(reach, reach.value > 0, UnreachablePoseError, "reach margin", "must be > ")
     travel = extreme(np.abs(measures.theta), robot.travel_limit - travel_margin, np.argmax)
-    check(travel, travel.value <= travel.limit, TravelError, "|theta| in rad", "limit ")
+    check(
+        travel,
+        travel.value <= travel.limit,
+        TravelError,
+        f"|theta| in {'m' if robot.layout.prismatic else 'rad'}",
+        "limit ",
+    )
     leverage = extreme(measures.leverage, least_leverage, np.argmin)
     check(leverage, leverage.value >= leverage.limit, SingularPoseError, "leverage (J_a1)", "must be >= ")
     condition = extreme(measures.platform_condition, most_condition, np.argmax)

@@ -29,7 +29,6 @@ from dynamics.closed_loop.stick_slip_kernels import stop_joints
 from dynamics.compiled.kernel import address, chosen, plain
 from dynamics.compiled.machine_code import MachineFunction
 from dynamics.errors import SimulationError
-from dynamics.parameters import split_parameters
 
 FAILURES = {
     LEFT_REACH: "the robot left the reachable set (the loop is unstable):",
@@ -47,14 +46,14 @@ def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
     commands = problem.commands  # a controller's are written frame by frame, and take the place of the servo's, too
     if commands is None:
         commands = np.zeros((0 if problem.controller is None else frames, problem.sizes.joints))
-    plan = _plan(problem, commands)
+    plan, measured = _plan(problem, commands), np.full((frames, 6), np.nan)
     own, known = problem.robot.functions, problem.servo_robot.functions  # held here: code that nobody holds is freed
     _fill(memory, problem, own, known["equation_of_motion"], _addresses(problem.sizes, compiled))
     do = chosen(run_frames, compiled)
     for first, last in [(k, k + 1) for k in range(frames)] if problem.asked else [(0, frames)]:
         if problem.asked:
             try:
-                _consult(problem, first, memory.now, plan, record, commands)
+                _consult(problem, first, memory.now, plan, record, commands, measured)
             except Exception as error:
                 error.add_note(f"at frame {first} of the closed loop")
                 raise
@@ -62,27 +61,54 @@ def run(problem: LoopProblem, compiled: bool = True) -> ClosedLoopRun:
         if status:
             raise _failure(problem, status, frame, memory, record)
     found: dict[str, Any] = {name: array if array.size else None for name, array in record._asdict().items()}
+    found |= _poses(problem, found, measured)
     time, events = np.arange(frames) * problem.period, int(memory.now.events)
     return ClosedLoopRun(time=time, **found, events=events, start=problem.start)
 
 
-def _consult(problem: LoopProblem, frame: int, now: Any, plan: Plan, record: Any, commands: np.ndarray) -> None:
+def _poses(problem: LoopProblem, found: dict[str, Any], measured: np.ndarray) -> dict[str, Any]:
+    """What the kernels say of coordinates, as poses."""
+    chart = problem.robot.geometry.chart
+    poses = {"pose": chart.pose(found["pose"]), "pose_rate": chart.lifted(found["pose_rate"]), "measured": measured}
+    if problem.sensor is None:
+        poses["measured"] = chart.pose(found["measured"])
+        poses["measured"][~found["measured_ok"]] = np.nan
+        if problem.noise is not None:
+            poses["measured"] += chart.forbidden(chart.pose(np.zeros(problem.sizes.coordinates)) + problem.noise)
+    for name in ("pose_sensitivity", "start_sensitivity"):
+        if found[name] is not None:
+            poses[name] = chart.lifted(found[name], axis=1)
+    return poses
+
+
+def _consult(
+    problem: LoopProblem,
+    frame: int,
+    now: Any,
+    plan: Plan,
+    record: Any,
+    commands: np.ndarray,
+    measured: np.ndarray,
+) -> None:
     """Ask a user's own sensor what it measures at a frame, and the controller for a command."""
     sensor, size, time = problem.sensor, problem.sizes.coordinates, frame * problem.period
+    chart = problem.robot.geometry.chart
     if sensor is None:
         plain(measure_ideally)(now, plan, record, frame)
+        measured[frame] = chart.pose(record.measured[frame])
     else:
-        pose, rate = now.state[:size].copy(), now.state[size : 2 * size].copy()
+        pose, rate = chart.pose(now.state[:size]), chart.lifted(now.state[size : 2 * size]).copy()
         given = sensor.measure(frame, time, pose, rate) if isinstance(sensor, RateSensor) else sensor(frame, time, pose)
         record.measured_ok[frame] = given is not None
         what = f"what the pose sensor returned at frame {frame}"
-        record.measured[frame] = np.nan if given is None else floats(what, given, (size,), error=SimulationError)
+        measured[frame] = np.nan if given is None else floats(what, given, (6,), error=SimulationError)
+        record.measured[frame] = chart.coordinates(measured[frame])
     if problem.controller is None:
         return
     commands[frame] = commands[frame - 1] if frame else problem.start.commands[-1]
     if record.measured_ok[frame]:
         desired = problem.reference.poses[frame], problem.reference.rates[frame]
-        command = problem.controller(frame, time, record.measured[frame].copy(), *desired)
+        command = problem.controller(frame, time, measured[frame].copy(), *desired)
         what = f"what the controller returned at frame {frame}"
         commands[frame] = floats(what, command, (problem.sizes.joints,), error=SimulationError)
 
@@ -92,24 +118,26 @@ def _failure(problem: LoopProblem, status: int, frame: int, memory: Memory, reco
     said = f"closed loop stopped at frame {frame} (t = {frame * problem.period:.3f} s): {FAILURES[status]}"
     if status in (LEFT_REACH, MEASURED_OUT_OF_REACH):
         stopped = memory.now.known.inputs[: problem.sizes.coordinates]
-        margin = problem.robot.reach_margin(stopped if status == LEFT_REACH else record.measured[frame])
+        at = problem.robot.pose(stopped if status == LEFT_REACH else record.measured[frame])
+        margin = problem.robot.reach_margin(at)
         leg = int(np.argmin(margin))
         said += f" leg {leg + 1} has the least reach margin, {margin[leg]:.3g}, must be > 0"
     return LoopFailure(said, frame)
 
 
 def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
-    start = problem.start
+    start, chart, sizes = problem.start, problem.robot.geometry.chart, problem.sizes
+    slope = start.joint_integral_sensitivity
     given = {
-        "reference": problem.reference.poses,
-        "reference_rate": problem.reference.rates,
+        "reference": chart.coordinates(problem.reference.poses),
+        "reference_rate": chart.coordinates(problem.reference.rates),
         "commands": commands,
         "lost": np.zeros(0, bool) if problem.lost is None else np.ascontiguousarray(problem.lost),
-        "noise": np.zeros((0, 0)) if problem.noise is None else problem.noise,
+        "noise": np.zeros((0, 0)) if problem.noise is None else chart.coordinates(problem.noise),
         "start_commands": start.commands,
-        "start_integral_sensitivity": start.joint_integral_sensitivity,
+        "start_integral_sensitivity": np.zeros((sizes.joints, sizes.parameters)) if slope is None else slope,
     }
-    views = {name: array.view() for name, array in given.items()}
+    views = {name: np.ascontiguousarray(array).view() for name, array in given.items()}
     for view in views.values():  # kernels are compiled for each kind of array that they are given, so all are of one
         view.flags.writeable = False
     return Plan(**views, spans=command_schedule(problem))
@@ -130,21 +158,24 @@ def _fill(
     for name, found in addresses.items():
         task[name] = found
     task.servo_motion = servo_motion.address
-    rigid, task.coulomb, task.viscous, (task.lp, task.li, task.ld) = split_parameters(problem.parameters)
+    rigid, task.coulomb, task.viscous, (task.lp, task.li, task.ld) = problem.robot.layout.split(problem.parameters)
     task.kp, task.kd, task.ki = settings.servo.kp, settings.servo.kd, settings.servo.ki
     task.friction = settings.friction.record
     task.period = problem.period
     task.sensitivities = problem.sensitivities
     task.measured = problem.asked
     if settings.elasticity is not None:
-        rigid = settings.elasticity.beyond_the_springs(rigid)
+        rigid = settings.elasticity.beyond_the_springs(problem.robot.layout, rigid)
         task.stiffness, task.damping = settings.elasticity.stiffness, settings.elasticity.damping
         task.motor_inertia = settings.elasticity.motor_inertia
     task.rigid = rigid
     rest = np.zeros(sizes.joints)
     motor = [rest if part is None else part for part in (start.motor_angle, start.motor_rate)]
-    now.state = np.concatenate([start.pose, start.pose_rate, start.joint_integral, *motor])
-    now.servo_integral, now.last_measured = start.servo_integral, start.last_measured
+    chart = problem.robot.geometry.chart
+    now.state = np.concatenate(
+        [chart.coordinates(start.pose), chart.coordinates(start.pose_rate), start.joint_integral, *motor]
+    )
+    now.servo_integral, now.last_measured = start.servo_integral, chart.coordinates(start.last_measured)
     now.last_command = start.commands[-1]
     for room in (now.known, now.served, now.derivatives):
         room.inputs[-sizes.rigid :] = rigid

@@ -2,14 +2,14 @@
 
 Friction (eq. 24), N m: torque = coulomb * dry(theta_dot) + viscous * theta_dot.
 
-Elastic joints have a torsion spring between each motor and its crank (Spong, J. Dyn. Sys. Meas. Control 109, 1987).
-With q the pose, phi the motor angles as they turn the cranks, theta(q) the crank angles:
+Elastic joints have a spring between each motor and the body that it drives, a crank or a slider (Spong, J. Dyn. Sys.
+Meas. Control 109, 1987). With q the pose, phi the motor angles as they turn the cranks, theta(q) the crank angles:
 
     spring torque = stiffness (phi - theta) + damping (phi_dot - theta_dot)
     M q_ddot + b = J_theta^T spring torque,    motor inertia phi_ddot = motor torque - friction(phi_dot) - spring torque
 
-Encoder, joint PID and friction sit at the motor. What turns with it is taken out of the cranks' Izz, so that the rigid
-robot of the same parameters is the limit of stiff springs.
+Encoder, joint PID and friction sit at the motor. What turns with it is taken out of the cranks' Izz, or out of the
+sliders' mass, so that the rigid robot of the same parameters is the limit of stiff springs.
 """
 
 from dataclasses import dataclass
@@ -20,8 +20,7 @@ import numpy as np
 
 from dynamics.checks import check_choice, real, shown
 from dynamics.errors import SimulationError
-from dynamics.legs.rss_geometry import LEGS
-from dynamics.parameters import BODY_NAMES, INERTIAL, RIGID_BODY, RIGID_BODY_NAMES, VISCOUS, split_parameters
+from dynamics.parameters import INERTIAL, ParameterLayout
 from dynamics.robot import Robot
 
 LawName = Literal["coulomb_viscous", "smoothed", "stribeck"]
@@ -73,12 +72,11 @@ class FrictionLaw:
 LARGEST_STEP = 1.0
 """Largest eigenvalue times step of Runge-Kutta; it is unstable from 2.8 on."""
 
-CRANK_IZZ = np.array([RIGID_BODY_NAMES.index(f"crank{leg}.Izz") for leg in range(1, LEGS + 1)])
-
 
 @dataclass(frozen=True)
 class JointElasticity:
-    """Stiffness (N m/rad) and damping (N m s/rad) of every joint's spring; inertia (kg m^2) of every motor.
+    """Stiffness (N m/rad) and damping (N m s/rad) of every joint's spring; inertia (kg m^2) of every motor, as its joint
+    feels it; of actuators that slide N/m, N s/m and kg.
 
     Raises SimulationError for a stiffness or an inertia that is not > 0, a damping < 0, or one that is not finite.
     """
@@ -92,27 +90,36 @@ class JointElasticity:
         real("motor inertia", self.motor_inertia, SimulationError, above=0, unit=" kg m^2")
         real("joint damping", self.damping, SimulationError, least=0, unit=" N m s/rad")
 
-    def beyond_the_springs(self, rigid: np.ndarray) -> np.ndarray:
-        """Parameters of the rigid bodies (52,) that the springs carry: the cranks without their motors."""
+    def beyond_the_springs(self, layout: ParameterLayout, rigid: np.ndarray) -> np.ndarray:
+        """Parameters of the rigid bodies that the springs carry: the driven bodies without their motors.
+
+        Raises SimulationError for a robot with a leg whose actuator drives no body alone.
+        """
         carried = np.array(rigid)
-        carried[CRANK_IZZ] -= self.motor_inertia
+        for leg, row in enumerate(layout.of_leg):
+            body = layout.kinds[row[0]]
+            if body.driven is None:
+                raise SimulationError(f"joints cannot be elastic: the actuator of leg {leg + 1} drives no body alone")
+            layout.bodies_of(carried)[row[0], INERTIAL.index(body.driven)] -= self.motor_inertia
         return carried
 
     def steps_needed(
         self, robot: Robot, parameters: np.ndarray, pose: np.ndarray, frame_period: float, friction: FrictionLaw
     ) -> int:
-        """Steps of integration a frame (s) that follow the fastest motion around a pose (6,), for parameters (67,).
+        """Steps of integration a frame (s) that follow the fastest motion around a pose (6,), for all parameters.
 
         It is the largest eigenvalue of the joints and motors under joint PID and friction, linearised at rest.
         Raises SimulationError where the motors are more than the cranks' inertia.
         """
         self._check_motors(robot, parameters)
-        jacobian, n = robot.joint_jacobian(pose), LEGS
-        carried = robot.mass_matrix(pose, parameters[: VISCOUS.stop]) - self.motor_inertia * jacobian.T @ jacobian
+        free, n = robot.geometry.chart.basis, robot.layout.joints
+        jacobian = robot.joint_jacobian(pose) @ free
+        mass = free.T @ robot.mass_matrix(pose, parameters[robot.layout.dynamic]) @ free
+        carried = mass - self.motor_inertia * jacobian.T @ jacobian
         per_inertia = np.zeros((2 * n, 2 * n))
         per_inertia[:n, :n] = jacobian @ np.linalg.solve(carried, jacobian.T)
         per_inertia[n:, n:] = np.eye(n) / self.motor_inertia
-        _, coulomb, viscous, (lp, _, ld) = split_parameters(parameters)
+        _, coulomb, viscous, (lp, _, ld) = robot.layout.split(parameters)
         slope = 1 / friction.smoothing_velocity if friction.smoothing_velocity else 0.0  # of dry friction, at rest
         stiffness = _coupled(self.stiffness, np.full(n, lp))
         damping = _coupled(self.damping, ld + viscous + coulomb * slope)
@@ -122,17 +129,19 @@ class JointElasticity:
         return max(1, ceil(frame_period * float(np.abs(np.linalg.eigvals(motion)).max()) / LARGEST_STEP))
 
     def _check_motors(self, robot: Robot, parameters: np.ndarray) -> None:
-        bodies = parameters[RIGID_BODY].reshape(len(BODY_NAMES), len(INERTIAL))[1 : 1 + LEGS]
-        about_axis = bodies[:, 3] + bodies[:, 0] * robot.geometry.crank_length**2 / 4
-        least = int(np.argmin(about_axis))
-        if self.motor_inertia >= about_axis[least]:
+        layout = robot.layout
+        bodies = layout.bodies_of(parameters)
+        driven = [leg.driven_inertia(bodies[of[0]]) for leg, of in zip(robot.geometry.legs, layout.of_leg, strict=True)]
+        least = int(np.argmin(driven))
+        if self.motor_inertia >= driven[least]:
+            name, unit = layout.bodies[layout.of_leg[least][0]], "kg" if layout.prismatic else "kg m^2"
             raise SimulationError(
-                f"motor inertia is {self.motor_inertia:g} kg m^2, must be below the {about_axis[least]:.3g} kg m^2 "
-                f"of crank {least + 1} about its axis, which it is a part of"
+                f"motor inertia is {self.motor_inertia:g} {unit}, must be below the {driven[least]:.3g} {unit} "
+                f"of {name} about its axis, which it is a part of"
             )
 
 
 def _coupled(spring: float, at_motor: np.ndarray) -> np.ndarray:
-    """(12, 12): what a spring between every crank and its motor, and `at_motor` (6,) to the base, do to both."""
+    """(2 n, 2 n): what a spring between every driven body and its motor, and `at_motor` (n,) to the base, do to both."""
     one = spring * np.eye(len(at_motor))
     return np.block([[one, -one], [-one, one + np.diag(at_motor)]])

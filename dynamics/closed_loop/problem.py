@@ -10,11 +10,8 @@ import numpy as np
 from dynamics.checks import Shape, check_choice, check_type, floats, real, whole
 from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
 from dynamics.errors import SimulationError
-from dynamics.parameters import JOINT_PID_NAMES, PARAMETER_NAMES, check_parameters
 from dynamics.robot import Robot
 
-DYNAMIC_COUNT = len(PARAMETER_NAMES)
-PARAMETER_COUNT = DYNAMIC_COUNT + len(JOINT_PID_NAMES)
 MAX_DELAY_FRAMES = 60
 MAX_STEPS_PER_FRAME = 10_000
 
@@ -23,7 +20,7 @@ Hold = Literal["zero", "linear"]
 # (frame index, time s, true pose (6,)) -> measured pose (6,), or None when the measurement is lost.
 PoseSensor = Callable[[int, float, np.ndarray], np.ndarray | None]
 
-# (frame index, time s, measured pose (6,), desired pose (6,), desired pose rate (6,)) -> joint command (6,), rad.
+# (frame index, time s, measured pose (6,), desired pose (6,), desired pose rate (6,)) -> joint command (n,), rad or m.
 Controller = Callable[[int, float, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -114,16 +111,21 @@ class Reference:
         return f"Reference({len(self.poses)} frames)"
 
 
+OPTIONAL = ("joint_integral_sensitivity", "motor_angle", "motor_rate")
+
+
 @dataclass(frozen=True)
 class StartState:
-    """State of the loop at the first frame, before that frame is measured.
+    """State of the loop at the first frame, before that frame is measured; of n joints, m coordinates, p parameters.
 
-    pose (6,) and pose rate (6,); joint PID integral (6,), rad s; servo integral (6,), m s and rad s. These 24, in this
-    order, are what start_sensitivity differentiates by. commands (n, 6): the commands issued before, rad, oldest first
-    (the first one also acted before), and last_measured (6,): the pose measured one frame before; both are records.
-    joint_integral_sensitivity (6, 67): how the joint PID integral follows the parameters; zero where it is just given.
-    motor_angle (6,), rad, and motor_rate (6,): of elastic joints only.
-    Raises SimulationError for a wrong shape or a number that is not finite.
+    pose (6,) and pose rate (6,); joint PID integral (n,), rad s or m s; servo integral (m,), m s and rad s. These, poses
+    by their coordinates, in this order, are what start_sensitivity differentiates by (24 of six joints and freedoms).
+    commands (k, n): the commands issued before, rad or m, oldest first (the first one also acted before), and
+    last_measured (6,): the pose measured one frame before; both are records.
+    joint_integral_sensitivity (n, p): how the joint PID integral follows the parameters; None where it is just given.
+    motor_angle (n,) and motor_rate (n,): of elastic joints only.
+    Raises SimulationError for a wrong shape or a number that is not finite; the sizes of a robot are asked for when a
+    run begins.
     """
 
     pose: np.ndarray
@@ -132,19 +134,30 @@ class StartState:
     servo_integral: np.ndarray
     commands: np.ndarray
     last_measured: np.ndarray
-    joint_integral_sensitivity: np.ndarray = field(default_factory=lambda: np.zeros((6, PARAMETER_COUNT)))
+    joint_integral_sensitivity: np.ndarray | None = None
     motor_angle: np.ndarray | None = None
     motor_rate: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        shapes: dict[str, Shape] = {"commands": ("N", 6), "joint_integral_sensitivity": (6, PARAMETER_COUNT)}
+        poses: dict[str, Shape] = dict.fromkeys(("pose", "pose_rate", "last_measured"), (6,))
+        shapes = poses | dict.fromkeys(("commands", "joint_integral_sensitivity"), ("N", "N"))
         for name in self.__dataclass_fields__:
-            if getattr(self, name) is None and name in ("motor_angle", "motor_rate"):
+            if getattr(self, name) is None and name in OPTIONAL:
                 continue
-            array = floats(f"start {name}", getattr(self, name), shapes.get(name, (6,)), error=SimulationError)
+            array = floats(f"start {name}", getattr(self, name), shapes.get(name, ("N",)), error=SimulationError)
             object.__setattr__(self, name, np.ascontiguousarray(array))
         if not len(self.commands):
             raise SimulationError("start commands must have at least 1 row, got 0")
+
+    def check_sizes(self, robot: Robot) -> None:
+        """Raise SimulationError, naming the part, where this is no state of a robot."""
+        joints, parameters = robot.layout.joints, len(robot.layout.names)
+        wanted = dict.fromkeys(("joint_integral", "motor_angle", "motor_rate"), (joints,))
+        wanted |= {"servo_integral": (len(robot.coordinate_names),), "commands": (len(self.commands), joints)}
+        for name, shape in (wanted | {"joint_integral_sensitivity": (joints, parameters)}).items():
+            found = getattr(self, name)
+            if found is not None and found.shape != shape:
+                raise SimulationError(f"start {name} of {robot.name} must have shape {shape}, got {found.shape}")
 
 
 @dataclass(frozen=True)
@@ -207,11 +220,12 @@ class LoopProblem:
         return Sizes(joints=motion.outputs[2][0], coordinates=motion.inputs[0], rigid=motion.inputs[2])
 
 
-def checked_loop_parameters(parameters: object) -> np.ndarray:
-    """The 64 dynamic parameters and lp, li, ld (67,). Raises SimulationError, or ParameterError for a dynamic one."""
-    values = floats("loop parameters", parameters, (PARAMETER_COUNT,), error=SimulationError, finite=False)
-    check_parameters(values[:DYNAMIC_COUNT])
-    for name, value in zip(JOINT_PID_NAMES, values[DYNAMIC_COUNT:], strict=True):
+def checked_loop_parameters(robot: Robot, parameters: object) -> np.ndarray:
+    """The dynamic parameters of a robot and lp, li, ld. Raises SimulationError, or ParameterError for a dynamic one."""
+    layout = robot.layout
+    values = floats("loop parameters", parameters, (len(layout.names),), error=SimulationError, finite=False)
+    layout.check(values[layout.dynamic])
+    for name, value in zip(layout.joint_pid_names, values[layout.joint_pid], strict=True):
         least, above = (None, 0) if name == "joint_pid.li" else (0, None)
         real(name, value, SimulationError, least=least, above=above)
     return values
@@ -219,7 +233,9 @@ def checked_loop_parameters(parameters: object) -> np.ndarray:
 
 def check_start_pose(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> None:
     """Raise UnreachablePoseError or SingularPoseError for a pose (6,) from which no run can start."""
-    robot.static_torque(pose, parameters[:DYNAMIC_COUNT])  # refuses a pose out of reach or singular, with the evidence
+    robot.static_torque(
+        pose, parameters[robot.layout.dynamic]
+    )  # refuses a pose out of reach or singular, with the evidence
     robot.pose_rate(pose, np.zeros(6))  # refuses Euler angles at their singularity
 
 
@@ -231,24 +247,26 @@ def equilibrium(
     servo_robot: Robot | None = None,
     elasticity: JointElasticity | None = None,
 ) -> StartState:
-    """State of rest at a pose (6,), friction unloaded, for parameters (67,); servo_robot as in `closed_loop.simulate`.
+    """State of rest at a pose (6,), friction unloaded, for all parameters; servo_robot as in `closed_loop.simulate`.
 
     The holding torque is linear in the dynamic parameters. Raises what that raises before a run.
     """
     check_type("robot", robot, Robot, SimulationError)
     check_type("servo", servo, ServoGains, SimulationError)
-    parameters, pose = checked_loop_parameters(parameters), floats("pose", pose, (6,))
-    rest, (dynamic, (_, li, _)) = np.zeros(6), np.split(parameters, [DYNAMIC_COUNT])
+    parameters, pose = checked_loop_parameters(robot, parameters), floats("pose", pose, (6,))
+    rest, li, free = np.zeros(6), parameters[robot.layout.joint_pid][1], robot.geometry.chart.basis
     check_start_pose(robot, parameters, pose)
     angles = robot.inverse_kinematics(pose)
-    torque_map = np.linalg.solve(robot.joint_jacobian(pose).T, robot.regressor(pose, rest, rest))
-    integral = torque_map @ dynamic / li
+    torque_map = np.linalg.solve((robot.joint_jacobian(pose) @ free).T, free.T @ robot.regressor(pose, rest, rest))
+    integral = torque_map @ parameters[robot.layout.dynamic] / li
     zero = np.zeros((len(integral), 1))
     sensitivity = np.hstack([torque_map / li, zero, -integral[:, None] / li, zero])  # by lp, li, ld in the end
     motors = {}
     if elasticity is not None:
         angles = angles + li * integral / elasticity.stiffness
-        motors = {"motor_angle": angles, "motor_rate": rest}
+        motors = {"motor_angle": angles, "motor_rate": np.zeros(len(integral))}
     known = servo_robot or robot
-    servo_integral = np.linalg.solve(known.pose_jacobian(pose), angles) / servo.ki if servo.ki else np.zeros(6)
+    servo_integral = np.zeros(free.shape[1])
+    if servo.ki:
+        servo_integral = np.linalg.solve(known.coordinate_jacobian(pose), angles) / servo.ki
     return StartState(pose, rest, integral, servo_integral, angles[None], pose, sensitivity, **motors)

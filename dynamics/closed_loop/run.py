@@ -11,11 +11,12 @@ from dynamics.errors import SimulationError
 
 @dataclass(frozen=True)
 class ClosedLoopRun:
-    """A run, one row a frame: time (s), true pose and pose rate, actuator torque (N m), command (rad), measured pose,
-    whether the measurement was good; joint PID integral (rad s) and servo integral (m s, rad s) as the frame begins;
-    derivatives of the poses by the parameters (frames, 6, 67) and by the start (frames, 6, 24; see StartState), and of
-    the 24 entries of the last frame's state by both, end_sensitivity (24, 67) and end_start_sensitivity (24, 24), each
-    or None; angle (rad) and rate of the motors of elastic joints, or None; number of stick-slip events; the start."""
+    """A run, one row a frame, of a robot with n joints, m coordinates and p parameters (rss6: 6, 6, 67): time (s), true
+    pose and pose rate (6,), actuator torque (N m or N) and command (rad or m) (n,), measured pose, whether the
+    measurement was good; joint PID integral (n,) and servo integral (m,) as the frame begins; derivatives of the poses
+    by the parameters (frames, 6, p) and by the s = 3 m + n entries of the start (frames, 6, s; see StartState), and of
+    those of the last frame's state by both, end_sensitivity (s, p) and end_start_sensitivity (s, s), each or None; angle
+    and rate of the motors of elastic joints, or None; number of stick-slip events; the start."""
 
     time: np.ndarray
     pose: np.ndarray

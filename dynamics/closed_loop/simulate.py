@@ -12,7 +12,6 @@ import numpy as np
 
 from dynamics.checks import Shape, check_type, flag, floats, mask, shown, whole
 from dynamics.closed_loop.problem import (
-    PARAMETER_COUNT,
     Controller,
     FrameTiming,
     LoopProblem,
@@ -51,17 +50,17 @@ def simulate(
     controller: Controller | None = None,
     compiled: bool = True,
 ) -> ClosedLoopRun:
-    """Run the closed loop for parameters (67,): the 64 dynamic ones, then lp, li, ld.
+    """Run the closed loop for all parameters of a robot: the dynamic ones, then lp, li, ld.
 
     sensor: None for the ideal one. start: None for the equilibrium at the first reference pose, which moves with the
     parameters. sensitivities: also derivatives of the poses and of the last frame's state with respect to all
     parameters; start_sensitivities: those and the ones with respect to the start (ideal sensor only).
-    commands (frames, 6): drive the joints with these instead of the servo's; what is measured is then recorded and
+    commands (frames, n): drive the joints with these instead of the servo's; what is measured is then recorded and
     steers nothing.
     latencies (frames,), s: of each frame's command, instead of the settings' for all; see `command_schedule`.
     servo_robot: the robot whose kinematics the servo knows, where that is another (no sensitivities then).
     controller: takes the place of the servo: (frame, time s, measured pose (6,), desired pose (6,), desired rate (6,))
-    -> joint command (6,), rad, at every frame that is measured.
+    -> joint command (n,), rad or m, at every frame that is measured.
     lost (frames,) bool: frames at which the ideal sensor measures nothing, so that a model loses what its plant lost.
     noise (frames, 6), m and rad: added to the poses that the ideal sensor measures elsewhere.
     compiled: False runs the same lines in plain Python, thousands of times slower.
@@ -81,11 +80,12 @@ def simulate(
     sensitivities = flag("sensitivities", sensitivities, SimulationError) or start_sensitivities
     compiled = flag("compiled", compiled, SimulationError)
     _check_reach(robot, reference)
-    frames, parameters = len(reference.poses), checked_loop_parameters(parameters)
+    frames, parameters = len(reference.poses), checked_loop_parameters(robot, parameters)
     if start is None:
         start = equilibrium(robot, parameters, reference.poses[0], settings.servo, servo_robot, settings.elasticity)
     else:
         check_type("start", start, StartState, SimulationError)
+        start.check_sizes(robot)
         check_start_pose(robot, parameters, start.pose)
     if latencies is not None:
         latencies = floats("latencies", latencies, (frames,), error=SimulationError)
@@ -100,9 +100,9 @@ def simulate(
         sensor,
         sensitivities,
         start_sensitivities,
-        commands=_checked_rows("commands", commands, frames),
+        commands=_checked_rows("commands", commands, (frames, robot.layout.joints)),
         lost=None if lost is None else mask("lost", lost, frames, SimulationError),
-        noise=_checked_rows("noise", noise, frames),
+        noise=_checked_rows("noise", noise, (frames, 6)),
         latencies=latencies,
         servo_robot=servo_robot or robot,
         controller=controller,
@@ -125,13 +125,15 @@ def simulate_batch(
     start_sensitivities: bool = False,
     workers: int | None = None,
 ) -> list[ClosedLoopRun]:
-    """Run the closed loop with the ideal sensor for N parameter vectors (N, 67), references, starts, or them in pairs.
+    """Run the closed loop with the ideal sensor for N parameter vectors (N, p), references, starts, or them in pairs.
 
-    A single vector (67,), reference or start serves all runs. Results are those of `simulate`, in order, and do not
+    A single vector (p,), reference or start serves all runs. Results are those of `simulate`, in order, and do not
     depend on `workers` (default: one a core). Raises what `simulate` raises, for the first run that fails.
     """
     threads = _cores() if workers is None else whole("workers", workers, SimulationError, least=1)
-    shapes: tuple[Shape, Shape] = (PARAMETER_COUNT,), ("N", PARAMETER_COUNT)
+    check_type("robot", robot, Robot, SimulationError)
+    width = len(robot.layout.names)
+    shapes: tuple[Shape, Shape] = (width,), ("N", width)
     vectors = np.atleast_2d(floats("loop parameters", parameters, *shapes, error=SimulationError, finite=False))
     given = _listed("references", references, Reference)
     begins: Sequence[StartState | None] = [None] if starts is None else _listed("starts", starts, StartState)
@@ -185,14 +187,16 @@ def _check_reach(robot: Robot, reference: Reference) -> None:
     robot.check_reach(reference.poses, "reference pose", "frame")
 
 
-def _checked_rows(name: str, rows: object, frames: int) -> np.ndarray | None:
-    """Rows (frames, 6) as C doubles; None stays None. Raises SimulationError."""
-    return None if rows is None else np.ascontiguousarray(floats(name, rows, (frames, 6), error=SimulationError))
+def _checked_rows(name: str, rows: object, shape: tuple[int, int]) -> np.ndarray | None:
+    """Rows of a shape as C doubles; None stays None. Raises SimulationError."""
+    return None if rows is None else np.ascontiguousarray(floats(name, rows, shape, error=SimulationError))
 
 
 def _check_together(problem: LoopProblem, servo_robot: Robot | None) -> None:
     """Raise SimulationError for options of a run that exclude each other; servo_robot as the caller gave it."""
     sensed, controlled, derived = problem.sensor is not None, problem.controller is not None, problem.sensitivities
+    if problem.servo_robot.geometry.chart != problem.robot.geometry.chart:
+        raise SimulationError(f"servo_robot {problem.servo_robot.name} has other coordinates than {problem.robot.name}")
     refusals = {
         "sensitivities need the ideal sensor: pass sensor=None": sensed and derived,
         "lost is for the ideal sensor: a sensor returns None at the frames that it loses": sensed

@@ -1,8 +1,7 @@
-"""Forward kinematics: Newton's method on the closure of the six loops, for all rows of a batch at once.
+"""Forward kinematics: Newton's method on the closure of the loops, for all rows of a batch at once.
 
 The gaps of the loops are smooth in the pose whether or not a leg can reach it, so no step can leave their domain. A
-pose found this way may have a crank on the far side of its dead point; the closed-form inverse kinematics has the last
-word.
+pose found this way may have a leg in another assembly; the closed-form inverse kinematics has the last word.
 """
 
 from collections.abc import Mapping
@@ -12,8 +11,9 @@ import numpy as np
 from dynamics.checks import row_text
 from dynamics.compiled.machine_code import MachineFunction
 from dynamics.errors import ConvergenceError, ShapeError
+from dynamics.kinematics.chart import Chart
 
-# Steps smaller than the first end the iteration; the second is what counts as solved, in rad.
+# Steps smaller than the first end the iteration; the second is what counts as solved, in rad or m.
 STEP_TOLERANCE = 1e-12
 ANGLE_TOLERANCE = 1e-12
 MAX_ITERATIONS = 50
@@ -24,22 +24,24 @@ Functions = Mapping[str, MachineFunction]
 """Compiled functions of a robot, of which `loop_closure` and `inverse_kinematics` are asked for."""
 
 
-def solve(functions: Functions, theta: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Pose (6,) or (N, 6) whose crank angles are theta, searched from start (6,) or (N, 6).
+def solve(functions: Functions, chart: Chart, theta: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Pose (6,) or (N, 6) whose joint coordinates (n,) or (N, n) are theta, searched from start (6,) or (N, 6).
 
-    Raises ConvergenceError with row, leg and residual where no pose near the start has these angles.
+    Raises ConvergenceError with row, leg and residual where no pose near the start has these coordinates.
     """
     angles = np.atleast_2d(theta)
     if (start.ndim == 2 and start.shape[0] not in (1, len(angles))) or start.ndim > theta.ndim:
-        raise ShapeError(f"initial_pose has shape {start.shape}, must be (6,) or that of theta {theta.shape}")
-    poses = np.array(np.broadcast_to(start, angles.shape))
-    poses, residual = search(functions, angles, poses)
+        raise ShapeError(
+            f"initial_pose has shape {start.shape}, must be (6,) or one row for each of theta {theta.shape}"
+        )
+    poses = np.array(np.broadcast_to(start, (len(angles), 6)))
+    poses, residual = search(functions, chart, angles, poses)
     _check(functions, angles, poses, residual)
-    return poses.reshape(theta.shape)
+    return poses.reshape(*theta.shape[:-1], 6)
 
 
-def search(functions: Functions, theta: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Best poses (N, 6) for crank angles (N, 6) from starts (N, 6), and what the angles there lack of those, (N, 6).
+def search(functions: Functions, chart: Chart, theta: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Best poses (N, 6) for joint coordinates (N, n) from starts (N, 6), and what those there lack of these, (N, n).
 
     Newton's iteration with step halving; rows leave it when their step or what it gains is nil. A row is solved where
     all its residuals are below ANGLE_TOLERANCE; they are NaN where a leg cannot reach.
@@ -48,7 +50,7 @@ def search(functions: Functions, theta: np.ndarray, start: np.ndarray) -> tuple[
     active = np.arange(len(theta))
     gaps, jacobians = functions["loop_closure"](poses, theta)
     for _ in range(MAX_ITERATIONS):
-        steps = -_solve_each(jacobians, gaps)[..., 0]
+        steps = -_solve_each(jacobians, gaps)[..., 0] @ chart.basis.T
         trials, gaps, jacobians, better = _damped(functions, theta[active], poses[active], steps, gaps)
         poses[active] = trials
         going = better & (np.abs(steps).max(axis=1) > STEP_TOLERANCE)
@@ -94,9 +96,8 @@ def _check(functions: Functions, theta: np.ndarray, poses: np.ndarray, residual:
     row, leg = (int(value) for value in np.argwhere(~(residual < ANGLE_TOLERANCE))[0])
     gap = np.abs(functions["loop_closure"](poses[row : row + 1], theta[row : row + 1])[0]).max()
     closed = gap < 1e-14
-    why = "closes the legs with a crank beyond its dead point" if closed else f"leaves a gap of {gap:.3g} m^2"
+    why = "closes the legs with one of them beyond its dead point" if closed else f"leaves a gap of {gap:.3g} m^2"
     raise ConvergenceError(
-        f"forward kinematics found no pose with crank angles {row_text(theta[row], 4)} (row {row}): "
-        f"the best {why}; crank {leg + 1} has a residual of {residual[row, leg]:.3g} rad, "
-        f"limit {ANGLE_TOLERANCE:.0e} rad"
+        f"forward kinematics found no pose with joint coordinates {row_text(theta[row], 4)} (row {row}): "
+        f"the best {why}; joint {leg + 1} has a residual of {residual[row, leg]:.3g}, limit {ANGLE_TOLERANCE:.0e}"
     )

@@ -6,6 +6,7 @@ turn their rates into a twist [h_dot, omega]. A platform with fewer freedoms wou
 
 import casadi as ca
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 
 def rotation_matrix(angles: ca.SX) -> ca.SX:
@@ -54,10 +55,11 @@ class PlatformJointMotion:
 
     Lists over the legs: position, velocity, acceleration (3,); gradient dA/dq = d(velocity)/d(rate) (3, 6);
     gradient_rate d(velocity)/dq (3, 6); acceleration_by_pose d(acceleration)/dq (3, 6).
-    d(acceleration)/d(rate) is twice gradient_rate.
+    d(acceleration)/d(rate) is twice gradient_rate. Pose, rate and acceleration (`gain`) are symbols.
     """
 
     def __init__(self, joints: np.ndarray, pose: ca.SX, rate: ca.SX, acceleration: ca.SX) -> None:
+        self.pose, self.rate, self.gain = pose, rate, acceleration
         angles, spin, spin_rate = pose[3:6], rate[3:6], acceleration[3:6]
         rotation = rotation_matrix(angles)
         first = _by_angles(rotation, angles)
@@ -73,6 +75,10 @@ class PlatformJointMotion:
         self.gradient_rate = [ca.horzcat(ca.SX.zeros(3, 3), *[m @ arm for m in first_rate]) for arm in arms]
         self.acceleration_by_pose = [ca.horzcat(ca.SX.zeros(3, 3), *[m @ arm for m in third]) for arm in arms]
 
+    def of(self, leg: int) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Position, velocity and acceleration (3,) of the joint of one leg."""
+        return self.position[leg], self.velocity[leg], self.acceleration[leg]
+
     def curvature(self, leg: int, force: ca.SX) -> ca.SX:
         """d(gradient^T force)/dq (6, 6) for a force (3,) held constant at the joint of one leg."""
         arm = self._arms[leg]
@@ -87,3 +93,8 @@ def _by_angles(matrix: ca.SX, angles: ca.SX) -> list[ca.SX]:
 
 def _combine(matrices: list[ca.SX], weights: ca.SX) -> ca.SX:
     return matrices[0] * weights[0] + matrices[1] * weights[1] + matrices[2] * weights[2]
+
+
+def base_from_platform(pose: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) of a pose (6,), as numbers (eq. 1)."""
+    return Rotation.from_euler("XYZ", pose[3:6]).as_matrix()

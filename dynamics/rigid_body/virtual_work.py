@@ -7,35 +7,35 @@ positive definite, G the wrench that holds the robot up, and tau_g = M twist_dot
 """
 
 import casadi as ca
+import numpy as np
 
 from dynamics.expressions import function, symmetric_from_lower
+from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.platform import joint_motion, pose_rate_to_twist, rotation_matrix, twist_bias
-from dynamics.legs.rss_dynamics import leg_columns, leg_coriolis, leg_force, leg_mass, leg_motion
-from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
-from dynamics.legs.rss_inverse_kinematics import (
-    joint_angles,
+from dynamics.parameters import parameter_layout
+from dynamics.rigid_body.jacobians import (
+    joint_coordinates,
     joint_jacobian,
-    leg_to,
-    legs_at,
     loop_closure,
     platform_arms,
     pose_jacobian,
     reach_margin,
     singularity_measures,
 )
-from dynamics.parameters import COULOMB, PARAMETER_NAMES, RIGID_BODY, VISCOUS
 
 
-def rigid_body_regressor(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> ca.SX:
-    """Columns of Gamma (6, 52) for the inertial parameters of platform, cranks and links (eq. 25)."""
-    gravity = ca.DM(geometry.gravity)
-    cranks, links = [], []
-    for leg, arm in legs_at(geometry, pose):
-        forces = leg_columns(leg, leg_motion(leg, *joint_motion(arm, twist, twist_dot)), gravity)
-        wrenches = ca.vertcat(forces, ca.skew(arm) @ forces)
-        cranks.append(wrenches[:, 0:4])
-        links.append(wrenches[:, 4:8])
-    return ca.horzcat(platform_columns(pose, twist, twist_dot, gravity), *cranks, *links)
+def rigid_body_regressor(geometry: RobotGeometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> ca.SX:
+    """Columns of Gamma (6, p) for the inertial parameters of platform and legs (eq. 25)."""
+    gravity, layout = ca.DM(geometry.gravity), parameter_layout(geometry.legs)
+    columns = ca.SX.zeros(6, layout.rigid.stop)
+    columns[:, 0:4] = platform_columns(pose, twist, twist_dot, gravity)
+    for number, (leg, arm) in enumerate(zip(geometry.legs, platform_arms(geometry, pose), strict=True)):
+        rows = layout.leg_rows(number)
+        own = ca.SX.sym("parameters", len(rows))
+        force = leg.force(pose[0:3] + arm, *joint_motion(arm, twist, twist_dot), own, gravity)
+        forces = ca.jacobian(force, own)  # in which it is linear
+        columns[:, rows] = ca.vertcat(forces, ca.skew(arm) @ forces)
+    return columns
 
 
 def platform_columns(pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, gravity: ca.DM) -> ca.SX:
@@ -50,41 +50,37 @@ def platform_columns(pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, gravity: ca.DM
     return ca.horzcat(mass, ca.vertcat(ca.SX.zeros(3, 3), ca.horzcat(*moments)))
 
 
-def inertial_wrench(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, rigid: ca.SX) -> ca.SX:
-    """M twist_dot + C twist + G (6,) for the 52 inertial parameters `rigid`: the regressor times them, without it."""
-    gravity = ca.DM(geometry.gravity)
+def inertial_wrench(geometry: RobotGeometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, rigid: ca.SX) -> ca.SX:
+    """M twist_dot + C twist + G (6,) for the inertial parameters `rigid`: the regressor times them, without it."""
+    gravity, layout = ca.DM(geometry.gravity), parameter_layout(geometry.legs)
     total = platform_columns(pose, twist, twist_dot, gravity) @ rigid[0:4]
-    for index, (leg, arm) in enumerate(legs_at(geometry, pose)):
-        motion = leg_motion(leg, *joint_motion(arm, twist, twist_dot))
-        force = leg_force(leg, motion, *leg_parameters(rigid, index), gravity)
+    for number, (leg, arm) in enumerate(zip(geometry.legs, platform_arms(geometry, pose), strict=True)):
+        motion = joint_motion(arm, twist, twist_dot)
+        force = leg.force(pose[0:3] + arm, *motion, rigid[layout.leg_rows(number)], gravity)
         total += ca.vertcat(force, ca.cross(arm, force))
     return total
 
 
-def mass_matrix(geometry: Rss6Geometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
+def mass_matrix(geometry: RobotGeometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
     """M (6, 6) of eq. 23, symmetric positive definite for positive parameters."""
-    total = platform_mass(pose, rigid[0:4])
-    for index, (leg, arm) in enumerate(legs_at(geometry, pose)):
-        at_joint = leg_mass(leg, *leg_parameters(rigid, index))
+    total, layout = platform_mass(pose, rigid[0:4]), parameter_layout(geometry.legs)
+    for number, (leg, arm) in enumerate(zip(geometry.legs, platform_arms(geometry, pose), strict=True)):
+        at_joint = leg.mass(pose[0:3] + arm, rigid[layout.leg_rows(number)])
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
         total += to_joint.T @ at_joint @ to_joint
     return symmetric_from_lower(total)
 
 
-def coriolis_matrix(geometry: Rss6Geometry, pose: ca.SX, twist: ca.SX, rigid: ca.SX) -> ca.SX:
+def coriolis_matrix(geometry: RobotGeometry, pose: ca.SX, twist: ca.SX, rigid: ca.SX) -> ca.SX:
     """C (6, 6) of eq. 23: C twist is the Coriolis and centrifugal wrench."""
-    frame, omega = rotation_matrix(pose[3:6]), twist[3:6]
+    frame, omega, layout = rotation_matrix(pose[3:6]), twist[3:6], parameter_layout(geometry.legs)
     total = ca.diagcat(ca.SX.zeros(3, 3), ca.skew(omega) @ frame @ ca.diag(rigid[1:4]) @ frame.T)
-    at, moving = ca.SX.sym("position", 3), ca.SX.sym("velocity", 3)
-    for index, arm in enumerate(platform_arms(geometry, pose)):
-        own = leg_parameters(rigid, index)
-        here = [pose[0:3] + arm, twist[0:3] + ca.cross(omega, arm)]
-        coriolis, mass = ca.substitute(
-            ca.cse([*leg_coriolis(leg_to(geometry, index, at), *own, at, moving)]), [at, moving], here
-        )
+    for number, (leg, arm) in enumerate(zip(geometry.legs, platform_arms(geometry, pose), strict=True)):
+        own, position = rigid[layout.leg_rows(number)], pose[0:3] + arm
+        coriolis = leg.coriolis(position, twist[0:3] + ca.cross(omega, arm), own)
         to_joint = ca.horzcat(ca.SX.eye(3), -ca.skew(arm))
         to_joint_rate = ca.horzcat(ca.SX.zeros(3, 3), -ca.skew(ca.cross(omega, arm)))
-        total += to_joint.T @ (coriolis @ to_joint + mass @ to_joint_rate)
+        total += to_joint.T @ (coriolis @ to_joint + leg.mass(position, own) @ to_joint_rate)
     return total
 
 
@@ -94,19 +90,13 @@ def platform_mass(pose: ca.SX, platform: ca.SX) -> ca.SX:
     return ca.diagcat(platform[0] * ca.SX.eye(3), frame @ ca.diag(platform[1:4]) @ frame.T)
 
 
-def leg_parameters(rigid: ca.SX, leg: int) -> tuple[ca.SX, ca.SX]:
-    """Mass, Ixx, Iyy, Izz (4,) of crank and link of a leg, 0..5, from the 52 inertial parameters."""
-    crank, link = 4 + 4 * leg, 4 + 4 * (LEGS + leg)
-    return rigid[crank : crank + 4], rigid[link : link + 4]
-
-
-def kinematic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
-    """Functions of pose and its rates alone: angles, reach, Jacobians, twist conversions."""
+def kinematic_functions(geometry: RobotGeometry) -> list[ca.Function]:
+    """Functions of pose and its rates alone: joint coordinates, reach, Jacobians, twist conversions."""
     pose, rate, acceleration = ca.SX.sym("pose", 6), ca.SX.sym("pose_rate", 6), ca.SX.sym("pose_acceleration", 6)
-    twist, theta = ca.SX.sym("twist", 6), ca.SX.sym("theta", 6)
+    twist, theta = ca.SX.sym("twist", 6), ca.SX.sym("theta", len(geometry.legs))
     to_twist = pose_rate_to_twist(pose)
     return [
-        function("inverse_kinematics", [pose], [joint_angles(geometry, pose), reach_margin(geometry, pose)]),
+        function("inverse_kinematics", [pose], [joint_coordinates(geometry, pose), reach_margin(geometry, pose)]),
         function("loop_closure", [pose, theta], list(loop_closure(geometry, pose, theta))),
         function("singularity_measures", [pose], list(singularity_measures(geometry, pose))),
         function("joint_jacobian", [pose], [joint_jacobian(geometry, pose)]),
@@ -117,34 +107,41 @@ def kinematic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
     ]
 
 
-def dynamic_functions(geometry: Rss6Geometry) -> list[ca.Function]:
-    """M, C, G, friction, regressor (eq. 23-26), inverse dynamics (eq. 17) and forward dynamics (eq. 40)."""
+def dynamic_functions(geometry: RobotGeometry) -> list[ca.Function]:
+    """M, C, G, friction, regressor (eq. 23-26), inverse dynamics (eq. 17) and forward dynamics (eq. 40).
+
+    Wrenches have six entries; those that the chart forbids are carried by the legs, and drop out where torques balance
+    the others.
+    """
+    layout = parameter_layout(geometry.legs)
     pose, twist, twist_dot = ca.SX.sym("pose", 6), ca.SX.sym("twist", 6), ca.SX.sym("twist_dot", 6)
-    torque, xi = ca.SX.sym("torque", 6), ca.SX.sym("parameters", len(PARAMETER_NAMES))
-    rigid = xi[RIGID_BODY]
+    torque, xi = ca.SX.sym("torque", layout.joints), ca.SX.sym("parameters", len(layout.dynamic_names))
+    rigid = xi[layout.rigid]
     jacobian = joint_jacobian(geometry, pose)
     velocity = jacobian @ twist
-    friction = xi[COULOMB] * ca.sign(velocity) + xi[VISCOUS] * velocity
+    friction = xi[layout.coulomb] * ca.sign(velocity) + xi[layout.viscous] * velocity
     inertial = inertial_wrench(geometry, pose, twist, twist_dot, rigid)
     bias = inertial_wrench(geometry, pose, twist, ca.SX.zeros(6), rigid)
     holding = inertial_wrench(geometry, pose, ca.SX(6, 1), ca.SX(6, 1), rigid)
     mass = mass_matrix(geometry, pose, rigid)
-    diagonal, upper, order = ca.ldl(mass)
-    acceleration = ca.ldl_solve(jacobian.T @ (torque - friction) - bias, diagonal, upper, order)
+    free = ca.sparsify(ca.DM(np.array(geometry.chart.basis)))
+    diagonal, upper, order = ca.ldl(symmetric_from_lower(free.T @ mass @ free))
+    acceleration = free @ ca.ldl_solve(free.T @ (jacobian.T @ (torque - friction) - bias), diagonal, upper, order)
     # Coulomb, then viscous friction: eq. 24 without its stray second v_E.
     rubbing = [jacobian.T @ ca.diag(ca.sign(velocity)), jacobian.T @ ca.diag(velocity)]
     regressor = ca.horzcat(rigid_body_regressor(geometry, pose, twist, twist_dot), *rubbing)
+    torques = ca.solve((jacobian @ free).T, free.T @ inertial) + friction
     return [
         function("mass_matrix", [pose, xi], [mass]),
         function("coriolis_matrix", [pose, twist, xi], [coriolis_matrix(geometry, pose, twist, rigid)]),
         function("gravity_wrench", [pose, xi], [holding]),
         function("friction_wrench", [pose, twist, xi], [jacobian.T @ friction]),
         function("regressor", [pose, twist, twist_dot], [regressor]),
-        function("inverse_dynamics", [pose, twist, twist_dot, xi], [ca.solve(jacobian.T, inertial) + friction]),
+        function("inverse_dynamics", [pose, twist, twist_dot, xi], [torques]),
         function("forward_dynamics", [pose, twist, torque, xi], [acceleration]),
     ]
 
 
-def robot_functions(geometry: Rss6Geometry) -> list[ca.Function]:
+def robot_functions(geometry: RobotGeometry) -> list[ca.Function]:
     """All that `Robot` evaluates."""
     return kinematic_functions(geometry) + dynamic_functions(geometry)

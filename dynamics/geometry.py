@@ -1,0 +1,138 @@
+"""Geometry of a parallel robot: its legs, where its platform is at home, and how far its joints may travel."""
+
+import hashlib
+from collections import Counter
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from dynamics.errors import RobotFileError
+from dynamics.kinematics.chart import FREEDOMS, Chart
+from dynamics.kinematics.platform import base_from_platform
+from dynamics.legs.leg import Leg
+
+SAME_PLACE = 1e-6
+"""m: joints of two legs nearer than this are one."""
+
+
+@dataclass(frozen=True, eq=False)
+class RobotGeometry:
+    """Legs and chart of a robot; home_pose (6,); travel_limit: largest magnitude of a joint coordinate, rad or m;
+    gravity (3,) in m/s^2. Lengths in m, vectors in base axes unless named otherwise.
+
+    Legs are assembled: each knows which solution of its inverse kinematics is the one at home.
+    Raises RobotFileError, with leg and numbers, for a machine with more or fewer freedoms than actuators, for two legs in
+    one place, and where a leg cannot reach the home pose. Two geometries are equal when all their numbers are.
+    """
+
+    legs: tuple[Leg, ...]
+    chart: Chart
+    travel_limit: float
+    gravity: np.ndarray
+
+    def __post_init__(self) -> None:
+        gravity = np.array(self.gravity, dtype=float)
+        for name, array, shape in (("home_pose", self.home_pose, (6,)), ("gravity", gravity, (3,))):
+            if array.shape != shape or not np.isfinite(array).all():
+                raise RobotFileError(f"{name} must be finite with shape {shape}, got shape {array.shape}")
+        gravity.setflags(write=False)
+        object.__setattr__(self, "gravity", gravity)
+        if not 0 < self.travel_limit < np.inf:
+            raise RobotFileError(f"travel_limit must be positive and finite, got {self.travel_limit}")
+        self._check_freedoms()
+        self._check_places()
+        at_home = zip(self.legs, self.joints_at(self.home_pose), strict=True)
+        object.__setattr__(self, "legs", tuple(leg.assembled(at, k + 1) for k, (leg, at) in enumerate(at_home)))
+
+    @property
+    def home_pose(self) -> np.ndarray:
+        """Pose (6,) of the platform at home."""
+        return np.array(self.chart.home)
+
+    @property
+    def base_joints(self) -> np.ndarray:
+        """B (legs, 3), base axes, m."""
+        return np.array([leg.base_joint for leg in self.legs])
+
+    @property
+    def platform_joints(self) -> np.ndarray:
+        """a (legs, 3), platform axes, m."""
+        return np.array([leg.platform_joint for leg in self.legs])
+
+    @property
+    def prismatic(self) -> bool:
+        """Whether the actuators slide; they turn otherwise."""
+        return self.legs[0].prismatic
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Fingerprint of all numbers; the key of what is built from a geometry."""
+        content = hashlib.sha256(repr((self.chart, self.travel_limit, self.gravity.tolist())).encode())
+        for leg in self.legs:
+            content.update(repr([(name, _plain(value)) for name, value in leg]).encode())
+        return content.digest()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, RobotGeometry) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    @property
+    def characteristic_length(self) -> float:
+        """Length in m that makes rotations comparable to translations: RMS distance of the joints A from the origin."""
+        return float(np.sqrt(np.mean(np.sum(self.platform_joints**2, axis=1))))
+
+    def joints_at(self, pose: np.ndarray) -> np.ndarray:
+        """Platform joints A (legs, 3), base axes, m, with the platform at a pose (6,)."""
+        return np.asarray(pose[:3] + self.platform_joints @ base_from_platform(pose).T)
+
+    def displaced(self, base: np.ndarray, platform: np.ndarray) -> "RobotGeometry":
+        """The geometry with its base and platform joints off by (legs, 3) each, m, and its joint coordinates set to zero
+        at home."""
+        shifts = zip(self.legs, base, platform, strict=True)
+        moved = [
+            leg.model_copy(update={"base_joint": leg.base_joint + b, "platform_joint": leg.platform_joint + a})
+            for leg, b, a in shifts
+        ]
+        geometry = replace(self, legs=tuple(moved))
+        at_home = zip(geometry.legs, geometry.joints_at(self.home_pose), strict=True)
+        return replace(geometry, legs=tuple(leg.zeroed(at) for leg, at in at_home))
+
+    def _check_freedoms(self) -> None:
+        if self.chart.name not in FREEDOMS:
+            raise RobotFileError(f"unknown chart `{self.chart.name}`; valid: {', '.join(FREEDOMS)}")
+        if not self.legs:
+            raise RobotFileError("a robot needs legs, it has none")
+        freedoms, charts = len(self.chart.freedoms), Counter(leg.chart for leg in self.legs)
+        for number, leg in enumerate(self.legs, 1):
+            if leg.chart != self.chart.name:
+                what = f"platform with the chart `{self.chart.name}` ({', '.join(self.chart.coordinate_names)})"
+                raise RobotFileError(
+                    f"leg {number} is of a kind ({type(leg).__name__}) that works with the chart `{leg.chart}`, "
+                    f"not on a {what}; legs by chart: {dict(charts)}"
+                )
+            if leg.prismatic != self.prismatic:
+                raise RobotFileError(f"leg {number}: actuators that slide and such that turn cannot share a joint PID")
+        if len(self.legs) != freedoms:
+            kind = "under-actuated" if len(self.legs) < freedoms else "over-constrained"
+            raise RobotFileError(
+                f"the machine is {kind}: {len(self.legs)} actuated legs for {freedoms} freedoms of the platform "
+                f"({', '.join(self.chart.coordinate_names)})"
+            )
+        if self.chart.name == "planar" and np.any(self.home_pose[3:5]):
+            raise RobotFileError(f"a planar platform needs alpha = beta = 0 at home, got {self.home_pose[3:5]}")
+
+    def _check_places(self) -> None:
+        for a, first in enumerate(self.legs):
+            for b, second in enumerate(self.legs[:a]):
+                ends = np.concatenate(
+                    [first.base_joint - second.base_joint, first.platform_joint - second.platform_joint]
+                )
+                if np.abs(ends).max() < SAME_PLACE:
+                    raise RobotFileError(f"legs {b + 1} and {a + 1} are in one place: both joints agree to 1e-6 m")
+
+
+def _plain(value: object) -> object:
+    return value.tolist() if isinstance(value, np.ndarray) else value

@@ -1,0 +1,238 @@
+"""A leg of any kind: a function of the motion of its platform joint A alone, in CasADi.
+
+A leg's bodies move as A makes them move (eq. 5-16), so each leg adds a force at A, and the robot's wrench is the sum of
+the platform's own and [F; a x F] over the legs: the virtual-work model of eq. 23, with the Jacobians taken with respect
+to the velocity of A (3 columns) in place of the twist (6 columns), at a fraction of the operations.
+
+A kind of leg says where its bodies are and how they turn; their forces follow here by virtual work. One whose closed
+form is faster may give that instead. All vectors in base axes, A as a position (3,) in them; SI units, and rad or m for
+the actuated coordinate: an angle where the actuator turns, a length where it slides.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, NamedTuple, Self
+
+import casadi as ca
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
+
+from dynamics.errors import RobotFileError
+from dynamics.expressions import symmetric_from_lower
+
+INERTIAL = ("mass", "Ixx", "Iyy", "Izz")
+"""What each body has: kg, and kg m^2 about its own axes through its centre of mass."""
+
+
+def _vector(value: object) -> np.ndarray:
+    array = np.array(value, dtype=float)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise ValueError(f"needs 3 finite numbers, got {value}")
+    array.setflags(write=False)
+    return array
+
+
+def _direction(value: object) -> np.ndarray:
+    array = _vector(value)
+    if abs(np.linalg.norm(array) - 1.0) > 1e-9:
+        raise ValueError(f"has length {np.linalg.norm(array):.9g}, must be 1")
+    return array
+
+
+_NUMBERS = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
+Point = Annotated[np.ndarray, PlainValidator(_vector), WithJsonSchema(_NUMBERS)]
+Direction = Annotated[np.ndarray, PlainValidator(_direction), WithJsonSchema(_NUMBERS)]
+Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+@dataclass(frozen=True)
+class Body:
+    """A kind of body: its name; the moments that do work as it moves; `driven`, the inertial parameter that an actuator
+    which moves it, and nothing else in the leg, has a share in (None: there is none)."""
+
+    name: str
+    moments: tuple[str, ...]
+    driven: str | None = None
+
+
+class Placement(NamedTuple):
+    """Where a body is: centre of mass (3,), and axes (3, 3) as columns, in which its moments are given."""
+
+    centre: ca.SX
+    axes: ca.SX
+
+
+class Segment(NamedTuple):
+    """One body in the chain from the base to A, as other engines build it and as it is drawn.
+
+    joint to the body before (or the base): "hinge" about `axis`, "slide" along it, "universal" about `axis`, then about
+    x of this body, or "ball"; `axis` (3,) and `origin`, where the joint is (3,), in the axes of the body before, the
+    latter from the joint of that. Its own frame stands at its joint, with the axes of its `Placement`; in that are
+    centre: its centre of mass (3,), rod: the two ends (2, 3) of what is drawn, m, of a radius, and end: where A is, of
+    the last body. actuated: whether the leg's coordinate is that of this joint.
+    """
+
+    joint: str
+    axis: np.ndarray
+    origin: np.ndarray
+    centre: np.ndarray
+    rod: np.ndarray
+    radius: float
+    end: np.ndarray | None = None
+    actuated: bool = False
+
+
+class Leg(BaseModel, ABC):
+    """One leg: the base joint B where it starts and its platform joint A, in platform axes, (3,) each in m.
+
+    `branch` names which of two solutions of its inverse kinematics the leg is assembled in, +1 or -1; left out, the one
+    whose coordinate at home is nearest to zero. Raises pydantic's ValidationError for numbers that make no leg.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    bodies: ClassVar[tuple[Body, ...]]
+    prismatic: ClassVar[bool]
+    chart: ClassVar[str] = "free"
+    """What the platform's freedoms have to be for this leg to work."""
+
+    base_joint: Point = Field(description="B, where the leg starts on the base; base axes, m")
+    platform_joint: Point = Field(description="A, where it ends on the platform; platform axes, m")
+    branch: Annotated[int, Field(ge=-1, le=1)] | None = Field(
+        None, description="+1 or -1: which solution of the inverse kinematics; default: nearest to zero at home"
+    )
+
+    def assembled(self, joint: np.ndarray, number: int) -> Self:
+        """The leg with its branch chosen, for the position (3,) of A at home.
+
+        Raises RobotFileError, with the leg's number, reach and lengths, where it cannot reach there.
+        """
+        margin = float(self.reach(ca.SX(joint)))
+        if not margin > 0:
+            raise RobotFileError(
+                f"leg {number} cannot reach the home pose: reach margin {margin:.3g}, must be > 0; "
+                f"B to A {np.linalg.norm(joint - self.base_joint):.4g} m, {self.lengths()}"
+            )
+        if self.branch is not None:
+            return self
+        both = [self.model_copy(update={"branch": sign}) for sign in (1, -1)]
+        return min(both, key=lambda leg: abs(float(leg.coordinate(ca.SX(joint)))))
+
+    @abstractmethod
+    def lengths(self) -> str:
+        """The leg's lengths, for messages."""
+
+    @abstractmethod
+    def zeroed(self, joint: np.ndarray) -> Self:
+        """The leg with its coordinate set to zero where A is at `joint` (3,)."""
+
+    @abstractmethod
+    def coordinate(self, position: ca.SX) -> ca.SX:
+        """The actuated coordinate; NaN out of reach."""
+
+    @abstractmethod
+    def reach(self, position: ca.SX) -> ca.SX:
+        """Reach margin, dimensionless and at most 1; zero or negative out of reach."""
+
+    @abstractmethod
+    def gap(self, position: ca.SX, coordinate: ca.SX) -> ca.SX:
+        """How far the leg is from closed, m^2, for a coordinate chosen freely; smooth wherever A is."""
+
+    @abstractmethod
+    def direction(self, position: ca.SX) -> ca.SX:
+        """Unit vector (3,) of the force at A that the actuator can give."""
+
+    @abstractmethod
+    def leverage(self, position: ca.SX) -> ca.SX:
+        """The actuator's on its leg, in 0..1; zero where the leg is singular (J_a1)."""
+
+    @abstractmethod
+    def placements(self, position: ca.SX) -> list[Placement]:
+        """Where the leg's bodies are."""
+
+    @abstractmethod
+    def angular_velocities(self, position: ca.SX, velocity: ca.SX) -> list[ca.SX]:
+        """Angular velocities (3,) of the bodies for a velocity (3,) of A, linear in that."""
+
+    def driven_inertia(self, body: np.ndarray) -> float:
+        """Inertia of the driven body, given as mass, Ixx, Iyy, Izz (4,), for its actuator; NaN where none is driven."""
+        return float(body[0]) if self.bodies[0].driven == "mass" else float("nan")
+
+    @abstractmethod
+    def segments(self) -> list[Segment]:
+        """The bodies as a chain from the base."""
+
+    def gradient(self, position: ca.SX) -> ca.SX:
+        """Gradient (3,) of the coordinate with respect to A: the force at A of a unit torque or force (eq. 8)."""
+        at = ca.SX.sym("position", 3)
+        return ca.substitute(ca.jacobian(self.coordinate(at), at).T, at, position)
+
+    def acceleration(self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX) -> ca.SX:
+        """Second time derivative of the coordinate."""
+        at, moving = ca.SX.sym("position", 3), ca.SX.sym("velocity", 3)
+        bend = ca.jtimes(ca.dot(self.gradient(at), moving), at, moving)
+        bend = ca.substitute(bend, ca.vertcat(at, moving), ca.vertcat(position, velocity))
+        return ca.dot(self.gradient(position), acceleration) + bend
+
+    def force(self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX, rigid: ca.SX, gravity: ca.DM) -> ca.SX:
+        """Force at A (3,), N, that moves the bodies, for their inertial parameters one after the other (4 n,)."""
+        at, moving, gaining, own = (
+            ca.SX.sym(name, n) for name, n in zip("pvai", (3, 3, 3, rigid.numel()), strict=True)
+        )
+        total = ca.SX.zeros(3)
+        for body, centre_map, spin_map, spin in self._maps(at, moving, own):
+            centre_rate, mass, inertia = centre_map @ moving, body[0], body[1]
+            centre_gain = centre_map @ gaining + ca.jtimes(centre_rate, at, moving)
+            spin_gain = spin_map @ gaining + ca.jtimes(spin, at, moving)
+            total += centre_map.T @ (mass * (centre_gain - gravity))
+            total += spin_map.T @ (inertia @ spin_gain + ca.cross(spin, inertia @ spin))
+        return _replaced(total, (at, moving, gaining, own), (position, velocity, acceleration, rigid))
+
+    def mass(self, position: ca.SX, rigid: ca.SX) -> ca.SX:
+        """Mass (3, 3) that the leg adds at A."""
+        at, moving, own = ca.SX.sym("p", 3), ca.SX.sym("v", 3), ca.SX.sym("i", rigid.numel())
+        total = ca.SX.zeros(3, 3)
+        for (mass, inertia), centre_map, spin_map, _ in self._maps(at, moving, own):
+            total += mass * (centre_map.T @ centre_map) + spin_map.T @ inertia @ spin_map
+        return symmetric_from_lower(_replaced(total, (at, own), (position, rigid)))
+
+    def coriolis(self, position: ca.SX, velocity: ca.SX, rigid: ca.SX) -> ca.SX:
+        """C (3, 3): C velocity is the Coriolis and centrifugal force at A. Eq. 21 and 22: sums of
+        J^T (M_body J_dot + C_body J)."""
+        at, moving, own = ca.SX.sym("p", 3), ca.SX.sym("v", 3), ca.SX.sym("i", rigid.numel())
+        total = ca.SX.zeros(3, 3)
+        for (mass, inertia), centre_map, spin_map, spin in self._maps(at, moving, own):
+            centre_gain, spin_gain = (
+                ca.reshape(ca.jtimes(ca.vec(ca.densify(m)), at, moving), 3, 3) for m in (centre_map, spin_map)
+            )
+            total += mass * (centre_map.T @ centre_gain)
+            total += spin_map.T @ (inertia @ spin_gain + ca.skew(spin) @ inertia @ spin_map)
+        return _replaced(total, (at, moving, own), (position, velocity, rigid))
+
+    def _maps(
+        self, position: ca.SX, velocity: ca.SX, rigid: ca.SX
+    ) -> list[tuple[tuple[ca.SX, ca.SX], ca.SX, ca.SX, ca.SX]]:
+        """Of every body: mass and inertia (3, 3); maps (3, 3) from the velocity of A to those of its centre and its
+        angular one; and that."""
+        found = []
+        spins = self.angular_velocities(position, velocity)
+        for body, (place, spin) in enumerate(zip(self.placements(position), spins, strict=True)):
+            own = rigid[4 * body : 4 * body + 4]
+            inertia = place.axes @ ca.diag(own[1:4]) @ place.axes.T
+            maps = ca.jacobian(place.centre, position), ca.jacobian(spin, velocity)
+            found.append(((own[0], inertia), *maps, spin))
+        return found
+
+
+def _replaced(expression: ca.SX, symbols: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.SX:
+    return ca.substitute(ca.cse(expression), ca.vertcat(*symbols), ca.vertcat(*values))
+
+
+def link_axes(across_from: np.ndarray | ca.SX, z: ca.SX) -> ca.SX:
+    """Axes (3, 3) of a link along the unit vector z: x normal to a given direction and to z, y = z x x."""
+    across = ca.cross(ca.SX(across_from), z)
+    x = across * (1 / ca.norm_2(across))
+    return ca.horzcat(x, ca.cross(z, x), z)

@@ -1,0 +1,238 @@
+"""RSS leg: a crank on the base (R), and a link between two spherical joints (S).
+
+Inverse kinematics in closed form (eq. 3 and 4), and dynamics with the Jacobians of eq. 5-16; their rates, Appendix A of
+the paper, are automatic derivatives (eq. A5 and A6 as printed are not). The vector a from the platform origin to joint
+A is in base axes throughout (eq. 3 and 5 need R a, though the text defines a in platform axes). Centres of mass are at
+mid-length. Forces follow by virtual work as those of any leg do (`Leg`), here in closed form, which is faster.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal, Self
+
+import casadi as ca
+import numpy as np
+from pydantic import Field, model_validator
+
+from dynamics.expressions import symmetric_from_lower
+from dynamics.legs.leg import Body, Direction, Leg, Length, Placement, Segment, link_axes
+
+Z = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class LegVectors:
+    """One leg, base axes, m: crank angle (rad), axis s, crank w = T - B and link l = A - T, each (3,), and their
+    lengths, which are constants of the robot."""
+
+    angle: ca.SX
+    axis: ca.SX
+    crank: ca.SX
+    link: ca.SX
+    crank_length: float
+    link_length: float
+
+
+@dataclass(frozen=True)
+class LegMotion:
+    """Crank acceleration (scalar), second derivatives of crank and link vectors (3,), and the link's angular
+    velocity and acceleration (3,); the link does not spin about its own axis."""
+
+    crank_acceleration: ca.SX
+    tip_acceleration: ca.SX
+    link_acceleration: ca.SX
+    angular_velocity: ca.SX
+    angular_acceleration: ca.SX
+
+
+class RssLeg(Leg):
+    """A crank that turns about an axis on the base, and a link from its tip T to the platform joint A."""
+
+    bodies = (Body("crank", ("Izz",), driven="Izz"), Body("link", ("Ixx", "Iyy")))
+    prismatic = False
+    link_joint: ClassVar[str] = "ball"
+
+    type: Literal["rss"] = "rss"
+    crank_axis: Direction = Field(description="axis of the crank, unit vector, base axes")
+    crank_zero_direction: Direction = Field(description="unit vector from B to the crank's tip at angle zero")
+    crank_length: Length = Field(description="from B to the crank's tip, m")
+    link_length: Length = Field(description="from the crank's tip to A, m")
+    crank_radius: Length = Field(0.010, description="of the crank as it is drawn and hides stickers, m")
+    link_radius: Length = Field(0.006, description="of the link as it is drawn and hides stickers, m")
+
+    @model_validator(mode="after")
+    def _normal(self) -> Self:
+        product = float(self.crank_axis @ self.crank_zero_direction)
+        if abs(product) > 1e-9:
+            raise ValueError(
+                f"crank_zero_direction must be normal to the crank axis; their dot product is {product:.3g}, limit 1e-9"
+            )
+        return self
+
+    def lengths(self) -> str:
+        return f"crank {self.crank_length:g} m, link {self.link_length:g} m"
+
+    def zeroed(self, joint: np.ndarray) -> Self:
+        crank = np.array(ca.DM(ca.evalf(self.vectors(ca.SX(joint)).crank))).ravel()
+        return self.model_copy(update={"crank_zero_direction": crank / self.crank_length})
+
+    def vectors(self, position: ca.SX) -> LegVectors:
+        """The leg with A at a position: along cos(theta) + across sin(theta) = chord, on the leg's branch."""
+        zero, axis = self.crank_zero_direction, self.crank_axis
+        along, across, chord = self._chord(position)
+        square = along**2 + across**2
+        root = float(self.branch or 1) * ca.sqrt(square - chord**2)
+        inverse = 1 / square
+        cosine = (along * chord - across * root) * inverse
+        sine = (across * chord + along * root) * inverse
+        crank = self.crank_length * (cosine * zero + sine * np.cross(axis, zero))
+        link = position - self.base_joint - crank
+        return LegVectors(ca.atan2(sine, cosine), ca.SX(axis), crank, link, self.crank_length, self.link_length)
+
+    def coordinate(self, position: ca.SX) -> ca.SX:
+        return self.vectors(position).angle
+
+    def reach(self, position: ca.SX) -> ca.SX:
+        """sin^2 of the angle between crank and direction of reach."""
+        along, across, chord = self._chord(position)
+        return 1 - chord**2 / (along**2 + across**2)
+
+    def gap(self, position: ca.SX, coordinate: ca.SX) -> ca.SX:
+        """(|A - T|^2 - link_length^2) / 2."""
+        zero, axis = self.crank_zero_direction, self.crank_axis
+        crank = self.crank_length * (ca.cos(coordinate) * zero + ca.sin(coordinate) * np.cross(axis, zero))
+        link = position - self.base_joint - crank
+        return (ca.dot(link, link) - self.link_length**2) / 2
+
+    def direction(self, position: ca.SX) -> ca.SX:
+        return self.vectors(position).link * (1 / self.link_length)
+
+    def leverage(self, position: ca.SX) -> ca.SX:
+        """|J_a1| / (|w| |l|)."""
+        return ca.fabs(crank_leverage(self.vectors(position))) / (self.crank_length * self.link_length)
+
+    def gradient(self, position: ca.SX) -> ca.SX:
+        return angle_gradient(self.vectors(position))
+
+    def acceleration(self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX) -> ca.SX:
+        return leg_motion(self.vectors(position), velocity, acceleration).crank_acceleration
+
+    def placements(self, position: ca.SX) -> list[Placement]:
+        leg = self.vectors(position)
+        x = leg.crank * (1 / leg.crank_length)
+        crank = Placement(self.base_joint + leg.crank / 2, ca.horzcat(x, ca.cross(leg.axis, x), leg.axis))
+        axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
+        return [crank, Placement(self.base_joint + leg.crank + leg.link / 2, axes)]
+
+    def angular_velocities(self, position: ca.SX, velocity: ca.SX) -> list[ca.SX]:
+        leg = self.vectors(position)
+        rate = ca.dot(angle_gradient(leg), velocity)
+        link_rate = velocity - rate * ca.cross(leg.axis, leg.crank)
+        return [rate * leg.axis, ca.cross(leg.link, link_rate) / leg.link_length**2]
+
+    def driven_inertia(self, body: np.ndarray) -> float:
+        """Of the crank about its axis."""
+        return float(body[3] + body[0] * self.crank_length**2 / 4)
+
+    def segments(self) -> list[Segment]:
+        origin, tip, end = np.zeros(3), np.array([self.crank_length, 0, 0]), self.link_length * Z
+        crank = np.array([origin, tip])
+        return [
+            Segment("hinge", self.crank_axis, self.base_joint, tip / 2, crank, self.crank_radius, actuated=True),
+            Segment(self.link_joint, Z, tip, end / 2, np.array([origin, end]), self.link_radius, end),
+        ]
+
+    def force(self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX, rigid: ca.SX, gravity: ca.DM) -> ca.SX:
+        leg, crank, link = self.vectors(position), rigid[0:4], rigid[4:8]
+        motion = leg_motion(leg, velocity, acceleration)
+        gradient, tangent = angle_gradient(leg), ca.cross(leg.axis, leg.crank)
+        # The crank turns about its own z alone, and a link without spin about l does no work against Izz.
+        lever = ca.dot(tangent / 2, motion.tip_acceleration / 2 - gravity)
+        torque = crank[0] * lever + crank[3] * motion.crank_acceleration
+        pull = link[0] * (motion.tip_acceleration + motion.link_acceleration / 2 - gravity) / 2
+        moment = ca.SX.zeros(3)
+        for inertia, direction in zip((link[1], link[2]), _link_xy(leg), strict=True):
+            spin = ca.dot(direction, motion.angular_velocity)
+            turning = ca.dot(direction, motion.angular_acceleration)
+            moment += inertia * (direction * turning + ca.cross(motion.angular_velocity, direction) * spin)
+        turn = ca.cross(moment, leg.link) * (1 / leg.link_length**2)
+        return pull + turn + gradient * (torque + ca.dot(tangent, pull - turn))
+
+    def mass(self, position: ca.SX, rigid: ca.SX) -> ca.SX:
+        leg, crank, link = self.vectors(position), rigid[0:4], rigid[4:8]
+        gradient, tangent = angle_gradient(leg), ca.cross(leg.axis, leg.crank)
+        reflected = crank[3] + (crank[0] + link[0]) * (leg.crank_length**2 / 4)
+        half = gradient @ (link[0] / 4 * tangent).T
+        total = reflected * (gradient @ gradient.T) + link[0] / 4 * ca.SX.eye(3) + half + half.T
+        # Turning about x moves A along -y and the other way round, less what the crank takes up (eq. 13).
+        x, y = _link_xy(leg)
+        for inertia, direction in ((link[1], y), (link[2], x)):
+            row = direction - gradient * ca.dot(tangent, direction)
+            total += (inertia * (1 / leg.link_length**2)) * (row @ row.T)
+        return symmetric_from_lower(total)
+
+    def _chord(self, position: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Components of B->A along and across the crank's zero direction, and the component the link length asks for."""
+        reach = position - self.base_joint
+        zero = self.crank_zero_direction
+        across = np.cross(self.crank_axis, zero)
+        radius, length = self.crank_length, self.link_length
+        chord = (ca.dot(reach, reach) + radius**2 - length**2) / (2 * radius)
+        return ca.dot(reach, zero), ca.dot(reach, across), chord
+
+
+class ParallelogramLeg(RssLeg):
+    """A crank and, as its link, two equal bars side by side that keep the platform from turning (Delta robots).
+
+    As the platform does not turn, neither does the line between the ends of the bars: both move as the link of an RSS
+    leg does, and the parameters of `link` are those of the two together, its moments the sum of their own.
+    """
+
+    chart: ClassVar[str] = "translation"
+    type: Literal["parallelogram"] = "parallelogram"  # type: ignore[assignment]
+    bar_distance: Length = Field(description="between the two bars of the parallelogram, m")
+
+
+class RrrLeg(RssLeg):
+    """A crank and a link in one plane, all three joints hinges normal to that (planar robots)."""
+
+    bodies = (Body("crank", ("Izz",), driven="Izz"), Body("link", ("Iyy",)))
+    chart: ClassVar[str] = "planar"
+    link_joint: ClassVar[str] = "hinge"
+    type: Literal["rrr"] = "rrr"  # type: ignore[assignment]
+
+
+def crank_leverage(leg: LegVectors) -> ca.SX:
+    """Diagonal entry of J_a1, m^2: (w x l) . s (eq. 7). Zero where the leg is singular."""
+    return ca.dot(ca.cross(leg.crank, leg.link), leg.axis)
+
+
+def angle_gradient(leg: LegVectors) -> ca.SX:
+    """l / J_a1 (3,), 1/m: gradient of the crank angle with respect to A, and force at A of a unit torque (eq. 8)."""
+    return leg.link * (1 / crank_leverage(leg))
+
+
+def leg_motion(leg: LegVectors, velocity: ca.SX, acceleration: ca.SX) -> LegMotion:
+    """Motion of crank and link for a velocity (3,) and an acceleration (3,) of A."""
+    gradient, tangent = angle_gradient(leg), ca.cross(leg.axis, leg.crank)
+    rate = ca.dot(gradient, velocity)
+    link_rate = velocity - rate * tangent
+    # l . A_ddot + |l_dot|^2 = l . w_ddot: the link keeps its length.
+    stretch = ca.dot(link_rate, link_rate) + rate**2 * ca.dot(leg.link, leg.crank)
+    crank_acceleration = ca.dot(gradient, acceleration) + stretch * (1 / crank_leverage(leg))
+    tip_acceleration = crank_acceleration * tangent - rate**2 * leg.crank
+    link_acceleration = acceleration - tip_acceleration
+    per_square = 1 / leg.link_length**2
+    return LegMotion(
+        crank_acceleration,
+        tip_acceleration,
+        link_acceleration,
+        ca.cross(leg.link, link_rate) * per_square,
+        ca.cross(leg.link, link_acceleration) * per_square,
+    )
+
+
+def _link_xy(leg: LegVectors) -> tuple[ca.SX, ca.SX]:
+    axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
+    return axes[:, 0], axes[:, 1]
