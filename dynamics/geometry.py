@@ -22,8 +22,8 @@ class RobotGeometry:
     gravity (3,) in m/s^2. Lengths in m, vectors in base axes unless named otherwise.
 
     Legs are assembled: each knows which solution of its inverse kinematics is the one at home.
-    Raises RobotFileError, with leg and numbers, for a machine with more or fewer freedoms than actuators, for two legs in
-    one place, and where a leg cannot reach the home pose. Two geometries are equal when all their numbers are.
+    Raises RobotFileError, with leg and numbers, for a machine with more or fewer freedoms than actuators, for two legs
+    in one place, and where a leg cannot reach the home pose. Two geometries are equal when all their numbers are.
     """
 
     legs: tuple[Leg, ...]
@@ -89,8 +89,8 @@ class RobotGeometry:
         return np.asarray(pose[:3] + self.platform_joints @ base_from_platform(pose).T)
 
     def displaced(self, base: np.ndarray, platform: np.ndarray) -> "RobotGeometry":
-        """The geometry with its base and platform joints off by (legs, 3) each, m, and its joint coordinates set to zero
-        at home."""
+        """The geometry with its base and platform joints off by (legs, 3) each, m, and its joint coordinates set to
+        zero at home."""
         shifts = zip(self.legs, base, platform, strict=True)
         moved = [
             leg.model_copy(update={"base_joint": leg.base_joint + b, "platform_joint": leg.platform_joint + a})

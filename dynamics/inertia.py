@@ -134,8 +134,8 @@ def _difference(before: np.ndarray, after: np.ndarray) -> str:
 
 STATES = 300
 TRAVEL_RATE, TORQUE_SHARE = 1.0, 0.5
-"""Standard deviations of joint rates, travel limits a second, and of torques on top of those that hold the robot, of the
-largest of those."""
+"""Standard deviations of joint rates, in travel limits a second, and of torques on top of those that hold the robot, in
+the largest of those."""
 
 
 def acceleration_changes(robot: Robot, parameters: np.ndarray, inertias: np.ndarray) -> dict[str, float]:

@@ -282,9 +282,9 @@ def _functions(geometry: RobotGeometry) -> dict[str, MachineFunction]:
 def with_geometry_error(robot: Robot, std: float, rng: np.random.Generator) -> Robot:
     """The robot with every coordinate of its base joints B and platform joints A off by a normal error of `std`, m.
 
-    Lengths and axes stay. Joint coordinates are set to zero at the home pose as those of a real robot are, so home keeps
-    them where they are zero there. An error of zero gives the robot itself; the same state of `rng` gives the same
-    robot. Raises RobotFileError for a negative error, and where a leg does not reach the home pose any more.
+    Lengths and axes stay. Joint coordinates are set to zero at the home pose as those of a real robot are, so home
+    keeps them where they are zero there. An error of zero gives the robot itself; the same state of `rng` gives the
+    same robot. Raises RobotFileError for a negative error, and where a leg does not reach the home pose any more.
     """
     check_type("robot", robot, Robot, RobotFileError)
     if real("geometry error", std, RobotFileError, least=0, unit=" m") == 0:

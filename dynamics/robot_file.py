@@ -130,7 +130,7 @@ def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, 
         if name is None:
             raise ValueError(f"legs: unknown key {key}; valid: {', '.join(fields)}")
         vector = KINDS[family.kind].model_fields[name].annotation is np.ndarray
-        each = isinstance(value, list) and (not vector or bool(value) and isinstance(value[0], list))
+        each = isinstance(value, list) and (not vector or (bool(value) and isinstance(value[0], list)))
         if each and len(value) != family.legs:
             raise ValueError(f"legs.{key} needs one value or {family.legs} values, got {len(value)}")
         for number, leg in enumerate(legs):

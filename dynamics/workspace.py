@@ -1,13 +1,13 @@
 """May the robot move so? How far poses are from its limits: travel, reach, and its two kinds of singularity.
 
 - Travel: the magnitude of each joint coordinate against the travel limit.
-- Reach: the reach margin of a leg; of one with a crank, sin^2 of the angle between that and the direction to the platform
-  joint in the crank's plane. At 0 the leg is stretched or folded.
+- Reach: the reach margin of a leg; of one with a crank, sin^2 of the angle between that and the direction to the
+  platform joint in the crank's plane. At 0 the leg is stretched or folded.
 - Actuator side (J_a1): the leverage of an actuator on its leg, in 0..1; of a crank |(w x l) . s| / (|w| |l|). Where it
   vanishes, for cranks together with the reach margin, the actuator moves the platform no more.
-- Platform side (J_a2): the condition number of J_a2 for the motions that the platform can make, its rows of unit vectors
-  along the legs' forces and its angular columns divided by the characteristic length, so that all entries are plain
-  numbers. At infinity the platform moves with all actuators locked.
+- Platform side (J_a2): the condition number of J_a2 for the motions that the platform can make, its rows of unit
+  vectors along the legs' forces and its angular columns divided by the characteristic length, so that all entries are
+  plain numbers. At infinity the platform moves with all actuators locked.
 
 The characteristic length is the RMS distance of the platform joints from the platform origin (0.2 m for rss6). As
 CasADi expressions, for a search that keeps their limits, they are `rigid_body.jacobians.singularity_measures`.
@@ -123,8 +123,9 @@ def check_motion(
     """The worst of a motion sampled as poses (N, 6) at times (N,) in s, N >= 1, if all of it is within the limits.
 
     Raises, with time (or row), leg, value and limit: UnreachablePoseError; TravelError beyond the travel limit less
-    `travel_margin` (rad or m); SingularPoseError for a leverage below `least_leverage` (J_a1) or a condition number of the
-    scaled J_a2 above `most_condition`; ShapeError for poses or times of the wrong shape, or times that do not increase.
+    `travel_margin` (rad or m); SingularPoseError for a leverage below `least_leverage` (J_a1) or a condition number of
+    the scaled J_a2 above `most_condition`; ShapeError for poses or times of the wrong shape, or times that do not
+    increase.
     """
     poses = np.atleast_2d(rows("pose", pose, 6))
     if not len(poses):

@@ -75,8 +75,8 @@ LARGEST_STEP = 1.0
 
 @dataclass(frozen=True)
 class JointElasticity:
-    """Stiffness (N m/rad) and damping (N m s/rad) of every joint's spring; inertia (kg m^2) of every motor, as its joint
-    feels it; of actuators that slide N/m, N s/m and kg.
+    """Stiffness (N m/rad) and damping (N m s/rad) of every joint's spring; inertia (kg m^2) of every motor, as its
+    joint feels it; of actuators that slide N/m, N s/m and kg.
 
     Raises SimulationError for a stiffness or an inertia that is not > 0, a damping < 0, or one that is not finite.
     """
@@ -142,6 +142,6 @@ class JointElasticity:
 
 
 def _coupled(spring: float, at_motor: np.ndarray) -> np.ndarray:
-    """(2 n, 2 n): what a spring between every driven body and its motor, and `at_motor` (n,) to the base, do to both."""
+    """(2 n, 2 n): what a spring between each driven body and its motor, and `at_motor` (n,) to the base, do to both."""
     one = spring * np.eye(len(at_motor))
     return np.block([[one, -one], [-one, one + np.diag(at_motor)]])

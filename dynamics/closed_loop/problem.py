@@ -118,8 +118,8 @@ OPTIONAL = ("joint_integral_sensitivity", "motor_angle", "motor_rate")
 class StartState:
     """State of the loop at the first frame, before that frame is measured; of n joints, m coordinates, p parameters.
 
-    pose (6,) and pose rate (6,); joint PID integral (n,), rad s or m s; servo integral (m,), m s and rad s. These, poses
-    by their coordinates, in this order, are what start_sensitivity differentiates by (24 of six joints and freedoms).
+    pose (6,) and pose rate (6,); joint PID integral (n,), rad s or m s; servo integral (m,), m s and rad s. These,
+    poses by their coordinates, in this order, are what start_sensitivity differentiates by (24 in all for rss6).
     commands (k, n): the commands issued before, rad or m, oldest first (the first one also acted before), and
     last_measured (6,): the pose measured one frame before; both are records.
     joint_integral_sensitivity (n, p): how the joint PID integral follows the parameters; None where it is just given.
@@ -152,7 +152,7 @@ class StartState:
     def check_sizes(self, robot: Robot) -> None:
         """Raise SimulationError, naming the part, where this is no state of a robot."""
         joints, parameters = robot.layout.joints, len(robot.layout.names)
-        wanted = dict.fromkeys(("joint_integral", "motor_angle", "motor_rate"), (joints,))
+        wanted: dict[str, tuple[int, ...]] = dict.fromkeys(("joint_integral", "motor_angle", "motor_rate"), (joints,))
         wanted |= {"servo_integral": (len(robot.coordinate_names),), "commands": (len(self.commands), joints)}
         for name, shape in (wanted | {"joint_integral_sensitivity": (joints, parameters)}).items():
             found = getattr(self, name)

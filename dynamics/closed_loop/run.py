@@ -15,8 +15,8 @@ class ClosedLoopRun:
     pose and pose rate (6,), actuator torque (N m or N) and command (rad or m) (n,), measured pose, whether the
     measurement was good; joint PID integral (n,) and servo integral (m,) as the frame begins; derivatives of the poses
     by the parameters (frames, 6, p) and by the s = 3 m + n entries of the start (frames, 6, s; see StartState), and of
-    those of the last frame's state by both, end_sensitivity (s, p) and end_start_sensitivity (s, s), each or None; angle
-    and rate of the motors of elastic joints, or None; number of stick-slip events; the start."""
+    those of the last frame's state by both, end_sensitivity (s, p) and end_start_sensitivity (s, s), each or None;
+    angle and rate of the motors of elastic joints, or None; number of stick-slip events; the start."""
 
     time: np.ndarray
     pose: np.ndarray

@@ -55,7 +55,7 @@ class Chart:
         return np.asarray(pose, dtype=float)[..., list(self.freedoms)]
 
     def lifted(self, values: np.ndarray, axis: int = -1) -> np.ndarray:
-        """Rates or derivatives of coordinates, along an axis of length m, as those of poses; themselves where m is 6."""
+        """Rates or derivatives of coordinates, along an axis of length m, as those of poses; the same if m is 6."""
         if len(self.freedoms) == len(POSE_NAMES):
             return values
         rows = np.moveaxis(values, axis, -1)

@@ -121,9 +121,9 @@ class RssLeg(Leg):
     def placements(self, position: ca.SX) -> list[Placement]:
         leg = self.vectors(position)
         x = leg.crank * (1 / leg.crank_length)
-        crank = Placement(self.base_joint + leg.crank / 2, ca.horzcat(x, ca.cross(leg.axis, x), leg.axis))
+        crank = Placement(leg.crank / 2 + self.base_joint, ca.horzcat(x, ca.cross(leg.axis, x), leg.axis))
         axes = link_axes(leg.axis, leg.link * (1 / leg.link_length))
-        return [crank, Placement(self.base_joint + leg.crank + leg.link / 2, axes)]
+        return [crank, Placement(leg.crank + leg.link / 2 + self.base_joint, axes)]
 
     def angular_velocities(self, position: ca.SX, velocity: ca.SX) -> list[ca.SX]:
         leg = self.vectors(position)
@@ -173,7 +173,7 @@ class RssLeg(Leg):
         return symmetric_from_lower(total)
 
     def _chord(self, position: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Components of B->A along and across the crank's zero direction, and the component the link length asks for."""
+        """Components of B->A along and across the crank's zero direction, and the one that the link length asks for."""
         reach = position - self.base_joint
         zero = self.crank_zero_direction
         across = np.cross(self.crank_axis, zero)

@@ -56,8 +56,8 @@ def equation_of_motion(geometry: RobotGeometry) -> ca.Function:
 def motion_derivatives(geometry: RobotGeometry) -> ca.Function:
     """(q, rate, acceleration (m,), torque (n,), rigid (p,)) -> derivatives at fixed acceleration and net joint torque.
 
-    Of the residual M q_ddot + b - J_theta^T torque: with respect to q (m, m), rate (m, m) and rigid (m, p). Of the joint
-    accelerations: with respect to q (n, m) and rate (n, m); the latter is 2 J_theta_dot.
+    Of the residual M q_ddot + b - J_theta^T torque: with respect to q (m, m), rate (m, m) and rigid (m, p). Of the
+    joint accelerations: with respect to q (n, m) and rate (n, m); the latter is 2 J_theta_dot.
     The linear solve for q_ddot is left to the caller and never differentiated.
     """
     layout, (q, rate, acceleration) = parameter_layout(geometry.legs), _coordinates(geometry, "q", "rate", "gain")
@@ -135,23 +135,24 @@ def _leg_derivatives(
     """Columns (3, p) of the leg's own parameters, net force (3,), and derivatives of that force and of theta_ddot with
     respect to position, velocity and acceleration of A."""
     leg = geometry.legs[number]
-    inputs = [ca.SX.sym(name, 3) for name in ("position", "velocity", "acceleration")]
-    moving = leg.force(*inputs, own, ca.DM(geometry.gravity))
+    position, velocity, acceleration = (ca.SX.sym(name, 3) for name in ("position", "velocity", "acceleration"))
+    moving = leg.force(position, velocity, acceleration, own, ca.DM(geometry.gravity))
     unit = ca.SX.sym("parameters", own.numel())
-    columns = ca.jacobian(leg.force(*inputs, unit, ca.DM(geometry.gravity)), unit)
-    force = moving - leg.gradient(inputs[0]) * torque
-    by_acceleration = leg.mass(inputs[0], own)
-    joint = leg.acceleration(*inputs)
+    columns = ca.jacobian(leg.force(position, velocity, acceleration, unit, ca.DM(geometry.gravity)), unit)
+    force = moving - leg.gradient(position) * torque
+    by_acceleration = leg.mass(position, own)
+    joint = leg.acceleration(position, velocity, acceleration)
     expressions = [
         columns,
         force,
-        ca.jacobian(force, inputs[0]),
-        ca.jacobian(force, inputs[1]),
+        ca.jacobian(force, position),
+        ca.jacobian(force, velocity),
         by_acceleration,
-        ca.jacobian(joint, inputs[0]),
-        ca.jacobian(joint, inputs[1]),
-        leg.gradient(inputs[0]).T,
+        ca.jacobian(joint, position),
+        ca.jacobian(joint, velocity),
+        leg.gradient(position).T,
     ]
+    inputs = [position, velocity, acceleration]
     columns, force, *rows = ca.substitute(ca.cse(expressions), inputs, list(joints.of(number)))
     return columns, force, rows[:3], rows[3:]
 

@@ -44,9 +44,9 @@ def pose_jacobian(geometry: RobotGeometry, pose: ca.SX) -> ca.SX:
 
 
 def singularity_measures(geometry: RobotGeometry, pose: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Leverage of each actuator on its leg (n,), in 0..1; and J_a2 (n, n) without unit: for the twists that the platform
-    can have, rows [d, a x d] of the unit vectors d along which the legs push, angular columns over the characteristic
-    length."""
+    """Leverage of each actuator on its leg (n,), in 0..1; and J_a2 (n, n) without unit: for the twists that the
+    platform can have, rows [d, a x d] of the unit vectors d along which the legs push, angular columns over the
+    characteristic length."""
     leverages, rows = [], []
     for leg, arm in zip(geometry.legs, platform_arms(geometry, pose), strict=True):
         direction = leg.direction(pose[0:3] + arm)
@@ -60,5 +60,7 @@ def loop_closure(geometry: RobotGeometry, pose: ca.SX, joints: ca.SX) -> tuple[c
     """How far the loops of eq. 3 and 4 are from closed at a pose and joint coordinates chosen freely, and its
     derivative: gaps (n,) in m^2, and d(gaps)/d(coordinates of the platform) (n, n)."""
     arms = platform_arms(geometry, pose)
-    gap = ca.vertcat(*[leg.gap(pose[0:3] + arm, joints[k]) for k, (leg, arm) in enumerate(zip(geometry.legs, arms))])
+    gap = ca.vertcat(
+        *[leg.gap(pose[0:3] + arm, joints[k]) for k, (leg, arm) in enumerate(zip(geometry.legs, arms, strict=True))]
+    )
     return gap, ca.jacobian(gap, pose) @ ca.DM(geometry.chart.basis)
