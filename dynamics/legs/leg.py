@@ -14,7 +14,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, NamedTuple, Self
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import casadi as ca
 import numpy as np
@@ -101,7 +101,7 @@ class Leg(BaseModel, ABC):
 
     base_joint: Point = Field(description="B, where the leg starts on the base; base axes, m")
     platform_joint: Point = Field(description="A, where it ends on the platform; platform axes, m")
-    branch: Annotated[int, Field(ge=-1, le=1)] | None = Field(
+    branch: Literal[-1, 1] | None = Field(
         None, description="+1 or -1: which solution of the inverse kinematics; default: nearest to zero at home"
     )
 
