@@ -33,7 +33,7 @@ def test_the_file_holds_the_robot_of_radii_and_angles(robot):
     assert set(of_legs(g, "crank_length")) == {0.06}
     assert (tuple(g.home_pose), tuple(g.gravity)) == ((0, 0, 0.2, 0, 0, 0), (0, 0, -9.81))
     assert g.travel_limit == 0.9948
-    assert not g.base_joints.flags.writeable
+    assert not g.legs[0].base_joint.flags.writeable
     np.testing.assert_allclose(robot.inverse_kinematics(robot.home_pose), 0, atol=1e-14)
 
 
