@@ -121,6 +121,15 @@ class RobotFile(_Strict):
         return values | {"legs": legs, "chart": values.get("chart") or family.chart}
 
 
+def robot_schema() -> dict[str, Any]:
+    """JSON schema of robot files, for editors; `dynamics/robots/robot.schema.json` holds it."""
+    schema = RobotFile.model_json_schema()
+    one_a_leg = schema["properties"]["legs"]
+    columns = {"type": "object", "description": "with a family: for each key one value, or a list with one a leg"}
+    schema["properties"]["legs"] = {"anyOf": [one_a_leg, columns], "description": one_a_leg.pop("description")}
+    return schema
+
+
 def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, Any]]:
     """One table a leg of one table with columns: a value for all legs, or a list with one a leg."""
     fields = {_plural(name): name for name in KINDS[family.kind].model_fields}
