@@ -72,7 +72,9 @@ class Segment(NamedTuple):
     x of this body, or "ball"; `axis` (3,) and `origin`, where the joint is (3,), in the axes of the body before, the
     latter from the joint of that. Its own frame stands at its joint, with the axes of its `Placement`; in that are
     centre: its centre of mass (3,), rod: the two ends (2, 3) of what is drawn, m, of a radius, and end: where A is, of
-    the last body. actuated: whether the leg's coordinate is that of this joint.
+    the last body. actuated: whether the leg's coordinate is that of this joint. copies: a body that is several equal
+    bars, which share its parameters, has offsets (bars, 3) of their joints from `origin`, in the same axes; where it is
+    the last one, each bar ends as far from A.
     """
 
     joint: str
@@ -83,6 +85,7 @@ class Segment(NamedTuple):
     radius: float
     end: np.ndarray | None = None
     actuated: bool = False
+    copies: np.ndarray = np.zeros((1, 3))
 
 
 class Leg(BaseModel, ABC):
