@@ -239,3 +239,14 @@ def link_axes(across_from: np.ndarray | ca.SX, z: ca.SX) -> ca.SX:
     across = ca.cross(ca.SX(across_from), z)
     x = across * (1 / ca.norm_2(across))
     return ca.horzcat(x, ca.cross(z, x), z)
+
+
+def universal_spin(axis: np.ndarray | ca.SX, z: ca.SX, z_rate: ca.SX) -> ca.SX:
+    """Angular velocity (3,) of a body on a universal joint, whose z moves at a rate (3,): it turns about a first axis, a
+    unit vector that stands still in base axes, and about its own x (see `link_axes`)."""
+    across = ca.cross(ca.SX(axis), z)
+    inverse = 1 / ca.dot(across, across)
+    # About the first axis z moves along `across`, and along y about x.
+    turn = ca.dot(z_rate, across) * inverse
+    swing = ca.dot(z_rate, ca.cross(z, across)) * inverse
+    return turn * axis - swing * across
