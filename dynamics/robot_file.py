@@ -31,6 +31,10 @@ class Family(NamedTuple):
 
 FAMILIES = {
     "rss6": Family("rss", 6, "free"),
+    "rus6": Family("rus", 6, "free"),
+    "ups6": Family("ups", 6, "free"),
+    "pss6": Family("pss", 6, "free"),
+    "pus6": Family("pus", 6, "free"),
     "delta3": Family("parallelogram", 3, "translation"),
     "rrr3": Family("rrr", 3, "planar"),
 }
