@@ -231,7 +231,7 @@ class Leg(BaseModel, ABC):
 
 
 def _replaced(expression: ca.SX, symbols: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.SX:
-    return ca.substitute(ca.cse(expression), ca.vertcat(*symbols), ca.vertcat(*values))
+    return ca.substitute(ca.cse(expression), ca.vertcat(*symbols), ca.densify(ca.vertcat(*values)))
 
 
 def link_axes(across_from: np.ndarray | ca.SX, z: ca.SX) -> ca.SX:
@@ -242,8 +242,8 @@ def link_axes(across_from: np.ndarray | ca.SX, z: ca.SX) -> ca.SX:
 
 
 def universal_spin(axis: np.ndarray | ca.SX, z: ca.SX, z_rate: ca.SX) -> ca.SX:
-    """Angular velocity (3,) of a body on a universal joint, whose z moves at a rate (3,): it turns about a first axis, a
-    unit vector that stands still in base axes, and about its own x (see `link_axes`)."""
+    """Angular velocity (3,) of a body on a universal joint, whose z moves at a rate (3,): it turns about a first axis,
+    a unit vector that stands still in base axes, and about its own x (see `link_axes`)."""
     across = ca.cross(ca.SX(axis), z)
     inverse = 1 / ca.dot(across, across)
     # About the first axis z moves along `across`, and along y about x.
