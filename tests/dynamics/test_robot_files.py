@@ -1,7 +1,9 @@
 """Robots from files, and robots whose joints are off their places: they are what they are said to be, or refused."""
 
 import itertools
+import json
 import pickle
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from scipy.stats import chi2
 import dynamics
 from dynamics.errors import RobotFileError
 from dynamics.robot import with_geometry_error
+from dynamics.robot_file import robot_schema
 from tests.dynamics.conftest import BOX, of_legs, place_legs
 
 
@@ -65,7 +68,7 @@ FIRST_JOINT = "[0.33383501391252074, -0.0784425512051534, 0.0]"
 def test_what_names_no_robot_is_one_line_with_what_was_given_and_the_valid_names(tmp_path):
     (tmp_path / "picture.toml").write_bytes(b"\x89PNG\xff\xfe")
     for name, words in (
-        ("rss7", r"unknown robot `rss7`; built-in robots: rss6; or give the path"),
+        ("rss7", r"unknown robot `rss7`; built-in robots: .*rss6, rss6_coplanar, .*; or give the path"),
         (tmp_path / "none.toml", r"cannot read robot file .*none\.toml"),
         ("rss6\0.toml", r"cannot read robot file .*null byte"),
         (tmp_path / "picture.toml", "cannot read robot file"),
@@ -76,7 +79,7 @@ def test_what_names_no_robot_is_one_line_with_what_was_given_and_the_valid_names
             dynamics.load_robot(name)
     with pytest.raises(RobotFileError, match="description must be of type RobotDescription, got 'rss6' of type str"):
         dynamics.Robot("rss6")
-    assert dynamics.built_in_robots() == ["rss6"]
+    assert {"rss6", "ups6", "delta3"} < set(dynamics.built_in_robots())
 
 
 def test_a_file_by_path_and_a_robot_sent_to_another_process_are_the_same_robot(load_changed, robot):
@@ -150,3 +153,8 @@ def test_the_plant_closes_its_own_loops_at_home_and_elsewhere(robot):
     solved = fsolve(_gaps, plant.home_pose, args=(THETA, plant.geometry), xtol=1e-13)
     np.testing.assert_allclose(pose, solved, atol=1e-12)
     assert 0.1 * ERROR < np.abs(pose - robot.forward_kinematics(THETA))[:3].max() < 10 * ERROR
+
+
+def test_the_schema_for_editors_is_that_of_the_files_that_are_read():
+    kept = (resources.files("dynamics") / "robots" / "robot.schema.json").read_text(encoding="utf-8")
+    assert json.loads(kept) == robot_schema()
