@@ -38,8 +38,8 @@ NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 Integrator = Literal["implicitfast", "RK4"]
 
 CHANGED_INERTIAS = (
-    "Inertias that no rigid body has were changed to the nearest that MuJoCo accepts. Moments that do no work in a leg,",
-    "as of a crank that turns about z alone and of a link that does not spin, do not alter the motion; others do.",
+    "Inertias that no rigid body has were changed to the nearest that MuJoCo accepts. Moments that do no work in its",
+    "leg, as of a crank that turns about z alone and of a link that does not spin, do not alter the motion; others do.",
 )
 
 
@@ -221,8 +221,8 @@ def _add_part(
 def _add_joint(
     body: Xml.Element, part: Part, axis: np.ndarray, coordinate: float, friction: dict[str, str]
 ) -> list[float]:
-    """Add the joint of a part; returns its coordinates at home. A universal joint is two hinges, that of the body before
-    first."""
+    """Add the joint of a part; returns its coordinates at home. A universal joint is two hinges, first the one in the
+    body before."""
     if part.segment.joint == "ball":
         Xml.SubElement(body, "joint", name=part.name, type="ball")
         return [1.0, 0.0, 0.0, 0.0]
