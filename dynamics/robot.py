@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dynamics.checks import check_type, floats, real, row_text, rows, shown
+from dynamics.checks import check_type, floats, real, row_text, rows, shown, whole
 from dynamics.compiled.machine_code import MachineFunction, compiled_functions
 from dynamics.errors import (
     ChartError,
@@ -112,6 +112,20 @@ class Robot:
         theta = rows("theta", theta, self.layout.joints)
         start = self.home_pose if initial_pose is None else self.charted(initial_pose, "initial_pose")
         return forward_kinematics.solve(self.functions, self.geometry.chart, theta, start)
+
+    def assembly_modes(self, theta: ArrayLike | None = None, starts: int = 2000, seed: int = 0) -> np.ndarray:
+        """Poses (k, 6) in which the robot can be assembled with joint coordinates (n,), by default those at home.
+
+        What Newton's method finds from so many random starts, the one nearest to home first; a Gough-Stewart platform
+        has up to 40 (Dietmaier, 1998). Nothing says that all were found: more starts find more.
+        """
+        joints = self.inverse_kinematics(self.home_pose) if theta is None else theta
+        joints, geometry = floats("theta", joints, (self.layout.joints,)), self.geometry
+        centre = geometry.base_joints.mean(axis=0)
+        reach = np.linalg.norm(geometry.joints_at(self.home_pose) - geometry.base_joints, axis=1).max()
+        radius = float(np.linalg.norm(geometry.base_joints - centre, axis=1).max() + reach)
+        count = whole("starts", starts, DynamicsError, least=1)
+        return forward_kinematics.assembly_modes(self.functions, geometry.chart, joints, centre, radius, count, seed)
 
     def joint_jacobian(self, pose: ArrayLike) -> np.ndarray:
         """J_ad (n, 6): theta_dot = J_ad twist (eq. 8)."""

@@ -31,6 +31,10 @@ class Family(NamedTuple):
 
 FAMILIES = {
     "rss6": Family("rss", 6, "free"),
+    "rus6": Family("rus", 6, "free"),
+    "ups6": Family("ups", 6, "free"),
+    "pss6": Family("pss", 6, "free"),
+    "pus6": Family("pus", 6, "free"),
     "delta3": Family("parallelogram", 3, "translation"),
     "rrr3": Family("rrr", 3, "planar"),
 }
@@ -92,9 +96,9 @@ class RobotFile(_Strict):
     chart: str | None = Field(
         None, description=f"freedoms of the platform, where no family says: {', '.join(FREEDOMS)}"
     )
-    home_pose: list[float] = Field(description="pose of the platform at home, m and rad")
+    home_pose: list[float] = Field(min_length=6, max_length=6, description="pose of the platform at home, m and rad")
     travel_limit: float = Field(description="largest magnitude of a joint coordinate, rad or m")
-    gravity: list[float] = Field([0.0, 0.0, -9.81], description="m/s^2, base axes")
+    gravity: list[float] = Field([0.0, 0.0, -9.81], min_length=3, max_length=3, description="m/s^2, base axes")
     legs: list[Annotated[AnyLeg, Field(discriminator="type")]] = Field(
         description="a table for each leg; with a family also one table with a value, or a list with one a leg, a key"
     )
@@ -119,6 +123,15 @@ class RobotFile(_Strict):
         if isinstance(legs, list):
             legs = [{"type": family.kind} | leg if isinstance(leg, dict) else leg for leg in legs]
         return values | {"legs": legs, "chart": values.get("chart") or family.chart}
+
+
+def robot_schema() -> dict[str, Any]:
+    """JSON schema of robot files, for editors; `dynamics/robots/robot.schema.json` holds it."""
+    schema = RobotFile.model_json_schema()
+    one_a_leg = schema["properties"]["legs"]
+    columns = {"type": "object", "description": "with a family: for each key one value, or a list with one a leg"}
+    schema["properties"]["legs"] = {"anyOf": [one_a_leg, columns], "description": one_a_leg.pop("description")}
+    return schema
 
 
 def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, Any]]:
@@ -198,8 +211,6 @@ def read_robot_file(name_or_path: str | Path) -> RobotDescription:
 
 
 def _geometry(content: RobotFile) -> RobotGeometry:
-    if len(content.home_pose) != 6:
-        raise RobotFileError(f"home_pose needs 6 numbers, got {len(content.home_pose)}")
     if content.chart is None:
         raise RobotFileError(f"a file without family needs a chart; valid: {', '.join(FREEDOMS)}")
     if content.chart not in FREEDOMS:
@@ -225,11 +236,16 @@ def _read_text(name_or_path: str | Path) -> tuple[str, str]:
 
 
 def _one_line(error: ValidationError) -> str:
-    lines = []
+    """What is wrong, with the place; what is wrong with several legs alike is said once."""
+    legs: dict[str, list[str]] = {}
     for item in error.errors():
-        place = ".".join(map(str, item["loc"]))
-        lines.append(f"{place}: {item['msg']}" if place else item["msg"])
-    return "; ".join(lines)
+        place, who = list(item["loc"]), ""
+        if len(place) > 1 and place[0] == "legs":
+            who, place = f"leg {int(place[1]) + 1}", place[3:]  # behind the leg's number stands its type
+        said = [".".join(map(str, place)), item["msg"].removeprefix("Value error, ")]
+        got = "" if item["type"] in ("value_error", "missing") else f", got {shown(item['input'])}"
+        legs.setdefault(": ".join(filter(None, said)) + got, []).append(who)
+    return "; ".join(": ".join(filter(None, [", ".join(who), text])) for text, who in legs.items())
 
 
 def _parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> ParameterSet:

@@ -1,11 +1,12 @@
-"""A 6-RSS robot as MJCF, the text of a model that MuJoCo loads: a closed chain of 13 bodies.
+"""A robot as MJCF, the text of a model that MuJoCo loads: a closed chain of all its bodies, at home.
 
-The platform flies freely; each crank turns about its axis on the base (angle zero as in `inverse_kinematics`), each
-link hangs on its crank's tip by a ball joint, and six `connect` equalities hold the link ends to the platform's joints.
-Motors act on the cranks. Joint damping is the viscous friction, joint friction loss the Coulomb friction.
+The platform flies freely; the bodies of each leg hang on the base and on each other by the joints that the leg's
+segments name, and a `connect` equality holds each leg's end to the platform, which so keeps the freedoms that the legs
+leave it. Joint coordinates are those of `inverse_kinematics`. Motors act on the actuated joints; joint damping is the
+viscous friction, joint friction loss the Coulomb friction. A link that is two equal bars is written as two.
 
-MuJoCo's ball joints leave the links free to spin about their own axes, which eq. 12 excludes. Nothing drives that spin
-as long as Ixx = Iyy: it stays zero. Damping it away would damp the other two axes of the ball joint too, so the export
+MuJoCo's ball joints leave bodies free to spin about their own axes, which eq. 12 excludes. Nothing drives that spin as
+long as Ixx = Iyy: it stays zero. Damping it away would damp the other two axes of the ball joint too, so the export
 adds none.
 """
 
@@ -20,11 +21,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from dynamics.bodies import Frames, Part, parts_of
 from dynamics.checks import check_choice, check_type, flag, real
 from dynamics.errors import DynamicsError
+from dynamics.geometry import RobotGeometry
 from dynamics.inertia import BodyInertias, grouped, physical_inertias
-from dynamics.legs.rss_geometry import LEGS, Rss6Geometry
-from dynamics.parameters import COULOMB, VISCOUS, check_parameters
+from dynamics.kinematics.platform import base_from_platform
 from dynamics.robot import Robot
 
 # MuJoCo silently lowers larger ones.
@@ -36,8 +38,8 @@ NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 Integrator = Literal["implicitfast", "RK4"]
 
 CHANGED_INERTIAS = (
-    "Inertias that no rigid body has were changed to the nearest that MuJoCo accepts. Cranks turn about z alone and",
-    "links do not spin, so a crank's Ixx, Iyy and a link's Izz do not alter the motion; other changes do.",
+    "Inertias that no rigid body has were changed to the nearest that MuJoCo accepts. Moments that do no work in a leg,",
+    "as of a crank that turns about z alone and of a link that does not spin, do not alter the motion; others do.",
 )
 
 
@@ -75,7 +77,7 @@ def mjcf_text(
     solver: MjcfSolver | None = None,
     source: str = "nominal parameters",
 ) -> str:
-    """MJCF of a robot with dynamic parameters (64,) (None: nominal); `source` says in the file where they come from.
+    """MJCF of a robot with dynamic parameters (p,) (None: nominal); `source` says in the file where they come from.
 
     coulomb: write the dry friction; without it the joints only damp. Raises ParameterError, and its subclass
     UnphysicalInertiaError where a body breaks Ix + Iy >= Iz and `allow_unphysical_inertia` is False.
@@ -84,29 +86,57 @@ def mjcf_text(
     check_type("source", source, str, DynamicsError)
     solver = MjcfSolver() if solver is None else solver
     check_type("solver", solver, MjcfSolver, DynamicsError)
-    values = check_parameters(robot.nominal_parameters if parameters is None else parameters)
+    values = robot.layout.check(robot.nominal_parameters if parameters is None else parameters)
     allow_unphysical_inertia = flag("allow_unphysical_inertia", allow_unphysical_inertia, DynamicsError)
     coulomb = flag("coulomb", coulomb, DynamicsError)
-    inertias = physical_inertias(values, allow_unphysical_inertia)
-    frames = body_frames(robot, robot.home_pose)
+    inertias = physical_inertias(robot.layout, values, allow_unphysical_inertia)
+    _, dry, viscous, _ = robot.layout.split(values)
+    chain = _Chain(robot)
     root = Xml.Element("mujoco", model=NOT_IN_XML.sub("?", robot.name))
     _add_header(root, robot, inertias, source)
     Xml.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
-    _add_options(root, robot, solver)
-    add_assets(root)
+    _add_options(root, robot, solver, len(chain.ends))
+    add_assets(root, robot.geometry)
     world = Xml.SubElement(root, "worldbody")
     add_base_looks(world, robot.geometry)
-    _add_platform(world, robot, inertias)
-    for leg in range(LEGS):
-        friction = (values[COULOMB][leg] if coulomb else 0.0, values[VISCOUS][leg])
-        _add_leg(world, robot, leg, frames, inertias, friction)
-    _add_loops_and_motors(root)
-    coordinates = [*robot.home_pose[:3], *quaternion(frames.platform)]
-    for angle in frames.angle:
-        coordinates += [angle, 1.0, 0.0, 0.0, 0.0]
+    _add_platform(world, chain, inertias.values[0])
+    coordinates = [*robot.home_pose[:3], *quaternion(base_from_platform(robot.home_pose))]
+    bodies = {-1: world}
+    for number, part in enumerate(chain.parts):
+        friction = {
+            "frictionloss": _numbers(dry[part.leg] if coulomb else 0.0),
+            "damping": _numbers(viscous[part.leg]),
+        }
+        inertia = part.share * inertias.values[part.body]
+        bodies[number], joints = _add_part(bodies[part.before], chain, number, inertia, friction)
+        coordinates += joints
+    _add_loops_and_motors(root, chain)
     Xml.SubElement(Xml.SubElement(root, "keyframe"), "key", name="home", qpos=_numbers(coordinates))
     Xml.indent(root)
     return Xml.tostring(root, encoding="unicode") + "\n"
+
+
+class _Chain:
+    """Parts of a robot where they are at home, and the points of the platform that the last ones are joined to (3,),
+    platform axes, m, by part."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot, self.parts = robot, parts_of(robot.geometry).all
+        self.home = parts_of(robot.geometry).frames(robot, robot.home_pose)
+        self.joints = robot.inverse_kinematics(robot.home_pose)
+        platform = base_from_platform(robot.home_pose)
+        self.ends = {
+            number: robot.geometry.legs[part.leg].platform_joint
+            + platform.T @ self.home.axes[part.before] @ part.offset
+            for number, part in enumerate(self.parts)
+            if part.last
+        }
+
+
+def end_names(part: Part) -> dict[str, str]:
+    """Names of the two sites that a loop holds together, at the end of a leg's last part and on the platform."""
+    tail = part.name.lstrip("abcdefghijklmnopqrstuvwxyz_")
+    return {"site1": f"link_end{tail}", "site2": f"platform_joint{tail}"}
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
@@ -116,9 +146,9 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 
 def _add_header(root: Xml.Element, robot: Robot, inertias: BodyInertias, source: str) -> None:
     lines = [
-        f"6-RSS robot {robot.name}, {source}; exported by cmmsim. Units: m, kg, s, rad, N m.",
-        "Keyframe home: all cranks at their home angles, platform at rest.",
-        "Links may spin about their own axes; no force makes them as long as Ixx = Iyy.",
+        f"Parallel robot {robot.name}, {source}; exported by cmmsim. Units: m, kg, s, rad, N, N m.",
+        "Keyframe home, and as written: all actuated joints at their home coordinates, platform at rest.",
+        "Links on ball joints may spin about their own axes; no force makes them as long as Ixx = Iyy.",
     ]
     if inertias.changes:
         lines += [*CHANGED_INERTIAS, *grouped(inertias.changes)]
@@ -126,8 +156,8 @@ def _add_header(root: Xml.Element, robot: Robot, inertias: BodyInertias, source:
         _add_comment(root, line.replace("->", "to"))
 
 
-def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver) -> None:
-    _add_comment(root, "Newton solves the 18 stiff loop equations exactly in a step or two.")
+def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver, loops: int) -> None:
+    _add_comment(root, f"Newton solves the {3 * loops} stiff loop equations exactly in a step or two.")
     Xml.SubElement(
         root,
         "option",
@@ -151,57 +181,85 @@ def _add_options(root: Xml.Element, robot: Robot, solver: MjcfSolver) -> None:
     Xml.SubElement(default, "site", size="0.004", group="3")
 
 
-def _add_platform(world: Xml.Element, robot: Robot, inertias: BodyInertias) -> None:
-    pose = robot.home_pose
-    turned = quaternion(Rotation.from_euler("XYZ", pose[3:6]).as_matrix())
-    body = Xml.SubElement(world, "body", name="platform", pos=_numbers(pose[:3]), quat=_numbers(turned))
+def _add_platform(world: Xml.Element, chain: _Chain, inertia: np.ndarray) -> None:
+    pose, joints = chain.robot.home_pose, chain.robot.geometry.platform_joints
+    turned = _numbers(quaternion(base_from_platform(pose)))
+    body = Xml.SubElement(world, "body", name="platform", pos=_numbers(pose[:3]), quat=turned)
     Xml.SubElement(body, "freejoint", name="platform")
-    _add_inertia(body, np.zeros(3), inertias.values[0])
-    for leg, joint in enumerate(robot.geometry.platform_joints):
-        Xml.SubElement(body, "site", name=f"platform_joint{leg + 1}", pos=_numbers(joint))
-    centre, radius = _disc(robot.geometry.platform_joints)
+    _add_inertia(body, np.zeros(3), inertia)
+    for number, end in chain.ends.items():
+        Xml.SubElement(body, "site", name=end_names(chain.parts[number])["site2"], pos=_numbers(end))
+    centre, radius = _disc(joints)
     half = np.array([0.0, 0.0, PLATE_THICKNESS / 2])
     _rod(body, "cylinder", centre - half, centre + half, radius, "plate")
-    for joint in robot.geometry.platform_joints:
-        _ball(body, _numbers(joint))
+    for end in chain.ends.values():
+        _ball(body, end, BALL_RADIUS)
 
 
-def _add_leg(
-    world: Xml.Element,
-    robot: Robot,
-    leg: int,
-    frames: BodyFrames,
-    inertias: BodyInertias,
-    friction: tuple[float, float],
-) -> None:
-    geometry, number = robot.geometry, leg + 1
-    at_zero = geometry.crank_frames(np.zeros(LEGS))[leg]
-    place = {"pos": _numbers(geometry.base_joints[leg]), "quat": _numbers(quaternion(at_zero))}
-    crank = Xml.SubElement(world, "body", name=f"crank{number}", attrib=place)
-    rubbing = {"frictionloss": _numbers(friction[0]), "damping": _numbers(friction[1])}
-    Xml.SubElement(crank, "joint", name=f"joint{number}", type="hinge", axis="0 0 1", attrib=rubbing)
-    _add_inertia(crank, np.array([geometry.crank_length / 2, 0, 0]), inertias.values[number])
-    _rod(crank, "capsule", [0, 0, 0], [geometry.crank_length, 0, 0], CRANK_RADIUS, "crank")
-    relative = quaternion(frames.crank[leg].T @ frames.link[leg])
-    tip = {"pos": _numbers([geometry.crank_length, 0, 0]), "quat": _numbers(relative)}
-    link = Xml.SubElement(crank, "body", name=f"link{number}", attrib=tip)
-    Xml.SubElement(link, "joint", name=f"tip{number}", type="ball")
-    _add_inertia(link, np.array([0, 0, geometry.link_length / 2]), inertias.values[LEGS + number])
-    Xml.SubElement(link, "site", name=f"link_end{number}", pos=_numbers([0, 0, geometry.link_length]))
-    _rod(link, "capsule", [0, 0, 0], [0, 0, geometry.link_length], LINK_RADIUS, "link")
-    _ball(link, "0 0 0")
+def _add_part(
+    parent: Xml.Element, chain: _Chain, number: int, inertia: np.ndarray, friction: dict[str, str]
+) -> tuple[Xml.Element, list[float]]:
+    """Add one part to the body before; returns it, and the coordinates of its joint at home."""
+    part, home = chain.parts[number], chain.home
+    segment, before = part.segment, part.before
+    turn = home.axes[before].T
+    place = {
+        "pos": _numbers(_cleaned(turn @ (home.origin[number] - home.origin[before]))),
+        "quat": _numbers(_cleaned(quaternion(turn @ home.axes[number]))),
+    }
+    body = Xml.SubElement(parent, "body", name=part.name, attrib=place)
+    coordinates = _add_joint(body, part, part_axis(part, home, number), chain.joints[part.leg], friction)
+    _add_inertia(body, segment.centre, inertia)
+    _rod(body, "capsule", *segment.rod, segment.radius, "crank" if segment.actuated else "link")
+    if segment.joint in ("ball", "universal"):
+        _ball(body, np.zeros(3), 1.5 * segment.radius)
+    if segment.end is not None:
+        Xml.SubElement(body, "site", name=end_names(part)["site1"], pos=_numbers(segment.end))
+    return body, coordinates
+
+
+def _add_joint(
+    body: Xml.Element, part: Part, axis: np.ndarray, coordinate: float, friction: dict[str, str]
+) -> list[float]:
+    """Add the joint of a part; returns its coordinates at home. A universal joint is two hinges, that of the body before
+    first."""
+    if part.segment.joint == "ball":
+        Xml.SubElement(body, "joint", name=part.name, type="ball")
+        return [1.0, 0.0, 0.0, 0.0]
+    if part.segment.joint == "universal":
+        Xml.SubElement(body, "joint", name=part.name, type="hinge", axis=_numbers(axis))
+        Xml.SubElement(body, "joint", name=f"{part.name}_x", type="hinge", axis="1 0 0")
+        return [0.0, 0.0]
+    form = {"type": part.segment.joint, "axis": _numbers(axis)}
+    if not part.segment.actuated:
+        Xml.SubElement(body, "joint", name=part.name, attrib=form)
+        return [0.0]
+    form |= {"ref": _numbers(coordinate)} | friction
+    Xml.SubElement(body, "joint", name=f"joint{part.leg + 1}", attrib=form)
+    return [coordinate]
+
+
+def part_axis(part: Part, frames: Frames, number: int) -> np.ndarray:
+    """Axis (3,) of the joint of a part, which is given in the axes of the body before, in its own."""
+    return _cleaned(frames.axes[number].T @ frames.axes[part.before] @ part.segment.axis)
+
+
+def _cleaned(values: np.ndarray) -> np.ndarray:
+    """Values of order one (m, or without unit) without the rounding that stands for their zeros."""
+    return np.where(np.abs(values) < 2e-15, 0.0, values)
 
 
 def _add_inertia(body: Xml.Element, centre: np.ndarray, inertia: np.ndarray) -> None:
     Xml.SubElement(body, "inertial", pos=_numbers(centre), mass=_numbers(inertia[0]), diaginertia=_numbers(inertia[1:]))
 
 
-def _add_loops_and_motors(root: Xml.Element) -> None:
+def _add_loops_and_motors(root: Xml.Element, chain: _Chain) -> None:
     equality, actuator = Xml.SubElement(root, "equality"), Xml.SubElement(root, "actuator")
-    for number in range(1, LEGS + 1):
-        ends = {"site1": f"link_end{number}", "site2": f"platform_joint{number}"}
-        Xml.SubElement(equality, "connect", name=f"loop{number}", attrib=ends)
-        Xml.SubElement(actuator, "motor", name=f"motor{number}", joint=f"joint{number}")
+    for number in chain.ends:
+        ends = end_names(chain.parts[number])
+        Xml.SubElement(equality, "connect", name=ends["site2"].replace("platform_joint", "loop"), attrib=ends)
+    for leg, joint in enumerate(chain.robot.joint_names, 1):
+        Xml.SubElement(actuator, "motor", name=f"motor{leg}", joint=joint)
 
 
 def _add_comment(parent: Xml.Element, text: str) -> None:
@@ -214,9 +272,8 @@ def _numbers(values: ArrayLike) -> str:
     return " ".join(repr(float(value)) for value in np.atleast_1d(np.asarray(values, dtype=float)))
 
 
-# What the exported robot looks like: geoms without mass or contact, so that a viewer shows a 6-RSS robot.
-CRANK_RADIUS, LINK_RADIUS, BALL_RADIUS = 0.010, 0.006, 0.009
-PLATE_THICKNESS = 0.012
+# What the exported robot looks like: geoms without mass or contact, so that a viewer shows it.
+BALL_RADIUS, PLATE_THICKNESS = 0.009, 0.012
 COLOURS = {
     "base": "0.35 0.37 0.40 1",
     "crank": "0.85 0.45 0.15 1",
@@ -225,11 +282,14 @@ COLOURS = {
 }
 
 
-def add_assets(root: Xml.Element) -> None:
+def add_assets(root: Xml.Element, geometry: RobotGeometry) -> None:
     """Sky, light and view, and the colours of the bodies."""
+    points = np.concatenate([geometry.base_joints, geometry.joints_at(geometry.home_pose)])
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    extent = 1.6 * np.linalg.norm(points - centre, axis=1).max()
     visual = Xml.SubElement(root, "visual")
     Xml.SubElement(visual, "headlight", ambient="0.4 0.4 0.4", diffuse="0.5 0.5 0.5")
-    Xml.SubElement(root, "statistic", center="0 0 0.1", extent="0.6")
+    Xml.SubElement(root, "statistic", center=_numbers(centre), extent=_numbers(extent))
     asset = Xml.SubElement(root, "asset")
     sky = {"type": "skybox", "builtin": "gradient", "rgb1": "0.9 0.93 0.97", "rgb2": "0.5 0.55 0.6"}
     Xml.SubElement(asset, "texture", sky, width="64", height="384")
@@ -237,13 +297,20 @@ def add_assets(root: Xml.Element) -> None:
         Xml.SubElement(asset, "material", name=name, rgba=colour)
 
 
-def add_base_looks(world: Xml.Element, geometry: Rss6Geometry) -> None:
-    """A plate below the cranks and a motor on each crank axis."""
+def add_base_looks(world: Xml.Element, geometry: RobotGeometry) -> None:
+    """A plate behind the legs, seen from the platform; a motor on each hinge of the base, a rail below each slide."""
     centre, radius = _disc(geometry.base_joints)
-    drop = np.array([0.0, 0.0, 0.05])
-    _rod(world, "cylinder", centre - drop, centre - drop - [0, 0, 0.01], radius + 0.04, "base")
-    for foot, axis in zip(geometry.base_joints, geometry.crank_axes, strict=True):
-        _rod(world, "cylinder", foot - 0.04 * axis, foot + 0.012 * axis, 0.022, "base")
+    behind = np.array([0.0, 0.0, -1.0 if geometry.home_pose[2] >= centre[2] else 1.0])
+    _rod(world, "cylinder", centre + 0.05 * behind, centre + 0.06 * behind, radius + 0.04, "base")
+    for leg in geometry.legs:
+        foot, segment = leg.base_joint, leg.segments()[0]
+        if segment.joint == "universal":
+            _ball(world, foot, 0.022)
+            continue
+        sliding = segment.joint == "slide"
+        low, high = (geometry.travel_limit,) * 2 if sliding else (0.04, 0.012)
+        ends = foot - low * segment.axis, foot + high * segment.axis
+        _rod(world, "cylinder", *ends, segment.radius if sliding else 0.022, "base")
 
 
 def _disc(points: np.ndarray) -> tuple[np.ndarray, float]:
@@ -256,30 +323,5 @@ def _rod(parent: Xml.Element, kind: str, start: ArrayLike, end: ArrayLike, radiu
     Xml.SubElement(parent, "geom", type=kind, fromto=ends, size=_numbers(radius), material=material)
 
 
-def _ball(parent: Xml.Element, centre: str) -> None:
-    Xml.SubElement(parent, "geom", type="sphere", pos=centre, size=_numbers(BALL_RADIUS), material="link")
-
-
-@dataclass(frozen=True)
-class BodyFrames:
-    """Crank angles (6,), crank tips T and platform joints A (6, 3) in m, and base-from-body rotations of the platform
-    (3, 3), the cranks (6, 3, 3) and the links (6, 3, 3)."""
-
-    angle: np.ndarray
-    tip: np.ndarray
-    joint: np.ndarray
-    platform: np.ndarray
-    crank: np.ndarray
-    link: np.ndarray
-
-
-def body_frames(robot: Robot, pose: np.ndarray) -> BodyFrames:
-    """Frames of all bodies with the platform at a pose (6,)."""
-    geometry, angle = robot.geometry, robot.inverse_kinematics(pose)
-    platform = Rotation.from_euler("XYZ", pose[3:6]).as_matrix()
-    tip, joint = geometry.crank_tips(angle), pose[:3] + geometry.platform_joints @ platform.T
-    z = (joint - tip) / np.linalg.norm(joint - tip, axis=1, keepdims=True)
-    across = np.cross(geometry.crank_axes, z)
-    x = across / np.linalg.norm(across, axis=1, keepdims=True)
-    link = np.stack([x, np.cross(z, x), z], axis=-1)
-    return BodyFrames(angle, tip, joint, platform, geometry.crank_frames(angle), link)
+def _ball(parent: Xml.Element, centre: np.ndarray, radius: float) -> None:
+    Xml.SubElement(parent, "geom", type="sphere", pos=_numbers(centre), size=_numbers(radius), material="link")

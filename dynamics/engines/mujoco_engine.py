@@ -5,11 +5,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from dynamics.bodies import parts_of
 from dynamics.checks import check_type, floats, real
-from dynamics.engines.mjcf import body_frames, quaternion
+from dynamics.engines.mjcf import end_names, part_axis, quaternion
 from dynamics.errors import DynamicsError
-from dynamics.legs.rss_geometry import LEGS
+from dynamics.kinematics.platform import base_from_platform
 from dynamics.robot import Robot
+
+X = np.array([1.0, 0.0, 0.0])
 
 
 class MujocoMissingError(DynamicsError):
@@ -35,7 +38,7 @@ def import_mujoco() -> Any:
 
 
 class MujocoRobot:
-    """A robot exported by `mjcf_text`, loaded. Poses, twists and crank angles are those of `Robot`."""
+    """A robot exported by `mjcf_text`, loaded. Poses, twists and joint coordinates are those of `Robot`."""
 
     def __init__(self, robot: Robot, text: str) -> None:
         check_type("robot", robot, Robot, MujocoError)
@@ -48,12 +51,14 @@ class MujocoRobot:
             raise MujocoError(f"MuJoCo refuses the model of {robot.name}: {error}") from error
         self.data = self._mujoco.MjData(self.model)
         try:
-            joints = [self.model.joint(f"joint{leg}") for leg in range(1, LEGS + 1)]
-            self._ends = [self.model.site(f"link_end{leg}").id for leg in range(1, LEGS + 1)]
-            self._joints = [self.model.site(f"platform_joint{leg}").id for leg in range(1, LEGS + 1)]
+            joints = [self.model.joint(name) for name in robot.joint_names]
+            self._parts = parts_of(robot.geometry)
+            ends = [end_names(part) for part in self._parts.all if part.last]
+            self._ends = np.array([[self.model.site(one[key]).id for one in ends] for key in ("site1", "site2")])
+            self._bodies = [self.model.body(part.name) for part in self._parts.all]
         except KeyError as error:
             raise MujocoError(f"the model is no export of {robot.name}: {error.args[0]}") from None
-        self._angle = np.array([joint.qposadr[0] for joint in joints])
+        self._joint = np.array([joint.qposadr[0] for joint in joints])
         self._rate = np.array([joint.dofadr[0] for joint in joints])
 
     @property
@@ -73,70 +78,83 @@ class MujocoRobot:
         return np.concatenate([self.data.qpos[:3], angles])
 
     @property
-    def crank_angle(self) -> np.ndarray:
-        """Crank angles (6,), rad."""
-        return self.data.qpos[self._angle]
+    def joints(self) -> np.ndarray:
+        """Joint coordinates (n,), rad or m."""
+        return self.data.qpos[self._joint]
 
     @property
-    def crank_rate(self) -> np.ndarray:
-        """Crank rates (6,), rad/s."""
+    def joint_rates(self) -> np.ndarray:
+        """Their rates (n,), rad/s or m/s."""
         return self.data.qvel[self._rate]
 
     @property
     def closure_error(self) -> float:
-        """Largest distance between a link's end and its platform joint, m."""
+        """Largest distance between a leg's end and its platform joint, m."""
         self._mujoco.mj_kinematics(self.model, self.data)
-        gaps = self.data.site_xpos[self._ends] - self.data.site_xpos[self._joints]
+        gaps = self.data.site_xpos[self._ends[0]] - self.data.site_xpos[self._ends[1]]
         return float(np.linalg.norm(gaps, axis=1).max())
 
     @property
     def link_spin(self) -> float:
-        """Largest angular velocity of a link about its own axis, rad/s."""
-        spins = []
-        for leg in range(1, LEGS + 1):
-            body = self.model.body(f"link{leg}").id
-            turn = np.zeros(6)
-            self._mujoco.mj_objectVelocity(self.model, self.data, self._mujoco.mjtObj.mjOBJ_XBODY, body, turn, 1)
-            spins.append(abs(turn[2]))
+        """Largest angular velocity about its own axis of a body on a ball joint, rad/s; zero without such bodies."""
+        spins = [0.0]
+        for part, body in zip(self._parts.all, self._bodies, strict=True):
+            if part.segment.joint == "ball":
+                turn = np.zeros(6)
+                kind = self._mujoco.mjtObj.mjOBJ_XBODY
+                self._mujoco.mj_objectVelocity(self.model, self.data, kind, body.id, turn, 1)
+                spins.append(abs(turn[2]))
         return max(spins)
 
     def put(self, pose: np.ndarray, twist: np.ndarray) -> None:
         """Put all bodies where the robot has them at a pose (6,) with a twist (6,), no link spinning (eq. 12)."""
         pose, twist = floats("pose", pose, (6,)), floats("twist", twist, (6,))
-        frames = body_frames(self._robot, pose)
-        rate = self._robot.joint_jacobian(pose) @ twist
-        data, axis, link = self.data, self._robot.geometry.crank_axes, frames.joint - frames.tip
-        tip_rate = rate[:, None] * np.cross(axis, self._robot.geometry.crank_length * frames.crank[:, :, 0])
-        link_rate = twist[:3] + np.cross(twist[3:], frames.joint - pose[:3]) - tip_rate
-        link_omega = np.cross(link, link_rate) / np.sum(link**2, axis=1, keepdims=True)
+        frames, platform = self._parts.frames(self._robot, pose, twist), base_from_platform(pose)
+        data = self.data
         self._mujoco.mj_resetData(self.model, data)
-        data.qpos[:7] = [*pose[:3], *quaternion(frames.platform)]
-        data.qvel[:6] = [*twist[:3], *(frames.platform.T @ twist[3:])]
-        data.qpos[self._angle], data.qvel[self._rate] = frames.angle, rate
-        for leg in range(LEGS):
-            body, joint = self.model.body(f"link{leg + 1}"), self.model.joint(f"tip{leg + 1}")
-            rest = Rotation.from_quat(body.quat, scalar_first=True).as_matrix()
-            turned = rest.T @ frames.crank[leg].T @ frames.link[leg]
-            data.qpos[joint.qposadr[0] : joint.qposadr[0] + 4] = quaternion(turned)
-            relative = link_omega[leg] - rate[leg] * axis[leg]
-            data.qvel[joint.dofadr[0] : joint.dofadr[0] + 3] = frames.link[leg].T @ relative
+        data.qpos[:7] = [*pose[:3], *quaternion(platform)]
+        data.qvel[:6] = [*twist[:3], *(platform.T @ twist[3:])]
+        data.qpos[self._joint] = self._robot.inverse_kinematics(pose)
+        data.qvel[self._rate] = self._robot.joint_jacobian(pose) @ twist
+        for number, (part, body) in enumerate(zip(self._parts.all, self._bodies, strict=True)):
+            if part.segment.actuated:
+                continue
+            at, rate = int(body.jntadr[0]), int(body.dofadr[0])
+            at = int(self.model.jnt_qposadr[at])
+            own, before = frames.axes[number], frames.axes[part.before]
+            at_rest = Rotation.from_quat(body.quat, scalar_first=True).as_matrix()
+            turned = at_rest.T @ before.T @ own
+            spin = own.T @ (frames.spin[number] - frames.spin[part.before])
+            if part.segment.joint == "ball":
+                data.qpos[at : at + 4], data.qvel[rate : rate + 3] = quaternion(turned), spin
+                continue
+            axis, resting = part_axis(part, frames, number), at_rest.T @ part.segment.axis
+            if part.segment.joint == "hinge":
+                data.qpos[at], data.qvel[rate] = Rotation.from_matrix(turned).as_rotvec() @ resting, spin @ axis
+                continue
+            # Universal: about the axis of the part before, then about x, which is normal to that.
+            moved = turned[:, 0]
+            angle = np.arctan2(np.cross(resting, X) @ moved, moved[0])
+            about_x = Rotation.from_rotvec(-angle * resting).as_matrix() @ turned
+            data.qpos[at : at + 2] = angle, np.arctan2(about_x[2, 1], about_x[1, 1])
+            data.qvel[rate : rate + 2] = spin @ axis, spin[0]
         self._mujoco.mj_forward(self.model, data)
 
     def twist_dot(self, torque: np.ndarray) -> np.ndarray:
-        """Acceleration [h_ddot, omega_dot] (6,), base axes, under crank torques (6,) in the present state."""
-        self.data.ctrl[:] = floats("torque", torque, (LEGS,))
+        """Acceleration [h_ddot, omega_dot] (6,), base axes, under actuator torques or forces (n,) in the present state."""
+        self.data.ctrl[:] = floats("torque", torque, (len(self._joint),))
         self._mujoco.mj_forward(self.model, self.data)
         platform = Rotation.from_quat(self.data.qpos[3:7], scalar_first=True).as_matrix()
         return np.concatenate([self.data.qacc[:3], platform @ self.data.qacc[3:6]])
 
     def feed_back(self, stiffness: float, damping: float) -> None:
-        """Let every motor add -stiffness angle - damping rate to its control, evaluated inside MuJoCo's integrator."""
+        """Let every motor add -stiffness coordinate - damping rate to its control, evaluated inside MuJoCo's integrator."""
         self.model.actuator_biastype[:] = self._mujoco.mjtBias.mjBIAS_AFFINE
         stiffness = real("stiffness", stiffness, MujocoError, least=0)
         damping = real("damping", damping, MujocoError, least=0)
         self.model.actuator_biasprm[:, :3] = [0.0, -stiffness, -damping]
 
     def step(self, control: np.ndarray) -> None:
-        """One step under a control (6,), N m."""
-        self.data.ctrl[:] = floats("control", control, (LEGS,))
+        """One step under a control (n,), N m or N."""
+        self.data.ctrl[:] = floats("control", control, (len(self._joint),))
         self._mujoco.mj_step(self.model, self.data)

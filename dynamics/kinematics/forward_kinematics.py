@@ -7,6 +7,7 @@ pose found this way may have a leg in another assembly; the closed-form inverse 
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dynamics.checks import row_text
 from dynamics.compiled.machine_code import MachineFunction
@@ -18,6 +19,9 @@ STEP_TOLERANCE = 1e-12
 ANGLE_TOLERANCE = 1e-12
 MAX_ITERATIONS = 50
 HALVINGS = 20
+
+# Poses nearer than this share of the radius in which they were searched, and so near in rotation, are one.
+SAME = 1e-5
 
 
 Functions = Mapping[str, MachineFunction]
@@ -38,6 +42,31 @@ def solve(functions: Functions, chart: Chart, theta: np.ndarray, start: np.ndarr
     poses, residual = search(functions, chart, angles, poses)
     _check(functions, angles, poses, residual)
     return poses.reshape(*theta.shape[:-1], 6)
+
+
+def assembly_modes(
+    functions: Functions, chart: Chart, theta: np.ndarray, centre: np.ndarray, radius: float, starts: int, seed: int
+) -> np.ndarray:
+    """The distinct poses (k, 6) with joint coordinates theta (n,) that Newton's method finds from random poses around a
+    place, `centre` (3,) give or take `radius` (m), turned in all directions that the chart allows.
+
+    Each is checked by the inverse kinematics. The nearest to home comes first.
+    """
+    rng = np.random.default_rng(seed)
+    turns = Rotation.random(starts, random_state=rng).as_euler("XYZ")
+    drawn = np.hstack([centre + radius * rng.uniform(-1, 1, (starts, 3)), turns])
+    poses, residual = search(functions, chart, np.tile(theta, (starts, 1)), chart.pose(chart.coordinates(drawn)))
+    found = poses[(residual < ANGLE_TOLERANCE).all(axis=1)]
+    turned = Rotation.from_euler("XYZ", found[:, 3:])
+    found = np.hstack([found[:, :3], turned.as_euler("XYZ")])
+    order = np.argsort(np.linalg.norm(found[:, :3] - np.array(chart.home)[:3], axis=1), kind="stable")
+    found, matrices = found[order], turned.as_matrix()[order].reshape(-1, 9)
+    kept: list[int] = []
+    for row, (place, matrix) in enumerate(zip(found[:, :3], matrices, strict=True)):
+        near = np.abs(found[kept, :3] - place).max(axis=1, initial=0.0) < SAME * radius
+        if not (near & (np.abs(matrices[kept] - matrix).max(axis=1, initial=0.0) < SAME)).any():
+            kept.append(row)
+    return found[kept]
 
 
 def search(functions: Functions, chart: Chart, theta: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -5,9 +5,20 @@ paper's robot. All that knows which leg it is stands in this room and in robot f
 """
 
 from dynamics.legs.leg import Leg
+from dynamics.legs.pss import PssLeg, PusLeg
 from dynamics.legs.rss import ParallelogramLeg, RrrLeg, RssLeg
+from dynamics.legs.rus import RusLeg
+from dynamics.legs.ups import UpsLeg
 
-AnyLeg = RssLeg | ParallelogramLeg | RrrLeg
+AnyLeg = RssLeg | RusLeg | UpsLeg | PssLeg | PusLeg | ParallelogramLeg | RrrLeg
 
-KINDS: dict[str, type[Leg]] = {"rss": RssLeg, "parallelogram": ParallelogramLeg, "rrr": RrrLeg}
+KINDS: dict[str, type[Leg]] = {
+    "rss": RssLeg,
+    "rus": RusLeg,
+    "ups": UpsLeg,
+    "pss": PssLeg,
+    "pus": PusLeg,
+    "parallelogram": ParallelogramLeg,
+    "rrr": RrrLeg,
+}
 """Kinds of legs by the name that robot files give them."""

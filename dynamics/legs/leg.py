@@ -14,7 +14,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, NamedTuple, Self
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import casadi as ca
 import numpy as np
@@ -72,7 +72,9 @@ class Segment(NamedTuple):
     x of this body, or "ball"; `axis` (3,) and `origin`, where the joint is (3,), in the axes of the body before, the
     latter from the joint of that. Its own frame stands at its joint, with the axes of its `Placement`; in that are
     centre: its centre of mass (3,), rod: the two ends (2, 3) of what is drawn, m, of a radius, and end: where A is, of
-    the last body. actuated: whether the leg's coordinate is that of this joint.
+    the last body. actuated: whether the leg's coordinate is that of this joint. copies: a body that is several equal
+    bars, which share its parameters, has offsets (bars, 3) of their joints from `origin`, in the same axes; where it is
+    the last one, each bar ends as far from A.
     """
 
     joint: str
@@ -83,6 +85,7 @@ class Segment(NamedTuple):
     radius: float
     end: np.ndarray | None = None
     actuated: bool = False
+    copies: np.ndarray = np.zeros((1, 3))
 
 
 class Leg(BaseModel, ABC):
@@ -101,7 +104,7 @@ class Leg(BaseModel, ABC):
 
     base_joint: Point = Field(description="B, where the leg starts on the base; base axes, m")
     platform_joint: Point = Field(description="A, where it ends on the platform; platform axes, m")
-    branch: Annotated[int, Field(ge=-1, le=1)] | None = Field(
+    branch: Literal[-1, 1] | None = Field(
         None, description="+1 or -1: which solution of the inverse kinematics; default: nearest to zero at home"
     )
 
@@ -228,7 +231,7 @@ class Leg(BaseModel, ABC):
 
 
 def _replaced(expression: ca.SX, symbols: Sequence[ca.SX], values: Sequence[ca.SX]) -> ca.SX:
-    return ca.substitute(ca.cse(expression), ca.vertcat(*symbols), ca.vertcat(*values))
+    return ca.substitute(ca.cse(expression), ca.vertcat(*symbols), ca.densify(ca.vertcat(*values)))
 
 
 def link_axes(across_from: np.ndarray | ca.SX, z: ca.SX) -> ca.SX:
@@ -236,3 +239,14 @@ def link_axes(across_from: np.ndarray | ca.SX, z: ca.SX) -> ca.SX:
     across = ca.cross(ca.SX(across_from), z)
     x = across * (1 / ca.norm_2(across))
     return ca.horzcat(x, ca.cross(z, x), z)
+
+
+def universal_spin(axis: np.ndarray | ca.SX, z: ca.SX, z_rate: ca.SX) -> ca.SX:
+    """Angular velocity (3,) of a body on a universal joint, whose z moves at a rate (3,): it turns about a first axis,
+    a unit vector that stands still in base axes, and about its own x (see `link_axes`)."""
+    across = ca.cross(ca.SX(axis), z)
+    inverse = 1 / ca.dot(across, across)
+    # About the first axis z moves along `across`, and along y about x.
+    turn = ca.dot(z_rate, across) * inverse
+    swing = ca.dot(z_rate, ca.cross(z, across)) * inverse
+    return turn * axis - swing * across

@@ -193,6 +193,11 @@ class ParallelogramLeg(RssLeg):
     type: Literal["parallelogram"] = "parallelogram"  # type: ignore[assignment]
     bar_distance: Length = Field(description="between the two bars of the parallelogram, m")
 
+    def segments(self) -> list[Segment]:
+        """The bars stand side by side along the crank's axis."""
+        crank, link = super().segments()
+        return [crank, link._replace(copies=np.outer([-0.5, 0.5], self.bar_distance * Z))]
+
 
 class RrrLeg(RssLeg):
     """A crank and a link in one plane, all three joints hinges normal to that (planar robots)."""

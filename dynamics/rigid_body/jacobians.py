@@ -43,6 +43,17 @@ def pose_jacobian(geometry: RobotGeometry, pose: ca.SX) -> ca.SX:
     return joint_jacobian(geometry, pose) @ pose_rate_to_twist(pose)
 
 
+def placements(geometry: RobotGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:
+    """Of the bodies of all legs, leg by leg (bodies, 15): centre of mass, m, axes (3, 3) row by row, and angular
+    velocity, rad/s, base axes."""
+    rows = []
+    for leg, arm in zip(geometry.legs, platform_arms(geometry, pose), strict=True):
+        position, velocity = pose[0:3] + arm, twist[0:3] + ca.cross(twist[3:6], arm)
+        found = zip(leg.placements(position), leg.angular_velocities(position, velocity), strict=True)
+        rows += [ca.vertcat(place.centre, ca.vec(place.axes.T), spin).T for place, spin in found]
+    return ca.vertcat(*rows)
+
+
 def singularity_measures(geometry: RobotGeometry, pose: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Leverage of each actuator on its leg (n,), in 0..1; and J_a2 (n, n) without unit: for the twists that the
     platform can have, rows [d, a x d] of the unit vectors d along which the legs push, angular columns over the

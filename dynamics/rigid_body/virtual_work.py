@@ -18,6 +18,7 @@ from dynamics.rigid_body.jacobians import (
     joint_jacobian,
     loop_closure,
     platform_arms,
+    placements,
     pose_jacobian,
     reach_margin,
     singularity_measures,
@@ -104,6 +105,7 @@ def kinematic_functions(geometry: RobotGeometry) -> list[ca.Function]:
         function("twist", [pose, rate], [to_twist @ rate]),
         function("twist_dot", [pose, rate, acceleration], [to_twist @ acceleration + twist_bias(pose, rate)]),
         function("pose_rate", [pose, twist], [ca.solve(to_twist, twist)]),
+        function("placements", [pose, twist], [placements(geometry, pose, twist)]),
     ]
 
 

@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 from identify.commands import new_folder
 from identify.commands.calibrate import CALIBRATE_HELP, calibrate
 from identify.commands.comparisons import compare_excitation, estimators, variation
+from identify.commands.check import CHECK_HELP, check
 from identify.commands.robot import base_parameters, export, verify_model, workspace
 from identify.commands.sensor import acceptance, detectors
 from identify.commands.study import STUDY_HELP, study
@@ -77,6 +78,7 @@ Which motion shows most:
 
 \b
 Where the robot can go:
+  cmmsim check mine.toml                 what a designer wants to know of a robot
   cmmsim workspace rss6                  maps of travel, reach and conditioning
 
 \b
@@ -276,6 +278,7 @@ def report(out: RunFolderOption, quiet: Quiet = False) -> None:
 app.command("verify-model")(verify_model)
 app.add_typer(export, name="export")
 app.command()(detectors)
+app.command(help=CHECK_HELP)(check)
 app.command()(workspace)
 app.command(help=CALIBRATE_HELP)(calibrate)
 app.command()(acceptance)

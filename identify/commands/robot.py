@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from identify.arrays import Array
     from identify.estimation.base_parameters import BaseParameters
 
-RobotArgument = Annotated[str, typer.Argument(help="Built-in robot (rss6) or path of a TOML file.")]
+RobotArgument = Annotated[str, typer.Argument(help="Built-in robot (rss6, ups6, ...) or path of a TOML file.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary.")]
 
 THRESHOLD = 1e-3
@@ -172,7 +172,7 @@ def _changes(robot: "Robot", parameters: "Array") -> list[str]:
     """Lines: the inertias that the export changed, and by how much that changes the robot's accelerations."""
     from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 
-    inertias = physical_inertias(parameters, allow_changes=True)
+    inertias = physical_inertias(robot.layout, parameters, allow_changes=True)
     if not inertias.changes:
         return []
     effects = acceleration_changes(robot, parameters, inertias.values)
@@ -219,7 +219,7 @@ def _print_verdict(entry: dict[str, Any], folder: Path) -> None:
     ):
         limit = f"{goal[key]:g}" if key in goal else ""
         rows.append((label, key.rpartition("_")[2], f"{found[key]:.2g}", limit, f"{paper[key]:g}"))
-    rows.append(("torque, whole run", "N m", f"{found['torque_max_nm']:.2g}", "", ""))
+    rows.append(("torque, whole run", entry["torque_unit"], f"{found['torque_max']:.2g}", "", ""))
     rows.append(("MuJoCo's loop closure", "um", f"{found['closure_max_um']:.2g}", "", ""))
     print_table(("largest difference", "unit", "value", "goal", "paper"), rows, ("largest difference", "unit"), title)
     typer.echo(f"figure: {folder / 'figure8.png'}")

@@ -11,37 +11,27 @@ import cmmsim
 from cmmsim.files import SensorFile, read_sensor_file
 from cmmsim.imaging.renderer import choose_renderer
 from dynamics import Robot
+from dynamics.bodies import parts_of
 from identify.arrays import Array
 from identify.progress import Advance
 from identify.scenario import Scenario
 
-CRANK_RADIUS_M = 0.010
-LINK_RADIUS_M = 0.006
-
-
 def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:
-    """Meshes [m] of the six cranks and six links, each along its z axis from its first joint; they hide stickers."""
-    crank = cmmsim.rod(robot.geometry.crank_length, CRANK_RADIUS_M)
-    link = cmmsim.rod(robot.geometry.link_length, LINK_RADIUS_M)
-    legs = range(1, 7)
-    return {f"crank{leg}": crank for leg in legs} | {f"link{leg}": link for leg in legs}
+    """Meshes [m] of the bodies of all legs, rods along their z axes from their first joints; they hide stickers."""
+    return {
+        part.name: cmmsim.rod(float(np.linalg.norm(np.diff(part.segment.rod, axis=0))), part.segment.radius)
+        for part in parts_of(robot.geometry).all
+    }
 
 
 def robot_transforms(robot: Robot, pose: Array) -> dict[str, Array]:
-    """base_from_body (4, 4) of every crank and link with the platform at a pose (6,)."""
-    geometry = robot.geometry
-    base_from_platform = cmmsim.pose_to_transform(pose)
-    ends = geometry.platform_joints @ base_from_platform[:3, :3].T + base_from_platform[:3, 3]
-    tips = geometry.crank_tips(robot.inverse_kinematics(pose))
-    transforms = {}
-    for leg in range(6):
-        transforms[f"crank{leg + 1}"] = cmmsim.rod_transform(geometry.base_joints[leg], tips[leg])
-        transforms[f"link{leg + 1}"] = cmmsim.rod_transform(tips[leg], ends[leg])
-    return transforms
+    """base_from_body (4, 4) of the rods of all legs with the platform at a pose (6,)."""
+    parts = parts_of(robot.geometry)
+    return {part.name: cmmsim.rod_transform(*ends) for part, ends in zip(parts.all, parts.rods(robot, pose), strict=True)}
 
 
 def make_sensor(scenario: Scenario, robot: Robot, seed: int, taught: cmmsim.Taught | None = None) -> cmmsim.Sensor:
-    """The scenario's sensor, with its timing and with the robot's cranks and links in its view.
+    """The scenario's sensor, with its timing and with the bodies of the robot's legs in its view.
 
     One a process: it owns the renderer.
     """
@@ -64,7 +54,7 @@ def with_renderer(scenario: Scenario) -> Scenario:
 class PoseSensor(Protocol):
     """What measures in the loop: `cmmsim.Sensor`, or one that answers as it does.
 
-    One that says `sees_bodies = False` is not told where cranks and links are, which takes time.
+    One that says `sees_bodies = False` is not told where the robot's legs are, which takes time.
     """
 
     def start_run(self, seed: int) -> None:

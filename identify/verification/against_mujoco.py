@@ -1,6 +1,6 @@
 """The paper's model validation (section 4.1): this model against MuJoCo in the loop of its figure 7, and its figure 8.
 
-The same joint PID (eq. 31) on both engines follows the crank angles of the same exciting trajectory (eq. 37); torques
+The same joint PID (eq. 31) on both engines follows the joint coordinates of the same exciting trajectory (eq. 37); torques
 come from each engine's own motion. This model goes through the closed loop of the experiments, driven by commands;
 MuJoCo through `mj_step` on the exported MJCF.
 
@@ -19,7 +19,6 @@ from dynamics import Robot, closed_loop
 from dynamics.engines.mjcf import MjcfSolver, mjcf_text
 from dynamics.engines.mujoco_engine import MujocoRobot, import_mujoco
 from dynamics.inertia import grouped, physical_inertias
-from dynamics.parameters import COULOMB, VISCOUS
 from identify.arrays import Array
 from identify.excitation.design import admissible_trajectories
 from identify.progress import Progress, SilentProgress
@@ -47,8 +46,8 @@ PAPER = {"position_max_um": 1250.0, "angle_max_urad": 3250.0, "position_steady_u
 
 @dataclass(frozen=True)
 class EngineRuns:
-    """Both engines over time (N,) [s]: poses (N, 6) [m, rad] of this model, of MuJoCo and of the reference; crank
-    torques (N, 6) [N m] of this model and of MuJoCo; MuJoCo's closure error (N,) [m] and link spin (N,) [rad/s]."""
+    """Both engines over time (N,) [s]: poses (N, 6) [m, rad] of this model, of MuJoCo and of the reference;
+    actuator torques or forces (N, n) [N m, N] of this model and of MuJoCo; MuJoCo's closure error (N,) [m] and link spin (N,) [rad/s]."""
 
     time: Array
     reference: Array
@@ -72,14 +71,14 @@ def verify(robot: Robot, progress: Progress | None = None) -> EngineRuns:
     Raises DynamicsError, TrajectoryError: see `compare_engines`.
     """
     values = robot.parameter_sets[PARAMETER_SET].vector.copy()
-    values[COULOMB], values[VISCOUS] = 0.0, 0.0
+    values[robot.layout.coulomb], values[robot.layout.viscous] = 0.0, 0.0
     return compare_engines(robot, values, values, DURATION_S, progress)
 
 
 def compare_engines(
     robot: Robot, model_parameters: Array, mujoco_parameters: Array, duration_s: float, progress: Progress | None = None
 ) -> EngineRuns:
-    """Both engines on the exciting trajectory, each with its own parameters (67,): the 64 dynamic ones, lp, li, ld.
+    """Both engines on the exciting trajectory, each with its own parameters: the dynamic ones (p,), lp, li, ld.
 
     Raises DynamicsError: MuJoCo is missing or refuses the model, or the loop is unstable. Raises TrajectoryError: no
     exciting trajectory of this amplitude stays inside the robot's travel.
@@ -101,13 +100,14 @@ def compare_engines(
         model = closed_loop.simulate(robot, model_parameters, reference, settings, commands=commands)
         advance()
     # Table 1's inertias break the triangle inequality in ways that the motion does not feel
-    mjcf = mjcf_text(robot, mujoco_parameters[:64], allow_unphysical_inertia=True, solver=SOLVER)
-    engine, rows = MujocoRobot(robot, mjcf), np.empty((len(time), 14))
+    chosen, joints = mujoco_parameters[robot.layout.dynamic], robot.layout.joints
+    mjcf = mjcf_text(robot, chosen, allow_unphysical_inertia=True, solver=SOLVER)
+    engine, rows = MujocoRobot(robot, mjcf), np.empty((len(time), 8 + joints))
     with progress.stage("MuJoCo", len(time)) as advance:
         for frame, row in enumerate(_mujoco_rows(robot, engine, mujoco_parameters, reference, commands)):
             rows[frame] = row
             advance()
-    pose, torque, closure, spin = rows[:, :6], rows[:, 6:12], rows[:, 12], rows[:, 13]
+    pose, torque, closure, spin = rows[:, :6], rows[:, 6:-2], rows[:, -2], rows[:, -1]
     return EngineRuns(
         time, reference.poses, model.pose, pose, model.torque, torque, closure, spin, mujoco_version=engine.version
     )
@@ -122,38 +122,38 @@ def exciting_trajectory(robot: Robot) -> FourierTrajectory:
 def _mujoco_rows(
     robot: Robot, engine: MujocoRobot, parameters: Array, reference: closed_loop.Reference, commands: Array
 ) -> Iterator[Array]:
-    """Pose (6,), torque (6,), closure error and link spin at every command, as rows (14,); the command ramps from the
-    one before to the present one, as in the closed loop with linear hold."""
-    lp, li, ld = parameters[64:]
+    """Pose (6,), torques (n,), closure error and link spin at every command, in a row; the command ramps from the one
+    before to the present one, as in the closed loop with linear hold."""
+    lp, li, ld = parameters[robot.layout.joint_pid]
     steps = round(1 / (COMMAND_RATE_HZ * engine.timestep))
     dt = 1 / (COMMAND_RATE_HZ * steps)
-    integral = robot.static_torque(reference.poses[0], parameters[:64]) / li
+    integral = robot.static_torque(reference.poses[0], parameters[robot.layout.dynamic]) / li
     engine.put(reference.poses[0], np.zeros(6))
     engine.feed_back(lp, ld)
     before = commands[0]
     for command in commands:
         rate = (command - before) * COMMAND_RATE_HZ
-        torque = lp * (before - engine.crank_angle) + ld * (rate - engine.crank_rate) + li * integral
+        torque = lp * (before - engine.joints) + ld * (rate - engine.joint_rates) + li * integral
         yield np.concatenate([engine.pose, torque, [engine.closure_error, engine.link_spin]])
         for step in range(steps):
             wanted = before + rate * (step + 0.5) * dt
-            start = engine.crank_angle
+            start = engine.joints
             engine.step(lp * wanted + ld * rate + li * (integral + dt / 2 * (wanted - start)))
-            integral = integral + dt * (wanted - (start + engine.crank_angle) / 2)
+            integral = integral + dt * (wanted - (start + engine.joints) / 2)
         before = command
 
 
 @dataclass(frozen=True)
 class Verdict:
     """Largest differences between the engines, of the whole run and from STEADY_FROM_S on: distances of the platform
-    [um], lengths of the vector of Euler angle differences [urad], crank torque [N m]; MuJoCo's loop closure error [um]
-    and link spin [rad/s]; how far this model is from its reference [um, urad], which is what the PID leaves to see."""
+    [um], lengths of the vector of Euler angle differences [urad], actuator torque or force [N m, N]; MuJoCo's loop closure
+    error [um] and link spin [rad/s]; how far this model is from its reference [um, urad], which is what the PID leaves to see."""
 
     position_max_um: float
     position_steady_um: float
     angle_max_urad: float
     angle_steady_urad: float
-    torque_max_nm: float
+    torque_max: float
     closure_max_um: float
     spin_max_rad_s: float
     tracking_max_um: float
@@ -175,7 +175,7 @@ def judge(runs: EngineRuns) -> Verdict:
         position_steady_um=1e6 * position[steady].max(),
         angle_max_urad=1e6 * angle.max(),
         angle_steady_urad=1e6 * angle[steady].max(),
-        torque_max_nm=float(np.abs(runs.mujoco_torque - runs.model_torque).max()),
+        torque_max=float(np.abs(runs.mujoco_torque - runs.model_torque).max()),
         closure_max_um=1e6 * runs.closure.max(),
         spin_max_rad_s=float(runs.spin.max()),
         tracking_max_um=1e6 * tracking[0].max(),
@@ -200,9 +200,10 @@ def verification_entry(robot: Robot, runs: EngineRuns) -> dict[str, Any]:
         "mujoco": {
             "version": runs.mujoco_version,
             **asdict(SOLVER),
-            "inertias_changed": grouped(physical_inertias(chosen.dynamic, allow_changes=True).changes),
+            "inertias_changed": grouped(physical_inertias(robot.layout, chosen.dynamic, allow_changes=True).changes),
         },
         "difference": asdict(verdict),
+        "torque_unit": robot.layout.unit("joint1.coulomb"),
         "goal": {"position_steady_um": GOAL_UM, "angle_steady_urad": GOAL_URAD},
         "met": verdict.met,
         "paper": PAPER,

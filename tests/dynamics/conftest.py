@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import dynamics
 from dynamics import closed_loop
-from dynamics.legs.rss_geometry import Rss6Geometry
+from dynamics.geometry import RobotGeometry
 
 BOX = np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])
 METHODS = (
@@ -84,20 +84,26 @@ class Legs:
     crank: np.ndarray
 
 
-def place_legs(geometry: Rss6Geometry, pose: np.ndarray, theta: np.ndarray) -> Legs:
+def of_legs(geometry: RobotGeometry, name: str) -> np.ndarray:
+    """One number or vector of every leg, by the name that robot files give it."""
+    return np.array([getattr(leg, name) for leg in geometry.legs])
+
+
+def place_legs(geometry: RobotGeometry, pose: np.ndarray, theta: np.ndarray) -> Legs:
     """Where the legs of a geometry are at a pose (6,) with crank angles (6,), whether they close or not."""
     cosine, sine = np.cos(theta)[:, None], np.sin(theta)[:, None]
-    across = np.cross(geometry.crank_axes, geometry.crank_zero_directions)
-    crank = geometry.crank_length * (cosine * geometry.crank_zero_directions + sine * across)
+    zero = of_legs(geometry, "crank_zero_direction")
+    across = np.cross(of_legs(geometry, "crank_axis"), zero)
+    crank = of_legs(geometry, "crank_length")[:, None] * (cosine * zero + sine * across)
     joint = pose[:3] + geometry.platform_joints @ base_from_platform(pose).T
     return Legs(geometry.base_joints + crank, joint, crank)
 
 
-def link_axes(geometry: Rss6Geometry, legs: Legs) -> np.ndarray:
+def link_axes(geometry: RobotGeometry, legs: Legs) -> np.ndarray:
     """Axes (6, 3, 3) of the links as columns: z along the link, x = crank axis x z, y = z x x."""
     z = legs.joint - legs.tip
     z /= np.linalg.norm(z, axis=1, keepdims=True)
-    x = np.cross(geometry.crank_axes, z)
+    x = np.cross(of_legs(geometry, "crank_axis"), z)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     return np.stack([x, np.cross(z, x), z], axis=-1)
 

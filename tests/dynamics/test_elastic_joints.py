@@ -5,13 +5,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
-from dynamics import closed_loop
+from dynamics import closed_loop, load_robot
 from dynamics.closed_loop import JointElasticity
-from dynamics.parameters import COULOMB, PARAMETER_NAMES
 from tests.dynamics.conftest import at_rest
 
 GRAVITY = 9.81
-CRANK_IZZ = [PARAMETER_NAMES.index(f"crank{leg}.Izz") for leg in range(1, 7)]
+LAYOUT = load_robot("rss6").layout
+CRANK_IZZ = [LAYOUT.names.index(f"crank{leg}.Izz") for leg in range(1, 7)]
 SOFT = JointElasticity(stiffness=500.0, motor_inertia=3e-4, damping=0.02)
 
 
@@ -19,7 +19,7 @@ SOFT = JointElasticity(stiffness=500.0, motor_inertia=3e-4, damping=0.02)
 def frictionless(identified):
     """The truth without dry friction, all cranks heavier than a motor."""
     values = identified.copy()
-    values[COULOMB] = 0.0
+    values[LAYOUT.coulomb] = 0.0
     values[CRANK_IZZ] = 6e-4
     return values
 
@@ -79,7 +79,7 @@ def test_motion_is_that_of_the_twist_space_model(loop, robot, identified, fricti
     settings = loop.settings(steps=200, elasticity=el, smoothing_velocity=smoothing)
     run = loop.run(frames, settings, values, commands=0.02 * np.sin(np.arange(frames))[:, None] * np.ones(6))
     lp, li, ld = values[64:]
-    carried, coulomb, viscous = values[:64].copy(), values[COULOMB], values[58:64]
+    carried, coulomb, viscous = values[:64].copy(), values[LAYOUT.coulomb], values[LAYOUT.viscous]
     carried[52:] = 0.0
     if el:
         carried[CRANK_IZZ] -= el.motor_inertia

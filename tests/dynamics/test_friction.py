@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from dynamics import load_robot
 from dynamics.closed_loop import FrameTiming, FrictionLaw, LoopSettings, ServoGains, StartState
 from dynamics.closed_loop.execution import run
 from dynamics.closed_loop.problem import LoopProblem
 from dynamics.compiled.machine_code import compiled_functions
 from dynamics.expressions import function
+from dynamics.kinematics.chart import Chart
 from tests.dynamics.conftest import BOX, at_rest
 
 MASS, STIFFNESS, COULOMB = 0.8, 20.0, 1.0
@@ -45,7 +47,9 @@ def _one_joint(x, time, steps, *, rate=0.0, end=0.0, speed=0.0, law=None, derive
     timing = FrameTiming(1 / time, hold="linear")
     settings = LoopSettings(ServoGains(0.0, 0.0, 0.0), timing, law or FrictionLaw(), steps)
     start = StartState(x * FIRST, rate * FIRST, rest, rest, end * FIRST[None], rest)
-    masses = SimpleNamespace(functions=compiled_functions(getsource(_six_masses).encode(), _six_masses))
+    machine = compiled_functions(getsource(_six_masses).encode(), _six_masses)
+    chart = SimpleNamespace(chart=Chart("free", (0.0,) * 6))
+    masses = SimpleNamespace(functions=machine, layout=load_robot("rss6").layout, geometry=chart)
     pull = np.tile((end + speed * time) * FIRST, (2, 1))
     fixed, none = (masses, parameters, at_rest(rest, 2), settings, start, None), (None,) * 3
     found = run(LoopProblem(*fixed, derived, derived, pull, *none, servo_robot=masses))

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dynamics import load_robot
 from dynamics.engines.mjcf import mjcf_text
 from dynamics.errors import ParameterError
 from dynamics.inertia import UnphysicalInertiaError, acceleration_changes, physical_inertias, travel_states
-from dynamics.parameters import RIGID_BODY
 
 moments = st.floats(0, 1) | st.sampled_from([0.0, 1e-12, 1e-6])
 
@@ -27,7 +27,7 @@ def test_inertias_that_no_body_has_are_refused_by_name_or_changed_so_that_the_mo
     assert "link5, link6: Izz 0.00213 to 0.001046" in text
     assert "do not alter the motion" in text
     changed, torques = robot.nominal_parameters.copy(), np.ones((300, 6))
-    changed[RIGID_BODY] = physical_inertias(changed, allow_changes=True).values.ravel()
+    changed[robot.layout.rigid] = physical_inertias(robot.layout, changed, allow_changes=True).values.ravel()
     assert not np.array_equal(changed, robot.nominal_parameters)
     ours, theirs = (robot.forward_dynamics(states.pose, states.twist, torques, values) for values in (None, changed))
     np.testing.assert_allclose(theirs, ours, rtol=1e-11)
@@ -37,7 +37,7 @@ def test_effect_of_a_platform_inertia_is_the_share_it_adds_where_the_legs_weigh_
     """Euler's equation: with all moments e larger, the same moment of force turns the body 1 - 1/(1 + e) less."""
     values = np.full(64, 1e-9)
     values[:4] = [24, 0.16, 0.16, 0.16]  # round, so that nothing else turns it
-    inertias = values[RIGID_BODY].reshape(13, 4).copy()
+    inertias = robot.layout.bodies_of(values).copy()
     assert acceleration_changes(robot, values, inertias) == {}
     inertias[0, 1:] *= 1.05
     assert acceleration_changes(robot, values, inertias) == {"platform": pytest.approx(1 - 1 / 1.05, rel=1e-5)}
@@ -55,7 +55,10 @@ def test_effect_is_measured_all_over_the_travel(robot):
 @given(st.lists(moments, min_size=52, max_size=52))
 def test_changed_inertias_are_physical_and_keep_what_the_motion_feels(numbers):
     given_ = np.array(numbers)
-    before, after = given_.reshape(13, 4), physical_inertias(given_, allow_changes=True).values
+    before, after = (
+        given_.reshape(13, 4),
+        physical_inertias(load_robot("rss6").layout, given_, allow_changes=True).values,
+    )
     assert (after > 0).all()
     for x, y, z in itertools.permutations(after[:, 1:].T):
         assert (x + y >= z).all()
@@ -69,7 +72,7 @@ def test_changed_inertias_are_physical_and_keep_what_the_motion_feels(numbers):
 def test_the_largest_moments_are_changed_as_small_ones_are():
     """Powers of two scale without rounding: up to the largest floats the result is the same, without overflow."""
     given_ = np.tile([0.5, 0.1, 0.2, 0.8], 13)
-    expected = physical_inertias(given_, allow_changes=True).values
+    expected = physical_inertias(load_robot("rss6").layout, given_, allow_changes=True).values
     largest = physical_inertias(given_ * 2.0**1023 * 2, allow_changes=True).values
     np.testing.assert_array_equal(largest / 2.0**512, expected * 2.0**512)
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dynamics.errors import ConvergenceError, ShapeError
-from tests.dynamics.conftest import base_from_platform, derivative
+from tests.dynamics.conftest import base_from_platform, derivative, of_legs
 
 
 def test_pose_jacobian_is_the_derivative_of_the_inverse_kinematics(robot, states):
@@ -45,17 +45,18 @@ def test_twist_is_the_velocity_of_place_and_rotation_and_twist_dot_its_derivativ
 def followed_from_home(geometry, theta, steps=40):
     """Oracle: poses (N, 6) reached from home while all cranks turn evenly, loops kept closed in base axes by scipy's
     rotations; and the smallest determinant of J_a2 on the way, as a share of that at home."""
-    across = np.cross(geometry.crank_axes, geometry.crank_zero_directions)
+    zero, leg = of_legs(geometry, "crank_zero_direction"), geometry.legs[0]
+    across = np.cross(of_legs(geometry, "crank_axis"), zero)
     places = np.tile(geometry.home_pose[:3], (len(theta), 1))
     turns = Rotation.from_euler("XYZ", np.tile(geometry.home_pose[3:], (len(theta), 1)))
     least, at_home = np.inf, None
     for share in np.linspace(0, 1, steps + 1):
         cosine, sine = np.cos(share * theta)[..., None], np.sin(share * theta)[..., None]
-        tips = geometry.base_joints + geometry.crank_length * (cosine * geometry.crank_zero_directions + sine * across)
+        tips = geometry.base_joints + leg.crank_length * (cosine * zero + sine * across)
         for _ in range(4):
             arms = np.einsum("nij,lj->nli", turns.as_matrix(), geometry.platform_joints)
             links = places[:, None] + arms - tips
-            gaps = (np.sum(links**2, axis=2) - geometry.link_length**2) / 2
+            gaps = (np.sum(links**2, axis=2) - leg.link_length**2) / 2
             rows = np.concatenate([links, np.cross(arms, links)], axis=2)
             step = -np.linalg.solve(rows, gaps[..., None])[..., 0]
             places, turns = places + step[:, :3], Rotation.from_rotvec(step[:, 3:]) * turns
@@ -80,9 +81,9 @@ def test_every_joint_vector_within_travel_has_one_pose_that_newton_finds_from_ho
 
 def test_rows_that_have_no_pose_are_named_with_crank_and_residual_or_as_beyond_a_dead_point(robot):
     """Far beyond the travel the legs can close with a crank on its other side, where the closed form never is."""
-    with pytest.raises(ConvergenceError, match=r"\(row 1\): .*crank \d has a residual of .* rad, limit 1e-12 rad"):
+    with pytest.raises(ConvergenceError, match=r"\(row 1\): .*joint \d has a residual of .*, limit 1e-12"):
         robot.forward_kinematics([np.zeros(6), [3.0, -3.0, 3.0, -3.0, 3.0, -3.0], np.zeros(6)])
-    with pytest.raises(ConvergenceError, match=r"\(row 0\): the best closes .* with a crank beyond its dead point"):
+    with pytest.raises(ConvergenceError, match=r"\(row 0\): the best closes .* with one of them beyond its dead point"):
         robot.forward_kinematics([1.2393, -1.4656, -0.0294, 1.3016, 0.6802, 0.0804])
 
 

@@ -6,7 +6,7 @@ import pytest
 import dynamics
 from dynamics import workspace
 from dynamics.errors import SingularPoseError, TravelError, UnreachablePoseError
-from tests.dynamics.conftest import place_legs
+from tests.dynamics.conftest import of_legs, place_legs
 
 
 def test_reach_margin_is_that_of_the_law_of_cosines(robot, states):
@@ -16,8 +16,9 @@ def test_reach_margin_is_that_of_the_law_of_cosines(robot, states):
     for pose, margin in zip(poses, robot.reach_margin(poses), strict=True):
         reach = place_legs(g, pose, np.zeros(6)).joint - g.base_joints
         square = np.sum(reach**2, axis=1)
-        in_plane = square - np.sum(reach * g.crank_axes, axis=1) ** 2
-        cosine = (square + g.crank_length**2 - g.link_length**2) / (2 * g.crank_length) / np.sqrt(in_plane)
+        in_plane = square - np.sum(reach * of_legs(g, "crank_axis"), axis=1) ** 2
+        crank, link = of_legs(g, "crank_length"), of_legs(g, "link_length")
+        cosine = (square + crank**2 - link**2) / (2 * crank) / np.sqrt(in_plane)
         np.testing.assert_allclose(margin, 1 - cosine**2, rtol=1e-12, atol=1e-12)
 
 
@@ -28,7 +29,7 @@ def test_leverage_and_conditions_are_those_of_the_joints_places(robot, states, l
     measures = workspace.measure(robot, states.pose)
     for row, pose in enumerate(states.pose[:20]):
         legs = legs_at(pose)
-        along = (legs.joint - legs.tip) / robot.geometry.link_length
+        along = (legs.joint - legs.tip) / robot.geometry.legs[0].link_length
         np.testing.assert_allclose(measures.leverage[row], np.abs(np.cross(legs.crank, along)[:, 2]) / 0.06, atol=1e-12)
         wrench = np.hstack([along, np.cross(legs.joint - pose[:3], along) / 0.2])
         assert measures.platform_condition[row] == pytest.approx(np.linalg.cond(wrench), rel=1e-9)
@@ -103,7 +104,7 @@ def test_a_platform_that_moves_with_locked_cranks_is_found_and_refused(robot, lo
     """Links in the plane of the platform carry no vertical force: the condition of J_a2 says so, leverage does not.
     M is regular there, so that eq. 40 still holds: the platform falls freely, whatever the torques."""
     legs = robot.geometry
-    tips = legs.base_joints + legs.crank_length * legs.crank_zero_directions
+    tips = legs.base_joints + 0.06 * of_legs(legs, "crank_zero_direction")
     link = np.linalg.norm(legs.platform_joints - tips, axis=1)[0]
     robot = load_changed(
         {

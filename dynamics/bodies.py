@@ -1,0 +1,88 @@
+"""The bodies of a robot's legs as parts that can be placed: for other engines, and to draw them."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from dynamics.geometry import RobotGeometry
+from dynamics.legs.leg import Segment
+from dynamics.parameters import parameter_layout
+from dynamics.robot import Robot
+
+
+class Part(NamedTuple):
+    """A body of a leg, or one of the equal bars that it consists of.
+
+    name, such as link1 or link1a; leg: its number, from 0; body: its row in the robot's layout; offset (3,) of its
+    joint from the body's, in the axes of the body before, m; share: of the body's parameters; before: the part that it
+    hangs on (-1: the base); last: whether it ends at the platform.
+    """
+
+    name: str
+    leg: int
+    body: int
+    segment: Segment
+    offset: np.ndarray
+    share: float
+    before: int
+    last: bool
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Where parts are: origin (parts, 3), the joint to the part before, m; axes (parts, 3, 3) as columns and angular
+    velocities (parts, 3), rad/s. Base axes; a last row stands for the base itself, so that -1 is its number."""
+
+    origin: np.ndarray
+    axes: np.ndarray
+    spin: np.ndarray
+
+
+class Parts:
+    """The parts of all legs of a geometry, leg by leg from the base."""
+
+    def __init__(self, geometry: RobotGeometry) -> None:
+        layout = parameter_layout(geometry.legs)
+        self.all: list[Part] = []
+        rows: list[int] = []
+        first = 0
+        for number, leg in enumerate(geometry.legs):
+            segments, before = leg.segments(), -1
+            for place, segment in enumerate(segments):
+                body, several = layout.of_leg[number][place], len(segment.copies) > 1
+                name, last, share = layout.bodies[body], place == len(segments) - 1, 1 / len(segment.copies)
+                for suffix, offset in zip("abcd" if several else [""], segment.copies, strict=False):
+                    self.all.append(Part(name + suffix, number, body, segment, offset, share, before, last))
+                    rows.append(first + place)
+                before = len(self.all) - 1
+            first += len(segments)
+        self._rows, self._before = np.array(rows), np.array([part.before for part in self.all])
+        self._offset = np.array([part.offset for part in self.all])
+        self._centre = np.array([part.segment.centre for part in self.all])
+        self._rods = np.array([part.segment.rod for part in self.all])
+
+    def frames(self, robot: Robot, pose: np.ndarray, twist: np.ndarray | None = None) -> Frames:
+        """Where the parts are with the platform at a pose (6,) and moving with a twist (6,).
+
+        Raises UnreachablePoseError, ChartError.
+        """
+        robot.check_reach(pose)
+        moving = np.zeros(6) if twist is None else twist
+        found = robot.functions["placements"](pose[None], moving[None])[0][0][self._rows]
+        axes, spin = found[:, 3:12].reshape(-1, 3, 3), found[:, 12:]
+        axes, spin = np.concatenate([axes, np.eye(3)[None]]), np.concatenate([spin, np.zeros((1, 3))])
+        shift = (axes[self._before] @ self._offset[..., None] - axes[:-1] @ self._centre[..., None])[..., 0]
+        return Frames(np.concatenate([found[:, :3] + shift, np.zeros((1, 3))]), axes, spin)
+
+    def rods(self, robot: Robot, pose: np.ndarray) -> np.ndarray:
+        """Ends (parts, 2, 3) of what is drawn of each part, base axes, m. Raises as `frames`."""
+        frames = self.frames(robot, pose)
+        return frames.origin[:-1, None] + self._rods @ frames.axes[:-1].transpose(0, 2, 1)
+
+
+@lru_cache(maxsize=16)
+def parts_of(geometry: RobotGeometry) -> Parts:
+    """The parts of a geometry, made once."""
+    return Parts(geometry)

@@ -1,0 +1,144 @@
+"""Stability of the sampled loop near rest: the linear map of its state from one frame to the next.
+
+Small deviations of the robot under its joint PID (eq. 31) follow a linear differential equation, of which the matrix
+exponential is the exact solution while a command acts; the servo (eq. 30) and the commands on their way close the loop
+once a frame. The loop is stable where all eigenvalues of that map are inside the unit circle. Dry friction, which only
+helps at rest, and elasticity of the joints are left out.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import floor
+
+import numpy as np
+from scipy.linalg import expm
+
+from dynamics.closed_loop.problem import (
+    FrameTiming,
+    LoopSettings,
+    ServoGains,
+    check_start_pose,
+    checked_loop_parameters,
+    equilibrium,
+)
+from dynamics.robot import Robot
+
+SLOWEST_HZ, MOST_GAIN = 0.5, 1e3
+"""Ends of the searches for the frame rate and the gains at which a loop is lost."""
+
+STEP = 1.02
+"""Ratio of neighbours in these searches, between which the limit is then bisected."""
+
+
+def frame_map(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> np.ndarray:
+    """The map (s, s) of small deviations from rest at a pose (6,), for all parameters, from frame to frame.
+
+    The state: coordinates, their rates, joint PID integrals, coordinates measured at the last frame, servo integrals,
+    and the commands on their way, the latest first. Raises what `closed_loop.equilibrium` raises.
+    """
+    parameters = checked_loop_parameters(robot, parameters)
+    check_start_pose(robot, parameters, pose)
+    motion, servo = _joint_loop(robot, parameters, pose), _servo(robot, parameters, settings, pose)
+    joints, size, timing = robot.layout.joints, len(robot.coordinate_names), settings.timing
+    period = 1 / timing.frame_rate_hz
+    whole = floor(timing.latency_s / period + 1e-9)
+    rest = max(0.0, timing.latency_s - whole * period)
+    inner, kept = 2 * size + joints, whole + 2
+    start = np.eye(inner + 2 * size + kept * joints)
+    coordinates, integral = start[:size], start[inner + size : inner + 2 * size]
+    seen = np.vstack([coordinates, start[inner : inner + size], integral])
+    commands = [servo @ seen, *np.split(start[inner + 2 * size :], kept)]
+    state = start[:inner]
+    for age, begin, end in ((whole + 1, 0.0, rest), (whole, rest, period)):
+        newer, older = commands[age], commands[age + 1] if age + 1 <= kept else commands[age]
+        ramp = (begin + (period - rest if age > whole else -rest)) / period if timing.hold == "linear" else 1.0
+        slope = (newer - older) / period
+        at_once = older + ramp * (newer - older)
+        moving = slope if timing.hold == "linear" else 0 * slope
+        state = expm(motion * (end - begin))[:inner] @ np.vstack([state, at_once, moving, slope])
+    return np.vstack([state, coordinates, integral - period * coordinates, *commands[:kept]])
+
+
+def spectral_radius(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> float:
+    """Largest magnitude of the eigenvalues of `frame_map`: the loop is stable below 1."""
+    return float(np.abs(np.linalg.eigvals(frame_map(robot, parameters, settings, pose))).max())
+
+
+def gain_margin(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> float:
+    """Factor by which the gains of the servo may grow, or below 1 have to shrink, until the loop is just stable."""
+
+    def radius(factor: float) -> float:
+        gains = settings.servo
+        servo = ServoGains(factor * gains.kp, factor * gains.kd, factor * gains.ki)
+        return spectral_radius(robot, parameters, replace(settings, servo=servo), pose)
+
+    return _last_stable(radius, 1.0, MOST_GAIN if radius(1.0) < 1 else 1 / MOST_GAIN)
+
+
+def lowest_frame_rate(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> float:
+    """Frame rate, Hz, from which on the loop is stable with all else as it is; the latency stays a time.
+
+    Above the settings' rate where it is not stable there. NaN where no rate makes it stable.
+    """
+    rate = settings.timing.frame_rate_hz
+
+    def radius(hz: float) -> float:
+        timing = FrameTiming(hz, settings.timing.latency_s, settings.timing.hold)
+        return spectral_radius(robot, parameters, replace(settings, timing=timing), pose)
+
+    fastest = min(100 * rate, 50 / settings.timing.latency_s if settings.timing.latency_s else np.inf)
+    return _last_stable(radius, rate, SLOWEST_HZ if radius(rate) < 1 else fastest)
+
+
+def _joint_loop(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """d/dt of [q, q_dot, joint integrals, command, slope of the command, U_dot] by these, square: a command changes
+    with its slope, and what the joint PID takes for U_dot need not be that."""
+    q, joints = robot.coordinates(pose), robot.layout.joints
+    rigid, _, viscous, (lp, li, ld) = robot.layout.split(parameters)
+    at_rest, size = np.zeros(len(q)), len(q)
+    holding = robot.static_torque(pose, parameters[robot.layout.dynamic])
+    mass, _, jacobian, *_ = _values(robot, "equation_of_motion", q, at_rest, rigid)
+    by_pose, by_rate, *_ = _values(robot, "motion_derivatives", q, at_rest, at_rest, holding, rigid)
+    push = np.linalg.solve(mass, jacobian.T)
+    inner = 2 * size + joints
+    system = np.zeros((inner + 3 * joints, inner + 3 * joints))
+    at, moving, summed = slice(0, size), slice(size, 2 * size), slice(2 * size, inner)
+    command, slope, rate = (slice(inner + k * joints, inner + (k + 1) * joints) for k in range(3))
+    system[at, moving] = np.eye(size)
+    system[moving, at] = -np.linalg.solve(mass, by_pose) - lp * push @ jacobian
+    system[moving, moving] = -np.linalg.solve(mass, by_rate) - push @ ((ld + viscous)[:, None] * jacobian)
+    system[moving, summed] = li * push
+    system[moving, command], system[moving, rate] = lp * push, ld * push
+    system[summed, at], system[summed, command] = -jacobian, np.eye(joints)
+    system[command, slope] = np.eye(joints)
+    return system
+
+
+def _servo(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> np.ndarray:
+    """The command of a frame by [coordinates, those measured before, servo integral before]."""
+    gains, period, q = settings.servo, 1 / settings.timing.frame_rate_hz, robot.coordinates(pose)
+    demand = gains.ki * equilibrium(robot, parameters, pose, gains).servo_integral
+    jacobian = robot.coordinate_jacobian(pose)
+    (turning,) = _values(robot, "rate_map_derivative", q, demand)
+    by_now = turning - (gains.kp + gains.kd / period + gains.ki * period) * jacobian
+    return np.hstack([by_now, gains.kd / period * jacobian, gains.ki * jacobian])
+
+
+def _values(robot: Robot, name: str, *inputs: np.ndarray) -> list[np.ndarray]:
+    return [output[0] for output in robot.functions[name](*[value[None] for value in inputs])]
+
+
+def _last_stable(radius: Callable[[float], float], start: float, end: float) -> float:
+    """Where on the way from start to end the radius first passes 1; the end, or NaN if that is not stable either."""
+    step = STEP if end > start else 1 / STEP
+    stable, value = radius(start) < 1, start
+    while (value < end) == (step > 1):
+        following = value * step
+        if (radius(following) < 1) != stable:
+            low, high = value, following
+            for _ in range(30):
+                middle = (low * high) ** 0.5
+                low, high = (middle, high) if (radius(middle) < 1) == stable else (low, middle)
+            return (low * high) ** 0.5
+        value = following
+    return end if stable else float("nan")

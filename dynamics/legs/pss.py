@@ -1,0 +1,129 @@
+"""Legs with a slider on the base (P) and a link from that to A, with spherical joints (S) at both ends, or a universal
+one (U) at the slider. The slider does not turn: of its inertia only the mass does work.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal, Self
+
+import casadi as ca
+import numpy as np
+from pydantic import Field
+
+from dynamics.legs.leg import Body, Direction, Leg, Length, Placement, Segment, link_axes, universal_spin
+from dynamics.legs.rss import Z
+
+
+class PssLeg(Leg):
+    """A slider that is at B where its coordinate is zero, and a link from that to the platform joint A.
+
+    The link does not spin about its length. Its x is normal to the direction of the slider and to its length.
+    """
+
+    bodies = (Body("slider", (), driven="mass"), Body("link", ("Ixx", "Iyy")))
+    prismatic = True
+    link_joint: ClassVar[str] = "ball"
+
+    type: Literal["pss"] = "pss"
+    slider_axis: Direction = Field(description="where the slider goes as its coordinate grows, unit vector, base axes")
+    link_length: Length = Field(description="from the slider to A, m")
+    slider_length: Length = Field(0.040, description="of the slider as it is drawn and hides stickers, m")
+    slider_radius: Length = Field(0.014, description="of the slider as it is drawn and hides stickers, m")
+    link_radius: Length = Field(0.006, description="of the link as it is drawn and hides stickers, m")
+
+    @property
+    def across_from(self) -> np.ndarray:
+        """What the link's x is normal to, besides its length (3,)."""
+        return self.slider_axis
+
+    def lengths(self) -> str:
+        return f"link {self.link_length:g} m"
+
+    def zeroed(self, joint: np.ndarray) -> Self:
+        there = float(self.coordinate(ca.SX(joint)))
+        return self.model_copy(update={"base_joint": self.base_joint + there * self.slider_axis})
+
+    def coordinate(self, position: ca.SX) -> ca.SX:
+        along, across = self._parts(position)
+        root = ca.sqrt(self.link_length**2 - ca.dot(across, across))
+        return along - float(self.branch or 1) * root
+
+    def link(self, position: ca.SX) -> ca.SX:
+        """From the slider to A (3,), m."""
+        _, across = self._parts(position)
+        root = ca.sqrt(self.link_length**2 - ca.dot(across, across))
+        return across + float(self.branch or 1) * root * self.slider_axis
+
+    def reach(self, position: ca.SX) -> ca.SX:
+        """sin^2 of the angle between the link and the plane across the slider's axis."""
+        across = self._parts(position)[1]
+        return 1 - ca.dot(across, across) / self.link_length**2
+
+    def gap(self, position: ca.SX, coordinate: ca.SX) -> ca.SX:
+        """(|link|^2 - link_length^2) / 2."""
+        link = position - self.base_joint - coordinate * self.slider_axis
+        return (ca.dot(link, link) - self.link_length**2) / 2
+
+    def direction(self, position: ca.SX) -> ca.SX:
+        return self.link(position) * (1 / self.link_length)
+
+    def leverage(self, position: ca.SX) -> ca.SX:
+        """|cos| of the angle between link and slider axis."""
+        return ca.fabs(ca.dot(self.link(position), self.slider_axis)) / self.link_length
+
+    def gradient(self, position: ca.SX) -> ca.SX:
+        link = self.link(position)
+        return link * (1 / ca.dot(link, self.slider_axis))
+
+    def acceleration(self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX) -> ca.SX:
+        gradient, link_rate = self.gradient(position), self._link_rate(position, velocity)
+        # link . A_ddot + |link_dot|^2 = link . slider_axis s_ddot: the link keeps its length.
+        stretch = ca.dot(link_rate, link_rate) / ca.dot(self.link(position), self.slider_axis)
+        return ca.dot(gradient, acceleration) + stretch
+
+    def placements(self, position: ca.SX) -> list[Placement]:
+        link = self.link(position)
+        axes = link_axes(self.across_from, link * (1 / self.link_length))
+        return [Placement(position - link, ca.SX.eye(3)), Placement(position - link / 2, axes)]
+
+    def angular_velocities(self, position: ca.SX, velocity: ca.SX) -> list[ca.SX]:
+        return [ca.SX.zeros(3), self._spin(self.link(position), self._link_rate(position, velocity))]
+
+    def segments(self) -> list[Segment]:
+        origin, end, half = np.zeros(3), self.link_length * Z, self.slider_length / 2 * self.slider_axis
+        slider, link = np.array([-half, half]), np.array([origin, end])
+        return [
+            Segment("slide", self.slider_axis, self.base_joint, origin, slider, self.slider_radius, actuated=True),
+            Segment(self.link_joint, self.across_from, origin, end / 2, link, self.link_radius, end),
+        ]
+
+    def _spin(self, link: ca.SX, link_rate: ca.SX) -> ca.SX:
+        return ca.cross(link, link_rate) / self.link_length**2
+
+    def _link_rate(self, position: ca.SX, velocity: ca.SX) -> ca.SX:
+        return velocity - ca.dot(self.gradient(position), velocity) * self.slider_axis
+
+    def _parts(self, position: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Of B->A: the component along the slider's axis, and what is left across it (3,)."""
+        reach, axis = position - self.base_joint, self.slider_axis
+        along = ca.dot(reach, axis)
+        return along, reach - along * axis
+
+
+class PusLeg(PssLeg):
+    """A slider, and a link on a universal joint at it, so that the link's spin follows. Its x is normal to the first
+    axis of that joint and to its length."""
+
+    bodies = (Body("slider", (), driven="mass"), Body("link", ("Ixx", "Iyy", "Izz")))
+    link_joint: ClassVar[str] = "universal"
+
+    type: Literal["pus"] = "pus"  # type: ignore[assignment]
+    joint_axis: Direction = Field(description="first axis of the universal joint, unit vector, base axes")
+
+    @property
+    def across_from(self) -> np.ndarray:
+        """What the link's x is normal to, besides its length (3,)."""
+        return self.joint_axis
+
+    def _spin(self, link: ca.SX, link_rate: ca.SX) -> ca.SX:
+        return universal_spin(self.joint_axis, link / self.link_length, link_rate / self.link_length)

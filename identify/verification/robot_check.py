@@ -1,0 +1,169 @@
+"""What a designer wants to know of a robot before it is built or run: each question with its number and its limit.
+
+Over the travel: random joint coordinates within the travel limit, and the pose that the robot has with them, followed
+from home. The loop is judged at home, by its linear map from frame to frame, without dry friction.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from dynamics import Robot, closed_loop, workspace
+from dynamics.closed_loop import stability
+from dynamics.errors import DynamicsError
+from dynamics.inertia import acceleration_changes, grouped, physical_inertias
+from dynamics.kinematics import forward_kinematics
+from identify.arrays import Array
+from identify.estimation.base_parameters import base_parameters, structural_regressor
+from identify.progress import Progress, SilentProgress
+
+SAMPLES = 2000
+"""Joint coordinates over the travel."""
+
+UNFELT = 1e-9
+"""Largest share of an acceleration that a change of inertias may make to count as not felt."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One answer: the check by name, whether it is within its limit (None where there is none), value, limit and unit,
+    the leg 1..n that it concerns (None: no single one), and a sentence."""
+
+    check: str
+    ok: bool
+    value: float | None
+    limit: float | None
+    unit: str
+    leg: int | None
+    text: str
+
+    def entry(self) -> dict[str, Any]:
+        """As it stands in JSON."""
+        return asdict(self)
+
+
+def check_robot(
+    robot: Robot, parameters: Array, settings: closed_loop.LoopSettings, progress: Progress | None = None
+) -> list[Finding]:
+    """All findings about a robot with all its parameters in a loop with these settings."""
+    questions: list[Callable[[], Iterator[Finding]]] = [
+        lambda: _freedoms(robot),
+        lambda: _travel(robot),
+        lambda: _assembly(robot),
+        lambda: _holding(robot, parameters),
+        lambda: _visible(robot),
+        lambda: _bodies(robot, parameters),
+        lambda: _loop(robot, parameters, settings),
+    ]
+    findings = []
+    with (progress or SilentProgress()).stage("check", len(questions)) as advance:
+        for question in questions:
+            findings += list(question())
+            advance()
+    return findings
+
+
+def _freedoms(robot: Robot) -> Iterator[Finding]:
+    names, joints = robot.coordinate_names, robot.layout.joints
+    text = f"{joints} actuators for {len(names)} freedoms of the platform: {', '.join(names)}"
+    yield Finding("freedoms", joints == len(names), joints, len(names), "1", None, text)
+
+
+def _travel(robot: Robot) -> Iterator[Finding]:
+    """At home, then over the travel: what `workspace.check_motion` judges, with its limits."""
+    unit, limit = "m" if robot.layout.prismatic else "rad", robot.travel_limit
+    at_home = workspace.measure(robot, robot.home_pose)
+    yield from _extremes("at home", at_home)
+    most, leg = _worst(np.abs(at_home.theta), np.argmax)
+    text = f"joint {leg} is {most:.3g} {unit} from zero at home, of a travel of {limit:g} {unit}"
+    yield Finding("travel at home", most <= limit, most, limit, unit, leg, text)
+    joints = np.random.default_rng(0).uniform(-limit, limit, (SAMPLES, robot.layout.joints))
+    start = np.tile(robot.home_pose, (SAMPLES, 1))
+    poses, residual = forward_kinematics.search(robot.functions, robot.geometry.chart, joints, start)
+    solved = (residual < forward_kinematics.ANGLE_TOLERANCE).all(axis=1)
+    share = float(solved.mean())
+    text = f"{100 * share:.1f} % of {SAMPLES} random joint coordinates within the travel have a pose near home"
+    yield Finding("travel closes", share > 0, share, 0.0, "1", None, text)
+    if solved.any():
+        yield from _extremes("over the travel", workspace.measure(robot, poses[solved]))
+
+
+def _extremes(where: str, measures: workspace.WorkspaceMeasures) -> Iterator[Finding]:
+    reach, leg = _worst(measures.reach_margin, np.argmin)
+    text = f"least reach margin {where} is {reach:.3g}, of leg {leg}; at 0 it is stretched or folded"
+    yield Finding(f"reach {where}", reach > 0, reach, 0.0, "1", leg, text)
+    leverage, leg = _worst(measures.leverage, np.argmin)
+    least, most = workspace.LEAST_LEVERAGE, workspace.MOST_CONDITION
+    text = f"least leverage of an actuator on its leg (J_a1) {where} is {leverage:.3g}, of leg {leg}"
+    yield Finding(f"leverage {where}", leverage >= least, leverage, least, "1", leg, text)
+    condition = float(np.max(measures.platform_condition))
+    text = f"largest condition of the platform side (J_a2) {where} is {condition:.3g}; at infinity it moves unheld"
+    yield Finding(f"condition {where}", condition <= most, condition, most, "1", None, text)
+
+
+def _worst(values: Array, pick: Callable[..., np.intp]) -> tuple[float, int]:
+    row, leg = np.unravel_index(pick(values), values.shape)
+    return float(values[row, leg]), int(leg) + 1
+
+
+def _assembly(robot: Robot) -> Iterator[Finding]:
+    modes = robot.assembly_modes()
+    away = (
+        f"; the next is {np.linalg.norm(modes[1, :3] - robot.home_pose[:3]):.3g} m from home" if modes[1:].any() else ""
+    )
+    text = f"{len(modes)} assembly modes found with the joints as at home{away}"
+    yield Finding("assembly modes", len(modes) > 0, len(modes), None, "1", None, text)
+
+
+def _holding(robot: Robot, parameters: Array) -> Iterator[Finding]:
+    torque, unit = (
+        robot.static_torque(robot.home_pose, parameters[robot.layout.dynamic]),
+        robot.layout.unit("joint1.coulomb"),
+    )
+    leg = int(np.argmax(np.abs(torque)))
+    mean = np.abs(torque).mean()
+    text = f"joint {leg + 1} holds the most at home, {torque[leg]:.3g} {unit}; the mean of all is {mean:.3g} {unit}"
+    yield Finding("holding torque", True, float(np.abs(torque[leg])), None, unit, leg + 1, text)
+
+
+def _visible(robot: Robot) -> Iterator[Finding]:
+    found = base_parameters(structural_regressor(robot), robot.parameter_names)
+    unseen = f"no motion shows {', '.join(found.unseen)}" if found.unseen else "all are seen"
+    text = f"{found.rank} base parameters of {len(robot.parameter_names)}; {unseen}"
+    yield Finding("base parameters", found.rank > 0, found.rank, None, "1", None, text)
+
+
+def _bodies(robot: Robot, parameters: Array) -> Iterator[Finding]:
+    """Inertias that no body has count where the motion feels what would make them possible."""
+    inertias = physical_inertias(robot.layout, parameters, allow_changes=True)
+    effects = acceleration_changes(robot, parameters[robot.layout.dynamic], inertias.values) if inertias.changes else {}
+    largest = max(effects.values(), default=0.0)
+    text = "all bodies can exist"
+    leg = None
+    if inertias.changes:
+        worst = robot.layout.bodies.index(max(effects, key=effects.__getitem__))
+        leg = next((leg + 1 for leg, bodies in enumerate(robot.layout.of_leg) if worst in bodies), None)
+        felt = f"accelerations change by up to {100 * largest:.2g} %" if largest > UNFELT else "no motion feels it"
+        text = f"no rigid body has these: {'; '.join(grouped(inertias.changes))}; {felt}"
+    yield Finding("inertias", largest <= UNFELT, largest, UNFELT, "1", leg, text)
+
+
+def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -> Iterator[Finding]:
+    timing, home = settings.timing, robot.home_pose
+    arguments = robot, parameters, settings, home
+    try:
+        radius = stability.spectral_radius(*arguments)
+    except DynamicsError as error:  # singular at home, which has been found above
+        yield Finding("loop", False, None, 1.0, "1", None, f"the loop cannot be judged at home: {error}")
+        return
+    at = f"at {timing.frame_rate_hz:g} Hz and {1e3 * timing.latency_s:.3g} ms of latency"
+    text = f"largest eigenvalue of the loop from frame to frame {at} is {radius:.4f}; it is stable below 1"
+    yield Finding("loop", radius < 1, radius, 1.0, "1", None, text)
+    factor = stability.gain_margin(*arguments)
+    text = f"the servo's gains may be {factor:.3g} times as large until the loop is lost"
+    yield Finding("gain margin", factor > 1, factor, 1.0, "1", None, text)
+    rate = stability.lowest_frame_rate(*arguments)
+    text = f"the loop holds from {rate:.3g} Hz on with this latency" if rate > 0 else "no frame rate makes it stable"
+    yield Finding("frame rate", rate < timing.frame_rate_hz, rate, timing.frame_rate_hz, "Hz", None, text)
