@@ -1,4 +1,4 @@
-"""The closed loop of a scenario: its settings, its 67 parameters, and those that a command line names."""
+"""The closed loop of a scenario: its settings, its parameters, and those that a command line names."""
 
 import json
 import sys
@@ -10,32 +10,32 @@ from typing import Any
 from dynamics import Robot
 from dynamics.closed_loop import FrameTiming, FrictionLaw, LoopSettings, ServoGains
 from dynamics.errors import ParameterError
-from dynamics.parameters import JOINT_PID_NAMES, PARAMETER_NAMES, check_parameters
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import load_result
 from identify.scenario import Model, Plant, Scenario
-
-NAMES: tuple[str, ...] = PARAMETER_NAMES + JOINT_PID_NAMES
+from identify.scenario.sections import ACTUATOR_KEYS, Section
 
 NOMINAL = "initial"
 """The parameter set that is meant where none is named."""
 
 
-def model_settings(scenario: Scenario) -> LoopSettings:
-    """The loop around the estimator's model: of the latency it knows the mean only."""
-    return loop_settings(scenario, scenario.model)
+def model_settings(robot: Robot, scenario: Scenario) -> LoopSettings:
+    """The loop around the estimator's model: of the latency it knows the mean only. Raises as `loop_settings`."""
+    return loop_settings(robot, scenario, scenario.model)
 
 
-def loop_settings(scenario: Scenario, side: Plant | Model) -> LoopSettings:
-    """The scenario's servo and timing, with the friction law and the steps of the plant or of the model."""
+def loop_settings(robot: Robot, scenario: Scenario, side: Plant | Model) -> LoopSettings:
+    """The scenario's servo and timing, with the friction law and the steps of the plant or of the model.
+
+    Raises ScenarioError for a law whose constants are those of the other kind of actuators.
+    """
     servo, timing = scenario.servo, scenario.timing
+    velocities = [of_actuators(robot, side, name) for name in ("smoothing_velocity", "stribeck_velocity")]
     return LoopSettings(
         servo=ServoGains(servo.kp, servo.kd, servo.ki),
         timing=FrameTiming(timing.frame_rate_hz, timing.latency_s, timing.hold),
-        friction=FrictionLaw(
-            side.friction, side.smoothing_velocity_rad_s, side.static_ratio, side.stribeck_velocity_rad_s
-        ),
+        friction=FrictionLaw(side.friction, velocities[0], side.static_ratio, velocities[1]),
         steps_per_frame=side.steps_per_frame,
     )
 
@@ -47,14 +47,29 @@ def check_parameter_set(robot: Robot, set_name: str) -> None:
         raise ScenarioError(f"robot {robot.name} has no parameter set {set_name!r}; it has {valid}")
 
 
-def index_of(name: str) -> int:
-    """Position of a parameter in the vector."""
-    return NAMES.index(name)
+def of_actuators(robot: Robot, section: Section, name: str) -> Any:
+    """The value of a setting that has one key for actuators that turn and one for those that slide.
+
+    Raises ScenarioError where only the key of the other kind is set, with both.
+    """
+    turning, sliding = ACTUATOR_KEYS[name]
+    own, other = (sliding, turning) if robot.layout.prismatic else (turning, sliding)
+    if (
+        other in section.model_fields_set
+        and own not in section.model_fields_set
+        and getattr(section, other) is not None
+    ):
+        raise ScenarioError(
+            f"{type(section).__name__.lower()}.{other} = {getattr(section, other):g} is of actuators that "
+            f"{'turn' if robot.layout.prismatic else 'slide'}; those of {robot.name} "
+            f"{'slide' if robot.layout.prismatic else 'turn'}: set {own}"
+        )
+    return getattr(section, own)
 
 
 @dataclass(frozen=True)
 class ParameterChoice:
-    """Dynamic parameters (64,) [SI] and, in words, where they come from."""
+    """Dynamic parameters (p,) [SI] and, in words, where they come from."""
 
     values: Array
     source: str
@@ -74,7 +89,7 @@ def choose_parameters(robot: Robot, choice: str | None = None) -> ParameterChoic
         raise ScenarioError(f"{name!r} is neither a parameter set of robot {robot.name} ({valid}) nor a result.json")
     result = load_result(name)
     try:
-        values = check_parameters(parameter_column(result.get("identification"), "estimate", PARAMETER_NAMES))
+        values = robot.layout.check(parameter_column(result.get("identification"), "estimate", robot.parameter_names))
     except (RecordError, ParameterError) as error:
         raise RecordError(f"{name}: {error}") from None
     return ParameterChoice(values, f"estimates of {name}")

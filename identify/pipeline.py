@@ -111,7 +111,7 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
     seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
     if scenario != planned:
         write_text(run_folder.scenario, scenario.to_toml())
-    write_covariance(run_folder.covariance, result.names, result.covariance)
+    write_covariance(run_folder.covariance, result.layout, result.covariance)
     save_result(
         run_folder.result,
         {
@@ -146,7 +146,7 @@ def validate(folder: Path, progress: Progress, workers: int | None = None, taugh
     excitation_truth = read_truth(run_folder.experiment)
     check_entries(run_folder.result, result, "identify")
     files.check_made_of(*RECORDS, run_folder.covariance.name, result=result)
-    models = _identified_models(run_folder, result)
+    models = _identified_models(robot, run_folder, result)
     taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
     runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, workers, progress)
     recording.write_runs(run_folder.validation, [(unseen.record, unseen.truth) for unseen in runs])
@@ -220,13 +220,13 @@ def _check_singularities(robot: Robot, scenario: Scenario, trajectories: Traject
     """Raise TrajectoryError, with time and leg, where a trajectory comes near a singularity (section 3.3)."""
     durations = [scenario.excitation.duration_s] + [scenario.validation.duration_s] * len(trajectories.validation)
     for trajectory, duration in zip((trajectories.excitation, *trajectories.validation), durations, strict=True):
-        check_travel(robot, trajectory, scenario.timing.frame_times(duration))
+        check_travel(robot, trajectory, scenario.timing.frame_times(duration), **scenario.excitation.singularity_limits)
 
 
-def _identified_models(run_folder: RunFolder, result: dict[str, Any]) -> list[Array]:
-    """Parameters (67,) of the starting and of the identified model."""
+def _identified_models(robot: Robot, run_folder: RunFolder, result: dict[str, Any]) -> list[Array]:
+    """Parameters (p,) of the starting and of the identified model."""
     try:
-        return [parameter_vector(result["identification"], column) for column in ("initial", "estimate")]
+        return [parameter_vector(robot, result["identification"], column) for column in ("initial", "estimate")]
     except RecordError as error:
         again = f"run `cmmsim identify --out {run_folder.path}` again"
         raise RecordError(f"{run_folder.result}: {error}; {again}") from None

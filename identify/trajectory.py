@@ -1,6 +1,7 @@
-"""Reference trajectories as finite Fourier series of the pose (eq. 37), from rest at home, and their file.
+"""Reference trajectories: Fourier series of the platform's coordinates (eq. 37), from rest at home; and their file.
 
-Pose ``[x y z alpha beta gamma]`` in m and rad. With ``w = 2 pi f0 l`` each component is
+Coordinates are those entries of the pose ``[x y z alpha beta gamma]``, m and rad, that the platform can change. With
+``w = 2 pi f0 l`` each is
 
     chi(t) = offset + sum_l  s_l sin(w t) / w  -  c_l cos(w t) / w.
 
@@ -9,7 +10,7 @@ The start is smooth when the series begins at the home pose, at rest and without
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ from numpy.typing import ArrayLike
 from dynamics import Robot
 from dynamics.closed_loop import Reference
 from dynamics.errors import DynamicsError
-from dynamics.workspace import check_motion
+from dynamics.kinematics.chart import Chart
+from dynamics.workspace import LEAST_LEVERAGE, MOST_CONDITION, check_motion
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.files.atomic import write_text
@@ -27,8 +29,10 @@ from identify.files.atomic import write_text
 
 @dataclass(frozen=True)
 class FourierTrajectory:
-    """One trajectory; ``sine`` and ``cosine`` (6, n) are s and c of eq. 37 [m/s, rad/s], ``offset`` (6,) [m, rad]."""
+    """One trajectory of m coordinates; ``sine`` and ``cosine`` (m, n) are s and c of eq. 37 [m/s, rad/s], ``offset``
+    (m,) [m, rad]; chart: which coordinates these are."""
 
+    chart: Chart
     fundamental_hz: float
     sine: Array
     cosine: Array
@@ -39,11 +43,11 @@ class FourierTrajectory:
             value = np.array(getattr(self, name), dtype=float)
             value.setflags(write=False)
             object.__setattr__(self, name, value)
-        n = self.sine.shape[-1] if self.sine.ndim else 0
-        if self.sine.shape != (6, n) or self.cosine.shape != (6, n) or self.offset.shape != (6,) or n == 0:
+        m, n = len(self.chart.freedoms), self.sine.shape[-1] if self.sine.ndim else 0
+        if self.sine.shape != (m, n) or self.cosine.shape != (m, n) or self.offset.shape != (m,) or n == 0:
             raise TrajectoryError(
-                f"a trajectory needs sine (6, n), cosine (6, n) and offset (6,), "
-                f"got {self.sine.shape}, {self.cosine.shape} and {self.offset.shape}"
+                f"a trajectory in {', '.join(self.chart.coordinate_names)} needs sine ({m}, n), cosine ({m}, n) and "
+                f"offset ({m},), got {self.sine.shape}, {self.cosine.shape} and {self.offset.shape}"
             )
         if not all(np.isfinite(a).all() for a in (self.sine, self.cosine, self.offset, self.fundamental_hz)):
             raise TrajectoryError("a trajectory's coefficients must be finite numbers")
@@ -56,17 +60,17 @@ class FourierTrajectory:
     def pose(self, t: ArrayLike) -> Array:
         """Poses (N, 6) [m, rad] at times ``t`` (N,) [s]; one pose (6,) for a single time."""
         w, sin, cos = self._waves(t)
-        return self.offset + sin @ (self.sine / w).T - cos @ (self.cosine / w).T
+        return self.chart.pose(self.offset + sin @ (self.sine / w).T - cos @ (self.cosine / w).T)
 
     def pose_rate(self, t: ArrayLike) -> Array:
         """Time derivative of the pose, (N, 6) [m/s, rad/s]."""
         _, sin, cos = self._waves(t)
-        return cos @ self.sine.T + sin @ self.cosine.T
+        return self.chart.lifted(cos @ self.sine.T + sin @ self.cosine.T)
 
     def pose_acceleration(self, t: ArrayLike) -> Array:
         """Second time derivative of the pose, (N, 6) [m/s², rad/s²] (eq. 36 without its stray factor t)."""
         w, sin, cos = self._waves(t)
-        return cos @ (self.cosine * w).T - sin @ (self.sine * w).T
+        return self.chart.lifted(cos @ (self.cosine * w).T - sin @ (self.sine * w).T)
 
     def reference(self, times: ArrayLike) -> Reference:
         """Desired poses and pose rates at the frames ``times`` (N,) [s]."""
@@ -78,9 +82,14 @@ class FourierTrajectory:
         return w, np.sin(phase), np.cos(phase)
 
 
+def box_of(chart: Chart, position_m: float, orientation_rad: float) -> Array:
+    """Largest distances (m,) from home of the coordinates, m and rad."""
+    return np.array([position_m if unit == "m" else orientation_rad for unit in chart.units])
+
+
 def random_trajectory(
     rng: np.random.Generator,
-    home_pose: ArrayLike,
+    chart: Chart,
     fundamental_hz: float,
     harmonics: int,
     position_amplitude_m: float,
@@ -95,30 +104,42 @@ def random_trajectory(
     if harmonics < 2:
         raise TrajectoryError(f"a smooth start needs at least 2 harmonics, got {harmonics}")
     order = np.arange(1, harmonics + 1)
-    sine = _without(rng.standard_normal((6, harmonics)), np.ones(harmonics))
-    cosine = _without(rng.standard_normal((6, harmonics)), order.astype(float))
-    shape = from_home(np.zeros(6), fundamental_hz, sine, cosine)
-    box = np.repeat([position_amplitude_m, orientation_amplitude_rad], 3)
+    freedoms = len(chart.freedoms)
+    sine = _without(rng.standard_normal((freedoms, harmonics)), np.ones(harmonics))
+    cosine = _without(rng.standard_normal((freedoms, harmonics)), order.astype(float))
+    shape = from_home(replace(chart, home=(0.0,) * 6), fundamental_hz, sine, cosine)
+    box = box_of(chart, position_amplitude_m, orientation_amplitude_rad)
     period = np.linspace(0.0, 1.0 / fundamental_hz, 200 * harmonics, endpoint=False)
-    scale = (box / np.abs(shape.pose(period)).max(axis=0))[:, None]
-    return from_home(np.asarray(home_pose, dtype=float), fundamental_hz, scale * sine, scale * cosine)
+    scale = (box / np.abs(chart.coordinates(shape.pose(period))).max(axis=0))[:, None]
+    return from_home(chart, fundamental_hz, scale * sine, scale * cosine)
 
 
-def from_home(home: Array, fundamental_hz: float, sine: Array, cosine: Array) -> FourierTrajectory:
-    """Trajectory with coefficients ``sine`` and ``cosine`` (6, n) [m/s, rad/s] that is at ``home`` (6,) at t = 0."""
+def from_home(chart: Chart, fundamental_hz: float, sine: Array, cosine: Array) -> FourierTrajectory:
+    """Trajectory with coefficients ``sine`` and ``cosine`` (m, n) [m/s, rad/s] that is at the chart's home at t = 0."""
     w = 2 * np.pi * fundamental_hz * np.arange(1, sine.shape[1] + 1)
-    return FourierTrajectory(fundamental_hz, sine, cosine, home + (cosine / w).sum(axis=1))
+    home = chart.coordinates(np.array(chart.home))
+    return FourierTrajectory(chart, fundamental_hz, sine, cosine, home + (cosine / w).sum(axis=1))
 
 
-def check_travel(robot: Robot, trajectory: FourierTrajectory, t: ArrayLike, margin_rad: float = 0.0) -> float:
-    """Largest crank angle [rad] of a trajectory that the robot may follow, sampled at times ``t`` (N,) [s].
+def check_travel(
+    robot: Robot,
+    trajectory: FourierTrajectory,
+    t: ArrayLike,
+    margin: float = 0.0,
+    *,
+    least_leverage: float = LEAST_LEVERAGE,
+    most_condition: float = MOST_CONDITION,
+) -> float:
+    """Largest joint coordinate, rad or m, of a trajectory that the robot may follow, sampled at times ``t`` (N,) [s],
+    with a margin, rad or m, to the travel limit, and limits of leverage and condition.
 
     Raises TrajectoryError: out of reach, beyond the travel limit less the margin, or near a singularity; the message
     names time, leg, value and limit (`dynamics.workspace.check_motion`).
     """
     times = np.asarray(t, dtype=float)
     try:
-        return check_motion(robot, trajectory.pose(times), times, travel_margin=margin_rad).travel.value
+        limits = {"travel_margin": margin, "least_leverage": least_leverage, "most_condition": most_condition}
+        return check_motion(robot, trajectory.pose(times), times, **limits).travel.value
     except DynamicsError as error:
         raise TrajectoryError(f"the robot may not follow the trajectory: {error}") from error
 
@@ -128,11 +149,14 @@ def _without(rows: Array, direction: Array) -> Array:
     return rows - np.outer(rows @ unit, unit)
 
 
+FREE, HOME = "free", (0.0,) * 6
+"""Of files that do not say: their platforms move freely, and such a chart does not ask where home is."""
+
 FORMAT = "cmmsim trajectories, version 1"
 EQUATION = "pose(t) = offset + sum_l sine_l sin(w t)/w - cosine_l cos(w t)/w with w = 2 pi fundamental_hz l"
 UNITS = {
     "fundamental_hz": "Hz",
-    "sine": "m/s for x, y, z; rad/s for alpha, beta, gamma; one row per pose component, one column per harmonic",
+    "sine": "m/s for x, y, z; rad/s for alpha, beta, gamma; one row per coordinate, one column per harmonic",
     "cosine": "as sine",
     "offset": "m for x, y, z; rad for alpha, beta, gamma",
     "observability_index": "paper's eq. 39, without unit",
@@ -141,7 +165,8 @@ UNITS = {
 
 @dataclass(frozen=True)
 class TrajectorySet:
-    """The trajectories of a run: the excitation with its observability index (eq. 39), and those for validation.
+    """The trajectories of a run, all of one chart: the excitation with its observability index (eq. 39), and those for
+    validation.
 
     ``first_index`` is the index of the first random candidate, ``median_index`` that of the middle one.
     """
@@ -161,6 +186,8 @@ def save_trajectories(path: Path | str, trajectories: TrajectorySet) -> None:
         "equation": EQUATION,
         "units": UNITS,
         "seed": trajectories.seed,
+        "chart": trajectories.excitation.chart.name,
+        "home_pose": list(trajectories.excitation.chart.home),
         "observability_index": {
             "best": trajectories.observability_index,
             "first": trajectories.first_index,
@@ -181,11 +208,11 @@ def load_trajectories(path: Path | str) -> TrajectorySet:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
         if data["format"] != FORMAT:
             raise TrajectoryError(f"{path} has format {data['format']!r}, expected {FORMAT!r}")
-        index = data["observability_index"]
+        index, chart = data["observability_index"], Chart(data.get("chart", FREE), tuple(data.get("home_pose", HOME)))
         return TrajectorySet(
             seed=int(data["seed"]),
-            excitation=_from_dict(data["excitation"]),
-            validation=tuple(_from_dict(entry) for entry in data["validation"]),
+            excitation=_from_dict(data["excitation"], chart),
+            validation=tuple(_from_dict(entry, chart) for entry in data["validation"]),
             observability_index=float(index["best"]),
             first_index=float(index["first"]),
             median_index=float(index["median"]),
@@ -199,8 +226,8 @@ def load_trajectories(path: Path | str) -> TrajectorySet:
 
 
 def _to_dict(trajectory: FourierTrajectory) -> dict[str, Any]:
-    return {name: np.asarray(value).tolist() for name, value in vars(trajectory).items()}
+    return {name: np.asarray(value).tolist() for name, value in vars(trajectory).items() if name != "chart"}
 
 
-def _from_dict(data: dict[str, Any]) -> FourierTrajectory:
-    return FourierTrajectory(float(data["fundamental_hz"]), data["sine"], data["cosine"], data["offset"])
+def _from_dict(data: dict[str, Any], chart: Chart) -> FourierTrajectory:
+    return FourierTrajectory(chart, float(data["fundamental_hz"]), data["sine"], data["cosine"], data["offset"])

@@ -78,13 +78,11 @@ def estimators(
 
 def _entry(score: "Score") -> dict[str, Any]:
     """A score with its parameters by name."""
-    from identify.loop_parameters import NAMES
-
     entry = asdict(score)
-    estimate, std = entry.pop("parameters"), entry.pop("std")
+    estimate, std, names = entry.pop("parameters"), entry.pop("std"), entry.pop("names")
     if estimate is not None:
         entry["parameters"] = {
-            name: {"estimate": estimate[k], "std": None if std is None else std[k]} for k, name in enumerate(NAMES)
+            name: {"estimate": estimate[k], "std": None if std is None else std[k]} for k, name in enumerate(names)
         }
     return entry
 

@@ -41,8 +41,9 @@ def base_parameters(
     from dynamics import load_robot
     from identify.estimation import base_parameters as base
 
-    matrix = base.structural_regressor(load_robot(robot))
-    found = base.base_parameters(matrix)
+    chosen = load_robot(robot)
+    matrix = base.structural_regressor(chosen)
+    found = base.base_parameters(matrix, chosen.layout)
     singular, angle = base.rank_by_singular_values(matrix), base.angle_to_singular_vectors(matrix, found)
     counts = {10**d: base.rank_by_threshold(matrix / 10**d, THRESHOLD) for d in DECADES}
     if out is not None:

@@ -10,12 +10,13 @@ the same whatever motion shows them.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import orth, qr, subspace_angles
 
 from dynamics import Robot
 from dynamics.closed_loop import Reference
 from dynamics.errors import DynamicsError
-from dynamics.parameters import COULOMB_NAMES, PARAMETER_NAMES, VISCOUS_NAMES
+from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.filtering import spline_derivatives
@@ -38,7 +39,7 @@ REACH_SHARES, TURN = (0.03, 0.01, 0.003, 0.001), 0.05
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """Base parameters of a regression matrix with columns `names`.
+    """Base parameters of a regression matrix with columns `names`, the dynamic parameters of a robot.
 
     combinations (rank, p): base = combinations @ parameters; pivots (rank,): the parameter that each group is named
     after, with coefficient 1; unseen: names of the parameters with no effect at all; gap: largest column remainder that
@@ -71,18 +72,20 @@ class BaseParameters:
         return " ".join([self.names[pivot], *terms])
 
 
-def base_parameters(matrix: Array, names: tuple[str, ...] = PARAMETER_NAMES) -> BaseParameters:
-    """Base parameters of a regression matrix (rows, p) by pivoted QR.
+def base_parameters(matrix: Array, layout: ParameterLayout) -> BaseParameters:
+    """Base parameters of a regression matrix (rows, p) of a robot with this layout by pivoted QR.
 
-    Among the columns of which enough is left, pivots go to friction first, then to the platform, the inertias of cranks
-    and links, the masses of links, and last of cranks. Raises EstimationError for a matrix without any effect.
+    Among the columns of which enough is left, pivots go to friction first, then to the platform, the moments of the
+    legs' bodies, and their masses, those nearest to the platform first. Raises EstimationError for a matrix without any
+    effect.
     """
+    names = layout.dynamic_names
     lengths = np.linalg.norm(matrix, axis=0)
     seen = np.flatnonzero(lengths > DEPENDENT * lengths.max(initial=0.0))
     if len(seen) == 0:
         raise EstimationError(f"the regression matrix {matrix.shape} is zero: the motion excites no parameter")
     columns = matrix[:, seen] / lengths[seen]
-    pivots, gap = _pivots(columns, np.array([_preference(names[k]) for k in seen]))
+    pivots, gap = _pivots(columns, _preferences(layout)[seen])
     others = np.setdiff1d(np.arange(len(seen)), pivots)
     beta = np.linalg.lstsq(columns[:, pivots], columns[:, others], rcond=None)[0]
     beta[np.abs(beta) < NEGLIGIBLE] = 0.0
@@ -91,17 +94,18 @@ def base_parameters(matrix: Array, names: tuple[str, ...] = PARAMETER_NAMES) -> 
     combinations[:, seen[others]] = beta * lengths[seen[others]] / lengths[seen[pivots]][:, None]
     order = np.argsort(seen[pivots])
     unseen = tuple(name for k, name in enumerate(names) if k not in seen)
-    return BaseParameters(tuple(names), combinations[order], tuple(int(k) for k in seen[pivots][order]), unseen, gap)
+    return BaseParameters(names, combinations[order], tuple(int(k) for k in seen[pivots][order]), unseen, gap)
 
 
 def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) -> Array:
-    """Regression matrix (6 motions, 64) of random poses about home, twists and accelerations: what can be excited is.
+    """Regression matrix (m motions, p) of random poses about home, twists and accelerations: what can be excited is.
+    Rows are wrenches along the platform's m coordinates: what the chart forbids moves nothing.
 
     Raises EstimationError, with the last reason, where no neighbourhood of home is in reach.
     """
-    rng = np.random.default_rng(seed)
+    rng, chart = np.random.default_rng(seed), robot.geometry.chart
     size = float(np.abs(robot.geometry.platform_joints).max())
-    draws = rng.uniform(-1.0, 1.0, (3, motions, 6))
+    draws = chart.lifted(rng.uniform(-1.0, 1.0, (3, motions, len(chart.freedoms))))
     reason: Exception | None = None
     for share in REACH_SHARES:
         poses = robot.home_pose + draws[0] * np.repeat([share * size, TURN * share / REACH_SHARES[0]], 3)
@@ -111,7 +115,7 @@ def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) ->
             reason = error
             continue
         unit = np.repeat([size, 1.0], 3)
-        regressor = robot.regressor(poses, draws[1] * unit, 10.0 * draws[2] * unit)
+        regressor = chart.basis.T @ robot.regressor(poses, draws[1] * unit, 10.0 * draws[2] * unit)
         return np.asarray(regressor, dtype=float).reshape(-1, regressor.shape[2])
     raise EstimationError(f"robot {robot.name} reaches no neighbourhood of its home pose: {reason}")
 
@@ -142,15 +146,15 @@ def rank_by_threshold(matrix: Array, threshold: float) -> int:
 
 
 def reference_regressor(robot: Robot, reference: Reference, rate_hz: float) -> Array:
-    """Regression matrix H (6 n, 64) of a reference motion sampled at `rate_hz`."""
+    """Regression matrix H (m n, p) of a reference motion sampled at `rate_hz`."""
     acceleration, _ = spline_derivatives(reference.rates, rate_hz)
     twist = robot.twist(reference.poses, reference.rates)
     twist_dot = robot.twist_dot(reference.poses, reference.rates, acceleration)
-    regressor = robot.regressor(reference.poses, twist, twist_dot)
+    regressor = robot.geometry.chart.basis.T @ robot.regressor(reference.poses, twist, twist_dot)
     return np.asarray(regressor.reshape(-1, regressor.shape[2]), dtype=float)
 
 
-def _pivots(columns: Array, preference: Array) -> tuple[Array, tuple[float, float]]:
+def _pivots(columns: Array, preference: NDArray[np.intp]) -> tuple[Array, tuple[float, float]]:
     """Indices of independent columns, and the remainders on both sides of the limit."""
     left, smallest = columns.copy(), 1.0
     chosen: list[int] = []
@@ -169,17 +173,17 @@ def _pivots(columns: Array, preference: Array) -> tuple[Array, tuple[float, floa
         left[:, chosen] = 0.0
 
 
-def _preference(name: str) -> int:
-    """Place of a parameter among columns that are long enough."""
-    kinds = (
-        name in COULOMB_NAMES + VISCOUS_NAMES,
-        name.startswith("platform"),
-        not name.endswith(".mass"),
-        name.startswith("link"),
-        True,
-    )
-    place = PARAMETER_NAMES.index(name) if name in PARAMETER_NAMES else 0
-    return kinds.index(True) * len(PARAMETER_NAMES) + place
+def _preferences(layout: ParameterLayout) -> NDArray[np.intp]:
+    """Place (p,) of each dynamic parameter among columns that are long enough."""
+    friction, platform, moment, mass = range(4)
+    kinds = np.full(len(layout.dynamic_names), friction)
+    rigid = layout.bodies_of(kinds)
+    rigid[:] = moment
+    places = {body: place for bodies in layout.of_leg for place, body in enumerate(bodies)}
+    last = max(places.values())
+    rigid[:, 0] = [mass + last - places.get(body, last) for body in range(len(rigid))]
+    rigid[0] = platform
+    return np.asarray(kinds * len(kinds) + np.arange(len(kinds)))
 
 
 def _coefficient(value: float) -> str:

@@ -28,11 +28,10 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from dynamics.inertia import MOMENTS, SMALLEST, physical_inertias
-from dynamics.parameters import BODY_NAMES
+from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.estimation.bounded_least_squares import Problem
 from identify.estimation.prior import StartingGuess
-from identify.loop_parameters import NAMES, index_of
 
 
 def combined_std(rows: Array, covariance: Array) -> Array:
@@ -51,20 +50,21 @@ MOMENTS_FROM_SECOND = np.ones((3, 3)) - np.eye(3)
 class ParameterBounds:
     """Coordinates (p,) of a search and their lower bounds (p,), with parameters = matrix (p, p) @ coordinates.
 
-    statements: what each bound says of the parameters; physical: only bodies that can exist.
+    layout: of the parameters; statements: what each bound says of them; physical: only bodies that can exist.
     """
 
+    layout: ParameterLayout
     matrix: Array
     lower: Array
     statements: tuple[str, ...]
     physical: bool
 
     def nearest(self, parameters: Array) -> Array:
-        """Parameters (67,) within the bounds: negative ones raised, and bodies changed where they cannot exist, if it
+        """Parameters (p,) within the bounds: negative ones raised, and bodies changed where they cannot exist, if it
         can be in what the motion does not feel."""
         allowed = np.maximum(parameters, 0.0)
         if self.physical:
-            bodies = physical_inertias(allowed[:64], allow_changes=True).values
+            bodies = physical_inertias(self.layout, allowed, allow_changes=True).values
             allowed[: bodies.size] = bodies.ravel()
         return self.parameters(np.maximum(self.coordinates(allowed), self.lower))
 
@@ -105,20 +105,21 @@ class InCoordinates:
 
 
 def parameter_bounds(guess: StartingGuess, physical: bool) -> ParameterBounds:
-    """Bounds of the 67 parameters; physical: only masses and inertias that a rigid body can have."""
-    matrix, lower = np.eye(len(NAMES)), np.zeros(len(NAMES))
-    for name in ("platform.mass", "joint_pid.li"):
-        lower[index_of(name)] = SMALLEST_SHARE * guess.values[index_of(name)]
+    """Bounds of all parameters; physical: only masses and inertias that a rigid body can have."""
+    layout, names = guess.layout, guess.layout.names
+    matrix, lower = np.eye(len(names)), np.zeros(len(names))
+    for place in (names.index(name) for name in ("platform.mass", "joint_pid.li")):
+        lower[place] = SMALLEST_SHARE * guess.values[place]
     if physical:
-        lower[: 4 * len(BODY_NAMES)] = np.maximum(lower[: 4 * len(BODY_NAMES)], SMALLEST)
-    statements = [f"{name} >= {bound:g}" for name, bound in zip(NAMES, lower, strict=True)]
-    for body in BODY_NAMES if physical else ():
-        first = index_of(f"{body}.Ixx")
+        lower[layout.rigid] = np.maximum(lower[layout.rigid], SMALLEST)
+    statements = [f"{name} >= {bound:g}" for name, bound in zip(names, lower, strict=True)]
+    for body in layout.bodies if physical else ():
+        first = names.index(f"{body}.Ixx")
         matrix[first : first + 3, first : first + 3] = MOMENTS_FROM_SECOND
         for axis, moment in enumerate(MOMENTS):
             others = [one for one in MOMENTS if one != moment]
             statements[first + axis] = f"{body}.{moment} <= {' + '.join(others)}"
-    return ParameterBounds(matrix, lower, tuple(statements), physical)
+    return ParameterBounds(layout, matrix, lower, tuple(statements), physical)
 
 
 HALF_WIDTH = float(norm.ppf(0.975))

@@ -40,8 +40,8 @@ FEWEST = 50
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Covariance (67, 67) of the estimate, were there no bounds; information (67, 67) that the poses alone hold;
-    gradient (67,): J^T r of poses and all that is known beside them, at the estimate; misfit of the record; unstable:
+    """Covariance (p, p) of the estimate, were there no bounds; information (p, p) that the poses alone hold;
+    gradient (p,): J^T r of poses and all that is known beside them, at the estimate; misfit of the record; unstable:
     repeated experiments that ended early and were left out."""
 
     covariance: Array
@@ -52,7 +52,7 @@ class Uncertainty:
 
     @property
     def std(self) -> Array:
-        """Standard deviations (67,)."""
+        """Standard deviations (p,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)), dtype=float)
 
     def warnings(self) -> tuple[str, ...]:
@@ -69,7 +69,7 @@ class Uncertainty:
 def estimate_uncertainty(
     problem: OutputErrorProblem, parameters: Array, rng: np.random.Generator, advance: Advance = lambda n=1: None
 ) -> Uncertainty:
-    """Uncertainty of the estimate `parameters` (67,), from DRAWS repeated experiments.
+    """Uncertainty of the estimate `parameters` (p,), from DRAWS repeated experiments.
 
     Raises EstimationError when too many of them are unstable.
     """
@@ -129,9 +129,9 @@ def _noise(
     rng: np.random.Generator,
     advance: Advance,
 ) -> tuple[Array, Misfit, int]:
-    """Covariance (67, 67) of the scores that noise makes, the misfit beyond it, and how many repetitions ended early.
+    """Covariance (p, p) of the scores that noise makes, the misfit beyond it, and how many repetitions ended early.
 
-    found: residuals (n, 6) of each run and their Jacobian (n, 6, 67), in the units of the scores. Where the model's
+    found: residuals (n, 6) of each run and their Jacobian (n, 6, p), in the units of the scores. Where the model's
     error decides, or its residuals are white, no experiment is repeated.
     """
     white = misfit_of_white(np.concatenate([residual for residual, _ in found]))

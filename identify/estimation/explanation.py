@@ -194,7 +194,7 @@ class Explanation:
 
 
 def explanation(driven: OutputErrorProblem, parameters: Array, misfit: Misfit) -> Explanation:
-    """Judge the model from the command-driven problem at its own optimum (67,), and the misfit of the estimate.
+    """Judge the model from the command-driven problem at its own optimum (p,), and the misfit of the estimate.
 
     Raises EstimationError with too few good frames.
     """

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 
 from dynamics import Robot
-from dynamics.parameters import COULOMB_NAMES, JOINT_PID_NAMES, VISCOUS_NAMES
+from dynamics.parameters import JOINT_PID
 from identify.arrays import Array
 from identify.estimation.base_parameters import (
     BaseParameters,
@@ -48,21 +48,20 @@ from identify.estimation.bounds import bounded_estimate, combined_std
 from identify.estimation.covariance import Uncertainty
 from identify.estimation.explanation import Explanation
 from identify.estimation.output_error import OutputErrorProblem
-from identify.estimation.prior import StartingGuess, holding_torque
+from identify.estimation.prior import StartingGuess, friction, holding_torque
 from identify.estimation.scale_anchor import ScaleAnchor
-from identify.loop_parameters import NAMES
 from identify.scenario import Scenario
 
 IDENTIFIABLE_SHARE = 0.5
 """Of the guess's standard deviation and of the size: what the record may leave of an identified quantity."""
 
 FRICTION_SHARE = 0.1
-"""Of the holding torque [N m]: an ordinary Coulomb friction [N m], and viscous friction at 1 rad/s [N m s/rad]."""
+"""Of the holding torque or force: an ordinary Coulomb friction, and viscous friction at 1 rad/s or 1 m/s."""
 
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What the starting guess leaves of each parameter, std (67,), and its size (67,), SI; model_holds: whether noise,
+    """What the starting guess leaves of each parameter, std (p,), and its size (p,), SI; model_holds: whether noise,
     and not an error of the model, makes most of the residuals: with another model nothing is identified."""
 
     std: Array
@@ -70,7 +69,7 @@ class Identifiability:
     model_holds: bool = True
 
     def judge(self, rows: Array, covariance: Array) -> NDArray[np.bool_]:
-        """Whether each quantity rows (n, 67) @ parameters is identified, with the estimate's covariance (67, 67)."""
+        """Whether each quantity rows (n, p) @ parameters is identified, with the estimate's covariance (p, p)."""
         left = combined_std(rows, covariance)
         before, size = np.sqrt(rows**2 @ self.std**2), np.sqrt(rows**2 @ self.sizes**2)
         return self.model_holds & (left < IDENTIFIABLE_SHARE * np.minimum(before, size))
@@ -78,16 +77,16 @@ class Identifiability:
 
 def identifiability(guess: StartingGuess, robot: Robot, model_holds: bool = True) -> Identifiability:
     """The criterion that follows from a starting guess; a guess of zero, other than of friction, has the size 1."""
-    friction = np.isin(NAMES, COULOMB_NAMES + VISCOUS_NAMES)
-    unsaid = np.where(friction, FRICTION_SHARE * holding_torque(robot, guess.values[: len(robot.parameter_names)]), 1.0)
+    held = FRICTION_SHARE * holding_torque(robot, guess.values[robot.layout.dynamic])
+    unsaid = np.where(friction(robot.layout), held, 1.0)
     return Identifiability(guess.std, np.where(guess.values != 0, np.abs(guess.values), unsaid), model_holds)
 
 
 @dataclass(frozen=True)
 class GroupEstimates:
-    """Base parameters of the 64 dynamic parameters, one row each: what they are, and what is known of them.
+    """Base parameters of the dynamic parameters, one row each: what they are, and what is known of them.
 
-    combinations (rank, 64); initial, estimate, std (rank,), SI units of the leading parameter; identifiable (rank,).
+    combinations (rank, p); initial, estimate, std (rank,), SI units of the leading parameter; identifiable (rank,).
     """
 
     names: tuple[str, ...]
@@ -100,14 +99,14 @@ class GroupEstimates:
 
 
 def group_rows(base: BaseParameters) -> Array:
-    """The groups as combinations (rank, 67) of all parameters: the gains of the joint PID belong to none."""
-    return np.pad(base.combinations, ((0, 0), (0, len(JOINT_PID_NAMES))))
+    """The groups as combinations (rank, p) of all parameters: the gains of the joint PID belong to none."""
+    return np.pad(base.combinations, ((0, 0), (0, len(JOINT_PID))))
 
 
 def group_estimates(
     base: BaseParameters, guess: StartingGuess, criterion: Identifiability, estimate: Array, covariance: Array
 ) -> GroupEstimates:
-    """Estimates of the groups from parameters (67,) and their covariance (67, 67)."""
+    """Estimates of the groups from parameters (p,) and their covariance (p, p)."""
     rows = group_rows(base)
     return GroupEstimates(
         names=base.group_names(),
@@ -124,16 +123,20 @@ ROUNDING = 1e-6
 """Of a unit vector: what may be left of it outside the combinations that are shown, in units of the sizes."""
 
 
-def rests_on_prior(base: BaseParameters, anchor: ScaleAnchor, estimate: Array, sizes: Array) -> NDArray[np.bool_]:
-    """Whether each of the 67 parameters is no combination of what record and anchor show.
+def rests_on_prior(
+    base: BaseParameters, guess: StartingGuess, anchor: ScaleAnchor, estimate: Array, sizes: Array
+) -> NDArray[np.bool_]:
+    """Whether each of the p parameters is no combination of what record and anchor show.
 
-    estimate (67,): the direction of the common factor; sizes (67,): the unit in which each parameter is counted.
+    Poses show the groups and gains up to their common factor; an anchor that is measured shows its parameter, and a
+    payload the factor. estimate (p,): the direction of the factor; sizes (p,): the unit in which each parameter counts.
     """
     gains = np.eye(len(sizes))[base.combinations.shape[1] :]
-    shown = np.concatenate([group_rows(base), gains, anchor.row()[0]]) * sizes
-    if anchor.name == "prior":
+    shown = np.concatenate([group_rows(base), gains]) * sizes
+    if anchor.name != "payload":
         factor = estimate / sizes
         shown = shown - np.outer(shown @ factor, factor) / (factor @ factor)
+    shown = np.concatenate([shown, anchor.row(guess.layout)[0] * sizes])
     shown /= np.linalg.norm(shown, axis=1, keepdims=True)
     _, singular, directions = np.linalg.svd(shown, full_matrices=False)
     span = directions[singular > ROUNDING * singular[0]]
@@ -176,7 +179,7 @@ class Conditioning:
 def conditioning(
     information: Array, known: Array, base: BaseParameters, guess: StartingGuess, estimate: Array
 ) -> Conditioning:
-    """Conditioning of an estimate (67,) from the information (67, 67) of the poses and of what is known beside them."""
+    """Conditioning of an estimate (p,) from the information (p, p) of the poses and of what is known beside them."""
     everything = np.linalg.eigvalsh((information + known) * np.outer(guess.std, guess.std))
     count = base.combinations.shape[1]
     gains = np.arange(count, len(estimate))
@@ -194,7 +197,7 @@ def conditioning(
 
 @dataclass(frozen=True)
 class Judgement:
-    """identifiable, rests_on_prior (67,) bool; intervals (67, 2) and group_intervals: 95 %, cut at the bounds;
+    """identifiable, rests_on_prior (p,) bool; intervals (p, 2) and group_intervals: 95 %, cut at the bounds;
     base_rank: independent groups that the references excite by the paper's rule; active_bounds: what holds the estimate
     back; warnings: what a reader must know before believing any of it."""
 
@@ -218,9 +221,9 @@ def judge(
 ) -> Judgement:
     """Judge what a search found, given its uncertainty and how well it explains the records."""
     robot, guess, estimate = problem.runs[0].robot, problem.guess, solution.parameters
-    base, known = base_parameters(structural_regressor(robot)), problem.known_information()
+    base, known = base_parameters(structural_regressor(robot), robot.layout), problem.known_information()
     criterion = identifiability(guess, robot, model_holds=explanation.model_holds)
-    identifiable = criterion.judge(np.eye(len(NAMES)), uncertainty.covariance)
+    identifiable = criterion.judge(np.eye(len(estimate)), uncertainty.covariance)
     conditioned = conditioning(uncertainty.information, known, base, guess, estimate)
     bounded = bounded_estimate(
         estimate,
@@ -233,8 +236,8 @@ def judge(
     of_the_records = (warning for run in problem.runs for warning in run.warnings())
     return Judgement(
         identifiable=identifiable,
-        rests_on_prior=identifiable & rests_on_prior(base, problem.anchor, estimate, criterion.sizes),
-        intervals=bounded.intervals(np.eye(len(NAMES))),
+        rests_on_prior=identifiable & rests_on_prior(base, guess, problem.anchor, estimate, criterion.sizes),
+        intervals=bounded.intervals(np.eye(len(estimate))),
         groups=group_estimates(base, guess, criterion, estimate, uncertainty.covariance),
         group_intervals=bounded.intervals(group_rows(base)),
         conditioning=conditioned,

@@ -21,7 +21,6 @@ from identify.estimation.prior import StartingGuess, starting_guess
 from identify.estimation.result import IdentificationResult
 from identify.estimation.scale_anchor import read_anchor
 from identify.estimation.warm_start import linear_warm_start
-from identify.loop_parameters import NAMES
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
 from identify.record.provenance import recorded_seed
@@ -63,7 +62,7 @@ def identify(
     judgement = judge(problem, scenario, solution, uncertainty, explained)
     ended = time.perf_counter()
     return IdentificationResult(
-        names=NAMES,
+        layout=robot.layout,
         initial=problem.guess.values,
         warm_start=warm,
         estimate=solution.parameters,
@@ -97,7 +96,7 @@ def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: 
     if not records:
         raise EstimationError("no record to identify from")
     runs = tuple(recorded_run(record, robot, scenario) for record in records)
-    anchor = read_anchor(records[0])
+    anchor = read_anchor(records[0], robot.layout)
     if anchor.name == "payload" and len({float(run.payload @ run.payload) for run in runs}) < 2:
         raise EstimationError(
             f"the scale anchor is a payload, and the {len(runs)} records have all the same load: one with and one "
@@ -111,7 +110,7 @@ def _guess(robot: Robot, scenario: Scenario) -> StartingGuess:
     settings = scenario.identification
     guess = starting_guess(robot, scenario.model.start_parameters, settings.start_std, settings.prior)
     try:
-        checked_loop_parameters(guess.values)
+        checked_loop_parameters(robot, guess.values)
     except DynamicsError as error:
         known = ", ".join(settings.prior) or "nothing"
         raise ScenarioError(

@@ -1,9 +1,10 @@
 """Multiple shooting: the record in short segments, for models that do not run through the whole of it.
 
 A model that is unstable, or that leaves the reachable set, has no output error over a record. Driven by the logged
-commands it has one over half a second, where each segment starts from a state of its own: pose, pose rate and joint PID
-integral. These states are unknowns beside the parameters, and each segment must end where the next starts, up to what
-the sensor can see, so that in the optimum the segments make up one run.
+commands it has one over half a second, where each segment starts from a state of its own: coordinates of the platform,
+their rates and joint PID integral, s = 2 m + n numbers of m coordinates and n joints. These states are unknowns beside
+the parameters, and each segment must end where the next starts, up to what the sensor can see, so that in the optimum
+the segments make up one run.
 
 In the linearised problem the states form a chain. They are eliminated one after the other by QR, which leaves a problem
 in the parameters alone (condensing; Bock and Plitt, "A multiple shooting algorithm for direct solution of optimal
@@ -18,6 +19,7 @@ import numpy as np
 from dynamics import DynamicsError
 from dynamics.closed_loop import ClosedLoopRun, Reference, StartState, equilibrium, simulate
 from dynamics.closed_loop.problem import MAX_DELAY_FRAMES
+from dynamics.kinematics.chart import Chart
 from identify.arrays import Array
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.warm_start import effective_command, running_integral
@@ -31,13 +33,10 @@ SEGMENT_S = 0.5
 BANDWIDTH = 20.0
 """rad/s, of the joint loop: turns the sensor's noise into a deviation of rates and integrals."""
 
-STATES = 18
-"""Entries of a state: pose (6,), pose rate (6,), joint PID integral (6,)."""
-
 
 @dataclass(frozen=True)
 class Segment:
-    """Frames first to last of a run; the last one is the next segment's first. state_std (18,): what the sensor's noise
+    """Frames first to last of a run; the last one is the next segment's first. state_std (s,): what the sensor's noise
     is in a state."""
 
     run: RecordedRun
@@ -52,15 +51,23 @@ class Segment:
         return self.last == len(self.run.ok) - 1
 
     @property
+    def chart(self) -> Chart:
+        """Of the platform."""
+        return self.run.robot.geometry.chart
+
+    @property
     def measured(self) -> Array:
         """Measured poses (frames, 6)."""
         return self.run.measured[self.first : self.last + 1]
 
     def simulate(self, parameters: Array, state: Array, sensitivities: bool = False) -> ClosedLoopRun:
-        """The model's run from a state (18,); the first segment starts in equilibrium. Raises LoopFailure."""
-        run, (pose, rate, integral) = self.run, state.reshape(3, 6)
+        """The model's run from a state (s,); the first segment starts in equilibrium. Raises LoopFailure."""
+        run, chart = self.run, self.chart
+        coordinates, rates, integral = np.split(state, [len(chart.freedoms), 2 * len(chart.freedoms)])
         before = run.logged[max(0, self.first - MAX_DELAY_FRAMES - 2) : self.first]
-        start = StartState(pose, rate, integral, np.zeros(6), before, pose) if self.first else None
+        pose = chart.pose(coordinates)
+        at_rest = np.zeros(len(chart.freedoms))
+        start = StartState(pose, chart.lifted(rates), integral, at_rest, before, pose) if self.first else None
         return simulate(
             run.robot,
             parameters + run.payload,
@@ -84,10 +91,12 @@ def segments(run: RecordedRun) -> list[Segment]:
     frames = len(run.ok)
     count = max(1, round((frames - 1) / (SEGMENT_S * run.settings.timing.frame_rate_hz)))
     edges = np.linspace(0, frames - 1, count + 1).round().astype(int)
-    jacobian = run.robot.pose_jacobian(run.reference.poses[0])
-    pose = np.sqrt(np.diag(run.covariance))
-    angle = np.sqrt(np.diag(jacobian @ run.covariance @ jacobian.T))
-    std = np.concatenate([pose, BANDWIDTH * pose, angle / BANDWIDTH])
+    free = run.robot.geometry.chart.basis
+    covariance = free.T @ run.covariance @ free
+    jacobian = run.robot.coordinate_jacobian(run.reference.poses[0])
+    place = np.sqrt(np.diag(covariance))
+    joint = np.sqrt(np.diag(jacobian @ covariance @ jacobian.T))
+    std = np.concatenate([place, BANDWIDTH * place, joint / BANDWIDTH])
     poses, rates = run.reference.poses, run.reference.rates
     return [
         Segment(run, Reference(poses[first : last + 1], rates[first : last + 1]), int(first), int(last), std)
@@ -96,27 +105,28 @@ def segments(run: RecordedRun) -> list[Segment]:
 
 
 def measured_states(chain: list[Segment], parameters: Array, scenario: Scenario) -> Array:
-    """States (segments, 18) at the starts of a run's segments: filtered poses and rates, and what the joint PID has
-    integrated since the start, where it held the model of parameters (67,) at rest."""
+    """States (segments, s) at the starts of a run's segments: filtered poses and rates, and what the joint PID has
+    integrated since the start, where it held the model of parameters (p,) at rest."""
     run, rate_hz, filtering = chain[0].run, scenario.timing.frame_rate_hz, scenario.filter
-    pose, rate, _ = filtered_derivatives(run.without_gaps(), rate_hz, filtering.cutoff_hz, filtering.order)
+    measured = run.robot.geometry.chart.coordinates(run.without_gaps())
+    place, rate, _ = filtered_derivatives(measured, rate_hz, filtering.cutoff_hz, filtering.order)
     _, _, command_integral = effective_command(run.logged, scenario)
-    angle_integral = running_integral(run.robot.inverse_kinematics(pose), rate_hz)
+    angle_integral = running_integral(run.robot.inverse_kinematics(run.robot.pose(place)), rate_hz)
     rest = equilibrium(run.robot, parameters + run.payload, run.reference.poses[0], run.settings.servo)
-    states = np.hstack([pose, rate, rest.joint_integral + command_integral - angle_integral])
+    states = np.hstack([place, rate, rest.joint_integral + command_integral - angle_integral])
     return np.asarray(states[[part.first for part in chain]], dtype=float)
 
 
-def end_state(run: ClosedLoopRun) -> Array:
-    """State (18,) at the last frame of a run."""
-    return np.concatenate([run.pose[-1], run.pose_rate[-1], run.joint_integral[-1]])
+def end_state(run: ClosedLoopRun, chart: Chart) -> Array:
+    """State (s,) at the last frame of a run of a robot with this chart."""
+    return np.concatenate([*(chart.coordinates(of[-1]) for of in (run.pose, run.pose_rate)), run.joint_integral[-1]])
 
 
 @dataclass
 class MultipleShooting:
-    """Least-squares problem in the 67 parameters, for `bounded_least_squares.minimise`.
+    """Least-squares problem in a robot's p parameters, for `bounded_least_squares.minimise`.
 
-    chains: the segments of each record; states: a (segments, 18) for each record. The states follow the parameters by
+    chains: the segments of each record; states: a (segments, s) for each record. The states follow the parameters by
     the latest linearisation, and are moved with each new one.
     """
 
@@ -136,7 +146,8 @@ class MultipleShooting:
                     run = part.simulate(parameters, states[k])
                     total += float(np.sum(part.whitened(run.pose - part.measured) ** 2))
                     if not part.ends_the_run:
-                        total += float(np.sum(((end_state(run) - states[k + 1]) / part.state_std) ** 2))
+                        gap = end_state(run, part.chart) - states[k + 1]
+                        total += float(np.sum((gap / part.state_std) ** 2))
         except DynamicsError:
             return np.inf
         return total
@@ -152,21 +163,22 @@ class MultipleShooting:
         size, cost = len(parameters), float(known @ known)
         condensed = np.column_stack([known_rows, known])
         for chain, states in zip(self.chains, self.states, strict=True):
-            carried, eliminated = np.eye(STATES, STATES + size + 1), []  # nothing depends on the first state: it stays
+            state = states.shape[1]
+            carried, eliminated = np.eye(state, state + size + 1), []  # nothing depends on the first state: it stays
             for k, part in enumerate(chain):
                 rows = _linearised(part, parameters, states[k], None if part.ends_the_run else states[k + 1])
                 cost += float(np.sum(rows[:, -1] ** 2))
-                carried = np.insert(carried, [STATES] * STATES, 0.0, axis=1)  # columns of the next state
+                carried = np.insert(carried, [state] * state, 0.0, axis=1)  # columns of the next state
                 triangle = np.asarray(np.linalg.qr(np.vstack([carried, rows]), mode="r"))
-                eliminated.append(triangle[:STATES])
-                carried = triangle[STATES:, STATES:]
-            condensed = np.vstack([condensed, carried[:, STATES:]])
+                eliminated.append(triangle[:state])
+                carried = triangle[state:, state:]
+            condensed = np.vstack([condensed, carried[:, state:]])
             self._eliminated.append(eliminated)
         triangle = np.asarray(np.linalg.qr(condensed, mode="r"))
         return cost, triangle[:size, :size], triangle[:size, size]
 
     def _moved(self, parameters: Array) -> list[Array]:
-        """The states after the step from the latest linearisation to parameters (67,)."""
+        """The states after the step from the latest linearisation to parameters (p,)."""
         if not self._eliminated:
             return self.states
         step = np.append(parameters - self._at, 1.0)
@@ -182,23 +194,23 @@ def _linearised(part: Segment, parameters: Array, state: Array, following: Array
         np.asarray(one)
         for one in (run.start_sensitivity, run.pose_sensitivity, run.end_start_sensitivity, run.end_sensitivity)
     )
-    counts = float(part.first > 0)
-    values, own = part.whitened(run.pose - part.measured), counts * part.whitened(by_state[:, :, :STATES])
+    counts, size = float(part.first > 0), len(part.state_std)
+    values, own = part.whitened(run.pose - part.measured), counts * part.whitened(by_state[:, :, :size])
     rows = np.column_stack([own, np.zeros_like(own), part.whitened(by_parameters), values])
     if following is None:
         return rows
-    own, gap = counts * end_by_state[:STATES, :STATES], end_state(run) - following
-    joint = np.column_stack([own, -np.eye(STATES), end_by_parameters[:STATES], gap])
+    own, gap = counts * end_by_state[:size, :size], end_state(run, part.chart) - following
+    joint = np.column_stack([own, -np.eye(size), end_by_parameters[:size], gap])
     return np.vstack([rows, joint / part.state_std[:, None]])
 
 
 def _moved_chain(states: Array, eliminated: list[Array], step: Array) -> Array:
-    """States (segments, 18) after a step (68,) of the parameters (its last entry 1), by the triangles of their QR."""
-    moved = states.copy()
-    following: Array = np.zeros(STATES)
+    """States (segments, s) after a step (p + 1,) of the parameters (its last entry 1), by the triangles of their QR."""
+    moved, size = states.copy(), states.shape[1]
+    following: Array = np.zeros(size)
     for k in reversed(range(len(states))):
         triangle = eliminated[k]
-        right = triangle[:, STATES : 2 * STATES] @ following + triangle[:, 2 * STATES :] @ step
-        following = np.asarray(-np.linalg.solve(triangle[:, :STATES], right), dtype=float)
+        right = triangle[:, size : 2 * size] @ following + triangle[:, 2 * size :] @ step
+        following = np.asarray(-np.linalg.solve(triangle[:, :size], right), dtype=float)
         moved[k] += following
     return moved

@@ -22,7 +22,7 @@ from identify.record.recorded_run import RecordedRun
 
 @dataclass(frozen=True)
 class OutputErrorProblem:
-    """Least-squares problem in the 67 parameters over one or several records, for `bounded_least_squares.minimise`;
+    """Least-squares problem in a robot's parameters over one or several records, for `bounded_least_squares.minimise`;
     physical: whether only bodies that can exist are allowed."""
 
     runs: tuple[RecordedRun, ...]
@@ -63,10 +63,10 @@ class OutputErrorProblem:
         return cost, triangle[:size, :size], triangle[:size, size]
 
     def known_information(self) -> Array:
-        """Information (67, 67) of what is known beside the poses."""
+        """Information (p, p) of what is known beside the poses."""
         _, rows = self.known(self.guess.values)
         return np.asarray(rows.T @ rows, dtype=float)
 
     def known(self, parameters: Array) -> tuple[Array, Array]:
-        """Residuals (k,) of what is known beside the poses, and their rows (k, 67)."""
+        """Residuals (k,) of what is known beside the poses, and their rows (k, p)."""
         return prior_residuals(parameters, self.guess, self.anchor)

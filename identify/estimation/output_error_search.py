@@ -26,7 +26,7 @@ CLOSE_ENOUGH = 1e-2
 def output_error_searches(
     problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress: Progress
 ) -> dict[str, Solution]:
-    """What each search found, in their order, from the warm start (67,); the last is that of the scenario's method.
+    """What each search found, in their order, from the warm start (p,); the last is that of the scenario's method.
 
     Raises EstimationError: no model that runs.
     """
@@ -47,7 +47,7 @@ def output_error_searches(
 
 
 def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance) -> Solution:
-    """Minimise one output-error problem from parameters (67,), within its bounds."""
+    """Minimise one output-error problem from parameters (p,), within its bounds."""
     settings = scenario.identification
     criteria = StopCriteria(settings.cost_tolerance, settings.parameter_tolerance, settings.max_iterations)
     return _within_bounds(problem, problem, start, criteria, advance)
@@ -77,14 +77,14 @@ def shoot(problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress
 
 
 def runnable_start(problem: OutputErrorProblem, warm: Array) -> Array | None:
-    """The better of warm start and starting guess (67,), within the bounds; None where the model runs with neither."""
+    """The better of warm start and starting guess (p,), within the bounds; None where the model runs with neither."""
     costs = [(problem.cost(start), start) for start in _candidates(problem, warm)]
     cost, start = min(costs, key=lambda entry: entry[0])
     return start if np.isfinite(cost) else None
 
 
 def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
-    """The better of what the command-driven search found (67,) and the starting guess, for the closed loop."""
+    """The better of what the command-driven search found (p,) and the starting guess, for the closed loop."""
     start = runnable_start(problem, driven)
     if start is None:
         raise EstimationError(

@@ -9,19 +9,21 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynamics import Robot
-from dynamics.parameters import COULOMB_NAMES, VISCOUS_NAMES
+from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.estimation.scale_anchor import ScaleAnchor
-from identify.loop_parameters import NAMES, check_parameter_set, index_of
+from identify.loop_parameters import check_parameter_set
 from identify.scenario import PriorValue
 
 
 @dataclass(frozen=True)
 class StartingGuess:
-    """What is known before the experiment: values (67,) and their standard deviations (67,), SI."""
+    """What is known before the experiment of a robot's parameters: values (p,) and standard deviations (p,), SI."""
 
+    layout: ParameterLayout
     values: Array
     std: Array
 
@@ -37,29 +39,34 @@ def starting_guess(
     check_parameter_set(robot, set_name)
     chosen = robot.parameter_sets[set_name]
     torque = holding_torque(robot, chosen.dynamic)
-    values, std = chosen.vector.copy(), relative_std * typical_sizes(chosen.vector, torque)
+    values, std = chosen.vector.copy(), relative_std * typical_sizes(robot.layout, chosen.vector, torque)
     for name, prior in known.items():
-        values[index_of(name)], std[index_of(name)] = prior.value, prior.std
-    return StartingGuess(values, std)
+        place = robot.layout.names.index(name)
+        values[place], std[place] = prior.value, prior.std
+    return StartingGuess(robot.layout, values, std)
 
 
 def holding_torque(robot: Robot, dynamic: Array) -> float:
-    """Mean torque [N m] that the joints hold at the home pose, with dynamic parameters (64,)."""
+    """Mean torque [N m] or force [N] that the joints hold at the home pose, with dynamic parameters (p,)."""
     return float(np.abs(robot.static_torque(robot.home_pose, dynamic)).mean())
 
 
-def typical_sizes(values: Array, torque: float) -> Array:
-    """Size (67,) of each parameter: its own value, and for friction [N m, N m s/rad] the holding torque [N m].
+def typical_sizes(layout: ParameterLayout, values: Array, torque: float) -> Array:
+    """Size (p,) of each parameter: its own value, and for friction the torque [N m] or force [N] that the joints hold.
 
     A specification says little about friction; a joint that rubs more than it carries would be called broken.
     """
-    friction = np.isin(NAMES, COULOMB_NAMES + VISCOUS_NAMES)
-    return np.where(friction, torque, np.where(values > 0, values, 1.0))
+    return np.where(friction(layout), torque, np.where(values > 0, values, 1.0))
+
+
+def friction(layout: ParameterLayout) -> NDArray[np.bool_]:
+    """Whether each parameter (p,) is one of friction."""
+    return np.isin(layout.names, layout.coulomb_names + layout.viscous_names)
 
 
 def prior_residuals(parameters: Array, guess: StartingGuess, anchor: ScaleAnchor) -> tuple[Array, Array]:
-    """Residuals (k,) of what is known beside the poses, in standard deviations, and their rows (k, 67)."""
-    place, measured = anchor.row()
+    """Residuals (k,) of what is known beside the poses, in standard deviations, and their rows (k, p)."""
+    place, measured = anchor.row(guess.layout)
     rows = np.vstack([np.diag(1 / guess.std), place])
     values = np.concatenate([guess.values / guess.std, measured])
     return rows @ parameters - values, rows

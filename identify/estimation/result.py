@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynamics.parameters import unit_of
+from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.estimation.covariance import correlation_matrix, strongest_pairs
 from identify.estimation.explanation import Misfit, Whiteness
@@ -27,10 +27,10 @@ STRONGEST = 10
 
 @dataclass(frozen=True)
 class IdentificationResult:
-    """What one record says about the 67 parameters, in the order of `names`; SI.
+    """What one record says about the parameters of a robot, in the order of its `layout`; SI.
 
-    initial, warm_start, estimate, std (67,), covariance (67, 67), the last two as they were without bounds; intervals
-    (67, 2): 95 %, cut at the bounds; identifiable (67,) bool; rests_on_prior (67,) bool: identified, but only with what
+    initial, warm_start, estimate, std (p,), covariance (p, p), the last two as they were without bounds; intervals
+    (p, 2): 95 %, cut at the bounds; identifiable (p,) bool; rests_on_prior (p,) bool: identified, but only with what
     the guess says of other parameters; groups, group_intervals: what the record says of the base parameters;
     base_rank: independent groups that the trajectory excites by the paper's rule; iterations and evaluations: of all
     searches; stop_reason: of the last; searches: their names in order, and costs: after each iteration, one tuple a
@@ -40,7 +40,7 @@ class IdentificationResult:
     commands.
     """
 
-    names: tuple[str, ...]
+    layout: ParameterLayout
     initial: Array
     warm_start: Array
     estimate: Array
@@ -67,6 +67,11 @@ class IdentificationResult:
     warnings: tuple[str, ...]
     seconds: dict[str, float]
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.layout.names
+
     def __repr__(self) -> str:
         misfit = Misfit(self.noise_ratio, self.expected_noise_ratio, self.noise_ratio_std)
         return (
@@ -80,7 +85,7 @@ class IdentificationResult:
         import pandas as pd
 
         columns = {
-            "unit": [unit_of(name) for name in self.names],
+            "unit": [self.layout.unit(name) for name in self.names],
             "initial": self.initial,
             "estimate": self.estimate,
             "std": self.std,
@@ -119,7 +124,7 @@ class IdentificationResult:
 
     def _parameter(self, k: int) -> dict[str, Any]:
         return {
-            "unit": unit_of(self.names[k]),
+            "unit": self.layout.unit(self.names[k]),
             "initial": self.initial[k],
             "true": None,
             "warm_start": self.warm_start[k],

@@ -15,19 +15,23 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from dynamics.parameters import unit_of
+from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import as_number, shown
-from identify.loop_parameters import NAMES, index_of
 
 MEASURED_PARAMETER = {"platform_mass": "platform.mass", "joint_gain": "joint_pid.lp"}
 """Anchors that measure a parameter."""
 
 ANCHORS = (*MEASURED_PARAMETER, "payload", "prior")
 
-DEFAULT_STD = {"platform_mass": 0.005, "joint_gain": 0.01}
-"""Standard deviation of an ordinary platform balance [kg], and of a gain read from the controller's data [N m/rad]."""
+DEFAULT_STD = {"kg": 0.005, "N m/rad": 0.01, "N/m": 10.0}
+"""Standard deviation of an ordinary platform balance [kg], and of a gain read from the controller's data, by units."""
+
+
+def default_std(name: str, layout: ParameterLayout) -> float:
+    """Standard deviation [SI] of an ordinary instrument for what an anchor measures of a robot."""
+    return DEFAULT_STD[layout.unit(MEASURED_PARAMETER[name])]
 
 
 @dataclass(frozen=True)
@@ -38,21 +42,25 @@ class ScaleAnchor:
     value: float | None = None
     std: float | None = None
 
-    def row(self) -> tuple[Array, Array]:
-        """What was measured as equations: rows (k, 67) and right side (k,), in standard deviations; k is 0 or 1."""
+    def row(self, layout: ParameterLayout) -> tuple[Array, Array]:
+        """What was measured as equations: rows (k, p) and right side (k,), in standard deviations; k is 0 or 1."""
         if self.value is None or self.std is None:
-            return np.zeros((0, len(NAMES))), np.zeros(0)
-        row = np.zeros((1, len(NAMES)))
-        row[0, index_of(MEASURED_PARAMETER[self.name])] = 1 / self.std
+            return np.zeros((0, len(layout.names))), np.zeros(0)
+        row = np.zeros((1, len(layout.names)))
+        row[0, layout.names.index(MEASURED_PARAMETER[self.name])] = 1 / self.std
         return row, np.array([self.value / self.std])
 
 
-def measured_anchor(name: str, std: float | None, true: Array, rng: np.random.Generator) -> ScaleAnchor:
-    """The anchor as an experimenter with an instrument of standard deviation `std` (or the usual one) brings it."""
+def measured_anchor(
+    name: str, std: float | None, layout: ParameterLayout, true: Array, rng: np.random.Generator
+) -> ScaleAnchor:
+    """The anchor as an experimenter with an instrument of standard deviation `std` (or the usual one) brings it, of a
+    robot whose true parameters (p,) are `true`."""
     if name not in MEASURED_PARAMETER:
         return ScaleAnchor(name)
-    spread = DEFAULT_STD[name] if std is None else std
-    return ScaleAnchor(name, float(true[index_of(MEASURED_PARAMETER[name])] + spread * rng.standard_normal()), spread)
+    spread = default_std(name, layout) if std is None else std
+    measured = true[layout.names.index(MEASURED_PARAMETER[name])]
+    return ScaleAnchor(name, float(measured + spread * rng.standard_normal()), spread)
 
 
 def store_anchor(record: xr.Dataset, anchor: ScaleAnchor) -> None:
@@ -62,8 +70,8 @@ def store_anchor(record: xr.Dataset, anchor: ScaleAnchor) -> None:
         record.attrs |= {"scale_anchor_value": anchor.value, "scale_anchor_std": anchor.std}
 
 
-def read_anchor(record: xr.Dataset) -> ScaleAnchor:
-    """The anchor's measurement of a record.
+def read_anchor(record: xr.Dataset, layout: ParameterLayout) -> ScaleAnchor:
+    """The anchor's measurement of a record of a robot.
 
     Raises RecordError: the record has none, so that the scale of its parameters is free; or a measured value or
     standard deviation that is no finite number > 0.
@@ -76,10 +84,11 @@ def read_anchor(record: xr.Dataset) -> ScaleAnchor:
         )
     if name not in MEASURED_PARAMETER:
         return ScaleAnchor(str(name))
-    return ScaleAnchor(str(name), _positive(record, "scale_anchor_value"), _positive(record, "scale_anchor_std"))
+    value, std = (_positive(record, f"scale_anchor_{what}", layout) for what in ("value", "std"))
+    return ScaleAnchor(str(name), value, std)
 
 
-def _positive(record: xr.Dataset, attribute: str) -> float:
+def _positive(record: xr.Dataset, attribute: str, layout: ParameterLayout) -> float:
     """A record's attribute that must be a finite number > 0."""
     value = record.attrs.get(attribute)
     number = as_number(value)
@@ -88,6 +97,6 @@ def _positive(record: xr.Dataset, attribute: str) -> float:
         measured = MEASURED_PARAMETER[anchor]
         raise RecordError(
             f"the record's attribute {attribute} is {shown(value)}, must be a finite number > 0 in "
-            f"{unit_of(measured)}: the scale anchor {anchor} measures {measured}"
+            f"{layout.unit(measured)}: the scale anchor {anchor} measures {measured}"
         )
     return number

@@ -1,10 +1,11 @@
 """Linear warm start: the closed-loop equation is linear in everything unknown, so one fit starts the search close by.
 
-With the logged commands U and the crank angles theta of the measured poses, at every instant
+With the logged commands U and the joint coordinates theta of the measured poses, at every instant
 
     J_ad^-T Gamma(pose, twist, twist_dot) Xi - lp (U - theta) - ld (U_dot - theta_dot) - li integral(U - theta) = z
 
-with z the torque the integrators held at the start (6,). Poses are filtered and differentiated. Each row is the balance
+with z the torque the integrators held at the start (n,). Poses are filtered and differentiated, and of those of a
+platform with fewer freedoms its coordinates count, along which the wrench Gamma Xi is balanced. Each row is the balance
 of one joint, whose dry friction is known only while it slips: rows of joints near rest are left out. The equation is
 homogeneous: the scale anchor, and weakly the starting guess, decide the common factor.
 """
@@ -22,7 +23,6 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.prior import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.filtering import filtered_derivatives, zero_phase_filter
-from identify.loop_parameters import NAMES
 from identify.record.recorded_run import RecordedRun
 from identify.scenario import Scenario
 
@@ -37,53 +37,58 @@ REWEIGHTINGS = 3
 
 
 def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
-    """Parameters (67,) fitted to the measured poses and commands of the problem's runs.
+    """Parameters (p,) fitted to the measured poses and commands of the problem's runs.
 
     Each run has its own starting torques; what a known payload adds stands on the right side. The residual's size is
     estimated from the fit itself, so that the starting guess counts as much as it should.
     """
     matrix, right = _stacked(problem.runs, scenario)
-    lower = np.concatenate([np.zeros(len(NAMES)), np.full(matrix.shape[1] - len(NAMES), -np.inf)])
+    count = len(problem.guess.values)
+    lower = np.concatenate([np.zeros(count), np.full(matrix.shape[1] - count, -np.inf)])
     noise = 0.1
     for _ in range(REWEIGHTINGS):
         solution = bounded_fit(matrix / noise, right / noise, problem.guess, problem.anchor, lower)
         noise = max(float(np.sqrt(np.mean((matrix @ solution - right) ** 2))), 1e-9)
-    return np.maximum(solution[: len(NAMES)], 0.0)
+    return np.maximum(solution[:count], 0.0)
 
 
 def _stacked(runs: Sequence[RecordedRun], scenario: Scenario) -> tuple[Array, Array]:
-    """Equations of all runs: matrix (rows, 67 + 6 runs) and right side (rows,), N m."""
+    """Equations of all runs: matrix (rows, p + n runs) and right side (rows,), N m or N."""
     matrices, right = [], []
+    layout = runs[0].robot.layout
+    count, joints = len(layout.names), layout.joints
     for place, run in enumerate(runs):
         balance, slipping = joint_balance(run.robot, run.without_gaps(), run.logged, scenario)
         columns = balance[slipping]
-        matrix = np.zeros((len(columns), len(NAMES) + 6 * len(runs)))
-        matrix[:, : len(NAMES)] = columns[:, : len(NAMES)]
-        matrix[:, len(NAMES) + 6 * place :][:, :6] = columns[:, len(NAMES) :]
+        matrix = np.zeros((len(columns), count + joints * len(runs)))
+        matrix[:, :count] = columns[:, :count]
+        matrix[:, count + joints * place :][:, :joints] = columns[:, count:]
         matrices.append(matrix)
-        right.append(-columns[:, : len(NAMES)] @ run.payload)
+        right.append(-columns[:, :count] @ run.payload)
     return np.concatenate(matrices), np.concatenate(right)
 
 
 def joint_balance(
     robot: Robot, measured: Array, commands: Array, scenario: Scenario
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Torque balance of every joint (N, 6, 73) of poses (N, 6) and commands (N, 6), and where it slips (N, 6).
+    """Torque balance of every joint (N, n, p + n) of poses (N, 6) and commands (N, n), and where it slips (N, n).
 
-    Columns: 64 dynamic parameters, which give the joint's torque, then lp, li, ld and the six starting torques, which
-    give the controller's with the opposite sign; N m per unit of each.
+    Columns: the dynamic parameters, which give the joint's torque, then lp, li, ld and the starting torques, which give
+    the controller's with the opposite sign; N m or N per unit of each.
     """
     rate_hz, cutoff_hz, order = scenario.timing.frame_rate_hz, scenario.filter.cutoff_hz, scenario.filter.order
-    pose, pose_rate, acceleration = filtered_derivatives(measured, rate_hz, cutoff_hz, order)
+    chart = robot.geometry.chart
+    coordinates = filtered_derivatives(chart.coordinates(measured), rate_hz, cutoff_hz, order)
+    pose, pose_rate, acceleration = chart.pose(coordinates[0]), *(chart.lifted(rows) for rows in coordinates[1:])
     twist, twist_dot = robot.twist(pose, pose_rate), robot.twist_dot(pose, pose_rate, acceleration)
-    regressor = robot.regressor(pose, twist, twist_dot)
-    torque_map = np.linalg.inv(robot.joint_jacobian(pose)).transpose(0, 2, 1)
+    regressor = chart.basis.T @ robot.regressor(pose, twist, twist_dot)
+    torque_map = np.linalg.inv(robot.joint_jacobian(pose) @ chart.basis).transpose(0, 2, 1)
     angle = robot.inverse_kinematics(pose)
     velocity = np.einsum("nij,nj->ni", robot.joint_jacobian(pose), twist)
     command, command_rate, integral = effective_command(commands, scenario)
     angle_integral = running_integral(angle, rate_hz)
-    count = len(measured)
-    start = np.broadcast_to(-np.eye(6), (count, 6, 6))
+    count, joints = len(measured), robot.layout.joints
+    start = np.broadcast_to(-np.eye(joints), (count, joints, joints))
     pid = -np.stack([command - angle, integral - angle_integral, command_rate - velocity], axis=2)
     columns = np.concatenate([torque_map @ regressor, pid, start], axis=2)
     slipping = np.abs(velocity) > SLIPPING_SHARE * velocity.std(axis=0)
@@ -116,14 +121,15 @@ def running_integral(samples: Array, rate_hz: float) -> Array:
 
 
 def bounded_fit(matrix: Array, right: Array, guess: StartingGuess, anchor: ScaleAnchor, lower: Array) -> Array:
-    """Unknowns (p,) >= lower of whitened equations (rows, p), beside the starting guess and the anchor.
+    """Unknowns (u,) >= lower of whitened equations (rows, u), beside the starting guess and the anchor.
 
-    The first 67 unknowns are the parameters; of those after them nothing is known beforehand.
+    The first p unknowns are the parameters; of those after them nothing is known beforehand.
     """
-    size, extra = matrix.shape[1], matrix.shape[1] - len(NAMES)
+    size, known_size = matrix.shape[1], len(guess.values)
+    extra = size - known_size
     triangle = np.asarray(np.linalg.qr(np.column_stack([matrix, right]), mode="r"))[:size]
-    prior = np.eye(len(NAMES), size) / guess.std[:, None]
-    place, measured = anchor.row()
+    prior = np.eye(known_size, size) / guess.std[:, None]
+    place, measured = anchor.row(guess.layout)
     known = np.vstack([triangle[:, :size], prior, np.pad(place, ((0, 0), (0, extra)))])
     values = np.concatenate([triangle[:, size], guess.values / guess.std, measured])
     scale = np.concatenate([guess.std, np.ones(extra)])

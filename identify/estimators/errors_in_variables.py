@@ -27,8 +27,6 @@ from identify.estimation.prior import StartingGuess
 from identify.estimation.warm_start import REWEIGHTINGS
 from identify.estimators.estimator import Estimate, Evidence, estimator
 from identify.estimators.least_squares import (
-    DYNAMIC,
-    UNKNOWNS,
     TorqueEquations,
     fit_equations,
     information,
@@ -39,7 +37,6 @@ from identify.estimators.least_squares import (
     standard_deviations,
     torque_equations,
 )
-from identify.loop_parameters import NAMES
 from identify.random_streams import DISTURBED_COPIES, mixed_generator
 
 MAX_ITERATIONS = 10
@@ -57,22 +54,23 @@ def instrumental_variables(evidence: Evidence) -> Estimate:
     began = time.perf_counter()
     equations, guess = measured_equations(evidence), evidence.problem.guess
     unknowns, noise = fit_equations(equations, guess, weighted=True)
+    count = len(guess.values)
     runs, moved = 0, np.array([np.inf])
     while moved.max() > SETTLED and runs < MAX_ITERATIONS:
-        instruments = _simulated_matrix(evidence, equations, unknowns[: len(NAMES)])
+        instruments = _simulated_matrix(evidence, equations, unknowns[:count])
         new, covariance = iv_fit(equations, instruments, noise, guess)
-        moved = np.abs(new - unknowns)[: len(NAMES)] / standard_deviations(covariance)
+        moved = np.abs(new - unknowns)[:count] / standard_deviations(covariance, count)
         unknowns, noise, runs = new, row_noise(equations, new, equations.kind), runs + 1
     seconds = time.perf_counter() - began
     note = f"last step {moved.max():.2g} standard deviations"
-    std = standard_deviations(covariance)
-    return Estimate(unknowns[: len(NAMES)], std, seconds, REWEIGHTINGS + runs, runs, note)
+    std = standard_deviations(covariance, count)
+    return Estimate(unknowns[:count], std, seconds, REWEIGHTINGS + runs, runs, note)
 
 
 def iv_fit(equations: TorqueEquations, instruments: Array, noise: Array, guess: StartingGuess) -> tuple[Array, Array]:
-    """Unknowns (73,) with Z^T (W x - tau) = 0 in whitened rows, beside the starting guess, and their covariance.
+    """Unknowns (u,) with Z^T (W x - tau) = 0 in whitened rows, beside the starting guess, and their covariance.
 
-    instruments: Z (2 n, 73); noise (2 n,): standard deviations of the rows, N m.
+    instruments: Z (2 n, u); noise (2 n,): standard deviations of the rows, N m or N.
     """
     values, std = prior_of(guess)
     rows, z = equations.whitened(noise), instruments / noise[:, None]
@@ -84,11 +82,11 @@ def iv_fit(equations: TorqueEquations, instruments: Array, noise: Array, guess: 
     spread = (z.T @ z) * np.outer(std, std) + prior
     covariance = inverse @ spread @ inverse.T * np.outer(std, std)
     unknowns = values + std * (inverse @ moment)
-    return nearest_admissible(unknowns, spread / np.outer(std, std), std), covariance
+    return nearest_admissible(guess.layout, unknowns, spread / np.outer(std, std), std), covariance
 
 
 def _simulated_matrix(evidence: Evidence, equations: TorqueEquations, parameters: Array) -> Array:
-    """Regression matrix (2 n, 73) of the model's own closed loop, at the rows of the equations."""
+    """Regression matrix (2 n, u) of the model's own closed loop, at the rows of the equations."""
     try:
         simulated = evidence.run.simulate(parameters)
     except DynamicsError as error:
@@ -120,14 +118,15 @@ def total_least_squares(evidence: Evidence) -> Estimate:
     values, std = prior_of(guess)
     rows, half = equations.whitened(noise), len(noise) // 2
     unknowns, deviations = values.copy(), std.copy()
-    for block, columns in ((slice(0, half), slice(0, DYNAMIC)), (slice(half, None), slice(DYNAMIC, UNKNOWNS))):
+    dynamic, count = guess.layout.dynamic, len(guess.values)
+    for block, columns in ((slice(0, half), dynamic), (slice(half, None), slice(dynamic.stop, len(std)))):
         matrix, right = rows.matrix[block, columns], rows.right[block]
         solution, covariance = _fit_block(matrix, right, errors[:, block], columns, values, std)
         unknowns[columns] += std[columns] * solution
         deviations[columns] *= np.sqrt(np.diag(covariance))
-    admissible = nearest_admissible(unknowns, information(rows, guess), std)
+    admissible = nearest_admissible(guess.layout, unknowns, information(rows, guess), std)
     seconds = time.perf_counter() - began
-    return Estimate(admissible[: len(NAMES)], deviations[: len(NAMES)], seconds, REWEIGHTINGS + 1)
+    return Estimate(admissible[:count], deviations[:count], seconds, REWEIGHTINGS + 1)
 
 
 def truncated_tls(matrix: Array, right: Array, errors: Array) -> tuple[Array, Array]:
@@ -164,14 +163,14 @@ def _fit_block(
     matrix: Array, right: Array, errors: Array, columns: slice, values: Array, std: Array
 ) -> tuple[Array, Array]:
     """Fit of one block of unknowns, counted from the starting guess in its standard deviations."""
-    block = errors[..., [*range(UNKNOWNS)[columns], -1]]
+    block = errors[..., [*range(len(std))[columns], -1]]
     block[..., -1] -= block[..., :-1] @ values[columns]
     scale = std[columns]
     return truncated_tls(matrix * scale, right - matrix @ values[columns], block * np.append(scale, 1.0))
 
 
 def _drawn_errors(evidence: Evidence, equations: TorqueEquations, noise: Array) -> Array:
-    """Errors (draws, 2 n, 74) of the whitened columns and right side, from drawn noise of poses and torques."""
+    """Errors (draws, 2 n, u + 1) of the whitened columns and right side, from drawn noise of poses and torques."""
     rng, run, channels = mixed_generator(DISTURBED_COPIES), evidence.run, evidence.joint_channels()
     factor, poses, drawn = np.linalg.cholesky(run.covariance), run.without_gaps(), []
     for _ in range(DRAWS):

@@ -21,7 +21,7 @@ from identify.scenario import Scenario
 
 @dataclass(frozen=True)
 class JointChannels:
-    """Channels of the joints: torque (N, 6) in N m, mean over a frame, and encoder angle (N, 6) in rad."""
+    """Channels of n joints: torque (N, n) in N m or N, mean over a frame, and encoder angle (N, n) in rad or m."""
 
     torque: Array
     angle: Array
@@ -52,7 +52,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Parameters (67,) with standard deviations (67,) (None: the method states none), seconds without those of the
+    """Parameters (p,) with standard deviations (p,) (None: the method states none), seconds without those of the
     standard deviations, iterations (searches: steps; linear fits: solutions), evaluations: simulated runs of the model,
     those with sensitivities counted once."""
 

@@ -1,11 +1,11 @@
-"""Inverse dynamics by least squares: measured torque, ordinary and weighted; or crank angles from encoders.
+"""Inverse dynamics by least squares: measured torque, ordinary and weighted; or joint coordinates from encoders.
 
 With tau the filtered torque of a slipping joint, at every instant (eq. 17 and 25; eq. 31)
 
     (J_ad^-T Gamma(chi, v, v_dot) Xi)_j = tau_j
     lp (U - theta)_j + li integral(U - theta)_j + ld (U_dot - theta_dot)_j + z_j = tau_j
 
-Both stand in one system with the unknowns Xi, lp, li, ld and the starting torques z (6,). The measured torque gives
+Both stand in one system with the unknowns Xi, lp, li, ld and the starting torques z (n,). The measured torque gives
 the scale: no anchor is needed. What the motion does not show is left to the starting guess with its deviations.
 
 Noise in the poses gets into the regression matrix through both derivatives, which draws the estimates towards zero: no
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from dynamics import DynamicsError
+from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.prior import StartingGuess
@@ -28,23 +29,26 @@ from identify.estimation.scale_anchor import ScaleAnchor
 from identify.estimation.warm_start import REWEIGHTINGS, bounded_fit, joint_balance
 from identify.estimators.estimator import Estimate, Evidence, estimator
 from identify.filtering import zero_phase_filter
-from identify.loop_parameters import NAMES
 from identify.record.recorded_run import RecordedRun
 from identify.scenario import Scenario
 
-DYNAMIC, UNKNOWNS = 64, len(NAMES) + 6
-
-FREE_TORQUE_N_M = 1e3
-"""Standard deviation of a starting torque before the experiment: nothing is known of it."""
+FREE_TORQUE = {False: 1e3, True: 1e6}
+"""Standard deviation of a starting torque [N m], or of a force [N] of prismatic joints, before the experiment: nothing
+is known of it."""
 
 
 @dataclass(frozen=True)
 class TorqueEquations:
-    """matrix (2 n, 73) times unknowns = right (2 n,), N m: n rows of the dynamics, then the same of the controller.
+    """matrix (2 n, u) times the u unknowns = right (2 n,), N m or N: n rows of the dynamics, then the same of the
+    controller.
 
-    kind (2 n,): 0 to 5 dynamics of each joint, 6 to 11 its controller; correlation: samples to one independent sample,
-    because a low-pass filter of cutoff f leaves 2 f independent ones a second; slipping (N, 6): which rows stand here.
+    layout: of the parameters, the first unknowns; after them come the starting torques of the joints. kind (2 n,):
+    number of the joint for its dynamics, and that after all joints for its controller; correlation: samples to one
+    independent sample, because a low-pass filter of cutoff f leaves 2 f independent ones a second; slipping (N,
+    joints): which rows stand here.
     """
+
+    layout: ParameterLayout
 
     matrix: Array
     right: Array
@@ -64,38 +68,44 @@ class TorqueEquations:
 def torque_equations(
     run: RecordedRun, poses: Array, torque: Array, scenario: Scenario, slipping: NDArray[np.bool_] | None = None
 ) -> TorqueEquations:
-    """Equations of poses (N, 6) and torques (N, 6) of a run with its logged commands; those of the joints that slip, or
-    of the ones given (N, 6)."""
+    """Equations of poses (N, 6) and torques (N, n) of a run with its logged commands; those of the joints that slip, or
+    of the ones given (N, n)."""
     timing, filtering = scenario.timing, scenario.filter
     balance, found = joint_balance(run.robot, poses, run.logged, scenario)
     rows = found if slipping is None else slipping
     columns = balance[rows]
     smooth = zero_phase_filter(torque, timing.frame_rate_hz, filtering.cutoff_hz, filtering.order)[rows]
-    matrix = np.zeros((2 * len(columns), UNKNOWNS))
-    matrix[: len(columns), :DYNAMIC] = columns[:, :DYNAMIC]
-    matrix[len(columns) :, DYNAMIC:] = -columns[:, DYNAMIC:]
+    layout = run.robot.layout
+    dynamic, others = layout.dynamic, slice(layout.dynamic.stop, None)
+    matrix = np.zeros((2 * len(columns), columns.shape[1]))
+    matrix[: len(columns), dynamic] = columns[:, dynamic]
+    matrix[len(columns) :, others] = -columns[:, others]
     joint = np.nonzero(rows)[1]
-    right = np.concatenate([smooth - columns[:, :DYNAMIC] @ run.payload[:DYNAMIC], smooth])
+    right = np.concatenate([smooth - columns[:, dynamic] @ run.payload[dynamic], smooth])
     correlation = max(1.0, timing.frame_rate_hz / (2 * filtering.cutoff_hz))
-    return TorqueEquations(matrix, right, np.concatenate([joint, joint + 6]), correlation, rows)
+    kind = np.concatenate([joint, joint + layout.joints])
+    return TorqueEquations(layout, matrix, right, kind, correlation, rows)
 
 
-LOWER = np.concatenate([np.zeros(len(NAMES)), np.full(6, -np.inf)])
-"""Bounds (73,): parameters and gains are not negative, starting torques are free."""
+def lower_bounds(layout: ParameterLayout) -> Array:
+    """Bounds (u,): parameters and gains are not negative, starting torques are free."""
+    return np.concatenate([np.zeros(len(layout.names)), np.full(layout.joints, -np.inf)])
 
 
 def prior_of(guess: StartingGuess) -> tuple[Array, Array]:
-    """Values (73,) and standard deviations (73,) of the unknowns before the experiment."""
-    return np.append(guess.values, np.zeros(6)), np.append(guess.std, np.full(6, FREE_TORQUE_N_M))
+    """Values (u,) and standard deviations (u,) of the unknowns before the experiment."""
+    joints, free = guess.layout.joints, FREE_TORQUE[guess.layout.prismatic]
+    return np.append(guess.values, np.zeros(joints)), np.append(guess.std, np.full(joints, free))
 
 
-def nearest_admissible(unknowns: Array, information: Array, scale: Array) -> Array:
-    """Unknowns (73,) within their bounds that are nearest in the metric of the information matrix (73, 73)."""
-    if (unknowns >= LOWER).all():
+def nearest_admissible(layout: ParameterLayout, unknowns: Array, information: Array, scale: Array) -> Array:
+    """Unknowns (u,) within their bounds that are nearest in the metric of the information matrix (u, u)."""
+    lower = lower_bounds(layout)
+    if (unknowns >= lower).all():
         return unknowns
     factor = np.linalg.cholesky(information * np.outer(scale, scale)).T
-    solved = lsq_linear(factor, factor @ (unknowns / scale), bounds=(LOWER / scale, np.inf), method="bvls")
-    return np.maximum(solved.x * scale, LOWER)
+    solved = lsq_linear(factor, factor @ (unknowns / scale), bounds=(lower / scale, np.inf), method="bvls")
+    return np.maximum(solved.x * scale, lower)
 
 
 SMALLEST_NOISE_N_M = 1e-9
@@ -136,7 +146,8 @@ def _solved(evidence: Evidence, began: float, weighted: bool, poses: Array | Non
     unknowns, noise = fit_equations(equations, guess, weighted)
     seconds = time.perf_counter() - began
     covariance = np.asarray(np.linalg.inv(information(equations.whitened(noise), guess)), dtype=float)
-    return Estimate(unknowns[: len(NAMES)], standard_deviations(covariance), seconds, REWEIGHTINGS)
+    count = len(guess.values)
+    return Estimate(unknowns[:count], standard_deviations(covariance, count), seconds, REWEIGHTINGS)
 
 
 def measured_equations(evidence: Evidence, poses: Array | None = None) -> TorqueEquations:
@@ -149,15 +160,15 @@ def measured_equations(evidence: Evidence, poses: Array | None = None) -> Torque
 
 
 def fit_equations(equations: TorqueEquations, guess: StartingGuess, weighted: bool) -> tuple[Array, Array]:
-    """Unknowns (73,) of the equations, and the standard deviation (2 n,) of the rows, N m.
+    """Unknowns (u,) of the equations, and the standard deviation (2 n,) of the rows, N m or N.
 
     The deviations come from the residuals, of a joint or of all, and count the filter's correlation.
     """
-    groups = equations.kind if weighted else equations.kind // 6
+    groups = equations.kind if weighted else equations.kind // equations.layout.joints
     noise = np.full(len(equations.right), 0.1)
     for _ in range(REWEIGHTINGS):
         rows = equations.whitened(noise)
-        unknowns = bounded_fit(rows.matrix, rows.right, guess, ScaleAnchor("prior"), LOWER)
+        unknowns = bounded_fit(rows.matrix, rows.right, guess, ScaleAnchor("prior"), lower_bounds(guess.layout))
         noise = row_noise(equations, unknowns, groups)
     return unknowns, noise
 
@@ -170,11 +181,11 @@ def row_noise(equations: TorqueEquations, unknowns: Array, groups: NDArray[np.in
 
 
 def information(rows: TorqueEquations, guess: StartingGuess) -> Array:
-    """Information (73, 73) of whitened rows and the starting guess."""
+    """Information (u, u) of whitened rows and the starting guess."""
     _, std = prior_of(guess)
     return np.asarray(rows.matrix.T @ rows.matrix + np.diag(1 / std**2), dtype=float)
 
 
-def standard_deviations(covariance: Array) -> Array:
-    """Standard deviations (67,) of the parameters from a covariance (73, 73) of the unknowns."""
-    return np.asarray(np.sqrt(np.diag(covariance))[: len(NAMES)], dtype=float)
+def standard_deviations(covariance: Array, count: int) -> Array:
+    """Standard deviations (p,) of the first `count` unknowns, the parameters, from a covariance (u, u) of all."""
+    return np.asarray(np.sqrt(np.diag(covariance))[:count], dtype=float)

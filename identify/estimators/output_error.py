@@ -15,8 +15,6 @@ from identify.estimators.estimator import Estimate, Evidence, estimator
 from identify.progress import SilentProgress
 from identify.random_streams import ROUTES_UNCERTAINTY, mixed_generator
 
-GAINS = slice(64, 67)
-
 KNOWN = 1e-6
 """Relative standard deviation of a gain that is known."""
 
@@ -38,10 +36,12 @@ def known_pid(evidence: Evidence) -> Estimate:
     """Closed-loop output error with the joint PID's gains known. Raises EstimationError where they are not."""
     if evidence.known_gains is None:
         raise EstimationError("the gains of the joint PID are not known: this estimator needs lp, li and ld")
-    values, std = evidence.problem.guess.values.copy(), evidence.problem.guess.std.copy()
-    values[GAINS] = evidence.known_gains
-    std[GAINS] = KNOWN * np.abs(evidence.known_gains)
-    return _searched(evidence, replace(evidence.problem, guess=StartingGuess(values, std)), "closed_loop")
+    guess = evidence.problem.guess
+    values, std, gains = guess.values.copy(), guess.std.copy(), guess.layout.joint_pid
+    values[gains] = evidence.known_gains
+    std[gains] = KNOWN * np.abs(evidence.known_gains)
+    known = StartingGuess(guess.layout, values, std)
+    return _searched(evidence, replace(evidence.problem, guess=known), "closed_loop")
 
 
 @estimator("linear warm start alone", uses="poses")

@@ -15,6 +15,7 @@ from identify.excitation.design import motion_check, random_candidates, search_p
 from identify.excitation.information import knowledge, log_information
 from identify.excitation.motion import sample_times
 from identify.excitation.search import FEWEST_MEMBERS, SEARCHES
+from identify.loop_parameters import of_actuators
 from identify.progress import Progress
 from identify.random_streams import SEARCH, child
 from identify.scenario import Scenario
@@ -93,12 +94,12 @@ POINTS = 1000
 
 
 def comparison_figure(robot: Robot, scenario: Scenario, comparison: Comparison) -> Figure:
-    """One column a method: position, orientation and crank angles over one period, limits dashed."""
-    settings = scenario.excitation
+    """One column a method: position, orientation and joints over one period, limits dashed."""
+    settings, sliding = scenario.excitation, robot.layout.prismatic
     figure = Figure(figsize=(5 * len(comparison.entries), 9), layout="constrained")
     panels = figure.subplots(3, len(comparison.entries), sharex=True, sharey="row", squeeze=False)
     time = np.linspace(0.0, 1.0 / settings.fundamental_hz, POINTS)
-    travel = robot.travel_limit - settings.travel_margin_rad
+    travel = robot.travel_limit - of_actuators(robot, settings, "travel_margin")
     boxes = (1e3 * settings.position_amplitude_m, 1e3 * settings.orientation_amplitude_rad)
     for column, entry in enumerate(comparison.entries):
         poses = entry.trajectory.pose(time)
@@ -107,7 +108,7 @@ def comparison_figure(robot: Robot, scenario: Scenario, comparison: Comparison) 
         rows = [
             (away[:, :3], COMPONENTS[:3], boxes[0]),
             (away[:, 3:], COMPONENTS[3:], boxes[1]),
-            (angles, [f"crank {k}" for k in range(1, 7)], travel),
+            (angles, robot.joint_names, travel),
         ]
         for axes, (values, names, limit) in zip(panels[:, column], rows, strict=True):
             for name, line in zip(names, values.T, strict=True):
@@ -118,7 +119,9 @@ def comparison_figure(robot: Robot, scenario: Scenario, comparison: Comparison) 
         panels[0, column].set_title(f"{entry.method}: index {entry.observability:.3f}, {entry.seconds:.1f} s")
         panels[2, column].set_xlabel("time [s]")
     for axes, label in zip(
-        panels[:, 0], ("position from home [mm]", "orientation from home [mrad]", "crank angle [rad]"), strict=True
+        panels[:, 0],
+        ("position from home [mm]", "orientation from home [mrad]", f"joint [{'m' if sliding else 'rad'}]"),
+        strict=True,
     ):
         axes.set_ylabel(label)
         axes.legend(loc="upper right", fontsize="small", ncols=2)

@@ -3,12 +3,12 @@
 Every constraint is written as the share of its limit that is used; the trajectory is admissible while all shares are
 within -1 and +1:
 
-    box           distance from home over the amplitude that the scenario allows, a pose component
-    travel        crank angle over the travel limit less the margin, a leg
-    velocity      crank velocity over the largest allowed, a leg
+    box           distance from home over the amplitude that the scenario allows, a coordinate
+    travel        joint coordinate over the travel limit less the margin, a leg
+    velocity      joint velocity over the largest allowed, a leg
     leverage      least leverage of J_a1 over the leverage, a leg (see `dynamics.workspace`)
-    conditioning  condition number of the scaled J_a2 over its limit. The one of the Frobenius norm is taken: it is
-                  smooth, and never below that of the 2-norm
+    conditioning  condition number of the scaled J_a2 over its limit, of the 2-norm as everywhere; expressions have that
+                  of a Schatten norm near it, which is smooth, never below, and at most 3 % above
     visibility    angle to grazing and place in the image of four stickers a plane and both cameras; left out where the
                   whole box is proved to be in sight
 
@@ -25,20 +25,23 @@ import numpy as np
 from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.pose_estimation.observation import GRAZING
 from cmmsim.visibility import EDGE_PX, SightLines, sight_lines
-from dynamics import Robot
+from dynamics import DynamicsError, Robot
 from dynamics.kinematics.platform import rotation_matrix
-from dynamics.legs.rss_inverse_kinematics import joint_angles, pose_jacobian, singularity_measures
-from dynamics.workspace import LEAST_LEVERAGE, MOST_CONDITION
+from dynamics.rigid_body.jacobians import joint_coordinates, pose_jacobian, singularity_measures
+from dynamics.workspace import check_motion, measure
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.excitation.motion import is_whole_periods
-from identify.scenario import Scenario
-from identify.trajectory import FourierTrajectory
+from identify.loop_parameters import of_actuators
+from identify.scenario import Excitation, Scenario
+from identify.trajectory import FourierTrajectory, box_of
 
 STICKERS_A_PLANE = 4
 """Stickers of each plane that both cameras must be able to look for at every pose; all where it has fewer."""
 
 PLANES = "ABC"
+
+CONDITIONING = "conditioning"
 
 
 def required_stickers(sight: SightLines, home: Array) -> list[int]:
@@ -107,7 +110,27 @@ def _functions(sight: SightLines, stickers: range | list[int]) -> ca.Function:
     return ca.Function("sight_uses", [pose], [sight_uses(sight, list(stickers), pose)])
 
 
-COMPONENTS = ("x", "y", "z", "alpha", "beta", "gamma")
+SQUARINGS = 6
+"""Of J^T J: the Schatten norm that stands for the 2-norm is that of p = 2^(SQUARINGS + 1)."""
+
+
+def condition_number(matrix: ca.SX) -> ca.SX:
+    """Condition number of a square matrix in a norm near the 2-norm: never below that one, and for six rows at most 3 %
+    above."""
+    inverse = ca.solve(matrix, ca.SX.eye(matrix.rows()))
+    return _schatten_norm(matrix) * _schatten_norm(inverse)
+
+
+def _schatten_norm(matrix: ca.SX) -> ca.SX:
+    """(sum of sigma^p)^(1/p) over the singular values; powers of a matrix whose trace is one cannot overflow."""
+    power = ca.densify(matrix.T @ matrix)
+    logarithm = 0
+    for step in range(SQUARINGS):
+        trace = ca.trace(power)
+        logarithm += ca.log(trace) / 2**step
+        power = (power / trace) @ (power / trace)
+    logarithm += ca.log(ca.trace(power)) / 2**SQUARINGS
+    return ca.exp(logarithm / 2)
 
 
 @dataclass(frozen=True)
@@ -147,32 +170,40 @@ class Worst:
 
 
 class MotionConstraints:
-    """The constraints of a scenario on the motion of a robot."""
+    """The constraints of a scenario on the motion of a robot.
+
+    Raises TrajectoryError, with value, limit and leg, where not even the home pose keeps them, and ScenarioError for
+    settings of another kind of actuators.
+    """
 
     def __init__(self, robot: Robot, scenario: Scenario, sight: SightLines | None = None) -> None:
-        settings, geometry = scenario.excitation, robot.geometry
-        sight = sight or sight_lines(scenario.sensor, scenario.sensor_changes)
-        self.box = np.repeat([settings.position_amplitude_m, settings.orientation_amplitude_rad], 3)
-        stickers = required_stickers(sight, robot.home_pose)
-        self.always_in_sight = within_sight(sight, stickers, robot.home_pose, self.box)
-        travel, velocity = robot.travel_limit - settings.travel_margin_rad, settings.max_joint_velocity_rad_s
+        settings, geometry, chart = scenario.excitation, robot.geometry, robot.geometry.chart
+        margin, velocity = (of_actuators(robot, settings, key) for key in ("travel_margin", "max_joint_velocity"))
+        travel, unit = robot.travel_limit - margin, "m" if robot.layout.prismatic else "rad"
         if travel <= 0:
             raise TrajectoryError(
-                f"excitation.travel_margin_rad = {settings.travel_margin_rad:g} rad leaves nothing of the travel "
-                f"limit {robot.travel_limit:g} rad of {robot.name}"
+                f"excitation.travel_margin_{unit} = {margin:g} {unit} leaves nothing of the travel limit "
+                f"{robot.travel_limit:g} {unit} of {robot.name}"
             )
-        self._pose, self._rate = ca.SX.sym("pose", 6), ca.SX.sym("rate", 6)
+        _check_home(robot, settings, margin)
+        sight = sight or sight_lines(scenario.sensor, scenario.sensor_changes)
+        self.box = box_of(chart, settings.position_amplitude_m, settings.orientation_amplitude_rad)
+        stickers = required_stickers(sight, robot.home_pose)
+        self.always_in_sight = within_sight(sight, stickers, robot.home_pose, chart.lifted(self.box))
+        self._robot, self._pose, self._rate = robot, ca.SX.sym("pose", 6), ca.SX.sym("rate", 6)
         leverage, link_rows = singularity_measures(geometry, self._pose)
-        condition = ca.norm_fro(link_rows) * ca.norm_fro(ca.solve(link_rows, ca.SX.eye(6)))
-        angles, velocities = joint_angles(geometry, self._pose), pose_jacobian(geometry, self._pose) @ self._rate
-        legs, away = tuple(f"leg {k}" for k in range(1, 7)), self._pose - geometry.home_pose
+        joints = joint_coordinates(geometry, self._pose)
+        velocities = pose_jacobian(geometry, self._pose) @ self._rate
+        legs, away = tuple(f"leg {k}" for k in range(1, len(geometry.legs) + 1)), self._pose - geometry.home_pose
+        least, most, count = settings.least_leverage, settings.most_condition, len(legs)
         self.limits = [
-            Limit("box", away / self.box, tuple(self.box), "", COMPONENTS),
-            Limit("travel", angles / travel, (travel,) * 6, " rad", legs),
-            Limit("velocity", velocities / velocity, (velocity,) * 6, " rad/s", legs),
-            Limit("leverage", LEAST_LEVERAGE / leverage, (LEAST_LEVERAGE,) * 6, "", legs, lower=True),
-            Limit("conditioning", condition / MOST_CONDITION, (MOST_CONDITION,), "", ("",)),
+            Limit("box", away[list(chart.freedoms)] / self.box, tuple(self.box), "", chart.coordinate_names),
+            Limit("travel", joints / travel, (travel,) * count, f" {unit}", legs),
+            Limit("velocity", velocities / velocity, (velocity,) * count, f" {unit}/s", legs),
+            Limit("leverage", least / leverage, (least,) * count, "", legs, lower=True),
+            Limit(CONDITIONING, condition_number(link_rows) / most, (most,), "", ("",)),
         ]
+        self._box_units = chart.units
         if not self.always_in_sight:
             names = [
                 f"sticker {sight.platform.sticker_ids[k]}, {side} camera, {what}"
@@ -197,13 +228,16 @@ class MotionConstraints:
         """Where a trajectory, sampled at `times` (N,) [s], comes nearest to each limit; share NaN: out of reach."""
         poses, rates = trajectory.pose(times), trajectory.pose_rate(times)
         used = np.array(self.shares(poses.T, rates.T)).T
+        condition = measure(self._robot, poses).platform_condition
         found, first = [], 0
         for limit in self.limits:
             block = np.abs(used[:, first : first + len(limit.who)])
+            if limit.name == CONDITIONING:
+                block = condition[:, None] / limit.limit[0]
             row, who = np.unravel_index(np.argmax(block), block.shape)  # the first NaN counts as the largest
             share, bound = float(block[row, who]), limit.limit[who]
             value = bound / share if limit.lower else bound * share
-            unit = (" m" if who < 3 else " rad") if limit.name == "box" else limit.unit
+            unit = f" {self._box_units[who]}" if limit.name == "box" else limit.unit
             found.append(Worst(limit.name, value, bound, unit, share, limit.who[who], float(times[row])))
             first += len(limit.who)
         return found
@@ -218,6 +252,14 @@ class MotionConstraints:
         if broken:
             raise TrajectoryError(f"the trajectory is not admissible: {max(broken, key=Worst.excess)}")
         return found
+
+
+def _check_home(robot: Robot, settings: Excitation, margin: float) -> None:
+    """Raise TrajectoryError where the home pose breaks a limit that the robot has."""
+    try:
+        check_motion(robot, robot.home_pose, travel_margin=margin, **settings.singularity_limits)
+    except DynamicsError as error:
+        raise TrajectoryError(f"{robot.name} may not even be at home: {error}") from error
 
 
 def check_periods(scenario: Scenario) -> None:

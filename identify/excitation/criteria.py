@@ -3,9 +3,9 @@
 A criterion is a function (robot, scenario, unknowns, typical) -> Criterion, named in `identify.plugins` or given as
 ``module:function``. `typical` is the z of a trajectory that excites everything, from which it may take its scale.
 
-The observability index is the geometric mean of the singular values of H over sqrt(m). Of the 64 columns of H only
+The observability index is the geometric mean of the singular values of H over sqrt(m). Of the p columns of H only
 those of the base parameters are independent: H = H_1 C with H_1 the pivot columns and C the base combinations
-(rank, 64), so the product of the singular values that are not zero is sqrt(det(H_1^T H_1) det(C C^T)), whichever
+(rank, p), so the product of the singular values that are not zero is sqrt(det(H_1^T H_1) det(C C^T)), whichever
 pivots were chosen:
 
     ln O_in = (ln det(H_1^T H_1) + ln det(C C^T)) / (2 rank) - ln(m) / 2.
@@ -34,8 +34,13 @@ from identify.plugins import CRITERIA, chosen
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
-SMOOTHING_RAD_S = 0.02
+SMOOTHING_RAD_S, SMOOTHING_M_S = 0.02, 0.002
 """v_s in tanh(theta_dot / v_s) where derivatives are asked for: as much as a velocity changes between two samples."""
+
+
+def smoothing_of(robot: Robot) -> float:
+    """v_s for a robot's actuators, rad/s or m/s."""
+    return SMOOTHING_M_S if robot.layout.prismatic else SMOOTHING_RAD_S
 
 
 @dataclass(frozen=True)
@@ -62,24 +67,24 @@ def criterion_of(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: 
 def observability(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array) -> Criterion:
     """The observability index (eq. 39) of the run that the scenario plays."""
     duration_s = scenario.excitation.duration_s
-    value, smooth = (log_observability(robot, unknowns, duration_s, typical, v) for v in (None, SMOOTHING_RAD_S))
+    value, smooth = (log_observability(robot, unknowns, duration_s, typical, v) for v in (None, smoothing_of(robot)))
     return Criterion(value, smooth)
 
 
 def log_observability(
-    robot: Robot, unknowns: Unknowns, duration_s: float, typical: Array, smoothing_rad_s: float | None = None
+    robot: Robot, unknowns: Unknowns, duration_s: float, typical: Array, smoothing: float | None = None
 ) -> ca.Function:
     """z -> ln O_in (eq. 39) of a run of `duration_s`; -inf or NaN where it is too short to show every base parameter.
 
-    `typical` is the z of a trajectory that excites everything; it only sets the scale. `smoothing_rad_s` smooths the
-    sign of Coulomb friction, which makes the function differentiable.
+    `typical` is the z of a trajectory that excites everything; it only sets the scale. `smoothing` [rad/s or m/s]
+    smooths the sign of Coulomb friction, which makes the function differentiable.
     """
-    base = base_parameters(structural_regressor(robot))
+    base = base_parameters(structural_regressor(robot), robot.layout)
     times = played_times(unknowns.fundamental_hz, unknowns.harmonics, duration_s)
     z = ca.MX.sym("z", unknowns.size)
-    if 6 * len(times) < base.rank:
+    if unknowns.coordinates * len(times) < base.rank:
         return ca.Function("log_observability", [z], [ca.MX(-np.inf)], ["z"], ["value"])
-    sampled = regressor(robot, smoothing_rad_s, "wrench").map(len(times))(*motion(unknowns, z, times))
+    sampled = regressor(robot, smoothing, "wrench").map(len(times))(*motion(unknowns, z, times))
     columns = ca.Function("pivots", [z], [sampled[list(base.pivots), :]])
     index = log_index(columns(z), base.combinations, np.array(columns(typical)), len(times))
     return ca.Function("log_observability", [z], [index], ["z"], ["value"])
@@ -88,7 +93,7 @@ def log_observability(
 def log_index(columns: ca.MX, combinations: Array, typical: Array, samples: int) -> ca.MX:
     """ln O_in (eq. 39) of H = columns^T combinations over `samples` poses.
 
-    `columns` (rank, 6 m) is H_1 transposed, `combinations` (rank, p) is C, and `typical` is as `columns`, of full rank.
+    `columns` (rank, rows) is H_1 transposed, `combinations` (rank, p) is C; `typical` is as `columns`, of full rank.
     """
     rank = len(combinations)
     factor = qr(typical.T, mode="r")[0][:rank]

@@ -5,12 +5,14 @@ from collections.abc import Callable
 import numpy as np
 
 from dynamics import Robot
+from dynamics.kinematics.chart import Chart
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.excitation.constraints import MotionConstraints, check_periods
 from identify.excitation.criteria import criterion_of, log_observability, observability_index
 from identify.excitation.motion import SAMPLES_PER_HARMONIC, unknowns
 from identify.excitation.search import SEARCHES, SearchProblem
+from identify.loop_parameters import of_actuators
 from identify.progress import Advance, Progress, SilentProgress
 from identify.random_streams import EXCITATION, SEARCH, UNSEEN, child
 from identify.scenario import Excitation, Scenario
@@ -23,10 +25,10 @@ Check = Callable[[FourierTrajectory, Array], object]
 """Raises TrajectoryError for a trajectory that is not admissible at some instants (N,) [s]."""
 
 
-def drawn_trajectory(rng: np.random.Generator, home_pose: Array, settings: Excitation) -> FourierTrajectory:
-    """A random trajectory that fills the box of a scenario's excitation about a pose (6,), whatever else limits it."""
+def drawn_trajectory(rng: np.random.Generator, chart: Chart, settings: Excitation) -> FourierTrajectory:
+    """A random trajectory that fills the box of a scenario's excitation about home, whatever else limits it."""
     box = (settings.position_amplitude_m, settings.orientation_amplitude_rad)
-    return random_trajectory(rng, home_pose, settings.fundamental_hz, settings.harmonics, *box)
+    return random_trajectory(rng, chart, settings.fundamental_hz, settings.harmonics, *box)
 
 
 def admissible_trajectories(
@@ -37,7 +39,7 @@ def admissible_trajectories(
     seed: np.random.SeedSequence,
     check: Check = lambda trajectory, times: None,
 ) -> list[FourierTrajectory]:
-    """Random trajectories that stay inside the travel less the margin and pass `check`.
+    """Random trajectories that stay inside the travel less the margin, off singularities, and pass `check`.
 
     Raises TrajectoryError, with the last reason, when too few of them do.
     """
@@ -45,11 +47,11 @@ def admissible_trajectories(
     rate_hz = 4 * SAMPLES_PER_HARMONIC * settings.harmonics * settings.fundamental_hz
     t = np.arange(round(duration_s * rate_hz) + 1) / rate_hz
     accepted: list[FourierTrajectory] = []
-    reason = TrajectoryError("none tried")
+    margin, reason = of_actuators(robot, settings, "travel_margin"), TrajectoryError("none tried")
     for _ in range(ATTEMPTS * count):
-        candidate = drawn_trajectory(rng, robot.home_pose, settings)
+        candidate = drawn_trajectory(rng, robot.geometry.chart, settings)
         try:
-            check_travel(robot, candidate, t, settings.travel_margin_rad)
+            check_travel(robot, candidate, t, margin, **settings.singularity_limits)
             check(candidate, t)
         except TrajectoryError as error:
             reason = error
@@ -120,7 +122,7 @@ def search_problem(
     settings = scenario.excitation
     if settings.method != "random":
         check_periods(scenario)
-    free = unknowns(robot.home_pose, settings)
+    free = unknowns(robot.geometry.chart, settings)
     pool = [free.of(trajectory) for trajectory in candidates]
     criterion, values = criterion_of(robot, scenario, free, pool[0]), []
     for z in pool:

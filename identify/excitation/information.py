@@ -1,9 +1,9 @@
 """D-optimality of the output error's information: in the simulated closed loop, and in the loop linearised at home.
 
-With J = d(poses)/d(67 parameters) of the closed loop at the starting guess, Sigma the covariance that the sensor
+With J = d(poses)/d(p parameters) of the closed loop at the starting guess, Sigma the covariance that the sensor
 states, and what is known before (starting guess, the scenario's prior of single parameters, scale anchor),
 
-    W = sum over frames J^T Sigma^-1 J + prior,      D = (det(S W S))^(1 / (2 67)),      S = diag(prior deviations).
+    W = sum over frames J^T Sigma^-1 J + prior,      D = (det(S W S))^(1 / (2 p)),      S = diag(prior deviations).
 
 D is the factor by which the experiment narrows the prior, the geometric mean over all directions of the parameter
 space; it has no unit. That the sensor's noise also moves the plant (through the servo) is left out.
@@ -15,9 +15,10 @@ latency plus half a frame of hold, the pose x follows a torque error d (Nm, join
     x = -S d,   S = (J_ad^-T M E s^2 + F_v J_theta s + d(holding torque)/dx + L J_theta (1 + C exp(-s t_d)))^-1,
 
 E from pose rates to twists, and follows a reference x_d as x = T x_d with T = S L J_theta C exp(-s t_d). Friction
-counts with its viscous part only. So the robot follows each harmonic of the trajectory with a known lag, and the
-sensitivities are filtered columns of the torque regressor along that motion: with Y its Fourier coefficients at a
-harmonic, tau = Y Xi the torques and e = tau / L the joint error that the PID needs for them,
+counts with its viscous part only. Poses, wrenches and Jacobians are those along the platform's coordinates. So the
+robot follows each harmonic of the trajectory with a known lag, and the sensitivities are filtered columns of the torque
+regressor along that motion: with Y its Fourier coefficients at a harmonic, tau = Y Xi the torques and e = tau / L the
+joint error that the PID needs for them,
 
     d(pose)/d(Xi) = -S Y,    d(pose)/d(lp, li, ld) = S (e, e / s, e s).
 
@@ -34,14 +35,13 @@ from numpy.typing import NDArray
 from cmmsim.visibility import expected_covariance
 from dynamics import Robot
 from dynamics.closed_loop import LoopFailure, simulate
-from dynamics.parameters import VISCOUS
 from identify.arrays import Array
 from identify.errors import TrajectoryError
 from identify.estimation.prior import StartingGuess, starting_guess
-from identify.estimation.scale_anchor import DEFAULT_STD, MEASURED_PARAMETER
-from identify.excitation.criteria import SMOOTHING_RAD_S, Criterion
+from identify.estimation.scale_anchor import MEASURED_PARAMETER, default_std
+from identify.excitation.criteria import Criterion, smoothing_of
 from identify.excitation.motion import Unknowns, log_determinant, regressor, sample_times, tracked_motion
-from identify.loop_parameters import NAMES, index_of, model_settings
+from identify.loop_parameters import model_settings
 from identify.scenario import Scenario
 from identify.trajectory import FourierTrajectory
 
@@ -49,14 +49,14 @@ from identify.trajectory import FourierTrajectory
 def information(robot: Robot, scenario: Scenario, unknowns: Unknowns, typical: Array) -> Criterion:
     """D in the linearised loop, by which searches go; what they end in is judged by that of the simulated loop."""
     known = knowledge(robot, scenario)
-    value, smooth = (log_linear_information(robot, unknowns, scenario, known, v) for v in (None, SMOOTHING_RAD_S))
+    value, smooth = (log_linear_information(robot, unknowns, scenario, known, v) for v in (None, smoothing_of(robot)))
     return Criterion(value, smooth, judge=partial(log_information, robot, scenario, known))
 
 
 @dataclass(frozen=True)
 class Knowledge:
     """What is known before the run: starting guess, covariance (6, 6) of a measured pose [m, rad], and the prior's
-    information (67, 67) in units of its own standard deviations."""
+    information (p, p) in units of its own standard deviations."""
 
     guess: StartingGuess
     covariance: Array
@@ -67,11 +67,11 @@ def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
     """The scenario's starting guess with its prior, anchor and sensor."""
     settings = scenario.identification
     guess = starting_guess(robot, scenario.model.start_parameters, settings.start_std, settings.prior)
-    prior = np.eye(len(NAMES))
+    prior = np.eye(len(robot.layout.names))
     anchor = settings.scale_anchor
     if anchor in MEASURED_PARAMETER:
-        place = index_of(MEASURED_PARAMETER[anchor])
-        std = settings.anchor_std or DEFAULT_STD[anchor]
+        place = robot.layout.names.index(MEASURED_PARAMETER[anchor])
+        std = settings.anchor_std or default_std(anchor, robot.layout)
         prior[place, place] += (guess.std[place] / std) ** 2
     covariance = expected_covariance(
         scenario.sensor, robot.home_pose, scenario.pose_method, changes=scenario.sensor_changes
@@ -90,7 +90,7 @@ def log_information(robot: Robot, scenario: Scenario, known: Knowledge, trajecto
             robot,
             known.guess.values,
             trajectory.reference(times),
-            model_settings(scenario),
+            model_settings(robot, scenario),
             sensitivities=True,
         )
     except LoopFailure as error:
@@ -100,8 +100,9 @@ def log_information(robot: Robot, scenario: Scenario, known: Knowledge, trajecto
         ) from error
     assert run.pose_sensitivity is not None
     whitener = np.linalg.inv(np.linalg.cholesky(known.covariance))
-    rows = (whitener @ run.pose_sensitivity).reshape(-1, len(NAMES)) * known.guess.std
-    return float(np.linalg.slogdet(rows.T @ rows + known.scaled_prior)[1] / (2 * len(NAMES)))
+    count = len(known.guess.std)
+    rows = (whitener @ run.pose_sensitivity).reshape(-1, count) * known.guess.std
+    return float(np.linalg.slogdet(rows.T @ rows + known.scaled_prior)[1] / (2 * count))
 
 
 ComplexArray = NDArray[np.complex128]
@@ -110,30 +111,31 @@ STEP = 1e-6
 """Step [m, rad] of the difference quotient of the holding torque."""
 
 
-def pid_response(parameters: Array, s: ComplexArray) -> ComplexArray:
-    """L (K,) [Nm/rad] of the joint PID of `parameters` (67,) at s (K,) [1/s]."""
-    lp, li, ld = parameters[64:]
+def pid_response(robot: Robot, parameters: Array, s: ComplexArray) -> ComplexArray:
+    """L (K,) [N m/rad or N/m] of the joint PID of `parameters` (p,) at s (K,) [1/s]."""
+    lp, li, ld = parameters[robot.layout.joint_pid]
     return np.asarray(lp + ld * s + li / s)
 
 
 def torque_response(robot: Robot, parameters: Array, scenario: Scenario, s: ComplexArray) -> ComplexArray:
-    """S (K, 6, 6) [m/Nm, rad/Nm] for `parameters` (67,) at s = i omega (K,) [1/s], none of them zero."""
-    home, xi = robot.home_pose, parameters[:64]
-    to_twist = robot.twist(np.tile(home, (6, 1)), np.eye(6)).T
-    joint_rates = robot.pose_jacobian(home)
-    inertia = np.linalg.solve(robot.joint_jacobian(home).T, robot.mass_matrix(home, xi) @ to_twist)
-    steps = STEP * np.eye(6)
+    """S (K, m, n), coordinates per torque or force, for `parameters` (p,) at s = i omega (K,) [1/s], none of them
+    zero."""
+    home, xi, free = robot.home_pose, parameters[robot.layout.dynamic], robot.geometry.chart.basis
+    to_twist = robot.twist(np.tile(home, (len(free.T), 1)), free.T).T
+    joint_rates = robot.coordinate_jacobian(home)
+    inertia = np.linalg.solve((robot.joint_jacobian(home) @ free).T, free.T @ robot.mass_matrix(home, xi) @ to_twist)
+    steps = STEP * free.T
     stiffness = (robot.static_torque(home + steps, xi) - robot.static_torque(home - steps, xi)).T / (2 * STEP)
-    damping = xi[VISCOUS][:, None] * joint_rates
-    loop = pid_response(parameters, s) * (1 + servo_response(scenario, s))
+    damping = parameters[robot.layout.viscous][:, None] * joint_rates
+    loop = pid_response(robot, parameters, s) * (1 + servo_response(scenario, s))
     total = np.multiply.outer(s**2, inertia) + np.multiply.outer(s, damping) + stiffness
     return np.asarray(np.linalg.inv(total + np.multiply.outer(loop, joint_rates)))
 
 
 def tracking_response(robot: Robot, parameters: Array, scenario: Scenario, s: ComplexArray) -> ComplexArray:
-    """T (K, 6, 6) from desired to actual poses, as `torque_response`."""
-    gain = pid_response(parameters, s) * servo_response(scenario, s)
-    drive = np.multiply.outer(gain, robot.pose_jacobian(robot.home_pose))
+    """T (K, m, m) from desired to actual coordinates, as `torque_response`."""
+    gain = pid_response(robot, parameters, s) * servo_response(scenario, s)
+    drive = np.multiply.outer(gain, robot.coordinate_jacobian(robot.home_pose))
     return np.asarray(torque_response(robot, parameters, scenario, s) @ drive)
 
 
@@ -149,17 +151,18 @@ HARMONICS_SEEN = 8
 
 
 def log_linear_information(
-    robot: Robot, unknowns: Unknowns, scenario: Scenario, known: Knowledge, smoothing_rad_s: float | None = None
+    robot: Robot, unknowns: Unknowns, scenario: Scenario, known: Knowledge, smoothing: float | None = None
 ) -> ca.Function:
-    """z -> ln D in the linearised loop; `smoothing_rad_s` as in `log_observability`."""
+    """z -> ln D in the linearised loop; `smoothing` as in `log_observability`."""
     z = ca.MX.sym("z", unknowns.size)
-    rows = sensitivity_spectrum(robot, unknowns, scenario, known.guess.values, z, smoothing_rad_s)
-    whitener = np.linalg.inv(np.linalg.cholesky(known.covariance))
+    rows = sensitivity_spectrum(robot, unknowns, scenario, known.guess.values, z, smoothing)
+    count, free = len(known.guess.std), unknowns.chart.basis
+    whitener = np.linalg.inv(np.linalg.cholesky(known.covariance)) @ free
     rows = rows @ ca.DM(np.kron(np.eye(2 * len(harmonics(unknowns))), whitener.T))
     frames = scenario.timing.frames(scenario.excitation.duration_s)
     scaled = ca.diag(known.guess.std * np.sqrt(frames / 2)) @ rows
-    determinant = log_determinant(len(NAMES))(scaled @ scaled.T + ca.DM(known.scaled_prior))
-    return ca.Function("log_linear_information", [z], [determinant / (2 * len(NAMES))], ["z"], ["value"])
+    determinant = log_determinant(count)(scaled @ scaled.T + ca.DM(known.scaled_prior))
+    return ca.Function("log_linear_information", [z], [determinant / (2 * count)], ["z"], ["value"])
 
 
 def harmonics(unknowns: Unknowns) -> ComplexArray:
@@ -174,9 +177,9 @@ def sensitivity_spectrum(
     scenario: Scenario,
     parameters: Array,
     z: ca.MX,
-    smoothing_rad_s: float | None = None,
+    smoothing: float | None = None,
 ) -> ca.MX:
-    """Fourier coefficients of d(pose)/d(67 parameters), (67, 12 K): six real and six imaginary parts a harmonic.
+    """Fourier coefficients of d(coordinates)/d(p parameters), (p, 2 m K): m real and m imaginary parts a harmonic.
 
     A coefficient x_k means Re(x_k exp(s_k t)).
     """
@@ -184,17 +187,20 @@ def sensitivity_spectrum(
     response = torque_response(robot, parameters, scenario, s)
     tracking = tracking_response(robot, parameters, scenario, s[: unknowns.harmonics])
     moved = tracked_motion(unknowns, z, times, tracking)
-    sampled = regressor(robot, smoothing_rad_s, "torque").map(len(times))(*moved)
+    sampled = regressor(robot, smoothing, "torque").map(len(times))(*moved)
     waves = np.exp(-np.outer(times, s)) * 2 / len(times)
     transform = np.stack([waves.real, waves.imag], axis=-1).reshape(len(times), -1)
-    spectrum = ca.reshape(ca.reshape(sampled, 64 * 6, len(times)) @ ca.DM(transform), 64, 12 * len(s))
-    error = 1 / pid_response(parameters, s)
-    torque = ca.DM(parameters[:64]).T @ spectrum
+    dynamic, joints = parameters[robot.layout.dynamic], robot.layout.joints
+    count = len(dynamic)
+    waved = ca.reshape(sampled, count * joints, len(times)) @ ca.DM(transform)
+    spectrum = ca.reshape(waved, count, 2 * joints * len(s))
+    error = 1 / pid_response(robot, parameters, s)
+    torque = ca.DM(dynamic).T @ spectrum
     gains = [torque @ _real_filter(response * f[:, None, None]) for f in (error, error / s, error * s)]
     return ca.vertcat(-spectrum @ _real_filter(response), *gains)
 
 
 def _real_filter(response: ComplexArray) -> ca.DM:
-    """Block-diagonal (12 K, 12 K): rows (Re y_k, Im y_k) times it are (Re x_k, Im x_k) of x_k = response_k y_k."""
+    """Block-diagonal (2 n K, 2 m K): rows (Re y_k, Im y_k) times it are (Re x_k, Im x_k) of x_k = response_k y_k."""
     blocks = [np.block([[r.real.T, r.imag.T], [-r.imag.T, r.real.T]]) for r in response]
     return ca.diagcat(*[ca.DM(block) for block in blocks])

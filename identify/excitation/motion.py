@@ -1,11 +1,12 @@
 """The unknowns of a smooth-start trajectory (eq. 37), and motion and regressors as CasADi expressions of them.
 
-The conditions of a smooth start leave 2 (n - 1) free directions a pose component: n - 1 combinations of the sines with
-sum_l s_l = 0, and n - 1 of the cosines with sum_l l c_l = 0. With Z (6, 2 (n - 1)), without unit, and a box (6,)
+The conditions of a smooth start leave 2 (n - 1) free directions a coordinate: n - 1 combinations of the sines with
+sum_l s_l = 0, and n - 1 of the cosines with sum_l l c_l = 0. With Z (m, 2 (n - 1)), without unit, and a box (m,) the m
+coordinates q are
 
-    pose(t) = home + box Z B_0(t)^T,    pose_rate(t) = box Z B_1(t)^T,    pose_acceleration(t) = box Z B_2(t)^T,
+    q(t) = home + box Z B_0(t)^T,    q_dot(t) = box Z B_1(t)^T,    q_ddot(t) = box Z B_2(t)^T,
 
-so that every trajectory that starts smoothly at home is one vector z of 12 (n - 1) numbers, and each z one trajectory.
+so that every trajectory that starts smoothly at home is one vector z of 2 m (n - 1) numbers, and each z one trajectory.
 """
 
 from dataclasses import dataclass
@@ -18,32 +19,43 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import null_space
 
 from dynamics import Robot
+from dynamics.kinematics.chart import Chart
 from dynamics.kinematics.platform import pose_rate_to_twist, twist_bias
-from dynamics.legs.rss_inverse_kinematics import joint_jacobian
+from dynamics.rigid_body.jacobians import joint_jacobian
 from dynamics.rigid_body.virtual_work import rigid_body_regressor
 from identify.arrays import Array
 from identify.scenario import Excitation
-from identify.trajectory import FourierTrajectory, from_home
+from identify.trajectory import FourierTrajectory, box_of, from_home
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """home (6,) and box (6,) [m, rad], fundamental_hz, harmonics n."""
+    """chart with home, box (m,) [m, rad] of its coordinates, fundamental_hz, harmonics n."""
 
-    home: Array
+    chart: Chart
     box: Array
     fundamental_hz: float
     harmonics: int
 
     @property
+    def home(self) -> Array:
+        """Pose (6,) at the start."""
+        return np.array(self.chart.home)
+
+    @property
+    def coordinates(self) -> int:
+        """Number of coordinates m."""
+        return len(self.chart.freedoms)
+
+    @property
     def columns(self) -> int:
-        """Free directions a pose component, 2 (n - 1)."""
+        """Free directions a coordinate, 2 (n - 1)."""
         return 2 * (self.harmonics - 1)
 
     @property
     def size(self) -> int:
-        """Number of unknowns, 12 (n - 1)."""
-        return 6 * self.columns
+        """Number of unknowns, 2 m (n - 1)."""
+        return self.coordinates * self.columns
 
     def basis(self, t: ArrayLike) -> tuple[Array, Array, Array]:
         """B_0 (N, k) without unit, B_1 [1/s], B_2 [1/s²] at times ``t`` (N,) [s]; k = ``columns``."""
@@ -58,16 +70,16 @@ class Unknowns:
         )
 
     def trajectory(self, z: ArrayLike) -> FourierTrajectory:
-        """The trajectory of z (12 (n - 1),)."""
-        matrix = np.asarray(z, dtype=float).reshape(6, self.columns)
+        """The trajectory of z (2 m (n - 1),)."""
+        matrix = np.asarray(z, dtype=float).reshape(self.coordinates, self.columns)
         speed = (self.box * 2 * np.pi * self.fundamental_hz)[:, None]
         half = self.columns // 2
         sines, cosines = self._directions()
         sine, cosine = speed * matrix[:, :half] @ sines.T, speed * matrix[:, half:] @ cosines.T
-        return from_home(self.home, self.fundamental_hz, sine, cosine)
+        return from_home(self.chart, self.fundamental_hz, sine, cosine)
 
     def of(self, trajectory: FourierTrajectory) -> Array:
-        """z (12 (n - 1),) of a trajectory with a smooth start."""
+        """z (2 m (n - 1),) of a trajectory with a smooth start."""
         speed = (self.box * 2 * np.pi * self.fundamental_hz)[:, None]
         sines, cosines = self._directions()
         return np.hstack([trajectory.sine / speed @ sines, trajectory.cosine / speed @ cosines]).ravel()
@@ -78,10 +90,10 @@ class Unknowns:
         return null_space(np.ones((1, self.harmonics))), null_space(order[None])
 
 
-def unknowns(home_pose: ArrayLike, settings: Excitation) -> Unknowns:
-    """The unknowns of a scenario's excitation; the box is what its amplitudes allow."""
-    box = np.repeat([settings.position_amplitude_m, settings.orientation_amplitude_rad], 3)
-    return Unknowns(np.asarray(home_pose, dtype=float), box, settings.fundamental_hz, settings.harmonics)
+def unknowns(chart: Chart, settings: Excitation) -> Unknowns:
+    """The unknowns of a scenario's excitation about a chart's home; the box is what its amplitudes allow."""
+    box = box_of(chart, settings.position_amplitude_m, settings.orientation_amplitude_rad)
+    return Unknowns(chart, box, settings.fundamental_hz, settings.harmonics)
 
 
 SAMPLES_PER_HARMONIC = 20
@@ -111,20 +123,21 @@ def played_times(fundamental_hz: float, harmonics: int, duration_s: float) -> Ar
 
 def motion(unknowns: Unknowns, z: ca.MX, times: Array) -> tuple[ca.MX, ca.MX, ca.MX]:
     """Poses, pose rates and pose accelerations, each (6, N), of z at `times` (N,) [s]."""
-    matrix = ca.reshape(z, unknowns.columns, 6).T
-    offset, rate, acceleration = (ca.diag(unknowns.box) @ matrix @ ca.DM(b.T) for b in unknowns.basis(times))
+    matrix = ca.reshape(z, unknowns.columns, unknowns.coordinates).T
+    scale = ca.DM(unknowns.chart.basis @ np.diag(unknowns.box))
+    offset, rate, acceleration = (scale @ matrix @ ca.DM(b.T) for b in unknowns.basis(times))
     return ca.repmat(ca.DM(unknowns.home), 1, len(times)) + offset, rate, acceleration
 
 
 def tracked_motion(
     unknowns: Unknowns, z: ca.MX, times: Array, tracking: NDArray[np.complex128]
 ) -> tuple[ca.MX, ca.MX, ca.MX]:
-    """As `motion`, of a robot that follows harmonic k of the trajectory with `tracking` (harmonics, 6, 6), and its mean
+    """As `motion`, of a robot that follows harmonic k of the trajectory with `tracking` (harmonics, m, m), and its mean
     exactly; in the steady state."""
     speeds = 2j * np.pi * unknowns.fundamental_hz * np.arange(1, unknowns.harmonics + 1)
     period = sample_times(unknowns.fundamental_hz, unknowns.harmonics)
     basis, box = unknowns.basis(period)[0], np.diag(unknowns.box)
-    maps = [np.zeros((len(times), 6, unknowns.size)) for _ in range(3)]
+    maps = [np.zeros((len(times), unknowns.coordinates, unknowns.size)) for _ in range(3)]
     maps[0] += np.kron(box, basis.mean(axis=0))
     for s, followed in zip(speeds, tracking, strict=True):
         coefficient = 2 / len(period) * np.exp(-s * period) @ basis
@@ -132,29 +145,32 @@ def tracked_motion(
         for derivative, total in enumerate(maps):
             total += (s**derivative * amplitude).real
     offset, rate, acceleration = (
-        ca.reshape(ca.DM(total.reshape(-1, unknowns.size)) @ z, 6, len(times)) for total in maps
+        ca.reshape(ca.DM(unknowns.chart.lifted(total, axis=1).reshape(-1, unknowns.size)) @ z, 6, len(times))
+        for total in maps
     )
     return ca.repmat(ca.DM(unknowns.home), 1, len(times)) + offset, rate, acceleration
 
 
-def regressor(robot: Robot, smoothing_rad_s: float | None, of: Literal["wrench", "torque"]) -> ca.Function:
-    """(pose, rate, acceleration) (6,) -> regressor of wrench (eq. 25) or actuator torques, transposed (64, 6).
+def regressor(robot: Robot, smoothing: float | None, of: Literal["wrench", "torque"]) -> ca.Function:
+    """(pose, rate, acceleration) (6,) -> regressor of wrench (eq. 25), along the m coordinates, or of the n actuators'
+    torques, transposed (p, m) or (p, n).
 
-    The former is J_ad^T times the latter. The sign of Coulomb friction has no derivative: `smoothing_rad_s` replaces it
-    by tanh(theta_dot / v_s); None keeps it.
+    The former is J_ad^T times the latter, projected on the chart. The sign of Coulomb friction has no derivative:
+    `smoothing` replaces it by tanh(theta_dot / v_s), v_s in rad/s, or m/s where actuators slide; None keeps it.
     """
     pose, rate, acceleration = (ca.SX.sym(name, 6) for name in ("pose", "rate", "acceleration"))
     to_twist = pose_rate_to_twist(pose)
     twist, twist_dot = to_twist @ rate, to_twist @ acceleration + twist_bias(pose, rate)
     jacobian = joint_jacobian(robot.geometry, pose)
     velocity = jacobian @ twist
-    sign = ca.sign(velocity) if smoothing_rad_s is None else ca.tanh(velocity / smoothing_rad_s)
-    rigid = rigid_body_regressor(robot.geometry, pose, twist, twist_dot)
+    sign = ca.sign(velocity) if smoothing is None else ca.tanh(velocity / smoothing)
+    free = ca.sparsify(ca.DM(robot.geometry.chart.basis))
+    rigid, along = free.T @ rigid_body_regressor(robot.geometry, pose, twist, twist_dot), jacobian @ free
     friction = ca.horzcat(ca.diag(sign), ca.diag(velocity))
     if of == "torque":
-        whole = ca.horzcat(ca.solve(jacobian.T, rigid), friction)
+        whole = ca.horzcat(ca.solve(along.T, rigid), friction)
     else:
-        whole = ca.horzcat(rigid, jacobian.T @ friction)
+        whole = ca.horzcat(rigid, along.T @ friction)
     return ca.Function("regressor", [pose, rate, acceleration], ca.cse([ca.densify(whole.T)]))
 
 

@@ -120,7 +120,7 @@ NOT_ADMISSIBLE = 1e6
 def evolve(problem: SearchProblem, seed: np.random.SeedSequence, progress: Progress) -> SearchResult:
     """What the generations of differential evolution find that begin with the best of the candidates.
 
-    A member of the population is scaled, a pose component at a time, until it fills the box, as a random trajectory is:
+    A member of the population is scaled, a coordinate at a time, until it fills the box, as a random trajectory is:
     its size is then no unknown any more, and no limit on the amplitude has to be found by chance. Among two members the
     admissible one wins, among two that are not the one that breaks its limits less.
 
@@ -159,21 +159,23 @@ class _Filling:
 
     def member(self, z: Array) -> Array:
         """The member that z is, within -1 and 1."""
-        matrix = z.reshape(6, -1)
+        matrix = z.reshape(self._problem.unknowns.coordinates, -1)
         return np.asarray((matrix / np.abs(matrix).max(axis=1, keepdims=True)).ravel())
 
     def fill(self, member: Array) -> Array:
-        """z of a member: each pose component scaled to fill the box."""
-        matrix = member.reshape(6, -1)
+        """z of a member: each coordinate scaled to fill the box."""
+        matrix = member.reshape(self._problem.unknowns.coordinates, -1)
         largest = np.abs(matrix @ self._offset.T).max(axis=1)
         return np.asarray((matrix / np.where(largest > 0, largest, 1.0)[:, None]).ravel())
 
     def cost(self, member: Array) -> float:
         """Minus the logarithm of the criterion, or what is broken."""
         z = self.fill(member)
-        matrix, unknowns = z.reshape(6, -1), self._problem.unknowns
-        poses = unknowns.home[:, None] + unknowns.box[:, None] * (matrix @ self._offset.T)
-        shares = np.array(self._shares(poses, unknowns.box[:, None] * (matrix @ self._rate.T)))[6:]
+        unknowns = self._problem.unknowns
+        matrix, lifted = z.reshape(unknowns.coordinates, -1), unknowns.chart.lifted
+        poses = unknowns.home[:, None] + lifted(unknowns.box[:, None] * (matrix @ self._offset.T), axis=0)
+        rates = lifted(unknowns.box[:, None] * (matrix @ self._rate.T), axis=0)
+        shares = np.array(self._shares(poses, rates))[unknowns.coordinates :]
         worst = float(np.abs(shares).max())
         if not worst <= 1:
             return NOT_ADMISSIBLE * (2 if np.isnan(worst) else 2 - 1 / worst)

@@ -1,4 +1,4 @@
-"""Optional instruments at the joints, simulated from the truth of a run: a torque sensor and an encoder in each crank.
+"""Optional instruments at the joints, simulated from the truth of a run: a torque sensor and an encoder in each joint.
 
 The visual experiment does without them; they are what the estimators of the literature need. Channels stand in a file
 of their own beside the record. The torque is the mean over one frame around the instant of exposure: with a held
@@ -21,7 +21,7 @@ from identify.scenario import Timing
 
 VARIABLES: Variables = {
     "joint_torque": (("time", "joint"), "N m", "measured torque of each joint, mean over one frame"),
-    "joint_angle": (("time", "joint"), "rad", "crank angle read from the encoder"),
+    "joint_angle": (("time", "joint"), "rad", "joint coordinate read from the encoder"),
 }
 ATTRIBUTES = ("torque_noise_N_m", "encoder_noise_rad", "encoder_resolution_rad")
 
@@ -56,7 +56,7 @@ def measure_joints(
     rng: np.random.Generator,
     latencies: Array | None = None,
 ) -> xr.Dataset:
-    """What the instruments read during a run, `joint_torque` and `joint_angle` (N, 6).
+    """What the instruments read during a run, `joint_torque` and `joint_angle` (N, n).
 
     latencies (N,): of each frame's command, s, where they differ from the timing's.
     """
@@ -78,10 +78,10 @@ def measure_joints(
 def frame_mean(
     torque: Array, command: Array, start_angle: Array, gains: Array, timing: Timing, latencies: Array
 ) -> Array:
-    """Torque (N, 6) averaged over one frame around each sample, from samples of a torque that jumps with each command.
+    """Torque (N, n) averaged over one frame around each sample, from samples of a torque that jumps with each command.
 
-    The jump is lp dU + ld dU_dot, without lp dU where commands (N, 6) ramp; before the first one the command is
-    `start_angle` (6,). gains: lp, ld; latencies (N,), s, of the frames' commands. A jump s before or after a sample is
+    The jump is lp dU + ld dU_dot, without lp dU where commands (N, n) ramp; before the first one the command is
+    `start_angle` (n,). gains: lp, ld; latencies (N,), s, of the frames' commands. A jump s before or after a sample is
     in it or not, and in the mean over a frame T for T/2 - s: the difference is taken off the sample.
     """
     issued = np.vstack([start_angle, start_angle, command])

@@ -16,11 +16,12 @@ from dynamics.closed_loop import (
     Reference,
     simulate,
 )
+from dynamics.parameters import ParameterLayout
 from dynamics.robot import with_geometry_error
 from identify.arrays import Array
 from identify.estimation.prior import starting_guess
 from identify.experiment.truth import build_truth
-from identify.loop_parameters import NAMES, loop_settings
+from identify.loop_parameters import loop_settings, of_actuators
 from identify.record.payload import payload_vector
 from identify.scenario import Scenario
 
@@ -30,7 +31,7 @@ class Plant:
     """The true robot in its loop, made once by `build_plant`.
 
     nominal: the robot that servo and estimator know; robot: the true one, the same object where there is no geometry
-    error; parameters (67,): the true ones; settings: of its loop, whose joints may be elastic.
+    error; parameters (p,): the true ones; settings: of its loop, whose joints may be elastic.
     """
 
     scenario: Scenario
@@ -52,7 +53,7 @@ class Plant:
     ) -> ClosedLoopRun:
         """Follow a reference under a servo that knows the nominal robot; sensor None: an ideal one.
 
-        load (67,): what the platform carries, as it adds to the parameters. Raises what `dynamics.closed_loop.simulate`
+        load (p,): what the platform carries, as it adds to the parameters. Raises what `dynamics.closed_loop.simulate`
         does.
         """
         parameters = self.parameters if load is None else self.parameters + load
@@ -68,9 +69,10 @@ class Plant:
             joint_angle=self.robot.inverse_kinematics(run.pose),
             joint_velocity=np.einsum("nij,nj->ni", self.robot.pose_jacobian(run.pose), run.pose_rate),
             joint_torque=run.torque,
-            parameter_names=list(NAMES),
+            parameter_names=list(self.robot.layout.names),
             parameters=self.parameters,
             mismatch=self._mismatch(run),
+            prismatic=self.robot.layout.prismatic,
         )
         switches = self.scenario.plant.model_dump(exclude_none=True)
         return truth.assign_attrs({f"plant_{name}": value for name, value in switches.items()})
@@ -101,10 +103,10 @@ def build_plant(scenario: Scenario, nominal: Robot | None = None) -> Plant:
     Raises ScenarioError: no such parameter set (with the valid names).
     """
     nominal, switches = nominal or load_robot(scenario.robot), scenario.plant
-    settings = loop_settings(scenario, switches)
-    if switches.joint_stiffness_N_m_rad is not None:
-        stiffness, inertia = switches.joint_stiffness_N_m_rad, switches.motor_inertia_kg_m2
-        settings = replace(settings, elasticity=JointElasticity(stiffness, inertia, switches.joint_damping_N_m_s_rad))
+    settings, stiffness = loop_settings(nominal, scenario, switches), of_actuators(nominal, switches, "joint_stiffness")
+    if stiffness is not None:
+        inertia, damping = (of_actuators(nominal, switches, name) for name in ("motor_inertia", "joint_damping"))
+        settings = replace(settings, elasticity=JointElasticity(stiffness, inertia, damping))
     return Plant(
         scenario=scenario,
         nominal=nominal,
@@ -116,18 +118,18 @@ def build_plant(scenario: Scenario, nominal: Robot | None = None) -> Plant:
 
 @dataclass(frozen=True)
 class PlatformLoad:
-    """What a load adds to the parameters (67,): the stated values with their standard deviations, and the true ones."""
+    """What a load adds to the parameters (p,): the stated values with their standard deviations, and the true ones."""
 
     stated: Array
     std: Array
     true: Array
 
 
-def drawn_load(scenario: Scenario, rng: np.random.Generator) -> PlatformLoad:
+def drawn_load(layout: ParameterLayout, scenario: Scenario, rng: np.random.Generator) -> PlatformLoad:
     """The scenario's load, whose true figures miss the stated ones by the stated deviations; no figure is negative."""
     load = scenario.payload
-    stated = payload_vector(load.mass_kg, (load.Ixx_kg_m2, load.Iyy_kg_m2, load.Izz_kg_m2))
-    std = payload_vector(load.mass_std_kg, (load.Ixx_std_kg_m2, load.Iyy_std_kg_m2, load.Izz_std_kg_m2))
+    stated = payload_vector(layout, load.mass_kg, (load.Ixx_kg_m2, load.Iyy_kg_m2, load.Izz_kg_m2))
+    std = payload_vector(layout, load.mass_std_kg, (load.Ixx_std_kg_m2, load.Iyy_std_kg_m2, load.Izz_std_kg_m2))
     true = stated + std * rng.standard_normal(stated.shape)
     while (true < 0).any():
         true = stated + std * rng.standard_normal(stated.shape)

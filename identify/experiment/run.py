@@ -103,7 +103,7 @@ def excitation_run(
     duration_s = plant.scenario.excitation.duration_s
     if not payload:
         return run_plant(plant, sensor, trajectory, duration_s, seed, 0, advance)
-    load = drawn_load(plant.scenario, np.random.default_rng(stream_seed(seed, LOAD)))
+    load = drawn_load(plant.robot.layout, plant.scenario, np.random.default_rng(stream_seed(seed, LOAD)))
     return run_plant(plant, sensor, trajectory, duration_s, seed, PAYLOAD_RUN, advance, load)
 
 
@@ -122,7 +122,7 @@ def run_plant(
     Raises TrajectoryError before the run when the trajectory leaves the travel, LoopFailure when the loop is unstable.
     """
     scenario, times = plant.scenario, plant.scenario.timing.frame_times(duration_s)
-    check_travel(plant.nominal, trajectory, times)
+    check_travel(plant.nominal, trajectory, times, **scenario.excitation.singularity_limits)
     reference = trajectory.reference(times)
     eye = SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, run), advance)
     latencies = scenario.timing.drawn_latencies(len(times), np.random.default_rng(stream_seed(seed, LATENCY, run)))
@@ -130,10 +130,11 @@ def run_plant(
     done = plant.run(reference, RateSensor(eye.measure), latencies, true_load)
     record, truth = _record(plant, reference, done, eye, seed), plant.truth(done)
     settings, rng = scenario.identification, np.random.default_rng(stream_seed(seed, ANCHOR))
-    store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, plant.parameters, rng))
+    layout = plant.robot.layout
+    store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, layout, plant.parameters, rng))
     if load is not None:
-        store_payload(record, load.stated, load.std)
-        store_payload(truth, load.true)
+        store_payload(record, layout, load.stated, load.std)
+        store_payload(truth, layout, load.true)
     return Experiment(record, truth)
 
 
@@ -150,6 +151,7 @@ def _record(plant: Plant, reference: Reference, run: ClosedLoopRun, eye: SensorI
         robot=plant.nominal.name,
         seed=seed,
         frame_rate_hz=plant.scenario.timing.frame_rate_hz,
+        prismatic=plant.nominal.layout.prismatic,
     )
     store_robot(record, plant.nominal)
     return record.assign_attrs(sensor_seconds=eye.seconds, lost_frames="; ".join(eye.lost[:20]))
@@ -185,6 +187,7 @@ def compile_robots(robots: tuple[Robot, ...], progress: Progress) -> None:
 
 def _nearby(robot: Robot, frame_rate_hz: float) -> Reference:
     """A motion of some millimetres from home."""
-    rate = np.array([0.02, 0.0, 0.0, 0.0, 0.05, 0.0])
+    chart = robot.geometry.chart
+    rate = chart.basis @ chart.coordinates(np.array([0.02, 0.0, 0.0, 0.0, 0.05, 0.0]))
     times = np.arange(WARM_UP_FRAMES)[:, None] / frame_rate_hz
     return Reference(robot.home_pose + times * rate, np.tile(rate, (WARM_UP_FRAMES, 1)))

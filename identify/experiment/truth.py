@@ -9,22 +9,31 @@ from numpy.typing import ArrayLike
 
 from identify.arrays import Array
 from identify.errors import RecordError
-from identify.files.dataset import Variables, check_finite, check_variables, described_dataset, pose_parts, read_group
+from identify.files.dataset import (
+    Variables,
+    check_finite,
+    check_variables,
+    described_dataset,
+    joint_numbers,
+    of_actuators,
+    pose_parts,
+    read_group,
+)
 from identify.record.recording import TRUTH_GROUP, run_names
 
 VARIABLES: Variables = {
     "position": (("time", "axis"), "m", "true position of the platform"),
     "orientation": (("time", "angle"), "rad", "true orientation of the platform"),
-    "joint_angle": (("time", "joint"), "rad", "true crank angle"),
-    "joint_velocity": (("time", "joint"), "rad/s", "true crank velocity"),
-    "joint_torque": (("time", "joint"), "N m", "torque of the joint controller"),
+    "joint_angle": (("time", "joint"), "rad", "true joint coordinate"),
+    "joint_velocity": (("time", "joint"), "rad/s", "true joint velocity"),
+    "joint_torque": (("time", "joint"), "N m", "torque or force of the joint controller"),
     "parameter_value": (("parameter",), "SI", "true parameter of the plant and its joint controller"),
 }
 
 MISMATCH: Variables = {
     "base_joint_error": (("joint", "axis"), "m", "true joint centre B on the base less the nominal one"),
     "platform_joint_error": (("joint", "axis"), "m", "true joint centre A on the platform less the nominal one"),
-    "motor_angle": (("time", "joint"), "rad", "angle of the motor of an elastic joint, which its encoder reads"),
+    "motor_angle": (("time", "joint"), "rad", "place of the motor of an elastic joint, which its encoder reads"),
 }
 """What is recorded of a plant only where it is not the nominal robot with rigid joints."""
 
@@ -39,9 +48,10 @@ def build_truth(
     parameter_names: list[str],
     parameters: ArrayLike,
     mismatch: Mapping[str, ArrayLike] | None = None,
+    prismatic: bool = False,
 ) -> xr.Dataset:
-    """Truth of one run at the frames: ``time`` (N,) [s], pose and joint arrays (N, 6), parameters (p,) with names;
-    ``mismatch``: values of some of `MISMATCH`.
+    """Truth of one run at the frames: ``time`` (N,) [s], pose (N, 6), joint arrays (N, n), parameters (p,) with names;
+    ``mismatch``: values of some of `MISMATCH`; ``prismatic``: whether the joints slide.
 
     Raises RecordError: wrong shapes, or numbers that are not finite.
     """
@@ -55,8 +65,9 @@ def build_truth(
             **{name: np.asarray(values, dtype=float) for name, values in (mismatch or {}).items()},
         },
         time,
-        VARIABLES | {name: MISMATCH[name] for name in mismatch or {}},
+        of_actuators(VARIABLES | {name: MISMATCH[name] for name in mismatch or {}}, prismatic),
         parameter=list(parameter_names),
+        joint=joint_numbers(joint_angle),
     )
     truth.attrs["title"] = "Truth of the simulated experiment, not known to the estimator"
     return check_truth(truth, "new truth")

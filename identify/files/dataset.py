@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from dynamics.parameters import unit_of
+from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.atomic import atomic_path
@@ -75,7 +75,6 @@ Variables = dict[str, tuple[tuple[str, ...], str, str]]
 AXIS = ["x", "y", "z"]
 ANGLE = ["alpha", "beta", "gamma"]
 POSE = AXIS + ANGLE
-JOINT = [1, 2, 3, 4, 5, 6]
 
 COORDINATES = {
     "time": ("s", "time since the start of the run"),
@@ -85,13 +84,32 @@ COORDINATES = {
     "pose_component": ("", "pose component"),
     "pose_component_2": ("", "pose component"),
 }
-LABELS: dict[str, list[Any]] = {
+LABELS: dict[str, list[str]] = {
     "axis": AXIS,
     "angle": ANGLE,
-    "joint": JOINT,
     "pose_component": POSE,
     "pose_component_2": POSE,
 }
+
+
+SLIDING_UNITS = {"rad": "m", "rad/s": "m/s", "N m": "N"}
+"""Units of what is said of joints where actuators slide, by those where they turn."""
+
+
+def of_actuators(variables: Variables, prismatic: bool) -> Variables:
+    """The variables with the units of joints that slide, where a robot's do."""
+    if not prismatic:
+        return variables
+    return {
+        name: (dims, SLIDING_UNITS.get(unit, unit) if "joint" in dims else unit, text)
+        for name, (dims, unit, text) in variables.items()
+    }
+
+
+def joint_numbers(values: ArrayLike) -> list[int]:
+    """Labels of the joints, from 1 on, of values whose last axis they are."""
+    shape = np.shape(values)
+    return list(range(1, (shape[-1] if len(shape) > 1 else 0) + 1))
 
 
 def pose_parts(values: ArrayLike, name: str, position: str, orientation: str) -> dict[str, Array]:
@@ -102,7 +120,7 @@ def pose_parts(values: ArrayLike, name: str, position: str, orientation: str) ->
     return {position: array[:, :3], orientation: array[:, 3:]}
 
 
-def described_dataset(values: dict[str, Any], time: ArrayLike, variables: Variables, **labels: list[str]) -> xr.Dataset:
+def described_dataset(values: dict[str, Any], time: ArrayLike, variables: Variables, **labels: Any) -> xr.Dataset:
     """Dataset of described variables on a time axis; ``labels`` are the coordinates of further dimensions.
 
     Raises RecordError: an array whose shape does not fit its dimensions.
@@ -171,12 +189,12 @@ VARIABLE = "covariance"
 DIMENSIONS = ("parameter", "parameter_2")
 
 
-def write_covariance(path: Path | str, names: tuple[str, ...], covariance: Array) -> None:
-    """Write the covariance (n, n) of named parameters."""
-    labels = {name: list(names) for name in DIMENSIONS}
+def write_covariance(path: Path | str, layout: ParameterLayout, covariance: Array) -> None:
+    """Write the covariance (p, p) of a robot's parameters."""
+    labels, units = {name: list(layout.names) for name in DIMENSIONS}, [layout.unit(name) for name in layout.names]
     described = {"units": "product of the units of both parameters", "long_name": "covariance of the estimates"}
     data = xr.Dataset({VARIABLE: (DIMENSIONS, covariance, described)}, coords=labels)
-    write_groups(path, {"": data.assign_coords(unit=(DIMENSIONS[0], [unit_of(name) for name in names]))})
+    write_groups(path, {"": data.assign_coords(unit=(DIMENSIONS[0], units))})
 
 
 def read_covariance(path: Path | str, names: tuple[str, ...]) -> Array:

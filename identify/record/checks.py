@@ -10,6 +10,7 @@ from scipy.interpolate import make_interp_spline
 
 from dynamics import Robot
 from dynamics.closed_loop import Reference
+from dynamics.kinematics.chart import Chart
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.files.dataset import POSE, as_number, shown
@@ -44,6 +45,10 @@ def check_origin(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
     """
     check_record(record, "the record")
     check_robot(record, robot)
+    if record.sizes["joint"] != robot.layout.joints:
+        raise EstimationError(
+            f"the record has commands of {record.sizes['joint']} joints, robot {robot.name!r} has {robot.layout.joints}"
+        )
     recorded = recorded_scenario(record)
     for section in ("timing", "servo"):
         theirs, ours = getattr(recorded, section).model_dump(), getattr(scenario, section).model_dump()
@@ -132,9 +137,10 @@ def check_good_share(ok: NDArray[np.bool_]) -> None:
         )
 
 
-def check_channels(measured: Array, logged: Array, ok: NDArray[np.bool_]) -> None:
-    """No measured pose (N, 6) in the good frames, `ok` (N,), and no command (N, 6), that is dead."""
-    channels = list(zip(POSE, measured[ok].T, strict=True))
+def check_channels(chart: Chart, measured: Array, logged: Array, ok: NDArray[np.bool_]) -> None:
+    """No coordinate of the poses (N, 6) in the good frames, `ok` (N,), and no command (N, n), that is dead. What the
+    chart does not let move may stand still."""
+    channels = list(zip(chart.coordinate_names, chart.coordinates(measured[ok]).T, strict=True))
     channels += [(f"command of joint {joint}", column) for joint, column in enumerate(logged.T, start=1)]
     for name, values in channels:
         if np.ptp(values) == 0:

@@ -8,10 +8,10 @@ standard deviation: how well it was weighed or computed. Records that state the 
 import numpy as np
 import xarray as xr
 
+from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import as_number, shown
-from identify.loop_parameters import NAMES, index_of
 from identify.scenario.sections import check_load_std, check_moments
 
 ADDED = {
@@ -23,34 +23,34 @@ ADDED = {
 """Attributes of a record, and the parameter and unit to which each adds; `payload_mass_std` is the deviation of one."""
 
 
-def payload_vector(mass_kg: float, inertia_kg_m2: tuple[float, float, float]) -> Array:
-    """What a load adds to the parameters (67,); or, of standard deviations, the deviations of that."""
-    added = np.zeros(len(NAMES))
+def payload_vector(layout: ParameterLayout, mass_kg: float, inertia_kg_m2: tuple[float, float, float]) -> Array:
+    """What a load adds to a robot's parameters (p,); or, of standard deviations, the deviations of that."""
+    added = np.zeros(len(layout.names))
     for (parameter, _), value in zip(ADDED.values(), (mass_kg, *inertia_kg_m2), strict=True):
-        added[index_of(parameter)] = value
+        added[layout.names.index(parameter)] = value
     return added
 
 
-def store_payload(record: xr.Dataset, payload: Array, std: Array | None = None) -> None:
-    """Keep a load (67,) with the record made under it, and its standard deviations (67,); None: known exactly."""
-    deviations = np.zeros(len(NAMES)) if std is None else std
+def store_payload(record: xr.Dataset, layout: ParameterLayout, payload: Array, std: Array | None = None) -> None:
+    """Keep a load (p,) with the record made under it, and its standard deviations (p,); None: known exactly."""
+    deviations = np.zeros(len(layout.names)) if std is None else std
     for name, (parameter, _) in ADDED.items():
-        place = index_of(parameter)
+        place = layout.names.index(parameter)
         record.attrs |= {name: float(payload[place]), f"{name}_std": float(deviations[place])}
 
 
-def recorded_payload(record: xr.Dataset) -> tuple[Array, Array]:
-    """The load (67,) of a record and its standard deviations (67,); zero where it states none.
+def recorded_payload(record: xr.Dataset, layout: ParameterLayout) -> tuple[Array, Array]:
+    """The load (p,) of a record and its standard deviations (p,); zero where it states none.
 
     Raises RecordError: some but not all of its figures, one or its deviation that is no finite number >= 0, moments of
     no body, or a deviation that exceeds its figure.
     """
-    load, std, stated = np.zeros(len(NAMES)), np.zeros(len(NAMES)), record.attrs
+    load, std, stated = np.zeros(len(layout.names)), np.zeros(len(layout.names)), record.attrs
     if not any(name in stated or f"{name}_std" in stated for name in ADDED):
         return load, std
     try:
         for name, (parameter, unit) in ADDED.items():
-            place = index_of(parameter)
+            place = layout.names.index(parameter)
             load[place] = _not_negative(name, stated.get(name), unit)
             std[place] = _not_negative(f"{name}_std", stated.get(f"{name}_std", 0.0), unit)
             check_load_std(f"{name}_std", std[place], name, load[place], unit)

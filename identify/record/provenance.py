@@ -6,7 +6,6 @@ longer theirs.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from functools import cached_property
 from hashlib import sha256
 from typing import Any
@@ -20,7 +19,7 @@ from identify.arrays import Array
 from identify.errors import EstimationError, RecordError, ScenarioError
 from identify.files.dataset import plain, read_covariance, shown
 from identify.files.run_folder import RunFolder, load_result
-from identify.loop_parameters import NAMES
+from identify.loop_parameters import parameter_entries
 from identify.record.payload import ADDED
 from identify.record.recording import VARIABLES, read, read_model_runs, read_runs
 from identify.scenario import Scenario, scenario_from_toml
@@ -30,6 +29,12 @@ ROBOT = "robot_geometry"
 
 ROUNDING = 1e-9
 """Largest difference of any number [SI] of a geometry that another computer's arithmetic may make."""
+
+SHARED = ("base_joints", "platform_joints", "home_pose", "travel_limit", "gravity")
+"""Numbers of a geometry that do not depend on the kind of its legs."""
+
+OLDER = "crank_length"
+"""Stands in the geometry of records of older versions, which name the rest of the legs otherwise."""
 
 STATED = (
     "robot", ROBOT, "seed", "frame_rate_hz", "scale_anchor", "scale_anchor_value", "scale_anchor_std",
@@ -92,8 +97,10 @@ def check_robot(record: xr.Dataset, robot: Robot) -> None:
         raise EstimationError(f"the record is of robot {shown(record.attrs.get('robot'))}, not of {robot.name!r}")
     if ROBOT not in record.attrs:
         return
-    recorded = _read(record.attrs[ROBOT])
-    for name, ours in _numbers(robot).items():
+    recorded, numbers = _read(record.attrs[ROBOT]), _numbers(robot)
+    if OLDER in recorded:
+        numbers = {name: numbers[name] for name in SHARED}
+    for name, ours in numbers.items():
         theirs, known = recorded.get(name, np.zeros(0)), np.asarray(ours)
         if theirs.shape != known.shape:
             raise RecordError(f"{name} in the record's {ROBOT} has shape {theirs.shape}, expected {known.shape}")
@@ -108,8 +115,16 @@ def check_robot(record: xr.Dataset, robot: Robot) -> None:
 
 
 def _numbers(robot: Robot) -> dict[str, Any]:
+    """All numbers of a geometry by name, those of a leg by its own: as `leg2.crank_length`."""
     geometry = robot.geometry
-    return {field.name: np.asarray(getattr(geometry, field.name)).tolist() for field in fields(geometry)}
+    numbers: dict[str, Any] = {
+        "freedoms": list(geometry.chart.freedoms),
+        **{name: np.asarray(getattr(geometry, name)).tolist() for name in SHARED},
+    }
+    for number, leg in enumerate(geometry.legs, start=1):
+        own = leg.model_dump(exclude={"base_joint", "platform_joint", "type"})
+        numbers |= {f"leg{number}.{name}": np.asarray(value).tolist() for name, value in own.items()}
+    return numbers
 
 
 def _read(text: object) -> dict[str, Array]:
@@ -130,9 +145,14 @@ class RunFiles:
 
     experiment = cached_property(lambda self: read(self.folder.experiment))
     payload = cached_property(lambda self: read(self.folder.payload))  # of the same run under a known load
-    covariance = cached_property(lambda self: read_covariance(self.folder.covariance, NAMES))  # of the estimates
     validation = cached_property(lambda self: read_runs(self.folder.validation))
     model = cached_property(lambda self: read_model_runs(self.folder.model))  # by the run's name
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Of the estimates (p, p), in the order of the result's parameters."""
+        named = parameter_entries(load_result(self.folder.result).get("identification"))
+        return read_covariance(self.folder.covariance, tuple(named))
 
     def content(self, name: str) -> Any:
         """What a file holds, by its name, as ``experiment.nc``."""

@@ -31,11 +31,11 @@ LONG_GAP_S = 0.5
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """One run of the robot, for the output error of a model with parameters (67,).
+    """One run of the robot, for the output error of a model with parameters (p,).
 
     measured: poses (N, 6), NaN where lost; ok (N,) bool; covariance (6, 6) of one measured pose; logged: the joint
-    commands (N, 6) as they were given; driven: whether the model's joints get these, or its own servo acts; payload
-    (67,): what a known load on the platform adds to the parameters, with standard deviations payload_std (67,).
+    commands (N, n) as they were given; driven: whether the model's joints get these, or its own servo acts; payload
+    (p,): what a known load on the platform adds to the parameters, with standard deviations payload_std (p,).
     """
 
     robot: Robot
@@ -70,7 +70,7 @@ class RecordedRun:
         return self.simulate(parameters).pose
 
     def residuals(self, parameters: Array) -> tuple[Array, Array]:
-        """Whitened pose residuals model - measurement (n, 6) of the good frames, and their Jacobian (n, 6, 67)."""
+        """Whitened pose residuals model - measurement (n, 6) of the good frames, and their Jacobian (n, 6, p)."""
         run = self.simulate(parameters, sensitivities=True)
         assert run.pose_sensitivity is not None
         jacobian = np.asarray(self.whitener @ run.pose_sensitivity[self.ok], dtype=float)
@@ -115,7 +115,7 @@ def recorded_run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> Record
     check_length(record.sizes["time"], scenario)
     run = _run(record, robot, scenario)
     check_reference(run.reference, scenario)
-    check_channels(run.measured, run.logged, run.ok)
+    check_channels(robot.geometry.chart, run.measured, run.logged, run.ok)
     return run
 
 
@@ -140,10 +140,10 @@ def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
     """What a record holds, and what the scenario says of the model."""
     ok = record["measured_ok"].values.astype(bool)
     check_good_share(ok)
-    load, load_std = recorded_payload(record)
+    load, load_std = recorded_payload(record, robot.layout)
     return RecordedRun(
         robot=robot,
-        settings=model_settings(scenario),
+        settings=model_settings(robot, scenario),
         reference=recorded_reference(record),
         measured=poses(record, "measured"),
         ok=ok,

@@ -22,6 +22,8 @@ from identify.files.dataset import (
     check_variables,
     described_dataset,
     group_names,
+    joint_numbers,
+    of_actuators,
     pose_parts,
     read_group,
     write_groups,
@@ -68,12 +70,14 @@ def build_record(
     frame_rate_hz: float,
     seed: int | None = None,
     title: str = "Visual closed-loop experiment",
+    prismatic: bool = False,
 ) -> xr.Dataset:
-    """Record of one run: ``time`` (N,) [s], poses, rates and ``command`` (N, 6), covariance (N, 6, 6), ok (N,).
+    """Record of one run: ``time`` (N,) [s], poses and rates (N, 6), ``command`` (N, n), covariance (N, 6, 6), ok (N,).
 
-    SI units; the poses, and what is a rate, as CONVENTIONS says. ``command``: joint angles [rad], each from its frame
-    on. Where ``measured_ok`` is 0 the pose was lost, and may be NaN. ``scenario_toml``: timing and servo of the run, as
-    `Scenario.to_toml` gives them. ``seed``: of a simulated run; that of a real robot has none.
+    SI units; the poses, and what is a rate, as CONVENTIONS says. ``command``: of the n joints [rad, or m where they are
+    ``prismatic``], each from its frame on. Where ``measured_ok`` is 0 the pose was lost, and may be NaN.
+    ``scenario_toml``: timing and servo of the run, as `Scenario.to_toml` gives them. ``seed``: of a simulated run; that
+    of a real robot has none.
 
     Raises RecordError: wrong shapes, numbers that are not finite where a measurement was not lost, or a `measured_ok`
     that is neither 1 nor 0.
@@ -88,7 +92,8 @@ def build_record(
             "command": np.asarray(command, dtype=float),
         },
         time,
-        VARIABLES,
+        of_actuators(VARIABLES, prismatic),
+        joint=joint_numbers(command),
     )
     record.attrs = {
         "title": title,

@@ -16,7 +16,6 @@ from identify.estimation.covariance import correlation_matrix
 from identify.experiment.truth import read_truth_runs, true_poses
 from identify.files.atomic import write_figure, write_text
 from identify.files.run_folder import RunFolder, check_entries, load_result
-from identify.loop_parameters import NAMES
 from identify.progress import Progress, SilentProgress
 from identify.record.provenance import RECORDS, RunFiles
 from identify.record.recording import EXCITATION, poses, run_name
@@ -33,7 +32,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 @dataclass(frozen=True)
 class ReportData:
     """All that a report shows: the result, the records, the truth of the validation runs, the models' runs, the
-    covariance (67, 67) of the parameters and, where they are there, the trajectories."""
+    covariance (p, p) of the parameters and, where they are there, the trajectories."""
 
     result: dict[str, Any]
     experiment: xr.Dataset
@@ -59,8 +58,9 @@ class ReportData:
     def correlations(self) -> tuple[Array, list[str]]:
         """Correlations (n, n) of the identified parameters, and their names."""
         parameters = self.result["identification"]["parameters"]
-        chosen = [k for k, name in enumerate(NAMES) if parameters.get(name, {}).get("identifiable")]
-        return correlation_matrix(self.covariance[np.ix_(chosen, chosen)]), [NAMES[k] for k in chosen]
+        names = list(parameters)
+        chosen = [k for k, name in enumerate(names) if parameters[name].get("identifiable")]
+        return correlation_matrix(self.covariance[np.ix_(chosen, chosen)]), [names[k] for k in chosen]
 
 
 def _fit(record: xr.Dataset, model: xr.Dataset) -> Fit:

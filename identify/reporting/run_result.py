@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from dynamics import DynamicsError
+from dynamics import DynamicsError, Robot
 from dynamics.closed_loop.problem import checked_loop_parameters
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.experiment.truth import true_poses
 from identify.files.run_folder import rms_figures
-from identify.loop_parameters import NAMES, parameter_column, parameter_entries
+from identify.loop_parameters import parameter_column, parameter_entries
 from identify.record import recording
 from identify.validation.unseen import PosePrediction
 
@@ -24,14 +24,14 @@ def add_truth(identification: dict[str, Any], truth: dict[str, float]) -> None:
         group["true"] = sum(weight * truth[name] for name, weight in group["coefficients"].items())
 
 
-def parameter_vector(identification: dict[str, Any], column: str) -> Array:
-    """Parameters (67,) of one column ("initial", "estimate", ...) of an identification entry.
+def parameter_vector(robot: Robot, identification: dict[str, Any], column: str) -> Array:
+    """A robot's parameters (p,) of one column ("initial", "estimate", ...) of an identification entry.
 
     Raises RecordError: one that is missing or no number, or that no model can have.
     """
-    values = parameter_column(identification, column, NAMES)
+    values = parameter_column(identification, column, robot.layout.names)
     try:
-        return checked_loop_parameters(values)
+        return checked_loop_parameters(robot, values)
     except DynamicsError as error:
         raise RecordError(f"{column}: {error}") from None
 

@@ -12,7 +12,6 @@ from typing import Any
 
 import typer
 
-from dynamics.parameters import unit_of
 from identify.files.run_folder import AXES, predicted_row, rms_row
 from identify.progress import print_table
 from identify.reporting.goals import check_goals, explanation_goals
@@ -95,7 +94,7 @@ def parameter_table(result: dict[str, Any]) -> Table:
     rows = []
     for name, p in result["identification"]["parameters"].items():
         remark = (ON_GUESS if p.get("rests_on_prior") else "") if p["identifiable"] else NOT_SHOWN
-        rows.append((name, unit_of(name), number(p["initial"]), number(p["true"]), *_shown(p), remark))
+        rows.append((name, p["unit"], number(p["initial"]), number(p["true"]), *_shown(p), remark))
     anchor = result["identification"]["scale_anchor"]
     return Table(
         "Parameters (like the paper's table 2)",

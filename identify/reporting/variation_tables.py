@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from dynamics.parameters import COULOMB_NAMES, JOINT_PID_NAMES, VISCOUS_NAMES, unit_of
 from identify.reporting.tables import Table, number
 from identify.validation.variation import Variation
 
@@ -25,12 +24,12 @@ PAPER_PERCENT = {
     "link4.mass": 19.1,
     "link5.mass": 10.1,
     "link6.mass": 12.9,
-    **dict(zip(COULOMB_NAMES, (15.9, 21.4, 9.0, 17.8, 15.1, 23.4), strict=True)),
-    **dict(zip(VISCOUS_NAMES, (11.7, 13.9, 16.4, 15.2, 21.8, 13.0), strict=True)),
-    **dict(zip(JOINT_PID_NAMES, (2.82, 0.44, 3.7), strict=True)),
+    **{f"joint{leg}.coulomb": value for leg, value in enumerate((15.9, 21.4, 9.0, 17.8, 15.1, 23.4), start=1)},
+    **{f"joint{leg}.viscous": value for leg, value in enumerate((11.7, 13.9, 16.4, 15.2, 21.8, 13.0), start=1)},
+    **dict(zip(("joint_pid.lp", "joint_pid.li", "joint_pid.ld"), (2.82, 0.44, 3.7), strict=True)),
 }
-"""Table 5, as far as its rows can be told apart (in our copy a cell is missing in its left column) and as far as these
-parameters can be identified at all."""
+"""Table 5 of the paper's robot, as far as its rows can be told apart (in our copy a cell is missing in its left column)
+and as far as these parameters can be identified at all."""
 
 
 def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:
@@ -44,7 +43,7 @@ def variation_entry(found: Variation, trajectories: str) -> dict[str, Any]:
         "paper_worst_percent": PAPER_WORST_PERCENT,
         "parameters": {
             parameter: {
-                "unit": unit_of(parameter),
+                "unit": found.layout.unit(parameter),
                 "mean": found.mean[k],
                 "variation_percent": 100 * found.variation[k],
                 "expected_percent": 100 * found.expected[k],
@@ -61,7 +60,7 @@ def variation_table(found: Variation) -> Table:
     rows = tuple(
         (
             found.names[k],
-            unit_of(found.names[k]),
+            found.layout.unit(found.names[k]),
             number(found.mean[k]),
             number(100 * found.variation[k]),
             number(100 * found.expected[k]),

@@ -11,6 +11,7 @@ from pydantic import Field, field_validator, model_validator
 
 from identify.errors import ScenarioError
 from identify.filtering import padding_samples
+from identify.scenario.parameter_names import check_parameter_names
 from identify.scenario.sections import (
     Excitation,
     Filter,
@@ -66,6 +67,7 @@ class Scenario(Section):
     def _fits_together(self) -> "Scenario":
         self._complete_from_the_sensor()
         self.timing.check()
+        check_parameter_names(self.identification.prior, self.robot)
         self._check_filter()
         self._check_excitation_fits_the_filter()
         self._check_whole_frames("excitation.duration_s", self.excitation.duration_s)

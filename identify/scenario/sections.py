@@ -7,30 +7,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from identify.plugins import CRITERIA, check_choice
 
-VALID_NAMES = (
-    "mass, Ixx, Iyy or Izz of platform, crank1 to crank6 or link1 to link6 (platform.mass), coulomb or viscous of "
-    "joint1 to joint6, and joint_pid.lp, .li, .ld"
-)
-"""The names of all parameters in one line."""
-
 ROUNDING = 1e-9
 """Share by which the moments of a flat body may miss their sum."""
-
-
-def check_parameter_names(known: Any) -> Any:
-    """Return what is known by parameter name; what is no mapping is left to the check of its type.
-
-    Raises ValueError for a name that is no parameter's, with the valid ones.
-    """
-    from dynamics.parameters import JOINT_PID_NAMES, PARAMETER_NAMES
-
-    names = PARAMETER_NAMES + JOINT_PID_NAMES
-    for name in known if isinstance(known, Mapping) else ():
-        if name not in names:
-            unquoted = any(full.startswith(f"{name}.") for full in names)
-            hint = f'; its dot needs quotes: {{"{name}.…" = {{value = …, std = …}}}}' if unquoted else ""
-            raise ValueError(f"no parameter {name!r}; valid: {VALID_NAMES}{hint}")
-    return known
 
 
 def check_moments(moments: Mapping[str, float]) -> None:
@@ -60,12 +38,23 @@ FrictionName = Literal["coulomb_viscous", "smoothed", "stribeck"]
 """``coulomb_viscous``: the exact law with stick and slip (eq. 24); ``smoothed``: tanh(theta_dot / v_s);
 ``stribeck``: exact, with a breakaway torque above the Coulomb torque."""
 
-FRICTION_CONSTANTS = {
+FRICTION_CONSTANTS: dict[str, tuple[tuple[str, ...], ...]] = {
     "coulomb_viscous": (),
-    "smoothed": ("smoothing_velocity_rad_s",),
-    "stribeck": ("static_ratio", "stribeck_velocity_rad_s"),
+    "smoothed": (("smoothing_velocity_rad_s", "smoothing_velocity_m_s"),),
+    "stribeck": (("static_ratio",), ("stribeck_velocity_rad_s", "stribeck_velocity_m_s")),
 }
-"""The constants each law needs; it takes no others."""
+"""The constants each law needs, one key of each; it takes no others."""
+
+ACTUATOR_KEYS = {
+    "smoothing_velocity": ("smoothing_velocity_rad_s", "smoothing_velocity_m_s"),
+    "stribeck_velocity": ("stribeck_velocity_rad_s", "stribeck_velocity_m_s"),
+    "joint_stiffness": ("joint_stiffness_N_m_rad", "joint_stiffness_N_m"),
+    "joint_damping": ("joint_damping_N_m_s_rad", "joint_damping_N_s_m"),
+    "motor_inertia": ("motor_inertia_kg_m2", "motor_mass_kg"),
+    "travel_margin": ("travel_margin_rad", "travel_margin_m"),
+    "max_joint_velocity": ("max_joint_velocity_rad_s", "max_joint_velocity_m_s"),
+}
+"""Settings of the joints: their key where a robot's actuators turn, and where they slide."""
 
 
 def quantity(default: Any, unit: str, what: str, **limits: Any) -> Any:
@@ -90,17 +79,22 @@ class Servo(Section):
 class _Friction(Section):
     friction: FrictionName = Field("coulomb_viscous", description="friction law of the joints")
     smoothing_velocity_rad_s: float | None = quantity(None, "rad/s", "v_s of the law smoothed", gt=0)
+    smoothing_velocity_m_s: float | None = quantity(None, "m/s", "the same, where actuators slide", gt=0)
     static_ratio: float | None = quantity(None, "1", "breakaway over Coulomb torque of the law stribeck", ge=1)
     stribeck_velocity_rad_s: float | None = quantity(None, "rad/s", "velocity at which the excess fades", gt=0)
+    stribeck_velocity_m_s: float | None = quantity(None, "m/s", "the same, where actuators slide", gt=0)
 
     @model_validator(mode="after")
     def _constants_fit_the_law(self) -> "_Friction":
         for law, constants in FRICTION_CONSTANTS.items():
-            for name in constants:
-                if (law == self.friction) != (getattr(self, name) is not None):
+            for keys in constants:
+                given = {name: value for name in keys if (value := getattr(self, name)) is not None}
+                if (law == self.friction) != (len(given) == 1):
+                    said = " and ".join(f"{name} = {value}" for name, value in (given or {keys[0]: None}).items())
+                    needed = " and ".join(" or ".join(names) for names in constants)
                     raise ValueError(
-                        f"friction = {self.friction!r} with {name} = {getattr(self, name)}: the law {law} needs "
-                        f"{' and '.join(constants)}, and no other law has them"
+                        f"friction = {self.friction!r} with {said}: the law {law} needs {needed}, and no other law "
+                        "has them"
                     )
         return self
 
@@ -119,10 +113,13 @@ class Plant(_Friction):
     )
     geometry_seed: int = quantity(0, "1", "which of the robots with such errors", ge=0)
     joint_stiffness_N_m_rad: float | None = quantity(
-        None, "N m/rad", "of a spring between motor and crank, makes the joints elastic", gt=0, le=1e6
+        None, "N m/rad", "of a spring between motor and driven body, makes the joints elastic", gt=0, le=1e6
     )
+    joint_stiffness_N_m: float | None = quantity(None, "N/m", "the same, where actuators slide", gt=0, le=1e9)
     joint_damping_N_m_s_rad: float = quantity(0.05, "N m s/rad", "damping of that spring", ge=0)
-    motor_inertia_kg_m2: float = quantity(3e-4, "kg m2", "share of a crank's inertia before that spring", gt=0)
+    joint_damping_N_s_m: float = quantity(50.0, "N s/m", "the same, where actuators slide", ge=0)
+    motor_inertia_kg_m2: float = quantity(3e-4, "kg m2", "share of a driven body's inertia before that spring", gt=0)
+    motor_mass_kg: float = quantity(0.3, "kg", "share of its mass, where actuators slide", gt=0)
 
 
 class Model(_Friction):
@@ -140,7 +137,8 @@ class Excitation(Section):
     duration_s: float = quantity(20.0, "s", "length of the excitation run", gt=0, le=3600)
     position_amplitude_m: float = quantity(0.010, "m", "largest distance from home in x, y and z", gt=0)
     orientation_amplitude_rad: float = quantity(0.04, "rad", "largest angle from home in each axis", gt=0, lt=1.5)
-    travel_margin_rad: float = quantity(0.10, "rad", "distance kept from the travel limit of the cranks", ge=0)
+    travel_margin_rad: float = quantity(0.10, "rad", "distance kept from the travel limit of the joints", ge=0)
+    travel_margin_m: float = quantity(0.01, "m", "the same, where actuators slide", ge=0)
     candidates: int = quantity(
         64, "1", "random trajectories: the best is chosen, is where a search begins, or they evolve", ge=1, le=100_000
     )
@@ -151,8 +149,16 @@ class Excitation(Section):
         "observability",
         description="eq. 39, D-optimality of the output error's information, or module:function",
     )
-    max_joint_velocity_rad_s: float = quantity(2.0, "rad/s", "largest velocity of a crank", gt=0)
+    max_joint_velocity_rad_s: float = quantity(2.0, "rad/s", "largest velocity of a joint", gt=0)
+    max_joint_velocity_m_s: float = quantity(0.2, "m/s", "the same, where actuators slide", gt=0)
+    least_leverage: float = quantity(0.05, "1", "least leverage of an actuator on its leg (J_a1)", ge=0, lt=1)
+    most_condition: float = quantity(20.0, "1", "largest condition number of J_a2 without unit, of the 2-norm", ge=1)
     generations: int = quantity(324, "1", "generations of the evolutionary method (the paper: 324)", ge=1, le=100_000)
+
+    @property
+    def singularity_limits(self) -> dict[str, float]:
+        """Least leverage and largest condition, as `dynamics.workspace.check_motion` takes them."""
+        return {"least_leverage": self.least_leverage, "most_condition": self.most_condition}
 
     @field_validator("criterion")
     @classmethod
@@ -196,11 +202,6 @@ class Identification(Section):
     cost_tolerance: float = quantity(1e-6, "1", "tol1 of eq. 35, relative change of the cost", gt=0, lt=1)
     parameter_tolerance: float = quantity(1e-3, "1", "tol2 of eq. 35, relative change of a parameter", gt=0, lt=1)
     qr_threshold: float = quantity(1e-3, "1", "entries of R below it count as zero in base_rank (section 4.2)", gt=0)
-
-    @field_validator("prior", mode="before")
-    @classmethod
-    def _of_parameters(cls, prior: Any) -> Any:
-        return check_parameter_names(prior)
 
     @model_validator(mode="after")
     def _anchor_measures_what_is_stated(self) -> "Identification":

@@ -31,7 +31,6 @@ from identify.experiment.joint_instruments import JointInstruments, measure_join
 from identify.experiment.truth import read_truth, read_truth_runs, true_parameters, true_poses
 from identify.files.dataset import write_groups
 from identify.files.run_folder import rms_figures, rms_row
-from identify.loop_parameters import NAMES
 from identify.progress import Progress
 from identify.random_streams import INSTRUMENTS, LATENCY, mixed_generator, stream_seed
 from identify.record.provenance import RunFiles
@@ -44,7 +43,8 @@ START = "starting guess"
 
 @dataclass(frozen=True)
 class Examination:
-    """The truth: parameters (67,), combinations (k, 64) of them that the record shows, and unseen runs of the plant."""
+    """The truth: parameters (p,), combinations (k, p) of the dynamic ones that the record shows, unseen runs of the
+    plant."""
 
     robot: Robot
     scenario: Scenario
@@ -54,8 +54,9 @@ class Examination:
 
     def group_errors(self, parameters: Array) -> Array:
         """Relative errors (k,) of the base parameters that the record shows."""
-        true = self.combinations @ self.true[:64]
-        return np.asarray((self.combinations @ parameters[:64] - true) / np.abs(true), dtype=float)
+        dynamic = self.robot.layout.dynamic
+        true = self.combinations @ self.true[dynamic]
+        return np.asarray((self.combinations @ parameters[dynamic] - true) / np.abs(true), dtype=float)
 
     def pose_distance(self, parameters: Array) -> tuple[float, float]:
         """RMS of the worst axis and run, um and urad; NaN where the model's loop is unstable, or an estimator gives
@@ -74,8 +75,8 @@ class Examination:
 @dataclass(frozen=True)
 class Score:
     """One row of the table. Distances: RMS and median relative errors of groups, RMS of gains, um and urad on
-    unseen trajectories; NaN with a reason in the note where an estimator gave nothing. parameters, std (67,): what it
-    gave."""
+    unseen trajectories; NaN with a reason in the note where an estimator gave nothing. parameters, std (p,): what it
+    gave, of the parameters with these names."""
 
     name: str
     title: str
@@ -91,6 +92,7 @@ class Score:
     note: str
     parameters: Array | None = None
     std: Array | None = None
+    names: tuple[str, ...] = ()
 
 
 def compare_on_run(
@@ -110,23 +112,24 @@ def compare_on_run(
     latencies = scenario.timing.drawn_latencies(record.sizes["time"], draws)
     rng, channels = mixed_generator(INSTRUMENTS, seed), folder.path / "instruments.nc"
     write_groups(channels, {"": measure_joints(record, truth, scenario.timing, instruments, rng, latencies)})
-    known = true_parameters(truth)
-    true = np.array([known[name] for name in NAMES])
-    problem = output_error_problem([record], load_robot(scenario.robot), scenario)
-    evidence = Evidence(problem, scenario, joint_channels(read_channels(channels), record), true[64:])
+    known, robot = true_parameters(truth), load_robot(scenario.robot)
+    true = np.array([known[name] for name in robot.layout.names])
+    problem = output_error_problem([record], robot, scenario)
+    gains = true[robot.layout.joint_pid]
+    evidence = Evidence(problem, scenario, joint_channels(read_channels(channels), record), gains)
     unseen = zip(files.validation, read_truth_runs(folder.validation), strict=True)
     return compare(evidence, examination(evidence, true, list(unseen)), estimators, progress)
 
 
 def examination(evidence: Evidence, true: Array, unseen: Sequence[tuple[xr.Dataset, xr.Dataset]]) -> Examination:
-    """What is asked of the estimators, from the true parameters (67,) and unseen (record, truth) pairs.
+    """What is asked of the estimators, from the true parameters (p,) and unseen (record, truth) pairs.
 
     Raises EstimationError where the record shows no base parameter, or no unseen run is given.
     """
     if not unseen:
         raise EstimationError("no unseen trajectory to judge the estimators on")
     robot = evidence.run.robot
-    base = base_parameters(structural_regressor(robot))
+    base = base_parameters(structural_regressor(robot), robot.layout)
     driven = evidence.problem.driven_by_commands()
     covariance = estimate_uncertainty(driven, true, np.random.default_rng(0)).covariance
     guess = evidence.problem.guess
@@ -157,9 +160,10 @@ def _score(name: str, estimator: Estimator, evidence: Evidence, asked: Examinati
     except (EstimationError, DynamicsError) as error:
         nothing = (np.nan, np.nan, np.nan, np.nan, np.nan, np.nan)
         return Score(name, estimator.title, estimator.uses, *nothing, 0, 0, f"failed: {error}")
-    groups, gains = asked.group_errors(found.parameters), found.parameters[64:] / asked.true[64:] - 1
+    pid = asked.robot.layout.joint_pid
+    groups, gains = asked.group_errors(found.parameters), found.parameters[pid] / asked.true[pid] - 1
     distances = (_rms(groups), float(np.median(np.abs(groups))), _rms(gains), *asked.pose_distance(found.parameters))
-    return Score(name, estimator.title, estimator.uses, *distances, **vars(found))
+    return Score(name, estimator.title, estimator.uses, *distances, **vars(found), names=asked.robot.layout.names)
 
 
 def _rms(values: Array) -> float:

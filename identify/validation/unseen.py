@@ -18,6 +18,7 @@ import cmmsim
 from dynamics import Robot
 from dynamics.closed_loop import LoopFailure, Reference, simulate
 from dynamics.closed_loop.problem import checked_loop_parameters
+from dynamics.kinematics.chart import Chart
 from identify.arrays import Array
 from identify.estimation.covariance import repeated_experiment
 from identify.excitation.design import unseen_trajectories
@@ -71,7 +72,7 @@ def model_run(robot: Robot, scenario: Scenario, parameters: Array, reference: Re
     reach.
     """
     try:
-        return simulate(robot, parameters, reference, model_settings(scenario)).pose
+        return simulate(robot, parameters, reference, model_settings(robot, scenario)).pose
     except LoopFailure:
         return np.full_like(reference.poses, np.nan)
 
@@ -82,7 +83,8 @@ REPETITIONS = 4
 
 @dataclass(frozen=True)
 class PosePrediction:
-    """The model's poses (N, 6) [m, rad], and the covariance (N, 6, 6) of the plant's true ones about them.
+    """The model's poses (N, 6) [m, rad], and the covariance (N, 6, 6) of the plant's true ones about them, of a robot
+    with this chart; zero where that forbids motion.
 
     Two things keep the plant away from the model. The parameters are uncertain: their covariance C comes through the
     exact sensitivities S of the model's poses as S C S^T. And the sensor's noise goes through the servo into the
@@ -91,6 +93,7 @@ class PosePrediction:
     frames it was taught, moves the whole motion with it and is not predicted: no record of this sensor shows it.
     """
 
+    chart: Chart
     poses: Array
     covariance: Array
 
@@ -100,17 +103,19 @@ class PosePrediction:
         return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)), dtype=float)
 
     def normalised_squared_error(self, true: Array) -> float:
-        """Mean over the frames of e^T P^-1 e / 6 with the error e of the true poses (N, 6): near one where P is right.
+        """Mean over the frames of e^T P^-1 e / m with the error e of the true poses (N, 6) in the m coordinates of the
+        platform: near one where P is right.
 
         Errors of parameters last for the whole motion: of a single run the figure spreads widely about one.
         """
-        errors = true - self.poses
-        weighted = np.linalg.solve(self.covariance, errors[..., None])[..., 0]
-        return float(np.mean(np.sum(errors * weighted, axis=1))) / 6
+        free = self.chart.basis
+        errors = (true - self.poses) @ free
+        weighted = np.linalg.solve(free.T @ self.covariance @ free, errors[..., None])[..., 0]
+        return float(np.mean(np.sum(errors * weighted, axis=1))) / free.shape[1]
 
 
 def predict_poses(run: RecordedRun, parameters: Array, covariance: Array, rng: np.random.Generator) -> PosePrediction:
-    """Predict a run with estimated parameters (67,) of covariance (67, 67).
+    """Predict a run with estimated parameters (p,) of covariance (p, p).
 
     Of the run only the reference, the sensor's covariance and the lost frames count, not what was measured.
     Raises LoopFailure where the model, or its repetition with the sensor's noise, is unstable.
@@ -120,7 +125,7 @@ def predict_poses(run: RecordedRun, parameters: Array, covariance: Array, rng: n
     drawn = [repeated_experiment(run, parameters, rng).pose - model.pose for _ in range(REPETITIONS)]
     noise = np.concatenate(drawn)
     from_parameters = model.pose_sensitivity @ covariance @ model.pose_sensitivity.transpose(0, 2, 1)
-    return PosePrediction(model.pose, from_parameters + noise.T @ noise / len(noise))
+    return PosePrediction(run.robot.geometry.chart, model.pose, from_parameters + noise.T @ noise / len(noise))
 
 
 def predicted_runs(
@@ -132,7 +137,7 @@ def predicted_runs(
     seed: int,
     progress: Progress,
 ) -> list[PosePrediction]:
-    """What the identified model (67,) with its covariance (67, 67) predicts for the plant on the references of records.
+    """What the identified model (p,) with its covariance (p, p) predicts for the plant on the references of records.
 
     NaN throughout where its loop is unstable, or too little was measured to know the sensor's noise.
 
@@ -147,7 +152,8 @@ def predicted_runs(
                 prediction = predict_poses(watched_run(record, robot, scenario), parameters, covariance, rng)
             except (LoopFailure, TooFewFramesError):
                 shape = (record.sizes["time"], 6)
-                prediction = PosePrediction(np.full(shape, np.nan), np.full((*shape, 6), np.nan))
+                chart = robot.geometry.chart
+                prediction = PosePrediction(chart, np.full(shape, np.nan), np.full((*shape, 6), np.nan))
             predictions.append(prediction)
             advance()
     return predictions
@@ -204,7 +210,7 @@ def _followed(counter: Synchronized[int], advance: Advance) -> Iterator[None]:
 
 
 def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed: int = 0) -> Array:
-    """Pose errors (runs, N, 6) [m, rad] of the model with these parameters (67,) against the plant with the true ones.
+    """Pose errors (runs, N, 6) [m, rad] of the model with these parameters (p,) against the plant with the true ones.
 
     On the scenario's unseen trajectories for this seed; plant and model each with their own friction law and steps.
     Both see by an ideal sensor, so that only the parameters and what the model leaves out make the error. NaN where the
@@ -213,7 +219,7 @@ def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed:
     Raises dynamics.DynamicsError: parameters of another shape, not finite, or outside their range. Raises
     TrajectoryError: no unseen trajectory keeps the robot's limits.
     """
-    values, plant = checked_loop_parameters(parameters), build_plant(scenario, robot)
+    values, plant = checked_loop_parameters(robot, parameters), build_plant(scenario, robot)
     times = scenario.timing.frame_times(scenario.validation.duration_s)
     references = [path.reference(times) for path in unseen_trajectories(robot, scenario, seed)]
     model = [model_run(robot, scenario, values, reference) for reference in references]

@@ -23,6 +23,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from dynamics import Robot, load_robot
+from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.identification import identify
@@ -47,12 +48,17 @@ class Variation:
     """Of each parameter (p,), SI: mean of the estimates, their standard deviation relative to it, the same as expected
     from the runs' own intervals, and whether every run identifies it; runs: their number."""
 
-    names: tuple[str, ...]
+    layout: ParameterLayout
     mean: Array
     variation: Array
     expected: Array
     identified: NDArray[np.bool_]
     runs: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.layout.names
 
     def __repr__(self) -> str:
         return (
@@ -88,7 +94,7 @@ def variation(results: Sequence[IdentificationResult]) -> Variation:
     mean = estimates.mean(axis=0)
     size = np.where(mean == 0, np.nan, np.abs(mean))
     return Variation(
-        names=results[0].names,
+        layout=results[0].layout,
         mean=mean,
         variation=estimates.std(axis=0, ddof=1) / size,
         expected=np.sqrt(np.mean(stds**2, axis=0)) / size,

@@ -47,16 +47,18 @@ class WorkspacePlane:
 
     @property
     def allowed(self) -> Array:
-        """Where all legs reach with cranks within the travel limit (n, n)."""
+        """Where all legs reach with their joints within the travel limit (n, n)."""
         return np.asarray(self.travel_share <= 1)
 
 
 @dataclass(frozen=True)
 class WorkspaceMap:
-    """Planes, range of each pose component alone (6, 2) [m, rad from home], and measures at home and of
-    those of JOINT_SAMPLES random joint vectors within travel that have a pose."""
+    """Planes, range of each coordinate of the platform alone (m, 2) [m, rad from home], and measures at home and of
+    those of JOINT_SAMPLES random joint vectors within travel that have a pose; unit: of the joints."""
 
     robot: str
+    unit: str
+    axes: tuple[int, ...]
     characteristic_length_m: float
     planes: tuple[WorkspacePlane, ...]
     ranges: Array
@@ -67,44 +69,51 @@ class WorkspaceMap:
         """The map in numbers, for JSON; units are in the names."""
         return {
             "robot": self.robot,
-            "travel_limit_rad": self.home.travel_limit,
+            f"travel_limit_{self.unit}": self.home.travel_limit,
             "characteristic_length_m": self.characteristic_length_m,
-            "home": _extremes(self.home),
+            "home": _extremes(self.home, self.unit),
             "whole_travel": {
                 "joint_vectors": JOINT_SAMPLES,
                 "without_pose": JOINT_SAMPLES - len(self.travel.theta),
-                **_extremes(self.travel),
+                **_extremes(self.travel, self.unit),
             },
-            "range_from_home": {axis: list(pair) for axis, pair in zip(AXES, self.ranges.tolist(), strict=True)},
+            "range_from_home": {AXES[k]: list(pair) for k, pair in zip(self.axes, self.ranges.tolist(), strict=True)},
             "planes": [_plane_summary(plane) for plane in self.planes],
         }
 
 
 def map_workspace(robot: Robot, progress: Progress | None = None, points: int = POINTS) -> WorkspaceMap:
-    """Maps of x-y at three heights with home's orientation, and of alpha-beta at three gamma with home's position.
+    """Maps of x-y at three heights with home's orientation, of a planar platform at three angles, and of alpha-beta at
+    three gamma with home's position, where the platform can do that.
 
-    The sides reach a crank's length from home, or 1.3 of it over the characteristic length in rotation.
+    The sides reach as far from home as the most sensitive joint goes at home's rate within its travel, or 1.3 of that
+    over the characteristic length in rotation.
     """
     progress = progress or SilentProgress()
-    length = robot.geometry.characteristic_length
-    step, turn = robot.geometry.crank_length, 1.3 * robot.geometry.crank_length / length
-    layout = [(0, 1, 2, step, offset * step) for offset in (-0.4, 0.0, 0.4)]
-    layout += [(3, 4, 5, turn, offset * turn) for offset in (-0.4, 0.0, 0.4)]
+    length, axes = robot.geometry.characteristic_length, robot.geometry.chart.freedoms
+    step = robot.travel_limit / float(np.abs(robot.pose_jacobian(robot.home_pose)[:, :3]).max())
+    turn = 1.3 * step / length
+    layout = [shown for shown in ((0, 1, 2), (0, 1, 5), (3, 4, 5)) if set(shown) <= set(axes)]
+    if (0, 1, 2) in layout and (0, 1, 5) in layout:
+        layout.remove((0, 1, 5))
     planes = []
-    with progress.stage("workspace", len(layout) + 2) as advance:
-        for across, up, fixed, side, offset in layout:
-            planes.append(_plane(robot, (across, up, fixed), side, offset, points))
-            advance()
-        ranges = np.array([_range(robot, axis, step if axis < 3 else turn) for axis in range(6)])
+    with progress.stage("workspace", 3 * len(layout) + 2) as advance:
+        for across, up, fixed in layout:
+            for offset in (-0.4, 0.0, 0.4):
+                side, beyond = (step if axis < 3 else turn for axis in (across, fixed))
+                planes.append(_plane(robot, (across, up, fixed), side, offset * beyond, points))
+                advance()
+        ranges = np.array([_range(robot, axis, step if axis < 3 else turn) for axis in axes])
         advance()
         limit = robot.travel_limit
-        theta = np.random.default_rng(0).uniform(-limit, limit, (JOINT_SAMPLES, 6))
+        theta = np.random.default_rng(0).uniform(-limit, limit, (JOINT_SAMPLES, robot.layout.joints))
         start = np.tile(robot.home_pose, (JOINT_SAMPLES, 1))
-        poses, residual = forward_kinematics.search(robot.functions, theta, start)
+        poses, residual = forward_kinematics.search(robot.functions, robot.geometry.chart, theta, start)
         solved = (residual < forward_kinematics.ANGLE_TOLERANCE).all(axis=1)
         travel = workspace.measure(robot, poses[solved])
         advance()
-    return WorkspaceMap(robot.name, length, tuple(planes), ranges, workspace.measure(robot, robot.home_pose), travel)
+    unit, home = "m" if robot.layout.prismatic else "rad", workspace.measure(robot, robot.home_pose)
+    return WorkspaceMap(robot.name, unit, axes, length, tuple(planes), ranges, home, travel)
 
 
 def _plane(robot: Robot, axes: tuple[int, int, int], side: float, offset: float, points: int) -> WorkspacePlane:
@@ -128,7 +137,7 @@ def _plane(robot: Robot, axes: tuple[int, int, int], side: float, offset: float,
 
 
 def _range(robot: Robot, axis: int, side: float, points: int = 4001) -> tuple[float, float]:
-    """How far one pose component alone goes down and up from home before a crank reaches its travel limit."""
+    """How far one pose component alone goes down and up from home before a joint reaches its travel limit."""
     steps = np.linspace(0, 3 * side, points)
     ends = []
     for sign in (-1.0, 1.0):
@@ -138,9 +147,9 @@ def _range(robot: Robot, axis: int, side: float, points: int = 4001) -> tuple[fl
     return ends[0], ends[1]
 
 
-def _extremes(measures: workspace.WorkspaceMeasures) -> dict[str, float]:
+def _extremes(measures: workspace.WorkspaceMeasures, unit: str) -> dict[str, float]:
     return {
-        "largest_angle_rad": float(np.abs(measures.theta).max()),
+        f"largest_{'angle_rad' if unit == 'rad' else 'length_m'}": float(np.abs(measures.theta).max()),
         "least_reach_margin": float(measures.reach_margin.min()),
         "least_leverage_J_a1": float(measures.leverage.min()),
         "largest_condition_J_a2": float(measures.platform_condition.max()),
@@ -162,8 +171,8 @@ def _plane_summary(plane: WorkspacePlane) -> dict[str, Any]:
 
 
 def travel_figure(workspace: WorkspaceMap) -> Figure:
-    """Largest crank angle as a share of the travel limit."""
-    title = f"{workspace.robot}: travel used, largest |θ| / {workspace.home.travel_limit:.4f} rad"
+    """Largest joint coordinate as a share of the travel limit."""
+    title = f"{workspace.robot}: travel used, largest |θ| / {workspace.home.travel_limit:.4f} {workspace.unit}"
     return _maps(workspace, "travel_share", title, "largest |θ| / travel limit", Normalize(0, 1.5))
 
 

@@ -19,7 +19,7 @@ from identify.random_streams import stream_seed
 from identify.record import recording
 from identify.scenario import Scenario
 from identify.scenario.sections import Section
-from identify.studies.rows.kind import NOISE_OFF, PATH, PICTURES, PLANT, Column, Kind, Reads, Row
+from identify.studies.rows.kind import LIMITS, NOISE_OFF, PATH, PICTURES, PLANT, Column, Kind, Reads, Row
 from identify.studies.rows.sensor import POSE_COLUMNS, Teaching, pose_figures, rms_um
 
 EXPERIMENT, TRAJECTORY = 0, 1
@@ -49,8 +49,7 @@ READS = Reads(
         "scenario.servo.",
         "scenario.plant.",
         *PATH,
-        "scenario.excitation.travel_margin_rad",
-        "scenario.excitation.max_joint_velocity_rad_s",
+        *LIMITS,
         "scenario.validation.duration_s",
     ),
     idle=(NOISE_OFF, *PLANT),

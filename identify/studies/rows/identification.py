@@ -15,7 +15,6 @@ from pydantic import Field
 from cmmsim.visibility import expected_covariance
 from dynamics import Robot, load_robot
 from dynamics.closed_loop import Reference, simulate
-from dynamics.parameters import COULOMB_NAMES, JOINT_PID_NAMES, VISCOUS_NAMES
 from identify.arrays import Array
 from identify.estimation.identification import identify as identify_record
 from identify.estimation.result import IdentificationResult
@@ -36,11 +35,12 @@ from identify.validation.unseen import model_run
 
 EXPERIMENT = 0
 CHOSEN = {
-    "coulomb": ("Coulomb friction", COULOMB_NAMES),
-    "viscous": ("viscous friction", VISCOUS_NAMES),
-    "gains": ("joint gains", JOINT_PID_NAMES),
+    "coulomb": ("Coulomb friction", "coulomb"),
+    "viscous": ("viscous friction", "viscous"),
+    "gains": ("joint gains", "joint_pid"),
 }
-"""Parameters that a record always shows, so that their spread follows the noise; rms over each set."""
+"""Parameters that a record always shows, so that their spread follows the noise, with their slice of the layout; rms
+over each set."""
 
 COLUMNS = {
     "frames": Column("1", "frames of the record"),
@@ -142,10 +142,10 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
     row: Row = {}
     for figure, values in (("std", result.std), ("error", result.estimate - truth)):
         for name, (_, members) in CHOSEN.items():
-            index = [result.names.index(member) for member in members]
+            index = getattr(result.layout, members)
             row[f"{name}_{figure}_percent"] = 100.0 * float(np.sqrt(np.mean((values[index] / truth[index]) ** 2)))
     groups = result.groups
-    true_groups = groups.combinations @ truth[: groups.combinations.shape[1]]
+    true_groups = groups.combinations @ truth[result.layout.dynamic]
     seen = groups.identifiable
     row["identified_groups"] = int(seen.sum())
     if seen.any():  # a wrong model identifies nothing, and the row has its other figures all the same
@@ -158,7 +158,7 @@ def _parameter_figures(result: IdentificationResult, truth: Array) -> Row:
 def prediction_figures(
     robot: Robot, scenario: Scenario, estimated: tuple[Array, Array], truth: Array, references: list[Reference]
 ) -> Row:
-    """What the error of parameters (67,), estimated with a covariance (67, 67), makes of the model's positions on
+    """What the error of parameters (p,), estimated with a covariance (p, p), makes of the model's positions on
     references, and what the covariance states of it.
 
     Every direction in which the parameters can err counts as much as it shows; so the figure has the scatter of many
@@ -167,7 +167,7 @@ def prediction_figures(
     estimate, covariance = estimated
     squares, stated = [], []
     for reference in references:
-        model = simulate(robot, estimate, reference, model_settings(scenario), sensitivities=True)
+        model = simulate(robot, estimate, reference, model_settings(robot, scenario), sensitivities=True)
         assert model.pose_sensitivity is not None
         slopes = model.pose_sensitivity[:, :3]
         squares.append(np.mean((model.pose - model_run(robot, scenario, truth, reference))[:, :3] ** 2))

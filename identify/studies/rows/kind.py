@@ -72,6 +72,13 @@ BOX = ("scenario.excitation.position_amplitude_m", "scenario.excitation.orientat
 PATH = ("scenario.excitation.fundamental_hz", "scenario.excitation.harmonics", *BOX)
 """What draws a pose in the scenario's box, and a path in it."""
 
+LIMITS = (
+    "scenario.excitation.travel_margin_rad", "scenario.excitation.travel_margin_m",
+    "scenario.excitation.max_joint_velocity_rad_s", "scenario.excitation.max_joint_velocity_m_s",
+    "scenario.excitation.least_leverage", "scenario.excitation.most_condition",
+)  # fmt: skip
+"""What decides whether such a path is admissible."""
+
 NOISE_OFF = Idle(
     tuple(f"sensor.camera.{name}" for name in ("dark_noise", "prnu", "dsnu", "pattern_seed")),
     {"sensor.camera.noise": lambda noise: not noise},
@@ -88,6 +95,11 @@ PLANT = (
         ("scenario.plant.joint_damping_N_m_s_rad", "scenario.plant.motor_inertia_kg_m2"),
         {"scenario.plant.joint_stiffness_N_m_rad": lambda stiffness: stiffness is None},
         "scenario.plant.joint_stiffness_N_m_rad is not given: the joints are rigid",
+    ),
+    Idle(
+        ("scenario.plant.joint_damping_N_s_m", "scenario.plant.motor_mass_kg"),
+        {"scenario.plant.joint_stiffness_N_m": lambda stiffness: stiffness is None},
+        "scenario.plant.joint_stiffness_N_m is not given: the joints are rigid",
     ),
 )
 """Keys of a plant that does not have what they belong to."""

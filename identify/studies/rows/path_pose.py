@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 import cmmsim
+from dynamics.kinematics.chart import Chart
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.excitation.design import drawn_trajectory
@@ -52,7 +53,7 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: PathPoseO
     """One row. Raises EstimationError where fewer than two poses were measured, and what the sensor raises."""
     eye = row_sensor(scenario, options.teaching, stream_seed(seed, SENSOR))
     rng = np.random.default_rng(stream_seed(seed, DRAWN_PATH))
-    path = drawn_trajectory(rng, eye.sensor.home, scenario.excitation)
+    path = drawn_trajectory(rng, Chart("free", tuple(eye.sensor.home)), scenario.excitation)
     start = rng.uniform(0.0, 1.0 / scenario.excitation.fundamental_hz)
     frames = max(2, scenario.timing.frames(options.stretch_s))
     times: Array = start + scenario.timing.frame_period_s * np.arange(frames, dtype=float)

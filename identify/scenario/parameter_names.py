@@ -1,0 +1,44 @@
+"""The names of a robot's parameters, as a scenario may state them."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from dynamics.parameters import ParameterLayout
+
+
+def check_parameter_names(known: Mapping[str, object], robot: str) -> None:
+    """Raise ValueError for a name that is no parameter's of a robot, given by name or path, with the valid ones; also
+    where there is no such robot."""
+    if not known:
+        return
+    from dynamics.errors import RobotFileError  # dynamics loads CasADi, for which the command line must not wait
+    from dynamics.parameters import parameter_layout
+    from dynamics.robot_file import read_robot_file
+
+    try:
+        layout = parameter_layout(read_robot_file(robot).geometry.legs)
+    except RobotFileError as error:
+        raise ValueError(f"robot: {error}") from None
+    for name in known:
+        if name not in layout.names:
+            unquoted = any(full.startswith(f"{name}.") for full in layout.names)
+            hint = f'; its dot needs quotes: {{"{name}.…" = {{value = …, std = …}}}}' if unquoted else ""
+            raise ValueError(f"identification.prior: no parameter {name!r}; valid: {in_words(layout)}{hint}")
+
+
+def in_words(layout: "ParameterLayout") -> str:
+    """The names of all parameters in one line."""
+    kinds: dict[str, list[str]] = {}
+    for body, kind in zip(layout.bodies, layout.kinds, strict=True):
+        kinds.setdefault(kind.name, []).append(body)
+    bodies = " or ".join(_range(names) for names in kinds.values())
+    gains = ", ".join(f".{name.split('.')[1]}" for name in layout.joint_pid_names[1:])
+    return (
+        f"mass, Ixx, Iyy or Izz of {bodies} (platform.mass), coulomb or viscous of {_range(layout.joint_names)}, and "
+        f"{layout.joint_pid_names[0]}, {gains}"
+    )
+
+
+def _range(names: list[str] | tuple[str, ...]) -> str:
+    return f"{names[0]} to {names[-1]}" if len(names) > 1 else names[0]
