@@ -210,7 +210,8 @@ def _add_part(
     body = Xml.SubElement(parent, "body", name=part.name, attrib=place)
     coordinates = _add_joint(body, part, part_axis(part, home, number), chain.joints[part.leg], friction)
     _add_inertia(body, segment.centre, inertia)
-    _rod(body, "capsule", *segment.rod, segment.radius, "crank" if segment.actuated else "link")
+    start, end = segment.rod
+    _rod(body, "capsule", start, end, segment.radius, "crank" if segment.actuated else "link")
     if segment.joint in ("ball", "universal"):
         _ball(body, np.zeros(3), 1.5 * segment.radius)
     if segment.end is not None:

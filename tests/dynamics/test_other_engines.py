@@ -82,10 +82,13 @@ def test_reloaded_bodies_accelerate_as_the_robot_with_the_changed_parameters(muj
     robot = load_robot(name)
     for chosen in robot.parameter_sets.values():
         values = as_exported(robot, chosen.dynamic)
-        engine, state = exported(robot, chosen.dynamic), travel_states(robot, values)
-        ours = robot.forward_dynamics(*state, values)
-        for pose, twist, torque, acceleration in zip(*state, ours, strict=True):
-            theirs = acceleration_in_rigid_loops(mujoco, engine, pose, twist, torque)
+        engine = exported(robot, chosen.dynamic)
+        pose, twist, holding = travel_states(robot, values)
+        usual = 0.1 * chosen.joint_pid[0] * robot.travel_limit
+        torques = holding + usual * np.random.default_rng(8).standard_normal(holding.shape)
+        ours = robot.forward_dynamics(pose, twist, torques, values)
+        for *state, torque, acceleration in zip(pose, twist, torques, ours, strict=True):
+            theirs = acceleration_in_rigid_loops(mujoco, engine, *state, torque)
             assert np.abs(theirs - acceleration).max() <= 1e-9 * np.abs(acceleration).max()
 
 
