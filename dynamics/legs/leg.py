@@ -224,7 +224,9 @@ class Leg(BaseModel, ABC):
         spins = self.angular_velocities(position, velocity)
         for body, (place, spin) in enumerate(zip(self.placements(position), spins, strict=True)):
             own = rigid[4 * body : 4 * body + 4]
-            inertia = place.axes @ ca.diag(own[1:4]) @ place.axes.T
+            # What does no work would leave rounding where there is nothing.
+            working = [own[k] if name in self.bodies[body].moments else 0 for k, name in enumerate(INERTIAL)]
+            inertia = place.axes @ ca.diag(ca.vertcat(*working[1:])) @ place.axes.T
             maps = ca.jacobian(place.centre, position), ca.jacobian(spin, velocity)
             found.append(((own[0], inertia), *maps, spin))
         return found
