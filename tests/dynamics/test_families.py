@@ -1,5 +1,6 @@
 """Every kind of leg and every built-in robot, and one that mixes legs: against Pinocchio, and consistent in itself."""
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 import dynamics
 from dynamics.closed_loop import FrameTiming, LoopSettings, Reference, ServoGains, simulate, stability
+from dynamics.errors import RobotFileError
 from dynamics.legs import KINDS
 from dynamics.legs.leg import Leg
 from dynamics.robot_file import built_in_robots
@@ -169,6 +171,16 @@ def test_sensitivities_of_a_run_are_its_finite_differences(robot, values):
             np.testing.assert_allclose(other.pose, base.pose, atol=1e-13, err_msg=name)
 
 
+def test_joint_coordinates_are_nan_exactly_where_a_leg_cannot_reach(robot):
+    rng, m = np.random.default_rng(6), len(robot.coordinate_names)
+    away = rng.uniform(-1, 1, (500, m)) * (np.repeat([0.25, 0.5], 3) @ robot.geometry.chart.basis)
+    poses = robot.pose(robot.coordinates(robot.home_pose) + away)
+    coordinates, reach = robot.functions["inverse_kinematics"](poses)
+    np.testing.assert_array_equal(np.isnan(coordinates), ~(reach > 0))
+    assert (reach <= 1).all()
+    assert 50 < (reach > 0).sum() < reach.size - 50
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_forces_mass_and_coriolis_of_a_leg_are_one_virtual_work(kind):
     """Closed forms are those of `Leg` to 1e-12 where the leg can move; the force at rest, mass acceleration and
@@ -220,3 +232,15 @@ def test_built_in_robots_reach_a_box_about_home_within_all_limits(name):
     extremes = check_motion(robot, robot.pose(robot.coordinates(robot.home_pose) + corners))
     assert extremes.reach.value > 0.1
     np.testing.assert_allclose(robot.inverse_kinematics(robot.home_pose), 0, atol=1e-7)
+
+
+@pytest.mark.parametrize(("name", "moved"), [("ups6", "joint_axis"), ("pus6", "joint_axis"), ("pss6", "base_joint")])
+def test_a_leg_whose_link_lies_along_an_axis_at_home_is_refused(name, moved):
+    """Of a universal joint; or, where it may not spin, of the slider that its moments are counted from."""
+    geometry = dynamics.load_robot(name).geometry
+    leg, joint = geometry.legs[2], geometry.joints_at(geometry.home_pose)[2]
+    along = (joint - leg.base_joint) / np.linalg.norm(joint - leg.base_joint)
+    value = along if moved == "joint_axis" else joint - leg.link_length * leg.slider_axis
+    legs = (*geometry.legs[:2], leg.model_copy(update={moved: value}), *geometry.legs[3:])
+    with pytest.raises(RobotFileError, match=r"leg 3 is singular at the home pose: its \w+ turns by .* rad/m"):
+        replace(geometry, legs=legs)
