@@ -36,7 +36,8 @@ def check(
     from identify.scenario import load_scenario
     from identify.verification.robot_check import check_robot
 
-    chosen, settings = load_robot(robot), model_settings(load_scenario(scenario))
+    chosen = load_robot(robot)
+    settings = model_settings(chosen, load_scenario(scenario))
     check_parameter_set(chosen, parameters)
     values = chosen.parameter_sets[parameters].vector
     findings = check_robot(chosen, values, settings, terminal_progress(quiet))

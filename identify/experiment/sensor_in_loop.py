@@ -16,6 +16,7 @@ from identify.arrays import Array
 from identify.progress import Advance
 from identify.scenario import Scenario
 
+
 def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:
     """Meshes [m] of the bodies of all legs, rods along their z axes from their first joints; they hide stickers."""
     return {
@@ -27,7 +28,9 @@ def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:
 def robot_transforms(robot: Robot, pose: Array) -> dict[str, Array]:
     """base_from_body (4, 4) of the rods of all legs with the platform at a pose (6,)."""
     parts = parts_of(robot.geometry)
-    return {part.name: cmmsim.rod_transform(*ends) for part, ends in zip(parts.all, parts.rods(robot, pose), strict=True)}
+    return {
+        part.name: cmmsim.rod_transform(*ends) for part, ends in zip(parts.all, parts.rods(robot, pose), strict=True)
+    }
 
 
 def make_sensor(scenario: Scenario, robot: Robot, seed: int, taught: cmmsim.Taught | None = None) -> cmmsim.Sensor:

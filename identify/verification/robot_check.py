@@ -129,7 +129,7 @@ def _holding(robot: Robot, parameters: Array) -> Iterator[Finding]:
 
 
 def _visible(robot: Robot) -> Iterator[Finding]:
-    found = base_parameters(structural_regressor(robot), robot.parameter_names)
+    found = base_parameters(structural_regressor(robot), robot.layout)
     unseen = f"no motion shows {', '.join(found.unseen)}" if found.unseen else "all are seen"
     text = f"{found.rank} base parameters of {len(robot.parameter_names)}; {unseen}"
     yield Finding("base parameters", found.rank > 0, found.rank, None, "1", None, text)
