@@ -35,8 +35,8 @@ def one_thread(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0))
+    """Cores that this process may use; where only Linux can say so, all of the machine."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 STOPPED = 130

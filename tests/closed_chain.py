@@ -1,8 +1,8 @@
-"""A robot in Pinocchio: free-flying platform, six revolute cranks, six links on spherical joints, 18 loop constraints.
+"""A robot in Pinocchio: free-flying platform, the bodies of each leg on their joints, and loop constraints at its end.
 
 Pinocchio knows nothing of virtual work, of the leg Jacobians or of the platform joints' motion: it gets bodies, joints
-and the demand that six points of the links stay on six points of the platform. Crank angles and rates are those the
-robot gives; `closure` shows whether they close the chain.
+and the demand that points of the last bodies stay on points of the platform, which is so kept from moving as it cannot.
+Joint coordinates and rates are those the robot gives; `closure` shows whether they close the chain.
 """
 
 from typing import NamedTuple
@@ -10,9 +10,19 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from tests.dynamics.conftest import base_from_platform, link_axes, place_legs
+from tests.dynamics.conftest import base_from_platform
 
 SETTINGS = pin.ProximalSettings(1e-14, 0.0, 20)
+NONE, X, Y, Z = np.zeros(3), *np.eye(3)
+JOINTS = {
+    "hinge": [pin.JointModelRZ],
+    "link hinge": [pin.JointModelRY],
+    "slide": [pin.JointModelPZ],
+    "ball": [pin.JointModelSpherical],
+    "universal": [pin.JointModelRZ, pin.JointModelRX],
+}
+LINK_HINGE = np.column_stack([Y, Z, X])
+"""Axes of a planar link in those of its crank, when both are in line: y is along the hinges."""
 
 
 class ChainState(NamedTuple):
@@ -23,59 +33,168 @@ class ChainState(NamedTuple):
     force: np.ndarray
 
 
+class Part(NamedTuple):
+    """A body of a leg: its joint to part `before` (-1: the base), where that is in the frame there, which inertia of the
+    leg it has and how much of it, its centre of mass, and its end, which is on the platform `off` the joint there."""
+
+    joint: str
+    before: int
+    place: pin.SE3
+    body: int
+    centre: np.ndarray
+    end: np.ndarray | None = None
+    share: float = 1.0
+    off: np.ndarray = NONE
+
+
+def turned(axes, origin):
+    return pin.SE3(np.array(axes), np.array(origin, dtype=float))
+
+
+def across(z, near=np.array([0.3, 0.5, 0.8])):
+    """Axes with a given z."""
+    x = np.cross(z, near) / np.linalg.norm(np.cross(z, near))
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def crank_parts(leg, joint, turn=np.eye(3), offs=(NONE,)):
+    """A crank and the links on it, of which there may be two."""
+    zero, tip, end = leg.crank_zero_direction, leg.crank_length * X, leg.link_length * Z
+    foot = np.column_stack([zero, np.cross(leg.crank_axis, zero), leg.crank_axis])
+    links = [
+        Part(joint, 0, turned(turn, tip + off), 1, end / 2, end, 1 / len(offs), off @ foot.T) for off in offs
+    ]
+    return [Part("hinge", -1, turned(foot, leg.base_joint), 0, tip / 2), *links]
+
+
+def parallelogram_parts(leg):
+    half = leg.bar_distance / 2 * Z
+    return crank_parts(leg, "ball", offs=(-half, half))
+
+
+def slider_parts(leg, joint, turn):
+    rail, end = across(leg.slider_axis), leg.link_length * Z
+    slider = Part("slide", -1, turned(rail, leg.base_joint), 0, NONE)
+    return [slider, Part(joint, 0, turned(rail.T @ turn, NONE), 1, end / 2, end)]
+
+
+def ups_parts(leg):
+    foot, rod = turned(across(leg.joint_axis), leg.base_joint), turned(np.eye(3), leg.zero_length * Z)
+    cylinder = Part("universal", -1, foot, 0, leg.cylinder_centre * Z)
+    return [cylinder, Part("slide", 0, rod, 1, -leg.rod_centre * Z, NONE)]
+
+
+PARTS = {
+    "rss": lambda leg: crank_parts(leg, "ball"),
+    "rus": lambda leg: crank_parts(leg, "universal"),
+    "rrr": lambda leg: crank_parts(leg, "link hinge", LINK_HINGE),
+    "parallelogram": parallelogram_parts,
+    "ups": ups_parts,
+    "pss": lambda leg: slider_parts(leg, "ball", np.eye(3)),
+    "pus": lambda leg: slider_parts(leg, "universal", across(leg.joint_axis)),
+}
+
+
+def link_motion(axis, link, rate, spins):
+    """Axes and angular velocity of a link: x is normal to a standing axis; about this it turns and about x, or, where it
+    hangs on a ball, as it does without spin."""
+    length = np.linalg.norm(link)
+    z, z_rate = link / length, rate / length
+    x = np.cross(axis, z) / np.linalg.norm(np.cross(axis, z))
+    omega, excluded = np.cross(z, z_rate), np.cross(axis, x)
+    if spins:
+        omega = omega - z * (omega @ excluded) / (z @ excluded)
+    return np.column_stack([x, np.cross(z, x), z]), omega
+
+
+def crank_motions(leg, theta, rate, at, moving):
+    axis, zero = leg.crank_axis, leg.crank_zero_direction
+    x = np.cos(theta) * zero + np.sin(theta) * np.cross(axis, zero)
+    tip, tip_rate = leg.base_joint + leg.crank_length * x, rate * leg.crank_length * np.cross(axis, x)
+    link = link_motion(axis, at - tip, moving - tip_rate, leg.type == "rus")
+    return [(np.column_stack([x, np.cross(axis, x), axis]), rate * axis), link, link]
+
+
+def slider_motions(leg, coordinate, rate, at, moving):
+    axis = leg.slider_axis
+    link, link_rate = at - leg.base_joint - coordinate * axis, moving - rate * axis
+    spins = leg.type == "pus"
+    return [(across(axis), NONE), link_motion(leg.joint_axis if spins else axis, link, link_rate, spins)]
+
+
+def ups_motions(leg, coordinate, rate, at, moving):
+    body = link_motion(leg.joint_axis, at - leg.base_joint, moving, True)
+    return [body, body]
+
+
+MOTIONS = {"ups": ups_motions, "pss": slider_motions, "pus": slider_motions}
+
+
 class ClosedChain:
-    """A robot with dynamic parameters (64,); friction is no part of it."""
+    """A robot with dynamic parameters (p,); friction is no part of it."""
 
     def __init__(self, robot, values):
         self.robot, self.model = robot, pin.Model()
         self.model.gravity.linear = robot.geometry.gravity
-        self._bodies = np.reshape(values[:52], (13, 4))
-        platform = self._body(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), 0, np.zeros(3))
-        self.joints, self.loops = [], pin.StdVec_RigidConstraintModel()
-        for leg in range(6):
-            self._leg(leg, platform)
+        self._bodies, layout = robot.layout.bodies_of(values), robot.layout
+        platform = self._body(0, pin.JointModelFreeFlyer, pin.SE3.Identity(), self._bodies[0], NONE)
+        self.legs, self.loops = [], pin.StdVec_RigidConstraintModel()
+        for leg, own in zip(robot.geometry.legs, layout.of_leg, strict=True):
+            self._leg(leg, own, platform)
         self.data, self.loop_data = self.model.createData(), pin.StdVec_RigidConstraintData()
         self.loop_data.extend([loop.createData() for loop in self.loops])
         later = (self.loop_data,) if int(pin.__version__.split(".")[0]) >= 4 else ()
         pin.initConstraintDynamics(self.model, self.data, self.loops, *later)
 
-    def _body(self, parent, joint, place, body, centre):
-        mass, *moments = self._bodies[body]
-        number = self.model.addJoint(parent, joint, place, f"body{body}")
-        self.model.appendBodyToJoint(number, pin.Inertia(mass, centre, np.diag(moments)), pin.SE3.Identity())
+    def _body(self, parent, joint, place, inertia, centre):
+        number = self.model.addJoint(parent, joint(), place, f"joint{self.model.njoints}")
+        if inertia is not None:
+            inertia = pin.Inertia(inertia[0], centre, np.diag(inertia[1:]))
+            self.model.appendBodyToJoint(number, inertia, pin.SE3.Identity())
         return number
 
-    def _leg(self, leg, platform):
-        g = self.robot.geometry
-        zero, axis = g.crank_zero_directions[leg], g.crank_axes[leg]
-        foot = pin.SE3(np.column_stack([zero, np.cross(axis, zero), axis]), g.base_joints[leg])
-        tip, end = (pin.SE3(np.eye(3), np.array(point)) for point in ([g.crank_length, 0, 0], [0, 0, g.link_length]))
-        crank = self._body(0, pin.JointModelRZ(), foot, 1 + leg, tip.translation / 2)
-        link = self._body(crank, pin.JointModelSpherical(), tip, 7 + leg, end.translation / 2)
-        joint = pin.SE3(np.eye(3), g.platform_joints[leg])
-        kind, frame = pin.ContactType.CONTACT_3D, pin.ReferenceFrame.LOCAL
-        self.loops.append(pin.RigidConstraintModel(kind, self.model, link, end, platform, joint, frame))
-        self.joints.append((self.model.joints[crank], self.model.joints[link]))
+    def _leg(self, leg, own, platform):
+        parts, joints = PARTS[leg.type](leg), []
+        for part in parts:
+            kinds, parent = JOINTS[part.joint], joints[part.before][-1] if part.before >= 0 else 0
+            inertia, numbers, place = part.share * self._bodies[own[part.body]], [], part.place
+            for kind in kinds:
+                last = len(numbers) == len(kinds) - 1
+                numbers.append(self._body(parent, kind, place, inertia if last else None, part.centre))
+                parent, place = numbers[-1], pin.SE3.Identity()
+            joints.append(numbers)
+            if part.end is not None:
+                at_home = base_from_platform(self.robot.home_pose)
+                on_platform = turned(np.eye(3), leg.platform_joint + part.off @ at_home)
+                kind, frame = pin.ContactType.CONTACT_3D, pin.ReferenceFrame.LOCAL
+                end = turned(np.eye(3), part.end)
+                self.loops.append(
+                    pin.RigidConstraintModel(kind, self.model, numbers[-1], end, platform, on_platform, frame)
+                )
+        self.legs.append((leg, parts, [[self.model.joints[n] for n in numbers] for numbers in joints]))
 
     def state(self, pose, twist, torque):
-        """The chain at a pose (6,), with a twist (6,) and net joint torques (6,); links do not spin (eq. 12)."""
-        g = self.robot.geometry
+        """The chain at a pose (6,), with a twist (6,) and net joint torques (n,); links on balls do not spin (eq. 12)."""
         turn = base_from_platform(pose)
         theta, rates = self.robot.inverse_kinematics(pose), self.robot.joint_jacobian(pose) @ twist
         q, v, force = pin.neutral(self.model), np.zeros(self.model.nv), np.zeros(self.model.nv)
         q[:3], q[3:7] = pose[:3], pin.Quaternion(turn).coeffs()
         v[:3], v[3:6] = turn.T @ twist[:3], turn.T @ twist[3:]
-        legs = place_legs(g, pose, theta)
-        arms, links, frames = legs.joint - pose[:3], legs.joint - legs.tip, link_axes(g, legs)
-        for leg, (crank_joint, link_joint) in enumerate(self.joints):
-            axis, l, link = g.crank_axes[leg], links[leg], frames[leg]
-            x = legs.crank[leg] / g.crank_length
-            crank = np.column_stack([x, np.cross(axis, x), axis])
-            l_dot = twist[:3] + np.cross(twist[3:], arms[leg]) - rates[leg] * np.cross(axis, legs.crank[leg])
-            omega = np.cross(l, l_dot) / (l @ l)
-            q[crank_joint.idx_q], v[crank_joint.idx_v], force[crank_joint.idx_v] = theta[leg], rates[leg], torque[leg]
-            q[link_joint.idx_q : link_joint.idx_q + 4] = pin.Quaternion(crank.T @ link).coeffs()
-            v[link_joint.idx_v : link_joint.idx_v + 3] = link.T @ (omega - rates[leg] * axis)
+        for number, (leg, parts, joints) in enumerate(self.legs):
+            arm = turn @ leg.platform_joint
+            at, moving = pose[:3] + arm, twist[:3] + np.cross(twist[3:], arm)
+            motions = MOTIONS.get(leg.type, crank_motions)(leg, theta[number], rates[number], at, moving)
+            for part, own, (axes, omega) in zip(parts, joints, motions[: len(parts)], strict=True):
+                before, omega_before = motions[part.before] if part.before >= 0 else (np.eye(3), NONE)
+                frame = before @ part.place.rotation
+                coordinates, speeds = _joint(part, frame.T @ axes, frame.T @ (omega - omega_before))
+                if part.joint == "slide":
+                    coordinates, speeds = [[theta[number]]], [[rates[number]]]
+                for joint, coordinate, speed in zip(own, coordinates, speeds, strict=True):
+                    q[joint.idx_q : joint.idx_q + joint.nq] = coordinate
+                    v[joint.idx_v : joint.idx_v + joint.nv] = speed
+                if part.joint in ("slide", "hinge"):
+                    force[own[0].idx_v] = torque[number]
         return ChainState(q, v, force)
 
     def acceleration(self, state):
@@ -84,12 +203,15 @@ class ClosedChain:
 
     def twist_dot(self, state):
         """Platform acceleration [h_ddot, omega_dot] (6,), base axes."""
-        a, v = self.acceleration(state), state.v
-        turn = pin.Quaternion(*state.q[[6, 3, 4, 5]]).toRotationMatrix()
+        return self.platform_acceleration(state, self.acceleration(state))
+
+    def platform_acceleration(self, state, a):
+        """Of a generalised acceleration: [h_ddot, omega_dot] (6,), base axes."""
+        turn, v = pin.Quaternion(*state.q[[6, 3, 4, 5]]).toRotationMatrix(), state.v
         return np.concatenate([turn @ (a[:3] + np.cross(v[3:6], v[:3])), turn @ a[3:6]])
 
     def closure(self, state):
-        """Largest gap (m) and gap velocity (m/s) of the 18 constraints: proves that the chain is set up closed."""
+        """Largest gap (m) and gap velocity (m/s) of the constraints: proves that the chain is set up closed."""
         pin.forwardKinematics(self.model, self.data, state.q, state.v)
 
         def end(joint, place):
@@ -98,3 +220,13 @@ class ClosedChain:
 
         gaps = [end(c.joint1_id, c.joint1_placement) - end(c.joint2_id, c.joint2_placement) for c in self.loops]
         return np.abs(gaps).max(axis=(0, 2))
+
+
+def _joint(part, axes, omega):
+    """Coordinates and speeds of the joints of a part, for its axes and angular velocity in the frame of the first."""
+    if part.joint == "ball":
+        return [pin.Quaternion(axes).coeffs()], [axes.T @ omega]
+    if part.joint == "link hinge":
+        return [[np.arctan2(axes[0, 2], axes[0, 0])]], [[omega[1]]]
+    turn, tilt = np.arctan2(axes[1, 0], axes[0, 0]), np.arctan2(axes[2, 1], axes[2, 2])
+    return [[turn], [tilt]][: len(JOINTS[part.joint])], [[omega[2]], [omega @ axes[:, 0]]][: len(JOINTS[part.joint])]

@@ -23,10 +23,10 @@ from dynamics.closed_loop.problem import (
 )
 from dynamics.robot import Robot
 
-SLOWEST_HZ, MOST_GAIN = 0.5, 1e3
+SLOWEST_HZ, MOST_GAIN = 0.5, 100.0
 """Ends of the searches for the frame rate and the gains at which a loop is lost."""
 
-STEP = 1.02
+STEP = 1.1
 """Ratio of neighbours in these searches, between which the limit is then bisected."""
 
 

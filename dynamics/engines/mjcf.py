@@ -38,8 +38,8 @@ NOT_IN_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 Integrator = Literal["implicitfast", "RK4"]
 
 CHANGED_INERTIAS = (
-    "Inertias that no rigid body has were changed to the nearest that MuJoCo accepts. Moments that do no work in a leg,",
-    "as of a crank that turns about z alone and of a link that does not spin, do not alter the motion; others do.",
+    "Inertias that no rigid body has were changed to the nearest that MuJoCo accepts. Moments that do no work in its",
+    "leg, as of a crank that turns about z alone and of a link that does not spin, do not alter the motion; others do.",
 )
 
 
@@ -210,7 +210,8 @@ def _add_part(
     body = Xml.SubElement(parent, "body", name=part.name, attrib=place)
     coordinates = _add_joint(body, part, part_axis(part, home, number), chain.joints[part.leg], friction)
     _add_inertia(body, segment.centre, inertia)
-    _rod(body, "capsule", *segment.rod, segment.radius, "crank" if segment.actuated else "link")
+    start, end = segment.rod
+    _rod(body, "capsule", start, end, segment.radius, "crank" if segment.actuated else "link")
     if segment.joint in ("ball", "universal"):
         _ball(body, np.zeros(3), 1.5 * segment.radius)
     if segment.end is not None:
@@ -221,8 +222,8 @@ def _add_part(
 def _add_joint(
     body: Xml.Element, part: Part, axis: np.ndarray, coordinate: float, friction: dict[str, str]
 ) -> list[float]:
-    """Add the joint of a part; returns its coordinates at home. A universal joint is two hinges, that of the body before
-    first."""
+    """Add the joint of a part; returns its coordinates at home. A universal joint is two hinges, first the one in the
+    body before."""
     if part.segment.joint == "ball":
         Xml.SubElement(body, "joint", name=part.name, type="ball")
         return [1.0, 0.0, 0.0, 0.0]

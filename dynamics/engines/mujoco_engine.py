@@ -141,14 +141,14 @@ class MujocoRobot:
         self._mujoco.mj_forward(self.model, data)
 
     def twist_dot(self, torque: np.ndarray) -> np.ndarray:
-        """Acceleration [h_ddot, omega_dot] (6,), base axes, under actuator torques or forces (n,) in the present state."""
+        """Acceleration [h_ddot, omega_dot] (6,), base axes, under actuator torques or forces (n,), in the state it is in."""
         self.data.ctrl[:] = floats("torque", torque, (len(self._joint),))
         self._mujoco.mj_forward(self.model, self.data)
         platform = Rotation.from_quat(self.data.qpos[3:7], scalar_first=True).as_matrix()
         return np.concatenate([self.data.qacc[:3], platform @ self.data.qacc[3:6]])
 
     def feed_back(self, stiffness: float, damping: float) -> None:
-        """Let every motor add -stiffness coordinate - damping rate to its control, evaluated inside MuJoCo's integrator."""
+        """Let every motor add -stiffness coordinate - damping rate to its control, inside MuJoCo's integrator."""
         self.model.actuator_biastype[:] = self._mujoco.mjtBias.mjBIAS_AFFINE
         stiffness = real("stiffness", stiffness, MujocoError, least=0)
         damping = real("damping", damping, MujocoError, least=0)

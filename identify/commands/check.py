@@ -26,21 +26,26 @@ Examples:
 def check(
     robot: Annotated[str, typer.Argument(help="Built-in robot or path of a TOML file.")],
     scenario: Annotated[str, typer.Option(help="Scenario whose servo and timing the loop has.")] = "paper",
-    parameters: Annotated[str, typer.Option(metavar="SET", help="Parameter set of the robot.")] = "initial",
+    parameters: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SET", help="Parameter set of the robot.", show_default="the scenario's truth, else initial"
+        ),
+    ] = None,
     json: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write the findings there.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no table.")] = False,
 ) -> None:
     """Judge a robot file."""
     from dynamics import load_robot
-    from identify.loop_parameters import check_parameter_set, model_settings
+    from identify.loop_parameters import NOMINAL, check_parameter_set, model_settings
     from identify.scenario import load_scenario
     from identify.verification.robot_check import check_robot
 
-    chosen = load_robot(robot)
-    settings = model_settings(chosen, load_scenario(scenario))
-    check_parameter_set(chosen, parameters)
-    values = chosen.parameter_sets[parameters].vector
-    findings = check_robot(chosen, values, settings, terminal_progress(quiet))
+    chosen, given = load_robot(robot), load_scenario(scenario)
+    name = parameters or (given.plant.parameters if given.plant.parameters in chosen.parameter_sets else NOMINAL)
+    check_parameter_set(chosen, name)
+    values = chosen.parameter_sets[name].vector
+    findings = check_robot(chosen, values, model_settings(chosen, given), terminal_progress(quiet))
     failed = [finding for finding in findings if not finding.ok]
     if json is not None:
         try:
@@ -49,7 +54,7 @@ def check(
             raise OutputFolderError(f"cannot write {json}: {error}; name another file with --json") from None
     if not quiet:
         rows = [("yes" if finding.ok else "NO", finding.check, finding.text) for finding in findings]
-        print_table(("ok", "check", "finding"), rows, ("ok", "check", "finding"), f"{chosen.name}: {robot}")
+        print_table(("ok", "check", "finding"), rows, ("ok", "check", "finding"), f"{chosen.name}, parameters `{name}`")
     if failed:
         said = "; ".join(f"{finding.check}: {finding.text}" for finding in failed)
         raise VerificationError(f"{len(failed)} of {len(findings)} findings about {chosen.name} fail: {said}")

@@ -1,8 +1,8 @@
 """The paper's model validation (section 4.1): this model against MuJoCo in the loop of its figure 7, and its figure 8.
 
-The same joint PID (eq. 31) on both engines follows the joint coordinates of the same exciting trajectory (eq. 37); torques
-come from each engine's own motion. This model goes through the closed loop of the experiments, driven by commands;
-MuJoCo through `mj_step` on the exported MJCF.
+The same joint PID (eq. 31) on both engines follows the joint coordinates of the same exciting trajectory (eq. 37);
+torques come from each engine's own motion. This model goes through the closed loop of the experiments, driven by
+commands; MuJoCo through `mj_step` on the exported MJCF.
 
 MuJoCo runs with RK4 and with the PID's stiffness and damping inside its integrator, so that its discretisation stays
 far below what is to be seen; only the integral part is held over a step of 0.25 ms, at its value in mid-step.
@@ -37,7 +37,6 @@ EXCITATION = Excitation(
     harmonics=5,
     position_amplitude_m=0.010,
     orientation_amplitude_rad=0.040,
-    travel_margin_rad=0.1,
 )
 
 GOAL_UM, GOAL_URAD = 10.0, 20.0
@@ -47,7 +46,8 @@ PAPER = {"position_max_um": 1250.0, "angle_max_urad": 3250.0, "position_steady_u
 @dataclass(frozen=True)
 class EngineRuns:
     """Both engines over time (N,) [s]: poses (N, 6) [m, rad] of this model, of MuJoCo and of the reference;
-    actuator torques or forces (N, n) [N m, N] of this model and of MuJoCo; MuJoCo's closure error (N,) [m] and link spin (N,) [rad/s]."""
+    actuator torques or forces (N, n) [N m, N] of this model and of MuJoCo; MuJoCo's closure error (N,) [m] and link
+    spin (N,) [rad/s]."""
 
     time: Array
     reference: Array
@@ -146,8 +146,9 @@ def _mujoco_rows(
 @dataclass(frozen=True)
 class Verdict:
     """Largest differences between the engines, of the whole run and from STEADY_FROM_S on: distances of the platform
-    [um], lengths of the vector of Euler angle differences [urad], actuator torque or force [N m, N]; MuJoCo's loop closure
-    error [um] and link spin [rad/s]; how far this model is from its reference [um, urad], which is what the PID leaves to see."""
+    [um], lengths of the vector of Euler angle differences [urad], actuator torque or force [N m, N]; MuJoCo's loop
+    closure error [um] and link spin [rad/s]; how far this model is from its reference [um, urad], which is what the PID
+    leaves to see."""
 
     position_max_um: float
     position_steady_um: float

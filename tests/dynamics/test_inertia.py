@@ -12,6 +12,7 @@ from dynamics.engines.mjcf import mjcf_text
 from dynamics.errors import ParameterError
 from dynamics.inertia import UnphysicalInertiaError, acceleration_changes, physical_inertias, travel_states
 
+LAYOUT = load_robot("rss6").layout
 moments = st.floats(0, 1) | st.sampled_from([0.0, 1e-12, 1e-6])
 
 
@@ -57,7 +58,7 @@ def test_changed_inertias_are_physical_and_keep_what_the_motion_feels(numbers):
     given_ = np.array(numbers)
     before, after = (
         given_.reshape(13, 4),
-        physical_inertias(load_robot("rss6").layout, given_, allow_changes=True).values,
+        physical_inertias(LAYOUT, given_, allow_changes=True).values,
     )
     assert (after > 0).all()
     for x, y, z in itertools.permutations(after[:, 1:].T):
@@ -72,8 +73,8 @@ def test_changed_inertias_are_physical_and_keep_what_the_motion_feels(numbers):
 def test_the_largest_moments_are_changed_as_small_ones_are():
     """Powers of two scale without rounding: up to the largest floats the result is the same, without overflow."""
     given_ = np.tile([0.5, 0.1, 0.2, 0.8], 13)
-    expected = physical_inertias(load_robot("rss6").layout, given_, allow_changes=True).values
-    largest = physical_inertias(given_ * 2.0**1023 * 2, allow_changes=True).values
+    expected = physical_inertias(LAYOUT, given_, allow_changes=True).values
+    largest = physical_inertias(LAYOUT, given_ * 2.0**1023 * 2, allow_changes=True).values
     np.testing.assert_array_equal(largest / 2.0**512, expected * 2.0**512)
 
 
@@ -81,7 +82,7 @@ def test_platform_gets_the_nearest_moments():
     """Against a dense sample of moments that a body can have, none is nearer."""
     values = np.full(52, 0.1)
     values[:4] = [24, 0.1, 0.15, 0.4]
-    changed = physical_inertias(values, allow_changes=True).values[0, 1:]
+    changed = physical_inertias(LAYOUT, values, allow_changes=True).values[0, 1:]
     sample = np.random.default_rng(1).uniform(0, 0.5, (200_000, 3))
     possible = sample[2 * sample.max(axis=1) <= sample.sum(axis=1)]
     nearest = np.linalg.norm(possible - values[1:4], axis=1).min()

@@ -10,10 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from dynamics.engines.mjcf import MjcfSolver, mjcf_text
 from dynamics.engines.mujoco_engine import MujocoMissingError, MujocoRobot
-from dynamics.inertia import physical_inertias
-from dynamics.parameters import BODY_NAMES, COULOMB, RIGID_BODY, VISCOUS
-from dynamics.robot import Robot
-from dynamics.robot_file import RobotDescription
+from dynamics.inertia import physical_inertias, travel_states
+from dynamics.robot import Robot, load_robot
+from dynamics.robot_file import RobotDescription, built_in_robots
 
 
 @pytest.fixture
@@ -25,44 +24,44 @@ def exported(robot, parameters=None, **options):
     return MujocoRobot(robot, mjcf_text(robot, parameters, allow_unphysical_inertia=True, **options))
 
 
-def as_exported(values):
-    """Parameters (64,) with the inertias that the export writes."""
+def as_exported(robot, values):
+    """Parameters (p,) with the inertias that the export writes."""
     changed = values.copy()
-    changed[RIGID_BODY] = physical_inertias(values, allow_changes=True).values.ravel()
+    changed[robot.layout.rigid] = physical_inertias(robot.layout, values, allow_changes=True).values.ravel()
     return changed
 
 
 def test_model_has_exactly_the_parameters_and_closed_loops_at_home(mujoco, robot, identified):
     """Those of Table 2 with other numbers in every body, all of which rigid bodies can have."""
     physical = identified[:64].copy()
-    bodies = physical[RIGID_BODY].reshape(-1, 4)
+    bodies = robot.layout.bodies_of(physical)
     bodies[:, 1:] = bodies[:, 3:] * np.random.default_rng(2).uniform(0.6, 1.0, (13, 3))
     engine = MujocoRobot(robot, mjcf_text(robot, physical))
     model = engine.model
-    for body, row in zip(BODY_NAMES, bodies, strict=True):
+    for body, row in zip(robot.layout.bodies, bodies, strict=True):
         assert model.body(body).mass[0] == row[0]
         np.testing.assert_array_equal(model.body(body).inertia, row[1:])
     for leg in range(6):
         joint = model.joint(f"joint{leg + 1}")
-        assert joint.damping[0] == physical[VISCOUS][leg]
-        assert joint.frictionloss[0] == physical[COULOMB][leg]
+        assert joint.damping[0] == physical[robot.layout.viscous][leg]
+        assert joint.frictionloss[0] == physical[robot.layout.coulomb][leg]
     np.testing.assert_array_equal(model.opt.gravity, robot.geometry.gravity)
     assert not model.geom_contype.any()
     assert (model.nv, model.nu, model.neq) == (30, 6, 6)
     mujoco.mj_resetDataKeyframe(model, engine.data, model.key("home").id)
     np.testing.assert_allclose(engine.pose, robot.home_pose, atol=1e-15)
-    np.testing.assert_allclose(engine.crank_angle, robot.inverse_kinematics(robot.home_pose), atol=1e-15)
+    np.testing.assert_allclose(engine.joints, robot.inverse_kinematics(robot.home_pose), atol=1e-15)
     assert engine.closure_error < 1e-14
     without = MujocoRobot(robot, mjcf_text(robot, physical, coulomb=False)).model
     assert not without.dof_frictionloss.any()
-    assert without.joint("joint1").damping[0] == physical[VISCOUS][0]
+    assert without.joint("joint1").damping[0] == physical[robot.layout.viscous][0]
 
 
 @pytest.mark.parametrize("name", ["initial", "identified"])
 def test_accelerations_differ_by_the_softness_of_the_loops_alone(mujoco, robot, states, name):
     """At rest, under random torques: 1 - impedance is the share of the loop forces that MuJoCo leaves out."""
-    values = as_exported(robot.parameter_sets[name].dynamic)
-    values[COULOMB] = 0.0
+    values = as_exported(robot, robot.parameter_sets[name].dynamic)
+    values[robot.layout.coulomb] = 0.0
     torques = 5 * np.random.default_rng(5).standard_normal((30, 6))
     ours = robot.forward_dynamics(states.pose[:30], np.zeros((30, 6)), torques, values)
     worst = {}
@@ -77,35 +76,42 @@ def test_accelerations_differ_by_the_softness_of_the_loops_alone(mujoco, robot, 
     assert worst[0.999] / worst[0.9999] == pytest.approx(10, rel=0.1)
 
 
-@pytest.mark.parametrize("name", ["initial", "identified"])
-def test_reloaded_bodies_accelerate_as_the_robot_with_the_changed_parameters(mujoco, robot, states, name):
+@pytest.mark.parametrize("name", built_in_robots())
+def test_reloaded_bodies_accelerate_as_the_robot_with_the_changed_parameters(mujoco, name):
     """With MuJoCo's bodies in loops that are closed exactly (not by its springs), moving, with friction: to 1e-9."""
-    values = robot.parameter_sets[name].dynamic
-    engine, torques = exported(robot, values), 5 * np.random.default_rng(8).standard_normal((300, 6))
-    ours = robot.forward_dynamics(states.pose, states.twist, torques, as_exported(values))
-    for pose, twist, torque, acceleration in zip(states.pose, states.twist, torques, ours, strict=True):
-        theirs = acceleration_in_rigid_loops(mujoco, engine, pose, twist, torque)
-        assert np.abs(theirs - acceleration).max() <= 1e-9 * np.abs(acceleration).max()
+    robot = load_robot(name)
+    for chosen in robot.parameter_sets.values():
+        values = as_exported(robot, chosen.dynamic)
+        engine = exported(robot, chosen.dynamic)
+        pose, twist, holding = travel_states(robot, values)
+        usual = 0.1 * chosen.joint_pid[0] * robot.travel_limit
+        torques = holding + usual * np.random.default_rng(8).standard_normal(holding.shape)
+        ours = robot.forward_dynamics(pose, twist, torques, values)
+        for *state, torque, acceleration in zip(pose, twist, torques, ours, strict=True):
+            theirs = acceleration_in_rigid_loops(mujoco, engine, *state, torque)
+            assert np.abs(theirs - acceleration).max() <= 1e-9 * np.abs(acceleration).max()
 
 
 def acceleration_in_rigid_loops(mujoco, engine, pose, twist, torque):
-    """twist_dot of MuJoCo's bodies with the 18 loop equations solved as they stand: M a - J^T f = Q, J a = -J_dot v."""
+    """twist_dot of MuJoCo's bodies with the loop equations solved as they stand: M a - J^T f = Q, J a = -J_dot v."""
     engine.put(pose, twist)
     model, data = engine.model, engine.data
-    mass, loops, drift = np.zeros((30, 30)), np.zeros((18, 30)), np.zeros((18, 30))
+    size, count = model.nv, 3 * model.neq
+    mass, loops, drift = np.zeros((size, size)), np.zeros((count, size)), np.zeros((count, size))
     mujoco.mj_fullM(model, data, mass)
-    for leg in range(6):
-        rows = slice(3 * leg, 3 * leg + 3)
-        for sign, name in ((1, f"link_end{leg + 1}"), (-1, f"platform_joint{leg + 1}")):
-            site, part, rate = data.site(name), np.zeros((3, 30)), np.zeros((3, 30))
-            body = model.site_bodyid[site.id]
-            mujoco.mj_jac(model, data, part, None, site.xpos, body)
-            mujoco.mj_jacDot(model, data, rate, None, site.xpos, body)
+    for loop in range(model.neq):
+        rows = slice(3 * loop, 3 * loop + 3)
+        for sign, site in ((1, model.eq_obj1id[loop]), (-1, model.eq_obj2id[loop])):
+            part, rate = np.zeros((3, size)), np.zeros((3, size))
+            at, body = data.site_xpos[site], model.site_bodyid[site]
+            mujoco.mj_jac(model, data, part, None, at, body)
+            mujoco.mj_jacDot(model, data, rate, None, at, body)
             loops[rows] += sign * part
             drift[rows] += sign * rate
+    assert np.abs(loops @ data.qvel).max() < 1e-10, "the loops stay closed"
     force = data.qfrc_passive - data.qfrc_bias - model.dof_frictionloss * np.sign(data.qvel)
-    force[[model.joint(f"joint{leg + 1}").dofadr[0] for leg in range(6)]] += torque
-    system = np.block([[mass, -loops.T], [loops, np.zeros((18, 18))]])
+    force[model.jnt_dofadr[model.actuator_trnid[:, 0]]] += torque
+    system = np.block([[mass, -loops.T], [loops, np.zeros((count, count))]])
     a = np.linalg.solve(system, np.concatenate([force, -drift @ data.qvel]))
     platform = Rotation.from_quat(data.qpos[3:7], scalar_first=True).as_matrix()
     return np.concatenate([a[:3], platform @ a[3:6]])
@@ -116,7 +122,7 @@ def test_resting_robot_stays_in_its_dry_friction(mujoco, robot):
     values = robot.parameter_sets["identified"].dynamic
     engine = exported(robot, values)
     engine.put(robot.home_pose, np.zeros(6))
-    torque = robot.static_torque(robot.home_pose, values) + 0.5 * values[COULOMB]
+    torque = robot.static_torque(robot.home_pose, values) + 0.5 * values[robot.layout.coulomb]
     for _ in range(round(1 / engine.timestep)):
         engine.step(torque)
     assert np.abs(engine.pose - robot.home_pose)[:3].max() < 1e-7
@@ -126,13 +132,10 @@ def test_robot_with_tilted_cranks_agrees_too(mujoco, robot, states):
     """The whole reference robot turned by 40 degrees under the same gravity: no axis is along z any more."""
     g, turn = robot.geometry, Rotation.from_rotvec([0.5, 0.4, 0.3]).as_matrix()
     turned_home = Rotation.from_matrix(turn) * Rotation.from_euler("XYZ", g.home_pose[3:])
-    geometry = replace(
-        g,
-        base_joints=g.base_joints @ turn.T,
-        crank_axes=g.crank_axes @ turn.T,
-        crank_zero_directions=g.crank_zero_directions @ turn.T,
-        home_pose=np.concatenate([turn @ g.home_pose[:3], turned_home.as_euler("XYZ")]),
-    )
+    fields = ("base_joint", "crank_axis", "crank_zero_direction")
+    legs = tuple(leg.model_copy(update={name: turn @ getattr(leg, name) for name in fields}) for leg in g.legs)
+    home = (*(turn @ g.home_pose[:3]).tolist(), *turned_home.as_euler("XYZ").tolist())
+    geometry = replace(g, legs=legs, chart=replace(g.chart, home=home))
     tilted = Robot(RobotDescription("tilted", geometry, robot.parameter_sets))
     engine = exported(tilted)
     rng = np.random.default_rng(3)
@@ -156,7 +159,7 @@ def test_forward_dynamics_agrees_with_pinocchio(robot, states, name):
     accelerations = robot.forward_dynamics(states.pose, states.twist, torques, values)
     for pose, twist, torque, ours in zip(states.pose, states.twist, torques, accelerations, strict=True):
         theta_dot = robot.joint_jacobian(pose) @ twist
-        net = torque - values[COULOMB] * np.sign(theta_dot) - values[VISCOUS] * theta_dot
+        net = torque - values[robot.layout.coulomb] * np.sign(theta_dot) - values[VISCOUS] * theta_dot
         state = chain.state(pose, twist, net)
         gap, speed = chain.closure(state)
         assert gap < 1e-14
@@ -169,7 +172,7 @@ def test_mujoco_accepts_what_was_changed(mujoco, robot):
     rng = np.random.default_rng(4)
     values = robot.nominal_parameters.copy()
     for _ in range(20):
-        values[RIGID_BODY] = rng.uniform(0, 1, 52) * rng.integers(0, 2, 52)
+        values[robot.layout.rigid] = rng.uniform(0, 1, 52) * rng.integers(0, 2, 52)
         values[0] = 24.0
         exported(robot, values)
 

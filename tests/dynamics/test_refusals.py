@@ -101,7 +101,7 @@ def test_poses_without_an_answer_are_named_and_never_become_nan(robot):
     long = np.array([1.234567e-300, 1.234567e200, -1.234567e-200, 1.234567e-100, -1.234567e100, 1.234567e-10])
     with pytest.raises(UnreachablePoseError, match=r"^leg 1 cannot reach pose \[[^\n]*$"):
         robot.inverse_kinematics(long)
-    with pytest.raises(ConvergenceError, match="forward kinematics found no pose with crank angles"):
+    with pytest.raises(ConvergenceError, match="forward kinematics found no pose with joint coordinates"):
         robot.forward_kinematics(rest, np.full(6, 1e308))
     with pytest.raises(SingularPoseError, match=r"beta = \+-pi/2"):
         robot.pose_rate([0, 0, 0.2, 0, np.pi / 2, 0], np.ones(6))
@@ -202,7 +202,7 @@ REFUSED = {
         (simulate, {"lost": FIVE[:, 0] > 0, "sensor": _ideal}, "lost is for the ideal sensor"),
         (simulate, {"noise": FIVE, "sensor": _ideal}, "noise is for the ideal sensor"),
         (simulate, {"commands": FIVE, "controller": _ideal}, "commands take the place of any controller"),
-        (simulate, {"settings": _elastic(1e-3)}, r"below the 0.000718 kg m\^2 of crank 2 about its axis"),
+        (simulate, {"settings": _elastic(1e-3)}, r"below the 0.000718 kg m\^2 of crank2 about its axis"),
         (simulate, {"settings": _elastic(steps=20)}, r"is 20, must be >= \d+ .* stiffness of 500 N m/rad"),
         (simulate_batch, {"workers": 0}, "workers is 0, must be a whole number >= 1"),
         (simulate_batch, {"parameters": np.zeros((0, 67))}, "0 parameter vectors and 1 references do not pair"),

@@ -1,7 +1,10 @@
 """Robots from files, and robots whose joints are off their places: they are what they are said to be, or refused."""
 
 import itertools
+import json
 import pickle
+from dataclasses import replace
+from importlib import resources
 
 import numpy as np
 import pytest
@@ -11,8 +14,10 @@ from scipy.optimize import fsolve
 from scipy.stats import chi2
 
 import dynamics
-from dynamics.errors import RobotFileError
+from dynamics.errors import ChartError, RobotFileError
+from dynamics.geometry import RobotGeometry
 from dynamics.robot import with_geometry_error
+from dynamics.robot_file import robot_schema
 from tests.dynamics.conftest import BOX, of_legs, place_legs
 
 
@@ -65,7 +70,7 @@ FIRST_JOINT = "[0.33383501391252074, -0.0784425512051534, 0.0]"
 def test_what_names_no_robot_is_one_line_with_what_was_given_and_the_valid_names(tmp_path):
     (tmp_path / "picture.toml").write_bytes(b"\x89PNG\xff\xfe")
     for name, words in (
-        ("rss7", r"unknown robot `rss7`; built-in robots: rss6; or give the path"),
+        ("rss7", r"unknown robot `rss7`; built-in robots: .*rss6, rss6_coplanar, .*; or give the path"),
         (tmp_path / "none.toml", r"cannot read robot file .*none\.toml"),
         ("rss6\0.toml", r"cannot read robot file .*null byte"),
         (tmp_path / "picture.toml", "cannot read robot file"),
@@ -76,7 +81,7 @@ def test_what_names_no_robot_is_one_line_with_what_was_given_and_the_valid_names
             dynamics.load_robot(name)
     with pytest.raises(RobotFileError, match="description must be of type RobotDescription, got 'rss6' of type str"):
         dynamics.Robot("rss6")
-    assert dynamics.built_in_robots() == ["rss6"]
+    assert {"rss6", "ups6", "delta3"} < set(dynamics.built_in_robots())
 
 
 def test_a_file_by_path_and_a_robot_sent_to_another_process_are_the_same_robot(load_changed, robot):
@@ -150,3 +155,47 @@ def test_the_plant_closes_its_own_loops_at_home_and_elsewhere(robot):
     solved = fsolve(_gaps, plant.home_pose, args=(THETA, plant.geometry), xtol=1e-13)
     np.testing.assert_allclose(pose, solved, atol=1e-12)
     assert 0.1 * ERROR < np.abs(pose - robot.forward_kinematics(THETA))[:3].max() < 10 * ERROR
+
+
+def test_the_schema_for_editors_is_that_of_the_files_that_are_read():
+    kept = (resources.files("dynamics") / "robots" / "robot.schema.json").read_text(encoding="utf-8")
+    assert json.loads(kept) == robot_schema()
+
+
+def _machine(name, keep=slice(None), add=(), chart=None):
+    """The geometry of a built-in robot with other legs or another chart."""
+    known = dynamics.load_robot(name).geometry
+    other = known.chart if chart is None else replace(known.chart, name=chart)
+    return RobotGeometry((*known.legs[keep], *add), other, known.travel_limit, known.gravity)
+
+
+def test_machines_with_more_or_fewer_freedoms_than_actuators_are_counted_and_named():
+    legs = {name: dynamics.load_robot(name).geometry.legs for name in ("rss6", "pss6", "delta3")}
+    for arguments, words in (
+        (("rss6", slice(5)), r"under-actuated: 5 actuated legs for 6 freedoms .*\(x, y, z, alpha, beta, gamma\)"),
+        (("ups6", slice(6), [legs["pss6"][0]]), "over-constrained: 7 actuated legs for 6 freedoms"),
+        (("rss6", slice(6), [legs["delta3"][0]]), r"leg 7 is of a kind \(ParallelogramLeg\) .* `translation`, not"),
+        (("rss6", slice(3), (), "translation"), r"leg 1 .*\(RssLeg\) that works with the chart `free`, not on a"),
+        (("rss6", slice(5), [legs["pss6"][0]]), "leg 6: actuators that slide and such that turn cannot share a joint"),
+        (("rss6", slice(5), [legs["rss6"][2]]), "legs 3 and 6 are in one place"),
+        (("delta3", slice(3), (), "spherical"), "unknown chart `spherical`; valid: free, translation, planar"),
+    ):
+        with pytest.raises(RobotFileError, match=words):
+            _machine(*arguments)
+
+
+def test_gains_of_the_wrong_unit_are_refused_with_value_and_unit(tmp_path):
+    text = (resources.files("dynamics") / "robots" / "ups6.toml").read_text(encoding="utf-8")
+    (tmp_path / "mine.toml").write_text(text.replace('unit = "N/m"', 'unit = "N m/rad"'), encoding="utf-8")
+    with pytest.raises(RobotFileError, match=r"lp = 5000 is in N m/rad, but the actuators slide: .* in N/m"):
+        dynamics.load_robot(tmp_path / "mine.toml")
+
+
+def test_poses_and_motions_that_a_platform_cannot_have_are_refused_by_number():
+    robot = dynamics.load_robot("delta3")
+    turned = robot.home_pose + 0.01 * np.eye(6)[4]
+    with pytest.raises(ChartError, match=r"delta3 moves in x, y, z only: pose .* is 0.01 off in beta"):
+        robot.inverse_kinematics(turned)
+    with pytest.raises(ChartError, match=r"twist .* is 0.3 off in gamma"):
+        robot.inverse_dynamics(robot.home_pose, [0, 0, 0, 0, 0, 0.3], np.zeros(6))
+    np.testing.assert_array_equal(robot.pose(robot.coordinates(turned)), robot.home_pose)

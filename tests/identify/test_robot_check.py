@@ -1,0 +1,59 @@
+"""`cmmsim check`: what is found of a sound robot, and of one spoilt in several ways, with number, limit and leg."""
+
+import json
+from importlib import resources
+
+import numpy as np
+import pytest
+
+from dynamics import load_robot
+from tests.identify.commands import command, one_line
+
+
+def _found(path):
+    content = json.loads(path.read_text(encoding="utf-8"))
+    assert all(set(entry) == {"check", "ok", "value", "limit", "unit", "leg", "text"} for entry in content["findings"])
+    assert content["ok"] == all(entry["ok"] for entry in content["findings"])
+    return {entry["check"]: entry for entry in content["findings"]}
+
+
+def test_a_gough_stewart_platform_is_found_sound_with_the_numbers_of_its_own_methods(tmp_path, capfd):
+    assert command("check", "ups6", "--json", tmp_path / "found.json") == 0
+    found, robot = _found(tmp_path / "found.json"), load_robot("ups6")
+    assert all(entry["ok"] for entry in found.values())
+    held = robot.static_torque(robot.home_pose, robot.parameter_sets["identified"].dynamic)
+    assert found["holding torque"]["value"] == pytest.approx(np.abs(held).max())
+    assert (found["holding torque"]["unit"], found["holding torque"]["leg"]) == ("N", np.abs(held).argmax() + 1)
+    assert found["leverage over the travel"]["value"] == 1.0  # a cylinder pushes along its leg
+    assert found["loop"]["value"] < 1 < found["gain margin"]["value"]
+    assert found["frame rate"]["value"] < 60
+    assert "ups6, parameters `identified`" in capfd.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_spoilt_robot_fails_by_number_and_leg(tmp_path, capfd):
+    """A cylinder that no body is, a travel beyond what the legs can reach, and gains that no frame rate holds."""
+    text = (resources.files("dynamics") / "robots" / "ups6.toml").read_text(encoding="utf-8")
+    for old, new in (
+        ("Ixx = [0.00672, 0.00607, 0.00703", "Ixx = [0.00672, 0.00607, 0.0203"),
+        ("travel_limit = 0.06", "travel_limit = 0.2"),
+        ("ld = 208.0", "ld = 0.0"),
+        ("viscous = [66.6, 53.9, 36.2, 60.2, 67.3, 67.2]", "viscous = 0.0"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
+    assert command("check", tmp_path / "mine.toml", "--json", tmp_path / "found.json", "--quiet") == 1
+    found = _found(tmp_path / "found.json")
+    failed = {name for name, entry in found.items() if not entry["ok"]}
+    assert {"inertias", "loop", "gain margin", "frame rate"} <= failed
+    assert found["inertias"]["leg"] == 3
+    assert found["loop"]["value"] > 1 == found["loop"]["limit"]
+    assert f"{len(failed)} of {len(found)} findings about ups6 fail" in one_line(capfd.readouterr().err)
+
+
+def test_a_report_that_cannot_be_written_and_an_unknown_set_are_named_in_one_line(tmp_path, capfd):
+    assert command("check", "ups6", "--quiet", "--json", tmp_path) != 0
+    assert "cannot write" in one_line(capfd.readouterr().err)
+    assert command("check", "ups6", "--parameters", "best") != 0
+    assert "it has identified, initial" in one_line(capfd.readouterr().err)
