@@ -117,8 +117,8 @@ def _numbers(robot: Robot) -> dict[str, Any]:
     """All numbers of a geometry by name, those of a leg by its own: as `leg2.crank_length`."""
     geometry = robot.geometry
     numbers: dict[str, Any] = {
-        "freedoms": list(geometry.chart.freedoms),
         **{name: np.asarray(getattr(geometry, name)).tolist() for name in SHARED},
+        "freedoms": list(geometry.chart.freedoms),
     }
     for number, leg in enumerate(geometry.legs, start=1):
         own = leg.model_dump(exclude={"base_joint", "platform_joint", "type"})

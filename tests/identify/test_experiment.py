@@ -86,7 +86,7 @@ def test_a_lost_frame_is_counted_holds_the_command_and_does_not_end_the_run(sens
     steps = np.diff(true_poses(experiment.truth), axis=0) * 60.0
     middle = (np.array(told.rates)[1:] + np.array(told.rates)[:-1]) / 2
     assert np.abs(middle - steps).max() < 0.05 * np.abs(steps).max()
-    wild = random_trajectory(np.random.default_rng(0), rss6().home_pose, 0.1, 5, 0.02, 0.08)
+    wild = random_trajectory(np.random.default_rng(0), rss6().geometry.chart, 0.1, 5, 0.02, 0.08)
     with pytest.raises(TrajectoryError, match=r"crank \d|leg \d"):
         run_plant(build_plant(quick(), rss6()), told, wild, 10.0, 0, 0)
     assert len(told.seeds) == 1, "refused before the run"
@@ -125,7 +125,7 @@ def test_the_sensor_gets_the_scenarios_timing_and_latencies_jitter_as_it_says(se
     assert (timing.frame_rate, timing.exposure, timing.dropout, timing.latency) == (60.0, 0.004, 0.25, 0.01)
     assert scenario.timing.drawn_latencies(400, np.random.default_rng(0)) is None
     assert late(0.002).timing.drawn_latencies(400, np.random.default_rng(0)).std() == pytest.approx(0.002, rel=0.15)
-    assert model_settings(late(0.002)).timing.latency_s == 0.01
+    assert model_settings(rss6(), late(0.002)).timing.latency_s == 0.01
     jittered = true(0, 0.005)
     assert np.array_equal(jittered, true(0, 0.005))
     assert 1e-7 < np.abs(jittered - true(0, 0.0)).max() < 1e-3
@@ -142,7 +142,7 @@ STRIBECK = {"plant.friction": "stribeck", "plant.static_ratio": 1.3, "plant.stri
 
 def test_the_model_knows_of_no_switch_and_without_one_the_plant_is_the_nominal_robot_bit_by_bit():
     switched, plain = quick(**ELASTIC, **MISPLACED, **STRIBECK), quick()
-    assert model_settings(switched) == model_settings(quick())
+    assert model_settings(rss6(), switched) == model_settings(rss6(), quick())
     assert build_plant(switched).settings.elasticity.stiffness == 1000.0
     text = switched.to_toml()
     assert scenario_from_toml(text) == switched

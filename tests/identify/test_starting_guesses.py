@@ -28,13 +28,12 @@ from identify.estimation.identifiability import identifiability
 from identify.estimation.identification import output_error_problem
 from identify.estimation.multiple_shooting import STATES, MultipleShooting, end_state, measured_states, segments
 from identify.estimation.output_error_search import output_error_searches, runnable_start, search, shoot
-from identify.estimation.prior import StartingGuess, holding_torque, typical_sizes
+from identify.estimation.prior import holding_torque, typical_sizes
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.estimation.warm_start import linear_warm_start
-from identify.loop_parameters import NAMES
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
-from tests.identify.synthetic import SIGMA, Stages, quick, rss6, run_plant, silent, truth
+from tests.identify.synthetic import LAYOUT, NAMES, SIGMA, Stages, guess_of, quick, rss6, run_plant, silent, truth
 
 SMALLEST_FACTOR = 0.2
 
@@ -48,7 +47,7 @@ def drawn_guess(spread, seed):
     while np.any(low := factors < SMALLEST_FACTOR):
         factors[low] = 1 + spread * rng.standard_normal(low.sum())
     values = truth() * factors
-    return StartingGuess(values, typical_sizes(values, holding_torque(rss6(), values[:64])))
+    return guess_of(values, typical_sizes(LAYOUT, values, holding_torque(rss6(), values[:64])))
 
 
 def distance(problem, parameters, others):
@@ -107,7 +106,7 @@ def found(plant_steps, model_steps):
     problem = replace(problem, guess=replace(problem.guess, values=start))
     driven = search(problem.driven_by_commands(), start, scenario, silent)
     solution = search(problem, driven.parameters, scenario, silent)
-    return problem, solution, base_parameters(structural_regressor(rss6()))
+    return problem, solution, base_parameters(structural_regressor(rss6()), LAYOUT)
 
 
 def relative_errors(solution, base):
@@ -192,7 +191,7 @@ def test_condensing_takes_the_step_of_the_whole_problem():
     """Against a dense Gauss-Newton step in parameters and states, its Jacobian by finite differences. The friction is
     smoothed, so that no event stands between two of them, and the guess exact enough to tell all parameters apart."""
     scenario, problem, _ = driven(2.0, SMOOTHED, lost=[30, 47])
-    problem = replace(problem, guess=StartingGuess(truth(), 0.02 * truth()))
+    problem = replace(problem, guess=guess_of(truth(), 0.02 * truth()))
     start = truth() * np.random.default_rng(0).uniform(0.95, 1.05, 67)
     chain = segments(problem.runs[0])
     shooting = MultipleShooting(problem, [chain], [measured_states(chain, start, scenario)])
