@@ -111,4 +111,6 @@ def joint_channels(channels: xr.Dataset, record: xr.Dataset) -> JointChannels:
             f"{ours[-1]:.3f} s: they are of another run"
         )
     torque, angle = (np.asarray(channels[name].values, dtype=float) for name in ("joint_torque", "joint_angle"))
-    return JointChannels(torque, angle, float(channels.attrs["torque_noise_N_m"]))
+    return JointChannels(
+        torque, angle, next(float(channels.attrs[name]) for name in TORQUE_NOISE if name in channels.attrs)
+    )

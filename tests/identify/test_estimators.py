@@ -337,14 +337,14 @@ def test_channels_survive_the_file_and_bad_ones_are_named(short, tmp_path):
         with pytest.raises(RecordError, match=says):
             read_channels(path)
     with pytest.raises(ScenarioError, match=r"encoder_noise_rad is .*finite number >= 0"):
-        JointInstruments(encoder_noise_rad=np.nan)
+        JointInstruments(encoder_noise=np.nan)
 
 
 @pytest.mark.slow
 def test_the_bias_of_least_squares_over_repeated_experiments():
     """Mean of eight records at 40 um: what the inertia and ld lose by least squares is many standard errors of the
     mean, and several times what the instrumental variables lose, whose stated deviations of the gains hold."""
-    runs = [evidence(seed, 8.0, JointInstruments(torque_noise_N_m=0.005)) for seed in range(8)]
+    runs = [evidence(seed, 8.0, JointInstruments(torque_noise=0.005)) for seed in range(8)]
     found = {estimate: [estimate(seen) for seen in runs] for estimate in (least_squares, instrumental_variables)}
     values = {estimate: np.array([one.parameters for one in all_]) for estimate, all_ in found.items()}
     for index in (LD, NAMES.index("platform.Izz")):

@@ -113,11 +113,11 @@ def test_a_deviation_that_cannot_be_is_refused_and_none_makes_two_loads_of_one(r
 def test_drawn_loads_spread_as_stated_and_are_never_negative():
     """Mean and spread of many: of a weighed mass, and of one hardly known, which normal deviations would make none."""
     rng = np.random.default_rng(0)
-    masses = np.array([drawn_load(SCENARIO, rng).true[MASS] for _ in range(2000)])
+    masses = np.array([drawn_load(LAYOUT, SCENARIO, rng).true[MASS] for _ in range(2000)])
     assert masses.std() == pytest.approx(0.04, rel=0.07)
     assert masses.mean() == pytest.approx(8.0, abs=4 * 0.04 / np.sqrt(2000))
     vague = quick(**{"payload.mass_std_kg": 8.0, "payload.Izz_std_kg_m2": 0.04})
-    drawn = np.array([drawn_load(vague, rng).true for _ in range(200)])
+    drawn = np.array([drawn_load(LAYOUT, vague, rng).true for _ in range(200)])
     assert (drawn >= 0).all()
     assert np.flatnonzero(np.ptp(drawn, axis=0)).tolist() == [MASS, index_of("platform.Izz")]
 
