@@ -13,7 +13,11 @@ import pinocchio as pin
 from tests.dynamics.conftest import base_from_platform
 
 SETTINGS = pin.ProximalSettings(1e-14, 0.0, 20)
-NONE, X, Y, Z = np.zeros(3), *np.eye(3)
+RECURSIVE = pin.ProximalSettings(1e-10, 1e-8, 20)
+"""Of `lcaba`, which needs some regularisation: with so little it is done after two iterations."""
+
+NONE, SAME = np.zeros(3), np.eye(3)
+X, Y, Z = SAME
 JOINTS = {
     "hinge": [pin.JointModelRZ],
     "link hinge": [pin.JointModelRY],
@@ -34,8 +38,8 @@ class ChainState(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A body of a leg: its joint to part `before` (-1: the base), where that is in the frame there, which inertia of the
-    leg it has and how much of it, its centre of mass, and its end, which is on the platform `off` the joint there."""
+    """A body of a leg: its joint to part `before` (-1: the base), where that is in the frame there; which inertia of
+    the leg it has and what share of it, its centre of mass; and its end, which is on the platform `off` the joint."""
 
     joint: str
     before: int
@@ -51,19 +55,17 @@ def turned(axes, origin):
     return pin.SE3(np.array(axes), np.array(origin, dtype=float))
 
 
-def across(z, near=np.array([0.3, 0.5, 0.8])):
+def across(z):
     """Axes with a given z."""
-    x = np.cross(z, near) / np.linalg.norm(np.cross(z, near))
+    x = np.cross(z, [0.3, 0.5, 0.8]) / np.linalg.norm(np.cross(z, [0.3, 0.5, 0.8]))
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def crank_parts(leg, joint, turn=np.eye(3), offs=(NONE,)):
+def crank_parts(leg, joint, turn=SAME, offs=(NONE,)):
     """A crank and the links on it, of which there may be two."""
     zero, tip, end = leg.crank_zero_direction, leg.crank_length * X, leg.link_length * Z
     foot = np.column_stack([zero, np.cross(leg.crank_axis, zero), leg.crank_axis])
-    links = [
-        Part(joint, 0, turned(turn, tip + off), 1, end / 2, end, 1 / len(offs), off @ foot.T) for off in offs
-    ]
+    links = [Part(joint, 0, turned(turn, tip + off), 1, end / 2, end, 1 / len(offs), off @ foot.T) for off in offs]
     return [Part("hinge", -1, turned(foot, leg.base_joint), 0, tip / 2), *links]
 
 
@@ -79,7 +81,7 @@ def slider_parts(leg, joint, turn):
 
 
 def ups_parts(leg):
-    foot, rod = turned(across(leg.joint_axis), leg.base_joint), turned(np.eye(3), leg.zero_length * Z)
+    foot, rod = turned(across(leg.joint_axis), leg.base_joint), turned(SAME, leg.zero_length * Z)
     cylinder = Part("universal", -1, foot, 0, leg.cylinder_centre * Z)
     return [cylinder, Part("slide", 0, rod, 1, -leg.rod_centre * Z, NONE)]
 
@@ -90,14 +92,14 @@ PARTS = {
     "rrr": lambda leg: crank_parts(leg, "link hinge", LINK_HINGE),
     "parallelogram": parallelogram_parts,
     "ups": ups_parts,
-    "pss": lambda leg: slider_parts(leg, "ball", np.eye(3)),
+    "pss": lambda leg: slider_parts(leg, "ball", SAME),
     "pus": lambda leg: slider_parts(leg, "universal", across(leg.joint_axis)),
 }
 
 
 def link_motion(axis, link, rate, spins):
-    """Axes and angular velocity of a link: x is normal to a standing axis; about this it turns and about x, or, where it
-    hangs on a ball, as it does without spin."""
+    """Axes and angular velocity of a link: x is normal to a standing axis; about this and about x it turns, or, where
+    it hangs on a ball, as it does without spin."""
     length = np.linalg.norm(link)
     z, z_rate = link / length, rate / length
     x = np.cross(axis, z) / np.linalg.norm(np.cross(axis, z))
@@ -145,6 +147,8 @@ class ClosedChain:
         self.loop_data.extend([loop.createData() for loop in self.loops])
         later = (self.loop_data,) if int(pin.__version__.split(".")[0]) >= 4 else ()
         pin.initConstraintDynamics(self.model, self.data, self.loops, *later)
+        if hasattr(pin, "lcaba"):
+            pin.computeJointMinimalOrdering(self.model, self.data, self.loops)
 
     def _body(self, parent, joint, place, inertia, centre):
         number = self.model.addJoint(parent, joint(), place, f"joint{self.model.njoints}")
@@ -165,16 +169,16 @@ class ClosedChain:
             joints.append(numbers)
             if part.end is not None:
                 at_home = base_from_platform(self.robot.home_pose)
-                on_platform = turned(np.eye(3), leg.platform_joint + part.off @ at_home)
+                on_platform = turned(SAME, leg.platform_joint + part.off @ at_home)
                 kind, frame = pin.ContactType.CONTACT_3D, pin.ReferenceFrame.LOCAL
-                end = turned(np.eye(3), part.end)
+                end = turned(SAME, part.end)
                 self.loops.append(
                     pin.RigidConstraintModel(kind, self.model, numbers[-1], end, platform, on_platform, frame)
                 )
         self.legs.append((leg, parts, [[self.model.joints[n] for n in numbers] for numbers in joints]))
 
     def state(self, pose, twist, torque):
-        """The chain at a pose (6,), with a twist (6,) and net joint torques (n,); links on balls do not spin (eq. 12)."""
+        """The chain at a pose (6,), with a twist (6,) and net joint torques (n,); on balls nothing spins (eq. 12)."""
         turn = base_from_platform(pose)
         theta, rates = self.robot.inverse_kinematics(pose), self.robot.joint_jacobian(pose) @ twist
         q, v, force = pin.neutral(self.model), np.zeros(self.model.nv), np.zeros(self.model.nv)
@@ -185,7 +189,7 @@ class ClosedChain:
             at, moving = pose[:3] + arm, twist[:3] + np.cross(twist[3:], arm)
             motions = MOTIONS.get(leg.type, crank_motions)(leg, theta[number], rates[number], at, moving)
             for part, own, (axes, omega) in zip(parts, joints, motions[: len(parts)], strict=True):
-                before, omega_before = motions[part.before] if part.before >= 0 else (np.eye(3), NONE)
+                before, omega_before = motions[part.before] if part.before >= 0 else (SAME, NONE)
                 frame = before @ part.place.rotation
                 coordinates, speeds = _joint(part, frame.T @ axes, frame.T @ (omega - omega_before))
                 if part.joint == "slide":
@@ -200,6 +204,10 @@ class ClosedChain:
     def acceleration(self, state):
         """One call of `constraintDynamics`: generalised acceleration."""
         return pin.constraintDynamics(self.model, self.data, *state, self.loops, self.loop_data, SETTINGS)
+
+    def recursive_acceleration(self, state):
+        """One call of `lcaba`, by articulated bodies with their loops: generalised acceleration, to some 1e-7."""
+        return pin.lcaba(self.model, self.data, *state, self.loops, self.loop_data, RECURSIVE)
 
     def twist_dot(self, state):
         """Platform acceleration [h_ddot, omega_dot] (6,), base axes."""

@@ -42,6 +42,9 @@ def _direction(value: object) -> np.ndarray:
     return array
 
 
+MOST_TURNING = 1e6
+"""rad/m: above it a body turns as no machine could; rounding makes 1e15 where the limit is infinite."""
+
 _NUMBERS = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
 Point = Annotated[np.ndarray, PlainValidator(_vector), WithJsonSchema(_NUMBERS)]
 Direction = Annotated[np.ndarray, PlainValidator(_direction), WithJsonSchema(_NUMBERS)]
@@ -111,7 +114,8 @@ class Leg(BaseModel, ABC):
     def assembled(self, joint: np.ndarray, number: int) -> Self:
         """The leg with its branch chosen, for the position (3,) of A at home.
 
-        Raises RobotFileError, with the leg's number, reach and lengths, where it cannot reach there.
+        Raises RobotFileError, with the leg's number, reach and lengths, where it cannot reach there, and where one of
+        its bodies lies along an axis that its turning is counted from, as of a universal joint.
         """
         margin = float(self.reach(ca.SX(joint)))
         if not margin > 0:
@@ -119,10 +123,25 @@ class Leg(BaseModel, ABC):
                 f"leg {number} cannot reach the home pose: reach margin {margin:.3g}, must be > 0; "
                 f"B to A {np.linalg.norm(joint - self.base_joint):.4g} m, {self.lengths()}"
             )
-        if self.branch is not None:
-            return self
-        both = [self.model_copy(update={"branch": sign}) for sign in (1, -1)]
-        return min(both, key=lambda leg: abs(float(leg.coordinate(ca.SX(joint)))))
+        found = self
+        if self.branch is None:
+            both = [self.model_copy(update={"branch": sign}) for sign in (1, -1)]
+            found = min(both, key=lambda leg: abs(float(leg.coordinate(ca.SX(joint)))))
+        for body, turning in zip(found.bodies, found._turning(joint), strict=True):
+            if not turning < MOST_TURNING:
+                raise RobotFileError(
+                    f"leg {number} is singular at the home pose: its {body.name} turns by {turning:.3g} rad/m, "
+                    f"limit {MOST_TURNING:.0e}; it lies along the axis of its universal joint or of its actuator"
+                )
+        return found
+
+    def _turning(self, joint: np.ndarray) -> np.ndarray:
+        """How much each body turns with A there, rad/m; NaN where its axes are not known."""
+        at, moving = ca.SX.sym("position", 3), ca.SX.sym("velocity", 3)
+        turns = [ca.norm_fro(ca.jacobian(spin, moving)) for spin in self.angular_velocities(at, moving)]
+        axes = [ca.sum1(ca.vec(place.axes)) for place in self.placements(at)]
+        turning, known = ca.Function("turning", [at], [ca.vertcat(*turns), ca.vertcat(*axes)])(joint)
+        return np.array(turning).ravel() + 0 * np.array(known).ravel()
 
     @abstractmethod
     def lengths(self) -> str:
@@ -224,7 +243,9 @@ class Leg(BaseModel, ABC):
         spins = self.angular_velocities(position, velocity)
         for body, (place, spin) in enumerate(zip(self.placements(position), spins, strict=True)):
             own = rigid[4 * body : 4 * body + 4]
-            inertia = place.axes @ ca.diag(own[1:4]) @ place.axes.T
+            # What does no work would leave rounding where there is nothing.
+            working = [own[k] if name in self.bodies[body].moments else 0 for k, name in enumerate(INERTIAL)]
+            inertia = place.axes @ ca.diag(ca.vertcat(*working[1:])) @ place.axes.T
             maps = ca.jacobian(place.centre, position), ca.jacobian(spin, velocity)
             found.append(((own[0], inertia), *maps, spin))
         return found
