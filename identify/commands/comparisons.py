@@ -46,9 +46,7 @@ def estimators(
     ] = None,
     torque_noise: Annotated[
         float | None,
-        typer.Option(
-            min=0, help="Standard deviation of a measured torque, N m, or force, N.", show_default="0.02, 0.5"
-        ),
+        typer.Option(min=0, help="Standard deviation of a torque, N m, or of a force, N.", show_default="0.02, 0.5"),
     ] = None,
     encoder_noise: Annotated[
         float | None,

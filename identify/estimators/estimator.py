@@ -99,6 +99,10 @@ def find_estimators(names: Sequence[str] | None = None) -> dict[str, Estimator]:
     return {name: one if isinstance(one, Estimator) else Estimator(name, "", one) for name, one in found.items()}
 
 
+TORQUE_NOISE = ("torque_noise_N_m", "force_noise_N")
+"""Attribute of joint channels with the standard deviation of a measured torque, or of a force."""
+
+
 def joint_channels(channels: xr.Dataset, record: xr.Dataset) -> JointChannels:
     """Channels of a dataset that belongs to the record.
 

@@ -44,8 +44,8 @@ SAME_INSTANT = 1e-9
 
 @dataclass(frozen=True)
 class JointInstruments:
-    """Standard deviations of one sample of torque (N m) and angle (rad); the encoder's step (rad, 0: none). Of actuators
-    that slide, `prismatic`, N and m.
+    """Standard deviations of one sample of torque (N m) and angle (rad); the encoder's step (rad, 0: none). N and m of
+    actuators that slide, `prismatic`.
 
     Defaults: 1 % of the holding torque of 2 to 3 N m of `rss6`, and an encoder of 17 bits.
     Raises ScenarioError for one that is negative or no finite number.
