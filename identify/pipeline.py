@@ -146,6 +146,7 @@ def validate(folder: Path, progress: Progress, workers: int | None = None, taugh
     excitation_truth = read_truth(run_folder.experiment)
     check_entries(run_folder.result, result, "identify")
     files.check_made_of(*RECORDS, run_folder.covariance.name, result=result)
+    covariance = files.covariance_of(robot)
     models = _identified_models(robot, run_folder, result)
     taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
     runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, workers, progress)
@@ -153,7 +154,7 @@ def validate(folder: Path, progress: Progress, workers: int | None = None, taugh
     records = [files.experiment, *(run.record for run in runs)]
     references = [recorded_reference(seen) for seen in records]
     model_poses = [[model_run(robot, scenario, values, reference) for values in models] for reference in references]
-    predictions = predicted_runs(robot, scenario, records[1:], models[1], files.covariance, trajectories.seed, progress)
+    predictions = predicted_runs(robot, scenario, records[1:], models[1], covariance, trajectories.seed, progress)
     deviations = [None, *(prediction.std for prediction in predictions)]
     drawn = [
         build_model_run(seen["time"].values, initial, identified, std)

@@ -11,8 +11,8 @@ from typer.core import TyperGroup
 
 from identify.commands import new_folder
 from identify.commands.calibrate import CALIBRATE_HELP, calibrate
-from identify.commands.comparisons import compare_excitation, estimators, variation
 from identify.commands.check import CHECK_HELP, check
+from identify.commands.comparisons import compare_excitation, estimators, variation
 from identify.commands.robot import base_parameters, export, verify_model, workspace
 from identify.commands.sensor import acceptance, detectors
 from identify.commands.study import STUDY_HELP, study
@@ -34,6 +34,7 @@ Examples:
   cmmsim run quick                       a one-minute run into runs/quick-0
   cmmsim run                             the paper's experiment into runs/paper-0
   cmmsim run paper --seed 7 --out mine   other noise and trajectories, into mine
+  cmmsim run quick --robot ups6          another robot, built in or your own file
   cmmsim run quick --set timing.latency_s=0.0167 --set pose_method=planes
 
 \b
@@ -125,6 +126,10 @@ ScenarioArgument = Annotated[
 NewFolder = Annotated[Path | None, new_folder("runs/SCENARIO-SEED")]
 RunFolderOption = Annotated[Path, typer.Option("--out", help="Folder of the run, as the stage before left it.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness: trajectories and sensor noise.")]
+RobotOption = Annotated[
+    str | None,
+    typer.Option("--robot", metavar="NAME|FILE", help="Another robot than the scenario's.", show_default="scenario's"),
+]
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Replace a value of the scenario: timing.frame_rate_hz=30."),
@@ -191,6 +196,7 @@ def run(
     scenario: ScenarioArgument = "paper",
     out: NewFolder = None,
     seed: Seed = 0,
+    robot: RobotOption = None,
     settings: Settings = None,
     workers: Workers = None,
     quiet: Quiet = False,
@@ -199,7 +205,7 @@ def run(
 
     A goal that is missed is said, and does not change the exit status.
     """
-    chosen = _scenario(scenario, settings)
+    chosen = _scenario(scenario, settings, robot)
     folder = new_run_folder(out or Path("runs") / f"{chosen.name}-{seed}")
     _pipeline().run(chosen, seed, folder.path, terminal_progress(quiet), workers)
     result = _warned(folder)
@@ -208,11 +214,16 @@ def run(
 
 
 @app.command()
-def warm_up(scenario: ScenarioArgument = "paper", settings: Settings = None, quiet: Quiet = False) -> None:
-    """Compile all that runs of a scenario need, once for this user: the runs that follow compile nothing."""
+def warm_up(
+    scenario: ScenarioArgument = "paper", robot: RobotOption = None, settings: Settings = None, quiet: Quiet = False
+) -> None:
+    """Compile all that runs of a scenario need, once for this user: the runs that follow compile nothing.
+
+    A robot is compiled for itself, and one with another number of joints or freedoms compiles the loop anew.
+    """
     from identify.experiment.run import warm_up
 
-    warm_up(_scenario(scenario, settings), terminal_progress(quiet))
+    warm_up(_scenario(scenario, settings, robot), terminal_progress(quiet))
 
 
 @app.command()
@@ -220,6 +231,7 @@ def excite(
     scenario: ScenarioArgument = "paper",
     out: NewFolder = None,
     seed: Seed = 0,
+    robot: RobotOption = None,
     settings: Settings = None,
     compare: Annotated[
         bool, typer.Option("--compare", help="Only compare the methods: writes comparison.json and comparison.png.")
@@ -227,7 +239,7 @@ def excite(
     quiet: Quiet = False,
 ) -> None:
     """Choose the exciting trajectory and the unseen ones: writes scenario.toml and trajectories.json."""
-    chosen = _scenario(scenario, settings)
+    chosen = _scenario(scenario, settings, robot)
     name = f"excite-{chosen.name}-{seed}" if compare else f"{chosen.name}-{seed}"
     folder = new_run_folder(out or Path("runs") / name)
     if compare:
@@ -309,8 +321,9 @@ def _toml_or_text(text: str) -> Any:
         return text
 
 
-def _scenario(name: str, settings: list[str] | None) -> Scenario:
-    return load_scenario(name).with_overrides(parse_settings(settings))
+def _scenario(name: str, settings: list[str] | None, robot: str | None) -> Scenario:
+    chosen = {} if robot is None else {"robot": robot}
+    return load_scenario(name).with_overrides(chosen | parse_settings(settings))
 
 
 def _warned(folder: RunFolder) -> dict[str, Any]:

@@ -44,9 +44,20 @@ def estimators(
     add: Annotated[
         list[str] | None, repeatable("Estimator of one's own beside these, as module:function", "none")
     ] = None,
-    torque_noise: Annotated[float, typer.Option(min=0, help="Standard deviation of a measured torque, N m.")] = 0.02,
-    encoder_noise: Annotated[float, typer.Option(min=0, help="Standard deviation of a joint angle, rad.")] = 1e-5,
-    encoder_bits: Annotated[int, typer.Option(min=4, max=40, help="Bits a turn of the joint encoders.")] = 17,
+    torque_noise: Annotated[
+        float | None,
+        typer.Option(min=0, help="Standard deviation of a torque, N m, or of a force, N.", show_default="0.02, 0.5"),
+    ] = None,
+    encoder_noise: Annotated[
+        float | None,
+        typer.Option(min=0, help="Standard deviation of a joint angle, rad, or length, m.", show_default="1e-5, 1e-6"),
+    ] = None,
+    encoder_bits: Annotated[
+        int | None,
+        typer.Option(
+            min=4, max=40, help="Bits a turn, or over the travel, of the encoders.", show_default="17, 1 um steps"
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the joint instruments' noise.")] = 0,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no table.")] = False,
 ) -> None:
@@ -58,8 +69,9 @@ def estimators(
     judged by the truth of the record and of the unseen trajectories. An estimator of one's own is a function of the
     evidence, see identify.estimators.estimator.
     """
+    from dynamics import load_robot
     from identify.estimators.estimator import find_estimators
-    from identify.experiment.joint_instruments import JointInstruments
+    from identify.experiment.joint_instruments import instruments_of
     from identify.record.provenance import RunFiles
     from identify.validation.estimator_comparison import compare_on_run, estimators_figure
 
@@ -67,10 +79,11 @@ def estimators(
     folder.require("scenario.toml", "experiment.nc", "validation.nc")
     files = RunFiles(folder)
     files.check_made_of("experiment.nc", "validation.nc")
-    instruments = JointInstruments(torque_noise, encoder_noise, 2 * math.pi / 2**encoder_bits)
+    robot = load_robot(load_scenario(folder.scenario).robot)
+    instruments = instruments_of(robot, torque_noise, encoder_noise, encoder_bits)
     chosen = find_estimators(only) | (find_estimators(add) if add else {})
     scores = compare_on_run(files, instruments, chosen, seed, terminal_progress(quiet))
-    entry = {"seed": seed, "instruments": asdict(instruments), "estimators": {s.name: _entry(s) for s in scores}}
+    entry = {"seed": seed, "instruments": instruments.figures, "estimators": {s.name: _entry(s) for s in scores}}
     save_files(folder.path, {"estimators.json": entry, "figures/estimators.png": estimators_figure(scores)})
     if not quiet:
         _print_scores(scores, out)

@@ -128,15 +128,13 @@ def rests_on_prior(
 ) -> NDArray[np.bool_]:
     """Whether each of the p parameters is no combination of what record and anchor show.
 
-    Poses show the groups and gains up to their common factor; an anchor that is measured shows its parameter, and a
-    payload the factor. estimate (p,): the direction of the factor; sizes (p,): the unit in which each parameter counts.
+    estimate (p,): the direction of the common factor; sizes (p,): the unit in which each parameter is counted.
     """
     gains = np.eye(len(sizes))[base.combinations.shape[1] :]
-    shown = np.concatenate([group_rows(base), gains]) * sizes
-    if anchor.name != "payload":
+    shown = np.concatenate([group_rows(base), gains, anchor.row(guess.layout)[0]]) * sizes
+    if anchor.name == "prior":
         factor = estimate / sizes
         shown = shown - np.outer(shown @ factor, factor) / (factor @ factor)
-    shown = np.concatenate([shown, anchor.row(guess.layout)[0] * sizes])
     shown /= np.linalg.norm(shown, axis=1, keepdims=True)
     _, singular, directions = np.linalg.svd(shown, full_matrices=False)
     span = directions[singular > ROUNDING * singular[0]]

@@ -46,9 +46,25 @@ def starting_guess(
     return StartingGuess(robot.layout, values, std)
 
 
+WEIGHTLESS = 0.01
+"""Share of the torque for an acceleration of GRAVITY that joints must hold for their load to count as held by them."""
+
+GRAVITY = 9.81  # m/s^2
+
+
 def holding_torque(robot: Robot, dynamic: Array) -> float:
-    """Mean torque [N m] or force [N] that the joints hold at the home pose, with dynamic parameters (p,)."""
-    return float(np.abs(robot.static_torque(robot.home_pose, dynamic)).mean())
+    """Mean torque [N m] or force [N] that the joints hold at the home pose, with dynamic parameters (p,).
+
+    Where they hold next to nothing, as those of a robot that lies flat, it is the mean of what they need to accelerate
+    the platform by that of gravity along each axis.
+    """
+    home, axes = robot.home_pose, robot.geometry.chart.basis.T
+    held = robot.static_torque(home, dynamic)
+    lifting = GRAVITY * axes[axes[:, :3].any(axis=1)]
+    rest = np.zeros_like(lifting)
+    needed = robot.inverse_dynamics(np.tile(home, (len(lifting), 1)), rest, lifting, dynamic) - held
+    mean, accelerating = float(np.abs(held).mean()), float(np.abs(needed).mean())
+    return mean if mean > WEIGHTLESS * accelerating else accelerating
 
 
 def typical_sizes(layout: ParameterLayout, values: Array, torque: float) -> Array:

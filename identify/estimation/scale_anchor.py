@@ -25,7 +25,7 @@ MEASURED_PARAMETER = {"platform_mass": "platform.mass", "joint_gain": "joint_pid
 
 ANCHORS = (*MEASURED_PARAMETER, "payload", "prior")
 
-DEFAULT_STD = {"kg": 0.005, "N m/rad": 0.01, "N/m": 10.0}
+DEFAULT_STD = {"kg": 0.005, "N m/rad": 0.01, "N/m": 5.0}
 """Standard deviation of an ordinary platform balance [kg], and of a gain read from the controller's data, by units."""
 
 

@@ -99,6 +99,10 @@ def find_estimators(names: Sequence[str] | None = None) -> dict[str, Estimator]:
     return {name: one if isinstance(one, Estimator) else Estimator(name, "", one) for name, one in found.items()}
 
 
+TORQUE_NOISE = ("torque_noise_N_m", "force_noise_N")
+"""Attribute of joint channels with the standard deviation of a measured torque, or of a force."""
+
+
 def joint_channels(channels: xr.Dataset, record: xr.Dataset) -> JointChannels:
     """Channels of a dataset that belongs to the record.
 
@@ -111,4 +115,6 @@ def joint_channels(channels: xr.Dataset, record: xr.Dataset) -> JointChannels:
             f"{ours[-1]:.3f} s: they are of another run"
         )
     torque, angle = (np.asarray(channels[name].values, dtype=float) for name in ("joint_torque", "joint_angle"))
-    return JointChannels(torque, angle, float(channels.attrs["torque_noise_N_m"]))
+    return JointChannels(
+        torque, angle, next(float(channels.attrs[name]) for name in TORQUE_NOISE if name in channels.attrs)
+    )

@@ -13,17 +13,30 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.experiment.truth import true_parameters
-from identify.files.dataset import Variables, check_finite, check_variables, described_dataset, read_group
+from identify.files.dataset import (
+    Variables,
+    check_finite,
+    check_variables,
+    described_dataset,
+    joint_numbers,
+    of_actuators,
+    read_group,
+)
 from identify.scenario import Timing
 
 VARIABLES: Variables = {
     "joint_torque": (("time", "joint"), "N m", "measured torque of each joint, mean over one frame"),
     "joint_angle": (("time", "joint"), "rad", "joint coordinate read from the encoder"),
 }
-ATTRIBUTES = ("torque_noise_N_m", "encoder_noise_rad", "encoder_resolution_rad")
+ATTRIBUTES = {
+    False: ("torque_noise_N_m", "encoder_noise_rad", "encoder_resolution_rad"),
+    True: ("force_noise_N", "encoder_noise_m", "encoder_resolution_m"),
+}
+"""Names of the instruments' figures where actuators turn, and where they slide."""
 
 SAME_INSTANT = 1e-9
 """Frames by which a command that arrives with an exposure may be off; the plant's torque is recorded after it."""
@@ -31,21 +44,48 @@ SAME_INSTANT = 1e-9
 
 @dataclass(frozen=True)
 class JointInstruments:
-    """Standard deviations of one sample of torque (N m) and angle (rad); the encoder's step (rad, 0: none).
+    """Standard deviations of one sample of torque (N m) and angle (rad); the encoder's step (rad, 0: none). N and m of
+    actuators that slide, `prismatic`.
 
-    Defaults: 1 % of this robot's holding torque of 2 to 3 N m, and an encoder of 17 bits.
+    Defaults: 1 % of the holding torque of 2 to 3 N m of `rss6`, and an encoder of 17 bits.
     Raises ScenarioError for one that is negative or no finite number.
     """
 
-    torque_noise_N_m: float = 0.02
-    encoder_noise_rad: float = 1e-5
-    encoder_resolution_rad: float = 2 * pi / 2**17
+    torque_noise: float = 0.02
+    encoder_noise: float = 1e-5
+    encoder_resolution: float = 2 * pi / 2**17
+    prismatic: bool = False
 
     def __post_init__(self) -> None:
-        for name in ATTRIBUTES:
-            value = getattr(self, name)
+        for name, value in self.figures.items():
             if not 0 <= value < np.inf:
                 raise ScenarioError(f"{name} is {value}, must be a finite number >= 0")
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """The figures by names that end in their units."""
+        values = self.torque_noise, self.encoder_noise, self.encoder_resolution
+        return dict(zip(ATTRIBUTES[self.prismatic], values, strict=True))
+
+
+TURNING = JointInstruments()
+SLIDING = JointInstruments(0.5, 1e-6, 1e-6, prismatic=True)
+"""Of actuators that slide: 1 % of a holding force of some 50 N, and scales that read a micrometre."""
+
+
+def instruments_of(
+    robot: Robot, torque_noise: float | None = None, encoder_noise: float | None = None, bits: int | None = None
+) -> JointInstruments:
+    """The usual instruments of a robot's joints; others where a noise (N m and rad, or N and m) or the bits of an
+    encoder are given, a turn or the travel."""
+    usual = SLIDING if robot.layout.prismatic else TURNING
+    whole = 2 * (robot.travel_limit if robot.layout.prismatic else pi)
+    return JointInstruments(
+        usual.torque_noise if torque_noise is None else torque_noise,
+        usual.encoder_noise if encoder_noise is None else encoder_noise,
+        usual.encoder_resolution if bits is None else whole / 2**bits,
+        robot.layout.prismatic,
+    )
 
 
 def measure_joints(
@@ -66,13 +106,13 @@ def measure_joints(
     gains = np.array([known[f"joint_pid.{name}"] for name in ("lp", "ld")])
     each = np.full(len(command), timing.latency_s) if latencies is None else latencies
     torque = frame_mean(truth["joint_torque"].values, command, angle[0], gains, timing, each)
-    torque = torque + instruments.torque_noise_N_m * rng.standard_normal(torque.shape)
-    read = angle + instruments.encoder_noise_rad * rng.standard_normal(angle.shape)
-    step = instruments.encoder_resolution_rad
+    torque = torque + instruments.torque_noise * rng.standard_normal(torque.shape)
+    read = angle + instruments.encoder_noise * rng.standard_normal(angle.shape)
+    step = instruments.encoder_resolution
     read = step * np.round(read / step) if step else read
-    channels = described_dataset({"joint_torque": torque, "joint_angle": read}, record["time"].values, VARIABLES)
-    channels.attrs = {name: getattr(instruments, name) for name in ATTRIBUTES}
-    return channels
+    values, variables = {"joint_torque": torque, "joint_angle": read}, of_actuators(VARIABLES, instruments.prismatic)
+    channels = described_dataset(values, record["time"].values, variables, joint=joint_numbers(torque))
+    return channels.assign_attrs(instruments.figures)
 
 
 def frame_mean(
@@ -108,7 +148,8 @@ def read_channels(path: Path) -> xr.Dataset:
     check_variables(channels, VARIABLES, str(path))
     for name in VARIABLES:
         check_finite(channels[name].values, name, str(path))
-    missing = [name for name in ATTRIBUTES if name not in channels.attrs]
+    wanted = ATTRIBUTES[channels["joint_angle"].attrs.get("units") == "m"]
+    missing = [name for name in wanted if name not in channels.attrs]
     if missing:
         raise RecordError(f"{path} lacks the attributes {', '.join(missing)}")
     return channels

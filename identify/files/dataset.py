@@ -197,19 +197,16 @@ def write_covariance(path: Path | str, layout: ParameterLayout, covariance: Arra
     write_groups(path, {"": data.assign_coords(unit=(DIMENSIONS[0], units))})
 
 
-def read_covariance(path: Path | str, names: tuple[str, ...]) -> Array:
-    """Read the covariance (n, n) of the parameters `names`.
+def read_covariance(path: Path | str) -> tuple[tuple[str, ...], Array]:
+    """Read names (p,) of parameters and their covariance (p, p).
 
-    Raises RecordError: a file that is damaged, of other parameters, or with variances that are none.
+    Raises RecordError: a file that is damaged, or with variances that are none.
     """
     data = read_group(path)
     if VARIABLE not in data or data[VARIABLE].dims != DIMENSIONS:
         raise RecordError(f"{path} lacks {VARIABLE} on {' and '.join(DIMENSIONS)}")
     found = tuple(map(str, data[DIMENSIONS[0]].values)) if DIMENSIONS[0] in data.coords else ()
-    if found != tuple(names):
-        different = sorted(set(found) ^ set(names))
-        raise RecordError(f"{path} is of other parameters than the result: {', '.join(different) or 'another order'}")
     covariance = np.asarray(data[VARIABLE].values, dtype=float)
     if not np.isfinite(covariance).all() or not (np.diag(covariance) > 0).all():
         raise RecordError(f"{path}: {VARIABLE} has variances that are not positive numbers")
-    return covariance
+    return found, covariance

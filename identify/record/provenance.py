@@ -19,7 +19,6 @@ from identify.arrays import Array
 from identify.errors import EstimationError, RecordError, ScenarioError
 from identify.files.dataset import plain, read_covariance, shown
 from identify.files.run_folder import RunFolder, load_result
-from identify.loop_parameters import parameter_entries
 from identify.record.payload import ADDED
 from identify.record.recording import VARIABLES, read, read_model_runs, read_runs
 from identify.scenario import Scenario, scenario_from_toml
@@ -118,8 +117,8 @@ def _numbers(robot: Robot) -> dict[str, Any]:
     """All numbers of a geometry by name, those of a leg by its own: as `leg2.crank_length`."""
     geometry = robot.geometry
     numbers: dict[str, Any] = {
-        "freedoms": list(geometry.chart.freedoms),
         **{name: np.asarray(getattr(geometry, name)).tolist() for name in SHARED},
+        "freedoms": list(geometry.chart.freedoms),
     }
     for number, leg in enumerate(geometry.legs, start=1):
         own = leg.model_dump(exclude={"base_joint", "platform_joint", "type"})
@@ -148,11 +147,20 @@ class RunFiles:
     validation = cached_property(lambda self: read_runs(self.folder.validation))
     model = cached_property(lambda self: read_model_runs(self.folder.model))  # by the run's name
 
-    @cached_property
+    named_covariance = cached_property(lambda self: read_covariance(self.folder.covariance))  # of the estimates
+
+    @property
     def covariance(self) -> Array:
-        """Of the estimates (p, p), in the order of the result's parameters."""
-        named = parameter_entries(load_result(self.folder.result).get("identification"))
-        return read_covariance(self.folder.covariance, tuple(named))
+        """Of the estimates (p, p)."""
+        return self.named_covariance[1]
+
+    def covariance_of(self, robot: Robot) -> Array:
+        """Of the estimates (p, p) of a robot. Raises RecordError where the file is of other parameters."""
+        found, names = self.named_covariance[0], robot.layout.names
+        if found != names:
+            said = ", ".join(sorted(set(found) ^ set(names))) or "another order"
+            raise RecordError(f"{self.folder.covariance} is of other parameters than the result: {said}")
+        return self.covariance
 
     def content(self, name: str) -> Any:
         """What a file holds, by its name, as ``experiment.nc``."""

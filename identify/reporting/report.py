@@ -32,7 +32,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 @dataclass(frozen=True)
 class ReportData:
     """All that a report shows: the result, the records, the truth of the validation runs, the models' runs, the
-    covariance (p, p) of the parameters and, where they are there, the trajectories."""
+    covariance (p, p) of the parameters with their names (p,) and, where they are there, the trajectories."""
 
     result: dict[str, Any]
     experiment: xr.Dataset
@@ -40,6 +40,7 @@ class ReportData:
     validation_truth: list[xr.Dataset]
     models: Mapping[str, xr.Dataset]
     covariance: Array
+    names: tuple[str, ...]
     trajectories: TrajectorySet | None = None
 
     @property
@@ -58,9 +59,8 @@ class ReportData:
     def correlations(self) -> tuple[Array, list[str]]:
         """Correlations (n, n) of the identified parameters, and their names."""
         parameters = self.result["identification"]["parameters"]
-        names = list(parameters)
-        chosen = [k for k, name in enumerate(names) if parameters[name].get("identifiable")]
-        return correlation_matrix(self.covariance[np.ix_(chosen, chosen)]), [names[k] for k in chosen]
+        chosen = [k for k, name in enumerate(self.names) if parameters.get(name, {}).get("identifiable")]
+        return correlation_matrix(self.covariance[np.ix_(chosen, chosen)]), [self.names[k] for k in chosen]
 
 
 def _fit(record: xr.Dataset, model: xr.Dataset) -> Fit:
@@ -111,6 +111,7 @@ def read_report_data(run: RunFolder) -> ReportData:
         validation_truth=read_truth_runs(run.validation),
         models=files.model,
         covariance=files.covariance,
+        names=files.named_covariance[0],
         trajectories=load_trajectories(run.trajectories) if run.trajectories.is_file() else None,
     )
     records = {EXCITATION: data.experiment}

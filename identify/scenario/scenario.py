@@ -63,11 +63,20 @@ class Scenario(Section):
     def _by_dotted_key(cls, changes: dict[str, Any]) -> dict[str, Any]:
         return by_dotted_key(changes)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _names_parameters_of_its_robot(cls, values: Any) -> Any:
+        if isinstance(values, Mapping):
+            section, robot = values.get("identification"), values.get("robot", cls.model_fields["robot"].default)
+            known = section.get("prior") if isinstance(section, Mapping) else getattr(section, "prior", None)
+            if isinstance(known, Mapping) and isinstance(robot, str):
+                check_parameter_names(known, robot)
+        return values
+
     @model_validator(mode="after")
     def _fits_together(self) -> "Scenario":
         self._complete_from_the_sensor()
         self.timing.check()
-        check_parameter_names(self.identification.prior, self.robot)
         self._check_filter()
         self._check_excitation_fits_the_filter()
         self._check_whole_frames("excitation.duration_s", self.excitation.duration_s)

@@ -7,9 +7,8 @@ import pytest
 
 from identify.files.dataset import write_covariance
 from identify.files.run_folder import RunFolder, rms_figures, save_result
-from identify.loop_parameters import NAMES
 from identify.record.recording import build_model_run, write_model_runs, write_runs
-from tests.identify.synthetic import recorded_run_folder, rss6, short_run, truth_of
+from tests.identify.synthetic import LAYOUT, NAMES, recorded_run_folder, rss6, short_run, truth_of
 
 
 def make_result():
@@ -28,6 +27,7 @@ def make_result():
         "joint1.viscous": parameter(0.0, 0.148, 0.146, 0.002),
         "joint_pid.lp": parameter(10.0, 10.5, 10.49, 0.02),
     }
+    parameters = {name: {"unit": LAYOUT.unit(name), **one} for name, one in parameters.items()}
     return {
         "scenario": "quick",
         "seed": 0,
@@ -86,7 +86,7 @@ def finished_run(tmp_path_factory):
     excitation = build_model_run(plant.time, initial, identified)
     unseen = [build_model_run(plant.time, start, identified, std) for start in (diverging, initial)]
     write_model_runs(run.model, excitation, unseen)
-    write_covariance(run.covariance, NAMES, np.diag(np.linspace(1.0, 2.0, len(NAMES))) + 0.1)
+    write_covariance(run.covariance, LAYOUT, np.diag(np.linspace(1.0, 2.0, len(NAMES))) + 0.1)
     save_result(run.result, make_result())
     return run
 

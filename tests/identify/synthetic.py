@@ -9,6 +9,7 @@ import numpy as np
 
 from dynamics import Robot, load_robot
 from identify.estimation.identification import output_error_problem
+from identify.estimation.prior import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.estimators.estimator import Evidence, joint_channels
 from identify.experiment.joint_instruments import JointInstruments, measure_joints
@@ -27,12 +28,26 @@ def rss6() -> Robot:
     return load_robot("rss6")
 
 
+LAYOUT = rss6().layout
+NAMES = LAYOUT.names
+
+
+def index_of(name):
+    """Place of a parameter of the reference robot."""
+    return NAMES.index(name)
+
+
+def guess_of(values, std):
+    """A starting guess of the reference robot's parameters."""
+    return StartingGuess(LAYOUT, values, std)
+
+
 def truth():
     return rss6().parameter_sets["identified"].vector
 
 
 def trajectory(seed, size=1.0):
-    return random_trajectory(np.random.default_rng(seed), rss6().home_pose, 0.1, 5, 0.010 * size, 0.04 * size)
+    return random_trajectory(np.random.default_rng(seed), rss6().geometry.chart, 0.1, 5, 0.010 * size, 0.04 * size)
 
 
 def run_plant(

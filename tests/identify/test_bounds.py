@@ -18,10 +18,8 @@ from identify.estimation.bounds import (
     parameter_bounds,
 )
 from identify.estimation.identification import identify
-from identify.estimation.prior import StartingGuess
-from identify.loop_parameters import NAMES, index_of
 from identify.scenario import load_scenario
-from tests.identify.synthetic import quick, rss6, run_plant, truth
+from tests.identify.synthetic import LAYOUT, NAMES, guess_of, index_of, quick, rss6, run_plant, truth
 
 CRITERIA = StopCriteria(cost_tolerance=1e-12, parameter_tolerance=1e-9, max_iterations=200)
 DRAWS = 500
@@ -119,7 +117,7 @@ def fitted(matrix, data, bounds, start) -> BoundedEstimate:
 
 
 def one_bounds(physical):
-    return parameter_bounds(StartingGuess(np.ones(67), np.ones(67)), physical)
+    return parameter_bounds(guess_of(np.ones(67), np.ones(67)), physical)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -149,7 +147,7 @@ def test_the_constrained_optimum_is_the_one_that_scipy_finds(seed):
     assert all(name.startswith("platform.I") for name in found.active_bounds)
     assert np.allclose(free.estimate[:4], target, atol=1e-6)
     with pytest.raises(UnphysicalInertiaError, match="platform"):
-        physical_inertias(free.estimate[:64])
+        physical_inertias(LAYOUT, free.estimate)
     held, free = (platform([2.0, 0.8, 0.9, 1.0], physical) for physical in (True, False))
     assert np.allclose(held.estimate, free.estimate, atol=1e-9)
     assert held.active_bounds == free.active_bounds == ()
@@ -158,9 +156,9 @@ def test_the_constrained_optimum_is_the_one_that_scipy_finds(seed):
 def test_the_nearest_parameters_are_within_the_bounds_and_physical_ones_stay():
     """The paper's starting values break the triangle inequality; the motion does not feel what is changed."""
     initial = rss6().parameter_sets["initial"].vector
-    bounds = parameter_bounds(StartingGuess(initial, initial), physical=True)
+    bounds = parameter_bounds(guess_of(initial, initial), physical=True)
     near = bounds.nearest(initial)
-    physical_inertias(near[:64])
+    physical_inertias(LAYOUT, near)
     changed = {NAMES[k] for k in np.flatnonzero(np.abs(near - initial) > 1e-9)}
     assert changed
     assert changed <= {
@@ -169,7 +167,7 @@ def test_the_nearest_parameters_are_within_the_bounds_and_physical_ones_stay():
         for body, moment in (("crank", "Ixx"), ("crank", "Iyy"), ("link", "Izz"))
     }
     assert np.allclose(bounds.nearest(near), near, rtol=1e-12)
-    plain = parameter_bounds(StartingGuess(initial, initial), physical=False)
+    plain = parameter_bounds(guess_of(initial, initial), physical=False)
     assert np.array_equal(plain.nearest(initial), initial)
 
 
@@ -179,15 +177,15 @@ def test_bodies_that_exist_are_identified_as_such(seed):
     """With noise the plain search finds bodies that cannot exist; the other does not, and fits as well. Its intervals
     hold what those without bounds hold, which a linearisation predicts to a fifth of a standard deviation."""
     flat = truth()
-    flat[:52] = physical_inertias(flat[:64], allow_changes=True).values.ravel()
+    flat[LAYOUT.rigid] = physical_inertias(LAYOUT, flat, allow_changes=True).values.ravel()
     flat[NAMES.index("platform.Izz")] = 0.999 * flat[1:3].sum()  # just below Ixx + Iyy, as of a plate
     scenario = quick(**{"identification.method": "command_driven"})
     consistent = scenario.with_overrides({"identification.physical_consistency": True})
     record, _ = run_plant(scenario, seed=seed, parameters=flat)
     plain, physical = identify(record, rss6(), scenario), identify(record, rss6(), consistent)
     with pytest.raises(UnphysicalInertiaError):
-        physical_inertias(plain.estimate[:64])
-    physical_inertias(physical.estimate[:64])
+        physical_inertias(LAYOUT, plain.estimate)
+    physical_inertias(LAYOUT, physical.estimate)
     assert physical.active_bounds
     assert any("held at" in warning for warning in physical.warnings)
     low, high = physical.intervals.T
@@ -201,7 +199,8 @@ def test_bodies_that_exist_are_identified_as_such(seed):
 
 
 def not_negative(size):
-    return ParameterBounds(np.eye(size), np.zeros(size), tuple(f"p{k} >= 0" for k in range(size)), physical=False)
+    statements = tuple(f"p{k} >= 0" for k in range(size))
+    return ParameterBounds(LAYOUT, np.eye(size), np.zeros(size), statements, physical=False)
 
 
 def coverage(estimates, truth, rows, intervals):

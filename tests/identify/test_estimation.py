@@ -12,14 +12,14 @@ from identify.estimation.identification import identify, output_error_problem
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.estimation.warm_start import joint_balance
 from identify.experiment.plant import build_plant, drawn_load
-from identify.loop_parameters import NAMES, choose_parameters, model_settings
+from identify.loop_parameters import choose_parameters, model_settings
 from identify.progress import SilentProgress
 from identify.record.payload import store_payload
 from identify.record.recorded_run import recorded_run
 from identify.reporting.run_result import prediction_entry
 from identify.scenario import load_scenario
 from identify.validation.unseen import PosePrediction, predict_poses, predicted_runs
-from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth, truth_of
+from tests.identify.synthetic import LAYOUT, NAMES, SIGMA, quick, rss6, run_plant, truth, truth_of
 from tests.identify.test_interval_coverage import check_coverage, row_of
 
 FRICTION_AND_PID = [i for i, name in enumerate(NAMES) if name.startswith("joint")]
@@ -207,7 +207,7 @@ def test_the_model_is_the_closed_loop_itself_and_the_gradient_of_the_whole_cost_
 ):
     """Of poses, starting guess and anchor together, off the optimum."""
     run = recorded_run(record, rss6(), scenario)
-    loop = simulate(rss6(), truth(), run.reference, model_settings(scenario))
+    loop = simulate(rss6(), truth(), run.reference, model_settings(rss6(), scenario))
     assert np.array_equal(run.model_poses(truth()), loop.pose)
     whole = output_error_problem([record], rss6(), scenario)
     at = 1.01 * truth()
@@ -228,12 +228,12 @@ def test_a_long_loss_is_flagged(scenario):
 
 def loaded(scenario, seed):
     """A record of the bare robot, and one with the scenario's known load on the platform."""
-    load, duration = drawn_load(scenario, np.random.default_rng(0)).stated, scenario.excitation.duration_s
+    load, duration = drawn_load(LAYOUT, scenario, np.random.default_rng(0)).stated, scenario.excitation.duration_s
     bare, _ = run_plant(scenario, seed=seed, duration_s=duration)
     heavy, _ = run_plant(scenario, seed=seed + 1000, parameters=truth() + load, duration_s=duration)
     for record in (bare, heavy):
         store_anchor(record, ScaleAnchor("payload"))
-    store_payload(heavy, load)
+    store_payload(heavy, LAYOUT, load)
     return [bare, heavy]
 
 
@@ -269,7 +269,8 @@ def test_normalised_squared_error_is_one_for_errors_of_the_stated_covariance():
     rng = np.random.default_rng(0)
     root = rng.normal(size=(6, 6))
     errors = rng.normal(size=(4000, 6)) @ root.T
-    prediction = PosePrediction(np.zeros((4000, 6)), np.broadcast_to(root @ root.T, (4000, 6, 6)))
+    chart, covariance = rss6().geometry.chart, np.broadcast_to(root @ root.T, (4000, 6, 6))
+    prediction = PosePrediction(chart, np.zeros((4000, 6)), covariance)
     assert prediction.normalised_squared_error(errors) == pytest.approx(1.0, abs=5 * np.sqrt(2 / 24000))
     assert prediction.normalised_squared_error(2 * errors) == pytest.approx(4.0, rel=0.05)
     np.testing.assert_allclose(prediction.std[7], np.sqrt(np.diag(root @ root.T)))

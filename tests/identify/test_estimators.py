@@ -9,15 +9,13 @@ import pytest
 from scipy.optimize import nnls
 
 from identify.errors import EstimationError, RecordError, ScenarioError
-from identify.estimation.prior import StartingGuess
 from identify.estimators.errors_in_variables import instrumental_variables, iv_fit, total_least_squares, truncated_tls
 from identify.estimators.estimator import Estimate, Estimator, Evidence, find_estimators, joint_channels
 from identify.estimators.least_squares import (
-    LOWER,
-    UNKNOWNS,
     TorqueEquations,
     encoder_route,
     least_squares,
+    lower_bounds,
     nearest_admissible,
     torque_equations,
     weighted_least_squares,
@@ -25,15 +23,17 @@ from identify.estimators.least_squares import (
 from identify.estimators.output_error import known_pid
 from identify.experiment.joint_instruments import JointInstruments, frame_mean, measure_joints, read_channels
 from identify.files.dataset import write_groups
-from identify.loop_parameters import NAMES
 from identify.progress import SilentProgress
 from identify.record import recording
 from identify.record.recorded_run import recorded_run
 from identify.validation.estimator_comparison import START, compare, estimators_figure, examination
 from tests.identify.commands import command, one_line
 from tests.identify.synthetic import (
+    LAYOUT,
+    NAMES,
     PERFECT,
     evidence,
+    guess_of,
     quick,
     recorded_run_folder,
     rss6,
@@ -236,13 +236,14 @@ def test_instruments_remove_the_attenuation_of_errors_in_variables():
     unknown by 1 / (1 + error^2); its instruments bring it back."""
     rng, n, error = np.random.default_rng(0), 1500, 0.5
     unknowns = np.concatenate([np.linspace(1, 2, len(NAMES)), np.zeros(6)])
-    clean = np.zeros((2 * n, UNKNOWNS))
+    clean = np.zeros((2 * n, len(unknowns)))
     clean[:n, :64], clean[n:, 64:] = rng.standard_normal((n, 64)), rng.standard_normal((n, 9))
     noisy = clean + error * rng.standard_normal(clean.shape) * (clean != 0)
-    equations = TorqueEquations(noisy, clean @ unknowns, np.repeat([0, 6], n), 1.0, np.ones((1, 6), dtype=bool))
+    kind, slipping = np.repeat([0, 6], n), np.ones((1, 6), dtype=bool)
+    equations = TorqueEquations(LAYOUT, noisy, clean @ unknowns, kind, 1.0, slipping)
     plain = np.linalg.lstsq(noisy, equations.right, rcond=None)[0]
     assert np.mean(plain[:64] / unknowns[:64]) == pytest.approx(1 / (1 + error**2), rel=0.03)
-    guess = StartingGuess(np.ones(67), np.full(67, 1e3))
+    guess = guess_of(np.ones(67), np.full(67, 1e3))
     rms = np.sqrt(np.mean((noisy @ unknowns - equations.right).reshape(2, -1) ** 2, axis=1))
     found, covariance = iv_fit(equations, clean, np.repeat(rms, n), guess)
     assert np.mean(found[:64] / unknowns[:64]) == pytest.approx(1.0, rel=0.03)
@@ -279,14 +280,15 @@ def test_truncated_tls_is_the_textbooks_where_all_errors_are_alike_and_leaves_a_
 def test_the_nearest_admissible_unknowns_have_no_negative_parameter():
     """Against scipy's non-negative least squares; the last six may be negative, as differences."""
     rng = np.random.default_rng(3)
-    root = rng.standard_normal((200, UNKNOWNS))
+    size, lower = 73, lower_bounds(LAYOUT)
+    root = rng.standard_normal((200, size))
     inside = np.concatenate([rng.uniform(0.1, 1, 67), rng.standard_normal(6)])
-    outside = np.where(np.arange(UNKNOWNS) == 5, -0.3, inside)
-    assert np.array_equal(nearest_admissible(inside, root.T @ root, np.ones(UNKNOWNS)), inside)
-    found = nearest_admissible(outside, root.T @ root, np.ones(UNKNOWNS))
+    outside = np.where(np.arange(size) == 5, -0.3, inside)
+    assert np.array_equal(nearest_admissible(LAYOUT, inside, root.T @ root, np.ones(size)), inside)
+    found = nearest_admissible(LAYOUT, outside, root.T @ root, np.ones(size))
     positive = nnls(np.hstack([root, -root[:, 67:]]), root @ outside)[0]
-    assert np.all(found >= LOWER)
-    assert np.allclose(found, positive[:UNKNOWNS] - np.append(np.zeros(67), positive[UNKNOWNS:]), atol=1e-6)
+    assert np.all(found >= lower)
+    assert np.allclose(found, positive[:size] - np.append(np.zeros(67), positive[size:]), atol=1e-6)
 
 
 def test_total_least_squares_and_the_encoder_route_agree_with_least_squares_where_noise_is_small():
@@ -335,14 +337,14 @@ def test_channels_survive_the_file_and_bad_ones_are_named(short, tmp_path):
         with pytest.raises(RecordError, match=says):
             read_channels(path)
     with pytest.raises(ScenarioError, match=r"encoder_noise_rad is .*finite number >= 0"):
-        JointInstruments(encoder_noise_rad=np.nan)
+        JointInstruments(encoder_noise=np.nan)
 
 
 @pytest.mark.slow
 def test_the_bias_of_least_squares_over_repeated_experiments():
     """Mean of eight records at 40 um: what the inertia and ld lose by least squares is many standard errors of the
     mean, and several times what the instrumental variables lose, whose stated deviations of the gains hold."""
-    runs = [evidence(seed, 8.0, JointInstruments(torque_noise_N_m=0.005)) for seed in range(8)]
+    runs = [evidence(seed, 8.0, JointInstruments(torque_noise=0.005)) for seed in range(8)]
     found = {estimate: [estimate(seen) for seen in runs] for estimate in (least_squares, instrumental_variables)}
     values = {estimate: np.array([one.parameters for one in all_]) for estimate, all_ in found.items()}
     for index in (LD, NAMES.index("platform.Izz")):

@@ -21,17 +21,18 @@ from identify.trajectory import FourierTrajectory, check_travel, load_trajectori
 from tests.identify.commands import refusal
 from tests.identify.synthetic import Stages, rss6
 
+CHART = rss6().geometry.chart
 HOME = np.array([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
 
 
 def random_one(seed, harmonics=5, fundamental_hz=0.1):
-    return random_trajectory(np.random.default_rng(seed), HOME, fundamental_hz, harmonics, 0.01, 0.04)
+    return random_trajectory(np.random.default_rng(seed), rss6().geometry.chart, fundamental_hz, harmonics, 0.01, 0.04)
 
 
 def test_single_harmonic_is_equation_37_written_out():
     sine, cosine = np.zeros((6, 2)), np.zeros((6, 2))
     sine[0, 1], cosine[4, 0] = 0.3, -0.2
-    trajectory = FourierTrajectory(0.1, sine, cosine, HOME)
+    trajectory = FourierTrajectory(CHART, 0.1, sine, cosine, HOME)
     t = 1.7
     expected = HOME.copy()
     expected[0] += np.sin(2 * np.pi * 0.1 * 2 * t) / (2 * np.pi * 0.1 * 2) * 0.3
@@ -68,9 +69,9 @@ def test_a_trajectory_has_its_fundamentals_period_and_frozen_coefficients_and_wr
     with pytest.raises(ValueError, match="read-only"):
         trajectory.sine[0, 0] = 1.0
     with pytest.raises(TrajectoryError, match=r"\(5, 2\)"):
-        FourierTrajectory(0.1, np.zeros((5, 2)), np.zeros((6, 2)), HOME)
+        FourierTrajectory(CHART, 0.1, np.zeros((5, 2)), np.zeros((6, 2)), HOME)
     with pytest.raises(TrajectoryError, match="finite"):
-        FourierTrajectory(0.1, np.full((6, 2), np.nan), np.zeros((6, 2)), HOME)
+        FourierTrajectory(CHART, 0.1, np.full((6, 2), np.nan), np.zeros((6, 2)), HOME)
     with pytest.raises(TrajectoryError, match="at least 2 harmonics"):
         random_one(0, harmonics=1)
 
@@ -80,12 +81,12 @@ def test_travel_is_the_largest_angle_and_refused_with_time_leg_angle_and_limit_o
     robot, times = rss6(), np.arange(5) / 16
     turned = robot.forward_kinematics(np.array([0.0, 0.3, 0.0, 0.0, 0.0, 0.0])) - HOME
     one_crank, far = (
-        FourierTrajectory(1.0, 2 * np.pi * np.reshape(way, (6, 1)), np.zeros((6, 1)), HOME)
+        FourierTrajectory(CHART, 1.0, 2 * np.pi * np.reshape(way, (6, 1)), np.zeros((6, 1)), HOME)
         for way in (turned, [1.0, 0, 0, 0, 0, 0])
     )
     assert check_travel(robot, one_crank, times) == pytest.approx(0.3, abs=1e-9)
     with pytest.raises(TrajectoryError, match=r"theta\| in rad of leg 2 of rss6 is 0\.3 at t = 0\.25 s, limit 0\.2948"):
-        check_travel(robot, one_crank, times, margin_rad=0.7)
+        check_travel(robot, one_crank, times, margin=0.7)
     with pytest.raises(TrajectoryError, match=r"reach margin of leg \d of rss6 is -.* must be > 0"):
         check_travel(robot, far, times)
 
@@ -198,7 +199,7 @@ def test_the_best_candidate_is_chosen_by_a_criterion_of_ones_own(tmp_path, monke
     )
     monkeypatch.syspath_prepend(tmp_path)
     scenario = quick(criterion="own_criterion:smallness")
-    free = unknowns(robot.home_pose, scenario.excitation)
+    free = unknowns(robot.geometry.chart, scenario.excitation)
     progress = Stages()
     chosen = design_trajectories(robot, scenario, 3, progress).excitation
     assert progress.seen == [("excitation", 4, [1] * 4)]

@@ -13,7 +13,6 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from dynamics.closed_loop import simulate
-from dynamics.parameters import VISCOUS
 from identify.errors import TrajectoryError
 from identify.excitation.comparison import compare_methods
 from identify.excitation.constraints import MotionConstraints
@@ -28,12 +27,12 @@ from identify.excitation.information import (
 )
 from identify.excitation.motion import sample_times, unknowns
 from identify.excitation.search import climb
-from identify.loop_parameters import NAMES, index_of, model_settings
+from identify.loop_parameters import model_settings
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
 from identify.trajectory import random_trajectory
 from tests.identify.commands import command
-from tests.identify.synthetic import rss6
+from tests.identify.synthetic import NAMES, index_of, rss6
 
 QUICK = load_scenario("quick")
 SMALL = QUICK.with_overrides(
@@ -52,16 +51,16 @@ def known(robot):
 def a_motion(robot, seed, scenario=QUICK):
     """Unknowns, and the z of a random trajectory."""
     of = scenario.excitation
-    free, size = unknowns(robot.home_pose, of), (of.position_amplitude_m, of.orientation_amplitude_rad)
+    free, size = unknowns(robot.geometry.chart, of), (of.position_amplitude_m, of.orientation_amplitude_rad)
     rng = np.random.default_rng(seed)
-    trajectory = random_trajectory(rng, robot.home_pose, of.fundamental_hz, of.harmonics, *size)
+    trajectory = random_trajectory(rng, robot.geometry.chart, of.fundamental_hz, of.harmonics, *size)
     return free, free.of(trajectory), trajectory
 
 
 def simulated(robot, parameters, trajectory, scenario):
     """Run of the whole scenario's duration, with sensitivities."""
     reference = trajectory.reference(scenario.timing.frame_times(scenario.excitation.duration_s))
-    return simulate(robot, parameters, reference, model_settings(scenario), sensitivities=True)
+    return simulate(robot, parameters, reference, model_settings(rss6(), scenario), sensitivities=True)
 
 
 @pytest.mark.parametrize("harmonics_", [2, 5])
@@ -120,7 +119,7 @@ def test_linear_loop_has_the_sensitivities_of_the_simulated_one(robot):
     scenario = QUICK.with_overrides({**TINY, "timing.frame_rate_hz": 600.0, "excitation.duration_s": 20.0})
     free, z, trajectory = a_motion(robot, 8, scenario)
     parameters = robot.parameter_sets["initial"].vector.copy()
-    parameters[VISCOUS] = 0.5  # without friction the loop rings longer than a period
+    parameters[robot.layout.viscous] = 0.5  # without friction the loop rings longer than a period
     run = simulated(robot, parameters, trajectory, scenario)
     s, t = harmonics(free), run.time[6000:]
     unknown = ca.MX.sym("z", z.size)
@@ -183,7 +182,7 @@ def designed(method, seed=0, **overrides):
 def drawn(count):
     """Random trajectories in the box of the built-in scenarios."""
     rng = np.random.default_rng(0)
-    return [random_trajectory(rng, rss6().home_pose, 0.1, 5, 0.01, 0.04) for _ in range(count)]
+    return [random_trajectory(rng, rss6().geometry.chart, 0.1, 5, 0.01, 0.04) for _ in range(count)]
 
 
 def climbed(problem):

@@ -61,9 +61,9 @@ def test_rods_join_the_robots_joints():
     transforms = robot_transforms(robot, pose)
     platform = cmmsim.pose_to_transform(pose)
     for leg in range(6):
-        crank, link = transforms[f"crank{leg + 1}"], transforms[f"link{leg + 1}"]
-        tip = crank[:3, 3] + robot.geometry.crank_length * crank[:3, 2]
-        end = link[:3, 3] + robot.geometry.link_length * link[:3, 2]
+        crank, link, own = transforms[f"crank{leg + 1}"], transforms[f"link{leg + 1}"], robot.geometry.legs[leg]
+        tip = crank[:3, 3] + own.crank_length * crank[:3, 2]
+        end = link[:3, 3] + own.link_length * link[:3, 2]
         joint = platform[:3, :3] @ robot.geometry.platform_joints[leg] + platform[:3, 3]
         assert np.allclose(crank[:3, 3], robot.geometry.base_joints[leg], atol=1e-12)
         assert np.allclose(tip, link[:3, 3], atol=1e-12)
@@ -86,7 +86,7 @@ def test_a_lost_frame_is_counted_holds_the_command_and_does_not_end_the_run(sens
     steps = np.diff(true_poses(experiment.truth), axis=0) * 60.0
     middle = (np.array(told.rates)[1:] + np.array(told.rates)[:-1]) / 2
     assert np.abs(middle - steps).max() < 0.05 * np.abs(steps).max()
-    wild = random_trajectory(np.random.default_rng(0), rss6().home_pose, 0.1, 5, 0.02, 0.08)
+    wild = random_trajectory(np.random.default_rng(0), rss6().geometry.chart, 0.1, 5, 0.02, 0.08)
     with pytest.raises(TrajectoryError, match=r"crank \d|leg \d"):
         run_plant(build_plant(quick(), rss6()), told, wild, 10.0, 0, 0)
     assert len(told.seeds) == 1, "refused before the run"
@@ -125,7 +125,7 @@ def test_the_sensor_gets_the_scenarios_timing_and_latencies_jitter_as_it_says(se
     assert (timing.frame_rate, timing.exposure, timing.dropout, timing.latency) == (60.0, 0.004, 0.25, 0.01)
     assert scenario.timing.drawn_latencies(400, np.random.default_rng(0)) is None
     assert late(0.002).timing.drawn_latencies(400, np.random.default_rng(0)).std() == pytest.approx(0.002, rel=0.15)
-    assert model_settings(late(0.002)).timing.latency_s == 0.01
+    assert model_settings(rss6(), late(0.002)).timing.latency_s == 0.01
     jittered = true(0, 0.005)
     assert np.array_equal(jittered, true(0, 0.005))
     assert 1e-7 < np.abs(jittered - true(0, 0.0)).max() < 1e-3
@@ -142,14 +142,14 @@ STRIBECK = {"plant.friction": "stribeck", "plant.static_ratio": 1.3, "plant.stri
 
 def test_the_model_knows_of_no_switch_and_without_one_the_plant_is_the_nominal_robot_bit_by_bit():
     switched, plain = quick(**ELASTIC, **MISPLACED, **STRIBECK), quick()
-    assert model_settings(switched) == model_settings(quick())
+    assert model_settings(rss6(), switched) == model_settings(rss6(), quick())
     assert build_plant(switched).settings.elasticity.stiffness == 1000.0
     text = switched.to_toml()
     assert scenario_from_toml(text) == switched
     for line in ("joint_stiffness_N_m_rad = 1000.0", "[N m/rad]", "geometry_error_m = 0.0001", "motor_inertia_kg_m2"):
         assert line in text
     assert "joint_stiffness" not in quick().to_toml()
-    with pytest.raises(SimulationError, match="of crank 2 about its axis"):
+    with pytest.raises(SimulationError, match="of crank2 about its axis"):
         build_plant(quick(**ELASTIC, **{"plant.motor_inertia_kg_m2": 1e-3}), rss6()).check()
     plant, reference = build_plant(plain, rss6()), trajectory(0).reference(plain.timing.frame_times(0.5))
     assert plant.robot is rss6()

@@ -9,7 +9,6 @@ import pytest
 from scipy.linalg import null_space
 
 from dynamics import load_robot
-from dynamics.parameters import PARAMETER_NAMES
 from identify.errors import EstimationError, RecordError, ScenarioError
 from identify.estimation.base_parameters import (
     BaseParameters,
@@ -30,13 +29,22 @@ from identify.estimation.identifiability import (
     rests_on_prior,
 )
 from identify.estimation.identification import identify
-from identify.estimation.prior import StartingGuess, holding_torque, starting_guess
+from identify.estimation.prior import holding_torque, starting_guess
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor, store_anchor
-from identify.loop_parameters import NAMES, index_of
 from identify.record.recorded_run import recorded_run
 from identify.reporting.tables import ON_GUESS, parameter_table
 from tests.identify.commands import command
-from tests.identify.synthetic import changed_robot_file, quick, rss6, run_plant, truth
+from tests.identify.synthetic import (
+    LAYOUT,
+    NAMES,
+    changed_robot_file,
+    guess_of,
+    index_of,
+    quick,
+    rss6,
+    run_plant,
+    truth,
+)
 
 WEIGHED = ScaleAnchor("platform_mass", 23.5, 0.005)
 GAIN = ScaleAnchor("joint_gain", 10.5, 0.01)
@@ -45,7 +53,7 @@ JOINTS = [k for k, name in enumerate(NAMES) if name.startswith("joint")]
 
 @pytest.fixture(scope="module")
 def base():
-    return base_parameters(structural_regressor(rss6()))
+    return base_parameters(structural_regressor(rss6()), LAYOUT)
 
 
 def test_the_base_parameters_alone_decide_the_torque(base):
@@ -76,15 +84,17 @@ def test_rank_and_space_are_those_of_the_singular_values_and_the_papers_threshol
     assert rank_by_threshold(matrix, 1e-3) == 37
     assert rank_by_threshold(matrix / 1e6, 1e-3) < 37
     with pytest.raises(EstimationError, match="excites no parameter"):
-        base_parameters(np.zeros((12, 64)))
+        base_parameters(np.zeros((12, 64)), LAYOUT)
 
 
 def test_the_angle_to_the_singular_vectors_is_that_by_which_a_group_is_wrong():
     """Columns of length 3 and 4, and one that no motion shows: a group turned towards it by 0.1 rad."""
-    matrix = np.array([[3.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 0.0]])
-    right = base_parameters(matrix, ("crank1.Izz", "crank2.Izz", "crank3.Izz"))
+    first, second, unseen = (index_of(f"crank{leg}.Izz") for leg in (1, 2, 3))
+    matrix, tilt = np.zeros((2, 64)), np.zeros((2, 64))
+    matrix[0, first], matrix[1, second], tilt[0, unseen] = 3.0, 4.0, np.tan(0.1) / 3.0
+    right = base_parameters(matrix, LAYOUT)
     assert angle_to_singular_vectors(matrix, right) < 1e-12
-    turned = right.combinations + np.array([[0.0, 0.0, np.tan(0.1) / 3.0], [0.0, 0.0, 0.0]])
+    turned = right.combinations + tilt
     assert angle_to_singular_vectors(matrix, replace(right, combinations=turned)) == pytest.approx(0.1, rel=1e-9)
     one_less = replace(right, combinations=right.combinations[:1])
     assert angle_to_singular_vectors(matrix, one_less) == pytest.approx(np.pi / 2)
@@ -95,19 +105,19 @@ def test_gravity_across_the_crank_axes_separates_mass_from_inertia(base, tmp_pat
     """On a slope a crank's weight turns it, so its mass is no longer tied to its inertia."""
     level, leaning = "gravity = [0.0, 0.0, -9.81]", "gravity = [4.0, 0.0, -8.9575]"
     matrix = structural_regressor(load_robot(changed_robot_file(tmp_path / "leaning.toml", level, leaning)))
-    sloped = base_parameters(matrix)
+    sloped = base_parameters(matrix, LAYOUT)
     assert sloped.rank == rank_by_singular_values(matrix) > base.rank
-    row = sloped.combinations[sloped.pivots.index(PARAMETER_NAMES.index("crank2.Izz"))]
-    assert row[PARAMETER_NAMES.index("crank2.mass")] == 0.0
+    row = sloped.combinations[sloped.pivots.index(LAYOUT.dynamic_names.index("crank2.Izz"))]
+    assert row[LAYOUT.dynamic_names.index("crank2.mass")] == 0.0
 
 
 def test_groups_do_not_depend_on_the_motions_and_a_crank_turns_about_its_joint(base):
     """A crank about a vertical axis shows its inertia about that axis: Izz + m (r / 2)², r = 60 mm."""
-    again = base_parameters(structural_regressor(rss6(), motions=333, seed=11))
+    again = base_parameters(structural_regressor(rss6(), motions=333, seed=11), LAYOUT)
     assert again.pivots == base.pivots
     assert np.allclose(again.combinations, base.combinations, atol=1e-9)
-    row = base.combinations[base.pivots.index(PARAMETER_NAMES.index("crank2.Izz"))]
-    assert row[PARAMETER_NAMES.index("crank2.mass")] == pytest.approx(0.03**2, rel=1e-9)
+    row = base.combinations[base.pivots.index(LAYOUT.dynamic_names.index("crank2.Izz"))]
+    assert row[LAYOUT.dynamic_names.index("crank2.mass")] == pytest.approx(0.03**2, rel=1e-9)
     assert all(f"crank{k}.Ixx" in base.unseen and f"link{k}.Izz" in base.unseen for k in range(1, 7))
 
 
@@ -171,7 +181,7 @@ def test_the_estimate_does_not_decide(base, factor):
 
 def resting(base, anchor):
     sizes = identifiability(starting_guess(rss6(), "initial", 1.0), rss6()).sizes
-    found = rests_on_prior(base, anchor, truth(), sizes)
+    found = rests_on_prior(base, starting_guess(rss6(), "initial", 1.0), anchor, truth(), sizes)
     return {name for name, rests in zip(NAMES, found, strict=True) if rests}
 
 
@@ -189,7 +199,7 @@ def test_with_no_anchor_all_rests_on_the_guess_and_a_weighed_platform_stands_alo
 def test_what_rests_on_the_guess_can_change_with_no_pose_changing_and_nothing_else_can(base):
     """A large change along all that neither poses nor weighing show, run through the closed loop."""
     gains = np.eye(len(NAMES))[64:]
-    shown = np.concatenate([group_rows(base), gains, WEIGHED.row()[0]]) * truth()
+    shown = np.concatenate([group_rows(base), gains, WEIGHED.row(LAYOUT)[0]]) * truth()
     unseen = null_space(shown / np.linalg.norm(shown, axis=1, keepdims=True))
     change = unseen @ np.random.default_rng(0).standard_normal(unseen.shape[1])
     named = {name for name, moved in zip(NAMES, change, strict=True) if abs(moved) > 1e-6}
@@ -226,7 +236,7 @@ def test_a_result_names_what_rests_on_the_guess_among_what_is_identified(base, r
 def three_unknowns(poses, groups=((1.0, 0.0), (0.0, 1.0))):
     """Conditioning of two dynamic parameters in groups and one gain, all of size one with a guess of 1 ± 1."""
     base = BaseParameters(("a", "b"), np.array(groups), tuple(range(len(groups))), (), (0.0, 1.0))
-    return conditioning(poses, np.eye(3), base, StartingGuess(np.ones(3), np.ones(3)), np.ones(3))
+    return conditioning(poses, np.eye(3), base, guess_of(np.ones(3), np.ones(3)), np.ones(3))
 
 
 def test_condition_numbers_are_those_worked_out_by_hand_and_a_poor_one_is_a_warning():
@@ -280,12 +290,12 @@ def test_a_known_gain_fixes_the_scale_as_its_anchor_does_and_of_what_no_motion_s
 
 def test_the_anchor_that_is_stored_is_read_and_a_weighing_is_one_equation_in_standard_deviations(record):
     for anchor in (ScaleAnchor("joint_gain", 10.5, 0.01), ScaleAnchor("payload")):
-        assert read_anchor(anchored(record, anchor)) == anchor
-    row, right = ScaleAnchor("platform_mass", 23.5, 0.005).row()
+        assert read_anchor(anchored(record, anchor), LAYOUT) == anchor
+    row, right = ScaleAnchor("platform_mass", 23.5, 0.005).row(LAYOUT)
     assert np.flatnonzero(row) == [index_of("platform.mass")]
     assert row[0, index_of("platform.mass")] == pytest.approx(200)
     assert right[0] == pytest.approx(4700)
-    assert ScaleAnchor("payload").row()[0].shape == (0, 67)
+    assert ScaleAnchor("payload").row(LAYOUT)[0].shape == (0, 67)
 
 
 @pytest.mark.parametrize("bad", [np.float64(-3.0), 0.0, np.nan, np.inf, "23.5", True])
@@ -293,7 +303,7 @@ def test_the_anchor_that_is_stored_is_read_and_a_weighing_is_one_equation_in_sta
 def test_an_impossible_anchor_is_refused_with_its_value_limit_and_unit(record, attribute, bad):
     shown = f"{float(bad)}" if isinstance(bad, float) else repr(bad)
     with pytest.raises(RecordError, match=rf"{attribute} is {shown}, must be a finite number > 0 in kg: .*form.mass"):
-        read_anchor(record.assign_attrs({attribute: bad}))
+        read_anchor(record.assign_attrs({attribute: bad}), LAYOUT)
 
 
 def test_what_no_model_has_an_anchor_that_is_unknown_or_incomplete_and_what_is_no_robot_or_scenario_are_refused(
@@ -307,7 +317,7 @@ def test_what_no_model_has_an_anchor_that_is_unknown_or_incomplete_and_what_is_n
         identify(record.assign_attrs(scale_anchor="guess"), rss6(), quick())
     half = anchored(record, ScaleAnchor("payload")).assign_attrs(scale_anchor="joint_gain", scale_anchor_value=1.0)
     with pytest.raises(RecordError, match=r"_std is None, must be .* in N m/rad: .*joint_gain measures joint_pid.lp"):
-        read_anchor(half)
+        read_anchor(half, LAYOUT)
     with pytest.raises(EstimationError, match="None is no Robot: dynamics"):
         identify(record, None, quick())
     with pytest.raises(EstimationError, match="'quick' is no Scenario: identify"):

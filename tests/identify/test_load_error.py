@@ -16,11 +16,10 @@ from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.experiment.plant import build_plant, drawn_load
 from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses
-from identify.loop_parameters import NAMES, index_of
 from identify.record.payload import store_payload
 from identify.record.recording import poses
 from identify.studies.rows.sensor import DrawnSensor
-from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, silent, trajectory, truth
+from tests.identify.synthetic import LAYOUT, NAMES, SIGMA, index_of, quick, rss6, run_plant, silent, trajectory, truth
 
 MASS, GAIN = index_of("platform.mass"), index_of("joint_pid.lp")
 JOINTS = [place for place, name in enumerate(NAMES) if name.startswith("joint")]
@@ -34,7 +33,7 @@ SCENARIO = quick(**{
     "identification.method": "command_driven",
     "payload.mass_std_kg": SHARE * 8.0,
 })  # fmt: skip
-DRAWN = drawn_load(SCENARIO, np.random.default_rng(0))
+DRAWN = drawn_load(LAYOUT, SCENARIO, np.random.default_rng(0))
 LOAD, STD = DRAWN.stated, DRAWN.std
 """What the scenario's load adds to the parameters (67,), and its standard deviations (67,)."""
 
@@ -45,7 +44,7 @@ def records():
     bare, _ = run_plant(SCENARIO, seed=1, duration_s=3.0)
     heavy, _ = run_plant(SCENARIO, seed=2, parameters=truth() + LOAD, duration_s=3.0)
     store_anchor(bare, ScaleAnchor("payload"))
-    store_payload(heavy, LOAD, STD)
+    store_payload(heavy, LAYOUT, LOAD, STD)
     return [bare, heavy]
 
 
@@ -53,7 +52,7 @@ def stating(records, *loads):
     """The problem of the bare record, and of the other one for each (load (67,), std (67,) or None) as stated."""
     restated = [records[1].copy() for _ in loads]
     for record, (load, std) in zip(restated, loads, strict=True):
-        store_payload(record, load, std)
+        store_payload(record, LAYOUT, load, std)
     return output_error_problem([records[0], *restated], rss6(), SCENARIO).driven_by_commands()
 
 
@@ -114,11 +113,11 @@ def test_a_deviation_that_cannot_be_is_refused_and_none_makes_two_loads_of_one(r
 def test_drawn_loads_spread_as_stated_and_are_never_negative():
     """Mean and spread of many: of a weighed mass, and of one hardly known, which normal deviations would make none."""
     rng = np.random.default_rng(0)
-    masses = np.array([drawn_load(SCENARIO, rng).true[MASS] for _ in range(2000)])
+    masses = np.array([drawn_load(LAYOUT, SCENARIO, rng).true[MASS] for _ in range(2000)])
     assert masses.std() == pytest.approx(0.04, rel=0.07)
     assert masses.mean() == pytest.approx(8.0, abs=4 * 0.04 / np.sqrt(2000))
     vague = quick(**{"payload.mass_std_kg": 8.0, "payload.Izz_std_kg_m2": 0.04})
-    drawn = np.array([drawn_load(vague, rng).true for _ in range(200)])
+    drawn = np.array([drawn_load(LAYOUT, vague, rng).true for _ in range(200)])
     assert (drawn >= 0).all()
     assert np.flatnonzero(np.ptp(drawn, axis=0)).tolist() == [MASS, index_of("platform.Izz")]
 

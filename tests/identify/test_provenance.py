@@ -8,14 +8,13 @@ from identify.errors import OutputFolderError, RecordError
 from identify.experiment.truth import read_truth
 from identify.files.dataset import write_covariance
 from identify.files.run_folder import load_result, save_result
-from identify.loop_parameters import NAMES
 from identify.progress import SilentProgress
 from identify.record.provenance import ENTRY, RunFiles, array_digest, digest
 from identify.record.recording import EXCITATION, read, read_model_runs, read_runs, write, write_model_runs, write_runs
 from identify.reporting.report import read_report_data, write_report
 from identify.reporting.run_result import parameter_vector
 from tests.identify.commands import command, one_line
-from tests.identify.synthetic import SHORT, short_run, truth
+from tests.identify.synthetic import LAYOUT, NAMES, SHORT, rss6, short_run, truth
 
 
 def moved(record):
@@ -55,7 +54,7 @@ def other_experiment(run):
 
 
 def other_covariance(run):
-    write_covariance(run.covariance, NAMES, 2 * np.eye(len(NAMES)))
+    write_covariance(run.covariance, LAYOUT, 2 * np.eye(len(NAMES)))
 
 
 def other_validation(run):
@@ -114,7 +113,7 @@ def entries(**changes):
 def test_what_reads_a_run_anew_refuses_in_one_line_files_of_another_and_a_result_that_is_none(recorded_folder, capsys):
     """And writes nothing."""
     run = recorded_folder
-    write_covariance(run.covariance, NAMES, np.eye(len(NAMES)))
+    write_covariance(run.covariance, LAYOUT, np.eye(len(NAMES)))
     write_runs(run.validation, [(short_run()[0], read_truth(run.experiment))] * 3)
     whole = {"seconds": {}, "before": {}, "after": {}, "identification": entries()}
     made_of = (
@@ -140,7 +139,7 @@ def test_what_reads_a_run_anew_refuses_in_one_line_files_of_another_and_a_result
 
 
 def test_parameters_of_a_result_that_no_model_has_are_named():
-    np.testing.assert_array_equal(parameter_vector(entries(), "estimate"), truth())
+    np.testing.assert_array_equal(parameter_vector(rss6(), entries(), "estimate"), truth())
     for identification, says in (
         (entries(link3__mass="1 kg"), 'estimate of link3.mass is "1 kg", must be a finite number'),
         (entries(link3__mass=True), "estimate of link3.mass is true, must be a finite number"),
@@ -152,4 +151,4 @@ def test_parameters_of_a_result_that_no_model_has_are_named():
         ({"parameters": []}, r"no identification\.parameters"),
     ):
         with pytest.raises(RecordError, match=says):
-            parameter_vector(identification, "estimate")
+            parameter_vector(rss6(), identification, "estimate")

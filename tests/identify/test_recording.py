@@ -18,7 +18,6 @@ from identify.experiment.truth import read_truth, read_truth_runs, true_paramete
 from identify.files.atomic import atomic_path, write_text
 from identify.files.dataset import group_names, write_covariance, write_groups
 from identify.files.run_folder import load_result, save_result
-from identify.loop_parameters import NAMES
 from identify.progress import SilentProgress
 from identify.record.checks import check_trajectory
 from identify.record.payload import recorded_payload
@@ -39,7 +38,7 @@ from identify.record.recording import (
 )
 from identify.trajectory import load_trajectories
 from tests.identify import synthetic
-from tests.identify.synthetic import SHORT, quick, rss6, run_plant, short_run, trajectory
+from tests.identify.synthetic import LAYOUT, NAMES, SHORT, quick, rss6, run_plant, short_run, trajectory
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +89,7 @@ def test_values_of_another_shape_that_are_not_finite_or_times_that_do_not_increa
     for values, says in (
         ({"measured_pose": measured}, "is not finite in 1 frames that count as measured, the first is frame 7"),
         ({"command": np.full((120, 6), np.inf)}, "command is not finite in 120 frames, the first is frame 0"),
-        ({"command": np.zeros((120, 5))}, "120"),
+        ({"command": np.zeros(120)}, "120"),
         ({"measured_covariance": np.zeros((120, 6))}, "120"),
         ({"measured_ok": np.zeros(119)}, "119"),
         ({"reference_pose": np.zeros((6, 120))}, "6"),
@@ -206,6 +205,7 @@ def without(record, *names):
 @pytest.mark.parametrize(
     ("spoil", "error", "says"),
     [
+        (lambda r: r.isel(joint=slice(0, 5)), EstimationError, "has commands of 5 joints, robot 'rss6' has 6"),
         (lambda r: r.isel(time=slice(0, 0)), RecordError, "the record has no time"),
         (lambda r: r.isel(time=slice(0, 1)), EstimationError, "1 frames .0.0167 s., at least 120 are needed"),
         (lambda r: r.assign_coords(time=r["time"].where(r["time"] > 1)), RecordError, "increase after frame 0"),
@@ -253,11 +253,11 @@ def test_what_a_record_need_not_have_and_what_rounding_leaves_of_symmetry_is_no_
 
 def test_a_load_that_no_body_has_is_refused_and_its_numbers_are_shown_as_plain_ones(record):
     load = {"payload_mass": 8.0, "payload_Ixx": 0.02, "payload_Iyy": 0.02, "payload_Izz": 0.04}
-    assert recorded_payload(record.assign_attrs(load))[0].sum() == pytest.approx(8.08)
+    assert recorded_payload(record.assign_attrs(load), LAYOUT)[0].sum() == pytest.approx(8.08)
     with pytest.raises(RecordError, match=r"attribute payload_Ixx 100 > .*0.02 .*0.04"):
-        recorded_payload(record.assign_attrs(load | {"payload_Ixx": 100.0}))
+        recorded_payload(record.assign_attrs(load | {"payload_Ixx": 100.0}), LAYOUT)
     with pytest.raises(RecordError, match=r"attribute payload_mass is -8.0, must be .*kg"):
-        recorded_payload(record.assign_attrs(load | {"payload_mass": np.float64(-8.0)}))
+        recorded_payload(record.assign_attrs(load | {"payload_mass": np.float64(-8.0)}), LAYOUT)
 
 
 def test_a_record_of_another_trajectory_is_refused_where_it_differs_most(record, recorded_folder):
@@ -291,7 +291,7 @@ def test_a_record_of_another_robot_is_refused_be_it_by_its_cranks_or_without_geo
 @pytest.mark.parametrize("stage", [pipeline.identify, pipeline.validate])
 def test_a_stage_refuses_a_record_that_is_not_of_its_folder(tmp_path, stage):
     run = synthetic.recorded_run_folder(tmp_path, chosen=trajectory(1))
-    write_covariance(run.covariance, NAMES, np.eye(len(NAMES)))
+    write_covariance(run.covariance, LAYOUT, np.eye(len(NAMES)))
     save_result(run.result, {})
     with pytest.raises(EstimationError, match=rf"{run.experiment}: the record's reference is not the exciting"):
         stage(run.path, SilentProgress())

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from dynamics.kinematics.chart import Chart
 from identify.errors import OutputFolderError, RecordError
 from identify.files.run_folder import load_result, rms_figures, rms_row, save_result
 from identify.record.recording import build_model_run, write_model_runs
@@ -47,7 +48,7 @@ def test_report_is_one_file_that_opens_offline_beside_readable_figures(run_folde
 
 def test_report_shows_goals_parameters_the_index_and_the_papers_numbers_and_names_what_is_missed(finished_run, result):
     data = read_report_data(finished_run)
-    path = random_trajectory(np.random.default_rng(0), np.zeros(6), 0.1, 5, 0.01, 0.04)
+    path = random_trajectory(np.random.default_rng(0), Chart("free", (0.0,) * 6), 0.1, 5, 0.01, 0.04)
     text = render(replace(data, trajectories=TrajectorySet(0, path, (path,), 0.5293, 0.4606, 0.4603)))
     chosen = "0.461 of the first random candidate, 0.46 of the middle one, 0.529 of the trajectory that is used"
     correlated = ("joint1.coulomb, joint_pid.lp", "+0.9877", "2.0e+11 of the poses alone")

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from dynamics.errors import UnreachablePoseError
-from dynamics.parameters import PARAMETER_NAMES
 from identify.errors import RecordError, TrajectoryError
 from identify.files.run_folder import load_result, save_result
 from identify.loop_parameters import choose_parameters
@@ -16,6 +15,7 @@ from identify.trajectory import check_travel
 from identify.verification import against_mujoco, workspace_map
 from identify.verification.against_mujoco import EngineRuns, compare_engines, exciting_trajectory, figure_8, judge
 from tests.identify.commands import command, one_line
+from tests.identify.synthetic import LAYOUT
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_a_wrong_parameter_in_one_engine_is_seen(robot):
     right = judge(compare_engines(robot, initial, initial, 2.1))
     for name, factor in (("platform.mass", 1.01), ("link1.mass", 1.01), ("platform.Ixx", 1.05)):
         other = initial.copy()
-        other[PARAMETER_NAMES.index(name)] *= factor
+        other[LAYOUT.dynamic_names.index(name)] *= factor
         assert judge(compare_engines(robot, initial, other, 2.1)).angle_max_urad > max(1, 500 * right.angle_max_urad)
 
 
@@ -104,7 +104,7 @@ def test_command_fails_in_one_line_where_a_goal_is_missed(made_runs, monkeypatch
 
 def test_export_writes_the_estimates_of_a_run_and_says_what_it_changed(robot, monkeypatch, capfd, tmp_path):
     mujoco = pytest.importorskip("mujoco")
-    values = dict(zip(PARAMETER_NAMES, robot.parameter_sets["identified"].dynamic.tolist(), strict=True))
+    values = dict(zip(LAYOUT.dynamic_names, robot.parameter_sets["identified"].dynamic.tolist(), strict=True))
     values["platform.mass"] = 23.456
     save_result(tmp_path / "result.json", made_result(values))
     out = tmp_path / "model.xml"
@@ -131,7 +131,7 @@ def made_result(values):
 
 def test_parameters_are_the_nominal_set_where_none_is_named_and_no_others_than_a_model_can_have(robot, tmp_path):
     np.testing.assert_array_equal(choose_parameters(robot).values, robot.nominal_parameters)
-    path, values = tmp_path / "result.json", dict.fromkeys(PARAMETER_NAMES, 1.0) | {"crank2.mass": -0.1}
+    path, values = tmp_path / "result.json", dict.fromkeys(LAYOUT.dynamic_names, 1.0) | {"crank2.mass": -0.1}
     save_result(path, made_result(values))
     with pytest.raises(RecordError, match=f"^{path}: crank2.mass = -0.1 kg is not allowed, must be finite and >= 0"):
         choose_parameters(robot, str(path))

@@ -15,7 +15,6 @@ from identify.errors import ScenarioError
 from identify.estimation.identification import identify
 from identify.experiment.sensor_in_loop import make_sensor
 from identify.files.run_folder import load_result
-from identify.loop_parameters import NAMES
 from identify.progress import SilentProgress
 from identify.record.recording import read
 from identify.reporting.report import provenance_section, read_report_data
@@ -24,7 +23,7 @@ from identify.reporting.tables import changed_settings_table
 from identify.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
 from identify.scenario.scenario import SECTIONS, estimator_settings, with_estimator_settings
 from tests.identify.commands import command, one_line, refusal
-from tests.identify.synthetic import SHORT, changed_robot_file, rss6
+from tests.identify.synthetic import NAMES, SHORT, changed_robot_file, rss6
 
 
 def refused(overrides):
@@ -102,10 +101,10 @@ def elsewhere(tmp_path, monkeypatch):
 
 def test_paths_in_a_scenario_start_from_its_own_file_and_hold_from_anywhere(elsewhere, monkeypatch):
     scenario = load_scenario("../project/mine.toml")
-    assert load_robot(scenario.robot).geometry.crank_length == 0.062
+    assert load_robot(scenario.robot).geometry.legs[0].crank_length == 0.062
     assert scenario.timing.frame_rate_hz == 50
     typed = scenario.with_overrides({"robot": "files/robot.toml"})
-    assert load_robot(typed.robot).geometry.crank_length == 0.065, "found from where it is typed"
+    assert load_robot(typed.robot).geometry.legs[0].crank_length == 0.065, "found from where it is typed"
     assert Path(typed.robot).is_absolute()
     assert typed.timing.frame_rate_hz == 50
     (elsewhere / "left").mkdir()
@@ -246,7 +245,7 @@ def test_a_setting_acts_and_is_kept_for_the_next_stages_and_the_reader(recorded_
     assert kept == SHORT.with_overrides(DRIVEN)
     assert result["settings"]["identification.method"] == "command_driven"
     expected = identify(read(recorded_folder.experiment), rss6(), SHORT.with_overrides(DRIVEN))
-    np.testing.assert_array_equal(parameter_vector(result["identification"], "estimate"), expected.estimate)
+    np.testing.assert_array_equal(parameter_vector(rss6(), result["identification"], "estimate"), expected.estimate)
     assert result["identification"]["searches"] == ["command_driven"]
     table = changed_settings_table(result, read(recorded_folder.experiment).attrs["scenario"])
     assert table.rows == (("identification.method", "command_driven", "closed_loop"),)

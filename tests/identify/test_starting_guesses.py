@@ -26,15 +26,14 @@ from identify.errors import EstimationError
 from identify.estimation.base_parameters import base_parameters, structural_regressor
 from identify.estimation.identifiability import identifiability
 from identify.estimation.identification import output_error_problem
-from identify.estimation.multiple_shooting import STATES, MultipleShooting, end_state, measured_states, segments
+from identify.estimation.multiple_shooting import MultipleShooting, end_state, measured_states, segments
 from identify.estimation.output_error_search import output_error_searches, runnable_start, search, shoot
-from identify.estimation.prior import StartingGuess, holding_torque, typical_sizes
+from identify.estimation.prior import holding_torque, typical_sizes
 from identify.estimation.scale_anchor import ScaleAnchor, store_anchor
 from identify.estimation.warm_start import linear_warm_start
-from identify.loop_parameters import NAMES
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
-from tests.identify.synthetic import SIGMA, Stages, quick, rss6, run_plant, silent, truth
+from tests.identify.synthetic import LAYOUT, NAMES, SIGMA, Stages, guess_of, quick, rss6, run_plant, silent, truth
 
 SMALLEST_FACTOR = 0.2
 
@@ -48,7 +47,7 @@ def drawn_guess(spread, seed):
     while np.any(low := factors < SMALLEST_FACTOR):
         factors[low] = 1 + spread * rng.standard_normal(low.sum())
     values = truth() * factors
-    return StartingGuess(values, typical_sizes(values, holding_torque(rss6(), values[:64])))
+    return guess_of(values, typical_sizes(LAYOUT, values, holding_torque(rss6(), values[:64])))
 
 
 def distance(problem, parameters, others):
@@ -107,7 +106,7 @@ def found(plant_steps, model_steps):
     problem = replace(problem, guess=replace(problem.guess, values=start))
     driven = search(problem.driven_by_commands(), start, scenario, silent)
     solution = search(problem, driven.parameters, scenario, silent)
-    return problem, solution, base_parameters(structural_regressor(rss6()))
+    return problem, solution, base_parameters(structural_regressor(rss6()), LAYOUT)
 
 
 def relative_errors(solution, base):
@@ -163,7 +162,7 @@ def test_segments_from_the_true_states_make_up_the_run_and_states_are_measured_t
     for part in chain:
         one = part.simulate(truth(), true[part.first])
         assert np.allclose(one.pose, run.pose[part.first : part.last + 1], rtol=0, atol=1e-12)
-        assert np.allclose(end_state(one), true[part.last], rtol=0, atol=1e-9)
+        assert np.allclose(end_state(one, rss6().geometry.chart), true[part.last], rtol=0, atol=1e-9)
     error = np.abs(measured_states(chain, truth(), scenario) - true[[part.first for part in chain]])[1:]
     assert np.all(error[:, :6] < 5 * SIGMA)
     assert np.all(error[:, 6:12] < 0.1 * np.abs(run.pose_rate).max(axis=0))
@@ -178,7 +177,7 @@ def residuals(shooting, parameters, states):
         run = part.simulate(parameters, states[k])
         rows.append(part.whitened(run.pose - part.measured))
         if not part.ends_the_run:
-            rows.append((end_state(run) - states[k + 1]) / part.state_std)
+            rows.append((end_state(run, rss6().geometry.chart) - states[k + 1]) / part.state_std)
     return np.concatenate(rows)
 
 
@@ -192,7 +191,7 @@ def test_condensing_takes_the_step_of_the_whole_problem():
     """Against a dense Gauss-Newton step in parameters and states, its Jacobian by finite differences. The friction is
     smoothed, so that no event stands between two of them, and the guess exact enough to tell all parameters apart."""
     scenario, problem, _ = driven(2.0, SMOOTHED, lost=[30, 47])
-    problem = replace(problem, guess=StartingGuess(truth(), 0.02 * truth()))
+    problem = replace(problem, guess=guess_of(truth(), 0.02 * truth()))
     start = truth() * np.random.default_rng(0).uniform(0.95, 1.05, 67)
     chain = segments(problem.runs[0])
     shooting = MultipleShooting(problem, [chain], [measured_states(chain, start, scenario)])
@@ -201,11 +200,11 @@ def test_condensing_takes_the_step_of_the_whole_problem():
 
     def of(unknowns):
         moved = states.copy()
-        moved[inner] = unknowns[size:].reshape(-1, STATES)
+        moved[inner] = unknowns[size:].reshape(-1, 18)
         return residuals(shooting, unknowns[:size], moved)
 
     at = np.concatenate([start, states[inner].ravel()])
-    steps = np.concatenate([1e-3 * start, np.tile(np.repeat([1e-6, 1e-5, 1e-6], 6), count // STATES)])
+    steps = np.concatenate([1e-3 * start, np.tile(np.repeat([1e-6, 1e-5, 1e-6], 6), count // 18)])
     jacobian = np.column_stack([(of(at + h) - of(at - h)) / (2 * h.sum()) for h in np.diag(steps)])
     expected = -np.linalg.lstsq(jacobian * steps, of(at), rcond=None)[0] * steps
     cost, factor, residual = shooting.linearise(start)
@@ -214,7 +213,7 @@ def test_condensing_takes_the_step_of_the_whole_problem():
     assert relative(step, expected[:size], problem.guess.std) < 3e-3
     shooting.linearise(start + step)
     moved = (shooting.states[0][inner] - states[inner]).ravel()
-    scale = np.tile(chain[0].state_std, count // STATES)
+    scale = np.tile(chain[0].state_std, count // 18)
     assert relative(moved, expected[size:], scale) < 3e-3
 
 

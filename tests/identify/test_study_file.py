@@ -214,7 +214,8 @@ KP, NOISE = "scenario.servo.kp", "sensor.camera.noise"
 ALONE = {
     "scenario.name", "scenario.description", "scenario.sensor_note", "sensor.name", "sensor.note", "scenario.robot",
     *(f"scenario.{side}.{name}" for side in ("plant", "model") for name in (
-        "friction", "smoothing_velocity_rad_s", "static_ratio", "stribeck_velocity_rad_s")),
+        "friction", "smoothing_velocity_rad_s", "smoothing_velocity_m_s", "static_ratio", "stribeck_velocity_rad_s",
+        "stribeck_velocity_m_s")),
     "scenario.plant.parameters", "scenario.model.start_parameters",
 }  # fmt: skip
 """Keys whose other values are names, or stand with others: not tried by `with_others`."""

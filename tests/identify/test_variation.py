@@ -13,7 +13,7 @@ from identify.record import recording
 from identify.reporting.variation_tables import PAPER_PERCENT, PAPER_WORST_PERCENT, variation_table
 from identify.validation.variation import variation
 from tests.identify.commands import command, one_line
-from tests.identify.synthetic import quick, run_plant, short_run
+from tests.identify.synthetic import LAYOUT, quick, run_plant, short_run
 
 IDENTIFIED = {
     *(f"platform.{name}" for name in ("mass", "Ixx", "Iyy", "Izz")),
@@ -26,7 +26,8 @@ IDENTIFIED = {
 
 def result(estimate, std, identifiable):
     names, columns = ("link1.mass", "joint1.coulomb", "link2.Ixx"), map(np.array, (estimate, std, identifiable))
-    return SimpleNamespace(names=names, **dict(zip(("estimate", "std", "identifiable"), columns, strict=True)))
+    layout = SimpleNamespace(names=names, unit=LAYOUT.unit)
+    return SimpleNamespace(layout=layout, **dict(zip(("estimate", "std", "identifiable"), columns, strict=True)))
 
 
 def test_variation_is_the_standard_deviation_over_the_mean_and_its_table_stands_beside_the_papers():
