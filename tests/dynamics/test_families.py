@@ -11,6 +11,7 @@ import pytest
 import dynamics
 from dynamics.closed_loop import FrameTiming, LoopSettings, Reference, ServoGains, simulate, stability
 from dynamics.errors import RobotFileError
+from dynamics.inertia import travel_states
 from dynamics.legs import KINDS
 from dynamics.legs.leg import Leg
 from dynamics.robot_file import built_in_robots
@@ -225,12 +226,13 @@ def test_built_in_loops_are_stable_at_60_hz_and_at_29_hz_with_a_frame_of_latency
 
 @pytest.mark.parametrize("name", [name for name in built_in_robots() if name != "rss6"])
 def test_built_in_robots_reach_a_box_about_home_within_all_limits(name):
-    """+-15 mm and +-50 mrad in all coordinates at once, nowhere singular; joint coordinates are zero at home."""
+    """+-15 mm and +-50 mrad in all coordinates at once; nowhere within the travel are they singular, nor out of reach."""
     robot = dynamics.load_robot(name)
     m = len(robot.coordinate_names)
     corners = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * m)).reshape(m, -1).T * (FULL_BOX @ robot.geometry.chart.basis)
     extremes = check_motion(robot, robot.pose(robot.coordinates(robot.home_pose) + corners))
     assert extremes.reach.value > 0.1
+    check_motion(robot, travel_states(robot, robot.nominal_parameters)[0])
     np.testing.assert_allclose(robot.inverse_kinematics(robot.home_pose), 0, atol=1e-7)
 
 
