@@ -226,7 +226,7 @@ def test_built_in_loops_are_stable_at_60_hz_and_at_29_hz_with_a_frame_of_latency
 
 @pytest.mark.parametrize("name", [name for name in built_in_robots() if name != "rss6"])
 def test_built_in_robots_reach_a_box_about_home_within_all_limits(name):
-    """+-15 mm and +-50 mrad in all coordinates at once; nowhere within the travel are they singular, nor out of reach."""
+    """+-15 mm and +-50 mrad in all coordinates at once; within the travel they reach all and are nowhere singular."""
     robot = dynamics.load_robot(name)
     m = len(robot.coordinate_names)
     corners = np.array(np.meshgrid(*[[-1.0, 0.0, 1.0]] * m)).reshape(m, -1).T * (FULL_BOX @ robot.geometry.chart.basis)
