@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from dynamics import built_in_robots, load_robot
 from identify.estimation.identification import identify
 from identify.excitation.design import design_trajectories
 from identify.experiment.plant import build_plant
 from identify.experiment.run import excitation_run, taught_sensor
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
-from tests.identify.synthetic import rss6, truth
 
 pytestmark = [pytest.mark.thorough, pytest.mark.xdist_group("coverage")]  # whose experiments are made once
 
@@ -33,10 +33,10 @@ CHANGES = {"renderer": "analytic", "excitation.method": "gradient", "excitation.
 LOWEST, HIGHEST = 0.93, 0.97
 
 
-def experiment_rows(count: int, processes: int) -> list[dict]:
-    """Rows of the first `count` experiments."""
-    scenario = load_scenario("paper").with_overrides(CHANGES)
-    trajectory = design_trajectories(rss6(), scenario, 0).excitation
+def experiment_rows(count: int, processes: int, robot: str = "rss6") -> list[dict]:
+    """Rows of the first `count` experiments with a robot."""
+    scenario = load_scenario("paper").with_overrides(CHANGES | {"robot": robot})
+    trajectory = design_trajectories(load_robot(robot), scenario, 0).excitation
     blocks = [range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
         return [row for rows in pool.map(partial(_block, scenario, trajectory), blocks) for row in rows]
@@ -71,28 +71,29 @@ def quantities(rows: list[dict]) -> dict[str, dict]:
 
 def _block(scenario, trajectory, numbers: range) -> list[dict]:
     """Rows of experiments with one teaching."""
-    sensor = taught_sensor(scenario, rss6(), numbers[0] // BLOCK * BLOCK, SilentProgress())
-    plant = build_plant(scenario, rss6())
+    robot = load_robot(scenario.robot)
+    sensor = taught_sensor(scenario, robot, numbers[0] // BLOCK * BLOCK, SilentProgress())
+    plant, true = build_plant(scenario, robot), robot.parameter_sets[scenario.plant.parameters].vector
     records = ((number, excitation_run(plant, sensor, trajectory, number).record) for number in numbers)
-    return [row_of(number, identify(record, rss6(), scenario)) for number, record in records]
+    return [row_of(number, identify(record, robot, scenario), true) for number, record in records]
 
 
-def row_of(number: int, result) -> dict:
+def row_of(number: int, result, truth: np.ndarray) -> dict:
     """What one experiment says of every parameter and of every group of several: error in standard deviations, relative
     standard deviation, whether it counts as identified, and whether the interval that is published holds the truth."""
     return {
         "experiment": number,
         "noise_ratio": result.noise_ratio,
         "expected_noise_ratio": result.expected_noise_ratio,
-        "quantities": {name: figures for name, *figures in _quantities(result)},
+        "quantities": {name: figures for name, *figures in _quantities(result, truth)},
     }
 
 
-def _quantities(result) -> Iterator[tuple[str, float, float, bool, bool]]:
+def _quantities(result, truth: np.ndarray) -> Iterator[tuple[str, float, float, bool, bool]]:
     groups = result.groups
     several = np.count_nonzero(groups.combinations, axis=1) > 1
-    parameters = (result.names, truth(), result.intervals, np.ones(67, dtype=bool))
-    combined = (groups.expressions, groups.combinations @ truth()[:64], result.group_intervals, several)
+    parameters = (result.names, truth, result.intervals, np.ones(len(truth), dtype=bool))
+    combined = (groups.expressions, groups.combinations @ truth[:-3], result.group_intervals, several)
     for found, (names, true, intervals, counted) in ((result, parameters), (groups, combined)):
         for k in np.flatnonzero(counted):
             error, std, (low, high) = found.estimate[k] - true[k], found.std[k], intervals[k]
@@ -131,3 +132,16 @@ def test_what_is_identified_is_not_chosen_by_the_noise_of_the_estimates(rows):
     assert "crank1.Ixx" not in found
     now_and_then = {name: seen["count"] for name, seen in found.items() if seen["count"] < len(rows)}
     assert len(now_and_then) <= 2, now_and_then
+
+
+@pytest.mark.parametrize("robot", [name for name in built_in_robots() if name != "rss6"])
+def test_intervals_of_every_robot_cover(robot, record_property):
+    """Twenty experiments with each: 90 to 99 % of the intervals of what is identified hold the truth."""
+    hits = [
+        inside
+        for row in experiment_rows(20, 2, robot)
+        for _, _, identified, inside in row["quantities"].values()
+        if identified
+    ]
+    record_property(f"covered_{robot}", float(np.mean(hits)))
+    assert 0.90 <= np.mean(hits) <= 0.99, np.mean(hits)
