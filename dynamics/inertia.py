@@ -133,9 +133,8 @@ def _difference(before: np.ndarray, after: np.ndarray) -> str:
 
 
 STATES = 300
-TRAVEL_RATE, TORQUE_SHARE = 1.0, 0.5
-"""Standard deviations of joint rates, in travel limits a second, and of torques on top of those that hold the robot, in
-the largest of those."""
+TRAVEL_RATE, TRAVEL_GAIN = 1.0, 10.0
+"""Standard deviations of joint rates, in travel limits a second, and of accelerations, in travel limits a second^2."""
 
 
 def acceleration_changes(robot: Robot, parameters: np.ndarray, inertias: np.ndarray) -> dict[str, float]:
@@ -154,7 +153,8 @@ def acceleration_changes(robot: Robot, parameters: np.ndarray, inertias: np.ndar
         layout.bodies_of(other)[index] = inertias[index]
         if not np.array_equal(other, own):
             change = robot.forward_dynamics(*state, other).reshape(-1, 2, 3) - before
-            effects[body] = float((np.linalg.norm(change, axis=2) / np.linalg.norm(before, axis=2)).max())
+            sizes = np.linalg.norm(before, axis=2)  # zero where the platform cannot turn
+            effects[body] = float((np.linalg.norm(change, axis=2)[sizes > 0] / sizes[sizes > 0]).max())
     return effects
 
 
@@ -170,7 +170,7 @@ def travel_states(robot: Robot, parameters: np.ndarray) -> tuple[np.ndarray, np.
         drawn = robot.home_pose + np.linalg.solve(at_home, angles.T).T @ free.T
         pose = np.concatenate([pose, drawn[measure(robot, drawn).travel_share <= 1]])
     pose = pose[:STATES]
-    rates = TRAVEL_RATE * robot.travel_limit * rng.standard_normal((STATES, joints, 1))
-    twist = np.linalg.solve(robot.joint_jacobian(pose) @ free, rates)[..., 0] @ free.T
-    holding = robot.static_torque(pose, parameters)
-    return pose, twist, holding + TORQUE_SHARE * np.abs(holding).max() * rng.standard_normal((STATES, joints))
+    drawn = robot.travel_limit * rng.standard_normal((2, STATES, joints, 1))
+    twist, gain = (np.linalg.solve(robot.joint_jacobian(pose) @ free, rates)[..., 0] @ free.T for rates in drawn)
+    twist, gain = TRAVEL_RATE * twist, TRAVEL_GAIN * gain
+    return pose, twist, robot.inverse_dynamics(pose, twist, gain, parameters)

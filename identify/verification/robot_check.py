@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dynamics import Robot, closed_loop, workspace
 from dynamics.closed_loop import stability
@@ -109,11 +110,11 @@ def _worst(values: Array, pick: Callable[..., np.intp]) -> tuple[float, int]:
 
 
 def _assembly(robot: Robot) -> Iterator[Finding]:
-    modes = robot.assembly_modes()
-    away = (
-        f"; the next is {np.linalg.norm(modes[1, :3] - robot.home_pose[:3]):.3g} m from home" if modes[1:].any() else ""
-    )
-    text = f"{len(modes)} assembly modes found with the joints as at home{away}"
+    modes, home = robot.assembly_modes(), robot.home_pose
+    text = f"{len(modes)} assembly modes found with the joints as at home"
+    if len(modes) > 1:
+        turn = Rotation.from_euler("XYZ", home[3:]).inv() * Rotation.from_euler("XYZ", modes[1, 3:])
+        text += f"; the next is {np.linalg.norm(modes[1, :3] - home[:3]):.3g} m and {turn.magnitude():.3g} rad from it"
     yield Finding("assembly modes", len(modes) > 0, len(modes), None, "1", None, text)
 
 

@@ -85,7 +85,7 @@ def test_intervals_cover_as_often_as_they_say_and_friction_and_gains_are_found_w
 
     Residuals are the sensor's noise, and what the servo made of it: as the repeated experiments predict.
     """
-    check_coverage([row_of(number, result) for number, result in enumerate(ensemble)])
+    check_coverage([row_of(number, result, truth()) for number, result in enumerate(ensemble)])
     errors = [assert_near_the_truth(result, 4) for result in ensemble]
     assert np.abs(np.mean(errors, axis=0)).max() < 3.5 / np.sqrt(len(ensemble))
     for result in ensemble:
