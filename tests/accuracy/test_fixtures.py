@@ -188,7 +188,7 @@ def test_what_does_not_exist_is_one_line_with_the_valid_names(project):
 def test_options_are_checked_though_no_test_uses_them(project):
     for option, says in (
         ("--accuracy-scenario", "scenario 'nosuch' is neither built in (paper, quick) nor a file"),
-        ("--accuracy-robot", "unknown robot `nosuch`; built-in robots: rss6; *"),
+        ("--accuracy-robot", "unknown robot `nosuch`; built-in robots: delta3, *rss6, *"),
         ("--accuracy-sensor", "unknown sensor 'nosuch': neither a built-in name (ctrack780, ctrack780_29hz) nor *"),
     ):
         done = project("def test_it(): pass", option, "nosuch")

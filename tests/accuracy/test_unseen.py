@@ -20,7 +20,9 @@ def unseen_errors(parameters, seed=0):
 def simulated(parameters, run, seed=0):
     """Poses of the loop with these parameters on an unseen trajectory."""
     path = design_trajectories(rss6(), SCENARIO, seed).validation[run]
-    return simulate(rss6(), parameters, path.reference(SCENARIO.timing.frame_times(1.0)), model_settings(SCENARIO)).pose
+    return simulate(
+        rss6(), parameters, path.reference(SCENARIO.timing.frame_times(1.0)), model_settings(rss6(), SCENARIO)
+    ).pose
 
 
 def test_the_true_parameters_leave_nothing_but_the_models_steps():

@@ -35,7 +35,7 @@ def test_verdict_and_figure_take_lengths_before_and_after_settling_and_one_beyon
     assert verdict.position_max_um == pytest.approx(5)
     assert verdict.position_steady_um == pytest.approx(2)
     assert verdict.angle_steady_urad == pytest.approx(3)
-    assert verdict.torque_max_nm == pytest.approx(0.5)
+    assert verdict.torque_max == pytest.approx(0.5)
     assert verdict.closure_max_um == pytest.approx(4e-3)
     assert verdict.spin_max_rad_s == pytest.approx(4e-3)
     assert (verdict.tracking_max_um, verdict.tracking_max_urad) == (pytest.approx(1e3), pytest.approx(2e3))
@@ -61,7 +61,7 @@ def test_verify_model_finds_the_engines_agreeing_to_nanometres_under_the_papers_
     assert entry["met"]
     found = entry["difference"]
     assert max(found["position_max_um"], found["angle_max_urad"], found["closure_max_um"]) < 0.01
-    assert found["torque_max_nm"] < 1e-5
+    assert found["torque_max"] < 1e-5
     assert found["spin_max_rad_s"] < 1e-6
     assert found["tracking_max_um"] > 500
     assert entry["mujoco"]["inertias_changed"][0].startswith("crank1")
