@@ -192,6 +192,10 @@ class Leg(BaseModel, ABC):
         at = ca.SX.sym("position", 3)
         return ca.substitute(ca.jacobian(self.coordinate(at), at).T, at, position)
 
+    def line(self, position: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """The gradient as a vector (3,) along it and what that is to be divided by: eq. 7 before it becomes eq. 8."""
+        return self.gradient(position), ca.SX(1)
+
     def acceleration(self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX) -> ca.SX:
         """Second time derivative of the coordinate."""
         at, moving = ca.SX.sym("position", 3), ca.SX.sym("velocity", 3)

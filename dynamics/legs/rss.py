@@ -115,6 +115,11 @@ class RssLeg(Leg):
     def gradient(self, position: ca.SX) -> ca.SX:
         return angle_gradient(self.vectors(position))
 
+    def line(self, position: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """The link, and J_a1."""
+        leg = self.vectors(position)
+        return leg.link, crank_leverage(leg)
+
     def acceleration(self, position: ca.SX, velocity: ca.SX, acceleration: ca.SX) -> ca.SX:
         return leg_motion(self.vectors(position), velocity, acceleration).crank_acceleration
 

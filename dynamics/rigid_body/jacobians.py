@@ -33,8 +33,8 @@ def joint_jacobian(geometry: RobotGeometry, pose: ca.SX) -> ca.SX:
     """J_ad (n, 6): theta_dot = J_ad twist (eq. 8)."""
     rows = []
     for leg, arm in zip(geometry.legs, platform_arms(geometry, pose), strict=True):
-        gradient = leg.gradient(pose[0:3] + arm)
-        rows.append(ca.horzcat(gradient.T, ca.cross(arm, gradient).T))
+        along, divisor = leg.line(pose[0:3] + arm)
+        rows.append(ca.horzcat(along.T, ca.cross(arm, along).T) / divisor)
     return ca.vertcat(*rows)
 
 

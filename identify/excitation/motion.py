@@ -124,7 +124,7 @@ def played_times(fundamental_hz: float, harmonics: int, duration_s: float) -> Ar
 def motion(unknowns: Unknowns, z: ca.MX, times: Array) -> tuple[ca.MX, ca.MX, ca.MX]:
     """Poses, pose rates and pose accelerations, each (6, N), of z at `times` (N,) [s]."""
     matrix = ca.reshape(z, unknowns.columns, unknowns.coordinates).T
-    scale = ca.DM(unknowns.chart.basis @ np.diag(unknowns.box))
+    scale = ca.sparsify(ca.DM(unknowns.chart.basis @ np.diag(unknowns.box)))
     offset, rate, acceleration = (scale @ matrix @ ca.DM(b.T) for b in unknowns.basis(times))
     return ca.repmat(ca.DM(unknowns.home), 1, len(times)) + offset, rate, acceleration
 

@@ -69,7 +69,7 @@ def lower_bounds(problem):
 
 def residuals(problem, values):
     """All residuals of parameters (67,), whose squares sum up to the cost. Raises LoopFailure where it is infinite."""
-    place, measured = problem.anchor.row()
+    place, measured = problem.anchor.row(problem.guess.layout)
     known = np.append((values - problem.guess.values) / problem.guess.std, place @ values - measured)
     seen = [run.whiten(run.model_poses(values) - run.measured).ravel() for run in problem.runs]
     return np.concatenate([known, *seen])
