@@ -59,8 +59,10 @@ class Connection:
         return self.second if body == self.first else self.first
 
     def seen_from(self, body: int) -> tuple[Freedom, ...]:
-        """The joints in the order from a body."""
-        return self.freedoms if body == self.first else self.freedoms[::-1]
+        """The joints in the order from a body, with axes about which the other turns, or along which it goes."""
+        if body == self.first:
+            return self.freedoms
+        return tuple(one._replace(axis=-one.axis) for one in self.freedoms[::-1])
 
 
 @dataclass(frozen=True)
@@ -142,14 +144,16 @@ def legs_of(mechanism: Mechanism, platform: int, from_platform: np.ndarray) -> I
 def _leg(mechanism: Mechanism, members: set[int], platform: int, from_platform: np.ndarray) -> MechanismLeg:
     paths = list(_paths(mechanism, BASE, platform, members, []))
     solids = mechanism.solids
-    used = {body for path in paths for body, _ in path}
-    for body in sorted(members - used):
-        raise RobotFileError(f"{solids[body].name} is on no way from the base to the platform")
     if not paths or len(paths) > 2 or len({len(path) for path in paths}) > 1:
         raise RobotFileError(
             f"it has {len(paths)} ways from the base to the platform, must have one, or two equal bars"
         )
-    joints, points, axes, bodies, actuated = [], [], [], [], []
+    for body in sorted(members - {body for path in paths for body, _ in path}):
+        raise RobotFileError(f"{solids[body].name} is on no way from the base to the platform")
+    actuated = [one for body, joint in paths[0] for one in joint.seen_from(body) if one.actuator is not None]
+    if len(actuated) != 1:
+        raise RobotFileError(f"it has {len(actuated)} actuated joints, must have one")
+    joints, points, axes, bodies = [], [], [], []
     across = np.zeros(3)
     for steps in zip(*paths, strict=True):
         kinds = [_joint(connection.seen_from(body)) for body, connection in steps]
@@ -161,15 +165,11 @@ def _leg(mechanism: Mechanism, members: set[int], platform: int, from_platform: 
             if before.any() and np.linalg.norm(across - before) > SAME:
                 raise RobotFileError("its two bars are not parallel")
             point = (kinds[0][1] + kinds[1][1]) / 2
-        driven = [one for one in steps[0][1].freedoms if one.actuator is not None]
-        actuated += driven
-        joints.append(kind + "*" * len(driven))
+        joints.append(kind + "*" * sum(one.actuator is not None for one in steps[0][1].freedoms))
         points.append(point)
         axes.append(axis)
         bodies.append([solids[body] for body in dict.fromkeys(body for body, _ in steps)])
     bodies = bodies[1:]
-    if len(actuated) != 1:
-        raise RobotFileError(f"it has {len(actuated)} actuated joints ({' '.join(joints)}), must have one")
     centres = np.array([np.average([s.centre for s in bars], axis=0) for bars in bodies])
     end = from_platform[:, :3].T @ (points[-1] - from_platform[:, 3])
     rods = [bars[0].rod for bars in bodies]

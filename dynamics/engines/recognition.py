@@ -26,7 +26,7 @@ DIAGONAL = 1e-9
 """Products of inertia below this share of the largest moment are rounding."""
 
 OWN_RATE, OWN_DAMPING = 2 * np.pi * 3, 0.7
-"""rad/s, and share of the critical: of the joint PID where a file has none, with what a joint feels at home."""
+"""rad/s, and share of the critical: of the joint PID where a file has none, with the least that a joint feels."""
 
 TRAVEL, TRAVEL_SHARE = 0.5, 0.1
 """Travel beyond the home coordinates where a file has no ranges: rad, or of the distance from B to A."""
@@ -71,7 +71,7 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     description = RobotDescription(plain.name, geometry, {"initial": ParameterSet(dynamic, gains)})
     if plain.gains is None:
         description.parameter_sets["initial"] = ParameterSet(dynamic, _gains(Robot(description)))
-        notes.append("the file has no joint PID: its gains are chosen for 3 Hz with what a joint feels at home")
+        notes.append("the file has no joint PID: its gains are chosen for 3 Hz with the least that a joint feels")
     return description, notes
 
 
@@ -165,9 +165,9 @@ def _travel(plain: Mechanism, found: list[MechanismLeg], legs: list[Leg], notes:
 
 
 def _gains(robot: Robot) -> np.ndarray:
-    """lp, li, ld for what the joint that feels most feels at home."""
+    """lp, li, ld for what the joint that feels least feels at home."""
     jacobian = robot.joint_jacobian(robot.home_pose) @ robot.geometry.chart.basis
     mass = robot.geometry.chart.basis.T @ robot.mass_matrix(robot.home_pose) @ robot.geometry.chart.basis
     felt = 1 / np.diagonal(jacobian @ np.linalg.solve(mass, jacobian.T)).min()
     stiff = felt * OWN_RATE**2
-    return np.array([stiff, stiff * OWN_RATE / 10, 2 * OWN_DAMPING * felt * OWN_RATE])
+    return np.array([stiff, stiff * OWN_RATE / 20, 2 * OWN_DAMPING * felt * OWN_RATE])

@@ -155,7 +155,7 @@ def _drawn(chain: Chain, *names: str) -> dict[str, float]:
 def _second_axis_across(chain: Chain, joint: int) -> None:
     """The body on a universal joint has its length across the second axis of that."""
     along = chain.points[-1] - chain.points[joint]
-    off = float(np.arcsin(abs(chain.axes[joint, 1] @ along) / np.linalg.norm(along)))
+    off = float(np.arcsin(np.abs(chain.axes[joint, 1] @ along) / np.linalg.norm(along)))
     if off > SAME:
         raise RobotFileError(
             f"the second axis of its universal joint is {np.degrees(off):.3g} deg from normal to the body on it"
@@ -163,7 +163,7 @@ def _second_axis_across(chain: Chain, joint: int) -> None:
 
 
 def _same_line(what: str, direction: np.ndarray, of: str, other: np.ndarray) -> None:
-    sine = np.linalg.norm(np.cross(direction, other)) / np.linalg.norm(direction) / np.linalg.norm(other)
+    sine = float(np.linalg.norm(np.cross(direction, other)) / np.linalg.norm(direction) / np.linalg.norm(other))
     if sine > SAME:
         raise RobotFileError(f"{what} is {np.degrees(np.arcsin(min(sine, 1.0))):.3g} deg from {of}, must be along that")
 
