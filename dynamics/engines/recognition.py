@@ -1,7 +1,7 @@
 """The robot that a mechanism of another program is, where its legs are of kinds that are known here.
 
-The platform's frame is at its centre of mass, with the file's axes where its inertia is diagonal in them, else with the
-principal ones nearest to those.
+The platform's frame is at its centre of mass, with the file's axes where its inertia is diagonal in them and a pose can
+say how they are turned, else with principal ones.
 """
 
 from collections import Counter
@@ -25,6 +25,9 @@ from dynamics.robot_file import ParameterSet, RobotDescription
 DIAGONAL = 1e-9
 """Products of inertia below this share of the largest moment are rounding."""
 
+MOST_TILT = 0.9
+"""Of sin(beta) at home; near 1 angles say nothing. A platform beyond it gets axes nearest to those of the base."""
+
 OWN_RATE, OWN_DAMPING = 2 * np.pi * 3, 0.7
 """rad/s, and share of the critical: of the joint PID where a file has none, with the least that a joint feels."""
 
@@ -43,9 +46,11 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
     platform = plain.solids[number]
     axes, moments = _principal(platform)
     if not np.array_equal(axes, platform.axes):
-        notes.append(f"the platform's axes are turned to the principal ones of {platform.name}")
+        notes.append(f"the platform's axes are not those of {platform.name}, but principal ones")
     found = list(legs_of(plain, number, np.column_stack([axes, platform.centre])))
     legs = [_leg(one, k) for k, one in enumerate(found, 1)]
+    if not legs:
+        raise RobotFileError(f"it has no legs: no body is between the base and {platform.name}, where most joints meet")
     charts = Counter(leg.chart for leg in legs)
     home = (*platform.centre.tolist(), *(Rotation.from_matrix(axes).as_euler("XYZ") + 0.0).tolist())
     chart = Chart(charts.most_common(1)[0][0], home)
@@ -118,16 +123,23 @@ def _inertia(body: Body, place: tuple[np.ndarray, np.ndarray], bars: list[Solid]
 
 def _principal(platform: Solid) -> tuple[np.ndarray, np.ndarray]:
     """Axes (3, 3) of the platform and its moments about them (3,)."""
-    own = platform.axes.T @ platform.inertia @ platform.axes
-    if np.abs(own - np.diag(np.diagonal(own))).max() <= DIAGONAL * np.abs(own).max():
-        return platform.axes, np.diagonal(own)
-    moments, turn = np.linalg.eigh(own)
-    _, order = linear_sum_assignment(-np.abs(turn))
-    turn, moments = turn[:, order], moments[order]
-    turn = turn * np.sign(np.diagonal(turn))
-    if np.linalg.det(turn) < 0:
-        turn[:, int(np.argmin(np.abs(np.diagonal(turn))))] *= -1
-    return platform.axes @ turn, moments
+    own, axes = platform.axes.T @ platform.inertia @ platform.axes, platform.axes
+    if np.abs(own - np.diag(np.diagonal(own))).max() > DIAGONAL * np.abs(own).max():
+        axes = _nearest(axes @ np.linalg.eigh(own)[1], axes)
+    if abs(axes[0, 2]) > MOST_TILT:
+        axes = _nearest(axes, np.eye(3))
+    return axes, np.diagonal(axes.T @ platform.inertia @ axes)
+
+
+def _nearest(axes: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """The same axes (3, 3) in the order and with the signs that bring them nearest to others; right-handed."""
+    cosines = wanted.T @ axes
+    order = linear_sum_assignment(-np.abs(cosines))[1]
+    aligned = np.diagonal(cosines[:, order])
+    turned = axes[:, order] * np.where(aligned < 0, -1.0, 1.0)
+    if np.linalg.det(turned) < 0:
+        turned[:, int(np.argmin(np.abs(aligned)))] *= -1
+    return turned
 
 
 def _upright(axes: np.ndarray, legs: list[Leg], home: tuple[float, ...]) -> Chart:

@@ -147,30 +147,6 @@ def test_robot_with_tilted_cranks_agrees_too(mujoco, robot, states):
         assert np.abs(engine.twist_dot(torque) - ours).max() < 5e-4 * np.abs(ours).max()
 
 
-<<<<<<< HEAD
-=======
-@pytest.mark.parametrize("name", ["initial", "identified"])
-def test_forward_dynamics_agrees_with_pinocchio(robot, states, name):
-    """twist_dot of 300 random states and torques agrees to 1e-9 of its size; friction enters as joint torque."""
-    pytest.importorskip("pinocchio")
-    from tests.closed_chain import ClosedChain
-
-    values = robot.parameter_sets[name].dynamic
-    chain = ClosedChain(robot, values)
-    torques = 5 * np.random.default_rng(5).standard_normal((300, 6))
-    accelerations = robot.forward_dynamics(states.pose, states.twist, torques, values)
-    for pose, twist, torque, ours in zip(states.pose, states.twist, torques, accelerations, strict=True):
-        theta_dot = robot.joint_jacobian(pose) @ twist
-        net = torque - values[robot.layout.coulomb] * np.sign(theta_dot) - values[robot.layout.viscous] * theta_dot
-        state = chain.state(pose, twist, net)
-        gap, speed = chain.closure(state)
-        assert gap < 1e-14
-        assert speed < 1e-14
-        theirs = chain.twist_dot(state)
-        assert np.abs(ours - theirs).max() <= 1e-9 * np.abs(theirs).max()
-
-
->>>>>>> a7be623 (Ask the robot for its parameters in the tests of its commands)
 def test_mujoco_accepts_what_was_changed(mujoco, robot):
     rng = np.random.default_rng(4)
     values = robot.nominal_parameters.copy()
