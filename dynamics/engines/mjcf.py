@@ -91,11 +91,14 @@ def mjcf_text(
     coulomb = flag("coulomb", coulomb, DynamicsError)
     inertias = physical_inertias(robot.layout, values, allow_unphysical_inertia)
     _, dry, viscous, _ = robot.layout.split(values)
-    chain = _Chain(robot)
+    chain, gains = _Chain(robot), robot.parameter_sets["initial"].joint_pid
     root = Xml.Element("mujoco", model=NOT_IN_XML.sub("?", robot.name))
     _add_header(root, robot, inertias, source)
     Xml.SubElement(root, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     _add_options(root, robot, solver, len(chain.ends))
+    custom = Xml.SubElement(root, "custom")
+    for name, numbers in (("joint_pid", gains), ("travel_limit", robot.travel_limit)):
+        Xml.SubElement(custom, "numeric", name=name, data=_numbers(numbers))
     add_assets(root, robot.geometry)
     world = Xml.SubElement(root, "worldbody")
     add_base_looks(world, robot.geometry)

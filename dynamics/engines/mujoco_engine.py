@@ -141,7 +141,7 @@ class MujocoRobot:
         self._mujoco.mj_forward(self.model, data)
 
     def twist_dot(self, torque: np.ndarray) -> np.ndarray:
-        """Acceleration [h_ddot, omega_dot] (6,), base axes, under actuator torques or forces (n,), in the state it is in."""
+        """Acceleration [h_ddot, omega_dot] (6,), base axes, under torques or forces (n,) in its present state."""
         self.data.ctrl[:] = floats("torque", torque, (len(self._joint),))
         self._mujoco.mj_forward(self.model, self.data)
         platform = Rotation.from_quat(self.data.qpos[3:7], scalar_first=True).as_matrix()

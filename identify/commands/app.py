@@ -12,7 +12,7 @@ from typer.core import TyperGroup
 from identify.commands import new_folder
 from identify.commands.calibrate import CALIBRATE_HELP, calibrate
 from identify.commands.check import CHECK_HELP, check
-from identify.commands.comparisons import compare_excitation, estimators, variation
+from identify.commands.importing import imports
 from identify.commands.robot import base_parameters, export, verify_model, workspace
 from identify.commands.sensor import acceptance, detectors
 from identify.commands.study import STUDY_HELP, study
@@ -59,6 +59,7 @@ Another estimator on the same record, then judged and shown as before:
 \b
 The model in other engines:
   cmmsim export mjcf rss6 --parameters mine/result.json --allow-unphysical-inertia
+  cmmsim import mjcf model.xml --out mine.toml
   cmmsim verify-model                    MuJoCo against this model, figure8.png
 
 \b
@@ -289,6 +290,7 @@ def report(out: RunFolderOption, quiet: Quiet = False) -> None:
 
 app.command("verify-model")(verify_model)
 app.add_typer(export, name="export")
+app.add_typer(imports, name="import")
 app.command()(detectors)
 app.command(help=CHECK_HELP)(check)
 app.command()(workspace)

@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
+from dynamics import load_robot
 from dynamics.errors import UnreachablePoseError
 from identify.errors import RecordError, TrajectoryError
 from identify.files.run_folder import load_result, save_result
@@ -180,3 +181,19 @@ def test_command_writes_numbers_and_figures(mapped, tmp_path, monkeypatch, capsy
     for name in ("travel.png", "conditioning.png"):
         assert (tmp_path / "map" / name).read_bytes().startswith(b"\x89PNG")
     assert "from home within travel" in capsys.readouterr().out
+
+
+def test_import_writes_a_robot_file_that_every_command_takes_or_nothing(capfd, tmp_path):
+    pytest.importorskip("mujoco")
+    model, out = tmp_path / "ups6.xml", tmp_path / "mine.toml"
+    assert command("export", "mjcf", "ups6", "--out", model, "--quiet") == 0
+    assert command("import", "mjcf", model, "--out", out) == 0
+    assert capfd.readouterr().out.splitlines()[1] == "legs: ups, ups, ups, ups, ups, ups"
+    np.testing.assert_array_equal(load_robot(out).nominal_parameters[:4], load_robot("ups6").nominal_parameters[:4])
+    model.write_text(model.read_text().replace("<motor ", "<general ").replace('joint="joint2"', 'joint="joint1"'))
+    out.unlink()
+    assert command("import", "mjcf", model, "--out", out) == 1
+    assert "leg 2 (cylinder2, rod2): it has 0 actuated joints" in one_line(capfd.readouterr().err)
+    assert command("import", "urdf", model, "--closures", tmp_path / "none.yaml", "--out", out) == 1
+    assert f"cannot read {tmp_path / 'none.yaml'}" in one_line(capfd.readouterr().err)
+    assert {path.name for path in tmp_path.iterdir()} == {"ups6.xml"}

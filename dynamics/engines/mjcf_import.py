@@ -1,0 +1,151 @@
+"""A robot from MJCF: a model of any program whose loops are `connect` or `weld` equalities, compiled by MuJoCo.
+
+Home is the keyframe `home`, else the first one, else the model as it is written. The platform may fly freely or hang on
+a leg. What the exporter writes besides (`numeric` joint_pid and travel_limit) is read back.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dynamics.engines.mechanism import Connection, Freedom, Mechanism, Solid
+from dynamics.engines.mujoco_engine import import_mujoco
+from dynamics.engines.recognition import recognised
+from dynamics.errors import RobotFileError
+from dynamics.legs.chain import SAME
+from dynamics.robot_file import RobotDescription
+
+
+def robot_of_mjcf(path: str | Path) -> tuple[RobotDescription, list[str]]:
+    """The robot in an MJCF file, and what a reader of it should know.
+
+    Raises RobotFileError: MuJoCo refuses the file, or its mechanism is none of the known kinds; MujocoMissingError.
+    """
+    mujoco = import_mujoco()
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise RobotFileError(f"MuJoCo refuses {path}: {' '.join(str(error).split())}") from None
+    try:
+        return recognised(_mechanism(mujoco, model))
+    except RobotFileError as error:
+        raise RobotFileError(f"{path}: {error}") from None
+
+
+def _mechanism(mujoco: Any, model: Any) -> Mechanism:
+    data = mujoco.MjData(model)
+    if model.nkey:
+        home = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home")
+        mujoco.mj_resetDataKeyframe(model, data, max(home, 0))
+    mujoco.mj_forward(model, data)
+    _refuse_others(mujoco, model)
+    solids = [_solid(mujoco, model, data, body) for body in range(model.nbody)]
+    driven = {int(model.actuator_trnid[k, 0]): k for k in range(model.nu)}
+    connections = []
+    for body in range(1, model.nbody):
+        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+        joints = range(first, first + count)
+        if any(model.jnt_type[joint] == int(mujoco.mjtJoint.mjJNT_FREE) for joint in joints):
+            continue
+        freedoms = tuple(_freedom(mujoco, model, data, joint, driven.get(joint)) for joint in joints)
+        connections.append(Connection(int(model.body_parentid[body]), body, freedoms))
+    connections += [_loop(mujoco, model, data, k) for k in range(model.neq) if model.eq_active0[k]]
+    limited = [joint for joint in range(model.njnt) if model.jnt_limited[joint]]
+    travel = _numeric(model, "travel_limit", 1)
+    return Mechanism(
+        name=bytes(model.names).split(b"\0")[0].decode(),
+        solids=solids,
+        connections=connections,
+        gravity=np.array(model.opt.gravity),
+        ranges={_joint_name(model, joint): tuple(model.jnt_range[joint].tolist()) for joint in limited},
+        gains=_numeric(model, "joint_pid", 3),
+        travel_limit=None if travel is None else float(travel[0]),
+    )
+
+
+def _solid(mujoco: Any, model: Any, data: Any, body: int) -> Solid:
+    turn = data.ximat[body].reshape(3, 3)
+    rods = [int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)]
+    first, rod = int(model.body_geomadr[body]), None
+    for geom in range(first, first + int(model.body_geomnum[body])):
+        if rod is None and model.geom_type[geom] in rods:
+            rod = (2 * float(model.geom_size[geom, 1]), float(model.geom_size[geom, 0]))
+    return Solid(
+        name=model.body(body).name or f"body {body}",
+        mass=float(model.body_mass[body]),
+        centre=data.xipos[body].copy(),
+        inertia=turn @ np.diag(model.body_inertia[body]) @ turn.T,
+        axes=data.xmat[body].reshape(3, 3).copy(),
+        rod=rod,
+    )
+
+
+def _freedom(mujoco: Any, model: Any, data: Any, joint: int, actuator: int | None) -> Freedom:
+    kind = {
+        int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
+        int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
+        int(mujoco.mjtJoint.mjJNT_BALL): "ball",
+    }[int(model.jnt_type[joint])]
+    name, dof = _joint_name(model, joint), int(model.jnt_dofadr[joint])
+    for what, value in (("stiffness", model.jnt_stiffness[joint]), ("armature", model.dof_armature[dof])):
+        if value:
+            raise RobotFileError(f"{name} has {what} {value:g}, which no joint has here")
+    return Freedom(
+        kind,
+        name,
+        data.xanchor[joint].copy(),
+        np.full(3, np.nan) if kind == "ball" else data.xaxis[joint].copy(),
+        float(data.qpos[model.jnt_qposadr[joint]]),
+        (float(model.dof_frictionloss[dof]), float(model.dof_damping[dof])),
+        actuator,
+    )
+
+
+def _joint_name(model: Any, joint: int) -> str:
+    return model.joint(joint).name or f"joint {joint}"
+
+
+def _loop(mujoco: Any, model: Any, data: Any, equality: int) -> Connection:
+    """A loop of two sites or two bodies, as a ball joint or a weld. Raises RobotFileError where it is open at home."""
+    first, second = (int(ids[equality]) for ids in (model.eq_obj1id, model.eq_obj2id))
+    name = model.equality(equality).name or f"equality {equality}"
+    if model.eq_objtype[equality] == int(mujoco.mjtObj.mjOBJ_SITE):
+        points = [data.site_xpos[site] for site in (first, second)]
+        first, second = (int(model.site_bodyid[site]) for site in (first, second))
+    elif model.eq_type[equality] == int(mujoco.mjtEq.mjEQ_WELD):
+        return Connection(first, second, ())
+    else:
+        anchors = model.eq_data[equality].reshape(-1)[:6].reshape(2, 3)
+        bodies = zip((first, second), anchors, strict=True)
+        points = [data.xpos[body] + data.xmat[body].reshape(3, 3) @ anchor for body, anchor in bodies]
+    gap = float(np.linalg.norm(points[0] - points[1]))
+    if gap > SAME:
+        raise RobotFileError(f"the loop {name} is open by {gap:.3g} m at home, must be closed to {SAME:g} m")
+    if model.eq_type[equality] == int(mujoco.mjtEq.mjEQ_WELD):
+        return Connection(first, second, ())
+    return Connection(first, second, (Freedom("ball", name, points[0].copy(), np.full(3, np.nan)),))
+
+
+def _refuse_others(mujoco: Any, model: Any) -> None:
+    """Raise RobotFileError for what closes loops or drives joints in another way."""
+    known = [int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)]
+    for k in range(model.neq):
+        if model.eq_active0[k] and model.eq_type[k] not in known:
+            kind = mujoco.mjtEq(int(model.eq_type[k])).name.removeprefix("mjEQ_").lower()
+            name = model.equality(k).name or k
+            raise RobotFileError(f"equality {name} is of the kind {kind}; loops are connect or weld here")
+    if model.ntendon:
+        raise RobotFileError(f"it has {model.ntendon} tendons, which no kind of leg has")
+    for k in range(model.nu):
+        if model.actuator_trntype[k] != int(mujoco.mjtTrn.mjTRN_JOINT):
+            raise RobotFileError(f"actuator {model.actuator(k).name or k} drives no joint")
+
+
+def _numeric(model: Any, name: str, count: int) -> np.ndarray | None:
+    """Numbers that the file holds by a name; None where it does not, or others."""
+    try:
+        found = np.array(model.numeric(name).data, dtype=float)
+    except KeyError:
+        return None
+    return found if len(found) == count else None

@@ -1,0 +1,185 @@
+"""The robot that a mechanism of another program is, where its legs are of kinds that are known here.
+
+The platform's frame is at its centre of mass, with the file's axes where its inertia is diagonal in them and a pose can
+say how they are turned, else with principal ones.
+"""
+
+from collections import Counter
+
+import casadi as ca
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
+
+from dynamics.engines.mechanism import Mechanism, MechanismLeg, Solid, legs_of, platform_of, simplified
+from dynamics.errors import RobotFileError
+from dynamics.geometry import RobotGeometry
+from dynamics.inertia import MOMENTS
+from dynamics.kinematics.chart import Chart
+from dynamics.legs.chain import SAME, leg_of
+from dynamics.legs.leg import Body, Leg, Placement
+from dynamics.parameters import parameter_layout
+from dynamics.robot import Robot
+from dynamics.robot_file import ParameterSet, RobotDescription
+
+DIAGONAL = 1e-9
+"""Products of inertia below this share of the largest moment are rounding."""
+
+MOST_TILT = 0.9
+"""Of sin(beta) at home; near 1 angles say nothing. A platform beyond it gets axes nearest to those of the base."""
+
+OWN_RATE, OWN_DAMPING = 2 * np.pi * 3, 0.7
+"""rad/s, and share of the critical: of the joint PID where a file has none, with the least that a joint feels."""
+
+TRAVEL, TRAVEL_SHARE = 0.5, 0.1
+"""Travel beyond the home coordinates where a file has no ranges: rad, or of the distance from B to A."""
+
+
+def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
+    """The robot, with one parameter set `initial`; and what a reader of its file should know.
+
+    Raises RobotFileError, naming leg and body, for a mechanism that is none of the known kinds.
+    """
+    plain = simplified(mechanism)
+    notes = list(plain.notes)
+    number = platform_of(plain)
+    platform = plain.solids[number]
+    axes, moments = _principal(platform)
+    if not np.array_equal(axes, platform.axes):
+        notes.append(f"the platform's axes are not those of {platform.name}, but principal ones")
+    found = list(legs_of(plain, number, np.column_stack([axes, platform.centre])))
+    legs = [_leg(one, k) for k, one in enumerate(found, 1)]
+    if not legs:
+        raise RobotFileError(f"it has no legs: no body is between the base and {platform.name}, where most joints meet")
+    charts = Counter(leg.chart for leg in legs)
+    home = (*platform.centre.tolist(), *(Rotation.from_matrix(axes).as_euler("XYZ") + 0.0).tolist())
+    chart = Chart(charts.most_common(1)[0][0], home)
+    if chart.name == "planar":
+        home = (*home[:3], 0.0, 0.0, home[5])
+        chart = _upright(axes, legs, home)
+    travel = plain.travel_limit or _travel(plain, found, legs, notes)
+    geometry = RobotGeometry(tuple(legs), chart, travel, plain.gravity)
+    layout = parameter_layout(geometry.legs)
+    dynamic = np.zeros(len(layout.dynamic_names))
+    rigid = layout.bodies_of(dynamic)
+    rigid[0] = [platform.mass, *moments]
+    for k, (one, leg) in enumerate(zip(found, geometry.legs, strict=True)):
+        places = [_numbers(place) for place in leg.placements(ca.SX(one.chain.points[-1]))]
+        for body, place, bars, row in zip(leg.bodies, places, one.bodies, layout.of_leg[k], strict=True):
+            try:
+                rigid[row] = _inertia(body, place, bars, chart.basis[:3])
+            except RobotFileError as error:
+                raise RobotFileError(f"leg {k + 1}: {error}") from None
+        dynamic[layout.coulomb][k], dynamic[layout.viscous][k] = one.actuated.friction
+    layout.check(dynamic)
+    gains = np.zeros(3) if plain.gains is None else plain.gains
+    description = RobotDescription(plain.name, geometry, {"initial": ParameterSet(dynamic, gains)})
+    if plain.gains is None:
+        description.parameter_sets["initial"] = ParameterSet(dynamic, _gains(Robot(description)))
+        notes.append("the file has no joint PID: its gains are chosen for 3 Hz with the least that a joint feels")
+    return description, notes
+
+
+def _leg(one: MechanismLeg, number: int) -> Leg:
+    try:
+        return leg_of(one.chain)
+    except RobotFileError as error:
+        names = ", ".join(solid.name for bars in one.bodies for solid in bars)
+        raise RobotFileError(f"leg {number} ({names}): {error}") from None
+
+
+def _numbers(place: Placement) -> tuple[np.ndarray, np.ndarray]:
+    return np.array(ca.evalf(place.centre)).ravel(), np.array(ca.evalf(place.axes))
+
+
+def _inertia(body: Body, place: tuple[np.ndarray, np.ndarray], bars: list[Solid], ways: np.ndarray) -> list[float]:
+    """Mass and moments of a body of a leg, which may be equal bars, in the axes of its kind.
+
+    ways (3, n): in which the platform can go; along others, and in a body that does not turn, masses may be
+    anywhere. Raises RobotFileError where a centre of mass is elsewhere, and for products of inertia that would do work.
+    """
+    centre, axes = place
+    name, mass = " and ".join(bar.name for bar in bars), sum(bar.mass for bar in bars)
+    if any(abs(bar.mass - bars[0].mass) > SAME * mass for bar in bars):
+        raise RobotFileError(f"the bars {name} differ: {', '.join(f'{bar.mass:g} kg' for bar in bars)}")
+    off = float(np.linalg.norm((np.mean([bar.centre for bar in bars], axis=0) - centre) @ ways))
+    if body.moments and off > SAME:
+        raise RobotFileError(
+            f"the centre of mass of {name} is {off:.4g} m from where its kind has it ({body.name}), "
+            f"{np.array2string(centre, precision=6)} at home"
+        )
+    inertia = sum(axes.T @ bar.inertia @ axes for bar in bars)
+    moments = np.diagonal(inertia)
+    working = np.array([MOMENTS.index(moment) for moment in body.moments], dtype=int)
+    block = inertia[np.ix_(working, working)]
+    products = np.abs(block - np.diag(np.diagonal(block))).max(initial=0.0)
+    if products > SAME * moments.max():
+        raise RobotFileError(
+            f"{name} has a product of inertia of {products:.3g} kg m^2 in the axes of its kind ({body.name}), "
+            f"must have moments alone ({', '.join(f'{moment:.3g}' for moment in moments)})"
+        )
+    return [mass, *moments]
+
+
+def _principal(platform: Solid) -> tuple[np.ndarray, np.ndarray]:
+    """Axes (3, 3) of the platform and its moments about them (3,)."""
+    own, axes = platform.axes.T @ platform.inertia @ platform.axes, platform.axes
+    if np.abs(own - np.diag(np.diagonal(own))).max() > DIAGONAL * np.abs(own).max():
+        axes = _nearest(axes @ np.linalg.eigh(own)[1], axes)
+    if abs(axes[0, 2]) > MOST_TILT:
+        axes = _nearest(axes, np.eye(3))
+    return axes, np.diagonal(axes.T @ platform.inertia @ axes)
+
+
+def _nearest(axes: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """The same axes (3, 3) in the order and with the signs that bring them nearest to others; right-handed."""
+    cosines = wanted.T @ axes
+    order = linear_sum_assignment(-np.abs(cosines))[1]
+    aligned = np.diagonal(cosines[:, order])
+    turned = axes[:, order] * np.where(aligned < 0, -1.0, 1.0)
+    if np.linalg.det(turned) < 0:
+        turned[:, int(np.argmin(np.abs(aligned)))] *= -1
+    return turned
+
+
+def _upright(axes: np.ndarray, legs: list[Leg], home: tuple[float, ...]) -> Chart:
+    """Chart of a planar robot. Raises RobotFileError where it is not in the plane of x and y."""
+    for number, leg in enumerate(legs, 1):
+        lean = np.linalg.norm(leg.segments()[0].axis[:2])
+        if lean > SAME:
+            raise RobotFileError(
+                f"leg {number} turns about {np.round(leg.segments()[0].axis, 6).tolist()}; those of planar robots turn "
+                "about z"
+            )
+    if np.linalg.norm(axes[:2, 2]) > SAME:
+        raise RobotFileError(f"the platform's z is {np.round(axes[:, 2], 6).tolist()}; of planar robots it is along z")
+    return Chart("planar", home)
+
+
+def _travel(plain: Mechanism, found: list[MechanismLeg], legs: list[Leg], notes: list[str]) -> float:
+    """Travel limit: the ranges of the file, else some way about home."""
+    limits = []
+    for one in found:
+        at_home, span = one.actuated.coordinate, plain.ranges.get(one.actuated.name)
+        if span is not None:
+            limits.append(min(-span[0], span[1]))
+            if limits[-1] <= abs(at_home):
+                raise RobotFileError(
+                    f"{one.actuated.name} has the range {span[0]:g} to {span[1]:g}, which needs zero and home "
+                    f"({at_home:g}) well inside"
+                )
+    if limits:
+        return float(min(limits))
+    lengths = [float(np.linalg.norm(one.chain.points[-1] - one.chain.points[0])) for one in found]
+    notes.append("the file has no ranges of the actuated joints: travel_limit is chosen")
+    beyond = TRAVEL_SHARE * min(lengths) if legs[0].prismatic else TRAVEL
+    return float(max(abs(one.actuated.coordinate) for one in found) + beyond)
+
+
+def _gains(robot: Robot) -> np.ndarray:
+    """lp, li, ld for what the joint that feels least feels at home."""
+    jacobian = robot.joint_jacobian(robot.home_pose) @ robot.geometry.chart.basis
+    mass = robot.geometry.chart.basis.T @ robot.mass_matrix(robot.home_pose) @ robot.geometry.chart.basis
+    felt = 1 / np.diagonal(jacobian @ np.linalg.solve(mass, jacobian.T)).min()
+    stiff = felt * OWN_RATE**2
+    return np.array([stiff, stiff * OWN_RATE / 20, 2 * OWN_DAMPING * felt * OWN_RATE])

@@ -1,0 +1,181 @@
+"""Which kind of leg a chain of joints is, as other programs describe it: its joints at home, from the base to A."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+
+from dynamics.errors import RobotFileError
+from dynamics.legs.leg import Leg
+from dynamics.legs.pss import PssLeg, PusLeg
+from dynamics.legs.rss import ParallelogramLeg, RrrLeg, RssLeg
+from dynamics.legs.rus import RusLeg
+from dynamics.legs.ups import UpsLeg
+
+SAME = 1e-6
+"""Angles (rad) and distances (m) below it are those of numbers that were written with few digits."""
+
+
+class Chain(NamedTuple):
+    """Joints of a leg at home, base axes, m.
+
+    joints: their kinds (k), "hinge", "slide", "universal" or "ball", with * behind the actuated one; points (k, 3):
+    where they are, the last one A, and of two bars side by side the middle; axes (k, 2, 3): the axis, and of a
+    universal joint its second; coordinate: of the actuated joint; platform_joint: A in platform axes; across (3,): from
+    the first of two bars to the second, zero where there is one; centres (k - 1, 3): centres of mass of the bodies;
+    rods: what is drawn of them, length and radius, None where unknown.
+    """
+
+    joints: tuple[str, ...]
+    points: np.ndarray
+    axes: np.ndarray
+    coordinate: float
+    platform_joint: np.ndarray
+    across: np.ndarray
+    centres: np.ndarray
+    rods: list[tuple[float, float] | None]
+
+    @property
+    def signature(self) -> str:
+        """The joints in words."""
+        first, *others = self.joints
+        return f"{first} 2 x ({' '.join(others)})" if self.across.any() else " ".join(self.joints)
+
+
+def leg_of(chain: Chain) -> Leg:
+    """The leg that has these joints, with the solution of its inverse kinematics that is assembled.
+
+    Raises RobotFileError, with the kinds there are, for joints that make none, and where they do not stand as they do
+    in that kind, with the number.
+    """
+    if chain.signature not in SIGNATURES:
+        kinds = ", ".join(f"{one.model_fields['type'].default} = {text}" for text, (one, _) in SIGNATURES.items())
+        raise RobotFileError(f"its joints, {chain.signature}, make no kind of leg (*: actuated); kinds: {kinds}")
+    kind, fields = SIGNATURES[chain.signature]
+    try:
+        leg = kind.model_validate(fields(chain) | {"platform_joint": chain.platform_joint})
+    except ValidationError as error:
+        said = [f"{'.'.join(map(str, item['loc']))} = {item['input']}: {item['msg']}" for item in error.errors()]
+        raise RobotFileError("; ".join(said)) from None
+    branches: list[Leg] = [leg.model_copy(update={"branch": sign}) for sign in (1, -1)]
+    off = [float(each.coordinate(ca.SX(chain.points[-1]))) - chain.coordinate for each in branches]
+    if not leg.prismatic:
+        off = [(value + np.pi) % (2 * np.pi) - np.pi for value in off]
+    best = int(np.argmin(np.nan_to_num(np.abs(off), nan=np.inf)))
+    if not abs(off[best]) < SAME:
+        raise RobotFileError(f"its coordinate at home, {chain.coordinate:g}, is {off[best]:.3g} from what it should be")
+    return branches[best]
+
+
+def _cranked(chain: Chain) -> dict[str, Any]:
+    """A crank, and a link that begins at its tip."""
+    tip, axis = chain.points[1], chain.axes[0, 0]
+    base = chain.points[0] + ((tip - chain.points[0]) @ axis) * axis
+    length = float(np.linalg.norm(tip - base))
+    if length < SAME:
+        raise RobotFileError(f"its crank is {length:.3g} m long: its first two joints are on one axis")
+    zero = Rotation.from_rotvec(-chain.coordinate * axis).apply((tip - base) / length)
+    zero -= (zero @ axis) * axis
+    return {
+        "base_joint": base,
+        "crank_axis": axis,
+        "crank_zero_direction": zero / np.linalg.norm(zero),
+        "crank_length": length,
+        "link_length": float(np.linalg.norm(chain.points[2] - tip)),
+        **_drawn(chain, "crank", "link"),
+    }
+
+
+def _with_universal_joint(chain: Chain) -> dict[str, Any]:
+    _same_line("the first axis of its universal joint", chain.axes[1, 0], "the crank's", chain.axes[0, 0])
+    _second_axis_across(chain, 1)
+    return _cranked(chain)
+
+
+def _parallelogram(chain: Chain) -> dict[str, Any]:
+    _same_line("the line from bar to bar", chain.across, "the crank's axis", chain.axes[0, 0])
+    return _cranked(chain) | {"bar_distance": float(np.linalg.norm(chain.across))}
+
+
+def _planar(chain: Chain) -> dict[str, Any]:
+    """Hinges along one direction; where on their axes they are said to be does not matter."""
+    axis = chain.axes[0, 0]
+    for joint, name in enumerate(chain.joints):
+        if name == "hinge":
+            _same_line(f"the axis of its joint {joint + 1}", chain.axes[joint, 0], "the crank's axis", axis)
+    flat = chain.points - np.outer((chain.points - chain.points[-1]) @ axis, axis)
+    return _cranked(chain._replace(points=flat))
+
+
+def _sliding(chain: Chain) -> dict[str, Any]:
+    slider, end = chain.points[1:3]
+    fields = {
+        "base_joint": slider - chain.coordinate * chain.axes[0, 0],
+        "slider_axis": chain.axes[0, 0],
+        "link_length": float(np.linalg.norm(end - slider)),
+        **_drawn(chain, "slider", "link"),
+    }
+    if chain.rods[0] is not None:
+        fields["slider_length"] = chain.rods[0][0]
+    if chain.joints[1] == "universal":
+        _second_axis_across(chain, 1)
+        fields["joint_axis"] = chain.axes[1, 0]
+    return fields
+
+
+def _telescopic(chain: Chain) -> dict[str, Any]:
+    """Cylinder and rod; where the file does not say how long they are, home is at mid-stroke of two equal ones."""
+    base, _, end = chain.points
+    length = float(np.linalg.norm(end - base))
+    _same_line("its slide", chain.axes[1, 0], "the line through its ends", end - base)
+    _second_axis_across(chain, 0)
+    if chain.axes[1, 0] @ (end - base) < 0:
+        raise RobotFileError("its coordinate grows as it gets shorter: turn the axis of its slide round")
+    lengths = [length / 1.5 if rod is None else rod[0] for rod in chain.rods]
+    along = (end - base) / length
+    return {
+        "base_joint": base,
+        "joint_axis": chain.axes[0, 0],
+        "zero_length": length - chain.coordinate,
+        "cylinder_centre": float((chain.centres[0] - base) @ along),
+        "rod_centre": float((end - chain.centres[1]) @ along),
+        "cylinder_length": lengths[0],
+        "rod_length": lengths[1],
+        **_drawn(chain, "cylinder", "rod"),
+    }
+
+
+def _drawn(chain: Chain, *names: str) -> dict[str, float]:
+    return {f"{name}_radius": rod[1] for name, rod in zip(names, chain.rods, strict=True) if rod is not None}
+
+
+def _second_axis_across(chain: Chain, joint: int) -> None:
+    """The body on a universal joint has its length across the second axis of that."""
+    along = chain.points[-1] - chain.points[joint]
+    off = float(np.arcsin(np.abs(chain.axes[joint, 1] @ along) / np.linalg.norm(along)))
+    if off > SAME:
+        raise RobotFileError(
+            f"the second axis of its universal joint is {np.degrees(off):.3g} deg from normal to the body on it"
+        )
+
+
+def _same_line(what: str, direction: np.ndarray, of: str, other: np.ndarray) -> None:
+    sine = float(np.linalg.norm(np.cross(direction, other)) / np.linalg.norm(direction) / np.linalg.norm(other))
+    if sine > SAME:
+        raise RobotFileError(f"{what} is {np.degrees(np.arcsin(min(sine, 1.0))):.3g} deg from {of}, must be along that")
+
+
+SIGNATURES: dict[str, tuple[type[Leg], Callable[[Chain], dict[str, Any]]]] = {
+    "hinge* ball ball": (RssLeg, _cranked),
+    "hinge* universal ball": (RusLeg, _with_universal_joint),
+    "universal slide* ball": (UpsLeg, _telescopic),
+    "slide* ball ball": (PssLeg, _sliding),
+    "slide* universal ball": (PusLeg, _sliding),
+    "hinge* 2 x (ball ball)": (ParallelogramLeg, _parallelogram),
+    "hinge* hinge hinge": (RrrLeg, _planar),
+    "hinge* hinge ball": (RrrLeg, _planar),
+}
+"""Kinds of legs by their joints from the base, with what gives their fields."""
