@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 from identify.commands import new_folder
 from identify.commands.calibrate import CALIBRATE_HELP, calibrate
 from identify.commands.check import CHECK_HELP, check
+from identify.commands.comparisons import compare_excitation, estimators, variation
 from identify.commands.importing import imports
 from identify.commands.robot import base_parameters, export, verify_model, workspace
 from identify.commands.sensor import acceptance, detectors
