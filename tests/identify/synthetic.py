@@ -46,22 +46,33 @@ def truth():
     return rss6().parameter_sets["identified"].vector
 
 
-def trajectory(seed, size=1.0):
-    return random_trajectory(np.random.default_rng(seed), rss6().geometry.chart, 0.1, 5, 0.010 * size, 0.04 * size)
+def trajectory(seed, size=1.0, robot=None):
+    chart = (robot or rss6()).geometry.chart
+    return random_trajectory(np.random.default_rng(seed), chart, 0.1, 5, 0.010 * size, 0.04 * size)
 
 
 def run_plant(
-    scenario, seed, sigma=SIGMA, lost=(), parameters=None, duration_s=10.0, trajectory_seed=0, size=1.0, **stated
+    scenario,
+    seed,
+    sigma=SIGMA,
+    lost=(),
+    parameters=None,
+    duration_s=10.0,
+    trajectory_seed=0,
+    size=1.0,
+    robot=None,
+    **stated,
 ):
     """(record, run of the plant) with Gaussian noise of `sigma` (6,) and the frames `lost` not measured.
 
-    size: of the motion, as a share of the usual box; stated: what `build_record` is given in place of what was.
+    size: of the motion, as a share of the usual box; robot: another than the reference robot; stated: what
+    `build_record` is given in place of what was.
     """
-    rng = np.random.default_rng(seed)
-    plant = build_plant(scenario, rss6())
+    rng, robot = np.random.default_rng(seed), robot or rss6()
+    plant = build_plant(scenario, robot)
     plant = plant if parameters is None else replace(plant, parameters=parameters)
     times = scenario.timing.frame_times(duration_s)
-    reference = trajectory(trajectory_seed, size).reference(times)
+    reference = trajectory(trajectory_seed, size, robot).reference(times)
 
     def sensor(frame, t, pose):
         noise = sigma * rng.standard_normal(6)
@@ -79,9 +90,10 @@ def run_plant(
         "measured_ok": run.measured_ok,
         "command": run.command,
         "scenario_toml": scenario.to_toml(),
-        "robot": "rss6",
+        "robot": robot.name,
         "seed": seed,
         "frame_rate_hz": scenario.timing.frame_rate_hz,
+        "prismatic": robot.layout.prismatic,
     }
     record = build_record(**(made | stated))
     store_anchor(record, ScaleAnchor("platform_mass", plant.parameters[0], 0.005))
