@@ -19,7 +19,8 @@ from dynamics.kinematics.chart import Chart
 from dynamics.legs.chain import SAME, leg_of
 from dynamics.legs.leg import Body, Leg, Placement
 from dynamics.parameters import parameter_layout
-from dynamics.robot import Robot
+from dynamics.rigid_body.jacobians import joint_jacobian
+from dynamics.rigid_body.virtual_work import mass_matrix
 from dynamics.robot_file import ParameterSet, RobotDescription
 
 DIAGONAL = 1e-9
@@ -72,12 +73,10 @@ def recognised(mechanism: Mechanism) -> tuple[RobotDescription, list[str]]:
                 raise RobotFileError(f"leg {k + 1}: {error}") from None
         dynamic[layout.coulomb][k], dynamic[layout.viscous][k] = one.actuated.friction
     layout.check(dynamic)
-    gains = np.zeros(3) if plain.gains is None else plain.gains
-    description = RobotDescription(plain.name, geometry, {"initial": ParameterSet(dynamic, gains)})
+    gains = _gains(geometry, dynamic[layout.rigid]) if plain.gains is None else plain.gains
     if plain.gains is None:
-        description.parameter_sets["initial"] = ParameterSet(dynamic, _gains(Robot(description)))
         notes.append("the file has no joint PID: its gains are chosen for 3 Hz with the least that a joint feels")
-    return description, notes
+    return RobotDescription(plain.name, geometry, {"initial": ParameterSet(dynamic, gains)}), notes
 
 
 def _leg(one: MechanismLeg, number: int) -> Leg:
@@ -176,10 +175,11 @@ def _travel(plain: Mechanism, found: list[MechanismLeg], legs: list[Leg], notes:
     return float(max(abs(one.actuated.coordinate) for one in found) + beyond)
 
 
-def _gains(robot: Robot) -> np.ndarray:
+def _gains(geometry: RobotGeometry, rigid: np.ndarray) -> np.ndarray:
     """lp, li, ld for what the joint that feels least feels at home."""
-    jacobian = robot.joint_jacobian(robot.home_pose) @ robot.geometry.chart.basis
-    mass = robot.geometry.chart.basis.T @ robot.mass_matrix(robot.home_pose) @ robot.geometry.chart.basis
+    home, free = ca.SX(geometry.home_pose), geometry.chart.basis
+    jacobian = np.array(ca.evalf(joint_jacobian(geometry, home))) @ free
+    mass = free.T @ np.array(ca.evalf(mass_matrix(geometry, home, ca.SX(rigid)))) @ free
     felt = 1 / np.diagonal(jacobian @ np.linalg.solve(mass, jacobian.T)).min()
     stiff = felt * OWN_RATE**2
     return np.array([stiff, stiff * OWN_RATE / 20, 2 * OWN_DAMPING * felt * OWN_RATE])

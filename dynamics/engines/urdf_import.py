@@ -26,6 +26,9 @@ from dynamics.legs.chain import SAME
 from dynamics.robot_file import RobotDescription
 
 KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
+STEPS = 60
+"""At most, to close the loops; one that can be closed takes some ten."""
+
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
 COORDINATES = {"hinge": 1, "slide": 1, "ball": 3, "weld": 0, "universal": 2, "floating": 6}
@@ -207,7 +210,7 @@ def _closed(base: str, joints: list[_Joint], loops: list[tuple[str, str, bool]])
 
     q = np.zeros(sum(COORDINATES[joint.kind] for joint in joints))
     if np.abs(gaps(q)).max() > SAME**2:
-        q = least_squares(gaps, q, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+        q = least_squares(gaps, q, xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=STEPS).x
     worst = float(np.abs(gaps(q)).max())
     if worst > SAME:
         raise RobotFileError(f"the loops do not close: {worst:.3g} m or rad are left, must be below {SAME:g}")

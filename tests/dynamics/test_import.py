@@ -12,6 +12,7 @@ from dynamics.engines.mjcf_import import robot_of_mjcf
 from dynamics.engines.urdf_import import robot_of_urdf
 from dynamics.errors import RobotFileError
 from dynamics.inertia import physical_inertias, travel_states
+from dynamics.rigid_body.virtual_work import robot_functions
 from dynamics.robot import Robot, load_robot
 from dynamics.robot_file import RobotDescription, built_in_robots
 from dynamics.robot_text import robot_text
@@ -31,11 +32,17 @@ def assert_same_dynamics(robot, values, description, folder):
     other = load_robot(folder / "robot.toml")
     assert other.geometry == description.geometry
     assert other.layout == robot.layout
-    pose, twist, torque = travel_states(robot, values)
-    ours, theirs = robot.forward_dynamics(pose, twist, torque, values), other.forward_dynamics(pose, twist, torque)
-    assert (np.abs(ours - theirs).max(axis=1) <= 1e-9 * np.abs(ours).max(axis=1)).all()
-    np.testing.assert_allclose(other.inverse_kinematics(pose), robot.inverse_kinematics(pose), atol=1e-9)
     assert other.travel_limit == robot.travel_limit
+    pose, twist, torque = (values.T for values in travel_states(robot, values))
+    joints, accelerations = [], []
+    for one, parameters in ((robot, values), (other, other.nominal_parameters)):
+        # As CasADi evaluates them: compiling takes longer, and these robots are asked once.
+        functions = {one.name(): one for one in robot_functions(one.geometry)}
+        joints.append(np.array(functions["inverse_kinematics"](pose)[0]))
+        accelerations.append(np.array(functions["forward_dynamics"](pose, twist, torque, parameters)))
+    ours, theirs = accelerations
+    assert (np.abs(ours - theirs).max(axis=0) <= 1e-9 * np.abs(ours).max(axis=0)).all()
+    np.testing.assert_allclose(*joints, atol=1e-9)
     return other
 
 
@@ -68,8 +75,18 @@ def test_a_robot_exported_as_mjcf_and_imported_has_the_same_dynamics(name, tmp_p
     np.testing.assert_array_equal(other.parameter_sets["initial"].joint_pid, gains)
 
 
-@pytest.mark.parametrize("platform_on_a_leg", [False, True])
-@pytest.mark.parametrize("name", built_in_robots())
+@pytest.mark.parametrize(
+    ("name", "platform_on_a_leg"),
+    [
+        ("rss6", False),
+        ("rss6", True),
+        ("rus6", True),
+        ("ups6", False),
+        ("pus6", True),
+        ("delta3", True),
+        ("rrr3", False),
+    ],
+)
 def test_a_robot_written_as_urdf_with_closures_has_the_same_dynamics(name, platform_on_a_leg, tmp_path):
     robot = load_robot(name)
     values = with_bodies(robot)

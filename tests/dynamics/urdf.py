@@ -73,7 +73,7 @@ def joint(name, kind, parent, child, places, axis=(1, 0, 0), turned=0.0, more=""
         point = point - turned * turn @ axis
     else:
         turn = turn @ Rotation.from_rotvec(-turned * axis).as_matrix()
-    angles = Rotation.from_matrix(axes.T @ turn).as_euler("xyz")
+    angles = Rotation.from_matrix(axes.T @ turn).as_euler("xyz", suppress_warnings=True)
     origin = f'<origin xyz="{numbers(axes.T @ (point - at))}" rpy="{numbers(angles)}"/>'
     ends = f'<parent link="{parent}"/><child link="{child}"/><axis xyz="{numbers(axis)}"/>'
     return f'<joint name="{name}" type="{kind}">{origin}{ends}{more}</joint>'
