@@ -103,7 +103,7 @@ def test_run_experiment_returns_what_it_writes_with_the_noise_of_its_seed(tmp_pa
     assert "truth" not in " ".join(map(str, record.data_vars))
     assert abs(record.attrs["scale_anchor_value"] - 23.5) < 5 * record.attrs["scale_anchor_std"]
     assert record.attrs["scale_anchor_value"] != 23.5
-    assert json.loads(record.attrs["robot_geometry"])["crank_length"] == 0.06
+    assert json.loads(record.attrs["robot_geometry"])["leg1.crank_length"] == 0.06
     plant = build_plant(quick(**SHORT), rss6())
     runs = [run_plant(plant, sensor, trajectory(3), 0.1, seed, 0).record for seed in (0, 0, 5)]
     assert np.array_equal(poses(runs[0], "measured"), poses(runs[1], "measured"))
