@@ -27,6 +27,16 @@ Array = np.ndarray  # of any type and shape, which docstrings state
 Record = Any  # a numpy.record, whose fields are those of its type
 
 
+def _record_symbol(record: Any) -> tuple[str, tuple[str]]:
+    """What stands for a type of record in the symbols of kernels: a digest of its fields."""
+    return "Record", (hashlib.sha256(record.name.encode()).hexdigest()[:16],)
+
+
+# numba counts the types of records instead, anew in every process: kernels for robots of other sizes that were compiled
+# in another process would have the same symbols as ours, and one would be run in place of the other.
+types.Record.mangling_args = property(_record_symbol)  # type: ignore[method-assign, assignment]
+
+
 def kernel(function: Callable[..., Any]) -> Any:
     """A kernel that only kernels call: compiled with each of them, without a door for Python."""
     function.kernel = True  # type: ignore[attr-defined]

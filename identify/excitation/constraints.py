@@ -7,9 +7,8 @@ within -1 and +1:
     travel        joint coordinate over the travel limit less the margin, a leg
     velocity      joint velocity over the largest allowed, a leg
     leverage      least leverage of J_a1 over the leverage, a leg (see `dynamics.workspace`)
-    conditioning  condition number of the scaled J_a2 over its limit, of the 2-norm as everywhere. Expressions have that
-                  of a smooth norm, which is never below: Frobenius' for a robot whose home is far from the limit, so
-                  that it finds what it always found; else a Schatten norm, which is at most 3 % above
+    conditioning  condition number of the scaled J_a2 over its limit, of the 2-norm as everywhere; expressions have that
+                  of a Schatten norm near it, which is smooth, never below, and at most 3 % above
     visibility    angle to grazing and place in the image of four stickers a plane and both cameras; left out where the
                   whole box is proved to be in sight
 
@@ -111,9 +110,6 @@ def _functions(sight: SightLines, stickers: range | list[int]) -> ca.Function:
     return ca.Function("sight_uses", [pose], [sight_uses(sight, list(stickers), pose)])
 
 
-FAR_FROM_LIMIT = 0.5
-"""Share of the limit of the condition number below which a robot's home is far from that."""
-
 SQUARINGS = 6
 """Of J^T J: the Schatten norm that stands for the 2-norm is that of p = 2^(SQUARINGS + 1)."""
 
@@ -123,11 +119,6 @@ def condition_number(matrix: ca.SX) -> ca.SX:
     above."""
     inverse = ca.solve(matrix, ca.SX.eye(matrix.rows()))
     return _schatten_norm(matrix) * _schatten_norm(inverse)
-
-
-def frobenius_condition(matrix: ca.SX) -> ca.SX:
-    """Condition number of a square matrix of n rows in the Frobenius norm: from that of the 2-norm to n times that."""
-    return ca.norm_fro(matrix) * ca.norm_fro(ca.solve(matrix, ca.SX.eye(matrix.rows())))
 
 
 def _schatten_norm(matrix: ca.SX) -> ca.SX:
@@ -205,15 +196,12 @@ class MotionConstraints:
         velocities = pose_jacobian(geometry, self._pose) @ self._rate
         legs, away = tuple(f"leg {k}" for k in range(1, len(geometry.legs) + 1)), self._pose - geometry.home_pose
         least, most, count = settings.least_leverage, settings.most_condition, len(legs)
-        at_home = measure(robot, robot.home_pose).platform_rows[0]
-        far = np.linalg.cond(at_home, "fro") < FAR_FROM_LIMIT * most
-        condition = frobenius_condition(link_rows) if far else condition_number(link_rows)
         self.limits = [
             Limit("box", away[list(chart.freedoms)] / self.box, tuple(self.box), "", chart.coordinate_names),
             Limit("travel", joints / travel, (travel,) * count, f" {unit}", legs),
             Limit("velocity", velocities / velocity, (velocity,) * count, f" {unit}/s", legs),
             Limit("leverage", least / leverage, (least,) * count, "", legs, lower=True),
-            Limit(CONDITIONING, condition / most, (most,), "", ("",)),
+            Limit(CONDITIONING, condition_number(link_rows) / most, (most,), "", ("",)),
         ]
         self._box_units = chart.units
         if not self.always_in_sight:

@@ -185,3 +185,26 @@ def test_everything_works_in_memory_after_one_warning_where_nothing_can_be_writt
     said = str(caught[0].message)
     assert "\n" not in said
     assert all(words in said for words in ("no_folder", "Not a directory", "CMMSIM_CACHE"))
+
+
+SYMBOLS = """
+import sys
+from numba import typeof
+from numba.core.itanium_mangler import mangle_type_or_value
+import dynamics.compiled.kernel
+from dynamics.closed_loop.memory import empty_memory
+from dynamics.closed_loop.problem import Sizes
+for number in map(int, sys.argv[1:]):
+    print(number, *[mangle_type_or_value(typeof(part)) for part in empty_memory(Sizes(number, number, 10 * number))])
+"""
+
+
+def test_kernels_of_robots_of_other_sizes_have_other_symbols_and_the_same_in_every_process():
+    """Whatever was compiled before: kernels from the cache, of several processes, stand beside each other."""
+    first, second = (
+        subprocess.run([sys.executable, "-c", SYMBOLS, *order], capture_output=True, text=True, check=True).stdout
+        for order in (("6", "3"), ("3", "6"))
+    )
+    assert sorted(first.splitlines()) == sorted(second.splitlines())
+    one, other = (line.split()[1:] for line in first.splitlines())
+    assert not set(one) & set(other)
