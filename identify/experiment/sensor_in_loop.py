@@ -21,7 +21,7 @@ def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:
     """Meshes [m] of the bodies of all legs, rods along their z axes from their first joints; they hide stickers."""
     return {
         part.name: cmmsim.rod(float(np.linalg.norm(np.diff(part.segment.rod, axis=0))), part.segment.radius)
-        for part in parts_of(robot.geometry).all
+        for part in sorted(parts_of(robot.geometry).all, key=lambda part: part.body)  # as parameters are ordered
     }
 
 
