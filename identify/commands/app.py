@@ -217,15 +217,21 @@ def run(
 
 @app.command()
 def warm_up(
-    scenario: ScenarioArgument = "paper", robot: RobotOption = None, settings: Settings = None, quiet: Quiet = False
+    scenario: ScenarioArgument = "paper",
+    robot: RobotOption = None,
+    settings: Settings = None,
+    all_robots: Annotated[bool, typer.Option("--all-robots", help="Compile every built-in robot, too.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Compile all that runs of a scenario need, once for this user: the runs that follow compile nothing.
 
     A robot is compiled for itself, and one with another number of joints or freedoms compiles the loop anew.
     """
+    from dynamics import built_in_robots, load_robot
     from identify.experiment.run import warm_up
 
-    warm_up(_scenario(scenario, settings, robot), terminal_progress(quiet))
+    others = tuple(load_robot(name) for name in built_in_robots()) if all_robots else ()
+    warm_up(_scenario(scenario, settings, robot), terminal_progress(quiet), others)
 
 
 @app.command()

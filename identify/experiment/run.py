@@ -160,13 +160,13 @@ def _record(plant: Plant, reference: Reference, run: ClosedLoopRun, eye: SensorI
 WARM_UP_FRAMES = 12
 
 
-def warm_up(scenario: Scenario, progress: Progress) -> None:
+def warm_up(scenario: Scenario, progress: Progress, robots: tuple[Robot, ...] = ()) -> None:
     """Compile what runs of a scenario need, into the caches on disk, by teaching its sensor and following the platform
-    for some frames with each renderer. Raises what a run raises.
+    for some frames with each renderer; and other robots. Raises what a run raises.
     """
     scenario = with_renderer(scenario)
     plant = build_plant(scenario)
-    compile_robots((plant.nominal, plant.robot), progress)
+    compile_robots((plant.nominal, plant.robot, *robots), progress)
     for renderer in dict.fromkeys(("analytic", scenario.renderer)):
         chosen = scenario.with_overrides({"renderer": renderer})
         sensor = taught_sensor(chosen, plant.nominal, 0, progress)

@@ -58,6 +58,13 @@ class States:
     twist_dot: np.ndarray
 
 
+SLOW_ROBOTS = [
+    name if name in ("ups6", "delta3") else pytest.param(name, marks=pytest.mark.slow)
+    for name in dynamics.built_in_robots()
+]
+"""Every built-in robot, two of them also among the quick tests."""
+
+
 def random_states(robot: dynamics.Robot, count: int, seed: int) -> States:
     rng = np.random.default_rng(seed)
     scale = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])

@@ -14,9 +14,8 @@ from dynamics.errors import RobotFileError
 from dynamics.inertia import travel_states
 from dynamics.legs import KINDS
 from dynamics.legs.leg import Leg
-from dynamics.robot_file import built_in_robots
 from dynamics.workspace import check_motion
-from tests.dynamics.conftest import Loop, States, derivative
+from tests.dynamics.conftest import SLOW_ROBOTS, Loop, States, derivative
 
 BOX = np.repeat([0.010, 0.040], 3)
 FULL_BOX = np.repeat([0.015, 0.050], 3)
@@ -53,7 +52,7 @@ def mixed_robot(folder: Path) -> dynamics.Robot:
     return dynamics.load_robot(path)
 
 
-@pytest.fixture(scope="module", params=[*built_in_robots(), MIXED])
+@pytest.fixture(scope="module", params=[*SLOW_ROBOTS, MIXED])
 def robot(request, tmp_path_factory):
     if request.param == MIXED:
         return mixed_robot(tmp_path_factory.getbasetemp())
@@ -212,7 +211,7 @@ def test_forces_mass_and_coriolis_of_a_leg_are_one_virtual_work(kind):
         np.testing.assert_allclose(within * mass, within * mass_by_work, atol=1e-12 * np.abs(mass).max())
 
 
-@pytest.mark.parametrize("name", built_in_robots())
+@pytest.mark.parametrize("name", SLOW_ROBOTS)
 def test_built_in_loops_are_stable_at_60_hz_and_at_29_hz_with_a_frame_of_latency(name):
     """With 1.5 times the paper's servo gains; rss6 has the paper's figures, which are only just stable or are not."""
     robot = dynamics.load_robot(name)
@@ -224,7 +223,7 @@ def test_built_in_loops_are_stable_at_60_hz_and_at_29_hz_with_a_frame_of_latency
             assert (radius < 1) == ((name, which) != ("rss6", "initial")), (which, timing)
 
 
-@pytest.mark.parametrize("name", [name for name in built_in_robots() if name != "rss6"])
+@pytest.mark.parametrize("name", [name for name in SLOW_ROBOTS if "rss6" not in getattr(name, "values", ())])
 def test_built_in_robots_reach_a_box_about_home_within_all_limits(name):
     """+-15 mm and +-50 mrad in all coordinates at once; within the travel they reach all and are nowhere singular."""
     robot = dynamics.load_robot(name)

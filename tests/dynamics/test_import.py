@@ -14,8 +14,9 @@ from dynamics.errors import RobotFileError
 from dynamics.inertia import physical_inertias, travel_states
 from dynamics.rigid_body.virtual_work import robot_functions
 from dynamics.robot import Robot, load_robot
-from dynamics.robot_file import RobotDescription, built_in_robots
+from dynamics.robot_file import RobotDescription
 from dynamics.robot_text import robot_text
+from tests.dynamics.conftest import SLOW_ROBOTS
 from tests.dynamics.urdf import urdf_of
 
 
@@ -46,7 +47,7 @@ def assert_same_dynamics(robot, values, description, folder):
     return other
 
 
-@pytest.mark.parametrize("name", built_in_robots())
+@pytest.mark.parametrize("name", SLOW_ROBOTS)
 def test_a_robot_written_as_toml_is_the_same_to_the_last_digit(name, tmp_path):
     robot = load_robot(name)
     description = RobotDescription(robot.name, robot.geometry, robot.parameter_sets)
@@ -58,7 +59,7 @@ def test_a_robot_written_as_toml_is_the_same_to_the_last_digit(name, tmp_path):
         np.testing.assert_array_equal(again.parameter_sets[key].vector, values.vector)
 
 
-@pytest.mark.parametrize("name", built_in_robots())
+@pytest.mark.parametrize("name", SLOW_ROBOTS)
 def test_a_robot_exported_as_mjcf_and_imported_has_the_same_dynamics(name, tmp_path):
     pytest.importorskip("mujoco")
     robot = load_robot(name)

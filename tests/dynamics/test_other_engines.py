@@ -12,7 +12,8 @@ from dynamics.engines.mjcf import MjcfSolver, mjcf_text
 from dynamics.engines.mujoco_engine import MujocoMissingError, MujocoRobot
 from dynamics.inertia import physical_inertias, travel_states
 from dynamics.robot import Robot, load_robot
-from dynamics.robot_file import RobotDescription, built_in_robots
+from dynamics.robot_file import RobotDescription
+from tests.dynamics.conftest import SLOW_ROBOTS
 
 
 @pytest.fixture
@@ -76,7 +77,7 @@ def test_accelerations_differ_by_the_softness_of_the_loops_alone(mujoco, robot, 
     assert worst[0.999] / worst[0.9999] == pytest.approx(10, rel=0.1)
 
 
-@pytest.mark.parametrize("name", built_in_robots())
+@pytest.mark.parametrize("name", SLOW_ROBOTS)
 def test_reloaded_bodies_accelerate_as_the_robot_with_the_changed_parameters(mujoco, name):
     """With MuJoCo's bodies in loops that are closed exactly (not by its springs), moving, with friction: to 1e-9."""
     robot = load_robot(name)
