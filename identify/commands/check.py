@@ -25,7 +25,7 @@ Examples:
 
 def check(
     robot: Annotated[str, typer.Argument(help="Built-in robot or path of a TOML file.")],
-    scenario: Annotated[str, typer.Option(help="Scenario whose servo and timing the loop has.")] = "paper",
+    scenario: Annotated[str, typer.Option(help="Scenario whose servo, timing and limits count.")] = "paper",
     parameters: Annotated[
         str | None,
         typer.Option(
@@ -45,7 +45,8 @@ def check(
     name = parameters or (given.plant.parameters if given.plant.parameters in chosen.parameter_sets else NOMINAL)
     check_parameter_set(chosen, name)
     values = chosen.parameter_sets[name].vector
-    findings = check_robot(chosen, values, model_settings(chosen, given), terminal_progress(quiet))
+    settings, limits = model_settings(chosen, given), given.excitation
+    findings = check_robot(chosen, values, settings, limits, terminal_progress(quiet))
     failed = [finding for finding in findings if not finding.ok]
     if json is not None:
         try:

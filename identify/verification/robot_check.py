@@ -19,6 +19,7 @@ from dynamics.kinematics import forward_kinematics
 from identify.arrays import Array
 from identify.estimation.base_parameters import base_parameters, structural_regressor
 from identify.progress import Progress, SilentProgress
+from identify.scenario import Excitation
 
 SAMPLES = 2000
 """Joint coordinates over the travel."""
@@ -46,12 +47,17 @@ class Finding:
 
 
 def check_robot(
-    robot: Robot, parameters: Array, settings: closed_loop.LoopSettings, progress: Progress | None = None
+    robot: Robot,
+    parameters: Array,
+    settings: closed_loop.LoopSettings,
+    limits: Excitation,
+    progress: Progress | None = None,
 ) -> list[Finding]:
-    """All findings about a robot with all its parameters in a loop with these settings."""
+    """All findings about a robot with all its parameters in a loop with these settings; `limits` has those of leverage
+    and condition."""
     questions: list[Callable[[], Iterator[Finding]]] = [
         lambda: _freedoms(robot),
-        lambda: _travel(robot),
+        lambda: _travel(robot, limits),
         lambda: _assembly(robot),
         lambda: _holding(robot, parameters),
         lambda: _visible(robot),
@@ -72,11 +78,11 @@ def _freedoms(robot: Robot) -> Iterator[Finding]:
     yield Finding("freedoms", joints == len(names), joints, len(names), "1", None, text)
 
 
-def _travel(robot: Robot) -> Iterator[Finding]:
-    """At home, then over the travel: what `workspace.check_motion` judges, with its limits."""
+def _travel(robot: Robot, limits: Excitation) -> Iterator[Finding]:
+    """At home, then over the travel: what `workspace.check_motion` judges."""
     unit, limit = "m" if robot.layout.prismatic else "rad", robot.travel_limit
     at_home = workspace.measure(robot, robot.home_pose)
-    yield from _extremes("at home", at_home)
+    yield from _extremes("at home", at_home, limits)
     most, leg = _worst(np.abs(at_home.theta), np.argmax)
     text = f"joint {leg} is {most:.3g} {unit} from zero at home, of a travel of {limit:g} {unit}"
     yield Finding("travel at home", most <= limit, most, limit, unit, leg, text)
@@ -88,15 +94,15 @@ def _travel(robot: Robot) -> Iterator[Finding]:
     text = f"{100 * share:.1f} % of {SAMPLES} random joint coordinates within the travel have a pose near home"
     yield Finding("travel closes", share > 0, share, 0.0, "1", None, text)
     if solved.any():
-        yield from _extremes("over the travel", workspace.measure(robot, poses[solved]))
+        yield from _extremes("over the travel", workspace.measure(robot, poses[solved]), limits)
 
 
-def _extremes(where: str, measures: workspace.WorkspaceMeasures) -> Iterator[Finding]:
+def _extremes(where: str, measures: workspace.WorkspaceMeasures, limits: Excitation) -> Iterator[Finding]:
     reach, leg = _worst(measures.reach_margin, np.argmin)
     text = f"least reach margin {where} is {reach:.3g}, of leg {leg}; at 0 it is stretched or folded"
     yield Finding(f"reach {where}", reach > 0, reach, 0.0, "1", leg, text)
     leverage, leg = _worst(measures.leverage, np.argmin)
-    least, most = workspace.LEAST_LEVERAGE, workspace.MOST_CONDITION
+    least, most = limits.least_leverage, limits.most_condition
     text = f"least leverage of an actuator on its leg (J_a1) {where} is {leverage:.3g}, of leg {leg}"
     yield Finding(f"leverage {where}", leverage >= least, leverage, least, "1", leg, text)
     condition = float(np.max(measures.platform_condition))

@@ -77,7 +77,7 @@ def test_dynamics_against_pinocchio(accuracy, cmmsim_robot, cmmsim_seed):
 
     values = cmmsim_robot.parameter_sets["initial"].dynamic  # the paper's Table 1 has no friction
     states, chain = random_states(cmmsim_robot, STATES, cmmsim_seed), ClosedChain(cmmsim_robot, values)
-    torques = 5 * np.random.default_rng(cmmsim_seed).standard_normal((STATES, 6))
+    torques = 5 * np.random.default_rng(cmmsim_seed).standard_normal((STATES, cmmsim_robot.layout.joints))
 
     def largest_difference(ours, torques):
         theirs = np.array(
