@@ -90,6 +90,19 @@ def lowest_frame_rate(robot: Robot, parameters: np.ndarray, settings: LoopSettin
     return _last_stable(radius, rate, SLOWEST_HZ if radius(rate) < 1 else fastest)
 
 
+def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> str:
+    """What the linear loop says of a run that was lost: its eigenvalue, and the frame rate that would hold it."""
+    arguments = robot, parameters, settings, pose
+    radius, hz = spectral_radius(*arguments), settings.timing.frame_rate_hz
+    said = f"its largest eigenvalue from frame to frame near the start is {radius:.4g}, and must be below 1"
+    if radius < 1:
+        return f"{said}: it is lost far from there"
+    rate = lowest_frame_rate(*arguments)
+    return (
+        f"{said}: {f'from {rate:.3g} Hz on it is' if rate > 0 else 'no frame rate makes it so'}, at {hz:g} Hz it is not"
+    )
+
+
 def _joint_loop(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """d/dt of [q, q_dot, joint integrals, command, slope of the command, U_dot] by these, square: a command changes
     with its slope, and what the joint PID takes for U_dot need not be that."""

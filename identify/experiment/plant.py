@@ -10,11 +10,13 @@ from dynamics import Robot, load_robot
 from dynamics.closed_loop import (
     ClosedLoopRun,
     JointElasticity,
+    LoopFailure,
     LoopSettings,
     PoseSensor,
     RateSensor,
     Reference,
     simulate,
+    stability,
 )
 from dynamics.parameters import ParameterLayout
 from dynamics.robot import with_geometry_error
@@ -54,12 +56,16 @@ class Plant:
         """Follow a reference under a servo that knows the nominal robot; sensor None: an ideal one.
 
         load (p,): what the platform carries, as it adds to the parameters. Raises what `dynamics.closed_loop.simulate`
-        does.
+        does, and says of a loop that is lost what its linear map says.
         """
         parameters = self.parameters if load is None else self.parameters + load
         settings = self._settings_at(parameters, reference.poses[0])
         known = None if self.robot is self.nominal else self.nominal
-        return simulate(self.robot, parameters, reference, settings, sensor, latencies=latencies, servo_robot=known)
+        try:
+            return simulate(self.robot, parameters, reference, settings, sensor, latencies=latencies, servo_robot=known)
+        except LoopFailure as error:
+            said = stability.verdict(self.nominal, parameters, settings, reference.poses[0])
+            raise LoopFailure(f"{error}; {said}", error.frame) from None
 
     def truth(self, run: ClosedLoopRun) -> xr.Dataset:
         """The truth of a run: what it did, the parameters without a load, and what the model has no place for."""

@@ -9,12 +9,18 @@ import trimesh
 
 import cmmsim
 from cmmsim.files import SensorFile, read_sensor_file
+from cmmsim.files.schema import unit
+from cmmsim.files.setup import marked_body
 from cmmsim.imaging.renderer import choose_renderer
 from dynamics import Robot
 from dynamics.bodies import parts_of
 from identify.arrays import Array
+from identify.errors import ScenarioError
 from identify.progress import Advance
 from identify.scenario import Scenario
+
+OFF_PLATFORM_M = 0.05
+"""How far a leg may end from the platform that the sensor sees, and home be from its home."""
 
 
 def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:
@@ -36,11 +42,33 @@ def robot_transforms(robot: Robot, pose: Array) -> dict[str, Array]:
 def make_sensor(scenario: Scenario, robot: Robot, seed: int, taught: cmmsim.Taught | None = None) -> cmmsim.Sensor:
     """The scenario's sensor, with its timing and with the bodies of the robot's legs in its view.
 
-    One a process: it owns the renderer.
+    One a process: it owns the renderer. Raises ScenarioError where the platform that it sees is not the robot's.
     """
-    sensor = cmmsim.Sensor(sensor_file(scenario), seed, scenario.pose_method, taught, renderer=scenario.renderer)
+    file = sensor_file(scenario)
+    check_platform(robot, file, scenario.sensor)
+    sensor = cmmsim.Sensor(file, seed, scenario.pose_method, taught, renderer=scenario.renderer)
     sensor.add_bodies(robot_meshes(robot))
     return sensor
+
+
+def check_platform(robot: Robot, file: SensorFile, sensor: str) -> None:
+    """Raise ScenarioError, with leg and distance, where legs end in mid-air beside the platform of a sensor file, or
+    where that is at home elsewhere than the robot's."""
+    body, cuts = marked_body("platform", file.platform), file.platform.cuts
+    normals = np.vstack([body.normals, *[unit(cut.normal) for cut in cuts]])
+    reach = np.append(body.offsets, [unit(cut.normal) @ cut.point for cut in cuts])
+    outside = (robot.geometry.platform_joints @ normals.T - reach).max(axis=1)
+    leg, away = int(np.argmax(outside)), robot.home_pose[:3] - np.array(file.platform.home[:3])
+    if outside[leg] > OFF_PLATFORM_M:
+        raise ScenarioError(
+            f"platform joint {leg + 1} of {robot.name} is {outside[leg]:.3g} m outside of the platform that sensor "
+            f"{sensor} sees, limit {OFF_PLATFORM_M:g} m: its [platform] has to be that of the robot"
+        )
+    if np.linalg.norm(away) > OFF_PLATFORM_M:
+        raise ScenarioError(
+            f"{robot.name} is at home {np.linalg.norm(away):.3g} m from where sensor {sensor} has its platform at "
+            f"home, limit {OFF_PLATFORM_M:g} m: platform.home has to be that of the robot"
+        )
 
 
 def sensor_file(scenario: Scenario) -> SensorFile:

@@ -7,8 +7,10 @@ import pytest
 from scipy.stats import chi2
 
 from dynamics import Robot, load_robot
-from dynamics.closed_loop import equilibrium, simulate
-from dynamics.robot_file import ParameterSet
+from dynamics.closed_loop import LoopFailure, equilibrium, simulate
+from dynamics.geometry import RobotGeometry
+from dynamics.kinematics.chart import Chart
+from dynamics.robot_file import ParameterSet, RobotDescription
 from identify.errors import ScenarioError, TrajectoryError
 from identify.estimation.base_parameters import (
     angle_to_singular_vectors,
@@ -25,6 +27,7 @@ from identify.excitation.criteria import log_observability
 from identify.excitation.information import harmonics, sensitivity_spectrum
 from identify.excitation.motion import unknowns
 from identify.experiment.plant import build_plant
+from identify.experiment.sensor_in_loop import make_sensor
 from identify.loop_parameters import model_settings
 from identify.scenario import load_scenario
 from identify.trajectory import TrajectorySet, load_trajectories, save_trajectories
@@ -247,3 +250,30 @@ def test_friction_of_a_robot_that_lies_flat_has_the_size_of_what_accelerates_it(
     rest, found = np.zeros((2, 6)), holding_torque(robot, initial)
     torques = robot.inverse_dynamics(np.tile(robot.home_pose, (2, 1)), rest, 9.81 * np.eye(6)[:2], initial)
     assert found == pytest.approx(np.abs(torques).mean(), rel=1e-12)
+
+
+def test_a_robot_that_is_not_the_one_whose_platform_the_sensor_sees_is_refused_with_leg_and_distance():
+    """Twice as large in all lengths, its legs would end in mid-air."""
+    small = load_robot("rss6")
+    legs = [
+        leg.model_copy(update={name: 2 * getattr(leg, name) for name in ("base_joint", "platform_joint")})
+        for leg in small.geometry.legs
+    ]
+    legs = [leg.model_copy(update={"crank_length": 0.12, "link_length": 2 * leg.link_length}) for leg in legs]
+    chart = Chart("free", tuple(2 * small.home_pose))
+    geometry = RobotGeometry(tuple(legs), chart, small.travel_limit, small.geometry.gravity)
+    large = Robot(RobotDescription("large", geometry, small.parameter_sets))
+    with pytest.raises(
+        ScenarioError, match=r"platform joint \d of large is 0.2\d* m outside .* ctrack780 .*limit 0.05"
+    ):
+        make_sensor(quick(), large, 0)
+    raised = quick(**{"sensor_changes.platform.home": [0, 0, 0.3, 0, 0, 0]})
+    with pytest.raises(ScenarioError, match=r"rss6 is at home 0.1 m from where sensor ctrack780"):
+        make_sensor(raised, small, 0)
+
+
+def test_a_loop_that_is_lost_says_its_eigenvalue_and_the_frame_rate_that_would_hold_it():
+    plant = build_plant(quick(**{"servo.kp": 12.0}))
+    reference = trajectory(0).reference(np.arange(600) / 60)
+    with pytest.raises(LoopFailure, match=r"eigenvalue .* is 1\.\d+, and must be below 1: from \d+ Hz on it is, at 60"):
+        plant.run(reference)
