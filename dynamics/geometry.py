@@ -67,14 +67,16 @@ class RobotGeometry:
 
     @cached_property
     def digest(self) -> bytes:
-        """Fingerprint of all numbers; the key of what is built from a geometry."""
-        content = hashlib.sha256(repr((self.chart, self.travel_limit, self.gravity.tolist())).encode())
+        """Fingerprint of all numbers but the travel limit; the key of what is built from a geometry."""
+        content = hashlib.sha256(repr((self.chart, self.gravity.tolist())).encode())
         for leg in self.legs:
             content.update(repr([(name, _plain(value)) for name, value in leg]).encode())
         return content.digest()
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, RobotGeometry) and self.digest == other.digest
+        if not isinstance(other, RobotGeometry):
+            return False
+        return self.digest == other.digest and self.travel_limit == other.travel_limit
 
     def __hash__(self) -> int:
         return hash(self.digest)
