@@ -28,7 +28,7 @@ def check_unseen(result) -> tuple[float, float]:
     return position, orientation
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_robot_that_no_code_knows_runs_from_its_file_alone(tmp_path):
     """Sliders with links of two lengths on universal joints and on balls, and cylinders: ten seconds of images, and
     three of unseen motion."""
