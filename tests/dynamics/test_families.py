@@ -52,7 +52,7 @@ def mixed_robot(folder: Path) -> dynamics.Robot:
     return dynamics.load_robot(path)
 
 
-@pytest.fixture(scope="module", params=[*SLOW_ROBOTS, MIXED])
+@pytest.fixture(scope="module", params=[*SLOW_ROBOTS, pytest.param(MIXED, marks=pytest.mark.slow)])
 def robot(request, tmp_path_factory):
     if request.param == MIXED:
         return mixed_robot(tmp_path_factory.getbasetemp())

@@ -80,12 +80,11 @@ def test_a_robot_exported_as_mjcf_and_imported_has_the_same_dynamics(name, tmp_p
     ("name", "platform_on_a_leg"),
     [
         ("rss6", False),
-        ("rss6", True),
-        ("rus6", True),
-        ("ups6", False),
-        ("pus6", True),
         ("delta3", True),
-        ("rrr3", False),
+        *[
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (("rss6", True), ("rus6", True), ("ups6", False), ("pus6", True), ("rrr3", False))
+        ],
     ],
 )
 def test_a_robot_written_as_urdf_with_closures_has_the_same_dynamics(name, platform_on_a_leg, tmp_path):

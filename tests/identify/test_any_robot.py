@@ -39,7 +39,10 @@ FORBIDDEN = {"delta3": (3, 4, 5), "rrr3": (2, 3, 4)}
 """Entries of the pose that these platforms cannot change."""
 
 
-@pytest.fixture(scope="module", params=["delta3", "rrr3", "ups6", "mixed"])
+@pytest.fixture(
+    scope="module",
+    params=["delta3", "rrr3", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ups6", "mixed"))],
+)
 def robot(request, tmp_path_factory) -> Robot:
     if request.param != "mixed":
         return load_robot(request.param)
