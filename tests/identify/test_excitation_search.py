@@ -189,7 +189,7 @@ def climbed(problem):
     return climb(problem, np.random.SeedSequence(0), SilentProgress())
 
 
-@pytest.mark.parametrize("method", ["evolutionary", "gradient"])
+@pytest.mark.parametrize("method", ["evolutionary", pytest.param("gradient", marks=pytest.mark.slow)])
 def test_limits_hold_between_the_instants_of_the_search(one_start, method):
     """Ten times as many instants; a velocity limit that random trajectories keep and an optimum runs into."""
     scenario = small(method=method, max_joint_velocity_rad_s=0.45)
@@ -208,6 +208,7 @@ def test_searches_beat_the_random_trajectories_they_begin_with(one_start):
     np.testing.assert_array_equal(climbed.validation[0].sine, random.validation[0].sine)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["evolutionary", pytest.param("gradient", marks=pytest.mark.thorough)])
 def test_seed_decides_what_is_found(method):
     a, b, c = (designed.__wrapped__(method, seed, generations=3) for seed in (0, 0, 1))
