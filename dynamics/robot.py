@@ -117,7 +117,8 @@ class Robot:
         """Poses (k, 6) in which the robot can be assembled with joint coordinates (n,), by default those at home.
 
         What Newton's method finds from so many random starts, the one nearest to home first; a Gough-Stewart platform
-        has up to 40 (Dietmaier, 1998). Nothing says that all were found: more starts find more.
+        has up to 40 (Dietmaier, 1998). Each leg is on its branch of home: poses in which one is folded the other way
+        have other joint coordinates by the inverse kinematics, and are left out. More starts may find more.
         """
         joints = self.inverse_kinematics(self.home_pose) if theta is None else theta
         joints, geometry = floats("theta", joints, (self.layout.joints,)), self.geometry

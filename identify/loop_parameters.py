@@ -44,7 +44,10 @@ def check_parameter_set(robot: Robot, set_name: str) -> None:
     """Raise ScenarioError, with the valid names, when the robot file has no such parameter set."""
     if set_name not in robot.parameter_sets:
         valid = ", ".join(sorted(robot.parameter_sets))
-        raise ScenarioError(f"robot {robot.name} has no parameter set {set_name!r}; it has {valid}")
+        raise ScenarioError(
+            f"robot {robot.name} has no parameter set {set_name!r}; it has {valid} "
+            "(plant.parameters names the truth, model.start_parameters what identification starts from)"
+        )
 
 
 def of_actuators(robot: Robot, section: Section, name: str) -> Any:

@@ -15,7 +15,7 @@ from identify.estimation import identification
 from identify.excitation.design import design_trajectories
 from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import compile_robots, excitation_run, taught_sensor, teach, untaught_sensor
-from identify.experiment.sensor_in_loop import with_renderer
+from identify.experiment.sensor_in_loop import check_platform, sensor_file, with_renderer
 from identify.experiment.truth import read_truth, true_parameters
 from identify.files.atomic import write_text
 from identify.files.dataset import write_covariance
@@ -59,7 +59,9 @@ def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers
 def excite(scenario: Scenario, seed: int, folder: Path, progress: Progress) -> None:
     """Choose the trajectories; writes scenario.toml and trajectories.json."""
     scenario = with_renderer(scenario)
-    _write_plan(folder, scenario, _designed(build_plant(scenario), seed, progress))
+    plant = build_plant(scenario)
+    check_platform(plant.nominal, sensor_file(scenario), scenario.sensor)
+    _write_plan(folder, scenario, _designed(plant, seed, progress))
 
 
 def record(

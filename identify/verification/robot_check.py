@@ -117,7 +117,7 @@ def _worst(values: Array, pick: Callable[..., np.intp]) -> tuple[float, int]:
 
 def _assembly(robot: Robot) -> Iterator[Finding]:
     modes, home = robot.assembly_modes(), robot.home_pose
-    text = f"{len(modes)} assembly modes found with the joints as at home"
+    text = f"{len(modes)} assembly modes found with the joints as at home, no leg folded the other way"
     if len(modes) > 1:
         turn = Rotation.from_euler("XYZ", home[3:]).inv() * Rotation.from_euler("XYZ", modes[1, 3:])
         text += f"; the next is {np.linalg.norm(modes[1, :3] - home[:3]):.3g} m and {turn.magnitude():.3g} rad from it"
@@ -170,6 +170,8 @@ def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -
     yield Finding("loop", radius < 1, radius, 1.0, "1", None, text)
     factor = stability.gain_margin(*arguments)
     text = f"the servo's gains may be {factor:.3g} times as large until the loop is lost"
+    if not factor > 0:
+        text = "the loop is lost with any gains of the servo"
     yield Finding("gain margin", factor > 1, factor, 1.0, "1", None, text)
     rate = stability.lowest_frame_rate(*arguments)
     text = f"the loop holds from {rate:.3g} Hz on with this latency" if rate > 0 else "no frame rate makes it stable"
