@@ -104,6 +104,11 @@ class ParameterLayout:
         """Where the inertial parameters of a leg's bodies stand, one body after the other."""
         return [len(INERTIAL) * body + entry for body in self.of_leg[leg] for entry in range(len(INERTIAL))]
 
+    @property
+    def joint_unit(self) -> str:
+        """Unit of the joint coordinates."""
+        return "m" if self.prismatic else "rad"
+
     def unit(self, name: str) -> str:
         """Unit of a parameter such as `crank1.mass` or `joint_pid.lp`; friction and gains follow the actuators."""
         return unit_of(name, self.prismatic)

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from dynamics.checks import check_type, floats, real, row_text, rows
 from dynamics.errors import DynamicsError, ShapeError, SingularPoseError, TravelError, UnreachablePoseError
+from dynamics.kinematics import forward_kinematics
 from dynamics.robot import Robot
 
 LEAST_LEVERAGE = 0.05
@@ -111,6 +112,19 @@ def measure(robot: Robot, pose: ArrayLike) -> WorkspaceMeasures:
     return WorkspaceMeasures(theta, margin, leverage[..., 0], platform_rows, robot.travel_limit)
 
 
+def measure_travel(robot: Robot, samples: int) -> WorkspaceMeasures:
+    """Measures of the poses that belong to random joint coordinates within the travel limit, followed from home.
+
+    Those without a pose near home are left out: as many as there are fewer rows than samples. Always the same for a
+    robot.
+    """
+    limit = robot.travel_limit
+    joints = np.random.default_rng(0).uniform(-limit, limit, (samples, robot.layout.joints))
+    start = np.tile(robot.home_pose, (samples, 1))
+    poses, residual = forward_kinematics.search(robot.functions, robot.geometry.chart, joints, start)
+    return measure(robot, poses[(residual < forward_kinematics.ANGLE_TOLERANCE).all(axis=1)])
+
+
 def check_motion(
     robot: Robot,
     pose: ArrayLike,
@@ -156,7 +170,7 @@ def check_motion(
         travel,
         travel.value <= travel.limit,
         TravelError,
-        f"|theta| in {'m' if robot.layout.prismatic else 'rad'}",
+        f"|theta| in {robot.layout.joint_unit}",
         "limit ",
     )
     leverage = extreme(measures.leverage, least_leverage, np.argmin)

@@ -233,9 +233,8 @@ def checked_loop_parameters(robot: Robot, parameters: object) -> np.ndarray:
 
 def check_start_pose(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> None:
     """Raise UnreachablePoseError or SingularPoseError for a pose (6,) from which no run can start."""
-    robot.static_torque(
-        pose, parameters[robot.layout.dynamic]
-    )  # refuses a pose out of reach or singular, with the evidence
+    # Refuses a pose out of reach or singular, with the evidence.
+    robot.static_torque(pose, parameters[robot.layout.dynamic])
     robot.pose_rate(pose, np.zeros(6))  # refuses Euler angles at their singularity
 
 

@@ -6,9 +6,12 @@ once a frame. The loop is stable where all eigenvalues of that map are inside th
 helps at rest, and elasticity of the joints are left out.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import replace
 from math import floor
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
@@ -19,7 +22,6 @@ from dynamics.closed_loop.problem import (
     ServoGains,
     check_start_pose,
     checked_loop_parameters,
-    equilibrium,
 )
 from dynamics.robot import Robot
 
@@ -36,11 +38,12 @@ def frame_map(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose
     The state: coordinates, their rates, joint PID integrals, coordinates measured at the last frame, servo integrals,
     and the commands on their way, the latest first. Raises what `closed_loop.equilibrium` raises.
     """
-    parameters = checked_loop_parameters(robot, parameters)
-    check_start_pose(robot, parameters, pose)
-    motion, servo = _joint_loop(robot, parameters, pose), _servo(robot, parameters, settings, pose)
-    joints, size, timing = robot.layout.joints, len(robot.coordinate_names), settings.timing
-    period = 1 / timing.frame_rate_hz
+    return _frame_map(_near_rest(robot, parameters, pose), settings)
+
+
+def _frame_map(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
+    (joints, size), timing = robot.jacobian.shape, settings.timing
+    period, servo = 1 / timing.frame_rate_hz, _servo(robot, settings)
     whole = floor(timing.latency_s / period + 1e-9)
     rest = max(0.0, timing.latency_s - whole * period)
     inner, kept = 2 * size + joints, whole + 2
@@ -55,24 +58,25 @@ def frame_map(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose
         slope = (newer - older) / period
         at_once = older + ramp * (newer - older)
         moving = slope if timing.hold == "linear" else 0 * slope
-        state = expm(motion * (end - begin))[:inner] @ np.vstack([state, at_once, moving, slope])
+        state = expm(robot.motion * (end - begin))[:inner] @ np.vstack([state, at_once, moving, slope])
     return np.vstack([state, coordinates, integral - period * coordinates, *commands[:kept]])
 
 
 def spectral_radius(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> float:
     """Largest magnitude of the eigenvalues of `frame_map`: the loop is stable below 1."""
-    return float(np.abs(np.linalg.eigvals(frame_map(robot, parameters, settings, pose))).max())
+    return _radius(_near_rest(robot, parameters, pose), settings)
 
 
 def gain_margin(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> float:
     """Factor by which the gains of the servo may grow, or below 1 have to shrink, until the loop is just stable."""
+    near = _near_rest(robot, parameters, pose)
 
     def radius(factor: float) -> float:
         gains = settings.servo
         servo = ServoGains(factor * gains.kp, factor * gains.kd, factor * gains.ki)
-        return spectral_radius(robot, parameters, replace(settings, servo=servo), pose)
+        return _radius(near, replace(settings, servo=servo))
 
-    return _last_stable(radius, 1.0, MOST_GAIN if radius(1.0) < 1 else 1 / MOST_GAIN)
+    return _last_stable(radius, 1.0, MOST_GAIN, 1 / MOST_GAIN)
 
 
 def lowest_frame_rate(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> float:
@@ -80,14 +84,14 @@ def lowest_frame_rate(robot: Robot, parameters: np.ndarray, settings: LoopSettin
 
     Above the settings' rate where it is not stable there. NaN where no rate makes it stable.
     """
-    rate = settings.timing.frame_rate_hz
+    rate, near = settings.timing.frame_rate_hz, _near_rest(robot, parameters, pose)
 
     def radius(hz: float) -> float:
         timing = FrameTiming(hz, settings.timing.latency_s, settings.timing.hold)
-        return spectral_radius(robot, parameters, replace(settings, timing=timing), pose)
+        return _radius(near, replace(settings, timing=timing))
 
     fastest = min(100 * rate, 50 / settings.timing.latency_s if settings.timing.latency_s else np.inf)
-    return _last_stable(radius, rate, SLOWEST_HZ if radius(rate) < 1 else fastest)
+    return _last_stable(radius, rate, SLOWEST_HZ, fastest)
 
 
 def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> str:
@@ -98,9 +102,30 @@ def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: 
     if radius < 1:
         return f"{said}: it is lost far from there"
     rate = lowest_frame_rate(*arguments)
-    return (
-        f"{said}: {f'from {rate:.3g} Hz on it is' if rate > 0 else 'no frame rate makes it so'}, at {hz:g} Hz it is not"
-    )
+    instead = f"from {rate:.3g} Hz on it is" if rate > 0 else "no frame rate makes it so"
+    return f"{said}: {instead}, at {hz:g} Hz it is not"
+
+
+class _NearRest(NamedTuple):
+    """A robot near rest, as far as neither the servo's gains nor timing matter: how it moves, see `_joint_loop`; J
+    (n, m) of its coordinates, and the derivative (n, m) of J times the demand that holds the joints where they are."""
+
+    motion: np.ndarray
+    jacobian: np.ndarray
+    turning: np.ndarray
+
+
+def _near_rest(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> _NearRest:
+    parameters = checked_loop_parameters(robot, parameters)
+    check_start_pose(robot, parameters, pose)
+    jacobian = robot.coordinate_jacobian(pose)
+    demand = np.linalg.solve(jacobian, robot.inverse_kinematics(pose))
+    (turning,) = _values(robot, "rate_map_derivative", robot.coordinates(pose), demand)
+    return _NearRest(_joint_loop(robot, parameters, pose), jacobian, turning)
+
+
+def _radius(robot: _NearRest, settings: LoopSettings) -> float:
+    return float(np.abs(np.linalg.eigvals(_frame_map(robot, settings))).max())
 
 
 def _joint_loop(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> np.ndarray:
@@ -127,12 +152,10 @@ def _joint_loop(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> np.nd
     return system
 
 
-def _servo(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> np.ndarray:
+def _servo(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
     """The command of a frame by [coordinates, those measured before, servo integral before]."""
-    gains, period, q = settings.servo, 1 / settings.timing.frame_rate_hz, robot.coordinates(pose)
-    demand = gains.ki * equilibrium(robot, parameters, pose, gains).servo_integral
-    jacobian = robot.coordinate_jacobian(pose)
-    (turning,) = _values(robot, "rate_map_derivative", q, demand)
+    gains, period, jacobian = settings.servo, 1 / settings.timing.frame_rate_hz, robot.jacobian
+    turning = robot.turning if gains.ki else 0 * robot.turning  # without integral the servo demands nothing at rest
     by_now = turning - (gains.kp + gains.kd / period + gains.ki * period) * jacobian
     return np.hstack([by_now, gains.kd / period * jacobian, gains.ki * jacobian])
 
@@ -141,10 +164,12 @@ def _values(robot: Robot, name: str, *inputs: np.ndarray) -> list[np.ndarray]:
     return [output[0] for output in robot.functions[name](*[value[None] for value in inputs])]
 
 
-def _last_stable(radius: Callable[[float], float], start: float, end: float) -> float:
-    """Where on the way from start to end the radius first passes 1; the end, or NaN if that is not stable either."""
-    step = STEP if end > start else 1 / STEP
+def _last_stable(radius: Callable[[float], float], start: float, stable_end: float, other_end: float) -> float:
+    """Where the radius first passes 1 on the way from start to an end: the first of these if it is stable at the start,
+    which is then returned where all the way is; else the other, and NaN where no way is."""
     stable, value = radius(start) < 1, start
+    end = stable_end if stable else other_end
+    step = STEP if end > start else 1 / STEP
     while (value < end) == (step > 1):
         following = value * step
         if (radius(following) < 1) != stable:

@@ -17,6 +17,7 @@ from dynamics.expressions import function, symmetric_from_lower
 from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.platform import PlatformJointMotion, pose_rate_to_twist, twist_bias
 from dynamics.parameters import parameter_layout
+from dynamics.rigid_body.jacobians import freedoms
 from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 
 
@@ -28,7 +29,7 @@ def motion_functions(geometry: RobotGeometry) -> list[ca.Function]:
 def equation_of_motion(geometry: RobotGeometry) -> ca.Function:
     """(q, rate (m,), rigid (p,)) -> M (m, m), b (m,), J_theta (n, m), J_theta_dot rate (n,), theta (n,)."""
     layout, (q, rate) = parameter_layout(geometry.legs), _coordinates(geometry, "q", "rate")
-    (pose, pose_rate, rest), free = _poses(geometry, q, rate, 0 * rate), _basis(geometry)
+    (pose, pose_rate, rest), free = _poses(geometry, q, rate, 0 * rate), freedoms(geometry)
     rigid = ca.SX.sym("rigid", layout.rigid.stop)
     joints = _joints(geometry)
     to_twist = pose_rate_to_twist(joints.pose)
@@ -61,7 +62,7 @@ def motion_derivatives(geometry: RobotGeometry) -> ca.Function:
     The linear solve for q_ddot is left to the caller and never differentiated.
     """
     layout, (q, rate, acceleration) = parameter_layout(geometry.legs), _coordinates(geometry, "q", "rate", "gain")
-    motion, free = _poses(geometry, q, rate, acceleration), _basis(geometry)
+    motion, free = _poses(geometry, q, rate, acceleration), freedoms(geometry)
     torque, rigid = ca.SX.sym("torque", layout.joints), ca.SX.sym("rigid", layout.rigid.stop)
     joints = _joints(geometry)
     platform = _platform_columns(geometry, joints)
@@ -100,7 +101,7 @@ def rate_map_derivative(geometry: RobotGeometry) -> ca.Function:
         at_joint = ca.substitute(gradient, position, joints.position[number])
         along = joints.velocity[number].T @ curvature @ joints.gradient[number]
         rows.append(at_joint.T @ joints.gradient_rate[number] + along)
-    outputs = [ca.vertcat(*rows) @ _basis(geometry)]
+    outputs = [ca.vertcat(*rows) @ freedoms(geometry)]
     return function("rate_map_derivative", [q, rate], _at(joints, outputs, *motion))
 
 
@@ -108,14 +109,9 @@ def _coordinates(geometry: RobotGeometry, *names: str) -> list[ca.SX]:
     return [ca.SX.sym(name, len(geometry.chart.freedoms)) for name in names]
 
 
-def _basis(geometry: RobotGeometry) -> ca.DM:
-    """d(pose)/dq (6, m)."""
-    return ca.sparsify(ca.DM(np.array(geometry.chart.basis)))
-
-
 def _poses(geometry: RobotGeometry, q: ca.SX, rate: ca.SX, acceleration: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Pose (6,), its rate and its acceleration of coordinates (m,) and theirs."""
-    free = _basis(geometry)
+    free = freedoms(geometry)
     at_home = ca.SX(ca.DM(geometry.chart.pose(np.zeros(free.shape[1]))))
     return at_home + free @ q, ca.densify(free @ rate), ca.densify(free @ acceleration)
 

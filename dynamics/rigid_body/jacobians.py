@@ -11,6 +11,11 @@ from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.platform import pose_rate_to_twist, rotation_matrix
 
 
+def freedoms(geometry: RobotGeometry) -> ca.DM:
+    """d(pose)/d(coordinates) (6, m), which also spans the twists, without its zeros."""
+    return ca.sparsify(ca.DM(geometry.chart.basis))
+
+
 def platform_arms(geometry: RobotGeometry, pose: ca.SX) -> list[ca.SX]:
     """Vectors a from the platform origin to its joints (3,), base axes, m."""
     rotation = rotation_matrix(pose[3:6])
@@ -64,7 +69,7 @@ def singularity_measures(geometry: RobotGeometry, pose: ca.SX) -> tuple[ca.SX, c
         leverages.append(leg.leverage(pose[0:3] + arm))
         rows.append(ca.horzcat(direction.T, ca.cross(arm, direction).T))
     scale = np.repeat([1.0, 1 / geometry.characteristic_length], 3)
-    return ca.vertcat(*leverages), ca.vertcat(*rows) @ ca.DM(np.diag(scale) @ geometry.chart.basis)
+    return ca.vertcat(*leverages), ca.vertcat(*rows) @ ca.diag(ca.DM(scale)) @ freedoms(geometry)
 
 
 def loop_closure(geometry: RobotGeometry, pose: ca.SX, joints: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -74,4 +79,4 @@ def loop_closure(geometry: RobotGeometry, pose: ca.SX, joints: ca.SX) -> tuple[c
     gap = ca.vertcat(
         *[leg.gap(pose[0:3] + arm, joints[k]) for k, (leg, arm) in enumerate(zip(geometry.legs, arms, strict=True))]
     )
-    return gap, ca.jacobian(gap, pose) @ ca.DM(geometry.chart.basis)
+    return gap, ca.jacobian(gap, pose) @ freedoms(geometry)

@@ -7,13 +7,13 @@ positive definite, G the wrench that holds the robot up, and tau_g = M twist_dot
 """
 
 import casadi as ca
-import numpy as np
 
 from dynamics.expressions import function, symmetric_from_lower
 from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.platform import joint_motion, pose_rate_to_twist, rotation_matrix, twist_bias
 from dynamics.parameters import parameter_layout
 from dynamics.rigid_body.jacobians import (
+    freedoms,
     joint_coordinates,
     joint_jacobian,
     loop_closure,
@@ -126,7 +126,7 @@ def dynamic_functions(geometry: RobotGeometry) -> list[ca.Function]:
     bias = inertial_wrench(geometry, pose, twist, ca.SX.zeros(6), rigid)
     holding = inertial_wrench(geometry, pose, ca.SX(6, 1), ca.SX(6, 1), rigid)
     mass = mass_matrix(geometry, pose, rigid)
-    free = ca.sparsify(ca.DM(np.array(geometry.chart.basis)))
+    free = freedoms(geometry)
     diagonal, upper, order = ca.ldl(symmetric_from_lower(free.T @ mass @ free))
     acceleration = free @ ca.ldl_solve(free.T @ (jacobian.T @ (torque - friction) - bias), diagonal, upper, order)
     # Coulomb, then viscous friction: eq. 24 without its stray second v_E.

@@ -95,7 +95,7 @@ POINTS = 1000
 
 def comparison_figure(robot: Robot, scenario: Scenario, comparison: Comparison) -> Figure:
     """One column a method: position, orientation and joints over one period, limits dashed."""
-    settings, sliding = scenario.excitation, robot.layout.prismatic
+    settings = scenario.excitation
     figure = Figure(figsize=(5 * len(comparison.entries), 9), layout="constrained")
     panels = figure.subplots(3, len(comparison.entries), sharex=True, sharey="row", squeeze=False)
     time = np.linspace(0.0, 1.0 / settings.fundamental_hz, POINTS)
@@ -120,7 +120,7 @@ def comparison_figure(robot: Robot, scenario: Scenario, comparison: Comparison) 
         panels[2, column].set_xlabel("time [s]")
     for axes, label in zip(
         panels[:, 0],
-        ("position from home [mm]", "orientation from home [mrad]", f"joint [{'m' if sliding else 'rad'}]"),
+        ("position from home [mm]", "orientation from home [mrad]", f"joint [{robot.layout.joint_unit}]"),
         strict=True,
     ):
         axes.set_ylabel(label)

@@ -179,7 +179,7 @@ class MotionConstraints:
     def __init__(self, robot: Robot, scenario: Scenario, sight: SightLines | None = None) -> None:
         settings, geometry, chart = scenario.excitation, robot.geometry, robot.geometry.chart
         margin, velocity = (of_actuators(robot, settings, key) for key in ("travel_margin", "max_joint_velocity"))
-        travel, unit = robot.travel_limit - margin, "m" if robot.layout.prismatic else "rad"
+        travel, unit = robot.travel_limit - margin, robot.layout.joint_unit
         if travel <= 0:
             raise TrajectoryError(
                 f"excitation.travel_margin_{unit} = {margin:g} {unit} leaves nothing of the travel limit "

@@ -21,7 +21,7 @@ from scipy.linalg import null_space
 from dynamics import Robot
 from dynamics.kinematics.chart import Chart
 from dynamics.kinematics.platform import pose_rate_to_twist, twist_bias
-from dynamics.rigid_body.jacobians import joint_jacobian
+from dynamics.rigid_body.jacobians import freedoms, joint_jacobian
 from dynamics.rigid_body.virtual_work import rigid_body_regressor
 from identify.arrays import Array
 from identify.scenario import Excitation
@@ -164,7 +164,7 @@ def regressor(robot: Robot, smoothing: float | None, of: Literal["wrench", "torq
     jacobian = joint_jacobian(robot.geometry, pose)
     velocity = jacobian @ twist
     sign = ca.sign(velocity) if smoothing is None else ca.tanh(velocity / smoothing)
-    free = ca.sparsify(ca.DM(robot.geometry.chart.basis))
+    free = freedoms(robot.geometry)
     rigid, along = free.T @ rigid_body_regressor(robot.geometry, pose, twist, twist_dot), jacobian @ free
     friction = ca.horzcat(ca.diag(sign), ca.diag(velocity))
     if of == "torque":

@@ -15,7 +15,6 @@ from dynamics import Robot, closed_loop, workspace
 from dynamics.closed_loop import stability
 from dynamics.errors import DynamicsError
 from dynamics.inertia import acceleration_changes, grouped, physical_inertias
-from dynamics.kinematics import forward_kinematics
 from identify.arrays import Array
 from identify.estimation.base_parameters import base_parameters, structural_regressor
 from identify.progress import Progress, SilentProgress
@@ -80,21 +79,18 @@ def _freedoms(robot: Robot) -> Iterator[Finding]:
 
 def _travel(robot: Robot, limits: Excitation) -> Iterator[Finding]:
     """At home, then over the travel: what `workspace.check_motion` judges."""
-    unit, limit = "m" if robot.layout.prismatic else "rad", robot.travel_limit
+    unit, limit = robot.layout.joint_unit, robot.travel_limit
     at_home = workspace.measure(robot, robot.home_pose)
     yield from _extremes("at home", at_home, limits)
     most, leg = _worst(np.abs(at_home.theta), np.argmax)
     text = f"joint {leg} is {most:.3g} {unit} from zero at home, of a travel of {limit:g} {unit}"
     yield Finding("travel at home", most <= limit, most, limit, unit, leg, text)
-    joints = np.random.default_rng(0).uniform(-limit, limit, (SAMPLES, robot.layout.joints))
-    start = np.tile(robot.home_pose, (SAMPLES, 1))
-    poses, residual = forward_kinematics.search(robot.functions, robot.geometry.chart, joints, start)
-    solved = (residual < forward_kinematics.ANGLE_TOLERANCE).all(axis=1)
-    share = float(solved.mean())
+    travel = workspace.measure_travel(robot, SAMPLES)
+    share = len(travel.theta) / SAMPLES
     text = f"{100 * share:.1f} % of {SAMPLES} random joint coordinates within the travel have a pose near home"
     yield Finding("travel closes", share > 0, share, 0.0, "1", None, text)
-    if solved.any():
-        yield from _extremes("over the travel", workspace.measure(robot, poses[solved]), limits)
+    if share > 0:
+        yield from _extremes("over the travel", travel, limits)
 
 
 def _extremes(where: str, measures: workspace.WorkspaceMeasures, limits: Excitation) -> Iterator[Finding]:

@@ -10,7 +10,6 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from dynamics import Robot, workspace
-from dynamics.kinematics import forward_kinematics
 from identify.arrays import Array
 from identify.progress import Progress, SilentProgress
 from identify.reporting.figures import COMPONENTS
@@ -105,14 +104,9 @@ def map_workspace(robot: Robot, progress: Progress | None = None, points: int = 
                 advance()
         ranges = np.array([_range(robot, axis, step if axis < 3 else turn) for axis in axes])
         advance()
-        limit = robot.travel_limit
-        theta = np.random.default_rng(0).uniform(-limit, limit, (JOINT_SAMPLES, robot.layout.joints))
-        start = np.tile(robot.home_pose, (JOINT_SAMPLES, 1))
-        poses, residual = forward_kinematics.search(robot.functions, robot.geometry.chart, theta, start)
-        solved = (residual < forward_kinematics.ANGLE_TOLERANCE).all(axis=1)
-        travel = workspace.measure(robot, poses[solved])
+        travel = workspace.measure_travel(robot, JOINT_SAMPLES)
         advance()
-    unit, home = "m" if robot.layout.prismatic else "rad", workspace.measure(robot, robot.home_pose)
+    unit, home = robot.layout.joint_unit, workspace.measure(robot, robot.home_pose)
     return WorkspaceMap(robot.name, unit, axes, length, tuple(planes), ranges, home, travel)
 
 
