@@ -23,8 +23,8 @@ from identify.files.dataset import (
     check_variables,
     described_dataset,
     joint_numbers,
-    of_actuators,
     read_group,
+    with_joint_units,
 )
 from identify.scenario import Timing
 
@@ -110,7 +110,10 @@ def measure_joints(
     read = angle + instruments.encoder_noise * rng.standard_normal(angle.shape)
     step = instruments.encoder_resolution
     read = step * np.round(read / step) if step else read
-    values, variables = {"joint_torque": torque, "joint_angle": read}, of_actuators(VARIABLES, instruments.prismatic)
+    values, variables = (
+        {"joint_torque": torque, "joint_angle": read},
+        with_joint_units(VARIABLES, instruments.prismatic),
+    )
     channels = described_dataset(values, record["time"].values, variables, joint=joint_numbers(torque))
     return channels.assign_attrs(instruments.figures)
 

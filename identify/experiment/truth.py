@@ -15,9 +15,9 @@ from identify.files.dataset import (
     check_variables,
     described_dataset,
     joint_numbers,
-    of_actuators,
     pose_parts,
     read_group,
+    with_joint_units,
 )
 from identify.record.recording import TRUTH_GROUP, run_names
 
@@ -65,7 +65,7 @@ def build_truth(
             **{name: np.asarray(values, dtype=float) for name, values in (mismatch or {}).items()},
         },
         time,
-        of_actuators(VARIABLES | {name: MISMATCH[name] for name in mismatch or {}}, prismatic),
+        with_joint_units(VARIABLES | {name: MISMATCH[name] for name in mismatch or {}}, prismatic),
         parameter=list(parameter_names),
         joint=joint_numbers(joint_angle),
     )

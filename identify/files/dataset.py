@@ -96,7 +96,7 @@ SLIDING_UNITS = {"rad": "m", "rad/s": "m/s", "N m": "N"}
 """Units of what is said of joints where actuators slide, by those where they turn."""
 
 
-def of_actuators(variables: Variables, prismatic: bool) -> Variables:
+def with_joint_units(variables: Variables, prismatic: bool) -> Variables:
     """The variables with the units of joints that slide, where a robot's do."""
     if not prismatic:
         return variables

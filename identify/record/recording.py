@@ -23,9 +23,9 @@ from identify.files.dataset import (
     described_dataset,
     group_names,
     joint_numbers,
-    of_actuators,
     pose_parts,
     read_group,
+    with_joint_units,
     write_groups,
 )
 from identify.files.versions import versions
@@ -92,7 +92,7 @@ def build_record(
             "command": np.asarray(command, dtype=float),
         },
         time,
-        of_actuators(VARIABLES, prismatic),
+        with_joint_units(VARIABLES, prismatic),
         joint=joint_numbers(command),
     )
     record.attrs = {

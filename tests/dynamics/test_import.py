@@ -18,6 +18,7 @@ from dynamics.robot_file import RobotDescription
 from dynamics.robot_text import robot_text
 from tests.dynamics.conftest import SLOW_ROBOTS
 from tests.dynamics.urdf import urdf_of
+from tests.identify.commands import refusal
 
 
 def with_bodies(robot):
@@ -207,9 +208,7 @@ def test_a_model_of_no_known_kind_is_refused_in_one_line(robot, old, new, words,
     text = re.sub("<keyframe>.*</keyframe>", "", mjcf_text(robot, with_bodies(robot)), flags=re.DOTALL)
     assert old in text
     (tmp_path / "robot.xml").write_text(text.replace(old, new, 1), encoding="utf-8")
-    with pytest.raises(RobotFileError, match=words) as caught:
-        robot_of_mjcf(tmp_path / "robot.xml")
-    assert "\n" not in str(caught.value)
+    assert re.search(words, refusal(RobotFileError, robot_of_mjcf, tmp_path / "robot.xml"))
 
 
 @pytest.mark.parametrize(
@@ -240,6 +239,4 @@ def test_a_urdf_of_no_known_kind_is_refused_in_one_line(robot, which, old, new, 
     texts = dict(zip(("urdf", "yaml"), urdf_of(robot, with_bodies(robot), False), strict=True))
     assert old in texts[which]
     texts[which] = texts[which].replace(old, new, 1)
-    with pytest.raises(RobotFileError, match=words) as caught:
-        robot_of(tmp_path, texts["urdf"], texts["yaml"])
-    assert "\n" not in str(caught.value)
+    assert re.search(words, refusal(RobotFileError, robot_of, tmp_path, texts["urdf"], texts["yaml"]))
