@@ -4,7 +4,9 @@ Sensor noise enters twice: in the measured poses, and through the servo in the p
 closes its own loop cannot follow (its residuals are coloured, and stick-slip makes the response nonlinear). So the
 experiment is repeated on the identified model with drawn noise: each draw gives residuals r, and their scores J^T r
 spread as those of the real record do. With W the information of data and prior, the covariance of the estimate is
-W^-1 (cov(J^T r) + prior information) W^-1. A model driven by the logged commands has white residuals, and W^-1 is all.
+W^-1 (cov(J^T r) + prior information) W^-1. Of the latter, the part of the starting guess is what its errors alone would
+make of the estimate: they are the same in every record that is taken. A model driven by the logged commands has white
+residuals, and W^-1 is all.
 Where either misses the record by more than noise explains, what its error does to the scores is added (`explanation`).
 It is all computed in units where W is one.
 
@@ -40,11 +42,12 @@ FEWEST = 50
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Covariance (p, p) of the estimate, were there no bounds; information (p, p) that the poses alone hold;
-    gradient (p,): J^T r of poses and all that is known beside them, at the estimate; misfit of the record; unstable:
-    repeated experiments that ended early and were left out."""
+    """Covariance (p, p) of the estimate, were there no bounds, and the part of it (p, p) that errors of the starting
+    guess make; information (p, p) that the poses alone hold; gradient (p,): J^T r of poses and all that is known beside
+    them, at the estimate; misfit of the record; unstable: repeated experiments that ended early and were left out."""
 
     covariance: Array
+    of_guess: Array
     information: Array
     gradient: Array
     misfit: Misfit
@@ -88,7 +91,8 @@ def estimate_uncertainty(
         scores = scores + load_score_covariance(problem.runs, informations, units)
     prior = _information(known_rows @ units)
     covariance = units @ (scores + prior) @ units.T
-    return Uncertainty((covariance + covariance.T) / 2, information, np.asarray(gradient), misfit, unstable)
+    of_guess = np.asarray(_information(problem.guess.rows @ units @ units.T))
+    return Uncertainty((covariance + covariance.T) / 2, of_guess, information, np.asarray(gradient), misfit, unstable)
 
 
 def load_score_covariance(runs: Sequence[RecordedRun], information: Sequence[Array], units: Array) -> Array:

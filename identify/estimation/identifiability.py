@@ -13,13 +13,15 @@ large as they are, though the guess may have it vanish: known to a fraction of t
 own relative error may be anything.
 
 Groups are the base parameters, the combinations that a record can show: what is known of one follows from its members
-by linear propagation, and it is often known well where none of them is. Poses show the groups and the gains; the scale
-anchor adds what it measures. A parameter that is none of these, nor a combination of them, may be estimated with a
-small standard deviation all the same: where the guess knows the other members of a sum well enough for that, however
-vaguely in their own units. Such an estimate rests on the prior: it is as good as what the guess says of them, and its
-interval holds the truth where that does. A mass shown only in link4.Ixx - 0.0227 link4.mass is one: it rests on the
-guess of link4.Ixx. The common factor of all parameters counts as known by its anchor; where that is the prior, no
-parameter is on its own.
+by linear propagation, and it is often known well where none of them is. Poses show the groups and the gains up to their
+common factor; the scale anchor adds what it measures. A parameter that is none of these, nor a combination of them, may
+be estimated with a small standard deviation all the same: where the guess knows the other members of a sum well enough
+for that, however vaguely in their own units. A mass shown only in link4.Ixx - 0.0227 link4.mass is one: it rests on the
+guess of link4.Ixx. Where errors of the guess make more than half of an estimate's variance, it rests on the prior: it
+is as good as what the guess says, which is the same in every record, and its interval holds the truth where that does.
+
+The common factor may rest on it, too: weighing a platform does not fix it where poses show the platform's mass only in
+a sum with others that are heavy. The gains tell, since poses show them but for this factor.
 
 Conditioning says how unevenly a record tells the parameters apart. The information is taken in units of the starting
 guess: an eigenvalue of one is a direction that the record shows as well as the guess knows it. With the guess the
@@ -55,6 +57,9 @@ from identify.scenario import Scenario
 IDENTIFIABLE_SHARE = 0.5
 """Of the guess's standard deviation and of the size: what the record may leave of an identified quantity."""
 
+RESTS_ON_PRIOR = 0.5
+"""Of an estimate's variance: what errors of the starting guess make of it where it rests on the prior."""
+
 FRICTION_SHARE = 0.1
 """Of the holding torque or force: an ordinary Coulomb friction, and viscous friction at 1 rad/s or 1 m/s."""
 
@@ -86,7 +91,8 @@ def identifiability(guess: StartingGuess, robot: Robot, model_holds: bool = True
 class GroupEstimates:
     """Base parameters of the dynamic parameters, one row each: what they are, and what is known of them.
 
-    combinations (rank, p); initial, estimate, std (rank,), SI units of the leading parameter; identifiable (rank,).
+    combinations (rank, p); initial, estimate, std (rank,), SI units of the leading parameter; identifiable (rank,);
+    prior_share (rank,): of the variance.
     """
 
     names: tuple[str, ...]
@@ -96,6 +102,12 @@ class GroupEstimates:
     estimate: Array
     std: Array
     identifiable: NDArray[np.bool_]
+    prior_share: Array
+
+    @property
+    def rests_on_prior(self) -> NDArray[np.bool_]:
+        """Whether each group (rank,) is identified only with what the starting guess says of other parameters."""
+        return self.identifiable & (self.prior_share > RESTS_ON_PRIOR)
 
 
 def group_rows(base: BaseParameters) -> Array:
@@ -104,9 +116,9 @@ def group_rows(base: BaseParameters) -> Array:
 
 
 def group_estimates(
-    base: BaseParameters, guess: StartingGuess, criterion: Identifiability, estimate: Array, covariance: Array
+    base: BaseParameters, guess: StartingGuess, criterion: Identifiability, estimate: Array, uncertainty: Uncertainty
 ) -> GroupEstimates:
-    """Estimates of the groups from parameters (p,) and their covariance (p, p)."""
+    """Estimates of the groups from parameters (p,) and their uncertainty."""
     rows = group_rows(base)
     return GroupEstimates(
         names=base.group_names(),
@@ -114,32 +126,28 @@ def group_estimates(
         combinations=base.combinations,
         initial=rows @ guess.values,
         estimate=rows @ estimate,
-        std=combined_std(rows, covariance),
-        identifiable=criterion.judge(rows, covariance),
+        std=combined_std(rows, uncertainty.covariance),
+        identifiable=criterion.judge(rows, uncertainty.covariance),
+        prior_share=prior_share(rows, uncertainty),
     )
 
 
-ROUNDING = 1e-6
-"""Of a unit vector: what may be left of it outside the combinations that are shown, in units of the sizes."""
+def prior_share(rows: Array, uncertainty: Uncertainty) -> Array:
+    """What share of the variance of each quantity rows (n, p) @ parameters is made by errors of the starting guess."""
+    return np.asarray((combined_std(rows, uncertainty.of_guess) / combined_std(rows, uncertainty.covariance)) ** 2)
 
 
-def rests_on_prior(
-    base: BaseParameters, guess: StartingGuess, anchor: ScaleAnchor, estimate: Array, sizes: Array
-) -> NDArray[np.bool_]:
-    """Whether each of the p parameters is no combination of what record and anchor show.
-
-    estimate (p,): the direction of the common factor; sizes (p,): the unit in which each parameter is counted.
-    """
-    gains = np.eye(len(sizes))[base.combinations.shape[1] :]
-    shown = np.concatenate([group_rows(base), gains, anchor.row(guess.layout)[0]]) * sizes
-    if anchor.name == "prior":
-        factor = estimate / sizes
-        shown = shown - np.outer(shown @ factor, factor) / (factor @ factor)
-    shown /= np.linalg.norm(shown, axis=1, keepdims=True)
-    _, singular, directions = np.linalg.svd(shown, full_matrices=False)
-    span = directions[singular > ROUNDING * singular[0]]
-    outside = np.eye(len(sizes)) - span.T @ span
-    return np.asarray(np.linalg.norm(outside, axis=1) > ROUNDING)
+def scale_warnings(anchor: ScaleAnchor, share: float) -> tuple[str, ...]:
+    """One line where an instrument was to fix the scale, and the starting guess makes most of the variance, a `share`,
+    of the controller's gain."""
+    if anchor.value is None or share <= RESTS_ON_PRIOR:
+        return ()
+    return (
+        f"the scale anchor {anchor.name} does not fix the scale of this robot: {share:.0%} of the variance of "
+        "joint_pid.lp comes from the starting guess, because poses show what was measured only in sums with other "
+        "parameters; all that is given in kg, N m or N is as good as the guess: take identification.scale_anchor = "
+        "joint_gain, or state what else was weighed in identification.prior",
+    )
 
 
 POOR = 1e13
@@ -195,12 +203,12 @@ def conditioning(
 
 @dataclass(frozen=True)
 class Judgement:
-    """identifiable, rests_on_prior (p,) bool; intervals (p, 2) and group_intervals: 95 %, cut at the bounds;
-    base_rank: independent groups that the references excite by the paper's rule; active_bounds: what holds the estimate
-    back; warnings: what a reader must know before believing any of it."""
+    """identifiable (p,) bool; prior_share (p,): of the variance, what errors of the guess make; intervals (p, 2) and
+    group_intervals: 95 %, cut at the bounds; base_rank: independent groups that the references excite by the paper's
+    rule; active_bounds: what holds the estimate back; warnings: what a reader must know before believing any of it."""
 
     identifiable: NDArray[np.bool_]
-    rests_on_prior: NDArray[np.bool_]
+    prior_share: Array
     intervals: Array
     groups: GroupEstimates
     group_intervals: Array
@@ -221,7 +229,8 @@ def judge(
     robot, guess, estimate = problem.runs[0].robot, problem.guess, solution.parameters
     base, known = base_parameters(structural_regressor(robot), robot.layout), problem.known_information()
     criterion = identifiability(guess, robot, model_holds=explanation.model_holds)
-    identifiable = criterion.judge(np.eye(len(estimate)), uncertainty.covariance)
+    each = np.eye(len(estimate))
+    share = prior_share(each, uncertainty)
     conditioned = conditioning(uncertainty.information, known, base, guess, estimate)
     bounded = bounded_estimate(
         estimate,
@@ -233,10 +242,10 @@ def judge(
     )
     of_the_records = (warning for run in problem.runs for warning in run.warnings())
     return Judgement(
-        identifiable=identifiable,
-        rests_on_prior=identifiable & rests_on_prior(base, guess, problem.anchor, estimate, criterion.sizes),
-        intervals=bounded.intervals(np.eye(len(estimate))),
-        groups=group_estimates(base, guess, criterion, estimate, uncertainty.covariance),
+        identifiable=criterion.judge(each, uncertainty.covariance),
+        prior_share=share,
+        intervals=bounded.intervals(each),
+        groups=group_estimates(base, guess, criterion, estimate, uncertainty),
         group_intervals=bounded.intervals(group_rows(base)),
         conditioning=conditioned,
         base_rank=_excited_rank(problem, scenario),
@@ -247,6 +256,7 @@ def judge(
             *explanation.warnings(),
             *bounded.warnings(),
             *conditioned.warnings(),
+            *scale_warnings(problem.anchor, share[robot.layout.names.index("joint_pid.lp")]),
         ),
     )
 

@@ -27,6 +27,11 @@ class StartingGuess:
     values: Array
     std: Array
 
+    @property
+    def rows(self) -> Array:
+        """What it says as equations of the parameters, in standard deviations (p, p)."""
+        return np.diag(1 / self.std)
+
 
 def starting_guess(
     robot: Robot, set_name: str, relative_std: float, known: Mapping[str, PriorValue] = MappingProxyType({})
@@ -83,6 +88,6 @@ def friction(layout: ParameterLayout) -> NDArray[np.bool_]:
 def prior_residuals(parameters: Array, guess: StartingGuess, anchor: ScaleAnchor) -> tuple[Array, Array]:
     """Residuals (k,) of what is known beside the poses, in standard deviations, and their rows (k, p)."""
     place, measured = anchor.row(guess.layout)
-    rows = np.vstack([np.diag(1 / guess.std), place])
+    rows = np.vstack([guess.rows, place])
     values = np.concatenate([guess.values / guess.std, measured])
     return rows @ parameters - values, rows

@@ -13,7 +13,7 @@ from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.estimation.covariance import correlation_matrix, strongest_pairs
 from identify.estimation.explanation import Misfit, Whiteness
-from identify.estimation.identifiability import Conditioning, GroupEstimates
+from identify.estimation.identifiability import RESTS_ON_PRIOR, Conditioning, GroupEstimates
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.files.dataset import POSE
 from identify.files.run_folder import save_result
@@ -30,11 +30,11 @@ class IdentificationResult:
     """What one record says about the parameters of a robot, in the order of its `layout`; SI.
 
     initial, warm_start, estimate, std (p,), covariance (p, p), the last two as they were without bounds; intervals
-    (p, 2): 95 %, cut at the bounds; identifiable (p,) bool; rests_on_prior (p,) bool: identified, but only with what
-    the guess says of other parameters; groups, group_intervals: what the record says of the base parameters;
-    base_rank: independent groups that the trajectory excites by the paper's rule; iterations and evaluations: of all
-    searches; stop_reason: of the last; searches: their names in order, and costs: after each iteration, one tuple a
-    search; active_bounds: what holds the estimate back, as "platform.Izz <= Ixx + Iyy";
+    (p, 2): 95 %, cut at the bounds; identifiable (p,) bool; prior_share (p,): of the variance, what errors of the
+    starting guess make; groups, group_intervals: what the record says of the base parameters; base_rank: independent
+    groups that the trajectory excites by the paper's rule; iterations and evaluations: of all searches; stop_reason: of
+    the last; searches: their names in order, and costs: after each iteration, one tuple a search; active_bounds: what
+    holds the estimate back, as "platform.Izz <= Ixx + Iyy";
     noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what the sensor's noise alone
     would leave, give or take noise_ratio_std; whiteness: test of the residuals of the model driven by the logged
     commands.
@@ -48,7 +48,7 @@ class IdentificationResult:
     covariance: Array
     intervals: Array
     identifiable: NDArray[np.bool_]
-    rests_on_prior: NDArray[np.bool_]
+    prior_share: Array
     groups: GroupEstimates
     group_intervals: Array
     conditioning: Conditioning
@@ -66,6 +66,11 @@ class IdentificationResult:
     whiteness: Whiteness
     warnings: tuple[str, ...]
     seconds: dict[str, float]
+
+    @property
+    def rests_on_prior(self) -> NDArray[np.bool_]:
+        """Whether each parameter (p,) is identified only with what the starting guess says of others."""
+        return self.identifiable & (self.prior_share > RESTS_ON_PRIOR)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -133,6 +138,7 @@ class IdentificationResult:
             "interval": self.intervals[k].tolist(),
             "identifiable": bool(self.identifiable[k]),
             "rests_on_prior": bool(self.rests_on_prior[k]),
+            "prior_share": self.prior_share[k],
         }
 
     def _group(self, k: int) -> dict[str, Any]:
@@ -146,4 +152,6 @@ class IdentificationResult:
             "std": groups.std[k],
             "interval": self.group_intervals[k].tolist(),
             "identifiable": bool(groups.identifiable[k]),
+            "rests_on_prior": bool(groups.rests_on_prior[k]),
+            "prior_share": groups.prior_share[k],
         }

@@ -131,9 +131,9 @@ def examination(evidence: Evidence, true: Array, unseen: Sequence[tuple[xr.Datas
     robot = evidence.run.robot
     base = base_parameters(structural_regressor(robot), robot.layout)
     driven = evidence.problem.driven_by_commands()
-    covariance = estimate_uncertainty(driven, true, np.random.default_rng(0)).covariance
+    uncertainty = estimate_uncertainty(driven, true, np.random.default_rng(0))
     guess = evidence.problem.guess
-    groups = group_estimates(base, guess, identifiability(guess, robot), true, covariance)
+    groups = group_estimates(base, guess, identifiability(guess, robot), true, uncertainty)
     # A relative error says nothing of a difference that almost vanishes.
     shown: NDArray[np.bool_] = groups.identifiable & (groups.std < IDENTIFIABLE_SHARE * np.abs(groups.estimate))
     if not shown.any():

@@ -29,13 +29,17 @@ pytestmark = [pytest.mark.thorough, pytest.mark.xdist_group("coverage")]  # whos
 BLOCK = 10
 """Experiments with one teaching."""
 
+KNOWN_GAIN = {"identification.scale_anchor": "joint_gain"}
+"""What fixes the scale of every robot. Weighing the platform does only where other masses beside it are small: else the
+scale rests on the starting guess, which is the same in all experiments and says nothing of how often intervals hold."""
+
 CHANGES = {"renderer": "analytic", "excitation.method": "gradient", "excitation.duration_s": 10.0}
 LOWEST, HIGHEST = 0.93, 0.97
 
 
-def experiment_rows(count: int, processes: int, robot: str = "rss6") -> list[dict]:
+def experiment_rows(count: int, processes: int, robot: str = "rss6", **settings) -> list[dict]:
     """Rows of the first `count` experiments with a robot."""
-    scenario = load_scenario("paper").with_overrides(CHANGES | {"robot": robot})
+    scenario = load_scenario("paper").with_overrides(CHANGES | {"robot": robot} | settings)
     trajectory = design_trajectories(load_robot(robot), scenario, 0).excitation
     blocks = [range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)]
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
@@ -139,7 +143,7 @@ def test_intervals_of_every_robot_cover(robot, record_property):
     """Twenty experiments with each: 90 to 99 % of the intervals of what is identified hold the truth."""
     hits = [
         inside
-        for row in experiment_rows(20, 2, robot)
+        for row in experiment_rows(20, 2, robot, **KNOWN_GAIN)
         for _, _, identified, inside in row["quantities"].values()
         if identified
     ]
