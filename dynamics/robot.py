@@ -26,6 +26,7 @@ from dynamics.errors import (
 from dynamics.geometry import RobotGeometry
 from dynamics.kinematics import forward_kinematics
 from dynamics.kinematics.chart import POSE_NAMES
+from dynamics.kinematics.forward_kinematics import ForwardSolution
 from dynamics.parameters import parameter_layout
 from dynamics.rigid_body.equation_of_motion import motion_functions
 from dynamics.rigid_body.virtual_work import robot_functions
@@ -53,7 +54,10 @@ class Robot:
     [h_dot, omega] in base axes; SI units and rad. What of a pose the platform can change are its coordinates (m,), see
     `pose` and `coordinates`; joint coordinates (n,) are angles, or lengths where actuators slide (then N and N s/m take
     the place of N m and N m s/rad). Every method also takes batches with a leading axis (N, 6), and then returns one
-    more axis. `parameters` (p,) or (N, p) follow `parameter_names`; None means `nominal_parameters`, the set `initial`.
+    more axis. `parameters` (p,) or (N, p) follow `parameter_names`, such as "platform.mass" and "joint1.coulomb"; None
+    means `nominal_parameters`, the set `initial`. `parameter_sets` has all sets of the file by name, `layout` where
+    each parameter stands and its unit, `geometry` joints, legs and chart.
+
     Methods raise ShapeError for wrong shapes or entries that are not finite, ParameterError for parameters outside
     their range, ChartError for a pose or a twist that the platform cannot have, UnreachablePoseError for a pose beyond
     a leg's reach, SingularPoseError where a Jacobian is singular.
@@ -107,7 +111,14 @@ class Robot:
     def forward_kinematics(self, theta: ArrayLike, initial_pose: ArrayLike | None = None) -> np.ndarray:
         """Pose (6,) of joint coordinates (n,) by Newton's method from `initial_pose` (home by default).
 
-        Raises ConvergenceError, naming the residual, when no pose near the start has these coordinates.
+        Raises ConvergenceError as `solve_forward_kinematics`.
+        """
+        return self.solve_forward_kinematics(theta, initial_pose).pose
+
+    def solve_forward_kinematics(self, theta: ArrayLike, initial_pose: ArrayLike | None = None) -> ForwardSolution:
+        """`forward_kinematics` with how the search converged: pose (6,), iterations () and residual (n,), rad or m.
+
+        Raises ConvergenceError, naming leg and residual, when no pose near the start has these coordinates.
         """
         theta = rows("theta", theta, self.layout.joints)
         start = self.home_pose if initial_pose is None else self.charted(initial_pose, "initial_pose")
@@ -125,8 +136,8 @@ class Robot:
         centre = geometry.base_joints.mean(axis=0)
         reach = np.linalg.norm(geometry.joints_at(self.home_pose) - geometry.base_joints, axis=1).max()
         radius = float(np.linalg.norm(geometry.base_joints - centre, axis=1).max() + reach)
-        count = whole("starts", starts, DynamicsError, least=1)
-        return forward_kinematics.assembly_modes(self.functions, geometry.chart, joints, centre, radius, count, seed)
+        count, drawn = whole("starts", starts, DynamicsError, least=1), whole("seed", seed, DynamicsError, least=0)
+        return forward_kinematics.assembly_modes(self.functions, geometry.chart, joints, centre, radius, count, drawn)
 
     def joint_jacobian(self, pose: ArrayLike) -> np.ndarray:
         """J_ad (n, 6): theta_dot = J_ad twist (eq. 8)."""

@@ -121,8 +121,8 @@ def measure_travel(robot: Robot, samples: int) -> WorkspaceMeasures:
     limit = robot.travel_limit
     joints = np.random.default_rng(0).uniform(-limit, limit, (samples, robot.layout.joints))
     start = np.tile(robot.home_pose, (samples, 1))
-    poses, residual = forward_kinematics.search(robot.functions, robot.geometry.chart, joints, start)
-    return measure(robot, poses[(residual < forward_kinematics.ANGLE_TOLERANCE).all(axis=1)])
+    found = forward_kinematics.search(robot.functions, robot.geometry.chart, joints, start)
+    return measure(robot, found.pose[found.converged])
 
 
 def check_motion(

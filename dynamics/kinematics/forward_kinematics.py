@@ -5,6 +5,7 @@ pose found this way may have a leg in another assembly; the closed-form inverse 
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,6 +21,9 @@ ANGLE_TOLERANCE = 1e-12
 MAX_ITERATIONS = 50
 HALVINGS = 20
 
+# A gap of squared lengths, in m^2, that is rounding.
+CLOSED = 1e-14
+
 # Poses nearer than this share of the radius in which they were searched, and so near in rotation, are one.
 SAME = 1e-5
 
@@ -28,8 +32,23 @@ Functions = Mapping[str, MachineFunction]
 """Compiled functions of a robot, of which `loop_closure` and `inverse_kinematics` are asked for."""
 
 
-def solve(functions: Functions, chart: Chart, theta: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Pose (6,) or (N, 6) whose joint coordinates (n,) or (N, n) are theta, searched from start (6,) or (N, 6).
+@dataclass(frozen=True)
+class ForwardSolution:
+    """Poses (6,) or (N, 6) that a search ended with, Newton steps () or (N,) that it took, and what the joint
+    coordinates there lack of those asked for (n,) or (N, n), rad or m: NaN where a leg cannot reach."""
+
+    pose: np.ndarray
+    iterations: np.ndarray
+    residual: np.ndarray
+
+    @property
+    def converged(self) -> np.ndarray:
+        """Whether each row () or (N,) has the joint coordinates asked for, to ANGLE_TOLERANCE."""
+        return np.asarray((self.residual < ANGLE_TOLERANCE).all(axis=-1))
+
+
+def solve(functions: Functions, chart: Chart, theta: np.ndarray, start: np.ndarray) -> ForwardSolution:
+    """Poses whose joint coordinates (n,) or (N, n) are theta, searched from start (6,) or (N, 6).
 
     Raises ConvergenceError with row, leg and residual where no pose near the start has these coordinates.
     """
@@ -39,9 +58,10 @@ def solve(functions: Functions, chart: Chart, theta: np.ndarray, start: np.ndarr
             f"initial_pose has shape {start.shape}, must be (6,) or one row for each of theta {theta.shape}"
         )
     poses = np.array(np.broadcast_to(start, (len(angles), 6)))
-    poses, residual = search(functions, chart, angles, poses)
-    _check(functions, angles, poses, residual)
-    return poses.reshape(*theta.shape[:-1], 6)
+    found = search(functions, chart, angles, poses)
+    _check(functions, angles, found)
+    rows, residual = theta.shape[:-1], found.residual.reshape(theta.shape)
+    return ForwardSolution(found.pose.reshape(*rows, 6), found.iterations.reshape(rows), residual)
 
 
 def assembly_modes(
@@ -55,8 +75,8 @@ def assembly_modes(
     rng = np.random.default_rng(seed)
     turns = Rotation.random(starts, random_state=rng).as_euler("XYZ")
     drawn = np.hstack([centre + radius * rng.uniform(-1, 1, (starts, 3)), turns])
-    poses, residual = search(functions, chart, np.tile(theta, (starts, 1)), chart.pose(chart.coordinates(drawn)))
-    found = poses[(residual < ANGLE_TOLERANCE).all(axis=1)]
+    ended = search(functions, chart, np.tile(theta, (starts, 1)), chart.pose(chart.coordinates(drawn)))
+    found = ended.pose[ended.converged]
     turned = Rotation.from_euler("XYZ", found[:, 3:])
     found = np.hstack([found[:, :3], turned.as_euler("XYZ")])
     order = np.argsort(np.linalg.norm(found[:, :3] - np.array(chart.home)[:3], axis=1), kind="stable")
@@ -69,25 +89,25 @@ def assembly_modes(
     return found[kept]
 
 
-def search(functions: Functions, chart: Chart, theta: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Best poses (N, 6) for joint coordinates (N, n) from starts (N, 6), and what those there lack of these, (N, n).
+def search(functions: Functions, chart: Chart, theta: np.ndarray, start: np.ndarray) -> ForwardSolution:
+    """Best poses (N, 6) for joint coordinates (N, n) from starts (N, 6).
 
-    Newton's iteration with step halving; rows leave it when their step or what it gains is nil. A row is solved where
-    all its residuals are below ANGLE_TOLERANCE; they are NaN where a leg cannot reach.
+    Newton's iteration with step halving; rows leave it when their step or what it gains is nil.
     """
     poses = np.array(start)
-    active = np.arange(len(theta))
+    active, iterations = np.arange(len(theta)), np.zeros(len(theta), dtype=int)
     gaps, jacobians = functions["loop_closure"](poses, theta)
     for _ in range(MAX_ITERATIONS):
         steps = -_solve_each(jacobians, gaps)[..., 0] @ chart.basis.T
         trials, gaps, jacobians, better = _damped(functions, theta[active], poses[active], steps, gaps)
         poses[active] = trials
+        iterations[active] += 1
         going = better & (np.abs(steps).max(axis=1) > STEP_TOLERANCE)
         active, gaps, jacobians = active[going], gaps[going], jacobians[going]
         if not len(active):
             break
     found = functions["inverse_kinematics"](poses)[0][..., 0]
-    return poses, np.abs(theta - found)
+    return ForwardSolution(poses, iterations, np.abs(theta - found))
 
 
 def _damped(
@@ -119,14 +139,20 @@ def _solve_each(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
         return solutions
 
 
-def _check(functions: Functions, theta: np.ndarray, poses: np.ndarray, residual: np.ndarray) -> None:
-    if (residual < ANGLE_TOLERANCE).all():
+def _check(functions: Functions, theta: np.ndarray, found: ForwardSolution) -> None:
+    if found.converged.all():
         return
-    row, leg = (int(value) for value in np.argwhere(~(residual < ANGLE_TOLERANCE))[0])
-    gap = np.abs(functions["loop_closure"](poses[row : row + 1], theta[row : row + 1])[0]).max()
-    closed = gap < 1e-14
-    why = "closes the legs with one of them beyond its dead point" if closed else f"leaves a gap of {gap:.3g} m^2"
+    row = int(np.argmin(found.converged))
+    leg = int(np.argmin(found.residual[row] < ANGLE_TOLERANCE))
+    lacking = found.residual[row, leg]
+    gap = np.abs(functions["loop_closure"](found.pose[row : row + 1], theta[row : row + 1])[0]).max()
+    why = f"its loops stay open by {gap:.3g} m^2 of squared length"
+    if gap < CLOSED:
+        why = f"it closes the loops with leg {leg + 1} folded the other way than at home"
+    there = f"joint {leg + 1} is off by {lacking:.3g}, limit {ANGLE_TOLERANCE:.0e}"
+    if np.isnan(lacking):
+        there = f"leg {leg + 1} cannot reach it"
     raise ConvergenceError(
-        f"forward kinematics found no pose with joint coordinates {row_text(theta[row], 4)} (row {row}): "
-        f"the best {why}; joint {leg + 1} has a residual of {residual[row, leg]:.3g}, limit {ANGLE_TOLERANCE:.0e}"
+        f"forward kinematics found no pose with joint coordinates {row_text(theta[row], 4)} (row {row}) in "
+        f"{found.iterations[row]} steps: of the nearest, {why}; {there}"
     )

@@ -13,8 +13,9 @@ CHECK_HELP = """
 Say in a page what a designer wants to know of a robot.
 
 Reach, travel and singularities at home and over the travel, assembly modes, holding torques, what its motion can show,
-inertias that no body has, and whether its loop is stable, up to which gains and down to which frame rate. Each with its
-number and limit, and with the leg that it concerns. Ends with status 1 where something is beyond its limit.
+inertias that no body has, whether its loop is stable, up to which gains and down to which frame rate, and whether the
+platform that the scenario's sensor sees is the robot's. Each with its number and limit, and with the leg that it
+concerns. Ends with status 1 where something is beyond its limit.
 
 \b
 Examples:
@@ -37,7 +38,7 @@ def check(
 ) -> None:
     """Judge a robot file."""
     from dynamics import load_robot
-    from identify.loop_parameters import NOMINAL, check_parameter_set, model_settings
+    from identify.loop_parameters import NOMINAL, check_parameter_set
     from identify.scenario import load_scenario
     from identify.verification.robot_check import check_robot
 
@@ -45,8 +46,7 @@ def check(
     name = parameters or (given.plant.parameters if given.plant.parameters in chosen.parameter_sets else NOMINAL)
     check_parameter_set(chosen, name)
     values = chosen.parameter_sets[name].vector
-    settings, limits = model_settings(chosen, given), given.excitation
-    findings = check_robot(chosen, values, settings, limits, terminal_progress(quiet))
+    findings = check_robot(chosen, values, given, terminal_progress(quiet))
     failed = [finding for finding in findings if not finding.ok]
     if json is not None:
         try:

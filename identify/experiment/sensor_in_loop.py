@@ -51,22 +51,29 @@ def make_sensor(scenario: Scenario, robot: Robot, seed: int, taught: cmmsim.Taug
     return sensor
 
 
-def check_platform(robot: Robot, file: SensorFile, sensor: str) -> None:
-    """Raise ScenarioError, with leg and distance, where legs end in mid-air beside the platform of a sensor file, or
-    where that is at home elsewhere than the robot's."""
+def platform_distances(robot: Robot, file: SensorFile) -> tuple[Array, float]:
+    """How far each leg of a robot ends outside of the platform of a sensor file (n,), and how far that is at home from
+    the robot's; m."""
     body, cuts = marked_body("platform", file.platform), file.platform.cuts
     normals = np.vstack([body.normals, *[unit(cut.normal) for cut in cuts]])
     reach = np.append(body.offsets, [unit(cut.normal) @ cut.point for cut in cuts])
     outside = (robot.geometry.platform_joints @ normals.T - reach).max(axis=1)
-    leg, away = int(np.argmax(outside)), robot.home_pose[:3] - np.array(file.platform.home[:3])
+    return outside, float(np.linalg.norm(robot.home_pose[:3] - np.array(file.platform.home[:3])))
+
+
+def check_platform(robot: Robot, file: SensorFile, sensor: str) -> None:
+    """Raise ScenarioError, with leg and distance, where legs end in mid-air beside the platform of a sensor file, or
+    where that is at home elsewhere than the robot's."""
+    outside, away = platform_distances(robot, file)
+    leg = int(np.argmax(outside))
     if outside[leg] > OFF_PLATFORM_M:
         raise ScenarioError(
             f"platform joint {leg + 1} of {robot.name} is {outside[leg]:.3g} m outside of the platform that sensor "
             f"{sensor} sees, limit {OFF_PLATFORM_M:g} m: its [platform] has to be that of the robot"
         )
-    if np.linalg.norm(away) > OFF_PLATFORM_M:
+    if away > OFF_PLATFORM_M:
         raise ScenarioError(
-            f"{robot.name} is at home {np.linalg.norm(away):.3g} m from where sensor {sensor} has its platform at "
+            f"{robot.name} is at home {away:.3g} m from where sensor {sensor} has its platform at "
             f"home, limit {OFF_PLATFORM_M:g} m: platform.home has to be that of the robot"
         )
 

@@ -17,8 +17,10 @@ from dynamics.errors import DynamicsError
 from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 from identify.arrays import Array
 from identify.estimation.base_parameters import base_parameters, structural_regressor
+from identify.experiment.sensor_in_loop import OFF_PLATFORM_M, platform_distances, sensor_file
+from identify.loop_parameters import model_settings
 from identify.progress import Progress, SilentProgress
-from identify.scenario import Excitation
+from identify.scenario import Excitation, Scenario
 
 SAMPLES = 2000
 """Joint coordinates over the travel."""
@@ -48,20 +50,20 @@ class Finding:
 def check_robot(
     robot: Robot,
     parameters: Array,
-    settings: closed_loop.LoopSettings,
-    limits: Excitation,
+    scenario: Scenario,
     progress: Progress | None = None,
 ) -> list[Finding]:
-    """All findings about a robot with all its parameters in a loop with these settings; `limits` has those of leverage
-    and condition."""
+    """All findings about a robot with all its parameters, in the loop and before the sensor of a scenario, whose
+    `excitation` has the limits of leverage and condition."""
     questions: list[Callable[[], Iterator[Finding]]] = [
         lambda: _freedoms(robot),
-        lambda: _travel(robot, limits),
+        lambda: _travel(robot, scenario.excitation),
         lambda: _assembly(robot),
         lambda: _holding(robot, parameters),
         lambda: _visible(robot),
         lambda: _bodies(robot, parameters),
-        lambda: _loop(robot, parameters, settings),
+        lambda: _loop(robot, parameters, model_settings(robot, scenario)),
+        lambda: _seen(robot, scenario),
     ]
     findings = []
     with (progress or SilentProgress()).stage("check", len(questions)) as advance:
@@ -162,7 +164,7 @@ def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -
         yield Finding("loop", False, None, 1.0, "1", None, f"the loop cannot be judged at home: {error}")
         return
     at = f"at {timing.frame_rate_hz:g} Hz and {1e3 * timing.latency_s:.3g} ms of latency"
-    text = f"largest eigenvalue of the loop from frame to frame {at} is {radius:.4f}; it is stable below 1"
+    text = f"largest eigenvalue of the loop from frame to frame {at} is {radius:.6f}; it is stable below 1"
     yield Finding("loop", radius < 1, radius, 1.0, "1", None, text)
     factor = stability.gain_margin(*arguments)
     text = f"the servo's gains may be {factor:.3g} times as large until the loop is lost"
@@ -172,3 +174,15 @@ def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -
     rate = stability.lowest_frame_rate(*arguments)
     text = f"the loop holds from {rate:.3g} Hz on with this latency" if rate > 0 else "no frame rate makes it stable"
     yield Finding("frame rate", rate < timing.frame_rate_hz, rate, timing.frame_rate_hz, "Hz", None, text)
+
+
+def _seen(robot: Robot, scenario: Scenario) -> Iterator[Finding]:
+    """Whether the platform that the scenario's sensor sees is the robot's."""
+    outside, away = platform_distances(robot, sensor_file(scenario))
+    leg, limit = int(np.argmax(outside)), OFF_PLATFORM_M
+    text = f"leg {leg + 1} ends {outside[leg]:.3g} m outside of the platform that sensor {scenario.sensor} sees"
+    if outside[leg] <= 0:
+        text = f"all legs end on the platform that sensor {scenario.sensor} sees"
+    yield Finding("sensor's platform", bool(outside[leg] <= limit), float(outside[leg]), limit, "m", leg + 1, text)
+    text = f"at home that platform is {away:.3g} m from the robot's"
+    yield Finding("sensor's home", away <= limit, away, limit, "m", None, text)

@@ -115,8 +115,12 @@ def test_parts_regressor_and_both_dynamics_agree(robot, values, states):
 
 
 def test_forward_kinematics_inverts_inverse_kinematics(robot, states):
-    found = robot.forward_kinematics(robot.inverse_kinematics(states.pose))
-    np.testing.assert_allclose(found, states.pose, atol=1e-11)
+    """Quadratically from home: within a few steps."""
+    found = robot.solve_forward_kinematics(robot.inverse_kinematics(states.pose))
+    np.testing.assert_allclose(found.pose, states.pose, atol=1e-11)
+    assert found.converged.all()
+    assert found.residual.max() < 1e-12
+    assert 2 <= found.iterations.max() <= 8
 
 
 def test_joint_rates_and_accelerations_are_derivatives_of_joint_coordinates(robot, values):

@@ -27,6 +27,7 @@ def test_a_gough_stewart_platform_is_found_sound_with_the_numbers_of_its_own_met
     assert found["leverage over the travel"]["value"] == 1.0  # a cylinder pushes along its leg
     assert found["loop"]["value"] < 1 < found["gain margin"]["value"]
     assert found["frame rate"]["value"] < 60
+    assert (found["sensor's home"]["value"], found["sensor's platform"]["ok"]) == (0.0, True)
     assert "ups6, parameters `identified`" in capfd.readouterr().out
 
 
