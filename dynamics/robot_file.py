@@ -69,7 +69,7 @@ class Friction(_Strict):
 
 
 class JointPid(_Strict):
-    """Gains of the joint PID, which all joints share; `unit`, where it is given, is that of lp, and is checked."""
+    """Gains of the joint PID, which all joints share; `unit` is that of lp, to be stated where actuators slide."""
 
     lp: float
     li: float
@@ -267,11 +267,12 @@ def _parameter_set(name: str, values: Parameters, layout: ParameterLayout) -> Pa
         rigid[rows] = np.transpose([per_leg(f"{kind}.{k}", v, len(rows)) for k, v in inertia.model_dump().items()])
     friction = [per_leg(f"joint.{key}", value, layout.joints) for key, value in values.joint.model_dump().items()]
     dynamic = layout.check(np.concatenate([rigid.ravel(), *friction]))
-    unit = values.joint_pid.unit
-    if unit not in (None, layout.unit("joint_pid.lp")):
+    stated, unit = values.joint_pid.unit, layout.unit("joint_pid.lp")
+    if stated != unit and (stated or layout.prismatic):
         raise RobotFileError(
-            f"parameters.{name}.joint_pid.lp = {values.joint_pid.lp:g} is in {unit}, but the actuators "
-            f"{'slide' if layout.prismatic else 'turn'}: their gains are in {layout.unit('joint_pid.lp')}"
+            f"parameters.{name}.joint_pid.lp = {values.joint_pid.lp:g} {f'is in {stated}' if stated else 'has no unit'}"
+            f", but the actuators {'slide' if layout.prismatic else 'turn'}: their gains are in {unit}, which "
+            f'joint_pid says by unit = "{unit}"'
         )
     joint_pid = np.array([getattr(values.joint_pid, gain) for gain in JOINT_PID])
     for array in (dynamic, joint_pid):

@@ -186,9 +186,10 @@ def test_machines_with_more_or_fewer_freedoms_than_actuators_are_counted_and_nam
 
 def test_gains_of_the_wrong_unit_are_refused_with_value_and_unit(tmp_path):
     text = (resources.files("dynamics") / "robots" / "ups6.toml").read_text(encoding="utf-8")
-    (tmp_path / "mine.toml").write_text(text.replace('unit = "N/m"', 'unit = "N m/rad"'), encoding="utf-8")
-    with pytest.raises(RobotFileError, match=r"lp = 5000 is in N m/rad, but the actuators slide: .* in N/m"):
-        dynamics.load_robot(tmp_path / "mine.toml")
+    for unit, words in ((', unit = "N m/rad"', "is in N m/rad"), ("", "has no unit")):
+        (tmp_path / "mine.toml").write_text(text.replace(', unit = "N/m"', unit), encoding="utf-8")
+        with pytest.raises(RobotFileError, match=rf"lp = 5000 {words}, but the actuators slide: .* in N/m"):
+            dynamics.load_robot(tmp_path / "mine.toml")
 
 
 def test_poses_and_motions_that_a_platform_cannot_have_are_refused_by_number():
