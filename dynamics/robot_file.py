@@ -108,12 +108,13 @@ class RobotFile(_Strict):
     @classmethod
     def _by_family(cls, values: Any) -> Any:
         """Legs one by one, each with its kind, where the file names a family."""
-        name = values.get("family") if isinstance(values, dict) else None
         if not isinstance(values, dict) or "legs" not in values:
             return values
+        name = values.get("family")
         if name is None:
             if isinstance(values["legs"], dict):
                 raise ValueError("legs: a file without family needs one table [[legs]] for each leg, with its type")
+            _check_types(values["legs"])
             return values
         if name not in FAMILIES:
             raise ValueError(f"family: unknown `{name}`; valid: {', '.join(FAMILIES)}")
@@ -122,6 +123,7 @@ class RobotFile(_Strict):
             legs = _legs_of_columns(legs, family)
         if isinstance(legs, list):
             legs = [{"type": family.kind} | leg if isinstance(leg, dict) else leg for leg in legs]
+        _check_types(legs)
         return values | {"legs": legs, "chart": values.get("chart") or family.chart}
 
 
@@ -132,6 +134,12 @@ def robot_schema() -> dict[str, Any]:
     columns = {"type": "object", "description": "with a family: for each key one value, or a list with one a leg"}
     schema["properties"]["legs"] = {"anyOf": [one_a_leg, columns], "description": one_a_leg.pop("description")}
     return schema
+
+
+def _check_types(legs: Any) -> None:
+    for number, leg in enumerate(legs if isinstance(legs, list) else (), 1):
+        if isinstance(leg, dict) and leg.get("type") not in KINDS:
+            raise ValueError(f"leg {number}: its type is {leg.get('type')!r}; valid: {', '.join(KINDS)}")
 
 
 def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, Any]]:
@@ -145,7 +153,7 @@ def _legs_of_columns(columns: dict[str, Any], family: Family) -> list[dict[str, 
         vector = KINDS[family.kind].model_fields[name].annotation is np.ndarray
         each = isinstance(value, list) and (not vector or (bool(value) and isinstance(value[0], list)))
         if each and len(value) != family.legs:
-            raise ValueError(f"legs.{key} needs one value or {family.legs} values, got {len(value)}")
+            raise ValueError(f"legs.{key} needs one value, or one for each of {family.legs} legs, got {len(value)}")
         for number, leg in enumerate(legs):
             leg[name] = value[number] if each else value
     return legs

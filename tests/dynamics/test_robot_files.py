@@ -101,10 +101,11 @@ def test_a_file_by_path_and_a_robot_sent_to_another_process_are_the_same_robot(l
         ("crank_length = 0.06\n", "", "leg 1, .*, leg 6: crank_length: Field required"),
         ("mass = 24.0, ", "mass = 24.0, weight = 1, ", "initial.platform: .*unknown key weight; valid: mass"),
         ('family = "rss6"', 'family = "delta"', "family: unknown `delta`; valid: rss6, "),
+        ("crank_length = 0.06", 'type = "rpr"', "leg 1: its type is 'rpr'; valid: rss, rus, ups, "),
         ("link_length = 0.30133373938841", "link_length = -0.3", "link_length: .* should be greater than 0, got -0.3"),
         ("link_length = 0.30133373938841", "link_length = 0.1", "leg 1 cannot reach the home pose: reach margin -"),
         ("link_length = 0.30133373938841", 'link_length = "long"', "link_length: .* a valid number, .*got 'long'"),
-        (f"    {FIRST_JOINT},\n", "", "legs.base_joints needs one value or 6 values, got 5"),
+        (f"    {FIRST_JOINT},\n", "", "legs.base_joints needs one value, or one for each of 6 legs, got 5"),
         (FIRST_JOINT, "[0.33, -0.07]", "leg 1: base_joint: needs 3 finite numbers, got .0.33, -0.07."),
         ("    [0.0, 0.0, 1.0],\n", "    [0.0, 0.0, 2.0],\n", "leg 1: crank_axis: has length 2, must be 1"),
         (
