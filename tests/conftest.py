@@ -15,7 +15,7 @@ import pytest
 from identify.accuracy.figure import PROPERTY
 from identify.files.atomic import write_text
 
-pytest_plugins = "pytester"
+pytest_plugins = ["pytester", "tests.browser"]
 
 # Two workers with two BLAS threads each on two cores are slower than two with one.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
