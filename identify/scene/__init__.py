@@ -1,0 +1,25 @@
+"""What an experiment looks like: robot, stickers and cameras, their images, and the page that replays a run.
+
+workcell(robot, sensor), workcell_of_scenario(scenario) -> Workcell    robot and sensor as they stand
+stereo_view(cell, pose) -> StereoView          both camera images, and the stickers found in them
+scene_figure(cell, pose) -> Figure             the scene, drawn for print
+stereo_figure(view) -> Figure                  both images with what was found, drawn for print
+"""
+
+from identify.scene.figures import View, scene_figure, stereo_figure
+from identify.scene.images import Found, StereoView, stereo_view
+from identify.scene.workcell import Solid, ViewingCamera, Workcell, workcell, workcell_of_scenario
+
+__all__ = [
+    "Found",
+    "Solid",
+    "StereoView",
+    "View",
+    "ViewingCamera",
+    "Workcell",
+    "scene_figure",
+    "stereo_figure",
+    "stereo_view",
+    "workcell",
+    "workcell_of_scenario",
+]

@@ -1,0 +1,180 @@
+"""The scene and what both cameras see, drawn for print: matplotlib figures that become PDF, SVG or PNG.
+
+Every colour stands beside another brightness or a word, so that they can be read without colour.
+"""
+
+import matplotlib.patheffects as effects
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from cmmsim.geometry.pose import apply
+from identify.arrays import Array
+from identify.scene.images import StereoView
+from identify.scene.painter import Painter, View, extent, tube
+from identify.scene.workcell import Solid, ViewingCamera, Workcell
+
+SOLIDS = {"platform": "#a9bdd0", "base": "#b8b3a6"}
+LEGS = ("#c9723a", "#e6c79c", "#7d9d8f", "#8a7fa8")
+"""Of the first, second, ... body of each leg."""
+
+CAMERA, RAY, DARK, BRIGHT = "#3b3f46", "#c8102e", "#22262b", "#fdfdf5"
+FOUND = {"platform": "#ff9f1c", "base": "#4cc9f0"}
+
+CAMERA_M = np.array([0.05, 0.04, 0.12])
+"""Half width, half height and length of the box that stands for a camera."""
+FRUSTUM_M = 0.30
+"""How far before a camera its field of view is drawn."""
+
+
+def scene_figure(
+    cell: Workcell,
+    pose: Array | None = None,
+    *,
+    view: View | None = None,
+    size: tuple[float, float] = (7.0, 5.0),
+    rays: bool = True,
+    labels: bool = True,
+) -> Figure:
+    """Robot with legs and stickers, both cameras with their field of view and rays to the stickers that both can see.
+
+    pose (6,) of the platform, m and rad, by default home; size in inches; rays, labels: whether to draw them. Needs no
+    OpenGL. Raises dynamics.UnreachablePoseError, dynamics.ChartError.
+    """
+    at = cell.home if pose is None else np.asarray(pose, dtype=float)
+    placed, rods = cell.placed(at), cell.rods(at)
+    solids = [apply(place, body.vertices) for body, place in placed]
+    shown = [*solids, rods.reshape(-1, 3), *(camera.frustum(FRUSTUM_M) for camera in cell.cameras)]
+    painter = Painter(view or View(), *extent(shown))
+    for body, place in placed:
+        _solid(painter, body, place)
+    for part, ends in zip(cell.parts, rods, strict=True):
+        painter.faces(*tube(ends, part.segment.radius), leg_colour(cell, part.leg, part.body))
+    for ends in cell.frame:
+        painter.line(ends, DARK, 1.6)
+    for camera in cell.cameras:
+        _camera(painter, camera)
+        for sticker in cell.seen(at) if rays else ():
+            painter.line(np.array([camera.centre, sticker]), RAY, 0.45, alpha=0.55, towards=0.02)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.add_subplot()
+    _triad(painter, axes, labels)
+    painter.paint(axes)
+    if labels:
+        _labels(painter, axes, cell, solids)
+    return figure
+
+
+def stereo_figure(view: StereoView, *, size: tuple[float, float] = (7.0, 3.9), arrows: float | None = 3000.0) -> Figure:
+    """Both camera images with the detected ellipses, and each centre's error as an arrow.
+
+    size in inches; arrows: how many times the errors (detected less true centre) are enlarged, None: no arrows.
+    """
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(1, 2, squeeze=False)[0]
+    for side, (axes, name) in enumerate(zip(panels, ("left", "right"), strict=True)):
+        show_image(axes, view, side)
+        for body in view.found:
+            _ellipses(axes, view, side, body, arrows)
+        axes.set_title(f"{name} camera", fontsize=9)
+    handles = [panels[0].plot([], [], "o", mfc="none", mec=colour)[0] for colour in FOUND.values()]
+    words = [f"{len(found.ids)} ellipses found on the {name}" for name, found in view.found.items()]
+    note = "" if arrows is None else f"arrows: detected less true centre, {arrows:g} times enlarged"
+    figure.legend(
+        handles, words, title=note, title_fontsize=8, fontsize=8, loc="outside lower center", ncols=2, frameon=False
+    )
+    return figure
+
+
+def show_image(axes: Axes, view: StereoView, side: int) -> None:
+    """One image of a view in its place in the whole image, px, brightened so that dark bodies show in print."""
+    image, (x, y) = view.images[side], view.corners[side]
+    height, width = image.shape
+    edges = (x - 0.5, x + width - 0.5, y + height - 0.5, y - 0.5)
+    axes.imshow(brightened(image), cmap="gray", vmin=0, vmax=255, extent=edges, interpolation="bilinear")
+    axes.tick_params(labelsize=7)
+    axes.set_xlabel("px", fontsize=8)
+    axes.label_outer()
+
+
+def brightened(image: Array) -> Array:
+    """Grey values (h, w) uint8 for a screen or paper: a square root, which shows what is dark."""
+    return np.asarray(np.sqrt(image / 255.0) * 255.0, dtype=np.uint8)
+
+
+def ellipse_points(centre: Array, shape: Array, count: int = 32) -> Array:
+    """Points (count + 1, 2) px along a detected ellipse, closed; centre (2,) and shape (2, 2) px."""
+    turn = np.linspace(0, 2 * np.pi, count + 1)
+    return np.asarray(centre + np.column_stack([np.cos(turn), np.sin(turn)]) @ shape.T)
+
+
+def leg_colour(cell: Workcell, leg: int, body: int) -> str:
+    """Colour of a body of a leg, by its number in the robot's layout."""
+    assert cell.robot is not None
+    return LEGS[cell.robot.layout.of_leg[leg].index(body) % len(LEGS)]
+
+
+def _solid(painter: Painter, body: Solid, place: Array) -> None:
+    vertices = apply(place, body.vertices)
+    painter.faces(vertices, body.faces, SOLIDS[body.name])
+    painter.edges(vertices, body.faces, DARK)
+    turned = body.normals @ place[:3, :3].T
+    for centre, normal in zip(apply(place, body.places), turned, strict=True):
+        painter.disc(centre, normal, body.ring_radius, DARK, 0.03)
+        painter.disc(centre, normal, max(body.radius, 0.45 * body.ring_radius), BRIGHT, 0.031)
+
+
+def camera_box(camera: ViewingCamera) -> tuple[Array, NDArray[np.int_]]:
+    """A box behind a camera's centre: vertices (8, 3), base axes, m, and faces (12, 3)."""
+    import trimesh
+
+    width, height, length = CAMERA_M
+    box = trimesh.creation.box((2 * width, 2 * height, length))
+    return apply(camera.base_from_camera, np.asarray(box.vertices) - [0.0, 0.0, 0.5 * length]), np.asarray(box.faces)
+
+
+def _camera(painter: Painter, camera: ViewingCamera) -> None:
+    vertices, faces = camera_box(camera)
+    painter.faces(vertices, faces, CAMERA)
+    painter.edges(vertices, faces, "#8b929c", 0.5)
+    corners = camera.frustum(FRUSTUM_M)
+    for k in range(4):
+        painter.line(np.array([camera.centre, corners[k]]), CAMERA, 0.7)
+        painter.line(corners[[k, (k + 1) % 4]], CAMERA, 0.7)
+
+
+def _triad(painter: Painter, axes: Axes, labels: bool) -> None:
+    """The axes of the base, 0.15 m long, before everything: they lie within the robot."""
+    for name, direction in zip("xyz", np.eye(3), strict=True):
+        ends = np.array([np.zeros(3), 0.15 * direction])
+        painter.line(ends, DARK, 1.4, towards=1.0)
+        if labels:
+            axes.annotate(name, tuple(painter.pixels(1.15 * ends[1])), fontsize=8, ha="center", va="center", zorder=5,
+                          path_effects=[effects.withStroke(linewidth=2, foreground="white")])  # fmt: skip
+
+
+def _labels(painter: Painter, axes: Axes, cell: Workcell, solids: list[Array]) -> None:
+    named = [(camera.base_from_camera @ [0, -0.09, -0.06, 1])[:3] for camera in cell.cameras]
+    words = [f"{camera.name} camera" for camera in cell.cameras]
+    for text, place in zip(words, named, strict=True):
+        axes.annotate(text, tuple(painter.pixels(place)), fontsize=8, ha="center", va="bottom", zorder=5)
+    for body, vertices, side in zip(cell.bodies, solids, (-1, 1), strict=False):
+        flat = painter.pixels(vertices)
+        end, align = flat[np.argmax(side * flat[:, 0])], "left" if side > 0 else "right"
+        axes.annotate(body.name, tuple(end), (8 * side, 8), textcoords="offset points", fontsize=8, ha=align, zorder=5,
+                      arrowprops={"arrowstyle": "-", "lw": 0.6, "shrinkA": 1, "shrinkB": 0})  # fmt: skip
+    axes.annotate("axes of the base: 0.15 m", (0.0, 0.0), xycoords="axes fraction", fontsize=7)
+
+
+def _ellipses(axes: Axes, view: StereoView, side: int, body: str, arrows: float | None) -> None:
+    found = view.found[body]
+    centres = found.centres[side]
+    if found.shapes is not None:
+        outlines = [ellipse_points(*one) for one in zip(centres, found.shapes[side], strict=True)]
+        axes.add_collection(LineCollection(outlines, colors=FOUND[body], linewidths=0.8))
+    axes.scatter(centres[:, 0], centres[:, 1], s=26, facecolors="none", edgecolors=FOUND[body], linewidths=0.6)
+    if arrows is not None and len(centres):
+        errors = arrows * (centres - found.expected[side])
+        axes.quiver(*centres.T, *errors.T, angles="xy", scale_units="xy", scale=1, color=FOUND[body], width=0.004)

@@ -1,0 +1,138 @@
+"""Both camera images of a pose, cut to where the robot is, and the stickers that the project's detector finds there."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.geometry.pose import apply, invert, pose_to_transform
+from cmmsim.radiometry.images import StereoFrame
+from cmmsim.radiometry.noise import cut_windows
+from identify.arrays import Array
+from identify.scene.workcell import Workcell
+
+MARGIN_PX = 24.0
+"""Around stickers and bodies, in the part of the images that is shown."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """k stickers of one body that were found in both images.
+
+    ids (k,); centres (2, k, 2) in the whole images, px; shapes (2, k, 2, 2) px: each carries the unit disc onto the
+    detected ellipse, None where the detector states none; expected (2, k, 2): where the true places are seen, px;
+    points (k, 3) m and covariances (k, 3, 3) m^2, triangulated, base axes.
+    """
+
+    ids: tuple[str, ...]
+    centres: Array
+    shapes: Array | None
+    expected: Array
+    points: Array
+    covariances: Array
+
+
+@dataclass(frozen=True)
+class StereoView:
+    """Both camera images of one pose (6,) m and rad, drawn with noise.
+
+    images (2, h, w) uint8, a part of the whole images whose first pixels (x, y) are corners (2, 2); found: stickers by
+    the body's name, "platform" and "base".
+    """
+
+    pose: Array
+    images: NDArray[np.uint8]
+    corners: NDArray[np.int_]
+    found: Mapping[str, Found]
+
+
+class StereoEye:
+    """Draws the images of a workcell's sensor at one pose after another, and finds the stickers in them.
+
+    Nothing is taught: a sticker is looked for about its nominal place. seed: of the noise; renderer: "analytic" needs
+    no OpenGL; region: first pixels (2, 2) and side px of the part that is shown, None: the whole images.
+    """
+
+    def __init__(
+        self,
+        cell: Workcell,
+        seed: int = 0,
+        renderer: str = "analytic",
+        region: tuple[NDArray[np.int_], int] | None = None,
+    ) -> None:
+        assert cell.rig is not None
+        self._cell, self._sensor = cell, cell.live_sensor(seed, renderer)
+        self._rig, self._camera_from_base = cell.rig
+        self._region = region
+
+    def look(self, pose: Array) -> StereoView:
+        """Images and stickers at a pose (6,). Raises dynamics.UnreachablePoseError, cmmsim.CmmError."""
+        drawn = self._sensor.look(pose, self._cell.obstacles(pose))
+        if self._region is not None and self._sensor.renderer == "analytic":
+            corners, side = self._region
+            images: NDArray = drawn.windows(corners[:, None], side)[:, 0]
+        else:
+            whole, corners = drawn.full(), np.zeros((2, 2), dtype=int)
+            images = np.stack([whole.left, whole.right])
+        cut = _Cut(images, corners)
+        found = {body.name: self._found(cut, pose, k) for k, body in enumerate(self._cell.bodies)}
+        white = self._sensor.noise.white_level
+        return StereoView(pose, np.asarray(images * (255.0 / white), dtype=np.uint8), corners, found)
+
+    def _found(self, images: "_Cut", pose: Array, number: int) -> Found:
+        """Stickers of the platform (0) or the base (1)."""
+        body, nominal = self._cell.bodies[number], self._cell.marked(self._cell.bodies[number].name)
+        place = self._camera_from_base @ (pose_to_transform(pose) if number == 0 else np.eye(4))
+        seen = self._sensor.observer.observe(images, place, nominal.nominal, nominal.sticker_normals)
+        base_from_camera = invert(self._camera_from_base)
+        turn = base_from_camera[:3, :3]
+        return Found(
+            ids=tuple(body.ids[k] for k in seen.index),
+            centres=np.stack([seen.left_pixels, seen.right_pixels]),
+            shapes=None if seen.outlines is None else seen.outlines.shapes,
+            expected=self._rig.project(apply(place, body.places[seen.index]))[0],
+            points=apply(base_from_camera, seen.points),
+            covariances=turn @ seen.covariances @ turn.T,
+        )
+
+
+def stereo_view(cell: Workcell, pose: Array | None = None, seed: int = 0, renderer: str = "analytic") -> StereoView:
+    """Both camera images of a workcell at a pose (6,), by default home, cut to the robot, and the stickers in them.
+
+    seed: of the noise; renderer: "pyrender" needs OpenGL. Raises dynamics.UnreachablePoseError, cmmsim.CmmError.
+    """
+    at = cell.home if pose is None else np.asarray(pose, dtype=float)
+    return StereoEye(cell, seed, renderer, region_of(cell, [at])).look(at)
+
+
+def region_of(cell: Workcell, poses: Sequence[Array]) -> tuple[NDArray[np.int_], int]:
+    """First pixels (2, 2) and side px of a square part of both images that shows both bodies at all poses (6,)."""
+    assert cell.rig is not None
+    rig, camera_from_base = cell.rig
+    platform, base = (body.vertices for body in cell.bodies)
+    points = np.vstack([base, *(apply(pose_to_transform(pose), platform) for pose in poses)])
+    pixels = rig.project(apply(camera_from_base, points))[0]
+    size = np.array([[camera.width, camera.height] for camera in rig.cameras])
+    low, high = (
+        np.clip(extreme, 0, size - 1) for extreme in (pixels.min(axis=1) - MARGIN_PX, pixels.max(axis=1) + MARGIN_PX)
+    )
+    side = int(min(np.ceil((high - low).max()), size.min()))
+    corners = np.clip(np.rint(0.5 * (low + high - side)), 0, size - side).astype(int)
+    return corners, side
+
+
+class _Cut:
+    """Parts of two images, read as if they were whole."""
+
+    def __init__(self, images: NDArray, corners: NDArray[np.int_]) -> None:
+        self._images, self._corners = images, corners
+
+    def full(self) -> StereoFrame:
+        """Both parts."""
+        return StereoFrame(*self._images)
+
+    def windows(self, corners: NDArray[np.int_], size: int) -> NDArray:
+        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2) in the whole images."""
+        sides = zip(self._images, corners, self._corners, strict=True)
+        return np.stack([cut_windows(image, at - first, size) for image, at, first in sides])

@@ -1,0 +1,130 @@
+"""Bodies drawn as shaded polygons in perspective, far ones first: vector graphics for print, without OpenGL.
+
+Large faces and long lines are cut into pieces, so that the order of their middles is the order in which they hide each
+other. Where two bodies pierce each other, what hides what is right to a piece's size.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb, to_rgba
+from numpy.typing import NDArray
+
+from cmmsim.geometry.pose import Array
+
+PIECE = 1 / 60
+"""Longest edge of a piece, in sizes of the scene."""
+LIGHT = np.array([0.35, -0.55, 0.76])
+SHADE = 0.62
+"""Brightness of a face that the light does not reach, of one that it reaches squarely."""
+
+
+@dataclass(frozen=True)
+class View:
+    """From where a scene is looked at: azimuth from the x axis about z and elevation, degrees; distance from the middle
+    of the scene in sizes of it."""
+
+    azimuth_deg: float = -50.0
+    elevation_deg: float = 23.0
+    distance: float = 3.0
+
+
+class Painter:
+    """Collects what is to be drawn and lays it into axes; centre (3,) and size of the scene, m."""
+
+    def __init__(self, view: View, centre: Array, size: float) -> None:
+        azimuth, elevation = np.deg2rad([view.azimuth_deg, view.elevation_deg])
+        level = np.cos(elevation)
+        back = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+        across = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        self._eye = centre + view.distance * size * back
+        self._axes = np.column_stack([across, np.cross(back, across), back])
+        self._far, self._piece = view.distance * size, PIECE * size
+        self._pieces: list[tuple[float, Array, tuple, tuple, float]] = []
+
+    def pixels(self, points: Array) -> Array:
+        """Places (..., 2) on the paper of points (..., 3), in m at the middle of the scene."""
+        seen = (points - self._eye) @ self._axes
+        return np.asarray(self._far * seen[..., :2] / -seen[..., 2:], dtype=float)
+
+    def faces(self, vertices: Array, faces: NDArray[np.int_], colour: str, towards: float = 0.0) -> None:
+        """Triangles (m, 3) of a closed body, counter-clockwise from outside, as its light falls on them.
+
+        towards: by how much they are drawn before what lies as far away, m.
+        """
+        corners, pieces = trimesh.remesh.subdivide_to_size(vertices, faces, self._piece)
+        triangles = np.asarray(corners)[np.asarray(pieces)]
+        normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        middles = triangles.mean(axis=1)
+        facing = np.einsum("ni,ni->n", normals, self._eye - middles) > 0
+        lit = normals[facing] @ LIGHT / (np.linalg.norm(normals[facing], axis=1) * np.linalg.norm(LIGHT))
+        bright = SHADE + (1 - SHADE) * np.maximum(lit, 0.0)
+        base = np.array(to_rgb(colour))
+        closed = self.pixels(triangles[facing])[:, [0, 1, 2, 0]]  # its outline fills the seams between pieces
+        for flat, middle, share in zip(closed, middles[facing], bright, strict=True):
+            self._add(middle, flat, (*(share * base), 1.0), None, 0.5, towards)
+
+    def edges(self, vertices: Array, faces: NDArray[np.int_], colour: str, width: float = 0.7) -> None:
+        """The edges of a convex body that its visible faces have."""
+        body = trimesh.Trimesh(vertices, faces, process=True)
+        sharp = body.face_adjacency_angles > 1e-3
+        normals, middles = body.face_normals, body.triangles_center
+        facing = np.einsum("ni,ni->n", normals, self._eye - middles) > 0
+        shown = sharp & facing[body.face_adjacency].any(axis=1)
+        for ends in np.asarray(body.vertices)[body.face_adjacency_edges[shown]]:
+            self.line(ends, colour, width, towards=0.5 * self._piece)
+
+    def disc(self, centre: Array, normal: Array, radius: float, colour: str, towards: float) -> None:
+        """A flat disc, where its outward normal (3,) looks this way."""
+        if normal @ (self._eye - centre) <= 0:
+            return
+        first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+        first /= np.linalg.norm(first)
+        turn = np.linspace(0, 2 * np.pi, 20, endpoint=False)[:, None]
+        rim = centre + radius * (np.cos(turn) * first + np.sin(turn) * np.cross(normal, first))
+        self._add(centre, self.pixels(rim), to_rgba(colour), None, 0.2, towards)
+
+    def line(self, ends: Array, colour: str, width: float, alpha: float = 1.0, towards: float = 0.0) -> None:
+        """A straight line between two points (2, 3)."""
+        count = int(np.ceil(np.linalg.norm(ends[1] - ends[0]) / self._piece)) + 1
+        places = ends[0] + np.linspace(0, 1, count)[:, None] * (ends[1] - ends[0])
+        flat = self.pixels(places)
+        for k in range(count - 1):
+            middle = 0.5 * (places[k] + places[k + 1])
+            self._add(middle, flat[k : k + 2], None, to_rgba(colour, alpha), width, towards)
+
+    def paint(self, axes: Axes) -> None:
+        """Lay all that was collected into axes of one scale, without a frame."""
+        self._pieces.sort(key=lambda piece: -piece[0])
+        polygons, filled, lines, widths = zip(*(piece[1:] for piece in self._pieces), strict=True)
+        drawn = PolyCollection(
+            polygons, closed=False, facecolors=filled, edgecolors=lines, linewidths=widths, capstyle="round"
+        )
+        axes.add_collection(drawn)
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+        axes.autoscale_view()
+
+    def _add(
+        self, middle: Array, flat: Array, fill: tuple | None, stroke: tuple | None, width: float, towards: float
+    ) -> None:
+        depth = float(np.linalg.norm(middle - self._eye)) - towards
+        nothing = (0.0, 0.0, 0.0, 0.0)
+        self._pieces.append((depth, flat, fill or nothing, stroke or fill or nothing, width))
+
+
+def tube(ends: Array, radius: float, sides: int = 14) -> tuple[Array, NDArray[np.int_]]:
+    """A closed cylinder between two points (2, 3): vertices (n, 3) and faces (m, 3), counter-clockwise from outside."""
+    body = trimesh.creation.cylinder(radius=radius, segment=ends, sections=sides)
+    return np.asarray(body.vertices), np.asarray(body.faces)
+
+
+def extent(points: Sequence[Array]) -> tuple[Array, float]:
+    """Middle (3,) and diagonal, m, of the box about points (n, 3) of several bodies."""
+    every = np.vstack(points)
+    low, high = every.min(axis=0), every.max(axis=0)
+    return 0.5 * (low + high), float(np.linalg.norm(high - low))

@@ -1,0 +1,205 @@
+"""A robot and the stereo sensor that looks at it, as they stand: bodies, stickers, legs and cameras, to be drawn."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+import cmmsim
+from cmmsim.files import SensorFile
+from cmmsim.files.setup import MarkedBody, marked_body, rig_from_file
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.pose import apply, invert, pose_to_transform
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.imaging.scene import scene_body
+from cmmsim.visibility import SightLines
+from dynamics import Robot, load_robot
+from dynamics.bodies import Part, parts_of
+from identify.arrays import Array
+from identify.errors import ScenarioError
+from identify.experiment.sensor_in_loop import check_platform, robot_meshes, robot_transforms, sensor_file
+from identify.scenario import Scenario
+
+PLATE_M = 0.012
+"""Half the thickness of the plate that stands for a platform of which only the joints are known."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A convex body with its stickers, in its own axes, m.
+
+    vertices (n, 3) and faces (m, 3), triangles seen counter-clockwise from outside; ids (k,) of the stickers, their
+    true places (k, 3) and outward normals (k, 3); radius and ring_radius of each.
+    """
+
+    name: str
+    vertices: Array
+    faces: NDArray[np.int_]
+    ids: tuple[str, ...] = ()
+    places: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    normals: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    radius: float = 0.0
+    ring_radius: float = 0.0
+
+
+@dataclass(frozen=True)
+class ViewingCamera:
+    """A camera where it stands: base_from_camera (4, 4), its axes x right, y down, z forward."""
+
+    name: str
+    lens: PinholeCamera
+    base_from_camera: Array
+
+    @property
+    def centre(self) -> Array:
+        """Where it sees from (3,), base axes, m."""
+        return np.asarray(self.base_from_camera[:3, 3])
+
+    def frustum(self, depth: float) -> Array:
+        """Corners (4, 3) of what it sees at a depth, m, base axes, clockwise from the top left of its image."""
+        right, low = self.lens.width - 0.5, self.lens.height - 0.5
+        pixels = np.array([[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]])
+        ideal = self.lens.undistort(pixels)[0]
+        rays = np.column_stack([ideal, np.ones(4)]) @ np.linalg.inv(self.lens.matrix).T
+        return apply(self.base_from_camera, depth * rays)
+
+
+@dataclass(frozen=True, eq=False)
+class Workcell:
+    """A robot, a sensor, or both: the sensor looks at the robot's platform. Made by `workcell`."""
+
+    robot: Robot | None
+    sensor: SensorFile | None
+
+    @property
+    def name(self) -> str:
+        """What a title calls it."""
+        robot = f"robot {self.robot.name}" if self.robot else ""
+        sensor = f"sensor {self.sensor.name}" if self.sensor else ""
+        return " and ".join(filter(None, (robot, sensor)))
+
+    @property
+    def home(self) -> Array:
+        """Pose (6,) of the platform at home, m and rad."""
+        if self.robot is not None:
+            return self.robot.home_pose
+        assert self.sensor is not None
+        return np.array(self.sensor.platform.home)
+
+    @cached_property
+    def bodies(self) -> tuple[Solid, ...]:
+        """The platform in its own axes, and the sensor's body with stickers on the base, in base axes."""
+        if self.sensor is None:
+            assert self.robot is not None
+            return (_plate("platform", self.robot.geometry.platform_joints),)
+        return tuple(_marked(name, self.sensor, stream) for stream, name in enumerate(("platform", "base")))
+
+    def placed(self, pose: Array) -> list[tuple[Solid, Array]]:
+        """The bodies, and base_from_body (4, 4) of each with the platform at a pose (6,)."""
+        return list(zip(self.bodies, (pose_to_transform(pose), np.eye(4)), strict=False))
+
+    @cached_property
+    def parts(self) -> tuple[Part, ...]:
+        """The bodies of the robot's legs, leg by leg from the base; none without a robot."""
+        return () if self.robot is None else tuple(parts_of(self.robot.geometry).all)
+
+    def rods(self, pose: Array) -> Array:
+        """Ends (parts, 2, 3) of the bodies of the legs, m, base axes, with the platform at a pose (6,).
+
+        Raises dynamics.UnreachablePoseError, dynamics.ChartError.
+        """
+        return np.zeros((0, 2, 3)) if self.robot is None else parts_of(self.robot.geometry).rods(self.robot, pose)
+
+    @cached_property
+    def frame(self) -> Array:
+        """Lines (n, 2, 3), m, base axes, from one leg's joint on the base to the next one's; none without a robot."""
+        if self.robot is None:
+            return np.zeros((0, 2, 3))
+        joints = self.robot.geometry.base_joints
+        away = joints - joints.mean(axis=0)
+        around = joints[np.argsort(np.arctan2(away[:, 1], away[:, 0]))]
+        return np.stack([around, np.roll(around, -1, axis=0)], axis=1)
+
+    @cached_property
+    def rig(self) -> tuple[StereoRig, Array] | None:
+        """The stereo rig and camera_from_base (4, 4); None without a sensor."""
+        return None if self.sensor is None else rig_from_file(self.sensor.rig)
+
+    @cached_property
+    def cameras(self) -> tuple[ViewingCamera, ...]:
+        """Left and right camera; none without a sensor."""
+        if self.rig is None:
+            return ()
+        rig, camera_from_base = self.rig
+        sides = zip(("left", "right"), rig.cameras, rig.from_camera, strict=True)
+        return tuple(ViewingCamera(name, lens, invert(move @ camera_from_base)) for name, lens, move in sides)
+
+    def seen(self, pose: Array) -> Array:
+        """Places (k, 3), m, base axes, of the platform's stickers that both cameras can look for at a pose (6,).
+
+        What stands between a sticker and a camera is not asked.
+        """
+        if self.rig is None or self.sensor is None:
+            return np.zeros((0, 3))
+        lines = SightLines(self.marked("platform"), *self.rig)
+        return apply(pose_to_transform(pose), self.bodies[0].places[lines.visible(pose)])
+
+    def marked(self, name: str) -> MarkedBody:
+        """Nominal stickers of the "platform" or the "base", as the sensor knows them."""
+        assert self.sensor is not None
+        return marked_body(name, getattr(self.sensor, name))
+
+    def live_sensor(self, seed: int, renderer: str) -> cmmsim.Sensor:
+        """The sensor with the legs in its view, not taught."""
+        assert self.sensor is not None
+        sensor = cmmsim.Sensor(self.sensor, seed, renderer=renderer)
+        if self.robot is not None:
+            sensor.add_bodies(robot_meshes(self.robot))
+        return sensor
+
+    def obstacles(self, pose: Array) -> dict[str, Array]:
+        """base_from_body (4, 4) by name of the legs' bodies, which may hide stickers, at a pose (6,)."""
+        return {} if self.robot is None else robot_transforms(self.robot, pose)
+
+
+def workcell(robot: Robot | None = None, sensor: SensorFile | None = None) -> Workcell:
+    """A robot, the file of a sensor (`cmmsim.files.read_sensor_file`), or both.
+
+    Raises ScenarioError: neither is given, or the platform that the sensor sees is not the robot's.
+    """
+    if robot is None and sensor is None:
+        raise ScenarioError("a scene needs a robot, a sensor, or both")
+    if robot is not None and sensor is not None:
+        check_platform(robot, sensor, sensor.name)
+    return Workcell(robot, sensor)
+
+
+def workcell_of_scenario(scenario: Scenario, robot: Robot | None = None) -> Workcell:
+    """Robot and sensor of a scenario, with its changes; robot: where it is loaded already.
+
+    Raises ScenarioError, cmmsim.CmmError, dynamics.RobotFileError.
+    """
+    return workcell(robot or load_robot(scenario.robot), sensor_file(scenario))
+
+
+def _marked(name: str, file: SensorFile, stream: int) -> Solid:
+    """A body of a sensor file with its stickers where they truly are."""
+    section, stickers = getattr(file, name), file.stickers
+    marked = marked_body(name, section)
+    drawn = scene_body(marked, section, stickers, stream)
+    ids, normals = tuple(map(str, marked.sticker_ids)), marked.sticker_normals
+    radii = stickers.radius, stickers.ring_radius
+    return Solid(name, drawn.solid.vertices, drawn.solid.faces, ids, drawn.sticker_places, normals, *radii)
+
+
+def _plate(name: str, joints: Array) -> Solid:
+    """A plate about joints (n, 3), where nothing else is known of a platform."""
+    around = PLATE_M * np.vstack([np.eye(3), -np.eye(3)]) * np.array([1.5, 1.5, 1.0])
+    points = (joints[:, None] + around).reshape(-1, 3)
+    hull = ConvexHull(points)
+    corners, outward = points[hull.simplices], hull.equations[:, :3]
+    turned = np.einsum("ni,ni->n", np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), outward) < 0
+    faces = np.where(turned[:, None], hull.simplices[:, ::-1], hull.simplices).astype(int)
+    return Solid(name, points, faces)
