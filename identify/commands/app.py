@@ -15,6 +15,7 @@ from identify.commands.check import CHECK_HELP, check
 from identify.commands.comparisons import compare_excitation, estimators, variation
 from identify.commands.importing import imports
 from identify.commands.robot import base_parameters, export, verify_model, workspace
+from identify.commands.scene import REPLAY_HELP, SHOW_HELP, replay, show
 from identify.commands.sensor import acceptance, detectors
 from identify.commands.study import STUDY_HELP, study
 from identify.errors import IdentifyError, ScenarioError
@@ -50,6 +51,7 @@ The stages alone, each reading what the one before wrote:
   cmmsim identify --out mine             result.json
   cmmsim validate --out mine             validation.nc, model.nc, result.json
   cmmsim report --out mine               report.html, figures/*.png
+  cmmsim replay mine                     replay.html: scene, images and curves over time
 
 \b
 Another estimator on the same record, then judged and shown as before:
@@ -62,6 +64,11 @@ The model in other engines:
   cmmsim export mjcf rss6 --parameters mine/result.json --allow-unphysical-inertia
   cmmsim import mjcf model.xml --out mine.toml
   cmmsim verify-model                    MuJoCo against this model, figure8.png
+
+\b
+What it looks like:
+  cmmsim show rss6                       robot, stickers and cameras: rss6.html
+  cmmsim show rss6 --png scene.pdf       the same as a picture for print
 
 \b
 How well the stickers are found:
@@ -295,6 +302,8 @@ def report(out: RunFolderOption, quiet: Quiet = False) -> None:
         _summary().print_goals(load_result(folder.result), folder.report)
 
 
+app.command(help=REPLAY_HELP)(replay)
+app.command(help=SHOW_HELP)(show)
 app.command("verify-model")(verify_model)
 app.add_typer(export, name="export")
 app.add_typer(imports, name="import")

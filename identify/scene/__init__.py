@@ -6,20 +6,28 @@ scene_figure(cell, pose) -> Figure             the scene, drawn for print
 stereo_figure(view) -> Figure                  both images with what was found, drawn for print
 """
 
-from identify.scene.figures import View, scene_figure, stereo_figure
+from identify.scene.figures import overview_figure, scene_figure, stereo_figure
 from identify.scene.images import Found, StereoView, stereo_view
+from identify.scene.motion import Motion, motion_at_home, read_motion
+from identify.scene.page import write_page
+from identify.scene.painter import View
 from identify.scene.workcell import Solid, ViewingCamera, Workcell, workcell, workcell_of_scenario
 
 __all__ = [
     "Found",
+    "Motion",
     "Solid",
     "StereoView",
     "View",
     "ViewingCamera",
     "Workcell",
+    "motion_at_home",
+    "overview_figure",
+    "read_motion",
     "scene_figure",
     "stereo_figure",
     "stereo_view",
     "workcell",
     "workcell_of_scenario",
+    "write_page",
 ]

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from cmmsim.geometry.pose import apply
@@ -22,6 +23,10 @@ LEGS = ("#c9723a", "#e6c79c", "#7d9d8f", "#8a7fa8")
 
 CAMERA, RAY, DARK, BRIGHT = "#3b3f46", "#c8102e", "#22262b", "#fdfdf5"
 FOUND = {"platform": "#ff9f1c", "base": "#4cc9f0"}
+
+SIDES = ("left", "right")
+ARROWS = 3000.0
+"""Times by which errors of a hundredth of a pixel are enlarged, so that they can be seen."""
 
 CAMERA_M = np.array([0.05, 0.04, 0.12])
 """Half width, half height and length of the box that stands for a camera."""
@@ -43,11 +48,52 @@ def scene_figure(
     pose (6,) of the platform, m and rad, by default home; size in inches; rays, labels: whether to draw them. Needs no
     OpenGL. Raises dynamics.UnreachablePoseError, dynamics.ChartError.
     """
-    at = cell.home if pose is None else np.asarray(pose, dtype=float)
-    placed, rods = cell.placed(at), cell.rods(at)
+    figure = Figure(figsize=size, layout="constrained")
+    draw_scene(figure.add_subplot(), cell, _at(cell, pose), view or View(), rays, labels)
+    return figure
+
+
+def stereo_figure(view: StereoView, *, size: tuple[float, float] = (7.0, 3.9), arrows: float | None = ARROWS) -> Figure:
+    """Both camera images with the detected ellipses, and each centre's error as an arrow.
+
+    size in inches; arrows: how many times the errors (detected less true centre) are enlarged, None: no arrows.
+    """
+    figure = Figure(figsize=size, layout="constrained")
+    for side, axes in enumerate(figure.subplots(1, 2, squeeze=False)[0]):
+        draw_image(axes, view, side, arrows)
+    _explain(figure, view, arrows)
+    return figure
+
+
+def overview_figure(
+    cell: Workcell,
+    view: StereoView,
+    *,
+    towards: View | None = None,
+    size: tuple[float, float] = (10.0, 5.2),
+    arrows: float | None = None,
+) -> Figure:
+    """The scene, and beside it what both cameras see of it, with the detected ellipses.
+
+    view: as `stereo_view` gives it, of the pose that the scene has too; towards: from where the scene is looked at;
+    size in inches; arrows: as of `stereo_figure`. Raises dynamics.UnreachablePoseError, dynamics.ChartError.
+    """
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplot_mosaic([["scene", "left"], ["scene", "right"]], width_ratios=[2.6, 1.0])
+    draw_scene(panels["scene"], cell, view.pose, towards or View(), rays=True, labels=True)
+    for side, name in enumerate(SIDES):
+        draw_image(panels[name], view, side, arrows)
+        panels[name].set(xlabel="", xticks=[], yticks=[])
+    _explain(figure, view, arrows)
+    return figure
+
+
+def draw_scene(axes: Axes, cell: Workcell, pose: Array, view: View, rays: bool, labels: bool) -> None:
+    """Draw a scene into axes, as `scene_figure` does."""
+    placed, rods = cell.placed(pose), cell.rods(pose)
     solids = [apply(place, body.vertices) for body, place in placed]
     shown = [*solids, rods.reshape(-1, 3), *(camera.frustum(FRUSTUM_M) for camera in cell.cameras)]
-    painter = Painter(view or View(), *extent(shown))
+    painter = Painter(view, *extent(shown))
     for body, place in placed:
         _solid(painter, body, place)
     for part, ends in zip(cell.parts, rods, strict=True):
@@ -56,36 +102,33 @@ def scene_figure(
         painter.line(ends, DARK, 1.6)
     for camera in cell.cameras:
         _camera(painter, camera)
-        for sticker in cell.seen(at) if rays else ():
+        for sticker in cell.seen(pose) if rays else ():
             painter.line(np.array([camera.centre, sticker]), RAY, 0.45, alpha=0.55, towards=0.02)
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.add_subplot()
     _triad(painter, axes, labels)
     painter.paint(axes)
     if labels:
         _labels(painter, axes, cell, solids)
-    return figure
 
 
-def stereo_figure(view: StereoView, *, size: tuple[float, float] = (7.0, 3.9), arrows: float | None = 3000.0) -> Figure:
-    """Both camera images with the detected ellipses, and each centre's error as an arrow.
+def draw_image(axes: Axes, view: StereoView, side: int, arrows: float | None) -> None:
+    """Draw one image, 0 left or 1 right, with the detected ellipses into axes, px of the whole image."""
+    show_image(axes, view, side)
+    for body in view.found:
+        _ellipses(axes, view, side, body, arrows)
+    axes.set_title(f"{SIDES[side]} camera", fontsize=9)
 
-    size in inches; arrows: how many times the errors (detected less true centre) are enlarged, None: no arrows.
-    """
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(1, 2, squeeze=False)[0]
-    for side, (axes, name) in enumerate(zip(panels, ("left", "right"), strict=True)):
-        show_image(axes, view, side)
-        for body in view.found:
-            _ellipses(axes, view, side, body, arrows)
-        axes.set_title(f"{name} camera", fontsize=9)
-    handles = [panels[0].plot([], [], "o", mfc="none", mec=colour)[0] for colour in FOUND.values()]
+
+def _at(cell: Workcell, pose: Array | None) -> Array:
+    return cell.home if pose is None else np.asarray(pose, dtype=float)
+
+
+def _explain(figure: Figure, view: StereoView, arrows: float | None) -> None:
+    """The legend below images."""
+    handles = [Line2D([], [], ls="", marker="o", mfc="none", mec=FOUND[name]) for name in view.found]
     words = [f"{len(found.ids)} ellipses found on the {name}" for name, found in view.found.items()]
-    note = "" if arrows is None else f"arrows: detected less true centre, {arrows:g} times enlarged"
-    figure.legend(
-        handles, words, title=note, title_fontsize=8, fontsize=8, loc="outside lower center", ncols=2, frameon=False
-    )
-    return figure
+    note = None if arrows is None else f"arrows: detected less true centre, {arrows:g} times enlarged"
+    small = {"title_fontsize": 8, "fontsize": 8, "frameon": False}
+    figure.legend(handles, words, title=note, loc="outside lower center", ncols=2, **small)
 
 
 def show_image(axes: Axes, view: StereoView, side: int) -> None:

@@ -1,0 +1,162 @@
+"""Commands that show: a run as a page that replays it, and a robot or a sensor as it stands. Heavy imports are late."""
+
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from identify.errors import OutputFolderError, ScenarioError
+from identify.progress import print_warnings, terminal_progress
+
+if TYPE_CHECKING:
+    from identify.scene import Workcell
+
+REPLAY_HELP = """
+Show a run as one HTML file that opens without a network.
+
+It has robot, stickers and cameras in space, what both cameras see, and the measured, true and modelled poses over
+time, their differences enlarged. Open it in a browser.
+
+\b
+Examples:
+  cmmsim replay runs/quick-0                            writes runs/quick-0/replay.html
+  cmmsim replay runs/quick-0 --motion run01             the first unseen trajectory instead of the exciting one
+"""
+
+SHOW_HELP = """
+Show a robot and a sensor as they stand, as one HTML file that opens without a network.
+
+A robot is shown before the sensor ctrack780 where its platform fits that, or before the sensor that is named with it.
+
+\b
+Examples:
+  cmmsim show ups6                                      writes ups6.html
+  cmmsim show mine.toml cameras.toml --out mine.html    a robot and a sensor of your own
+  cmmsim show rss6 --png scene.pdf                      a picture for print instead: .png, .pdf or .svg
+"""
+
+PICTURES = (".png", ".pdf", ".svg")
+SENSOR = "ctrack780"
+ROBOT_KEYS, SENSOR_KEYS = {"parameters", "legs", "family"}, {"rig", "stickers", "based_on"}
+
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary.")]
+
+
+def replay(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run that has been recorded.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="File to write.", show_default="RUN/replay.html")
+    ] = None,
+    motion: Annotated[
+        str, typer.Option(metavar="NAME", help="Which motion: excitation, or an unseen one, as run01.")
+    ] = "excitation",
+    quiet: Quiet = False,
+) -> None:
+    """Write the page that replays a run."""
+    from identify.scene import read_motion, write_page
+
+    path = out or run / "replay.html"
+    shown = read_motion(run, motion)
+    write_page(path, shown, terminal_progress(quiet))
+    print_warnings(shown.notes)
+    if not quiet:
+        typer.echo(f"replay: {path}")
+
+
+def show(
+    names: Annotated[list[str], typer.Argument(metavar="NAME|FILE...", help="A robot, a sensor, or one of each.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Page to write.", show_default="NAME.html")
+    ] = None,
+    png: Annotated[
+        Path | None, typer.Option("--png", metavar="FILE", help="Draw a picture for print: .png, .pdf or .svg.")
+    ] = None,
+    renderer: Annotated[
+        str, typer.Option(help="What draws the camera images: analytic, or pyrender, which needs OpenGL.")
+    ] = "analytic",
+    quiet: Quiet = False,
+) -> None:
+    """Show a robot and a sensor as they stand."""
+    from identify.scene import motion_at_home, write_page
+
+    if png is not None and png.suffix not in PICTURES:
+        raise OutputFolderError(f"--png {png} ends in {png.suffix or 'nothing'}; valid: {', '.join(PICTURES)}")
+    cell, notes = chosen_cell(names)
+    print_warnings(notes)
+    if png is not None:
+        write_picture(png, cell, renderer)
+    path = out or (None if png else Path(f"{Path(names[0]).stem}.html"))
+    if path is not None:
+        standing = motion_at_home(cell, renderer)
+        standing.notes.extend(notes)
+        write_page(path, standing, terminal_progress(quiet))
+    if not quiet:
+        for what, file in (("picture", png), ("page", path)):
+            if file is not None:
+                typer.echo(f"{what}: {file}")
+
+
+def write_picture(path: Path, cell: "Workcell", renderer: str) -> None:
+    """Draw the scene, beside it what the cameras see, into a file. Raises OutputFolderError: it cannot be written."""
+    from identify.files.atomic import atomic_path
+    from identify.scene import overview_figure, scene_figure, stereo_view
+
+    if cell.sensor is None:
+        figure = scene_figure(cell)
+    else:
+        figure = overview_figure(cell, stereo_view(cell, renderer=renderer))
+    try:
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, dpi=200)
+    except OSError as error:
+        raise OutputFolderError(f"cannot write {path}: {error.strerror}; name another file with --png") from None
+
+
+def chosen_cell(names: list[str]) -> tuple["Workcell", list[str]]:
+    """Robot and sensor of one or two names or files, and what is to be said of them.
+
+    Raises ScenarioError: two robots, two sensors, or what is neither; and for two that do not fit each other. Raises
+    dynamics.RobotFileError, cmmsim.CmmError for files that cannot be used.
+    """
+    from cmmsim.files import read_sensor_file
+    from dynamics import load_robot
+    from identify.scene import workcell
+
+    kinds = [kind_of(name) for name in names]
+    if len(set(kinds)) < len(kinds):
+        raise ScenarioError(f"show takes a robot, a sensor, or one of each; {' and '.join(names)} are {kinds[0]}s")
+    robot = next((load_robot(name) for name, kind in zip(names, kinds, strict=True) if kind == "robot"), None)
+    named = next((name for name, kind in zip(names, kinds, strict=True) if kind == "sensor"), None)
+    if robot is None or named is not None:
+        return workcell(robot, None if named is None else read_sensor_file(named)), []
+    try:
+        return workcell(robot, read_sensor_file(SENSOR)), []
+    except ScenarioError as error:
+        return workcell(robot), [f"{robot.name} is shown alone, name a sensor that fits it to see both: {error}"]
+
+
+def kind_of(name: str) -> str:
+    """Whether a built-in name or a file is a "robot" or a "sensor". Raises ScenarioError with the valid names."""
+    from cmmsim.files import built_in_names
+    from dynamics import built_in_robots
+
+    if name in built_in_robots():
+        return "robot"
+    if name in built_in_names():
+        return "sensor"
+    try:
+        content = tomllib.loads(Path(name).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        valid = f"robots {', '.join(built_in_robots())}, sensors {', '.join(built_in_names())}"
+        raise ScenarioError(f"there is no robot, sensor or file {name!r}; built in: {valid}") from None
+    except (OSError, ValueError) as error:
+        raise ScenarioError(f"cannot read {name} as TOML: {' '.join(str(error).split())}") from None
+    if ROBOT_KEYS & content.keys():
+        return "robot"
+    if SENSOR_KEYS & content.keys():
+        return "sensor"
+    raise ScenarioError(
+        f"{name} is neither a robot nor a sensor: a robot has {', '.join(sorted(ROBOT_KEYS))}, a sensor "
+        f"{', '.join(sorted(SENSOR_KEYS))}; it has {', '.join(content) or 'nothing'}"
+    )

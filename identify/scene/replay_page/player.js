@@ -1,0 +1,275 @@
+"use strict";
+/* The page: one time for scene, images, figures and curves. `window.replay` can be driven from outside. */
+
+const WORDS = {
+  legs: "legs", cameras: "cameras and their field of view", rays: "rays to the stickers that were found",
+  ellipsoid: "ellipsoid of the measured position × ", stickers: "ellipsoids of the stickers × ",
+  measured: "measured, difference × ", identified: "identified model, difference × ",
+  starting: "starting model, difference × ", true: "true pose, in which the robot is drawn",
+};
+const SHORT = { true: "true", measured: "measured", identified: "identified model", starting: "starting model" };
+const DASHES = { true: "none", measured: "none", identified: "7 2", starting: "2 3" };
+const WIDTHS = { true: 2.4, measured: 1, identified: 1.6, starting: 1.6 };
+const SAMPLES = {
+  rays: "#c8102e", ellipsoid: "var(--measured)", stickers: "var(--platform)", cameras: "var(--soft)", legs: "#c9723a",
+};
+const OFF_AT_FIRST = ["starting"];
+const NAMES = ["x", "y", "z", "α", "β", "γ"];
+
+class Replay {
+  constructor(data) {
+    this.data = data;
+    this.ready = false;
+    this.time = numbers(data.time, Float64Array);
+    this.tables = { drawn: numbers(data.drawn, Float64Array) };
+    for (const [kind, text] of Object.entries(data.poses)) this.tables[kind] = numbers(text, Float64Array);
+    this.frame = 0;
+    this.off = new Set(OFF_AT_FIRST);
+    this.scene = null;
+    this.panels = { poses: [], differences: [] };
+  }
+
+  /* A pose [x y z alpha beta gamma] of a kind in a frame, m and rad; null where there is none. */
+  pose(kind, frame) {
+    const table = this.tables[kind];
+    const row = table && Array.from(table.subarray(6 * frame, 6 * frame + 6));
+    return row && row.every(Number.isFinite) ? row : null;
+  }
+
+  async start() {
+    this.colours = this.readColours();
+    if (canDraw()) {
+      this.scene = new Scene(this.data, document.getElementById("scene"), (kind, frame) => this.pose(kind, frame));
+      await this.scene.build(this.colours);
+      document.getElementById("still").hidden = true;
+      document.getElementById("still").style.display = "none";
+    } else {
+      document.getElementById("without-webgl").hidden = false;
+      document.querySelectorAll("#scene figcaption, #enlargement").forEach((part) => { part.hidden = true; });
+    }
+    this.buildLegend();
+    document.getElementById("enlarged").addEventListener("change", () => this.seek(this.frame));
+    if (this.data.frames > 1) this.buildTime();
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+      this.colours = this.readColours();
+      this.drawCurves();
+      this.seek(this.frame);
+    });
+    this.seek(0);
+    this.ready = true;
+  }
+
+  readColours() {
+    const style = getComputedStyle(document.documentElement);
+    const names = ["soft", "true", "measured", "identified", "starting", "platform", "base"];
+    return Object.fromEntries(names.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
+  }
+
+  buildLegend() {
+    const layers = Object.entries(this.scene ? this.scene.layers : {}).filter(([, objects]) => objects.length);
+    const names = [...new Set([...Object.keys(this.data.poses), ...layers.map(([name]) => name)])];
+    for (const name of names) {
+      const [item, label, box] = ["li", "label", "input"].map((tag) => document.createElement(tag));
+      box.type = "checkbox";
+      box.checked = !this.off.has(name);
+      box.dataset.layer = name;
+      box.disabled = name === "true";
+      box.addEventListener("change", () => this.toggle(name, box.checked));
+      const words = document.createElement("span");
+      words.dataset.words = name;
+      label.append(box, this.sample(name), words);
+      item.append(label);
+      document.getElementById("legend").append(item);
+      if (this.scene && this.off.has(name)) this.scene.showLayer(name, false);
+    }
+  }
+
+  words(name) {
+    if (name === "true" && this.data.frames === 1) return "the robot at home";
+    if (!this.scene) return SHORT[name];
+    return WORDS[name].endsWith(" ") ? WORDS[name] + this.times().toLocaleString("en") : WORDS[name];
+  }
+
+  sample(name) {
+    const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+    svg.setAttribute("viewBox", "0 0 40 16");
+    const colour = SAMPLES[name] || `var(--${name})`;
+    if (name === "ellipsoid" || name === "stickers") {
+      element("ellipse", { cx: 20, cy: 8, rx: 14, ry: 6, fill: colour, opacity: 0.6 }, svg);
+    } else {
+      const line = { d: "M2 8H38", stroke: colour, "stroke-width": WIDTHS[name] || 2 };
+      element("path", { ...line, "stroke-dasharray": DASHES[name] || "none" }, svg);
+    }
+    return svg;
+  }
+
+  toggle(name, shown) {
+    this.off[shown ? "delete" : "add"](name);
+    if (this.scene) this.scene.showLayer(name, shown);
+    this.drawCurves();
+    this.seek(this.frame);
+  }
+
+  buildTime() {
+    this.slider = document.getElementById("time");
+    this.slider.max = this.data.frames - 1;
+    this.slider.addEventListener("input", () => this.seek(Number(this.slider.value)));
+    document.getElementById("play").addEventListener("click", () => this.play(!this.playing));
+    const seek = (time) => this.seek(this.frameAt(time));
+    const lengths = NAMES.map((name, k) => `${name} [${k < 3 ? "mm" : "mrad"}]`);
+    const errors = NAMES.map((name, k) => `${name} [${k < 3 ? "µm" : "µrad"}]`);
+    for (const [place, names] of [["poses", lengths], ["differences", errors]]) {
+      this.panels[place] = names.map((name) => new Panel(document.getElementById(place), name, this.time, seek));
+    }
+    this.choice = document.getElementById("difference");
+    const known = Object.keys(this.data.poses);
+    if (known.includes("true")) this.choice.append(new Option("measured and models, less the true pose", "true"));
+    if (known.includes("identified")) this.choice.append(new Option("residuals: measured less the model", "residual"));
+    this.choice.closest("section").hidden = !this.choice.options.length;
+    this.choice.addEventListener("change", () => { this.drawCurves(); this.seek(this.frame); });
+    this.drawCurves();
+  }
+
+  frameAt(time) {
+    const after = this.time.findIndex((value) => value >= time);
+    if (after <= 0) return after < 0 ? this.time.length - 1 : 0;
+    return time - this.time[after - 1] < this.time[after] - time ? after - 1 : after;
+  }
+
+  kinds() {
+    return Object.keys(this.data.poses).filter((kind) => !this.off.has(kind));
+  }
+
+  column(kind, k, scale, less) {
+    const [from, other] = [this.tables[kind], less && this.tables[less]];
+    return Float64Array.from(this.time, (_, n) => scale * (from[6 * n + k] - (other ? other[6 * n + k] : 0)));
+  }
+
+  drawCurves() {
+    if (!this.choice) return;
+    const look = (kind) => ({ colour: this.colours[kind], dash: DASHES[kind], width: WIDTHS[kind] });
+    this.panels.poses.forEach((panel, k) => {
+      panel.draw(this.kinds().map((kind) => ({ values: this.column(kind, k, 1e3), ...look(kind) })));
+    });
+    const residual = this.choice.value === "residual";
+    const shown = this.kinds().filter((kind) => kind !== "true" && !(residual && kind === "measured"));
+    const alone = shown.length === 1 ? { dash: "none", width: 1 } : {};
+    const difference = (kind, k) => (residual ? this.column("measured", k, 1e6, kind) : this.column(kind, k, 1e6, "true"));
+    this.panels.differences.forEach((panel, k) => {
+      panel.draw(shown.map((kind) => ({ values: difference(kind, k), ...look(kind), ...alone })));
+    });
+  }
+
+  /* The frame whose images are shown with a frame: the nearest one that has some. */
+  look(frame) {
+    const away = (look) => Math.abs(look.frame - frame);
+    return this.data.looks.reduce((best, look) => (!best || away(look) < away(best) ? look : best), null);
+  }
+
+  /* How much differences are enlarged. */
+  times() {
+    return Number(document.getElementById("enlarged").value);
+  }
+
+  seek(frame) {
+    this.frame = Math.max(0, Math.min(this.data.frames - 1, frame));
+    const times = this.times();
+    document.querySelectorAll("[data-words]").forEach((span) => { span.textContent = this.words(span.dataset.words); });
+    const scale = `10 mm in the scene are ${1e4 / times} µm, 0.1 rad are ${1e5 / times} µrad`;
+    document.getElementById("scale").textContent = scale;
+    const look = this.look(this.frame);
+    if (this.scene) this.scene.show(this.frame, look, times);
+    if (look !== this.shownLook) this.showImages(look);
+    if (!this.slider) return;
+    const time = this.time[this.frame];
+    this.slider.value = this.frame;
+    document.getElementById("clock").textContent = `${time.toFixed(3)} s`;
+    [...this.panels.poses, ...this.panels.differences].forEach((panel) => panel.at(time));
+    this.writeFigures();
+  }
+
+  showImages(look) {
+    this.shownLook = look;
+    document.querySelectorAll(".image").forEach((figure) => {
+      const side = Number(figure.dataset.side);
+      figure.querySelector("img").src = look.images[side];
+      const svg = figure.querySelector("svg");
+      const [x, y] = look.corners[side];
+      svg.setAttribute("viewBox", `${x - 0.5} ${y - 0.5} ${look.size.join(" ")}`);
+      svg.replaceChildren();
+      let count = 0;
+      for (const [body, found] of Object.entries(look.found)) {
+        count += found.ids.length;
+        found.centres[side].forEach((centre, k) => {
+          const shape = found.shapes.length ? found.shapes[side][k] : null;
+          this.ellipse(svg, centre, shape, `var(--${body})`, `${body} ${found.ids[k]}`);
+        });
+      }
+      const moment = this.data.frames > 1 ? ` at ${this.time[look.frame].toFixed(2)} s` : "";
+      const words = `What the ${side ? "right" : "left"} camera sees${moment}: ${count} ellipses found`;
+      figure.querySelector("figcaption").textContent = words;
+    });
+  }
+
+  ellipse(svg, [x, y], shape, colour, name) {
+    const halo = element("circle", { class: "halo", cx: x, cy: y, r: 16, stroke: colour }, svg);
+    element("title", {}, halo).textContent = name;
+    if (!shape) return;
+    const [[a, b], [c, d]] = shape;
+    element("ellipse", { rx: 1, ry: 1, stroke: colour, transform: `matrix(${a} ${c} ${b} ${d} ${x} ${y})` }, svg);
+  }
+
+  writeFigures() {
+    const truth = this.pose("true", this.frame);
+    const kinds = Object.keys(this.data.poses).filter((kind) => kind !== "true");
+    const head = ["", truth ? "true" : "", ...kinds.map((kind) => (truth ? `${SHORT[kind]} less true` : SHORT[kind]))];
+    const rows = NAMES.map((name, k) => {
+      const [large, small] = k < 3 ? ["mm", "µm"] : ["mrad", "µrad"];
+      const cells = kinds.map((kind) => {
+        const pose = this.pose(kind, this.frame);
+        if (!pose) return kind === "measured" ? "lost" : "none";
+        return truth ? `${(1e6 * (pose[k] - truth[k])).toFixed(2)} ${small}` : `${(1e3 * pose[k]).toFixed(4)} ${large}`;
+      });
+      return [name, truth ? `${(1e3 * truth[k]).toFixed(4)} ${large}` : "", ...cells];
+    });
+    const table = document.getElementById("figures");
+    table.replaceChildren();
+    for (const cells of [head, ...rows]) {
+      const row = table.insertRow();
+      cells.forEach((cell, k) => {
+        const place = document.createElement(k && cells !== head ? "td" : "th");
+        place.textContent = cell;
+        row.append(place);
+      });
+    }
+  }
+
+  play(on) {
+    this.playing = on;
+    const button = document.getElementById("play");
+    button.textContent = on ? "❚❚" : "▶";
+    button.setAttribute("aria-label", on ? "Pause" : "Play");
+    if (!on) return;
+    const last = this.time[this.time.length - 1];
+    if (this.frame === this.data.frames - 1) this.seek(0);
+    let [began, from, told] = [performance.now(), this.time[this.frame], this.frame];
+    const step = (now) => {
+      if (!this.playing) return;
+      if (this.frame !== told) [began, from] = [now, this.time[this.frame]]; /* the slider was moved meanwhile */
+      const time = from + (Number(document.getElementById("speed").value) * Math.max(0, now - began)) / 1000;
+      this.seek(this.frameAt(time));
+      told = this.frame;
+      if (time >= last) this.play(false);
+      else requestAnimationFrame(step);
+    };
+    requestAnimationFrame(step);
+  }
+
+  /* What is shown now: time in s, and poses [x y z alpha beta gamma], m and rad, read from the objects in the scene. */
+  shown() {
+    return { frame: this.frame, time: this.time[this.frame], ...(this.scene ? this.scene.shown() : {}) };
+  }
+}
+
+window.replay = new Replay(JSON.parse(document.getElementById("data").textContent));
+window.replay.start();
