@@ -102,12 +102,12 @@ def write_picture(path: Path, cell: "Workcell", renderer: str) -> None:
     from identify.files.atomic import atomic_path
     from identify.scene import overview_figure, scene_figure, stereo_view
 
-    if cell.sensor is None:
-        figure = scene_figure(cell)
-    else:
-        figure = overview_figure(cell, stereo_view(cell, renderer=renderer))
     try:
         with atomic_path(path) as temporary:
+            if cell.sensor is None:
+                figure = scene_figure(cell)
+            else:
+                figure = overview_figure(cell, stereo_view(cell, renderer=renderer))
             figure.savefig(temporary, dpi=200)
     except OSError as error:
         raise OutputFolderError(f"cannot write {path}: {error.strerror}; name another file with --png") from None

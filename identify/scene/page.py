@@ -19,7 +19,7 @@ from trimesh.viewer.notebook import scene_to_html
 
 from identify.arrays import Array
 from identify.errors import IdentifyError, OutputFolderError
-from identify.files.atomic import write_text
+from identify.files.atomic import atomic_path
 from identify.progress import Progress, SilentProgress
 from identify.scene.figures import scene_figure
 from identify.scene.gltf import gltf
@@ -47,9 +47,9 @@ def write_page(path: Path | str, motion: Motion, progress: Progress | None = Non
 
     Raises OutputFolderError: the file cannot be written. Raises dynamics.UnreachablePoseError, cmmsim.CmmError.
     """
-    text = page(motion, progress or SilentProgress())
     try:
-        write_text(path, text)
+        with atomic_path(path) as temporary:  # which fails before anything is drawn where it cannot be written
+            temporary.write_text(page(motion, progress or SilentProgress()), encoding="utf-8")
     except OSError as error:
         raise OutputFolderError(f"cannot write {path}: {error.strerror}; name another file with --out") from None
 

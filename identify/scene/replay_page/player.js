@@ -154,7 +154,9 @@ class Replay {
     const residual = this.choice.value === "residual";
     const shown = this.kinds().filter((kind) => kind !== "true" && !(residual && kind === "measured"));
     const alone = shown.length === 1 ? { dash: "none", width: 1 } : {};
-    const difference = (kind, k) => (residual ? this.column("measured", k, 1e6, kind) : this.column(kind, k, 1e6, "true"));
+    const difference = (kind, k) => {
+      return residual ? this.column("measured", k, 1e6, kind) : this.column(kind, k, 1e6, "true");
+    };
     this.panels.differences.forEach((panel, k) => {
       panel.draw(shown.map((kind) => ({ values: difference(kind, k), ...look(kind), ...alone })));
     });
