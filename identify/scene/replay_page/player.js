@@ -48,6 +48,7 @@ class Replay {
       document.querySelectorAll("#scene figcaption, #enlargement").forEach((part) => { part.hidden = true; });
     }
     this.buildLegend();
+    this.buildImages();
     document.getElementById("enlarged").addEventListener("change", () => this.seek(this.frame));
     if (this.data.frames > 1) this.buildTime();
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
@@ -190,6 +191,19 @@ class Replay {
     this.writeFigures();
   }
 
+  /* Magnify an image about the place that is clicked, or show the whole of it again. */
+  buildImages() {
+    document.querySelectorAll(".image button").forEach((button) => {
+      button.addEventListener("click", (event) => {
+        const box = button.getBoundingClientRect();
+        const [x, y] = event.detail ? [event.clientX - box.left, event.clientY - box.top] : [box.width / 2, box.height / 2];
+        const large = button.getAttribute("aria-pressed") === "true";
+        if (!large) button.firstElementChild.style.transformOrigin = `${x}px ${y}px`;
+        button.setAttribute("aria-pressed", String(!large));
+      });
+    });
+  }
+
   showImages(look) {
     this.shownLook = look;
     document.querySelectorAll(".image").forEach((figure) => {
@@ -208,7 +222,7 @@ class Replay {
         });
       }
       const moment = this.data.frames > 1 ? ` at ${this.time[look.frame].toFixed(2)} s` : "";
-      const words = `What the ${side ? "right" : "left"} camera sees${moment}: ${count} ellipses found`;
+      const words = `What the ${side ? "right" : "left"} camera sees${moment}: ${count} ellipses found (click to magnify)`;
       figure.querySelector("figcaption").textContent = words;
     });
   }
