@@ -57,6 +57,7 @@ class Replay {
       this.seek(this.frame);
     });
     this.seek(0);
+    for (let k = 0; k < 2; k += 1) await new Promise(requestAnimationFrame); /* until it has been drawn */
     this.ready = true;
   }
 

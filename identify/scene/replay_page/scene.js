@@ -74,8 +74,13 @@ class Scene {
     this.controls.addEventListener("change", () => this.draw());
     new ResizeObserver(() => this.resize()).observe(this.renderer.domElement);
     this.resize();
-    const turn = () => { this.controls.update(); requestAnimationFrame(turn); };
-    turn();
+    const turn = () => {
+      this.controls.update();
+      if (this.stale) this.renderer.render(this.world, this.eye);
+      this.stale = false;
+      requestAnimationFrame(turn);
+    };
+    requestAnimationFrame(turn);
   }
 
   node(name) {
@@ -262,7 +267,8 @@ class Scene {
     this.draw();
   }
 
+  /* Draw with the browser's next picture, once however often this is called. */
   draw() {
-    this.renderer.render(this.world, this.eye);
+    this.stale = true;
   }
 }
