@@ -85,6 +85,8 @@ def read_motion(folder: Path | str, name: str = EXCITATION) -> Motion:
         seen = {TRUE: truth} | seen
     seen |= _models(run, files, name, len(record["time"]), notes)
     what = "exciting trajectory" if name == EXCITATION else f"unseen trajectory {names.index(name)}"
+    if TRUE not in seen and not np.isfinite(seen[MEASURED]).all(axis=1).any():
+        raise RecordError(f"{run.path} has neither a truth nor one measured frame: there is no pose to show")
     title = f"Run {run.path.resolve().name}, {what}: {cell.name}"
     covariance = record["measured_covariance"].values
     seed = recorded_seed(record)

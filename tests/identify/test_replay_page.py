@@ -1,5 +1,7 @@
 """The page that replays a run, in a browser: what its scene shows is what the files of the run say."""
 
+import shutil
+import time
 from functools import cache
 
 import numpy as np
@@ -9,7 +11,7 @@ from cmmsim.files import read_sensor_file
 from cmmsim.geometry.pose import invert
 from dynamics import load_robot
 from identify.experiment.plant import build_plant
-from identify.files.dataset import read_group
+from identify.files.dataset import read_group, write_groups
 from identify.files.run_folder import RunFolder, save_result
 from identify.record.provenance import store_robot
 from identify.record.recording import build_model_run, write, write_model_runs
@@ -21,7 +23,6 @@ from tests.identify.synthetic import quick, rss6, run_plant
 
 pytestmark = pytest.mark.slow
 
-SECONDS = 1.0
 LOST = 7
 SMALL = (700, 500)
 """px: the software that draws in tests takes its time for larger ones."""
@@ -39,10 +40,10 @@ def replayed(tmp_path_factory):
     return written
 
 
-def replayed_run(robot, folder):
-    """A short run with a lost frame and a starting model that diverges, and its page."""
+def replayed_run(robot, folder, seconds=1.0, images=4):
+    """A run with a lost frame and a starting model that diverges, and its page with so many images a camera."""
     scenario = quick(robot=robot.name)
-    record, run = run_plant(scenario, 3, duration_s=SECONDS, robot=robot, lost=(LOST,))
+    record, run = run_plant(scenario, 3, duration_s=seconds, robot=robot, lost=(LOST,))
     store_robot(record, robot)
     folder.scenario.write_text(scenario.to_toml(), encoding="utf-8")
     write(folder.experiment, record, build_plant(scenario, robot).truth(run))
@@ -52,7 +53,7 @@ def replayed_run(robot, folder):
     write_model_runs(folder.model, build_model_run(run.time, starting, identified))
     save_result(folder.result, make_result())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(replay_page, "KEY_FRAMES", 4)
+        patch.setattr(replay_page, "KEY_FRAMES", images)
         assert command("replay", folder.path, "--quiet") == 0
     return folder
 
@@ -85,10 +86,10 @@ def test_the_slider_shows_the_poses_of_the_files(robot, replayed, browser):
              "identified": ("model.nc", "excitation", "identified_"),
              "starting": ("model.nc", "excitation", "initial_")}  # fmt: skip
     poses = {kind: stored(folder, *place) for kind, place in kinds.items()}
-    time = read_group(folder.experiment)["time"].values
+    times = read_group(folder.experiment)["time"].values
     for frame in (0, LOST, 23, 59):
         shown = sought(page, frame)
-        assert shown["time"] == time[frame]
+        assert shown["time"] == times[frame]
         for kind, rows in poses.items():
             if np.isfinite(rows[frame]).all():
                 np.testing.assert_allclose(shown[kind], rows[frame], rtol=0, atol=1e-12)
@@ -170,6 +171,22 @@ def luminance(colour):
     return float(np.dot(linear, [0.2126, 0.7152, 0.0722]))
 
 
+def test_a_record_without_truth_and_models_is_shown_with_what_it_has(replayed, browser, tmp_path):
+    folder = RunFolder(shutil.copytree(replayed().path, tmp_path / "run"))
+    write_groups(folder.experiment, {"": read_group(folder.experiment)})
+    folder.model.unlink()
+    assert command("replay", folder.path, "--quiet") == 0
+    page = opened(browser(), folder)
+    said = page.run("return document.body.innerText")
+    assert "holds no truth" in said
+    assert "not validated yet" in said
+    measured = stored(folder, "experiment.nc", "", "measured_")
+    np.testing.assert_allclose(sought(page, 20)["drawn"], measured[20], rtol=0, atol=1e-12)
+    shown = page.run("return [...document.querySelectorAll('[data-layer]')].map((box) => box.dataset.layer)")
+    assert set(shown) == {"measured", "legs", "cameras", "ellipsoid"}
+    assert page.console() == []
+
+
 def test_a_scene_without_a_run_opens_too(browser, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = browser()
@@ -180,3 +197,20 @@ def test_a_scene_without_a_run_opens_too(browser, tmp_path, monkeypatch):
         np.testing.assert_allclose(page.run("return window.replay.shown().drawn")[2], 0.2, atol=1e-12)
         assert page.console() == []
         assert page.requests() == []
+
+
+@pytest.mark.thorough
+def test_a_replay_of_quick_is_small_is_soon_written_and_opens_soon(tmp_path, browser, record_property):
+    folder = replayed_run(rss6(), RunFolder(tmp_path), seconds=10.0, images=replay_page.KEY_FRAMES)
+    began = time.perf_counter()
+    assert command("replay", folder.path, "--quiet") == 0
+    figures = {"written_s": time.perf_counter() - began, "megabytes": 1e-6 * (tmp_path / "replay.html").stat().st_size}
+    opened(browser(), folder)  # the browser itself has started
+    began = time.perf_counter()
+    opened(browser(), folder, (1280, 900))
+    figures["opened_s"] = time.perf_counter() - began
+    for name, value in figures.items():
+        record_property(name, value)
+    assert figures["megabytes"] < 6
+    assert figures["written_s"] < 15
+    assert figures["opened_s"] < 5

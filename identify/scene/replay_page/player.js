@@ -88,6 +88,7 @@ class Replay {
 
   words(name) {
     if (name === "true" && this.data.frames === 1) return "the robot at home";
+    if (name === "measured" && !this.data.poses.true) return "measured pose, in which the robot is drawn";
     if (!this.scene) return SHORT[name];
     return WORDS[name].endsWith(" ") ? WORDS[name] + this.times().toLocaleString("en") : WORDS[name];
   }

@@ -123,7 +123,7 @@ class Scene {
     const boxes = this.data.cameras.map((camera) => this.node(`${camera.name} camera`));
     this.layer("cameras", [...boxes, this.segments(frusta, colours.soft)]);
     this.rays = this.segments([], "#c8102e", 0.35);
-    this.layer("rays", [this.rays]);
+    this.layer("rays", this.data.looks.length ? [this.rays] : []);
   }
 
   /* Exact places of measured and modelled platforms, their enlarged ghosts, and the ellipsoids. */
@@ -150,7 +150,7 @@ class Scene {
     for (const name of ["platform", "base"]) {
       this.stickers[name] = (this.data.bodies[name] || { ids: [] }).ids.map(() => this.ellipsoid(colours[name]));
     }
-    this.layer("stickers", Object.values(this.stickers).flat());
+    this.layer("stickers", this.data.looks.length ? Object.values(this.stickers).flat() : []);
   }
 
   ellipsoid(colour) {
@@ -166,16 +166,14 @@ class Scene {
     const drawn = transformOf(this.poses("drawn", frame));
     this.move(this.platform, drawn);
     this.parts.forEach((part, k) => this.move(part, this.rod(frame, k)));
-    const known = this.poses("true", frame) ? drawn : null;
     for (const kind of Object.keys(this.exact)) {
       const pose = this.poses(kind, frame);
       const ghost = this.ghosts[kind];
       this.exact[kind].visible = Boolean(pose);
-      ghost.visible = ghost.userData.shift.visible = Boolean(pose && known);
+      ghost.visible = ghost.userData.shift.visible = Boolean(pose);
       if (!pose) continue;
       this.move(this.exact[kind], transformOf(pose));
-      if (!known) continue;
-      const place = enlargedTransform(known, this.exact[kind].matrix, times);
+      const place = enlargedTransform(drawn, this.exact[kind].matrix, times);
       this.move(ghost, place);
       const ends = [drawn, place].map((matrix) => new THREE.Vector3().setFromMatrixPosition(matrix));
       ghost.userData.shift.geometry.setFromPoints(ends);
@@ -188,9 +186,8 @@ class Scene {
   showEllipsoid(frame, times) {
     if (!this.ellipsoids) return;
     const shape = this.ellipsoids.subarray(9 * frame, 9 * frame + 9);
-    const ghost = this.ghosts.measured.visible ? this.ghosts.measured : this.exact.measured;
-    this.spread.visible = Number.isFinite(shape[0]) && ghost.visible;
-    if (this.spread.visible) this.move(this.spread, this.stretched(shape, times, ghost.matrix));
+    this.spread.visible = Number.isFinite(shape[0]) && this.ghosts.measured.visible;
+    if (this.spread.visible) this.move(this.spread, this.stretched(shape, times, this.ghosts.measured.matrix));
   }
 
   showLook(look, drawn, times) {
