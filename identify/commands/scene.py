@@ -133,7 +133,8 @@ def chosen_cell(names: list[str]) -> tuple["Workcell", list[str]]:
     try:
         return workcell(robot, read_sensor_file(SENSOR)), []
     except ScenarioError as error:
-        return workcell(robot), [f"{robot.name} is shown alone, name a sensor that fits it to see both: {error}"]
+        remedy = f"A sensor that fits can be named with it: cmmsim show {' '.join(names)} SENSOR"
+        return workcell(robot), [f"{robot.name} is shown without cameras, because {error}. {remedy}"]
 
 
 def kind_of(name: str) -> str:

@@ -24,7 +24,7 @@ from identify.progress import Progress, SilentProgress
 from identify.scene.figures import scene_figure
 from identify.scene.gltf import gltf
 from identify.scene.images import Found, StereoEye, StereoView, region_of
-from identify.scene.motion import Motion
+from identify.scene.motion import TRUE, Motion
 
 PARTS = Path(__file__).parent / "replay_page"
 SCRIPTS = ("scene.js", "curves.js", "player.js")
@@ -57,7 +57,7 @@ def write_page(path: Path | str, motion: Motion, progress: Progress | None = Non
 def page(motion: Motion, progress: Progress) -> str:
     """The page of a motion as one HTML text. Raises as `write_page`."""
     frames = np.unique(np.linspace(0, len(motion.time) - 1, KEY_FRAMES).round().astype(int))
-    with progress.stage("draw the replay", len(frames) + 2) as advance:
+    with progress.stage("draw the replay", 2 + len(frames) * _has_images(motion)) as advance:
         rods = np.array([motion.cell.rods(pose) for pose in motion.drawn])
         advance()
         looks = []
@@ -97,11 +97,16 @@ def three_js() -> str:
     return library + found
 
 
+def _has_images(motion: Motion) -> bool:
+    """Whether there are cameras, and a truth that they can see."""
+    return motion.cell.sensor is not None and TRUE in motion.poses
+
+
 def _views(motion: Motion, frames: Array) -> Any:
-    """Frames and what both cameras see in them; nothing without a sensor or without a truth to draw."""
-    if motion.cell.sensor is None or "true" not in motion.poses:
+    """Frames and what both cameras see in them, as far as there are images."""
+    if not _has_images(motion):
         return
-    chosen = motion.poses["true"][frames]
+    chosen = motion.poses[TRUE][frames]
     eye = StereoEye(motion.cell, motion.seed, motion.renderer, region_of(motion.cell, list(chosen)))
     for frame, pose in zip(frames, chosen, strict=True):
         yield int(frame), eye.look(pose)

@@ -231,7 +231,7 @@ def test_a_robot_that_fits_no_sensor_is_shown_alone_and_a_sensor_without_a_robot
     away = changed_robot_file(tmp_path / "away.toml", "home_pose = [0.0, 0.0, 0.2,", "home_pose = [0.0, 0.0, 0.12,")
     assert command("show", away, "--quiet") == 0
     said = capsys.readouterr().err
-    assert said.startswith("warning: rss6 is shown alone")
+    assert said.startswith("warning: rss6 is shown without cameras")
     assert "<svg" not in (tmp_path / "away.html").read_text().partition("<main>")[2].partition("</main>")[0]
     assert command("show", "ctrack780", "--quiet") == 0
     assert "Sensor ctrack780" in (tmp_path / "ctrack780.html").read_text()

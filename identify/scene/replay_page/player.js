@@ -45,8 +45,10 @@ class Replay {
       document.getElementById("still").style.display = "none";
     } else {
       document.getElementById("without-webgl").hidden = false;
-      document.querySelectorAll("#scene figcaption, #enlargement").forEach((part) => { part.hidden = true; });
+      document.querySelector("#scene figcaption").hidden = true;
     }
+    const differs = this.data.frames > 1 || this.data.looks.length > 0;
+    document.getElementById("enlargement").hidden = !this.scene || !differs;
     this.buildLegend();
     this.buildImages();
     document.getElementById("enlarged").addEventListener("change", () => this.seek(this.frame));
@@ -87,7 +89,7 @@ class Replay {
   }
 
   words(name) {
-    if (name === "true" && this.data.frames === 1) return "the robot at home";
+    if (name === "true" && this.data.frames === 1) return "the platform at home";
     if (name === "measured" && !this.data.poses.true) return "measured pose, in which the robot is drawn";
     if (!this.scene) return SHORT[name];
     return WORDS[name].endsWith(" ") ? WORDS[name] + this.times().toLocaleString("en") : WORDS[name];

@@ -64,7 +64,7 @@ class Scene {
     this.platform = this.node("platform");
     this.parts = this.data.parts.map((name) => this.node(name));
     for (const name of ["platform", "base"]) this.outline(this.node(name), 0x22262b);
-    this.layer("legs", [...this.parts, this.segments(this.data.frame, colours.soft)]);
+    this.layer("legs", this.parts.length ? [...this.parts, this.segments(this.data.frame, colours.soft)] : []);
     this.addCameras(colours);
     this.addKinds(colours);
     this.figure.prepend(this.renderer.domElement);
@@ -121,7 +121,7 @@ class Scene {
       });
     }
     const boxes = this.data.cameras.map((camera) => this.node(`${camera.name} camera`));
-    this.layer("cameras", [...boxes, this.segments(frusta, colours.soft)]);
+    this.layer("cameras", boxes.length ? [...boxes, this.segments(frusta, colours.soft)] : []);
     this.rays = this.segments([], "#c8102e", 0.35);
     this.layer("rays", this.data.looks.length ? [this.rays] : []);
   }
