@@ -15,6 +15,8 @@ Identification
     identify(record, robot, scenario) -> IdentificationResult
     unseen_errors(parameters, robot, scenario, seed) -> ndarray   model against plant on trajectories it never saw
 
+Pictures: the room `identify.scene` draws robot, cameras and images, and writes the page that replays a run.
+
 Every error that a user can cause is an IdentifyError, a `cmmsim.CmmError` or a `dynamics.DynamicsError`. Names are
 imported on first use: CasADi and OpenGL take seconds to load, and `cmmsim --help` must not wait for them.
 """

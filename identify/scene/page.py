@@ -27,7 +27,7 @@ from identify.scene.images import Found, StereoEye, StereoView, region_of
 from identify.scene.motion import TRUE, Motion
 
 PARTS = Path(__file__).parent / "replay_page"
-SCRIPTS = ("scene.js", "curves.js", "player.js")
+SCRIPTS = ("scene.js", "curves.js", "images.js", "player.js")
 
 KEY_FRAMES = 24
 """Frames of which the images are drawn: they take most of the time and half of the file."""

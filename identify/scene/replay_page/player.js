@@ -50,7 +50,7 @@ class Replay {
     const differs = this.data.frames > 1 || this.data.looks.length > 0;
     document.getElementById("enlargement").hidden = !this.scene || !differs;
     this.buildLegend();
-    this.buildImages();
+    this.images = new Images((frame) => (this.data.frames > 1 ? this.time[frame] : null));
     document.getElementById("enlarged").addEventListener("change", () => this.seek(this.frame));
     if (this.data.frames > 1) this.buildTime();
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
@@ -182,11 +182,12 @@ class Replay {
     this.frame = Math.max(0, Math.min(this.data.frames - 1, frame));
     const times = this.times();
     document.querySelectorAll("[data-words]").forEach((span) => { span.textContent = this.words(span.dataset.words); });
+    this.writeBadge(times);
     const scale = `10 mm in the scene are ${1e4 / times} µm, 0.1 rad are ${1e5 / times} µrad`;
     document.getElementById("scale").textContent = scale;
     const look = this.look(this.frame);
     if (this.scene) this.scene.show(this.frame, look, times);
-    if (look !== this.shownLook) this.showImages(look);
+    if (look) this.images.show(look);
     if (!this.slider) return;
     const time = this.time[this.frame];
     this.slider.value = this.frame;
@@ -195,48 +196,17 @@ class Replay {
     this.writeFigures();
   }
 
-  /* Magnify an image about the place that is clicked, or show the whole of it again. */
-  buildImages() {
-    document.querySelectorAll(".image button").forEach((button) => {
-      button.addEventListener("click", (event) => {
-        const box = button.getBoundingClientRect();
-        const [x, y] = event.detail ? [event.clientX - box.left, event.clientY - box.top] : [box.width / 2, box.height / 2];
-        const large = button.getAttribute("aria-pressed") === "true";
-        if (!large) button.firstElementChild.style.transformOrigin = `${x}px ${y}px`;
-        button.setAttribute("aria-pressed", String(!large));
-      });
-    });
-  }
-
-  showImages(look) {
-    this.shownLook = look;
-    document.querySelectorAll(".image").forEach((figure) => {
-      const side = Number(figure.dataset.side);
-      figure.querySelector("img").src = look.images[side];
-      const svg = figure.querySelector("svg");
-      const [x, y] = look.corners[side];
-      svg.setAttribute("viewBox", `${x - 0.5} ${y - 0.5} ${look.size.join(" ")}`);
-      svg.replaceChildren();
-      let count = 0;
-      for (const [body, found] of Object.entries(look.found)) {
-        count += found.ids.length;
-        found.centres[side].forEach((centre, k) => {
-          const shape = found.shapes.length ? found.shapes[side][k] : null;
-          this.ellipse(svg, centre, shape, `var(--${body})`, `${body} ${found.ids[k]}`);
-        });
-      }
-      const moment = this.data.frames > 1 ? ` at ${this.time[look.frame].toFixed(2)} s` : "";
-      const words = `What the ${side ? "right" : "left"} camera sees${moment}: ${count} ellipses found (click to magnify)`;
-      figure.querySelector("figcaption").textContent = words;
-    });
-  }
-
-  ellipse(svg, [x, y], shape, colour, name) {
-    const halo = element("circle", { class: "halo", cx: x, cy: y, r: 16, stroke: colour }, svg);
-    element("title", {}, halo).textContent = name;
-    if (!shape) return;
-    const [[a, b], [c, d]] = shape;
-    element("ellipse", { rx: 1, ry: 1, stroke: colour, transform: `matrix(${a} ${c} ${b} ${d} ${x} ${y})` }, svg);
+  /* In the scene itself: what its coloured outlines are, so that a picture of it says so, too. */
+  writeBadge(times) {
+    const badge = document.getElementById("badge");
+    badge.hidden = !this.scene || this.data.frames === 1;
+    badge.replaceChildren();
+    for (const kind of this.kinds().filter((name) => name !== "true")) {
+      const line = document.createElement("span");
+      line.style.color = this.colours[kind];
+      line.textContent = `${SHORT[kind]}: difference × ${times.toLocaleString("en")}`;
+      badge.append(line);
+    }
   }
 
   writeFigures() {

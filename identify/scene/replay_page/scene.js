@@ -31,6 +31,11 @@ function enlargedTransform(from, to, times) {
   return new THREE.Matrix4().compose(place, turn, new THREE.Vector3(1, 1, 1));
 }
 
+/* A colour of the page as three.js calculates with it. */
+function linear(colour) {
+  return new THREE.Color(colour).convertSRGBToLinear();
+}
+
 function canDraw() {
   const canvas = document.createElement("canvas");
   return Boolean(window.WebGLRenderingContext && (canvas.getContext("webgl2") || canvas.getContext("webgl")));
@@ -99,7 +104,7 @@ class Scene {
 
   segments(pairs, colour, opacity = 1) {
     const points = pairs.flat().map((point) => new THREE.Vector3(...point));
-    const material = new THREE.LineBasicMaterial({ color: colour, transparent: opacity < 1, opacity });
+    const material = new THREE.LineBasicMaterial({ color: linear(colour), transparent: opacity < 1, opacity });
     return new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(points), material);
   }
 
@@ -107,7 +112,7 @@ class Scene {
     let mesh = null;
     if (node) node.traverse((child) => { if (child.isMesh && !mesh) mesh = child; });
     if (!mesh) return null;
-    const material = new THREE.LineBasicMaterial({ color: colour, depthTest: !onTop, transparent: onTop });
+    const material = new THREE.LineBasicMaterial({ color: linear(colour), depthTest: !onTop, transparent: onTop });
     const lines = new THREE.LineSegments(new THREE.EdgesGeometry(mesh.geometry, 5), material);
     if (!onTop) node.add(lines);
     return lines;
@@ -122,7 +127,7 @@ class Scene {
     }
     const boxes = this.data.cameras.map((camera) => this.node(`${camera.name} camera`));
     this.layer("cameras", boxes.length ? [...boxes, this.segments(frusta, colours.soft)] : []);
-    this.rays = this.segments([], "#c8102e", 0.35);
+    this.rays = this.segments([], "#c8102e", 0.5);
     this.layer("rays", this.data.looks.length ? [this.rays] : []);
   }
 
@@ -154,7 +159,7 @@ class Scene {
   }
 
   ellipsoid(colour) {
-    const settings = { color: colour, transparent: true, opacity: 0.5, depthTest: false, depthWrite: false };
+    const settings = { color: linear(colour), transparent: true, opacity: 0.5, depthTest: false, depthWrite: false };
     const mesh = new THREE.Mesh(this.ball, new THREE.MeshLambertMaterial(settings));
     mesh.matrixAutoUpdate = false;
     mesh.frustumCulled = false;
