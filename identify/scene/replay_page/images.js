@@ -44,8 +44,8 @@ class Images {
       }
       const time = this.time(look.frame);
       const moment = time === null ? "" : ` at ${time.toFixed(2)} s`;
-      const words = `What the ${side ? "right" : "left"} camera sees${moment}: ${count} ellipses found (click to magnify)`;
-      figure.querySelector("figcaption").textContent = words;
+      const words = `What the ${side ? "right" : "left"} camera sees${moment}: ${count} ellipses found`;
+      figure.querySelector("figcaption").textContent = `${words} (click to magnify)`;
     });
   }
 
