@@ -125,7 +125,7 @@ def _at(cell: Workcell, pose: Array | None) -> Array:
 def _explain(figure: Figure, view: StereoView, arrows: float | None) -> None:
     """The legend below images."""
     handles = [Line2D([], [], ls="", marker="o", mfc="none", mec=FOUND[name]) for name in view.found]
-    words = [f"{len(found.ids)} ellipses found on the {name}" for name, found in view.found.items()]
+    words = [f"{len(found.ids)} stickers found on the {name}" for name, found in view.found.items()]
     note = None if arrows is None else f"arrows: detected less true centre, {arrows:g} times enlarged"
     small = {"title_fontsize": 8, "fontsize": 8, "frameon": False}
     figure.legend(handles, words, title=note, loc="outside lower center", ncols=2, **small)

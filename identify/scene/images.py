@@ -75,6 +75,9 @@ class StereoEye:
         else:
             whole, corners = drawn.full(), np.zeros((2, 2), dtype=int)
             images = np.stack([whole.left, whole.right])
+            if self._region is not None:
+                corners, side = self._region
+                images = _Cut(images, np.zeros_like(corners)).windows(corners[:, None], side)[:, 0]
         cut = _Cut(images, corners)
         found = {body.name: self._found(cut, pose, k) for k, body in enumerate(self._cell.bodies)}
         white = self._sensor.noise.white_level

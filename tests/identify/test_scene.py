@@ -134,7 +134,7 @@ def test_figures_are_drawn_with_words_of_what_they_show(cell, view):
     assert {"left camera", "right camera", "platform", "base", "x", "y", "z"} <= scene
     both = drawn_words(stereo_figure(view, arrows=2000.0))
     assert any("2000 times enlarged" in words for words in both)
-    assert {"18 ellipses found on the platform"} <= drawn_words(overview_figure(cell, view))
+    assert {"18 stickers found on the platform"} <= drawn_words(overview_figure(cell, view))
     assert drawn(overview_figure(cell, view)).std() > 10
 
 

@@ -44,7 +44,7 @@ class Images {
       }
       const time = this.time(look.frame);
       const moment = time === null ? "" : ` at ${time.toFixed(2)} s`;
-      const words = `What the ${side ? "right" : "left"} camera sees${moment}: ${count} ellipses found`;
+      const words = `What the ${side ? "right" : "left"} camera sees${moment}: ${count} stickers found`;
       figure.querySelector("figcaption").textContent = `${words} (click to magnify)`;
     });
   }
