@@ -16,6 +16,7 @@ from cmmsim.errors import ShapeError, TeachingError
 from cmmsim.files.schema import SensorFile
 from cmmsim.files.sensor_file import dotted
 from cmmsim.geometry.pose import Array, compose_covariance, pose_covariance, pose_to_transform, skew
+from cmmsim.geometry.stereo_rig import StereoRig
 
 SHOWN_CHANGES, SHOWN_CHARACTERS = 3, 40  # of what differs between two setups
 
@@ -78,25 +79,29 @@ class Taught:
         return pose_covariance(base_from_platform, total)
 
 
-def setup_of(file: SensorFile) -> str:
-    """JSON of the entries that teaching depends on, the same for the same entries."""
+def setup_of(file: SensorFile, known: StereoRig | None = None) -> str:
+    """JSON of the entries that teaching depends on, the same for the same entries; with the rig that it was done with,
+    where that is another than the file's."""
     rig = file.rig.model_dump(exclude={"distance"})  # it has become part of the position
     bodies = {name: {"planes": getattr(file, name).planes.model_dump()} for name in ("platform", "base")}
     stickers = file.stickers.model_dump(include={"placement", "placement_seed"})
-    return json.dumps({"rig": rig, "stickers": stickers, **bodies}, sort_keys=True)
+    other = {} if known is None else {"known_rig": known.parameters.tolist()}
+    return json.dumps({"rig": rig, "stickers": stickers, **bodies, **other}, sort_keys=True)
 
 
-def require_taught_for(taught: Taught, file: SensorFile, stickers: int) -> None:
-    """Raise TeachingError, naming what differs, unless ``taught`` holds for this file and its ``stickers`` ones.
+def require_taught_for(taught: Taught, file: SensorFile, stickers: int, known: StereoRig | None = None) -> None:
+    """Raise TeachingError, naming what differs, unless ``taught`` holds for this file and its ``stickers`` ones, and
+    for the rig as it is known, where that is another than the file's.
 
     One that was put together by hand states no setup: then the name of its sensor must be the file's.
     """
     if not taught.setup and taught.sensor_name != file.name:
         raise TeachingError(f"taught belongs to sensor {taught.sensor_name!r}, not to {file.name!r}")
-    if taught.setup and taught.setup != setup_of(file):
+    here = setup_of(file, known)
+    if taught.setup and taught.setup != here:
         raise TeachingError(
             f"taught belongs to sensor {taught.sensor_name!r} set up differently: "
-            f"{_changes(taught.setup, setup_of(file))}; teach this sensor anew"
+            f"{_changes(taught.setup, here)}; teach this sensor anew"
         )
     if len(taught.platform_places) != stickers:
         raise TeachingError(
