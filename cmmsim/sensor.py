@@ -211,8 +211,8 @@ class Sensor:
     def move_rig(self, changes: Mapping[str, float]) -> None:
         """Change the true rig by named amounts, as ``{"right.cx_px": 0.1}``; the estimator is not told.
 
-        Raises UnknownOptionError for a name that a rig has not (``cmmsim.geometry.stereo_rig.PARAMETER_NAMES``),
-        CmmError for a number that is not finite.
+        Raises CmmError for a name that a rig has not (``cmmsim.geometry.stereo_rig.PARAMETER_NAMES``), ShapeError for a
+        number that is not finite.
         """
         self._true_rig = self._true_rig.moved(rig_changes(changes))
         self.__dict__.pop("camera", None)  # it is built anew before the next picture

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from cmmsim.checks import finite_array
-from cmmsim.errors import CmmError, UnknownOptionError
+from cmmsim.errors import CmmError
+from cmmsim.geometry.camera import INTRINSIC_NAMES
 from cmmsim.geometry.pose import Array
-from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig
 
 ROUNDING = 1e-9  # of the largest: what rounding may leave of a covariance's negative eigenvalues, in units of its std
 
@@ -53,11 +54,14 @@ class KnownRig:
 def rig_changes(changes: Mapping[str, float]) -> Array:
     """Changes (24,) of a rig's parameters from those that are named, in their units.
 
-    Raises UnknownOptionError for a name that is none of PARAMETER_NAMES, CmmError for a number that is not finite.
+    Raises CmmError for a name that is none of PARAMETER_NAMES, ShapeError for a number that is not finite.
     """
     values = np.zeros(len(PARAMETER_NAMES))
     for name, value in changes.items():
         if name not in PARAMETER_NAMES:
-            raise UnknownOptionError("parameter of a rig", name, PARAMETER_NAMES)
+            raise CmmError(
+                f"a rig has no parameter {name!r}: it has left. and right. with {', '.join(INTRINSIC_NAMES)}, and "
+                f"right_from_left. with {', '.join(PLACE_NAMES)}"
+            )
         values[PARAMETER_NAMES.index(name)] = finite_array(value, (), f"the change of {name} must be a finite number")
     return values

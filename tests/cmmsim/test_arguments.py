@@ -88,7 +88,7 @@ def test_images_of_another_size_or_depth_are_refused(sensor, shape):
         (lambda s: s.add_bodies({3: trimesh.Trimesh()}), "the name of a body must be text, got 3 of type int"),
         (
             lambda s: s.move_rig({"middle.cx_px": 1.0}),
-            "unknown parameter of a rig 'middle.cx_px': valid are left.fx_px, ",
+            "a rig has no parameter 'middle.cx_px': it has left. and right. with fx_px, ",
         ),
         (lambda s: s.move_rig({"left.k1": np.nan}), "the change of left.k1 must be a finite number"),
         (lambda s: s.common_errors(np.zeros(6), np.zeros(6)), r"poses must be \(N,6\) and finite"),
