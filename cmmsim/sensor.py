@@ -23,7 +23,7 @@ from cmmsim.files.setup import marked_body, require_corner, rig_from_file
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.known_rig import KnownRig, rig_changes
 from cmmsim.geometry.pose import Array, checked_pose, checked_transform, pose_to_transform
-from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
 from cmmsim.imaging.formation import ImageFormation
 from cmmsim.imaging.renderer import Drawable, Renderer, choose_renderer
@@ -44,7 +44,8 @@ TEACHING_STREAM, RUN_STREAM, DROPOUT_STREAM = 0, 1, 2
 class Sensor:
     """A stereo optical CMM that looks at a posed platform.
 
-    The cameras that draw are the file's; those that measure are the file's, too, or as they are ``known``.
+    The cameras that draw are the file's; those that measure are the file's, too, or as they are ``known``, or were when
+    the sensor was ``taught``.
 
     It teaches itself on first use, or takes what a sensor with the same cameras, planes and stickers was taught; raises
     TeachingError, naming what differs, for what another one was taught.
@@ -72,15 +73,15 @@ class Sensor:
         self._file, self._seed, self._progress = file, _checked_seed(seed), progress
         self.method = method
         self._true_rig, self._camera_from_base = rig_from_file(file.rig)
-        self._known = known
-        self.rig = self._true_rig if known is None else known.rig
+        self._known = taught.known if isinstance(taught, Taught) else known
+        self.rig = self._true_rig if self._known is None else self._known.rig
         figures = file.camera.model_dump(exclude={"pattern_seed"})
         self.noise = CameraNoise(**{("enabled" if k == "noise" else k): v for k, v in figures.items()})
         self.optics = Optics(**file.lens.model_dump())
         self.platform, self.base = marked_body("platform", file.platform), marked_body("base", file.base)
         if taught is not None:
             require_kind(taught, Taught, "taught must be what another sensor's teach() returned")
-            require_taught_for(taught, file, len(self.platform.nominal), self._other_rig)
+            require_taught_for(taught, file, len(self.platform.nominal))
         self._scene = [
             scene_body(body, section, file.stickers, stream)
             for stream, (body, section) in enumerate(((self.platform, file.platform), (self.base, file.base)))
@@ -176,7 +177,7 @@ class Sensor:
             teacher = Teacher(self.camera, self.observer, self.platform, self.base, self._window_sizes.plan())
             rng = np.random.default_rng([self._seed, TEACHING_STREAM])
             found = teacher.teach(self.name, self.home, rng, progress or self._progress)
-            self._taught = replace(found, setup=setup_of(self._file, self._other_rig))
+            self._taught = replace(found, setup=setup_of(self._file), known=self._known)
         return self._taught
 
     def start_run(self, seed: int) -> None:
@@ -202,11 +203,6 @@ class Sensor:
         level = self._file.stickers.obstacle_level / 255.0
         self._obstacles.update({name: solid_mesh(mesh, level) for name, mesh in meshes.items()})
         self.__dict__.pop("camera", None)  # it is built anew before the next picture
-
-    @property
-    def _other_rig(self) -> StereoRig | None:
-        """The rig as it is known, where that is another than the file's."""
-        return None if self._known is None else self._known.rig
 
     def move_rig(self, changes: Mapping[str, float]) -> None:
         """Change the true rig by named amounts, as ``{"right.cx_px": 0.1}``; the estimator is not told.

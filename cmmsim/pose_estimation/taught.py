@@ -15,8 +15,8 @@ import numpy as np
 from cmmsim.errors import ShapeError, TeachingError
 from cmmsim.files.schema import SensorFile
 from cmmsim.files.sensor_file import dotted
+from cmmsim.geometry.known_rig import KnownRig
 from cmmsim.geometry.pose import Array, compose_covariance, pose_covariance, pose_to_transform, skew
-from cmmsim.geometry.stereo_rig import StereoRig
 
 SHOWN_CHANGES, SHOWN_CHARACTERS = 3, 40  # of what differs between two setups
 
@@ -28,7 +28,8 @@ class Taught:
     sensor_name; base_from_camera (4,4) and base_covariance (6,6) of its small error [dt, dphi]; platform_places (n,3)
     sticker coordinates in platform axes, m, and place_covariances (n,3,3); platform_covariance (6,6): error of the
     platform frame itself, in platform axes; base_places (k,3) sticker coordinates in base axes, m. setup: what of the
-    sensor file this holds for, see ``setup_of``; empty for one put together by hand.
+    sensor file this holds for, see ``setup_of``; empty for one put together by hand. known: the rig that it was taught
+    with, where that is another than the file's.
     """
 
     sensor_name: str
@@ -39,6 +40,7 @@ class Taught:
     platform_covariance: Array
     base_places: Array
     setup: str = ""
+    known: KnownRig | None = None
 
     def __post_init__(self) -> None:
         stickers, base_stickers = len(self.platform_places), len(self.base_places)
@@ -79,29 +81,25 @@ class Taught:
         return pose_covariance(base_from_platform, total)
 
 
-def setup_of(file: SensorFile, known: StereoRig | None = None) -> str:
-    """JSON of the entries that teaching depends on, the same for the same entries; with the rig that it was done with,
-    where that is another than the file's."""
+def setup_of(file: SensorFile) -> str:
+    """JSON of the entries that teaching depends on, the same for the same entries."""
     rig = file.rig.model_dump(exclude={"distance"})  # it has become part of the position
     bodies = {name: {"planes": getattr(file, name).planes.model_dump()} for name in ("platform", "base")}
     stickers = file.stickers.model_dump(include={"placement", "placement_seed"})
-    other = {} if known is None else {"known_rig": known.parameters.tolist()}
-    return json.dumps({"rig": rig, "stickers": stickers, **bodies, **other}, sort_keys=True)
+    return json.dumps({"rig": rig, "stickers": stickers, **bodies}, sort_keys=True)
 
 
-def require_taught_for(taught: Taught, file: SensorFile, stickers: int, known: StereoRig | None = None) -> None:
-    """Raise TeachingError, naming what differs, unless ``taught`` holds for this file and its ``stickers`` ones, and
-    for the rig as it is known, where that is another than the file's.
+def require_taught_for(taught: Taught, file: SensorFile, stickers: int) -> None:
+    """Raise TeachingError, naming what differs, unless ``taught`` holds for this file and its ``stickers`` ones.
 
     One that was put together by hand states no setup: then the name of its sensor must be the file's.
     """
     if not taught.setup and taught.sensor_name != file.name:
         raise TeachingError(f"taught belongs to sensor {taught.sensor_name!r}, not to {file.name!r}")
-    here = setup_of(file, known)
-    if taught.setup and taught.setup != here:
+    if taught.setup and taught.setup != setup_of(file):
         raise TeachingError(
             f"taught belongs to sensor {taught.sensor_name!r} set up differently: "
-            f"{_changes(taught.setup, here)}; teach this sensor anew"
+            f"{_changes(taught.setup, setup_of(file))}; teach this sensor anew"
         )
     if len(taught.platform_places) != stickers:
         raise TeachingError(

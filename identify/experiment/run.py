@@ -15,11 +15,13 @@ from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference, prepare
 from identify.estimation.scale_anchor import measured_anchor, store_anchor
 from identify.excitation.design import design_trajectories
+from identify.experiment.known_rig import known_rig
 from identify.experiment.plant import Plant, PlatformLoad, build_plant, drawn_load
-from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, make_sensor, with_renderer
+from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, make_sensor, sensor_file, with_renderer
 from identify.progress import Advance, Progress, SilentProgress
-from identify.random_streams import ANCHOR, LATENCY, LOAD, NOISE, TEACHING, stream_seed
+from identify.random_streams import ANCHOR, CALIBRATION, LATENCY, LOAD, NOISE, TEACHING, stream_seed
 from identify.record import recording
+from identify.record.common_errors import CommonErrors, store_common_errors
 from identify.record.payload import store_payload
 from identify.record.provenance import store_robot
 from identify.scenario import Scenario
@@ -68,14 +70,16 @@ def run_experiment(
 
 def taught_sensor(scenario: Scenario, robot: Robot, seed: int, progress: Progress) -> cmmsim.Sensor:
     """The scenario's sensor with its frames taught."""
-    sensor = untaught_sensor(scenario, robot, seed)
+    sensor = untaught_sensor(scenario, robot, seed, progress)
     teach(sensor, progress)
     return sensor
 
 
-def untaught_sensor(scenario: Scenario, robot: Robot, seed: int) -> cmmsim.Sensor:
-    """The scenario's sensor, its teaching seeded by the run's seed."""
-    return make_sensor(scenario, robot, stream_seed(seed, TEACHING))
+def untaught_sensor(scenario: Scenario, robot: Robot, seed: int, progress: Progress | None = None) -> cmmsim.Sensor:
+    """The scenario's sensor, its teaching and what is known of its rig seeded by the run's seed."""
+    rng = np.random.default_rng(stream_seed(seed, CALIBRATION))
+    known = known_rig(scenario, sensor_file(scenario), rng, progress)
+    return make_sensor(scenario, robot, stream_seed(seed, TEACHING), known=known)
 
 
 def teach(sensor: cmmsim.Sensor, progress: Progress) -> None:
@@ -131,6 +135,9 @@ def run_plant(
     record, truth = _record(plant, reference, done, eye, seed), plant.truth(done)
     settings, rng = scenario.identification, np.random.default_rng(stream_seed(seed, ANCHOR))
     layout = plant.robot.layout
+    if scenario.rig.known != "exact" and isinstance(sensor, cmmsim.Sensor):
+        found = sensor.common_errors(reference.poses, reference.rates)
+        store_common_errors(record, CommonErrors(found.names, found.changes, found.covariance))
     store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, layout, plant.parameters, rng))
     if load is not None:
         store_payload(record, layout, load.stated, load.std)

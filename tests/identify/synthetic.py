@@ -61,11 +61,13 @@ def run_plant(
     trajectory_seed=0,
     size=1.0,
     robot=None,
+    bias=lambda pose: 0.0,
     **stated,
 ):
     """(record, run of the plant) with Gaussian noise of `sigma` (6,) and the frames `lost` not measured.
 
-    size: of the motion, as a share of the usual box; robot: another than the reference robot; stated: what
+    size: of the motion, as a share of the usual box; robot: another than the reference robot; bias: of the sensor at a
+    pose (6,); stated: what
     `build_record` is given in place of what was.
     """
     rng, robot = np.random.default_rng(seed), robot or rss6()
@@ -76,7 +78,7 @@ def run_plant(
 
     def sensor(frame, t, pose):
         noise = sigma * rng.standard_normal(6)
-        return None if frame in lost else pose + noise
+        return None if frame in lost else pose + bias(pose) + noise
 
     run = plant.run(reference, sensor)
     covariance = np.broadcast_to(np.diag(np.maximum(sigma, 1e-9) ** 2), (len(times), 6, 6)).copy()
