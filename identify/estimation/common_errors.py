@@ -27,8 +27,8 @@ class CommonErrorEstimates:
 def common_error_estimates(problem: OutputErrorProblem, parameters: Array) -> CommonErrorEstimates:
     """What the first record of a problem says at its optimum (p,) of what its poses have in common."""
     run = problem.runs[0]
-    common = run.common
-    if not common.names:
+    names, factor = run.common.all_names, run.common.whole_factor
+    if not names:
         nothing = np.zeros(0)
         return CommonErrorEstimates((), nothing, nothing, nothing)
     residuals, jacobian, modes = _in_noise(run, parameters)
@@ -36,13 +36,13 @@ def common_error_estimates(problem: OutputErrorProblem, parameters: Array) -> Co
     information = rows.T @ rows
     count = len(parameters)
     information[:count, :count] += problem.known_information()
-    information[count:, count:] += np.eye(len(common.names))
+    information[count:, count:] += np.eye(len(names))
     scale = 1.0 / np.sqrt(np.diag(information))
     covariance = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
-    found = -np.linalg.solve(np.eye(len(common.names)) + modes.T @ modes, modes.T @ residuals)
-    spread = common.factor @ covariance[count:, count:] @ common.factor.T
-    prior_std = np.sqrt(np.diag(common.covariance))
-    return CommonErrorEstimates(common.names, prior_std, common.factor @ found, np.sqrt(np.diag(spread)))
+    found = -np.linalg.solve(np.eye(len(names)) + modes.T @ modes, modes.T @ residuals)
+    spread = factor @ covariance[count:, count:] @ factor.T
+    prior_std = np.sqrt(np.diag(factor @ factor.T))
+    return CommonErrorEstimates(names, prior_std, factor @ found, np.sqrt(np.diag(spread)))
 
 
 def _in_noise(run: RecordedRun, parameters: Array) -> tuple[Array, Array, Array]:

@@ -201,9 +201,15 @@ def repeated_experiment(run: RecordedRun, parameters: Array, rng: np.random.Gene
     Raises LoopFailure where the loop is unstable.
     """
     noise = rng.standard_normal(run.measured.shape) @ np.linalg.cholesky(run.covariance).T
-    if run.common.names:
-        noise = noise + run.common.modes @ rng.standard_normal(len(run.common.names))
-    return simulate(run.robot, parameters + run.payload, run.reference, run.settings, lost=~run.ok, noise=noise)
+    common, latencies = run.common, None
+    if common.names:
+        noise = noise + common.modes @ rng.standard_normal(len(common.names))
+    if common.latency_std:
+        drawn = run.settings.timing.latency_s + common.latency_std * rng.standard_normal()
+        latencies = np.full(len(noise), max(drawn, 0.0))
+    parameters = parameters + run.payload
+    lost = ~run.ok
+    return simulate(run.robot, parameters, run.reference, run.settings, lost=lost, noise=noise, latencies=latencies)
 
 
 def correlation_matrix(covariance: Array) -> Array:

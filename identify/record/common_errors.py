@@ -11,28 +11,43 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from scipy.linalg import cholesky
+from scipy.linalg import block_diag, cholesky
 
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
 
 CHANGES, COVARIANCE = "common_error", "common_error_covariance"
+LATENCY = "timing.latency_s"
 ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
 class CommonErrors:
     """names of the errors, each ending with its unit; changes (N, 6, k) of the measured poses per unit of each;
-    covariance (k, k) of what is true minus what is known."""
+    covariance (k, k) of what is true minus what is known. latency_std: of the mean latency of the frames, s, which only
+    a model of the loop can turn into poses; its name comes last."""
 
     names: tuple[str, ...]
     changes: Array
     covariance: Array
+    latency_std: float = 0.0
+
+    @property
+    def all_names(self) -> tuple[str, ...]:
+        """Names of all errors, the latency's among them."""
+        return (*self.names, LATENCY) if self.latency_std else self.names
+
+    @property
+    def whole_factor(self) -> Array:
+        """`factor` of all errors, the latency among them."""
+        return block_diag(self.factor, self.latency_std) if self.latency_std else self.factor
 
     @property
     def factor(self) -> Array:
         """L (k, k) with L L^T the covariance."""
+        if not self.names:
+            return np.zeros((0, 0))
         std = np.sqrt(np.diag(self.covariance))
         unit = self.covariance / np.outer(std, std)
         return std[:, None] * cholesky(unit + ROUNDING * np.eye(len(std)), lower=True)

@@ -60,7 +60,7 @@ class RecordedRun:
     def with_common_errors(self, parameters: Array) -> "RecordedRun":
         """The same run, whose residuals are whitened by what its poses have in common, too, as a model with these
         parameters (p,) shows it. Raises LoopFailure where that is unstable."""
-        if not self.common.names:
+        if not self.common.all_names:
             return self
         seen = self.modes(parameters)[self.ok]
         return replace(self, marginal=Marginal.of((self.whitener @ seen).reshape(-1, seen.shape[2])))
@@ -75,19 +75,27 @@ class RecordedRun:
         A model driven by the logged commands moves as the plant did, and what is measured beside that is the error. A
         closed loop sees the error as well, and its servo takes the platform where the error does not show.
         """
-        if self.driven:
-            return self.common.modes
-        each = np.moveaxis(self.common.modes, 2, 0)
-        apart = [self._measured(parameters, mode) - self._measured(parameters, -mode) for mode in each]
-        return np.stack(apart, axis=2) / 2.0
+        modes = self.common.modes if self.common.names else np.zeros((len(self.ok), 6, 0))
+        if not self.driven:
+            each = np.moveaxis(modes, 2, 0)
+            apart = [self._measured(parameters, mode) - self._measured(parameters, -mode) for mode in each]
+            modes = np.stack(apart, axis=2) / 2.0 if apart else modes
+        if not self.common.latency_std:
+            return modes
+        known, std = self.settings.timing.latency_s, self.common.latency_std
+        ends = known + std, max(known - std, 0.0)
+        late, early = (self.simulate(parameters, latency_s=end).pose for end in ends)
+        return np.concatenate([modes, std * ((late - early) / (ends[0] - ends[1]))[:, :, None]], axis=2)
 
     def _measured(self, parameters: Array, error: Array) -> Array:
         """Poses (N, 6) that the closed loop measures with an error (N, 6) in them."""
-        run = simulate(self.robot, parameters + self.payload, self.reference, self.settings, lost=~self.ok, noise=error)
+        lost = ~self.ok
+        run = simulate(self.robot, parameters + self.payload, self.reference, self.settings, lost=lost, noise=error)
         return run.measured
 
-    def simulate(self, parameters: Array, sensitivities: bool = False) -> ClosedLoopRun:
-        """The model's run. Raises LoopFailure where it is unstable."""
+    def simulate(self, parameters: Array, sensitivities: bool = False, latency_s: float | None = None) -> ClosedLoopRun:
+        """The model's run, with another latency of all its frames where one is given. Raises LoopFailure where it is
+        unstable."""
         return simulate(
             self.robot,
             parameters + self.payload,
@@ -96,6 +104,7 @@ class RecordedRun:
             sensitivities=sensitivities,
             commands=self.logged if self.driven else None,
             lost=None if self.driven else ~self.ok,
+            latencies=None if latency_s is None else np.full(len(self.ok), latency_s),
         )
 
     def model_poses(self, parameters: Array) -> Array:
@@ -190,5 +199,13 @@ def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
         logged=np.asarray(record["command"].values, dtype=float),
         payload=load,
         payload_std=load_std,
-        common=read_common_errors(record, tuple(scenario.identification.nuisances)),
+        common=_common_errors(record, scenario),
+    )
+
+
+def _common_errors(record: xr.Dataset, scenario: Scenario) -> CommonErrors:
+    """What of the poses' common errors a scenario has estimated beside the parameters."""
+    kinds = tuple(scenario.identification.nuisances)
+    return replace(
+        read_common_errors(record, kinds), latency_std=scenario.timing.latency_std_s if "latency" in kinds else 0.0
     )

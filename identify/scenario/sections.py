@@ -213,8 +213,8 @@ class Identification(Section):
     prior: dict[str, PriorValue] = Field(
         {}, description="parameters known better than the starting guess: { name = { value, std } }"
     )
-    nuisances: list[Literal["rig", "teaching", "exposure"]] = Field(
-        ["rig", "teaching", "exposure"],
+    nuisances: list[Literal["rig", "teaching", "exposure", "latency"]] = Field(
+        ["rig", "teaching", "exposure", "latency"],
         description="of what all poses of a record have in common, what is estimated beside the parameters",
     )
     physical_consistency: bool = Field(

@@ -52,7 +52,7 @@ def test_whitened_residuals_have_a_covariance_of_one():
     np.testing.assert_allclose(whitener @ (np.eye(30) + modes @ modes.T) @ whitener.T, np.eye(30), atol=1e-9)
 
 
-@pytest.mark.parametrize("method", ["command_driven", "closed_loop"])
+@pytest.mark.parametrize("method", ["command_driven", pytest.param("closed_loop", marks=pytest.mark.slow)])
 def test_parameters_are_found_in_spite_of_common_errors_and_the_errors_with_them(method):
     """Without being told of them, the model seems wrong. Told, it is right, estimates lie within their deviations, and
     the record shows the errors themselves three times better than they were known."""
@@ -74,6 +74,19 @@ def test_parameters_are_found_in_spite_of_common_errors_and_the_errors_with_them
     if method == "command_driven":  # a servo takes the platform where most of an error does not show
         assert (found.std < 0.3 * found.prior_std).all()
         assert ignorant.noise_ratio > 1.5 * result.noise_ratio
+
+
+@pytest.mark.parametrize("method", ["command_driven", pytest.param("closed_loop", marks=pytest.mark.slow)])
+def test_a_latency_that_is_known_to_two_milliseconds_is_found_beside_the_parameters(method):
+    scenario = quick(**{"identification.method": method, "timing.latency_s": 0.006, "timing.latency_std_s": 0.002})
+    record, _ = run_plant(scenario, 2, duration_s=5.0, latency_s=0.0075)
+    result = identify(record, rss6(), scenario)
+    found = result.common_errors
+    assert found.names == ("timing.latency_s",)
+    assert abs(found.estimate[0] - 0.0015) < 4.0 * found.std[0] < 0.002
+    z = ((result.estimate - truth()) / result.std)[result.identifiable]
+    assert np.sqrt(np.mean(z**2)) < 1.5
+    assert not result.warnings
 
 
 def test_eliminated_errors_are_those_that_would_be_estimated_beside_the_parameters():
