@@ -73,6 +73,7 @@ class Sensor:
         self._file, self._seed, self._progress = file, _checked_seed(seed), progress
         self.method = method
         self._true_rig, self._camera_from_base = rig_from_file(file.rig)
+        self._right_later = 0.0
         self._known = taught.known if isinstance(taught, Taught) else known
         self.rig = self._true_rig if self._known is None else self._known.rig
         figures = file.camera.model_dump(exclude={"pattern_seed"})
@@ -204,13 +205,14 @@ class Sensor:
         self._obstacles.update({name: solid_mesh(mesh, level) for name, mesh in meshes.items()})
         self.__dict__.pop("camera", None)  # it is built anew before the next picture
 
-    def move_rig(self, changes: Mapping[str, float]) -> None:
-        """Change the true rig by named amounts, as ``{"right.cx_px": 0.1}``; the estimator is not told.
+    def move_rig(self, changes: Mapping[str, float], right_later: float = 0.0) -> None:
+        """Change the true rig by named amounts, as ``{"right.cx_px": 0.1}``, and have the right camera expose later, s;
+        the estimator is not told.
 
         Raises CmmError for a name that a rig has not (``cmmsim.geometry.stereo_rig.PARAMETER_NAMES``), ShapeError for a
         number that is not finite.
         """
-        self._true_rig = self._true_rig.moved(rig_changes(changes))
+        self._true_rig, self._right_later = self._true_rig.moved(rig_changes(changes)), right_later
         self.__dict__.pop("camera", None)  # it is built anew before the next picture
 
     def common_errors(self, poses: ArrayLike, rates: ArrayLike) -> CommonErrors:
@@ -220,9 +222,10 @@ class Sensor:
         """
         if self.method != "registration":
             raise CmmError(f"common errors are known of poses by registration only, not by {self.method}")
-        covariance = np.zeros((len(PARAMETER_NAMES),) * 2) if self._known is None else self._known.covariance
+        known = self._known or KnownRig(self.rig, np.zeros((len(PARAMETER_NAMES),) * 2))
         geometry = MeasuringGeometry(self.rig, self.platform, self.base, self.taught, self.home)
-        return geometry.common_errors(np.asarray(poses, float), np.asarray(rates, float), covariance)
+        at, along = np.asarray(poses, dtype=float), np.asarray(rates, dtype=float)
+        return geometry.common_errors(at, along, known.covariance, known.exposure_std)
 
     def look(
         self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
@@ -289,6 +292,7 @@ class Sensor:
             list(self._obstacles),
             self._file.timing.exposure,
             self._file.camera.pattern_seed,
+            self._right_later,
         )
 
 

@@ -19,10 +19,12 @@ ROUNDING = 1e-9  # of the largest: what rounding may leave of a covariance's neg
 @dataclass(frozen=True)
 class KnownRig:
     """rig, and the covariance (24,24) of what is true minus what is known, in the order of PARAMETER_NAMES; its rows of
-    what is known exactly are zero. Raises CmmError for what is no covariance, naming the first parameter at fault."""
+    what is known exactly are zero. exposure_std: of the time by which the right camera exposes later, s. Raises
+    CmmError for what is no covariance, naming the first parameter at fault."""
 
     rig: StereoRig
     covariance: Array
+    exposure_std: float = 0.0
 
     def __post_init__(self) -> None:
         size = (len(PARAMETER_NAMES),) * 2
@@ -41,14 +43,14 @@ class KnownRig:
         object.__setattr__(self, "covariance", covariance)
 
     @classmethod
-    def drawn(cls, true: StereoRig, covariance: Array, rng: np.random.Generator) -> KnownRig:
+    def drawn(cls, true: StereoRig, covariance: Array, rng: np.random.Generator, exposure_std: float = 0.0) -> KnownRig:
         """What a calibration with this covariance (24,24) would have found of a true rig."""
         known = cls(true, covariance)
         std = np.sqrt(np.diag(known.covariance))
         unit = known.covariance / np.outer(*2 * (np.where(std > 0.0, std, 1.0),))
         values, vectors = np.linalg.eigh(unit)
         draw = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
-        return cls(true.moved(-std * draw), covariance)
+        return cls(true.moved(-std * draw), covariance, exposure_std)
 
 
 def rig_changes(changes: Mapping[str, float]) -> Array:

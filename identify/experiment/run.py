@@ -136,7 +136,7 @@ def run_plant(
     record, truth = _record(plant, reference, done, eye, seed), plant.truth(done)
     settings, rng = scenario.identification, np.random.default_rng(stream_seed(seed, ANCHOR))
     layout = plant.robot.layout
-    if scenario.rig.known != "exact" and isinstance(sensor, cmmsim.Sensor):
+    if not scenario.rig.exact and isinstance(sensor, cmmsim.Sensor):
         found = sensor.common_errors(reference.poses, reference.rates)
         store_common_errors(record, CommonErrors(found.names, found.changes, found.covariance))
     store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, layout, plant.parameters, rng))
