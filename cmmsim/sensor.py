@@ -14,13 +14,16 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from cmmsim.checks import finite_array, require_kind
+from cmmsim.common_errors import CommonErrors, MeasuringGeometry
 from cmmsim.detection.detector import FitLimits, find_detector
 from cmmsim.errors import CmmError, UnknownBodyError, UnknownOptionError
 from cmmsim.files.schema import SensorFile, Timing
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import marked_body, require_corner, rig_from_file
 from cmmsim.geometry.camera import Optics
+from cmmsim.geometry.known_rig import KnownRig, rig_changes
 from cmmsim.geometry.pose import Array, checked_pose, checked_transform, pose_to_transform
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
 from cmmsim.imaging.formation import ImageFormation
 from cmmsim.imaging.renderer import Drawable, Renderer, choose_renderer
@@ -41,6 +44,9 @@ TEACHING_STREAM, RUN_STREAM, DROPOUT_STREAM = 0, 1, 2
 class Sensor:
     """A stereo optical CMM that looks at a posed platform.
 
+    The cameras that draw are the file's; those that measure are the file's, too, or as they are ``known``, or were when
+    the sensor was ``taught``.
+
     It teaches itself on first use, or takes what a sensor with the same cameras, planes and stickers was taught; raises
     TeachingError, naming what differs, for what another one was taught.
     """
@@ -53,6 +59,7 @@ class Sensor:
         taught: Taught | None = None,
         progress: Progress | None = None,
         renderer: str | None = None,
+        known: KnownRig | None = None,
     ) -> None:
         require_kind(file, SensorFile, "a sensor is made of a SensorFile; load_sensor takes a name or a path")
         if method not in METHODS:
@@ -65,8 +72,10 @@ class Sensor:
             raise CmmError(f"progress must be a function of the steps done and their number, got {progress!r}")
         self._file, self._seed, self._progress = file, _checked_seed(seed), progress
         self.method = method
-        self.rig, self._camera_from_base = rig_from_file(file.rig)
-        self._true_rig = self.rig
+        self._true_rig, self._camera_from_base = rig_from_file(file.rig)
+        self._right_later = 0.0
+        self._known = taught.known if isinstance(taught, Taught) else known
+        self.rig = self._true_rig if self._known is None else self._known.rig
         figures = file.camera.model_dump(exclude={"pattern_seed"})
         self.noise = CameraNoise(**{("enabled" if k == "noise" else k): v for k, v in figures.items()})
         self.optics = Optics(**file.lens.model_dump())
@@ -169,7 +178,7 @@ class Sensor:
             teacher = Teacher(self.camera, self.observer, self.platform, self.base, self._window_sizes.plan())
             rng = np.random.default_rng([self._seed, TEACHING_STREAM])
             found = teacher.teach(self.name, self.home, rng, progress or self._progress)
-            self._taught = replace(found, setup=setup_of(self._file))
+            self._taught = replace(found, setup=setup_of(self._file), known=self._known)
         return self._taught
 
     def start_run(self, seed: int) -> None:
@@ -196,16 +205,27 @@ class Sensor:
         self._obstacles.update({name: solid_mesh(mesh, level) for name, mesh in meshes.items()})
         self.__dict__.pop("camera", None)  # it is built anew before the next picture
 
-    def shift_camera(self, side: int, shift_px: tuple[float, float]) -> None:
-        """Move the true principal point of one camera (0 left, 1 right) by (x, y) px; the estimator is not told.
+    def move_rig(self, changes: Mapping[str, float], right_later: float = 0.0) -> None:
+        """Change the true rig by named amounts, as ``{"right.cx_px": 0.1}``, and have the right camera expose later, s;
+        the estimator is not told.
 
-        Raises UnknownOptionError for another side, ShapeError for anything but two finite numbers.
+        Raises CmmError for a name that a rig has not (``cmmsim.geometry.stereo_rig.PARAMETER_NAMES``), ShapeError for a
+        number that is not finite.
         """
-        if side not in (0, 1):
-            raise UnknownOptionError("side", side, ("0 (left)", "1 (right)"))
-        x, y = finite_array(shift_px, (2,), "a shift of a camera is two finite numbers, px").tolist()
-        self._true_rig = self._true_rig.shifted(side, (x, y))
+        self._true_rig, self._right_later = self._true_rig.moved(rig_changes(changes)), right_later
         self.__dict__.pop("camera", None)  # it is built anew before the next picture
+
+    def common_errors(self, poses: ArrayLike, rates: ArrayLike) -> CommonErrors:
+        """What is not known exactly of rig and taught frames, and how it moves poses (N, 6) in motion at rates (N, 6).
+
+        Raises CmmError for the method "planes", ShapeError for anything but rows of six finite numbers.
+        """
+        if self.method != "registration":
+            raise CmmError(f"common errors are known of poses by registration only, not by {self.method}")
+        known = self._known or KnownRig(self.rig, np.zeros((len(PARAMETER_NAMES),) * 2))
+        geometry = MeasuringGeometry(self.rig, self.platform, self.base, self.taught, self.home)
+        at, along = np.asarray(poses, dtype=float), np.asarray(rates, dtype=float)
+        return geometry.common_errors(at, along, known.covariance, known.exposure_std)
 
     def look(
         self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
@@ -272,6 +292,7 @@ class Sensor:
             list(self._obstacles),
             self._file.timing.exposure,
             self._file.camera.pattern_seed,
+            self._right_later,
         )
 
 
@@ -294,13 +315,14 @@ def load_sensor(
     progress: Progress | None = None,
     renderer: str | None = None,
     changes: Mapping[str, Any] | None = None,
+    known: KnownRig | None = None,
 ) -> Sensor:
     """Sensor of a built-in name or of a TOML file.
 
     Parameters: seed of teaching and of the first run's noise; method "registration" or "planes"; taught: the result of
     an earlier teaching of the same cameras and bodies; progress(done, total), called while teaching; renderer:
     "pyrender", "analytic" or "auto" instead of what the file says; changes: other entries than the file's, by dotted
-    key as ``{"camera.dark_noise": 40.0}``.
+    key as ``{"camera.dark_noise": 40.0}``; known: the rig that measures where it is another than the one that draws.
     Raises UnknownSensorError, SensorFileError, UnknownOptionError, and TeachingError for what another one was taught.
     """
-    return Sensor(read_sensor_file(name, changes), seed, method, taught, progress, renderer)
+    return Sensor(read_sensor_file(name, changes), seed, method, taught, progress, renderer, known)

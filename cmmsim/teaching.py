@@ -93,7 +93,7 @@ class Teacher:
         except LostError as error:
             raise TeachingError(f"teaching failed: {error}") from error
         base_from_camera = invert(camera_from_base)
-        places, place_covariances, platform_covariance = self._platform_places(seen)
+        places, place_covariances, platform_covariance = platform_frame(self.platform, seen)
         return Taught(
             sensor_name,
             base_from_camera,
@@ -168,21 +168,23 @@ class Teacher:
                 f"at most {LARGEST_GAP * 1e6:.0f} um; it may be partly hidden"
             )
 
-    def _platform_places(self, seen: list[StickerObservation]) -> tuple[Array, Array, Array]:
-        """Sticker places (n,3), their covariances (n,3,3) and the covariance (6,6) of the platform frame."""
-        mean, covariances = seen[0].points, seen[0].covariances
-        for _ in range(3):
-            mean, covariances = _mean_constellation(mean, seen)
-        towards = _towards(self.platform, register(self.platform.nominal, mean, covariances).transform)
-        whole = replace(seen[0], points=mean, covariances=covariances)
-        mean_from_body, frame_covariance, _ = by_planes(whole, self.platform, towards)
-        body_from_mean = invert(mean_from_body)
-        turn = body_from_mean[:3, :3]
-        return (
-            apply(body_from_mean, mean),
-            turn @ covariances @ turn.T,
-            compose_covariance(body_from_mean, frame_covariance),
-        )
+
+def platform_frame(platform: MarkedBody, seen: list[StickerObservation]) -> tuple[Array, Array, Array]:
+    """Sticker places (n,3) on the platform, their covariances (n,3,3) and the covariance (6,6) of the platform frame,
+    from observations of all its stickers."""
+    mean, covariances = seen[0].points, seen[0].covariances
+    for _ in range(3):
+        mean, covariances = _mean_constellation(mean, seen)
+    towards = _towards(platform, register(platform.nominal, mean, covariances).transform)
+    whole = replace(seen[0], points=mean, covariances=covariances)
+    mean_from_body, frame_covariance, _ = by_planes(whole, platform, towards)
+    body_from_mean = invert(mean_from_body)
+    turn = body_from_mean[:3, :3]
+    return (
+        apply(body_from_mean, mean),
+        turn @ covariances @ turn.T,
+        compose_covariance(body_from_mean, frame_covariance),
+    )
 
 
 def teaching_path(home: Array, count: int) -> Array:

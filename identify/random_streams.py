@@ -18,8 +18,8 @@ TEACHING, ANCHOR = 2, 3
 """The sensor's teaching, and the error of what fixes the scale."""
 NOISE, LATENCY, PREDICTION = 4, 5, 6
 """Of each run: the sensor's noise, the latency of its frames, the noise in what is predicted of it."""
-DESIGN, LOAD = 7, 8
-"""The exciting trajectories of several runs, and the true load."""
+DESIGN, LOAD, CALIBRATION, MEAN_LATENCY = 7, 8, 9, 10
+"""The exciting trajectories of several runs, the true load, what is known of the cameras, and the true mean latency."""
 
 UNCERTAINTY = 5
 """Mixed with a record's seed: the repeated experiments behind an identification's standard deviations."""

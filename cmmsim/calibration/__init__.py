@@ -9,7 +9,6 @@ from cmmsim.calibration.calibrate import CalibrationOptions, calibrate
 from cmmsim.calibration.detection import BoardView, find_board
 from cmmsim.calibration.rendered_boards import board_poses, default_board, render_pairs
 from cmmsim.calibration.result import (
-    PARAMETER_NAMES,
     Calibration,
     SensorTemplate,
     as_dict,
@@ -19,6 +18,7 @@ from cmmsim.calibration.result import (
 )
 from cmmsim.calibration.sightings import ImagePair, PairView, pair_images, read_grey, view_pairs
 from cmmsim.errors import CalibrationError
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 
 __all__ = [
     "PARAMETER_NAMES",

@@ -20,10 +20,9 @@ from scipy.linalg import block_diag
 from cmmsim.calibration.shared_errors import SharedErrors, shared_errors
 from cmmsim.calibration.sightings import Sightings
 from cmmsim.errors import CalibrationError, UnknownOptionError
-from cmmsim.geometry.camera import Distortion, PinholeCamera
+from cmmsim.geometry.camera import INTRINSIC_NAMES
 from cmmsim.geometry.pose import Array, apply, rotation_exp, skew
 
-INTRINSIC_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 DISTORTIONS = {"none": (), "radial2": ("k1", "k2"), "brown5": ("k1", "k2", "p1", "p2", "k3")}
 DEFAULT_DISTORTION = "brown5"
 MOST_STEPS = 60
@@ -47,12 +46,6 @@ def free_directions(distortion: str, fix_aspect: bool) -> Array:
         free[:, 0] += free[:, 1]
         free = np.delete(free, 1, axis=1)
     return free
-
-
-def camera_from(values: Array, width: int, height: int) -> PinholeCamera:
-    """The camera of nine intrinsics (9,)."""
-    fx, fy, cx, cy, *terms = (float(value) for value in values)
-    return PinholeCamera(fx, cx, cy, width, height, aspect=fy / fx, distortion=Distortion(*terms))
 
 
 def camera_matrix(values: Array) -> Array:

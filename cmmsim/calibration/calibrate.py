@@ -11,7 +11,6 @@ from cmmsim.calibration.adjustment import (
     Adjustment,
     RigState,
     adjust,
-    camera_from,
     free_directions,
 )
 from cmmsim.calibration.board import Board
@@ -20,6 +19,7 @@ from cmmsim.calibration.sightings import SIDES, PairView, Sightings, sightings_o
 from cmmsim.calibration.start_values import start_values
 from cmmsim.calibration.warnings import contradictions, weaknesses
 from cmmsim.errors import CalibrationError
+from cmmsim.geometry.camera import camera_from
 from cmmsim.geometry.disc_image import centre_offset
 from cmmsim.geometry.pose import Array
 from cmmsim.geometry.stereo_rig import StereoRig

@@ -12,20 +12,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cmmsim.calibration.adjustment import INTRINSIC_NAMES, Adjustment
+from cmmsim.calibration.adjustment import Adjustment
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.sightings import SIDES, Sightings
 from cmmsim.errors import CalibrationError
 from cmmsim.files.sensor_file import built_in_names, read_sensor_file, sensor_text
 from cmmsim.files.setup import rig_from_file
+from cmmsim.geometry.known_rig import KnownRig
 from cmmsim.geometry.pose import Array, skew, transform_to_pose
-from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
 
-PLACE_NAMES = ("tx_m", "ty_m", "tz_m", "rx_rad", "ry_rad", "rz_rad")
-PARAMETER_NAMES = (
-    *(f"{side}.{name}" for side in ("left", "right") for name in INTRINSIC_NAMES),
-    *(f"right_from_left.{name}" for name in PLACE_NAMES),
-)
 TABLES = ("rig.left", "rig.right", "rig.right_from_left")
 HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(#.*)?$")
 BASIS = re.compile(r"^[ \t]*based_on[ \t]*=.*$", re.MULTILINE)
@@ -76,6 +72,11 @@ class Calibration:
         spread = np.eye(len(PARAMETER_NAMES))
         spread[-3:, -3:] = _inverse_left_jacobian(self.rotation_vector)
         return np.asarray(spread @ self.adjustment.covariance @ spread.T)
+
+    @property
+    def known(self) -> KnownRig:
+        """Both cameras as they are known by it, with their covariance."""
+        return KnownRig(self.rig, self.covariance)
 
     @property
     def std(self) -> Array:

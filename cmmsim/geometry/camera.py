@@ -30,6 +30,7 @@ NDArrayBool = NDArray[np.bool_]
 CONVERGED = 1e-12  # largest distance, in normalised coordinates, between a point and the image of its inverse
 MOST_STEPS = 60
 FARTHEST_FOLD = 1e3  # focal lengths: a fold beyond is none
+INTRINSIC_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 PSF_REACH = 5.0  # standard deviations after which the point spread is cut off
 
 
@@ -161,6 +162,11 @@ class PinholeCamera:
         (focal_x, focal_y), (x, y) = self.focal_lengths, self.centre
         return np.array([[focal_x, 0.0, x], [0.0, focal_y, y], [0.0, 0.0, 1.0]])
 
+    @property
+    def intrinsics(self) -> Array:
+        """Focal lengths, principal point and distortion (9,) in the order of INTRINSIC_NAMES."""
+        return np.array([*self.focal_lengths, *self.centre, *astuple(self.distortion)])
+
     @cached_property
     def ideal(self) -> PinholeCamera:
         """The same camera with a perfect lens."""
@@ -202,6 +208,12 @@ class PinholeCamera:
         """Derivative (..., 2, 2) of the image's pixels by the ideal ones (..., 2)."""
         focal = self.focal_lengths
         return self.distortion.jacobian((ideal - self.centre) / focal) * focal[:, None] / focal
+
+
+def camera_from(intrinsics: Array, width: int, height: int) -> PinholeCamera:
+    """The camera of nine intrinsics (9,), see INTRINSIC_NAMES."""
+    fx, fy, cx, cy, *terms = (float(value) for value in intrinsics)
+    return PinholeCamera(fx, cx, cy, width, height, aspect=fy / fx, distortion=Distortion(*terms))
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,15 @@ import cv2
 import numpy as np
 
 from cmmsim.errors import ShapeError
-from cmmsim.geometry.camera import NDArrayBool, PinholeCamera
-from cmmsim.geometry.pose import Array, apply, invert, rigid
+from cmmsim.geometry.camera import INTRINSIC_NAMES, NDArrayBool, PinholeCamera, camera_from
+from cmmsim.geometry.pose import Array, apply, invert, rigid, rotation_exp, rotation_log
+
+PLACE_NAMES = ("tx_m", "ty_m", "tz_m", "rx_rad", "ry_rad", "rz_rad")
+PARAMETER_NAMES = (
+    *(f"{side}.{name}" for side in ("left", "right") for name in INTRINSIC_NAMES),
+    *(f"right_from_left.{name}" for name in PLACE_NAMES),
+)
+"""What a rig is made of: the intrinsics of both cameras, and translation and rotation vector of ``right_from_left``."""
 
 STEPS = 2  # of Gauss-Newton after the linear start
 
@@ -88,13 +95,20 @@ class StereoRig:
         inverse = np.linalg.inv(np.where(found[..., None, None], jacobian, np.eye(2)))
         return ideal, inverse @ covariances @ inverse.swapaxes(-1, -2), found
 
-    def shifted(self, side: int, shift_px: tuple[float, float]) -> StereoRig:
-        """The rig with the principal point of camera ``side`` (0 left, 1 right) moved by (x, y) px."""
-        camera = self.cameras[side]
-        moved = replace(
-            camera, centre_x_px=camera.centre_x_px + shift_px[0], centre_y_px=camera.centre_y_px + shift_px[1]
+    @property
+    def parameters(self) -> Array:
+        """What it is made of (24,) in the order of PARAMETER_NAMES."""
+        place = self.right_from_left
+        return np.concatenate([self.left.intrinsics, self.right.intrinsics, place[:3, 3], rotation_log(place[:3, :3])])
+
+    def moved(self, changes: Array) -> StereoRig:
+        """The rig with changes (24,) of its parameters; its camera frame C stays that of the left camera."""
+        values = self.parameters + changes
+        left, right = (
+            camera_from(each, camera.width, camera.height)
+            for each, camera in zip(values[:18].reshape(2, 9), self.cameras, strict=True)
         )
-        return replace(self, left=moved) if side == 0 else replace(self, right=moved)
+        return StereoRig(left, right, rigid(rotation_exp(values[21:]), values[18:21]))
 
 
 def toed_in_rig(camera: PinholeCamera, baseline: float, position: Array, target: Array) -> tuple[StereoRig, Array]:

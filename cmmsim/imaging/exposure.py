@@ -156,7 +156,7 @@ class VirtualStereoCamera:
 
     rig and camera_from_base (4,4), its place in the base frame, the true ones; formation: how light becomes images, its
     drawable's body 0 the platform and body 1 the base, the others being ``obstacle_names`` in order; noise; exposure
-    in s; pattern_seed: of what differs from pixel to pixel.
+    in s; pattern_seed: of what differs from pixel to pixel; right_later: by how much the right camera exposes later, s.
     """
 
     rig: StereoRig
@@ -166,6 +166,7 @@ class VirtualStereoCamera:
     obstacle_names: Sequence[str] = ()
     exposure: float = 0.0
     pattern_seed: int = 0
+    right_later: float = 0.0
 
     def look(
         self,
@@ -183,7 +184,8 @@ class VirtualStereoCamera:
         poses = pose[None]
         if pose_rate is not None and self.exposure > 0.0:
             poses = sub_frame_poses(pose, pose_rate, self.exposure, self._sticker_pixels)
-        moments = [self._placed(pose_to_transform(p), obstacles or {}) for p in poses]
+        lag = np.zeros(6) if pose_rate is None else self.right_later * pose_rate
+        moments = [self._placed(p, p + lag, obstacles or {}) for p in poses]
         return LiveImages(self, moments, rng, quality or Quality())
 
     def radiance(
@@ -218,15 +220,16 @@ class VirtualStereoCamera:
         shapes = [(camera.height, camera.width) for camera in self.rig.cameras]
         return [draw_pattern(shape, prnu, dsnu, rng) for shape, rng in zip(shapes, rngs, strict=True)]
 
-    def _placed(self, base_from_platform: Array, obstacles: Mapping[str, Array]) -> list[Array]:
-        """camera_from_body (b,4,4) of all bodies for the left and the right camera."""
+    def _placed(self, left: Array, right: Array, obstacles: Mapping[str, Array]) -> list[Array]:
+        """camera_from_body (b,4,4) of all bodies for the left and the right camera, each at its own pose (6,) of the
+        platform."""
         absent = rigid(np.eye(3), (0.0, 0.0, -1e3))  # an obstacle without a place stands far behind both cameras
         return [
             np.stack(
-                [c @ p for p in (base_from_platform, np.eye(4))]
+                [c @ pose_to_transform(pose), c]
                 + [c @ obstacles[n] if n in obstacles else absent for n in self.obstacle_names]
             )
-            for c in self._from_base
+            for c, pose in zip(self._from_base, (left, right), strict=True)
         ]
 
     def _sticker_pixels(self, pose: Array) -> Array:

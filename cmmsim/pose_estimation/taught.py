@@ -15,6 +15,7 @@ import numpy as np
 from cmmsim.errors import ShapeError, TeachingError
 from cmmsim.files.schema import SensorFile
 from cmmsim.files.sensor_file import dotted
+from cmmsim.geometry.known_rig import KnownRig
 from cmmsim.geometry.pose import Array, compose_covariance, pose_covariance, pose_to_transform, skew
 
 SHOWN_CHANGES, SHOWN_CHARACTERS = 3, 40  # of what differs between two setups
@@ -27,7 +28,8 @@ class Taught:
     sensor_name; base_from_camera (4,4) and base_covariance (6,6) of its small error [dt, dphi]; platform_places (n,3)
     sticker coordinates in platform axes, m, and place_covariances (n,3,3); platform_covariance (6,6): error of the
     platform frame itself, in platform axes; base_places (k,3) sticker coordinates in base axes, m. setup: what of the
-    sensor file this holds for, see ``setup_of``; empty for one put together by hand.
+    sensor file this holds for, see ``setup_of``; empty for one put together by hand. known: the rig that it was taught
+    with, where that is another than the file's.
     """
 
     sensor_name: str
@@ -38,6 +40,7 @@ class Taught:
     platform_covariance: Array
     base_places: Array
     setup: str = ""
+    known: KnownRig | None = None
 
     def __post_init__(self) -> None:
         stickers, base_stickers = len(self.platform_places), len(self.base_places)

@@ -42,12 +42,14 @@ FEWEST = 50
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Covariance (p, p) of the estimate, were there no bounds, and the part of it (p, p) that errors of the starting
-    guess make; information (p, p) that the poses alone hold; gradient (p,): J^T r of poses and all that is known beside
-    them, at the estimate; misfit of the record; unstable: repeated experiments that ended early and were left out."""
+    """Covariance (p, p) of the estimate, were there no bounds, and the parts of it (p, p) that errors of the starting
+    guess make, and errors that all poses of a record have in common; information (p, p) that the poses alone hold;
+    gradient (p,): J^T r of poses and all that is known beside them, at the estimate; misfit of the record; unstable:
+    repeated experiments that ended early and were left out."""
 
     covariance: Array
     of_guess: Array
+    of_common: Array
     information: Array
     gradient: Array
     misfit: Misfit
@@ -92,7 +94,17 @@ def estimate_uncertainty(
     prior = _information(known_rows @ units)
     covariance = units @ (scores + prior) @ units.T
     of_guess = np.asarray(_information(problem.guess.rows @ units @ units.T))
-    return Uncertainty((covariance + covariance.T) / 2, of_guess, information, np.asarray(gradient), misfit, unstable)
+    of_common = units @ sum(_common_scores(run, j) for run, (_, j) in zip(problem.runs, shown, strict=True)) @ units.T
+    return Uncertainty(
+        (covariance + covariance.T) / 2, of_guess, of_common, information, np.asarray(gradient), misfit, unstable
+    )
+
+
+def _common_scores(run: RecordedRun, jacobian: Array) -> Array:
+    """Covariance (p, p) of the scores J^T r that errors in common to all poses of a record make; J (n, 6, p)."""
+    if run.marginal is None:
+        return np.zeros((jacobian.shape[2],) * 2)
+    return _information(run.marginal.whitened_modes.T @ jacobian.reshape(-1, jacobian.shape[2]))
 
 
 def load_score_covariance(runs: Sequence[RecordedRun], information: Sequence[Array], units: Array) -> Array:
@@ -183,12 +195,21 @@ def _repeated_scores(
 
 
 def repeated_experiment(run: RecordedRun, parameters: Array, rng: np.random.Generator) -> ClosedLoopRun:
-    """A repeated experiment whose plant is the identified model and whose sensor has drawn noise; NaN where lost.
+    """A repeated experiment whose plant is the identified model and whose sensor has drawn noise and common errors; NaN
+    where lost.
 
     Raises LoopFailure where the loop is unstable.
     """
     noise = rng.standard_normal(run.measured.shape) @ np.linalg.cholesky(run.covariance).T
-    return simulate(run.robot, parameters + run.payload, run.reference, run.settings, lost=~run.ok, noise=noise)
+    common, latencies = run.common, None
+    if common.names:
+        noise = noise + common.modes @ rng.standard_normal(len(common.names))
+    if common.latency_std:
+        drawn = run.settings.timing.latency_s + common.latency_std * rng.standard_normal()
+        latencies = np.full(len(noise), max(drawn, 0.0))
+    parameters = parameters + run.payload
+    lost = ~run.ok
+    return simulate(run.robot, parameters, run.reference, run.settings, lost=lost, noise=noise, latencies=latencies)
 
 
 def correlation_matrix(covariance: Array) -> Array:

@@ -203,12 +203,14 @@ def conditioning(
 
 @dataclass(frozen=True)
 class Judgement:
-    """identifiable (p,) bool; prior_share (p,): of the variance, what errors of the guess make; intervals (p, 2) and
-    group_intervals: 95 %, cut at the bounds; base_rank: independent groups that the references excite by the paper's
-    rule; active_bounds: what holds the estimate back; warnings: what a reader must know before believing any of it."""
+    """identifiable (p,) bool; prior_share, common_share (p,): of the variance, what errors of the guess make, and what
+    those make that all poses of a record have in common; intervals (p, 2) and group_intervals: 95 %, cut at the bounds;
+    base_rank: independent groups that the references excite by the paper's rule; active_bounds: what holds the estimate
+    back; warnings: what a reader must know before believing any of it."""
 
     identifiable: NDArray[np.bool_]
     prior_share: Array
+    common_share: Array
     intervals: Array
     groups: GroupEstimates
     group_intervals: Array
@@ -244,6 +246,7 @@ def judge(
     return Judgement(
         identifiable=criterion.judge(each, uncertainty.covariance),
         prior_share=share,
+        common_share=np.diag(uncertainty.of_common) / np.diag(uncertainty.covariance),
         intervals=bounded.intervals(each),
         groups=group_estimates(base, guess, criterion, estimate, uncertainty),
         group_intervals=bounded.intervals(group_rows(base)),

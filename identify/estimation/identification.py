@@ -12,6 +12,7 @@ import xarray as xr
 from dynamics import DynamicsError, Robot
 from dynamics.closed_loop.problem import checked_loop_parameters
 from identify.errors import EstimationError, ScenarioError
+from identify.estimation.common_errors import common_error_estimates
 from identify.estimation.covariance import DRAWS, estimate_uncertainty
 from identify.estimation.explanation import explanation
 from identify.estimation.identifiability import judge
@@ -56,9 +57,10 @@ def identify(
     method, driven = scenario.identification.method, problem.driven_by_commands()
     solution = searches[method]
     with progress.stage("uncertainty", DRAWS) as advance:
-        judged = problem if method == "closed_loop" else driven
+        judged = (problem if method == "closed_loop" else driven).with_common_errors(solution.parameters)
         uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
-    explained = explanation(driven, searches["command_driven"].parameters, uncertainty.misfit)
+    by_commands = searches["command_driven"].parameters
+    explained = explanation(driven.with_common_errors(by_commands), by_commands, uncertainty.misfit)
     judgement = judge(problem, scenario, solution, uncertainty, explained)
     ended = time.perf_counter()
     return IdentificationResult(
@@ -69,6 +71,7 @@ def identify(
         std=uncertainty.std,
         covariance=uncertainty.covariance,
         scale_anchor=problem.anchor,
+        common_errors=common_error_estimates(judged, solution.parameters),
         iterations=sum(one.iterations for one in searches.values()),
         evaluations=sum(one.evaluations for one in searches.values()),
         stop_reason=solution.stop_reason,

@@ -39,6 +39,11 @@ class OutputErrorProblem:
         """The same problem with the joints driven by the logged commands."""
         return replace(self, runs=tuple(run.driven_by_commands() for run in self.runs))
 
+    def with_common_errors(self, parameters: Array) -> "OutputErrorProblem":
+        """The same problem, which knows what the poses of each record have in common, as a model with these parameters
+        (p,) shows it. Raises LoopFailure where that is unstable."""
+        return replace(self, runs=tuple(run.with_common_errors(parameters) for run in self.runs))
+
     def cost(self, parameters: Array) -> float:
         """Sum of squared whitened residuals; infinite where the model cannot run."""
         known, _ = self.known(parameters)

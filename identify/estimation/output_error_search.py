@@ -31,7 +31,7 @@ def output_error_searches(
     Raises EstimationError: no model that runs.
     """
     found = {}
-    driven = problem.driven_by_commands()
+    driven = problem.driven_by_commands().with_common_errors(warm)
     start = runnable_start(driven, warm)
     if start is None:
         found["multiple_shooting"] = shoot(driven, scenario, warm, progress)
@@ -42,7 +42,7 @@ def output_error_searches(
         found["command_driven"] = search(driven, start, scenario, advance)
         if closed_loop:
             start = _closed_loop_start(problem, found["command_driven"].parameters)
-            found["closed_loop"] = search(problem, start, scenario, advance)
+            found["closed_loop"] = search(problem.with_common_errors(start), start, scenario, advance)
     return found
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
+from identify.estimation.common_errors import CommonErrorEstimates
 from identify.estimation.covariance import correlation_matrix, strongest_pairs
 from identify.estimation.explanation import Misfit, Whiteness
 from identify.estimation.identifiability import RESTS_ON_PRIOR, Conditioning, GroupEstimates
@@ -29,14 +30,14 @@ STRONGEST = 10
 class IdentificationResult:
     """What one record says about the parameters of a robot, in the order of its `layout`; SI.
 
-    initial, warm_start, estimate, std (p,), covariance (p, p), the last two as they were without bounds; intervals
-    (p, 2): 95 %, cut at the bounds; identifiable (p,) bool; prior_share (p,): of the variance, what errors of the
-    starting guess make; groups, group_intervals: what the record says of the base parameters; base_rank: independent
-    groups that the trajectory excites by the paper's rule; iterations and evaluations: of all searches; stop_reason: of
-    the last; searches: their names in order, and costs: after each iteration, one tuple a search; active_bounds: what
-    holds the estimate back, as "platform.Izz <= Ixx + Iyy";
-    noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what the sensor's noise alone
-    would leave, give or take noise_ratio_std; whiteness: test of the residuals of the model driven by the logged
+    initial, warm_start, estimate, std (p,), covariance (p, p), the last two as they were without bounds; intervals (p,
+    2): 95 %, cut at the bounds; identifiable (p,) bool; prior_share, common_share (p,): of the variance, what errors of
+    the starting guess make, and what those that all poses of a record have in common; groups, group_intervals: what the
+    record says of the base parameters; base_rank: independent groups that the trajectory excites by the paper's rule;
+    iterations and evaluations: of all searches; stop_reason: of the last; searches: their names in order, and costs:
+    after each iteration, one tuple a search; active_bounds: what holds the estimate back, as "platform.Izz <= Ixx +
+    Iyy"; noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what the sensor's noise
+    alone would leave, give or take noise_ratio_std; whiteness: test of the residuals of the model driven by the logged
     commands.
     """
 
@@ -49,10 +50,12 @@ class IdentificationResult:
     intervals: Array
     identifiable: NDArray[np.bool_]
     prior_share: Array
+    common_share: Array
     groups: GroupEstimates
     group_intervals: Array
     conditioning: Conditioning
     scale_anchor: ScaleAnchor
+    common_errors: CommonErrorEstimates
     base_rank: int
     iterations: int
     evaluations: int
@@ -106,6 +109,7 @@ class IdentificationResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Estimates with their uncertainty, for a JSON file; the true values, where known, are for others to add."""
+        common = self.common_errors
         anchor, whiteness, identified = self.scale_anchor, self.whiteness, np.flatnonzero(self.identifiable)
         correlations = correlation_matrix(self.covariance[np.ix_(identified, identified)])
         pairs = strongest_pairs(correlations, [self.names[k] for k in identified], STRONGEST)
@@ -122,6 +126,9 @@ class IdentificationResult:
             "conditioning": asdict(self.conditioning),
             "strongest_correlations": pairs,
             "warnings": list(self.warnings),
+            "nuisances": dict(zip(common.names, common.std.tolist(), strict=True)),
+            "nuisance_estimates": dict(zip(common.names, common.estimate.tolist(), strict=True)),
+            "nuisance_prior_std": dict(zip(common.names, common.prior_std.tolist(), strict=True)),
             "base_rank": self.base_rank,
             "parameters": {name: self._parameter(k) for k, name in enumerate(self.names)},
             "groups": {name: self._group(k) for k, name in enumerate(self.groups.names)},
@@ -139,6 +146,7 @@ class IdentificationResult:
             "identifiable": bool(self.identifiable[k]),
             "rests_on_prior": bool(self.rests_on_prior[k]),
             "prior_share": self.prior_share[k],
+            "common_share": self.common_share[k],
         }
 
     def _group(self, k: int) -> dict[str, Any]:

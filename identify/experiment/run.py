@@ -13,13 +13,16 @@ import xarray as xr
 import cmmsim
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference, prepare
+from identify.arrays import Array
 from identify.estimation.scale_anchor import measured_anchor, store_anchor
 from identify.excitation.design import design_trajectories
+from identify.experiment.known_rig import known_rig
 from identify.experiment.plant import Plant, PlatformLoad, build_plant, drawn_load
-from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, make_sensor, with_renderer
+from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, make_sensor, sensor_file, with_renderer
 from identify.progress import Advance, Progress, SilentProgress
-from identify.random_streams import ANCHOR, LATENCY, LOAD, NOISE, TEACHING, stream_seed
+from identify.random_streams import ANCHOR, CALIBRATION, LATENCY, LOAD, MEAN_LATENCY, NOISE, TEACHING, stream_seed
 from identify.record import recording
+from identify.record.common_errors import CommonErrors, store_common_errors
 from identify.record.payload import store_payload
 from identify.record.provenance import store_robot
 from identify.scenario import Scenario
@@ -68,14 +71,16 @@ def run_experiment(
 
 def taught_sensor(scenario: Scenario, robot: Robot, seed: int, progress: Progress) -> cmmsim.Sensor:
     """The scenario's sensor with its frames taught."""
-    sensor = untaught_sensor(scenario, robot, seed)
+    sensor = untaught_sensor(scenario, robot, seed, progress)
     teach(sensor, progress)
     return sensor
 
 
-def untaught_sensor(scenario: Scenario, robot: Robot, seed: int) -> cmmsim.Sensor:
-    """The scenario's sensor, its teaching seeded by the run's seed."""
-    return make_sensor(scenario, robot, stream_seed(seed, TEACHING))
+def untaught_sensor(scenario: Scenario, robot: Robot, seed: int, progress: Progress | None = None) -> cmmsim.Sensor:
+    """The scenario's sensor, its teaching and what is known of its rig seeded by the run's seed."""
+    rng = np.random.default_rng(stream_seed(seed, CALIBRATION))
+    known = known_rig(scenario, sensor_file(scenario), rng, progress)
+    return make_sensor(scenario, robot, stream_seed(seed, TEACHING), known=known)
 
 
 def teach(sensor: cmmsim.Sensor, progress: Progress) -> None:
@@ -125,17 +130,31 @@ def run_plant(
     check_travel(plant.nominal, trajectory, times, **scenario.excitation.singularity_limits)
     reference = trajectory.reference(times)
     eye = SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, run), advance)
-    latencies = scenario.timing.drawn_latencies(len(times), np.random.default_rng(stream_seed(seed, LATENCY, run)))
+    latencies = _true_latencies(scenario, len(times), seed, run)
     true_load = None if load is None else load.true
     done = plant.run(reference, RateSensor(eye.measure), latencies, true_load)
     record, truth = _record(plant, reference, done, eye, seed), plant.truth(done)
     settings, rng = scenario.identification, np.random.default_rng(stream_seed(seed, ANCHOR))
     layout = plant.robot.layout
+    if not scenario.rig.exact and isinstance(sensor, cmmsim.Sensor):
+        found = sensor.common_errors(reference.poses, reference.rates)
+        store_common_errors(record, CommonErrors(found.names, found.changes, found.covariance))
     store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, layout, plant.parameters, rng))
     if load is not None:
         store_payload(record, layout, load.stated, load.std)
         store_payload(truth, layout, load.true)
     return Experiment(record, truth)
+
+
+def _true_latencies(scenario: Scenario, frames: int, seed: int, run: int) -> Array | None:
+    """Latency of each frame (frames,) [s] of a run; None where all have the known mean. What is not known of the mean
+    is one draw for all runs of a seed."""
+    timing = scenario.timing
+    drawn = timing.drawn_latencies(frames, np.random.default_rng(stream_seed(seed, LATENCY, run)))
+    if not timing.latency_std_s:
+        return drawn
+    off = timing.latency_std_s * np.random.default_rng(stream_seed(seed, MEAN_LATENCY)).standard_normal()
+    return np.maximum((timing.latency_s if drawn is None else drawn) + np.full(frames, off), 0.0)
 
 
 def _record(plant: Plant, reference: Reference, run: ClosedLoopRun, eye: SensorInLoop, seed: int) -> xr.Dataset:

@@ -11,6 +11,7 @@ import cmmsim
 from cmmsim.files import SensorFile, read_sensor_file
 from cmmsim.files.schema import unit
 from cmmsim.files.setup import marked_body
+from cmmsim.geometry.known_rig import KnownRig
 from cmmsim.imaging.renderer import choose_renderer
 from dynamics import Robot
 from dynamics.bodies import parts_of
@@ -39,14 +40,22 @@ def robot_transforms(robot: Robot, pose: Array) -> dict[str, Array]:
     }
 
 
-def make_sensor(scenario: Scenario, robot: Robot, seed: int, taught: cmmsim.Taught | None = None) -> cmmsim.Sensor:
-    """The scenario's sensor, with its timing and with the bodies of the robot's legs in its view.
+def make_sensor(
+    scenario: Scenario,
+    robot: Robot,
+    seed: int,
+    taught: cmmsim.Taught | None = None,
+    known: KnownRig | None = None,
+) -> cmmsim.Sensor:
+    """The scenario's sensor, with its timing and with the bodies of the robot's legs in its view, and with its rig as
+    it is known; None: exactly, or as it was when it was taught.
 
     One a process: it owns the renderer. Raises ScenarioError where the platform that it sees is not the robot's.
     """
     file = sensor_file(scenario)
     check_platform(robot, file, scenario.sensor)
-    sensor = cmmsim.Sensor(file, seed, scenario.pose_method, taught, renderer=scenario.renderer)
+    sensor = cmmsim.Sensor(file, seed, scenario.pose_method, taught, renderer=scenario.renderer, known=known)
+    sensor.move_rig(scenario.rig.errors, scenario.rig.right_later_s)
     sensor.add_bodies(robot_meshes(robot))
     return sensor
 

@@ -21,6 +21,7 @@ from identify.record.checks import (
     check_reference,
     checked_covariance,
 )
+from identify.record.common_errors import NONE, CommonErrors, Marginal, read_common_errors
 from identify.record.payload import recorded_payload
 from identify.record.recording import poses
 from identify.scenario import Scenario
@@ -35,7 +36,8 @@ class RecordedRun:
 
     measured: poses (N, 6), NaN where lost; ok (N,) bool; covariance (6, 6) of one measured pose; logged: the joint
     commands (N, n) as they were given; driven: whether the model's joints get these, or its own servo acts; payload
-    (p,): what a known load on the platform adds to the parameters, with standard deviations payload_std (p,).
+    (p,): what a known load on the platform adds to the parameters, with standard deviations payload_std (p,); common:
+    errors that all measured poses have in common, and marginal: what whitens residuals by them (`with_common_errors`).
     """
 
     robot: Robot
@@ -47,14 +49,53 @@ class RecordedRun:
     logged: Array
     payload: Array
     payload_std: Array
+    common: CommonErrors = NONE
     driven: bool = False
+    marginal: Marginal | None = None
 
     def driven_by_commands(self) -> "RecordedRun":
         """The same run with the model's joints driven by the logged commands."""
-        return replace(self, driven=True)
+        return replace(self, driven=True, marginal=None)
 
-    def simulate(self, parameters: Array, sensitivities: bool = False) -> ClosedLoopRun:
-        """The model's run. Raises LoopFailure where it is unstable."""
+    def with_common_errors(self, parameters: Array) -> "RecordedRun":
+        """The same run, whose residuals are whitened by what its poses have in common, too, as a model with these
+        parameters (p,) shows it. Raises LoopFailure where that is unstable."""
+        if not self.common.all_names:
+            return self
+        seen = self.modes(parameters)[self.ok]
+        return replace(self, marginal=Marginal.of((self.whitener @ seen).reshape(-1, seen.shape[2])))
+
+    def without_common_errors(self) -> "RecordedRun":
+        """The same run, whose residuals are whitened by the sensor's noise alone."""
+        return replace(self, marginal=None)
+
+    def modes(self, parameters: Array) -> Array:
+        """How far (N, 6, k) the common errors, each of one standard deviation, take what is measured from the model.
+
+        A model driven by the logged commands moves as the plant did, and what is measured beside that is the error. A
+        closed loop sees the error as well, and its servo takes the platform where the error does not show.
+        """
+        modes = self.common.modes if self.common.names else np.zeros((len(self.ok), 6, 0))
+        if not self.driven:
+            each = np.moveaxis(modes, 2, 0)
+            apart = [self._measured(parameters, mode) - self._measured(parameters, -mode) for mode in each]
+            modes = np.stack(apart, axis=2) / 2.0 if apart else modes
+        if not self.common.latency_std:
+            return modes
+        known, std = self.settings.timing.latency_s, self.common.latency_std
+        ends = known + std, max(known - std, 0.0)
+        late, early = (self.simulate(parameters, latency_s=end).pose for end in ends)
+        return np.concatenate([modes, std * ((late - early) / (ends[0] - ends[1]))[:, :, None]], axis=2)
+
+    def _measured(self, parameters: Array, error: Array) -> Array:
+        """Poses (N, 6) that the closed loop measures with an error (N, 6) in them."""
+        lost = ~self.ok
+        run = simulate(self.robot, parameters + self.payload, self.reference, self.settings, lost=lost, noise=error)
+        return run.measured
+
+    def simulate(self, parameters: Array, sensitivities: bool = False, latency_s: float | None = None) -> ClosedLoopRun:
+        """The model's run, with another latency of all its frames where one is given. Raises LoopFailure where it is
+        unstable."""
         return simulate(
             self.robot,
             parameters + self.payload,
@@ -63,6 +104,7 @@ class RecordedRun:
             sensitivities=sensitivities,
             commands=self.logged if self.driven else None,
             lost=None if self.driven else ~self.ok,
+            latencies=None if latency_s is None else np.full(len(self.ok), latency_s),
         )
 
     def model_poses(self, parameters: Array) -> Array:
@@ -74,11 +116,17 @@ class RecordedRun:
         run = self.simulate(parameters, sensitivities=True)
         assert run.pose_sensitivity is not None
         jacobian = np.asarray(self.whitener @ run.pose_sensitivity[self.ok], dtype=float)
-        return self.whiten(run.pose - self.measured), jacobian
+        return self.whiten(run.pose - self.measured), self._without_common(jacobian)
 
     def whiten(self, differences: Array) -> Array:
         """Pose differences (N, 6) at the good frames in standard deviations of the sensor, (n, 6)."""
-        return np.asarray(differences[self.ok] @ self.whitener.T, dtype=float)
+        return self._without_common(np.asarray(differences[self.ok] @ self.whitener.T, dtype=float))
+
+    def _without_common(self, rows: Array) -> Array:
+        """Rows (n, 6, ...) in standard deviations of the noise, in those of noise and common errors."""
+        if self.marginal is None:
+            return rows
+        return self.marginal.whiten(rows.reshape(self.marginal.directions.shape[0], -1)).reshape(rows.shape)
 
     def without_gaps(self) -> Array:
         """Measured poses (N, 6) with lost frames interpolated in time; for linear fits only."""
@@ -151,4 +199,13 @@ def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
         logged=np.asarray(record["command"].values, dtype=float),
         payload=load,
         payload_std=load_std,
+        common=_common_errors(record, scenario),
+    )
+
+
+def _common_errors(record: xr.Dataset, scenario: Scenario) -> CommonErrors:
+    """What of the poses' common errors a scenario has estimated beside the parameters."""
+    kinds = tuple(scenario.identification.nuisances)
+    return replace(
+        read_common_errors(record, kinds), latency_std=scenario.timing.latency_std_s if "latency" in kinds else 0.0
     )

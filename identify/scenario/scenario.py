@@ -13,12 +13,14 @@ from identify.errors import ScenarioError
 from identify.filtering import padding_samples
 from identify.scenario.parameter_names import check_parameter_names
 from identify.scenario.sections import (
+    RIG_KNOWN,
     Excitation,
     Filter,
     Identification,
     Model,
     Payload,
     Plant,
+    Rig,
     Section,
     Servo,
     Validation,
@@ -41,6 +43,7 @@ class Scenario(Section):
         description="what draws the images: pyrender, analytic, auto: pyrender where OpenGL works, or module:name",
     )
     pose_method: Literal["registration", "planes"] = "registration"
+    rig: Rig = Rig()
     timing: Timing = Timing()
     servo: Servo = Servo()
     plant: Plant = Plant()
@@ -157,7 +160,7 @@ SCENARIOS = SettingsFiles(
     Path(__file__).parent / "built_in",
     Scenario,
     ScenarioError,
-    {"robot": _robot_names, "sensor": sensor_names},
+    {"robot": _robot_names, "sensor": sensor_names, "rig.known": lambda: RIG_KNOWN},
 )
 
 

@@ -181,6 +181,31 @@ class PriorValue(Section):
     std: float = quantity(..., "SI", "its standard deviation", gt=0)
 
 
+RIG_KNOWN = ["exact", "calibrated"]
+"""How well a rig may be known, beside the path of a calibration's result."""
+
+
+class Rig(Section):
+    """How well the estimator knows the cameras; those that take the pictures are the sensor file's."""
+
+    known: str = Field(
+        "exact",
+        description="exact; calibrated: from pictures of a board that the run takes first; or a calibration.json, "
+        "whose covariance says how well",
+    )
+    pairs: int = quantity(20, "1", "pairs of pictures of the board, where calibrated", ge=3, le=500)
+    errors: dict[str, float] = Field(
+        {}, description='true minus known, of which no covariance knows: { "left.cx_px" = 0.1 }, px, m or rad'
+    )
+    right_later_s: float = quantity(0.0, "s", "by how much the right camera truly exposes later", ge=-0.1, le=0.1)
+    right_later_std_s: float = quantity(0.0, "s", "how well that is known to be nothing", ge=0, le=0.1)
+
+    @property
+    def exact(self) -> bool:
+        """Whether the estimator takes the rig, and what was taught with it, for exact."""
+        return self.known == "exact" and self.right_later_std_s == 0.0
+
+
 class Identification(Section):
     """Output-error estimation and its stop criteria (eq. 35)."""
 
@@ -194,6 +219,10 @@ class Identification(Section):
     start_std: float = quantity(1.0, "1", "standard deviation of the starting guess, relative to each value", gt=0)
     prior: dict[str, PriorValue] = Field(
         {}, description="parameters known better than the starting guess: { name = { value, std } }"
+    )
+    nuisances: list[Literal["rig", "teaching", "exposure", "latency"]] = Field(
+        ["rig", "teaching", "exposure", "latency"],
+        description="of what all poses of a record have in common, what is estimated beside the parameters",
     )
     physical_consistency: bool = Field(
         False, description="only masses and moments of inertia that a rigid body can have (the paper's have others)"

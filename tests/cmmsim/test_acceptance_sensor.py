@@ -33,7 +33,7 @@ def under_test(seed=0, changes=None):
 def errors_along(volume, line, seed=0, changes=None, shift_px=0.0):
     """Errors (5,) m of the lengths of a line, with the right camera's image shifted along x."""
     sensor = under_test(seed, changes).facing(length_artefact(line), 1)
-    sensor.shift_camera(1, (shift_px, 0.0))
+    sensor.move_rig({"right.cx_px": shift_px})
     return np.array([length.error for length in measure_line(sensor, volume, line, 1)])
 
 

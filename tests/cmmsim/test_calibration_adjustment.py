@@ -15,7 +15,7 @@ from cmmsim.calibration import CalibrationError, CalibrationOptions, PairView, c
 from cmmsim.calibration.adjustment import project
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.detection import BoardView
-from cmmsim.calibration.result import PARAMETER_NAMES
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from tests.cmmsim.sensors import refused
 
 BOARD = Board(kind="chessboard", columns=9, rows=7, spacing=0.05)

@@ -67,7 +67,7 @@ def test_images_decide_the_result(taught):
     poses = {}
     for shift in (0.0, 0.1):
         sensor = cmmsim.load_sensor("ctrack780", seed=9, taught=taught)
-        sensor.shift_camera(1, (shift, 0.0))
+        sensor.move_rig({"right.cx_px": shift})
         poses[shift] = np.mean([sensor.measure(sensor.home).pose for _ in range(30)], axis=0)
     moved = poses[0.1] - poses[0.0]
 

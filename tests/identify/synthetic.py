@@ -61,11 +61,14 @@ def run_plant(
     trajectory_seed=0,
     size=1.0,
     robot=None,
+    bias=lambda frame, pose: 0.0,
+    latency_s=None,
     **stated,
 ):
     """(record, run of the plant) with Gaussian noise of `sigma` (6,) and the frames `lost` not measured.
 
-    size: of the motion, as a share of the usual box; robot: another than the reference robot; stated: what
+    size: of the motion, as a share of the usual box; robot: another than the reference robot; bias: of the sensor in a
+    frame at a pose (6,); latency_s: the true one, where it is not the scenario's; stated: what
     `build_record` is given in place of what was.
     """
     rng, robot = np.random.default_rng(seed), robot or rss6()
@@ -76,9 +79,9 @@ def run_plant(
 
     def sensor(frame, t, pose):
         noise = sigma * rng.standard_normal(6)
-        return None if frame in lost else pose + noise
+        return None if frame in lost else pose + bias(frame, pose) + noise
 
-    run = plant.run(reference, sensor)
+    run = plant.run(reference, sensor, None if latency_s is None else np.full(len(times), latency_s))
     covariance = np.broadcast_to(np.diag(np.maximum(sigma, 1e-9) ** 2), (len(times), 6, 6)).copy()
     covariance[~run.measured_ok] = np.nan
     made = {

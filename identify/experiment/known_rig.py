@@ -1,0 +1,111 @@
+"""The rig as the estimator knows it: exactly, as calibrated from pictures of a board, or as well as a calibration says.
+
+The cameras that take the pictures are the sensor file's in each case.
+"""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.calibration import PairView, board_poses, calibrate, default_board, render_pairs
+from cmmsim.calibration.detection import find_board
+from cmmsim.files import SensorFile
+from cmmsim.files.setup import rig_from_file
+from cmmsim.geometry.camera import Optics
+from cmmsim.geometry.known_rig import KnownRig
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
+from cmmsim.imaging.renderer import choose_renderer
+from cmmsim.radiometry.noise import CameraNoise
+from identify.arrays import Array
+from identify.errors import ScenarioError
+from identify.progress import Progress, SilentProgress
+from identify.scenario import Scenario
+
+LARGEST_RATIO = 1.5
+"""Of the focal lengths and baselines of two rigs, one over the other, of which one may be calibrated for the other."""
+
+
+def known_rig(
+    scenario: Scenario, file: SensorFile, rng: np.random.Generator, progress: Progress | None = None
+) -> KnownRig | None:
+    """What is known of the rig of a scenario's sensor file; None where it is known exactly.
+
+    `calibrated`: a board is drawn in front of the true cameras, found in the pictures and calibrated from. A path: the
+    rig that one calibration with that covariance would have found. Raises ScenarioError for a file that holds no
+    calibration, or that of another rig, CalibrationError where the pictures do not determine the cameras.
+    """
+    section, (rig, _) = scenario.rig, rig_from_file(file.rig)
+    if section.exact:
+        return None
+    exposure = section.right_later_std_s
+    if section.known == "exact":
+        return KnownRig(rig, np.zeros((len(PARAMETER_NAMES),) * 2), exposure)
+    if section.known == "calibrated":
+        return replace(calibrated_rig(file, section.pairs, rng, progress or SilentProgress()), exposure_std=exposure)
+    return KnownRig.drawn(rig, stated_covariance(Path(section.known), rig), rng, exposure)
+
+
+def calibrated_rig(file: SensorFile, pairs: int, rng: np.random.Generator, progress: Progress) -> KnownRig:
+    """The rig of a sensor file as calibrated from pictures of a board of dots, drawn by the analytic renderer."""
+    rig, _ = rig_from_file(file.rig)
+    board = default_board(rig)
+    figures = file.camera.model_dump(exclude={"pattern_seed"})
+    noise = CameraNoise(**{("enabled" if key == "noise" else key): value for key, value in figures.items()})
+    optics, poses = Optics(**file.lens.model_dump()), board_poses(rig, board, pairs, rng)
+    frames = render_pairs(rig, board, poses, choose_renderer("analytic"), optics, noise, rng)
+    views = []
+    with progress.stage("calibrate the cameras", pairs) as advance:
+        for number, frame in enumerate(frames, start=1):
+            sides = (find_board(_as_read(image, noise), board) for image in (frame.left, frame.right))
+            views.append(PairView(f"pair {number}", *sides))
+            advance()
+    return calibrate(board, views, (rig.left.width, rig.left.height)).known
+
+
+def _as_read(image: NDArray[np.unsignedinteger[Any]], noise: CameraNoise) -> NDArray[np.uint8]:
+    """An image (h, w) in 8 bit, as pictures of a board are read from files."""
+    return np.asarray(np.round(image * (255.0 / noise.white_level)), dtype=np.uint8)
+
+
+def stated_covariance(path: Path, rig: StereoRig) -> Array:
+    """Covariance (24, 24) of the parameters of a rig from a calibration.json of it, or of one like it.
+
+    Raises ScenarioError: no such file, no calibration in it, or that of other cameras (what differs, and how much).
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        names, matrix = content["covariance"]["names"], np.array(content["covariance"]["matrix"], dtype=float)
+        estimates = np.array([content["parameters"][name]["estimate"] for name in PARAMETER_NAMES], dtype=float)
+        size = content["image_size_px"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ScenarioError(
+            f"rig.known = {str(path)!r} is neither exact, calibrated, nor the calibration.json of `cmmsim calibrate`: "
+            f"{type(error).__name__} {error}"
+        ) from None
+    if list(names) != list(PARAMETER_NAMES) or matrix.shape != (len(PARAMETER_NAMES),) * 2:
+        raise ScenarioError(
+            f"rig.known = {str(path)!r}: its covariance is not of the {len(PARAMETER_NAMES)} parameters"
+        )
+    if size != [rig.left.width, rig.left.height]:
+        raise ScenarioError(
+            f"rig.known = {str(path)!r} is of cameras with {size[0]} x {size[1]} px, the sensor's have "
+            f"{rig.left.width} x {rig.left.height}"
+        )
+    for name, there, here in _sizes(estimates, rig.parameters):
+        if not 1.0 / LARGEST_RATIO < there / here < LARGEST_RATIO:
+            raise ScenarioError(
+                f"rig.known = {str(path)!r} is of another rig: {name} {there:.4g} there, {here:.4g} of the sensor"
+            )
+    return matrix
+
+
+def _sizes(*rigs: Array) -> list[tuple[str, float, float]]:
+    """Focal lengths and baseline of two rigs (24,), by name."""
+    pairs = [
+        (f"{name} [px]", *(rig[PARAMETER_NAMES.index(name)] for rig in rigs)) for name in ("left.fx_px", "right.fx_px")
+    ]
+    return [*pairs, ("baseline [m]", *(float(np.linalg.norm(rig[18:21])) for rig in rigs))]

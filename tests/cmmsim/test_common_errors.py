@@ -1,0 +1,116 @@
+"""What a rig that is known only so well does to all poses of a run: against the whole chain, and against images."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import cmmsim
+from cmmsim.common_errors import NAMES, MeasuringGeometry
+from cmmsim.errors import CmmError
+from cmmsim.files.sensor_file import read_sensor_file
+from cmmsim.files.setup import rig_from_file
+from cmmsim.geometry.known_rig import KnownRig, rig_changes
+from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
+from cmmsim.geometry.registration import register
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, triangulate
+from cmmsim.pose_estimation.observation import faces_camera
+
+BOX = np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])
+OFF = {"left.fx_px": 0.5, "right.cx_px": 0.2, "left.cy_px": -0.1, "right_from_left.ry_rad": 2e-5, "right.k1": 2e-4}
+
+
+@pytest.fixture(scope="module")
+def geometry():
+    sensor = cmmsim.load_sensor("ctrack780", renderer="analytic")
+    return MeasuringGeometry(sensor.rig, sensor.platform, sensor.base, sensor.truth, sensor.home)
+
+
+def seen_by_both(geometry):
+    placed = [move @ geometry.camera_from_base @ pose_to_transform(geometry.home) for move in geometry.rig.from_camera]
+    places, normals = geometry.taught.platform_places, geometry.platform.sticker_normals
+    return np.all([faces_camera(apply(at, places), normals @ at[:3, :3].T) for at in placed], axis=0)
+
+
+def measured(geometry, true, poses, later=None):
+    """Poses (N, 6) that the known rig measures through another one, taught by it as well; `later` (N, 6): the poses at
+    which the right camera exposes."""
+    base_from_camera, places = geometry._teach(true)
+    keep, found = seen_by_both(geometry), []
+    for each in zip(poses, poses if later is None else later, strict=True):
+        points = [
+            apply(geometry.camera_from_base @ pose_to_transform(p), geometry.taught.platform_places) for p in each
+        ]
+        pixels = np.stack([true.project(points[side])[0][side] for side in (0, 1)])
+        ideal, spread, _ = geometry.rig.undistort(pixels, np.tile(np.eye(2), (2, len(places), 1, 1)))
+        seen = triangulate(geometry.rig, ideal[0], ideal[1], spread[0], spread[1])
+        camera_from_platform = register(places[keep], seen.points[keep], seen.covariances[keep]).transform
+        found.append(transform_to_pose(base_from_camera @ camera_from_platform))
+    return np.array(found)
+
+
+def test_changes_of_poses_are_those_of_the_whole_chain_with_a_moved_rig(geometry):
+    rng = np.random.default_rng(0)
+    poses = geometry.home + BOX * rng.uniform(-1, 1, (3, 6))
+    rates = rng.normal(0.0, 0.05, (3, 6))
+    found = geometry.common_errors(poses, rates, np.eye(24), 1.0)
+    assert found.names == (*PARAMETER_NAMES, NAMES[-1])  # frames that were taught without error are left out
+    for name, size in OFF.items():
+        more, less = (measured(geometry, geometry.rig.moved(rig_changes({name: end})), poses) for end in (size, -size))
+        expected = (more - less) / (2.0 * size)
+        changes = found.changes[:, :, PARAMETER_NAMES.index(name)]
+        np.testing.assert_allclose(changes, expected, atol=2e-3 * np.abs(expected).max())
+    more, less = (measured(geometry, geometry.rig, poses, poses + step * rates) for step in (1e-4, -1e-4))
+    expected = (more - less) / 2e-4
+    np.testing.assert_allclose(found.changes[:, :, -1], expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_errors_of_teaching_have_the_covariance_that_teaching_states(geometry):
+    rng = np.random.default_rng(1)
+    spread = [(root := 1e-6 * rng.standard_normal((6, 6))) @ root.T for _ in range(2)]
+    taught = replace(geometry.taught, base_covariance=spread[0], platform_covariance=spread[1])
+    pose = geometry.home + BOX * rng.uniform(-1, 1, 6)
+    found = replace(geometry, taught=taught).common_errors(pose[None], np.zeros((1, 6)), np.zeros((24, 24)))
+    assert len(found.names) == 12
+    np.testing.assert_allclose(found.pose_covariances[0], taught.calibration_covariance(pose), rtol=1e-9, atol=1e-18)
+
+
+def test_draws_of_a_rig_spread_as_its_covariance_says_and_what_is_none_is_refused():
+    rig, _ = rig_from_file(read_sensor_file("ctrack780").rig)
+    root = np.zeros((24, 24))
+    root[:4, :4] = np.random.default_rng(0).standard_normal((4, 4))
+    rng, covariance, count = np.random.default_rng(1), root @ root.T, 500
+    drawn = np.array([rig.parameters - KnownRig.drawn(rig, covariance, rng).rig.parameters for _ in range(count)])
+    variances = np.diag(covariance)[:4]
+    chance = np.sqrt((np.outer(variances, variances) + covariance[:4, :4] ** 2) / count)
+    assert (np.abs(np.cov(drawn.T) - covariance)[:4, :4] < 4.0 * chance).all()
+    assert np.abs(drawn[:, 4:]).max() < 1e-9
+    for spoilt, words in ((-np.eye(24), "left.fx_px is negative"), (np.eye(24) + np.triu(root + 1), "not symmetric")):
+        with pytest.raises(CmmError, match=words):
+            KnownRig(rig, spoilt)
+
+
+@pytest.mark.slow
+def test_images_of_a_rig_that_is_known_wrongly_are_measured_as_predicted():
+    """Taught and measured from images, in motion with a right camera that exposes later: what is left of the error in
+    the mean of ten poses is noise."""
+    file = read_sensor_file("ctrack780")
+    true, _ = rig_from_file(file.rig)
+    off = rig_changes(OFF)
+    known = KnownRig(true.moved(-off), np.diag(off**2), exposure_std=2e-4)
+    sensor = cmmsim.Sensor(file, 0, renderer="analytic", known=known)
+    sensor.move_rig({}, right_later=2e-4)
+    rates = np.tile([0.05, -0.02, 0.03, 0.1, 0.0, -0.1], (10, 1))
+    poses = sensor.home + BOX * np.random.default_rng(2).uniform(-1, 1, (10, 6))
+    errors = sensor.common_errors(poses, rates)
+    drawn = OFF | {NAMES[-1]: 2e-4}
+    predicted = errors.changes[:, :, [errors.names.index(name) for name in drawn]] @ np.array(list(drawn.values()))
+    found = np.array(
+        [sensor.measure(pose, pose_rate=rate).pose - pose for pose, rate in zip(poses, rates, strict=True)]
+    )
+    assert np.abs(found[:, :3]).max() > 2e-5
+    taught = np.sqrt(np.diag(sensor.taught.calibration_covariance(sensor.home)))
+    noise = np.sqrt(np.mean([np.diag(sensor.measure(pose).covariance) for pose in poses], axis=0) / len(poses))
+    assert (
+        np.abs(np.mean(found - predicted, axis=0)) < 4.0 * np.hypot(taught, noise) + 2e-3 * np.abs(predicted).max(0)
+    ).all()

@@ -1,0 +1,175 @@
+"""Errors that all poses of a record have in common: marginalised, they cost precision and no truth.
+
+Records are of a plant whose sensor errs by drawn noise and by one draw of made-up errors: offsets, a wrong scale, and
+turns that couple into positions, of some deviations of the noise. What a real rig does is proved in
+`tests/cmmsim/test_common_errors.py`.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import cmmsim
+from cmmsim.geometry.known_rig import KnownRig
+from identify.errors import RecordError
+from identify.estimation.identification import identify, output_error_problem
+from identify.record.common_errors import CommonErrors, Marginal, read_common_errors, store_common_errors
+from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
+
+NAMES = ("left.fx_px", "left.cx_px", "right.cx_px", "taught.base.rz_rad", "taught.platform.tx_m")
+REFERENCE = (("position", "orientation"), ("velocity", "orientation_rate"))
+KINDS = ("rig", "teaching", "exposure")
+SIZES = 0.3 * SIGMA
+
+
+def slopes():
+    """Made-up errors (6, 5) of a pose at home, and how they grow (6, 6, 5) with the distance from home."""
+    rng = np.random.default_rng(3)
+    there, growing = rng.standard_normal((6, 5)), rng.standard_normal((6, 6, 5))
+    return SIZES[:, None] * there, SIZES[:, None, None] * growing / np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])[
+        :, None
+    ]
+
+
+def changes(poses):
+    """How errors of one standard deviation each change poses (N, 6): (N, 6, 5)."""
+    there, growing = slopes()
+    return there + np.einsum("ijk,nj->nik", growing, poses - rss6().home_pose)
+
+
+COVARIANCE = np.diag([1.0, 0.5, 2.0, 1.0, 0.2]) ** 2 + 0.3 * np.outer([1, 0, 1, 0, 0], [1, 0, 1, 0, 0])
+
+
+def experiment(seed, scenario):
+    """A record of five seconds with one draw of the errors, with what it states of them; and the draw."""
+    drawn = np.random.default_rng(seed + 100).multivariate_normal(np.zeros(5), COVARIANCE)
+    record, _ = run_plant(scenario, seed, duration_s=5.0, bias=lambda frame, pose: changes(pose[None])[0] @ drawn)
+    reference = np.hstack([record[f"reference_{part}"].values for part in ("position", "orientation")])
+    store_common_errors(record, CommonErrors(NAMES, changes(reference), COVARIANCE))
+    return record, drawn
+
+
+def test_whitened_residuals_have_a_covariance_of_one():
+    """(1 + M M^T) between two whiteners is one, worked out densely."""
+    modes = np.random.default_rng(0).standard_normal((30, 4)) * [0.1, 1.0, 10.0, 100.0]
+    whitener = Marginal.of(modes).whiten(np.eye(30))
+    np.testing.assert_allclose(whitener @ (np.eye(30) + modes @ modes.T) @ whitener.T, np.eye(30), atol=1e-9)
+
+
+@pytest.mark.parametrize("method", ["command_driven", pytest.param("closed_loop", marks=pytest.mark.slow)])
+def test_parameters_are_found_in_spite_of_common_errors_and_the_errors_with_them(method):
+    """Without being told of them, the model seems wrong. Told, it is right, estimates lie within their deviations, and
+    the record shows the errors themselves three times better than they were known."""
+    scenario = quick(**{"identification.method": method})
+    record, drawn = experiment(1, scenario)
+    result = identify(record, rss6(), scenario)
+    assert not result.warnings
+    assert result.identifiable.sum() >= 20
+    z = ((result.estimate - truth()) / result.std)[result.identifiable]
+    assert np.sqrt(np.mean(z**2)) < 1.5
+    assert 0.0 < result.common_share[result.identifiable].max() <= 1.0
+    found = result.common_errors
+    assert found.names == NAMES
+    assert (np.abs(found.estimate - drawn) < 4.0 * found.std).all()
+    ignorant = identify(record, rss6(), quick(**{"identification.method": method, "identification.nuisances": []}))
+    assert any("the model" in warning for warning in ignorant.warnings)
+    assert ignorant.whiteness.suspicious
+    assert not result.whiteness.suspicious
+    if method == "command_driven":  # a servo takes the platform where most of an error does not show
+        assert (found.std < 0.3 * found.prior_std).all()
+        assert ignorant.noise_ratio > 1.5 * result.noise_ratio
+
+
+@pytest.mark.parametrize("method", ["command_driven", pytest.param("closed_loop", marks=pytest.mark.slow)])
+def test_a_latency_that_is_known_to_two_milliseconds_is_found_beside_the_parameters(method):
+    scenario = quick(**{"identification.method": method, "timing.latency_s": 0.006, "timing.latency_std_s": 0.002})
+    record, _ = run_plant(scenario, 2, duration_s=5.0, latency_s=0.0075)
+    result = identify(record, rss6(), scenario)
+    found = result.common_errors
+    assert found.names == ("timing.latency_s",)
+    assert abs(found.estimate[0] - 0.0015) < 4.0 * found.std[0] < 0.002
+    z = ((result.estimate - truth()) / result.std)[result.identifiable]
+    assert np.sqrt(np.mean(z**2)) < 1.5
+    assert not result.warnings
+
+
+PHOTOGRAPHED = np.diag([*2 * (1.0, 1.0, 0.5, 0.5, 2e-3, 2e-3, 1e-4, 1e-4, 0.0), *3 * (5e-5,), *3 * (1e-4,)]) ** 2
+"""Covariance of a rig as fifteen photographs of a board leave it: focal lengths to 1 px, principal points to 0.5 px."""
+
+
+@pytest.mark.thorough
+def test_intervals_hold_with_the_cameras_of_photographs_and_a_latency_known_to_two_milliseconds(record_property):
+    """Each experiment has its own cameras, taught frames, latency and noise. The same without a word of them stands
+    beside it: most of its models miss their records, and the intervals of the others hold far more seldom."""
+    count, told = (
+        200,
+        {"identification.method": "command_driven", "timing.latency_s": 0.006, "timing.latency_std_s": 0.002},
+    )
+    scenario, silent = quick(**told), quick(**told, **{"identification.nuisances": []})
+    sensor = cmmsim.load_sensor("ctrack780", renderer="analytic")
+    known, frames = KnownRig(sensor.rig, PHOTOGRAPHED), 1e-12 * np.eye(6)
+    taught = replace(sensor.truth, base_covariance=frames, platform_covariance=frames, known=known)
+    sensor = cmmsim.load_sensor("ctrack780", renderer="analytic", taught=taught)
+    plain, _ = run_plant(scenario, 0, duration_s=5.0)
+    parts = [np.hstack([plain[f"reference_{a}"].values, plain[f"reference_{b}"].values]) for a, b in REFERENCE]
+    found = sensor.common_errors(*parts)
+    errors = CommonErrors(found.names, found.changes, found.covariance)
+    hits = {"told": [], "silent": []}
+    for seed in range(count):
+        rng = np.random.default_rng([seed, 77])
+        bias = errors.modes @ rng.standard_normal(len(errors.names))
+        latency_s = max(0.0, 0.006 + 0.002 * rng.standard_normal())
+        record, _ = run_plant(scenario, seed, duration_s=5.0, bias=lambda k, pose: bias[k], latency_s=latency_s)  # noqa: B023
+        store_common_errors(record, errors)
+        for name, model in (("told", scenario), ("silent", silent)):
+            result = identify(record, rss6(), model)
+            low, high = result.intervals[result.identifiable].T
+            true = truth()[result.identifiable]
+            hits[name].append(np.where(np.isfinite(true), (low <= true) & (true <= high), False))
+    shares = {name: float(np.concatenate(rows).mean()) if any(map(len, rows)) else 0.0 for name, rows in hits.items()}
+    identified = {name: float(np.mean([len(row) for row in rows])) for name, rows in hits.items()}
+    for name in hits:
+        record_property(f"covered_{name}", shares[name])
+        record_property(f"identified_{name}", identified[name])
+    assert 0.93 <= shares["told"] <= 0.97, shares
+    assert identified["silent"] < 0.5 * identified["told"], identified
+
+
+def test_eliminated_errors_are_those_that_would_be_estimated_beside_the_parameters():
+    """Whitened least squares in the parameters give what one least-squares problem in both does."""
+    rng = np.random.default_rng(5)
+    jacobian, modes, residuals = (
+        rng.standard_normal((40, 3)),
+        3.0 * rng.standard_normal((40, 2)),
+        rng.standard_normal(40),
+    )
+    both = np.block([[jacobian, modes], [np.zeros((2, 3)), np.eye(2)]])
+    together = np.linalg.lstsq(both, np.concatenate([residuals, np.zeros(2)]))[0][:3]
+    marginal = Marginal.of(modes)
+    alone = np.linalg.lstsq(marginal.whiten(jacobian), marginal.whiten(residuals))[0]
+    np.testing.assert_allclose(alone, together, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.inv((w := marginal.whiten(jacobian)).T @ w), np.linalg.inv(both.T @ both)[:3, :3], rtol=1e-9
+    )
+
+
+def test_a_record_without_them_is_whitened_as_ever():
+    record, _ = run_plant(quick(), seed=1, duration_s=5.0)
+    problem = output_error_problem([record], rss6(), quick())
+    assert problem.with_common_errors(truth()).runs[0] is problem.runs[0]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda record: record.drop_vars("common_error_covariance"), "holds common_error and not common_error_cov"),
+        (lambda record: record.assign(common_error=record["common_error"] * np.nan), "is not finite"),
+        (lambda record: record.assign(common_error_covariance=-record["common_error_covariance"]), "is no covariance"),
+    ],
+)
+def test_a_record_that_states_no_covariance_is_refused_in_one_line(spoil, words):
+    record, _ = experiment(0, quick())
+    with pytest.raises(RecordError, match=words) as error:
+        read_common_errors(spoil(record), KINDS)
+    assert "\n" not in str(error.value)
