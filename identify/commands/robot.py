@@ -8,19 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from identify.commands import new_folder
+from identify.commands.help import Command, Commands
+from identify.commands.options import JsonFile, Quiet, RobotArgument, new_folder, tell
 from identify.errors import OutputFolderError, VerificationError
 from identify.files.atomic import write_text
-from identify.files.run_folder import new_run_folder, save_files, save_result
+from identify.files.run_folder import new_run_folder, save_files
 from identify.progress import print_table, terminal_progress
 
 if TYPE_CHECKING:
     from dynamics import Robot
     from identify.arrays import Array
     from identify.estimation.base_parameters import BaseParameters
-
-RobotArgument = Annotated[str, typer.Argument(help="Built-in robot (rss6, ups6, ...) or path of a TOML file.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary.")]
 
 THRESHOLD = 1e-3
 """Entries of R below it count as zero in the paper (section 4.2)."""
@@ -29,14 +27,18 @@ DECADES = (0, 3, 6)
 """Units in which the paper's threshold is tried: the regressor in N, kN, MN."""
 
 
-def base_parameters(
-    robot: RobotArgument = "rss6",
-    out: Annotated[Path | None, typer.Option("--out", help="Also write the groups to this JSON file.")] = None,
-) -> None:
-    """Which combinations of its dynamic parameters a robot's motion can show at all.
+def base_parameters(robot: RobotArgument = "rss6", json: JsonFile = None, quiet: Quiet = False) -> None:
+    """Print which combinations of its dynamic parameters a robot's motion can show at all.
 
     A parameter that stands alone can be identified by itself, one in a sum only as part of it, and the unseen ones by
     no motion. All of it up to one common factor where only poses are measured.
+
+    Reads a robot file. Writes nothing but the JSON, which has the coefficients of each combination.
+
+    \b
+    Examples:
+      cmmsim base-parameters rss6
+      cmmsim base-parameters mine.toml --json groups.json
     """
     from dynamics import load_robot
     from identify.estimation import base_parameters as base
@@ -46,8 +48,11 @@ def base_parameters(
     found = base.base_parameters(matrix, chosen.layout)
     singular, angle = base.rank_by_singular_values(matrix), base.angle_to_singular_vectors(matrix, found)
     counts = {10**d: base.rank_by_threshold(matrix / 10**d, THRESHOLD) for d in DECADES}
-    if out is not None:
-        save_result(out, _groups(found, singular, angle))
+    entry = _groups(found, singular, angle)
+    tell(entry, json, quiet, lambda: _print_groups(found, singular, angle, counts))
+
+
+def _print_groups(found: "BaseParameters", singular: int, angle: float, counts: dict[int, int]) -> None:
     for expression in found.expressions():
         typer.echo(expression)
     typer.echo(f"unseen: {', '.join(found.unseen) or 'none'}")
@@ -81,9 +86,19 @@ def _groups(found: "BaseParameters", singular: int, angle: float) -> dict[str, A
 def workspace(
     robot: RobotArgument = "rss6",
     out: Annotated[Path | None, new_folder("runs/workspace-ROBOT")] = None,
+    json: JsonFile = None,
     quiet: Quiet = False,
 ) -> None:
-    """Map travel, reach and conditioning around home: writes workspace.json, travel.png and conditioning.png."""
+    """Map where a robot can go around home: travel, reach and conditioning.
+
+    Reads a robot file.
+
+    Writes workspace.json, which is also the JSON, travel.png and conditioning.png into the folder.
+
+    \b
+    Example:
+      cmmsim workspace mine.toml --out maps
+    """
     from dynamics import load_robot
     from identify.verification.workspace_map import conditioning_figure, map_workspace, travel_figure
 
@@ -93,8 +108,10 @@ def workspace(
     summary = found.summary()
     figures = {"travel.png": travel_figure(found), "conditioning.png": conditioning_figure(found)}
     save_files(folder, {**figures, "workspace.json": summary})
-    if quiet:
-        return
+    tell(summary, json, quiet, lambda: _print_workspace(summary, folder))
+
+
+def _print_workspace(summary: dict[str, Any], folder: Path) -> None:
     for axis, (low, high) in summary["range_from_home"].items():
         name, unit = axis.rsplit("_", 1)
         typer.echo(f"{name}: {1e3 * low:+.1f} to {1e3 * high:+.1f} m{unit} from home within travel")
@@ -106,16 +123,9 @@ def workspace(
     typer.echo(f"maps: {folder}")
 
 
-EXPORT_HELP = """
-Write a robot for another engine.
+EXPORT_HELP = "Write a robot for another engine."
 
-\b
-Examples:
-  cmmsim export mjcf rss6 --parameters runs/paper-0/result.json --allow-unphysical-inertia
-  cmmsim export mjcf mine.toml --parameters identified --out mine.xml
-"""
-
-export = typer.Typer(name="export", help=EXPORT_HELP, no_args_is_help=True, rich_markup_mode=None)
+export = typer.Typer(name="export", cls=Commands, help=EXPORT_HELP, no_args_is_help=True, rich_markup_mode=None)
 
 
 @export.callback()
@@ -123,7 +133,7 @@ def _export() -> None:
     pass
 
 
-@export.command()
+@export.command(cls=Command)
 def mjcf(
     robot: RobotArgument,
     parameters: Annotated[
@@ -146,7 +156,16 @@ def mjcf(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write the robot as MJCF, a closed chain that MuJoCo loads."""
+    """Write the robot as MJCF, a closed chain that MuJoCo loads.
+
+    Reads a robot file, and where --parameters names one the result.json of a run. Writes one XML file.
+
+    \b
+    Examples:
+      cmmsim export mjcf mine.toml --parameters identified --out mine.xml
+      cmmsim export mjcf rss6 --parameters runs/paper-0/result.json \\
+        --allow-unphysical-inertia
+    """
     from dynamics import load_robot
     from dynamics.engines.mjcf import mjcf_text
     from identify.loop_parameters import choose_parameters
@@ -186,9 +205,19 @@ def _changes(robot: "Robot", parameters: "Array") -> list[str]:
 def verify_model(
     robot: RobotArgument = "rss6",
     out: Annotated[Path | None, new_folder("runs/verify-ROBOT")] = None,
+    json: JsonFile = None,
     quiet: Quiet = False,
 ) -> None:
-    """Compare the model with MuJoCo in the paper's loop (figure 7): writes verification.json and figure8.png."""
+    """Compare the model of a robot with MuJoCo in the paper's loop (its figure 7).
+
+    Reads a robot file.
+
+    Writes verification.json, which is also the JSON, and figure8.png into the folder.
+
+    \b
+    Example:
+      cmmsim verify-model rss6
+    """
     from dynamics import load_robot
     from identify.verification.against_mujoco import figure_8, verification_entry, verify
 
@@ -197,8 +226,7 @@ def verify_model(
     runs = verify(chosen, terminal_progress(quiet))
     entry = verification_entry(chosen, runs)
     save_files(folder, {"verification.json": entry, "figure8.png": figure_8(runs)})
-    if not quiet:
-        _print_verdict(entry, folder)
+    tell(entry, json, quiet, lambda: _print_verdict(entry, folder))
     if not entry["met"]:
         found, goal = entry["difference"], entry["goal"]
         raise VerificationError(

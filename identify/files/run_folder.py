@@ -88,7 +88,12 @@ ENTRIES = {"identify": ("identification", "before", "after", "seconds"), "valida
 
 def save_result(path: Path | str, result: dict[str, Any]) -> None:
     """Write a result, whole or not at all; arrays become lists, and numbers that are not finite become null."""
-    write_text(path, json.dumps(_plain(result), indent=2, allow_nan=False) + "\n")
+    write_text(path, as_json(result))
+
+
+def as_json(result: dict[str, Any]) -> str:
+    """A result as the text that its file holds."""
+    return json.dumps(_plain(result), indent=2, allow_nan=False) + "\n"
 
 
 def save_files(folder: Path, files: Mapping[str, Any]) -> None:

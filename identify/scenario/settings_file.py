@@ -41,16 +41,20 @@ class SettingsFiles(Generic[Settings]):
 
         Raises IdentifyError: of this kind: neither a built-in name nor a file (with the names), no TOML, wrong content.
         """
+        text, path = self.text(name_or_path)
+        built_in = path.parent == self.folder
+        source = f"{self.kind} {path.stem!r}" if built_in else f"{self.kind} file {name_or_path}"
+        return self.from_toml(text, source, path.parent)
+
+    def text(self, name_or_path: str | Path) -> tuple[str, Path]:
+        """The text of a built-in file by name, or of a user's own by path, and where it stands. Raises as `load`."""
         name, built_in = str(name_or_path), self.names()
-        path, source = Path(name), f"{self.kind} file {name}"
-        if name in built_in:
-            path, source = self.folder / f"{name}.toml", f"{self.kind} {name!r}"
+        path = self.folder / f"{name}.toml" if name in built_in else Path(name)
         try:
-            text = path.read_text(encoding="utf-8")
+            return path.read_text(encoding="utf-8"), path
         except (OSError, UnicodeDecodeError) as error:
             reason = f", and {error}" if path.exists() else " nor a file"
             raise self.error(f"{self.kind} {name!r} is neither built in ({', '.join(built_in)}){reason}") from error
-        return self.from_toml(text, source, path.parent)
 
     def from_toml(self, text: str, source: str, folder: Path = Path()) -> Settings:
         """Settings from TOML text; `source` names it in messages, its paths start from `folder`. Raises as `load`."""

@@ -103,6 +103,9 @@ class Study(Section):
     seed: int = Field(0, description="seed of all randomness", ge=0)
     theory: list[Law] = Field([], description="laws with which the summary compares")
     options: dict[str, Any] = Field({}, description="options of the kind")
+    figures: list[str] | None = Field(
+        None, description="figures of the rows that are drawn and tabulated; none: the main ones of the kind"
+    )
 
     @field_validator("changes", mode="before")
     @classmethod
@@ -137,6 +140,33 @@ class Study(Section):
     def rows(self) -> int:
         """Number of rows: each point once a repeat."""
         return self.points * self.repeats
+
+    def with_settings(self, settings: Mapping[str, Any]) -> "Study":
+        """Copy with entries replaced by dotted path, such as ``{"repeats": 5, "scenario.timing.latency_s": 0.01}``.
+
+        A key of the scenario, of the sensor or of the options with a list of values, or with a table of low and high,
+        becomes a factor; with any other value it holds in every row.
+
+        Raises StudyError: no such entry (with the valid names), or a value that does not fit.
+        """
+        data = {"factors": {}, "changes": {}, "options": {}} | self.model_dump(exclude_unset=True)
+        single = [name for name in Study.model_fields if name not in ("factors", "changes", "options", "theory")]
+        for path, value in settings.items():
+            root, _, key = path.partition(".")
+            if path in single:
+                data[path] = value
+            elif root in ("scenario", "sensor", "options") and key:
+                place, name = ("options", key) if root == "options" else ("changes", path)
+                data["factors"].pop(path, None)
+                data[place].pop(name, None)
+                table, name = ("factors", path) if isinstance(value, (list, dict)) else (place, name)
+                data[table][name] = value
+            else:
+                raise StudyError(
+                    f"unknown key {path!r} of study {self.name!r}; valid names: {', '.join(single)}, and scenario.*, "
+                    "sensor.* and options.* for what its rows vary"
+                )
+        return STUDIES.from_dict(data, f"study {self.name!r}")
 
 
 _VARIED = {

@@ -121,7 +121,7 @@ def test_groups_do_not_depend_on_the_motions_and_a_crank_turns_about_its_joint(b
 
 def test_the_command_prints_and_writes_the_groups(tmp_path, capsys):
     file = tmp_path / "groups.json"
-    assert command("base-parameters", "rss6", "--out", file) == 0
+    assert command("base-parameters", "rss6", "--json", file) == 0
     shown = capsys.readouterr().out
     assert "crank1.Izz + 0.0009 crank1.mass" in shown
     assert "the same groups from singular vectors: largest angle between what both span" in shown

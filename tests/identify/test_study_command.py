@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from identify.commands import study as study_command
+from identify.commands.help import BEYOND_LIMIT, ROWS_FAILED
 from identify.studies import dask_cluster, summary
 from identify.studies.rows import KINDS
 from identify.studies.study_file import STUDIES, load_study
@@ -51,10 +52,10 @@ def test_study_leaves_its_files_adds_repeats_in_the_same_folder_and_says_nothing
     ("fails", "figure", "exponent", "status", "says"),
     [
         ([], "spread_um", 0.0, 0, ""),
-        ([], "spread_um", 3.0, study_command.A_LAW_FAILED, "1 of 1 laws failed; failed: spread_um ~"),
+        ([], "spread_um", 3.0, BEYOND_LIMIT, "1 of 1 laws failed; failed: spread_um ~"),
         ([], "error_um", 1.0, 0, ""),
-        ([1], "spread_um", 0.0, study_command.SOME_ROWS_FAILED, "1 of 8 rows failed; row 1: ValueError: row 1 has no"),
-        ([1], "spread_um", 9.0, study_command.SOME_ROWS_FAILED, "1 of 1 laws failed"),
+        ([1], "spread_um", 0.0, ROWS_FAILED, "1 of 8 rows failed; row 1: ValueError: row 1 has no"),
+        ([1], "spread_um", 9.0, ROWS_FAILED, "1 of 1 laws failed"),
     ],
 )
 def test_rows_or_laws_that_fail_make_an_exit_status_of_their_own(mine, capsys, fails, figure, exponent, status, says):
