@@ -24,6 +24,9 @@ from identify.files.run_folder import RunFolder, load_result, new_run_folder
 from identify.progress import print_warnings, terminal_progress
 from identify.scenario import Scenario, load_scenario
 
+PLANNED = ("scenario.toml", "trajectories.json", "experiment.nc")
+"""What the first two stages leave."""
+
 
 def run(
     scenario: ScenarioArgument = "paper",
@@ -141,29 +144,62 @@ def record(out: RunFolderOption, workers: Workers = None, quiet: Quiet = False) 
 
 
 def identify(
-    out: RunFolderOption,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help="Folder of the run, as the stage before left it; with --record a new one.",
+            show_default="with --record: runs/NAME-OF-THE-RECORD",
+        ),
+    ] = None,
+    record: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--record",
+            metavar="FILE",
+            help="Identify from a record of your own, netCDF or CSV; a second one of the same robot under a known "
+            "load, where that fixes the scale.",
+            show_default=False,
+        ),
+    ] = None,
     settings: EstimatorSettings = None,
     json: JsonFile = None,
     quiet: Quiet = False,
 ) -> None:
     """Estimate the robot's parameters from the record: the third stage.
 
-    Reads scenario.toml, trajectories.json and experiment.nc of the folder.
+    Reads scenario.toml, trajectories.json and experiment.nc of the folder; or a record of your own, netCDF as
+    experiment.nc is, or a CSV table with a TOML file of the same name beside it, which says what it is a record of.
+    cmmsim new record mine.csv writes both, with comments that say which columns there are, and these rules:
 
-    Writes result.json and covariance.nc there. What is set here stays in scenario.toml, so that validate, report and
-    the next identify go on with it; result.json, which is also the JSON, lists all settings of its estimator.
+    A record begins at rest: before its first row the robot has stood still at the first reference pose. It has one row
+    a frame, without gaps; a lost frame keeps its row, with empty measured columns. Units are m, rad and s. What breaks
+    a rule is refused with its line or frame.
+
+    Writes result.json and covariance.nc there, and from a record of your own also scenario.toml, experiment.nc and
+    model.nc: go on with cmmsim report, since nothing is known of the truth that could be validated. What is set here
+    stays in scenario.toml, so that validate, report and the next identify go on with it; result.json, which is also the
+    JSON, lists all settings of its estimator.
 
     \b
     Examples:
       cmmsim identify --out mine
+      cmmsim identify --record mine.csv
       cmmsim identify --out mine --set identification.method=command_driven
       cmmsim identify --out mine --set identification.physical_consistency=true
       cmmsim identify --out mine \\
         --set 'identification.prior={"platform.mass"={value=23.5,std=0.1}}'
     """
-    folder = RunFolder(out)
-    folder.require("scenario.toml", "trajectories.json", "experiment.nc")
-    _pipeline().identify(out, terminal_progress(quiet), parse_settings(settings))
+    chosen, progress = parse_settings(settings), terminal_progress(quiet)
+    if record:
+        folder = new_run_folder(out or Path("runs") / record[0].stem)
+        _pipeline().identify_own(record, folder.path, progress, chosen)
+    elif out is None:
+        raise typer.BadParameter("name the folder of a run, or a record of your own with --record", param_hint="--out")
+    else:
+        folder = RunFolder(out)
+        folder.require(*(PLANNED[:1] if folder.holds_own_record else PLANNED))
+        _pipeline().identify(out, progress, chosen)
     result = _warned(folder)
     tell(result, json, quiet, lambda: _summary().print_identification(result, folder.result))
 
@@ -180,7 +216,8 @@ def validate(out: RunFolderOption, workers: Workers = None, json: JsonFile = Non
       cmmsim validate --out mine
     """
     folder = RunFolder(out)
-    folder.require("scenario.toml", "trajectories.json", "experiment.nc", "result.json")
+    if not folder.holds_own_record:
+        folder.require(*PLANNED, "result.json")
     _pipeline().validate(out, terminal_progress(quiet), workers)
     tell(load_result(folder.result), json, quiet, lambda: None)
 

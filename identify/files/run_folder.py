@@ -45,6 +45,11 @@ class RunFolder:
         self.report = path / "report.html"
         self.figures = path / "figures"
 
+    @property
+    def holds_own_record(self) -> bool:
+        """Whether the record is one of the user's own: it follows no trajectories that were designed here."""
+        return self.experiment.is_file() and not self.trajectories.exists()
+
     def require(self, *names: str) -> None:
         """Refuse to go on without files of earlier stages, such as ``require("experiment.nc")``.
 
