@@ -13,6 +13,7 @@ from identify.commands.comparisons import estimators, variation
 from identify.commands.experiment import excite, identify, record, report, run, validate, warm_up
 from identify.commands.help import BEYOND_LIMIT, NOT_DONE, Command, Commands, Judging, StudyCommand
 from identify.commands.importing import imports
+from identify.commands.new import new
 from identify.commands.robot import base_parameters, export, verify_model, workspace
 from identify.commands.sensor import acceptance, detectors
 from identify.commands.study import study
@@ -30,6 +31,7 @@ EXAMPLES = """
 Examples:
   cmmsim run quick                     a whole experiment in a minute
   cmmsim run quick --robot ups6        with another robot, or your own file
+  cmmsim new robot mine.toml           a commented file to start from
   cmmsim check mine.toml               what a designer wants to know of a robot
   cmmsim study --list                  studies, such as error against noise
   cmmsim COMMAND --help                what a command reads, writes and returns
@@ -113,4 +115,5 @@ app.add_typer(imports, name="import", rich_help_panel=ROBOTS)
 _add(SENSORS, acceptance, cls=Judging)
 _add(SENSORS, detectors, calibrate)
 _add(STUDIES, stoppable(study), cls=StudyCommand)
+app.add_typer(new, name="new", rich_help_panel=SETTING_UP)
 _add(SETTING_UP, warm_up)

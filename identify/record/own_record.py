@@ -25,7 +25,7 @@ from identify.record.payload import payload_vector, store_payload
 from identify.record.provenance import recorded_scenario
 from identify.record.recording import build_record, read
 from identify.scenario import Scenario
-from identify.scenario.scenario import SCENARIOS
+from identify.scenario.scenario import SCENARIOS, scenario_schema
 from identify.scenario.sections import LOAD_UNITS, Section, quantity
 from identify.scenario.settings_file import one_line
 
@@ -111,6 +111,15 @@ def read_description(path: Path, table: Path) -> tuple[Scenario, Measured]:
     except ValidationError as error:
         raise RecordError(f"{path}: [{DESCRIPTION}] {one_line(error, Measured)}") from error
     return SCENARIOS.from_dict({"name": path.stem} | content, str(path), path.parent), measured
+
+
+def record_schema() -> dict[str, Any]:
+    """JSON schema of the files beside CSV records, for editors; `record.schema.json` holds it."""
+    schema, own = scenario_schema(), Measured.model_json_schema()
+    schema["required"].remove("name")
+    schema["properties"][DESCRIPTION] = {"$ref": "#/$defs/Measured"}
+    schema["$defs"]["Measured"] = own
+    return schema
 
 
 def _measured_ok(table: Table) -> NDArray[np.bool_]:

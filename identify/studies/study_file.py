@@ -177,6 +177,10 @@ STUDIES = SettingsFiles(
 )
 
 
+STARTING = Path(__file__).parent / "starting.toml"
+"""A study file that shows what one may have."""
+
+
 def load_study(name_or_path: str | Path) -> Study:
     """Load a built-in study by name, or one from a TOML file, from whose folder its paths start.
 
@@ -184,6 +188,23 @@ def load_study(name_or_path: str | Path) -> Study:
     changes are checked by `identify.studies.design`.
     """
     return STUDIES.load(name_or_path)
+
+
+def study_schema() -> dict[str, Any]:
+    """JSON schema of study files, for editors; `built_in/study.schema.json` holds it.
+
+    What is varied stands in tables in tables, whose keys are those of scenarios, sensors and kinds of row.
+    """
+    schema = Study.model_json_schema()
+    for name in ("changes", "factors"):
+        known = schema["properties"][name]
+        schema["properties"][name] = {
+            "type": "object",
+            "description": known["description"],
+            "propertyNames": {"pattern": r"^(scenario|sensor|options)(\.|$)"},
+        }
+    del schema["$defs"]["Range"]
+    return schema
 
 
 def _factor(path: str, value: Any) -> Any:
