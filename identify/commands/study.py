@@ -191,8 +191,8 @@ def _list() -> None:
 
 def _list_kinds() -> None:
     from identify.studies.design import valid_keys
+    from identify.studies.labels import factor_unit
     from identify.studies.rows import KINDS
-    from identify.studies.table import factor_unit
 
     for kind in KINDS.values():
         typer.echo(f"{kind.name}: {kind.what}\n\nIt reads {kind.reads}, and its options; no other factor is taken.\n")

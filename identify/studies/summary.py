@@ -16,9 +16,10 @@ from identify.files.run_folder import save_result
 from identify.files.versions import versions
 from identify.studies import theory
 from identify.studies.figures import draw
+from identify.studies.labels import labelled, unit_of
 from identify.studies.rows import KINDS
 from identify.studies.study_file import Study
-from identify.studies.table import figure_names, labelled, unit_of
+from identify.studies.table import figure_names
 from identify.studies.theory import Statistics, Verdict, check_laws
 
 JSON, MARKDOWN = "summary.json", "summary.md"

@@ -87,6 +87,29 @@ def test_studies_are_listed_with_their_rows_and_kinds_with_options_figures_and_w
     assert ["options.stretch_s", "0.5", "s"] in [line[:3] for line in lines]
 
 
+def test_a_file_is_shown_and_single_entries_are_replaced(mine, capsys):
+    assert command("study", "--show", "pixel_noise") == 0
+    Path("theirs.toml").write_text(capsys.readouterr().out)
+    assert load_study("theirs.toml") == load_study("pixel_noise")
+    changes = ("--set", "sensor.camera.dark_noise=[1.0,2.0,3.0]", "--set", "sensor.rig.baseline=0.9", "--seed", 5)
+    assert command("study", mine, "--workers", 0, "--out", "a", "--quiet", "--set", "repeats=1", *changes) == 0
+    frame, study = read_table("a/study.parquet")
+    assert frame["sensor.camera.dark_noise"].tolist() == [1.0, 2.0, 3.0]
+    assert (study.seed, study.changes, study.repeats) == (5, {"sensor.rig.baseline": 0.9}, 1)
+    for setting, says in (
+        ("reapeats=2", "unknown key 'reapeats' of study 'mine'; valid names: name, title, kind, scenario, sample, "),
+        ("sensor.camera.darkness=2", "unknown key 'sensor.camera.darkness'; the nearest are sensor.camera.dark_noise"),
+        ("repeats=many", "repeats = 'many': input should be a valid integer"),
+        ("scenario.timing.latency_s=late", "scenario.timing.latency_s = 'late': input should be a valid number"),
+        ("repeats", "is not of the form KEY=VALUE"),
+    ):
+        assert command("study", mine, "--workers", 0, "--out", "b", "--set", setting) == 1
+        assert says in one_line(capsys.readouterr().err)
+    assert command("study", "--show", "none") == 1
+    assert "neither built in (baseline, " in one_line(capsys.readouterr().err)
+    assert not Path("b").exists()
+
+
 def test_ten_million_rows_are_refused_at_once_and_many_are_run_where_confirmed(mine, capsys, monkeypatch):
     keys = ("dsnu", "dark_noise", "black_level", "gain", "full_well", "electrons_at_white")
     factors = "\n".join(f"sensor.camera.{name} = {[*range(1, 11)]}" for name in keys)
