@@ -218,8 +218,8 @@ def _print_summary(found: "Calibration", folder: Path) -> None:
         (name, f"{value:.6g}", f"{std:.2g}" if std > 0.0 else "fixed")
         for name, value, std in zip(PARAMETER_NAMES, found.values, found.std, strict=True)
     ]
-    title = f"{count} pairs, sigma {found.adjustment.sigma_px:.3g} px"
-    print_table(("parameter", "estimate", "std"), rows, ("parameter",), title)
+    title = f"{count} pairs of pictures; errors of the points in them: {found.adjustment.sigma_px:.3g} px"
+    print_table(("parameter", "estimate", "standard deviation"), rows, ("parameter",), title)
     for name, reason in found.rejected.items():
         typer.echo(f"not used: {name}: {reason}")
     typer.echo(f"calibration: {folder}")

@@ -24,15 +24,16 @@ ESTIMATORS_HEADER = (
     "groups\n%",
     "median\n%",
     "gains\n%",
-    "pos.\num",
-    "ori.\nurad",
+    "position\nµm",
+    "angle\nµrad",
     "time\ns",
-    "iter.",
-    "evals",
+    "iterations",
+    "runs",
 )
 
-METHODS_HEADER = ("method", "value", "eq. 39", "D", "seconds", "values", "gradients", "stopped")
+METHODS_HEADER = ("method", "maximised", "index", "narrows", "seconds", "values", "gradients", "stopped")
 
+PAPERS_ROBOT = "rss6"
 PAPER = "the paper, with its own robot and geometry: index 0.38 at the start, 1.345 after 324 generations"
 
 
@@ -116,9 +117,9 @@ def _print_scores(scores: list["Score"], out: Path) -> None:
         [(score.title, *_score_row(score)) for score in scores],
         ("estimator",),
         "estimators on one record, against one truth",
-        "groups: RMS and median relative error of the base parameters that the record shows; gains: RMS of "
-        "those of the joint PID; position, orientation: model against true plant on unseen trajectories, RMS of the "
-        "worst axis and run; evals: simulated runs of the model",
+        "groups: RMS and median relative error of the base parameters that the record shows; gains: RMS relative error "
+        "of those of the joint controller; position, angle: model against true plant on unseen trajectories, RMS of "
+        "the worst axis and run; runs: how often the model was simulated",
     )
     for score in scores:
         if score.note:
@@ -225,21 +226,22 @@ def compare_excitation(
     figures = {**asdict(found), "scenario": scenario.name}
     figure = comparison_figure(robot, scenario, found)
     save_files(folder, {"comparison.json": figures, "comparison.png": figure})
-    tell(figures, json, quiet, lambda: _print_methods(found, folder))
+    paper = PAPER if scenario.robot == PAPERS_ROBOT else None
+    tell(figures, json, quiet, lambda: _print_methods(found, folder, paper))
 
 
-def _print_methods(found: "Comparison", folder: Path) -> None:
+def _print_methods(found: "Comparison", folder: Path, note: str | None) -> None:
     """One row a method, and what is nearest to its limit."""
     title = f"criterion {found.criterion}, seed {found.seed}, {found.candidates} random candidates"
-    print_table(METHODS_HEADER, map(_method_row, found.entries), ("method", "stopped"), title, PAPER)
+    print_table(METHODS_HEADER, map(_method_row, found.entries), ("method", "stopped"), title, note)
     for entry in found.entries:
         nearest = sorted(entry.worst, key=lambda worst: -worst.share)
         used = ", ".join(f"{worst.name} {100 * worst.share:.2f} %" for worst in nearest)
         typer.echo(f"{entry.method}: share of each limit used: {used}")
     typer.echo(
-        f"value: what was maximised (information: D of the linearised loop). D: factor by which a run narrows the "
-        f"prior, simulated loop; - where it is unstable. Candidates and functions: {found.preparation_seconds:.1f} s. "
-        f"Files: {folder}"
+        f"maximised: the criterion (information: of the linearised loop). index: the paper's observability index, eq. "
+        f"39. narrows: factor by which a run narrows what is known before of the parameters, with the simulated loop; "
+        f"- where that is unstable. Candidates and functions took {found.preparation_seconds:.1f} s. Files: {folder}"
     )
 
 

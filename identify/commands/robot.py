@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 THRESHOLD = 1e-3
 """Entries of R below it count as zero in the paper (section 4.2)."""
 
+PAPERS = "rss6"
+"""The robot of the paper, beside which alone its numbers stand."""
+
 DECADES = (0, 3, 6)
 """Units in which the paper's threshold is tried: the regressor in N, kN, MN."""
 
@@ -49,23 +52,24 @@ def base_parameters(robot: RobotArgument = "rss6", json: JsonFile = None, quiet:
     singular, angle = base.rank_by_singular_values(matrix), base.angle_to_singular_vectors(matrix, found)
     counts = {10**d: base.rank_by_threshold(matrix / 10**d, THRESHOLD) for d in DECADES}
     entry = _groups(found, singular, angle)
-    tell(entry, json, quiet, lambda: _print_groups(found, singular, angle, counts))
+    tell(entry, json, quiet, lambda: _print_groups(found, singular, angle, counts, chosen.name == PAPERS))
 
 
-def _print_groups(found: "BaseParameters", singular: int, angle: float, counts: dict[int, int]) -> None:
+def _print_groups(found: "BaseParameters", singular: int, angle: float, counts: dict[int, int], papers: bool) -> None:
     for expression in found.expressions():
         typer.echo(expression)
-    typer.echo(f"unseen: {', '.join(found.unseen) or 'none'}")
+    typer.echo(f"No motion shows: {', '.join(found.unseen) or 'none of them, all are shown'}.")
     typer.echo(
-        f"{found.rank} base parameters of {len(found.names)} by pivoted QR, {singular} by singular values; columns of "
-        f"length one leave {found.gap[1]:.1e} outside the others where independent, {found.gap[0]:.1e} where not"
+        f"The {len(found.names)} parameters make {found.rank} base parameters, which are all that a motion can show; "
+        f"singular values find {singular}. What is independent stands out of the others by {found.gap[1]:.1e} of its "
+        f"length or more, what is not by {found.gap[0]:.1e} at most; both ways find the same groups to {angle:.1e} rad."
     )
-    typer.echo(f"the same groups from singular vectors: largest angle between what both span {angle:.1e} rad")
     tried = ", ".join(f"{count} in units of {unit:g} N" for unit, count in counts.items())
     left = len(found.names) - len(found.unseen)
     typer.echo(
-        f"the paper's rule (|R_ii| > {THRESHOLD:g}, unscaled): {tried}: it depends on the units. Deleting only the "
-        f"unseen ones leaves {left}, {left + 3} with the joint PID's gains (the paper's table lists 49)"
+        f"The paper's rule, a diagonal of R above {THRESHOLD:g} without scaling, depends on the units, and finds "
+        f"{tried}. Deleting only what no motion shows leaves {left} parameters, {left + 3} with the gains of the joint "
+        f"controller{'; its table lists 49' if papers else ''}."
     )
 
 
@@ -114,11 +118,12 @@ def workspace(
 def _print_workspace(summary: dict[str, Any], folder: Path) -> None:
     for axis, (low, high) in summary["range_from_home"].items():
         name, unit = axis.rsplit("_", 1)
-        typer.echo(f"{name}: {1e3 * low:+.1f} to {1e3 * high:+.1f} m{unit} from home within travel")
+        typer.echo(f"{name}: {1e3 * low:+.1f} to {1e3 * high:+.1f} m{unit} from home, within the joints' travel")
     worst = summary["whole_travel"]
     typer.echo(
-        f"whole travel: leverage (J_a1) at least {worst['least_leverage_J_a1']:.3f}, condition of J_a2 at most "
-        f"{worst['largest_condition_J_a2']:.2f}, of J_ad {worst['largest_condition_J_ad']:.2f}"
+        f"over the whole travel the actuators' leverage on their legs is at least {worst['least_leverage_J_a1']:.3f}; "
+        f"the condition number of the legs' directions (J_a2) is at most {worst['largest_condition_J_a2']:.2f}, and "
+        f"that of the whole Jacobian (J_ad) {worst['largest_condition_J_ad']:.2f}"
     )
     typer.echo(f"maps: {folder}")
 
