@@ -105,7 +105,7 @@ def test_every_file_that_the_packages_need_is_named_for_the_wheel():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
     patterns = project["tool"]["setuptools"]["package-data"]["*"]
     found = [path for name in PACKAGES for path in (ROOT / name).rglob("*") if path.is_file()]
-    others = [path for path in found if path.suffix not in (".py", ".pyc")]
+    others = [path for path in found if path.suffix != ".py" and path.parent.name != "__pycache__"]
     assert len(others) > 30
     assert [path for path in others if not any(path.match(pattern) for pattern in patterns)] == []
 

@@ -232,7 +232,7 @@ def report(out: RunFolderOption, quiet: Quiet = False) -> None:
       cmmsim report --out mine
     """
     folder = RunFolder(out)
-    folder.require("result.json", "experiment.nc", "validation.nc", "model.nc")
+    folder.require("result.json", "experiment.nc")
     _pipeline().report(out, terminal_progress(quiet))
     if not quiet:
         _summary().print_goals(load_result(folder.result), folder.report)
