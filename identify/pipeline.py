@@ -161,16 +161,11 @@ def _identified(records: Mapping[str, xr.Dataset], scenario: Scenario, progress:
 
 
 def _write_identified(run_folder: RunFolder, found: _Identified, scenario: Scenario, seed: int | None) -> None:
-    """Write covariance.nc and result.json; and of a record of one's own, which has no seed, model.nc: `validate`, which
-    writes it else, has nothing to judge it by."""
+    """Write covariance.nc and result.json; seed: None of a record of one's own."""
     seen, result = found.record, found.result
     measured, ok = recording.poses(seen, "measured"), seen["measured_ok"].values.astype(bool)
     before, after = found.models
     made_of = {name: digest(one) for name, one in found.records.items()} | {"covariance.nc": digest(result.covariance)}
-    if seed is None:
-        made_of["model.nc"] = digest(
-            write_model_runs(run_folder.model, build_model_run(seen["time"].values, before, after))
-        )
     seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
     write_covariance(run_folder.covariance, result.layout, result.covariance)
     save_result(

@@ -177,7 +177,7 @@ def _judge(outcome: "Outcome", laws: list[dict[str, Any]]) -> None:
 def _law_line(law: dict[str, Any]) -> str:
     measured = law["reason"]
     if law["measured"] is not None:
-        measured = f"{law['measured']:.4g} ({law['low']:.4g} to {law['high']:.4g}), expected {law['expected']}"
+        measured = f"measured {law['measured']:.4g} ({law['low']:.4g} to {law['high']:.4g}), expected {law['expected']}"
     return f"{law['verdict']}: {law['statement']}: {measured}"
 
 

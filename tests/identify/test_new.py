@@ -22,6 +22,11 @@ from identify.studies.study_file import STARTING, STUDIES, load_study, study_sch
 from tests.identify.commands import command, one_line
 
 
+def some(names, *quick):
+    """All names, most of them among the slow ones."""
+    return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in names]
+
+
 @pytest.fixture(autouse=True)
 def _in_a_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -38,7 +43,7 @@ def schema_named_in(path):
     return json.loads(Path(urlsplit(first.removeprefix("#:schema ")).path).read_text())
 
 
-@pytest.mark.parametrize("name", built_in_robots())
+@pytest.mark.parametrize("name", some(built_in_robots(), "ups6"))
 def test_a_new_robot_is_the_built_in_one_under_the_name_of_its_file(name, capsys):
     write("robot", "mine.toml", "--like", name)
     assert "cmmsim check mine.toml" in capsys.readouterr().out
@@ -70,7 +75,7 @@ def test_a_new_scenario_has_every_key_and_is_the_built_in_one_until_a_comment_is
     assert schema_named_in("mine.toml") == scenario_schema()
 
 
-@pytest.mark.parametrize("name", [None, *STUDIES.names()])
+@pytest.mark.parametrize("name", some([None, *STUDIES.names()], None, "frame_rate"))
 def test_a_new_study_can_be_run(name):
     write("study", "mine.toml", "--quiet", *([] if name is None else ["--like", name]))
     study = load_study("mine.toml")
@@ -90,7 +95,7 @@ def test_the_starting_study_runs_and_draws_what_it_chooses(capsys):
     assert drawn == {f"by_sensor.camera.dark_noise.{kind}" for kind in ("png", "pdf", "svg")}
 
 
-@pytest.mark.parametrize("name", ["rss6", "ups6", "delta3"])
+@pytest.mark.parametrize("name", some(["rss6", "ups6", "delta3"], "ups6"))
 def test_a_new_record_is_read_and_asks_for_its_rows(name, capfd):
     write("record", "mine.csv", name)
     assert command("identify", "--record", "mine.csv", "--out", "never", "--quiet") == NOT_DONE

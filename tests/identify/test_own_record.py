@@ -13,10 +13,11 @@ from identify.commands.help import NOT_DONE
 from identify.errors import EstimationError
 from identify.files.run_folder import load_result
 from identify.record.own_record import read_own_records
+from identify.record.payload import recorded_payload
 from identify.record.recorded_run import recorded_run
 from identify.record.recording import VARIABLES, poses, read
 from tests.identify.commands import command, one_line
-from tests.identify.synthetic import quick, rss6, short_run
+from tests.identify.synthetic import LAYOUT, index_of, quick, rss6, short_run
 from tests.identify.test_recording import with_values
 
 POSE = ("x", "y", "z", "alpha", "beta", "gamma")
@@ -92,6 +93,21 @@ def test_optional_columns_may_be_left_out(mine, record):
     np.testing.assert_allclose(found["measured_covariance"], np.tile(np.diag(std**2), (len(table), 1, 1)))
 
 
+def test_a_second_table_may_be_of_the_robot_under_a_known_load(mine, record):
+    """Nothing is measured by a platform's balance then; the load stands with the second record alone."""
+    for path in (mine, mine.with_name("loaded.csv")):
+        table_of(record).to_csv(path, index=False)
+        text = DESCRIPTION.replace("[record]\nanchor_value = {value!r}\n", "").replace("anchor_std = {std!r}\n", "")
+        text = text.replace("platform_mass", "payload") + "[payload]\nmass_kg = 5.0\nmass_std_kg = 0.01\n"
+        path.with_suffix(".toml").write_text(text + "[record]\nunder_payload = true\n" * (path != mine))
+    (free, loaded), scenario = read_own_records([mine, mine.with_name("loaded.csv")])
+    assert not recorded_payload(free, LAYOUT)[0].any()
+    load, std = recorded_payload(loaded, LAYOUT)
+    assert (load[index_of("platform.mass")], std[index_of("platform.mass")]) == (5.0, 0.01)
+    assert load[index_of("platform.Izz")] == scenario.payload.Izz_kg_m2
+    assert free.attrs["scale_anchor"] == "payload"
+
+
 @pytest.mark.slow
 def test_csv_and_netcdf_of_a_run_give_the_same_estimates_in_folders_without_its_truth(mine, record, tmp_path, capfd):
     record.drop_attrs(deep=False).assign_attrs({k: v for k, v in record.attrs.items() if k != "seed"}).to_netcdf(
@@ -106,7 +122,7 @@ def test_csv_and_netcdf_of_a_run_give_the_same_estimates_in_folders_without_its_
         np.testing.assert_allclose(values[0], values[1], rtol=1e-6)
     assert all(entry["true"] is None for entry in one["parameters"].values())
     made = {path.name for path in (tmp_path / "a").iterdir()}
-    assert made == {"scenario.toml", "experiment.nc", "covariance.nc", "model.nc", "result.json"}
+    assert made == {"scenario.toml", "experiment.nc", "covariance.nc", "result.json"}
     np.testing.assert_allclose(poses(read(tmp_path / "a" / "experiment.nc"), "measured"), poses(record, "measured"))
     capfd.readouterr()
     assert command("validate", "--out", tmp_path / "a") == NOT_DONE

@@ -10,6 +10,7 @@ from matplotlib.image import imread
 from scipy import stats
 
 from identify.errors import StudyError
+from identify.studies import figures as figures_of_studies
 from identify.studies import summary
 from identify.studies.design import Design, Finished, prepare
 from identify.studies.figures import FORMATS, factor_figure, laws_figure
@@ -127,8 +128,8 @@ def test_figures_show_each_factor_two_as_a_map_and_the_laws(written):
         assert "dark noise" in (folder / f"{name}.svg").read_text().lower()
 
 
-@pytest.mark.parametrize("levels", [[10.0, 20.0, 40.0], [1.0, 1.05, 1.1, 9.0], [0.001, 5e4], np.geomspace(1, 7, 7)])
-@pytest.mark.parametrize("spread", [1.0001, 1.3, 5.0, 300.0, 1e7])
+@pytest.mark.parametrize("levels", [[1.0, 1.05, 1.1, 9.0], [0.001, 5e4], np.geomspace(1, 7, 7)])
+@pytest.mark.parametrize("spread", [1.0001, 5.0, 1e7])
 def test_numbers_on_axes_never_touch_and_labels_are_words_with_units(levels, spread):
     """Of rows whose rms spans a little or seven decades, with bands as wide as few repeats leave them."""
     study = made_study(factors={DARK: list(levels), BASELINE: [0.5, 1.0]}, repeats=2, theory=[])
@@ -148,11 +149,14 @@ def test_numbers_on_axes_never_touch_and_labels_are_words_with_units(levels, spr
         assert not any(one.overlaps(other) for one, other in pairwise(boxes))
 
 
-def test_figures_chosen_in_the_file_are_drawn_and_tabulated_and_others_are_refused(tmp_path):
+def test_figures_chosen_in_the_file_are_drawn_and_tabulated_and_others_are_refused(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(summary, "draw", lambda *arguments: drawn.append(arguments[3]))
     chosen = made_study(figures=[ORIENTATION], theory=[])
     summary.write(tmp_path, chosen, made_table(chosen))
     assert "| orientation_rms_urad [urad] |" in (tmp_path / "summary.md").read_text()
     assert "position_rms_um" not in (tmp_path / "summary.md").read_text()
+    assert drawn == [[ORIENTATION]]
     with pytest.raises(StudyError, match="figures has 'speed', no figure of static_pose; the nearest are"):
         prepare(made_study(figures=["speed"]))
     own = made_study(kind="my_rows:count", figures=["speed"], theory=[])
@@ -187,7 +191,11 @@ def test_what_a_study_lacks_is_said(tmp_path, monkeypatch):
     assert entry["points"][0]["figures"][ORIENTATION]["rows"] == 4
 
 
-def test_law_against_a_figure_needs_no_factor_and_one_of_a_texts_power_is_undecided_and_not_drawn(tmp_path):
+def test_law_against_a_figure_needs_no_factor_and_one_of_a_texts_power_is_undecided_and_not_drawn(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(figures_of_studies, "FORMATS", ("png",))
+
     def figures(_, rng):
         sight = rng.uniform(1.0, 4.0)
         return {"sight_m": sight, POSITION: sight**2 * np.sqrt(rng.chisquare(12) / 12)}
@@ -201,7 +209,10 @@ def test_law_against_a_figure_needs_no_factor_and_one_of_a_texts_power_is_undeci
     assert (tmp_path / "figures" / f"by_{METHOD}.png").exists()
 
 
-def test_random_sample_is_summarised_as_a_whole_and_its_points_stand_in_order_with_digits_to_read(tmp_path):
+def test_random_sample_is_summarised_as_a_whole_and_its_points_stand_in_order_with_digits_to_read(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(figures_of_studies, "FORMATS", ("png",))
     study = made_study(sample=200, repeats=1, factors={DARK: Range(low=10.0, high=40.0), BASELINE: [0.5, 1.0]})
     entry = summary.write(tmp_path, study, made_table(study))
     assert [point["factors"] for point in entry["points"]] == [{}]
