@@ -161,11 +161,15 @@ def _identified(records: Mapping[str, xr.Dataset], scenario: Scenario, progress:
 
 
 def _write_identified(run_folder: RunFolder, found: _Identified, scenario: Scenario, seed: int | None) -> None:
-    """Write covariance.nc and result.json; seed: None of a record of one's own."""
+    """Write covariance.nc and result.json; and of a record of one's own, which has no seed, model.nc: `validate`, which
+    writes it else, has nothing to judge it by."""
     seen, result = found.record, found.result
     measured, ok = recording.poses(seen, "measured"), seen["measured_ok"].values.astype(bool)
     before, after = found.models
     made_of = {name: digest(one) for name, one in found.records.items()} | {"covariance.nc": digest(result.covariance)}
+    if seed is None:
+        runs = write_model_runs(run_folder.model, build_model_run(seen["time"].values, before, after))
+        made_of["model.nc"] = digest(runs)
     seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
     write_covariance(run_folder.covariance, result.layout, result.covariance)
     save_result(

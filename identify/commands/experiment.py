@@ -176,10 +176,10 @@ def identify(
     a frame, without gaps; a lost frame keeps its row, with empty measured columns. Units are m, rad and s. What breaks
     a rule is refused with its line or frame.
 
-    Writes result.json and covariance.nc there, and from a record of your own also scenario.toml and
-    experiment.nc: go on with cmmsim report, since nothing is known of the truth that could be validated. What is set
-    here stays in scenario.toml, so that validate, report and the next identify go on with it; result.json, which is
-    also the JSON, lists all settings of its estimator.
+    Writes result.json and covariance.nc there, and from a record of your own also scenario.toml, experiment.nc and
+    model.nc: go on with cmmsim report, since nothing is known of the truth that could be validated. What is set here
+    stays in scenario.toml, so that validate, report and the next identify go on with it; result.json, which is also the
+    JSON, lists all settings of its estimator.
 
     \b
     Examples:

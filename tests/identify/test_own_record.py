@@ -122,7 +122,7 @@ def test_csv_and_netcdf_of_a_run_give_the_same_estimates_in_folders_without_its_
         np.testing.assert_allclose(values[0], values[1], rtol=1e-6)
     assert all(entry["true"] is None for entry in one["parameters"].values())
     made = {path.name for path in (tmp_path / "a").iterdir()}
-    assert made == {"scenario.toml", "experiment.nc", "covariance.nc", "result.json"}
+    assert made == {"scenario.toml", "experiment.nc", "covariance.nc", "model.nc", "result.json"}
     np.testing.assert_allclose(poses(read(tmp_path / "a" / "experiment.nc"), "measured"), poses(record, "measured"))
     capfd.readouterr()
     assert command("validate", "--out", tmp_path / "a") == NOT_DONE
