@@ -21,6 +21,9 @@ REST_POSE = 0.1
 TRAVELS = 2.0
 """Travels by which a measured pose may be away from the reference, and a command from where that puts the joints."""
 
+BUILT = 0.05
+"""Share of the joints' travel limit by which a robot that is built otherwise than its file may need other commands."""
+
 OTHER_UNITS = {"mm": (1e-3, 1.0), "degrees": (1.0, np.pi / 180), "mm and degrees": (1e-3, np.pi / 180)}
 """Factors of positions and of angles from units in which records come by mistake."""
 
@@ -87,19 +90,20 @@ def _check_measured(reference: Reference, measured: Array, ok: NDArray[np.bool_]
 def _check_commands(robot: Robot, reference: Reference, logged: Array) -> None:
     wanted = robot.inverse_kinematics(reference.poses)
     travel = float(np.ptp(wanted, axis=0).max())
+    allowed = max(TRAVELS * travel, BUILT * robot.geometry.travel_limit)
 
     def follows(commands: Array) -> bool:
-        return bool(np.abs(commands - wanted).max() <= TRAVELS * travel)
+        return bool(np.abs(commands - wanted).max() <= allowed)
 
-    if travel > 0 and not follows(logged):
+    if not follows(logged):
         frame, joint = np.unravel_index(int(np.argmax(np.abs(logged - wanted))), logged.shape)
         other, factor = ("mm", 1e-3) if robot.layout.prismatic else ("degrees", np.pi / 180)
         unit = "m" if robot.layout.prismatic else "rad"
         hint = f"; in {other} it would fit, and records are in {unit}" if follows(factor * logged) else ""
         raise EstimationError(
             f"the command of joint {joint + 1} in frame {frame} is {logged[frame, joint]:.6g}, and the reference needs "
-            f"{wanted[frame, joint]:.6g} {unit}, {np.abs(logged - wanted).max() / travel:.1f} travels away: zero, "
-            f"direction or unit of the joints differ from the robot file's{hint}"
+            f"{wanted[frame, joint]:.6g} {unit}, more than {allowed:.3g} {unit} away: zero, direction or unit of the "
+            f"joints differ from the robot file's{hint}"
         )
 
 
