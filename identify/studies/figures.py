@@ -147,8 +147,10 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
         factor = str(law.factor)
         others = [path for path in study.factors if path != factor and factor in study.factors]
         have = with_data(law, done)
-        for place, (label, rows) in enumerate(_curves(have, others)):
-            _curve(axes, _levels(study, rows, factor), law_data(law, rows), label, place)
+        curves = _curves(have, others)
+        for place, (label, rows) in enumerate(curves):
+            levels = _beside(_levels(study, rows, factor), place, len(curves))
+            _curve(axes, levels, law_data(law, rows), label, place)
         _theory_line(axes, have[factor], law_data(law, have), law.exponent or 0.0)
         _scale(axes, _levels(study, have, factor))
         axes.set_title(
