@@ -86,6 +86,7 @@ class Finding:
 
 
 @pytest.mark.parametrize("quiet", [False, True])
+@pytest.mark.slow
 def test_json_goes_to_a_file_beside_the_table_or_to_standard_output_in_its_place(quiet, tmp_path, capfd):
     more = ["--quiet"] * quiet
     assert command("base-parameters", "rrr3", "--json", tmp_path / "a.json", *more) == 0
