@@ -6,41 +6,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from identify.commands.options import Quiet
 from identify.errors import OutputFolderError, ScenarioError
 from identify.progress import print_warnings, terminal_progress
 
 if TYPE_CHECKING:
     from identify.scene import Workcell
 
-REPLAY_HELP = """
-Show a run as one HTML file that opens without a network.
-
-It has robot, stickers and cameras in space, what both cameras see, and the measured, true and modelled poses over
-time, their differences enlarged. Open it in a browser.
-
-\b
-Examples:
-  cmmsim replay runs/quick-0                            writes runs/quick-0/replay.html
-  cmmsim replay runs/quick-0 --motion run01             the first unseen trajectory instead of the exciting one
-"""
-
-SHOW_HELP = """
-Show a robot and a sensor as they stand, as one HTML file that opens without a network.
-
-A robot is shown before the sensor ctrack780 where its platform fits that, or before the sensor that is named with it.
-
-\b
-Examples:
-  cmmsim show ups6                                      writes ups6.html
-  cmmsim show mine.toml cameras.toml --out mine.html    a robot and a sensor of your own
-  cmmsim show rss6 --png scene.pdf                      a picture for print instead: .png, .pdf or .svg
-"""
-
 PICTURES = (".png", ".pdf", ".svg")
 SENSOR = "ctrack780"
 ROBOT_KEYS, SENSOR_KEYS = {"parameters", "legs", "family"}, {"rig", "stickers", "based_on"}
-
-Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary.")]
 
 
 def replay(
@@ -53,7 +28,18 @@ def replay(
     ] = "excitation",
     quiet: Quiet = False,
 ) -> None:
-    """Write the page that replays a run."""
+    """Show a run as one HTML page that opens without a network.
+
+    It has robot, stickers and cameras in space, what both cameras see, and the measured, true and modelled poses over
+    time, their differences enlarged. Open it in a browser.
+
+    Reads the files of a run that has been recorded. It writes RUN/replay.html.
+
+    \b
+    Examples:
+      cmmsim replay runs/quick-0
+      cmmsim replay runs/quick-0 --motion run01   the first unseen trajectory
+    """
     from identify.scene import read_motion, write_page
 
     path = out or run / "replay.html"
@@ -77,7 +63,19 @@ def show(
     ] = "analytic",
     quiet: Quiet = False,
 ) -> None:
-    """Show a robot and a sensor as they stand."""
+    """Show a robot and a sensor as they stand, as one HTML page or as a picture.
+
+    A robot is shown before the sensor ctrack780 where its platform fits that, or before the sensor that is named with
+    it. The page opens without a network.
+
+    Reads the file of a robot, of a sensor, or of one of each. It writes NAME.html, or a picture for print.
+
+    \b
+    Examples:
+      cmmsim show ups6
+      cmmsim show mine.toml cameras.toml          a robot and a sensor of your own
+      cmmsim show rss6 --png scene.pdf            a picture: .png, .pdf or .svg
+    """
     from identify.scene import motion_at_home, write_page
 
     if png is not None and png.suffix not in PICTURES:
