@@ -1,0 +1,155 @@
+"""All that a report shows of a run, read from its files; of a record of a real robot there is less."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from dynamics import load_robot
+from identify.arrays import Array
+from identify.errors import RecordError
+from identify.estimation.covariance import correlation_matrix
+from identify.experiment.truth import read_truth, read_truth_runs, true_poses
+from identify.files.dataset import group_names
+from identify.files.run_folder import RunFolder, check_entries, load_result
+from identify.record.provenance import RECORDS, RunFiles, recorded_scenario
+from identify.record.recorded_run import recorded_reference
+from identify.record.recording import EXCITATION, TRUTH_GROUP, build_model_run, poses, run_name
+from identify.reporting.figures.fit import Fit
+from identify.reporting.paper import repeats_the_paper
+from identify.reporting.run_result import check_intervals, parameter_vector
+from identify.reporting.verdict import cameras_acquitted
+from identify.scenario import Scenario
+from identify.trajectory import TrajectorySet, load_trajectories
+from identify.validation.unseen import model_run
+
+
+@dataclass(frozen=True)
+class RunData:
+    """The result, the record with its truth, the unseen runs with theirs, what the models do on both, the covariance
+    (p, p) of the parameters with their names (p,), and the trajectories. What is not known of a record of a real robot
+    is None or empty: truth, unseen runs, trajectories."""
+
+    result: dict[str, Any]
+    experiment: xr.Dataset
+    truth: xr.Dataset | None
+    validation: list[xr.Dataset]
+    validation_truth: list[xr.Dataset]
+    models: Mapping[str, xr.Dataset]
+    covariance: Array
+    names: tuple[str, ...]
+    trajectories: TrajectorySet | None = None
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot."""
+        return str(self.experiment.attrs.get("robot", "of an unknown name"))
+
+    @property
+    def scenario_toml(self) -> str:
+        """The scenario that the record was made with."""
+        return str(self.experiment.attrs.get("scenario", ""))
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """The same, read. Raises RecordError: the record states none, or one that cannot be read."""
+        return recorded_scenario(self.experiment)
+
+    @cached_property
+    def beside_paper(self) -> bool:
+        """Whether this run repeats the paper's experiment, so that its figures may stand beside the paper's."""
+        return repeats_the_paper(self.scenario_toml)
+
+    @cached_property
+    def cameras_acquitted(self) -> bool | None:
+        """Whether the cameras cannot be the cause of what a model leaves; None where no truth is known."""
+        return cameras_acquitted(self.experiment, self.truth)
+
+    @cached_property
+    def excitation_fit(self) -> Fit:
+        """Measurement and models on the exciting trajectory."""
+        covariances = self.experiment["measured_covariance"].values
+        noise = np.sqrt(np.nanmean(np.diagonal(covariances, axis1=1, axis2=2), axis=0))
+        fit = replace(_fit(self.experiment, self.models[EXCITATION]), noise=noise)
+        return fit if self.truth is None else replace(fit, truth=true_poses(self.truth))
+
+    @cached_property
+    def validation_fit(self) -> Fit | None:
+        """Measurement, models and truth on the first unseen trajectory; None where there is none."""
+        if not self.validation:
+            return None
+        fit, model = _fit(self.validation[0], self.models[run_name(1)]), self.models[run_name(1)]
+        std = poses(model, "std") if "std_position" in model else None
+        return replace(fit, truth=true_poses(self.validation_truth[0]), std=std)
+
+    @cached_property
+    def correlations(self) -> tuple[Array, list[str]]:
+        """Correlations (n, n) of the identified parameters, and their names."""
+        parameters = self.result["identification"]["parameters"]
+        chosen = [k for k, name in enumerate(self.names) if parameters.get(name, {}).get("identifiable")]
+        return correlation_matrix(self.covariance[np.ix_(chosen, chosen)]), [self.names[k] for k in chosen]
+
+
+def _fit(record: xr.Dataset, model: xr.Dataset) -> Fit:
+    initial = poses(model, "initial")
+    return Fit(
+        time=record["time"].values,
+        measured=poses(record, "measured"),
+        identified=poses(model, "identified"),
+        initial=initial if np.isfinite(initial).any() else None,
+    )
+
+
+def read_run(run: RunFolder) -> RunData:
+    """Read what the stages of a run wrote. A record without truth needs no validation.
+
+    Raises OutputFolderError: an earlier stage has not been run. Raises RecordError: a file is damaged, or the files are
+    not of one run.
+    """
+    run.require("result.json", "covariance.nc", "experiment.nc")
+    files, simulated = RunFiles(run), TRUTH_GROUP in group_names(run.experiment)
+    if simulated:
+        run.require("validation.nc", "model.nc")
+    result = _checked_result(run, files, simulated)
+    data = RunData(
+        result=result,
+        experiment=files.experiment,
+        truth=read_truth(run.experiment) if simulated else None,
+        validation=files.validation if simulated else [],
+        validation_truth=read_truth_runs(run.validation) if simulated else [],
+        models=files.model if simulated else _model_runs(files.experiment, result),
+        covariance=files.covariance,
+        names=files.named_covariance[0],
+        trajectories=load_trajectories(run.trajectories) if run.trajectories.is_file() else None,
+    )
+    records = {EXCITATION: data.experiment}
+    records |= {run_name(number): record for number, record in enumerate(data.validation, start=1)}
+    for name, record in records.items():
+        if name not in data.models or data.models[name].sizes["time"] != record.sizes["time"]:
+            raise RecordError(f"{run.model} does not belong to the records of {run.path}: run {name} differs")
+    return data
+
+
+def _checked_result(run: RunFolder, files: RunFiles, simulated: bool) -> dict[str, Any]:
+    """The whole result of a run, made of the files that are there."""
+    result = load_result(run.result)
+    check_entries(run.result, result, "identify", *(["validate"] if simulated else []))
+    later = ["validation.nc", "model.nc"] if simulated else []
+    files.check_made_of(*RECORDS, "covariance.nc", *later, result=result)
+    try:
+        check_intervals(result["identification"])
+    except RecordError as error:
+        raise RecordError(f"{run.result}: {error}; run `cmmsim identify --out {run.path}` again") from None
+    return result
+
+
+def _model_runs(record: xr.Dataset, result: dict[str, Any]) -> Mapping[str, xr.Dataset]:
+    """What both models do on the exciting trajectory, computed anew from the estimates: no stage has written it."""
+    scenario = recorded_scenario(record).with_overrides(result.get("settings", {}))
+    robot, reference = load_robot(scenario.robot), recorded_reference(record)
+    columns = (parameter_vector(robot, result["identification"], column) for column in ("initial", "estimate"))
+    initial, identified = (model_run(robot, scenario, values, reference) for values in columns)
+    return {EXCITATION: build_model_run(record["time"].values, initial, identified)}
