@@ -1,6 +1,7 @@
 """How numbers are written: with the digits that they deserve, and zero where nothing but rounding is left."""
 
 import math
+import re
 
 ROUNDING = 1e-9
 """Of the size of what a number was made from: below, it is rounding."""
@@ -26,12 +27,7 @@ def with_deviation(value: float, std: float | None) -> str:
     """A value to the second digit of its standard deviation, as "0.1046 ± 0.0011"."""
     if std is None or not math.isfinite(std) or std <= 0:
         return number(value)
-    size = max(abs(value), std)
-    power = math.floor(math.log10(size))
-    power = 0 if -3 <= power <= 4 else power
-    places = max(0, 1 - math.floor(math.log10(std)) + power)
-    text = f"{value / 10**power:.{places}f} ± {std / 10**power:.{places}f}".replace("-", "−")
-    return f"({text}) × 10{str(power).translate(SUPERSCRIPTS)}" if power else text
+    return _to_the_second_digit((value, std), std, " ± ")
 
 
 def interval(low: float, high: float) -> str:
@@ -39,8 +35,22 @@ def interval(low: float, high: float) -> str:
     width = high - low
     if not math.isfinite(width) or width <= 0:
         return f"{number(low)} to {number(high)}"
-    digits = [max(2, math.floor(math.log10(abs(end) / width)) + 3) if end else 2 for end in (low, high)]
-    return " to ".join(number(end, n) for end, n in zip((low, high), digits, strict=True))
+    return _to_the_second_digit((low, high), width, " to ")
+
+
+def _to_the_second_digit(values: tuple[float, float], of: float, between: str) -> str:
+    """Two values to the second digit of another number; with a common power of ten where they are small or large."""
+    power = math.floor(math.log10(max(map(abs, values))))
+    power = 0 if -4 < power < LONG else power
+    places = max(0, 1 - math.floor(math.log10(of)) + power)
+    text = between.join(f"{value / 10**power + 0.0:.{places}f}" for value in values).replace("-", "−")
+    return f"({text}) × 10{str(power).translate(SUPERSCRIPTS)}" if power else text
+
+
+def spelled(text: str) -> str:
+    """A sentence of a computation with its numbers and signs as people write them."""
+    text = re.sub(r"\d+(\.\d+)?e[+-]?\d+", lambda found: number(float(found[0])), text)
+    return text.replace("<=", "≤").replace(">=", "≥").replace("**", "^")
 
 
 def rounded(value: float | None, size: float) -> float | None:

@@ -1,12 +1,12 @@
 """Tables of the parameters: what is identified, what is not and why, and the sums that motion shows."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from identify.reporting.numbers import interval, number, rounded, with_deviation
 from identify.reporting.tables import Table
 
-ON_GUESS = "rests on the starting values of others"
+ON_GUESS = "rests on starting values"
 
 Entry = dict[str, Any]
 
@@ -15,7 +15,12 @@ def parameter_table(result: dict[str, Any]) -> Table:
     """The identified parameters: starting value, truth where it is known, estimate with deviation and interval."""
     identification = result["identification"]
     rows = [
-        (name, p["unit"], *_shown(p, abs(p["initial"] or 0.0)), ON_GUESS if p.get("rests_on_prior") else "")
+        (
+            name,
+            p["unit"].replace("^2", "²"),
+            *_shown(p, abs(p["initial"] or 0.0)),
+            ON_GUESS if p.get("rests_on_prior") else "",
+        )
         for name, p in identification["parameters"].items()
         if p["identifiable"]
     ]
@@ -25,11 +30,11 @@ def parameter_table(result: dict[str, Any]) -> Table:
     )
     if any(row[-1] for row in rows):
         note += (
-            f"One that {ON_GUESS} is shown only in sums with them: it is right where their starting values, with the "
-            "standard deviations that were stated, are."
+            f"One that {ON_GUESS} is shown only in sums with other parameters: it is right where their starting "
+            "values are, within the standard deviations that were stated for them."
         )
     header = ("parameter", "unit", "start", "truth", "estimate ± standard deviation", "95 % interval", "error [%]", "")
-    return _without_truth(Table(f"The {len(rows)} identified parameters", header, tuple(rows), note, folded=True))
+    return Table(f"The {len(rows)} identified parameters", header, tuple(rows), note).without_empty()
 
 
 ANCHORS = {
@@ -46,14 +51,15 @@ def group_table(result: dict[str, Any]) -> Table:
     rows = []
     for group in identification.get("groups", {}).values():
         if len(group["coefficients"]) > 1:
-            known = (ON_GUESS if group.get("rests_on_prior") else "") if group["identifiable"] else "not identified"
-            rows.append((group["expression"], *_shown(group, _size(group, identification["parameters"])), known))
+            known = _remark(group) if group["identifiable"] else "not identified"
+            shown = _shown(group, _size(group, identification["parameters"]))
+            rows.append((group["expression"].replace(" - ", " − "), *shown[:-1], _deviations(group), known))
     note = (
-        "In the SI unit of the first parameter of each sum. A sum may be known where none of its members is. Known means "
-        "known beside the size of its members: of a difference that almost vanishes the relative error says nothing."
+        "In the SI unit of the first parameter of each sum. A sum may be known where none of its members is: it "
+        "counts as identified when little of the size of its members is in doubt, though it may almost vanish itself."
     )
-    header = ("sum", "start", "truth", "estimate ± standard deviation", "95 % interval", "error [%]", "")
-    return _without_truth(Table(f"The {len(rows)} sums that motion shows", header, tuple(rows), note, folded=True))
+    header = ("sum", "start", "truth", "estimate ± standard deviation", "95 % interval", "error / deviation", "")
+    return Table(f"The {len(rows)} sums that motion shows", header, tuple(rows), note, folded=True).without_empty()
 
 
 def correlation_table(result: dict[str, Any]) -> Table:
@@ -92,6 +98,10 @@ def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]
     return [(reason, names) for reason, names in kinds.items() if names]
 
 
+def _remark(entry: Entry) -> str:
+    return ON_GUESS if entry.get("rests_on_prior") else ""
+
+
 def _shown(entry: Entry, size: float) -> tuple[str, ...]:
     """Start, truth, estimate, interval and error; dashes for what is not identified, so that nobody quotes it.
 
@@ -105,6 +115,14 @@ def _shown(entry: Entry, size: float) -> tuple[str, ...]:
     return start, true, with_deviation(entry["estimate"], entry["std"]), reach, _percent(entry, size)
 
 
+def _deviations(group: Entry) -> str:
+    """The error in standard deviations."""
+    true, estimate, std = group["true"], group["estimate"], group["std"]
+    if not group["identifiable"] or true is None or estimate is None or not std:
+        return "-"
+    return f"{(estimate - true) / std:+.1f}".replace("-", "−")
+
+
 def _size(group: Entry, parameters: Mapping[str, Entry]) -> float:
     """Of the parts of a sum, by their starting values."""
     return sum(abs(weight * (parameters[name]["initial"] or 0.0)) for name, weight in group["coefficients"].items())
@@ -115,15 +133,3 @@ def _percent(entry: Entry, size: float) -> str:
     if not true or estimate is None:
         return "-"
     return f"{100 * (estimate - true) / abs(true):+.2f}".replace("-", "−")
-
-
-def _without_truth(table: Table) -> Table:
-    """The table without the columns of the truth where none is known."""
-    hidden = [k for k, name in enumerate(table.header) if name in ("truth", "error [%]")]
-    if any(row[k] != "-" for row in table.rows for k in hidden):
-        return table
-
-    def kept(cells: Iterable[str]) -> tuple[str, ...]:
-        return tuple(cell for k, cell in enumerate(cells) if k not in hidden)
-
-    return Table(table.title, kept(table.header), tuple(map(kept, table.rows)), table.note, table.folded)

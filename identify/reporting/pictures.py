@@ -11,18 +11,19 @@ from matplotlib.figure import Figure
 from identify.experiment.truth import true_poses
 from identify.files.run_folder import RunFolder
 from identify.record.recording import poses
-from identify.reporting.figures import fit, motion, parameters
+from identify.reporting.figures import fit, motion, parameters, scene
 from identify.reporting.figures.style import drawn, moving
 from identify.reporting.run_data import RunData, read_run
 
 
 @dataclass(frozen=True)
 class Picture:
-    """What draws a figure, and what it shows in words; own_colours: whether it is drawn for white paper only."""
+    """What draws a figure, and what it shows in words; painted: whether a page takes it as an image, for it is of too
+    many strokes, or of grey values."""
 
     draw: Callable[[], Figure]
     caption: str
-    own_colours: bool = False
+    painted: bool = False
 
 
 def run_figures(folder: Path | str) -> dict[str, Callable[[], Figure]]:
@@ -39,6 +40,7 @@ def pictures(data: RunData) -> dict[str, Picture]:
     names, groups = found["parameters"], found.get("groups", {})
     several = any(len(group["coefficients"]) > 1 for group in groups.values())
     return {
+        **_of_the_scene(data),
         "errors": _errors(data),
         **_of_the_sensor(data),
         **_of_the_motion(data),
@@ -51,13 +53,14 @@ def pictures(data: RunData) -> dict[str, Picture]:
 
 
 FIT = (
-    "The {}: measured poses (circles), starting model (dashed) and identified model (line); beneath each component what "
-    "the identified model leaves of every measured pose, with its RMS for the starting and for the identified model."
+    "The {}: measured poses (circles), starting model (dashed) and identified model (line); beneath each component "
+    "what the identified model leaves of every measured pose, with its RMS for the starting and for the identified "
+    "model."
 )
 
 GROUPS = (
-    "Which parameters enter which sum that motion shows: one row a sum, one column a parameter. The area of a dot is the "
-    "share of coefficient times starting value; an open one is subtracted. A star marks a sum that is identified."
+    "Which parameters enter which sum that motion shows: one row a sum, one column a parameter. The area of a dot is "
+    "the share of coefficient times starting value; an open one is subtracted. A star marks a sum that is identified."
 )
 
 CORRELATION = (
@@ -70,13 +73,37 @@ def _errors(data: RunData) -> Picture:
     """Both models against the truth in one look; against the measurement where no truth is known."""
     shown = data.validation_fit
     if shown is None:
-        text = "How far both models are from the measured poses of the record; dotted: the noise that the cameras state."
+        text = (
+            "How far both models are from the measured poses of the record; dotted: the noise that the cameras state."
+        )
         return Picture(lambda: fit.error_figure(data.excitation_fit), text)
     text = (
         "How far both models, and the single poses that the cameras measure, are from the true robot, on the first "
         "trajectory that no model was fitted to."
     )
     return Picture(lambda: fit.error_figure(shown), text)
+
+
+def _of_the_scene(data: RunData) -> dict[str, Picture]:
+    """Robot and cameras, and what these see; nothing where the robot's file is gone."""
+    cell, view = data.scene, data.stereo_view
+    if isinstance(cell, str):
+        return {}
+    if view is None:
+        text = f"The robot {data.robot} half way along its path."
+        return {"scene": Picture(lambda: scene.overview_figure(cell, data.middle), text, painted=True)}
+    text = (
+        f"The robot {data.robot} and both cameras, with their rays to the stickers of the platform, half way along the "
+        "exciting trajectory; beneath it what both cameras see at that time, with the stickers that were found."
+    )
+    residuals = (
+        "The same images, drawn anew from scenario, seed and true pose: detected ellipses, and arrows from each "
+        "detected centre that show by how much it misses the true one, enlarged as written."
+    )
+    return {
+        "scene": Picture(lambda: scene.overview_figure(cell, data.middle, view), text, painted=True),
+        "stereo_frame": Picture(lambda: scene.residual_figure(view), residuals, painted=True),
+    }
 
 
 def _of_the_sensor(data: RunData) -> dict[str, Picture]:
@@ -106,8 +133,8 @@ def _of_the_motion(data: RunData) -> dict[str, Picture]:
 def _parameters_caption(entries: dict[str, Any]) -> str:
     if any(entry["true"] is not None for entry in entries.values()):
         return (
-            "Error of each identified parameter with its 95 % interval, in per cent of the truth. Grey: 5 %. Nineteen of "
-            "twenty intervals should reach zero."
+            "Error of each identified parameter with its 95 % interval, in per cent of the truth. Grey: 5 %. "
+            "Nineteen of twenty intervals should reach zero."
         )
     return "95 % interval of each identified parameter, in per cent of the estimate. Grey: 5 %."
 

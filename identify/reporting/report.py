@@ -6,7 +6,7 @@ from identify.files.atomic import write_figure, write_text
 from identify.files.run_folder import RunFolder
 from identify.progress import Progress, SilentProgress
 from identify.reporting.figures.style import drawn, svg_text
-from identify.reporting.page import render
+from identify.reporting.page import painting, render
 from identify.reporting.pictures import pictures
 from identify.reporting.run_data import read_run
 
@@ -21,11 +21,10 @@ def write_report(folder: Path | str, progress: Progress | None = None) -> Path:
     shown, drawings = pictures(data), {}
     with (progress or SilentProgress()).stage("report", len(shown) + 1) as advance:
         for name, picture in shown.items():
-            figure = drawn(picture.draw)
-            write_figure(run.figures / f"{name}.png", figure)
-            figure.set_layout_engine("none")  # found once
-            write_figure(run.figures / f"{name}.pdf", figure)
-            drawings[name] = svg_text(figure, name)
+            figure, png = drawn(picture.draw), run.figures / f"{name}.png"
+            write_figure(png, figure)
+            write_figure(png.with_suffix(".pdf"), figure)
+            drawings[name] = painting(png) if picture.painted else svg_text(figure, name)
             advance()
         write_text(run.report, render(data, shown, drawings))
         advance()

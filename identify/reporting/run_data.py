@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from dynamics import load_robot
+from cmmsim import CmmError
+from dynamics import DynamicsError, load_robot
 from identify.arrays import Array
-from identify.errors import RecordError
+from identify.errors import IdentifyError, RecordError
 from identify.estimation.covariance import correlation_matrix
-from identify.experiment.truth import read_truth, read_truth_runs, true_poses
+from identify.experiment.truth import read_truth, true_poses
 from identify.files.dataset import group_names
 from identify.files.run_folder import RunFolder, check_entries, load_result
 from identify.record.provenance import RECORDS, RunFiles, recorded_scenario
@@ -23,21 +24,22 @@ from identify.reporting.paper import repeats_the_paper
 from identify.reporting.run_result import check_intervals, parameter_vector
 from identify.reporting.verdict import cameras_acquitted
 from identify.scenario import Scenario
+from identify.scene import StereoView, Workcell, stereo_view, workcell, workcell_of_scenario
 from identify.trajectory import TrajectorySet, load_trajectories
 from identify.validation.unseen import model_run
 
 
 @dataclass(frozen=True)
 class RunData:
-    """The result, the record with its truth, the unseen runs with theirs, what the models do on both, the covariance
-    (p, p) of the parameters with their names (p,), and the trajectories. What is not known of a record of a real robot
-    is None or empty: truth, unseen runs, trajectories."""
+    """The result, the record with its truth, the unseen runs with the truth of the first one, what the models do on
+    both, the covariance (p, p) of the parameters with their names (p,), and the trajectories. What is not known of a
+    record of a real robot is None or empty: truth, unseen runs, trajectories."""
 
     result: dict[str, Any]
     experiment: xr.Dataset
     truth: xr.Dataset | None
     validation: list[xr.Dataset]
-    validation_truth: list[xr.Dataset]
+    validation_truth: xr.Dataset | None
     models: Mapping[str, xr.Dataset]
     covariance: Array
     names: tuple[str, ...]
@@ -69,6 +71,32 @@ class RunData:
         return cameras_acquitted(self.experiment, self.truth)
 
     @cached_property
+    def scene(self) -> Workcell | str:
+        """Robot and cameras as the scenario places them, the robot alone where the record is of a real one; why there
+        is nothing to draw where a file is gone."""
+        try:
+            robot = load_robot(self.scenario.robot)
+            return workcell(robot) if self.truth is None else workcell_of_scenario(self.scenario, robot)
+        except (CmmError, DynamicsError, IdentifyError) as error:
+            return str(error)
+
+    @cached_property
+    def stereo_view(self) -> StereoView | None:
+        """What both cameras of a simulated run see at its middle, drawn anew from scenario, seed and true pose."""
+        if self.truth is None or isinstance(self.scene, str):
+            return None
+        try:
+            return stereo_view(self.scene, self.middle, seed=int(self.experiment.attrs.get("seed", 0)))
+        except (CmmError, DynamicsError):
+            return None
+
+    @property
+    def middle(self) -> Array:
+        """Pose (6,) of the platform half way through the record, m and rad: the true one where it is known."""
+        measured = poses(self.experiment, "reference") if self.truth is None else true_poses(self.truth)
+        return measured[len(measured) // 2]
+
+    @cached_property
     def excitation_fit(self) -> Fit:
         """Measurement and models on the exciting trajectory."""
         covariances = self.experiment["measured_covariance"].values
@@ -79,11 +107,11 @@ class RunData:
     @cached_property
     def validation_fit(self) -> Fit | None:
         """Measurement, models and truth on the first unseen trajectory; None where there is none."""
-        if not self.validation:
+        if not self.validation or self.validation_truth is None:
             return None
         fit, model = _fit(self.validation[0], self.models[run_name(1)]), self.models[run_name(1)]
         std = poses(model, "std") if "std_position" in model else None
-        return replace(fit, truth=true_poses(self.validation_truth[0]), std=std)
+        return replace(fit, truth=true_poses(self.validation_truth), std=std)
 
     @cached_property
     def correlations(self) -> tuple[Array, list[str]]:
@@ -119,7 +147,7 @@ def read_run(run: RunFolder) -> RunData:
         experiment=files.experiment,
         truth=read_truth(run.experiment) if simulated else None,
         validation=files.validation if simulated else [],
-        validation_truth=read_truth_runs(run.validation) if simulated else [],
+        validation_truth=read_truth(run.validation, run_name(1)) if simulated else None,
         models=files.model if simulated else _model_runs(files.experiment, result),
         covariance=files.covariance,
         names=files.named_covariance[0],

@@ -1,11 +1,12 @@
 """The sections of the report after its first look: words, pictures, tables, and what is folded."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from identify.reporting import paper, parameter_tables, tables
-from identify.reporting.numbers import number
+from identify.reporting.numbers import number, spelled
 from identify.reporting.run_data import RunData
 from identify.reporting.tables import Table
 
@@ -22,11 +23,13 @@ class Fold:
 
 @dataclass(frozen=True)
 class Section:
-    """One section of the report: its text in paragraphs, the names of its pictures, its tables and what is folded."""
+    """One section of the report: its text in paragraphs, the names of its pictures, those that stand folded under a
+    title, its tables, and what else is folded."""
 
     title: str
     text: tuple[str, ...] = ()
     pictures: tuple[str, ...] = ()
+    folded: Mapping[str, str] = field(default_factory=dict)
     tables: tuple[Table, ...] = ()
     folds: tuple[Fold, ...] = ()
 
@@ -35,11 +38,14 @@ def sensor_section(data: RunData) -> Section:
     """What the sensor measured against the truth, or what it says of itself."""
     ok = data.experiment["measured_ok"].values.astype(bool)
     note = data.scenario.sensor_note
-    said = [f"Sensor {data.scenario.sensor}{f': {note}' if note else ''}."]
+    name = Path(data.scenario.sensor).stem
+    said = [f"The sensor is {name}{f': {note}' if note else '.'}"]
+    if isinstance(data.scene, str):
+        said.append(f"Robot and cameras are not drawn: {data.scene}.")
     if "sensor" not in data.result:
         said.append(
-            f"{len(ok)} frames were recorded at {data.scenario.timing.frame_rate_hz:g} Hz; in {int((~ok).sum())} of them "
-            "the platform was lost. No truth is known here: what follows is what the sensor states of itself."
+            f"{len(ok)} frames were recorded at {data.scenario.timing.frame_rate_hz:g} Hz; in {int((~ok).sum())} of "
+            "them the platform was lost. No truth is known here: what follows is what the sensor states of itself."
         )
         return Section("Sensor", tuple(said), ("stereo_frame", "ellipses"))
     if data.cameras_acquitted is not None:
@@ -48,7 +54,7 @@ def sensor_section(data: RunData) -> Section:
             if data.cameras_acquitted
             else "Its errors are larger than the noise that it states, or depend on those of the frames before."
         )
-    return Section("Sensor", tuple(said), ("stereo_frame", "ellipses"), (tables.sensor_table(data.result),))
+    return Section("Sensor", tuple(said), ("stereo_frame", "ellipses"), tables=(tables.sensor_table(data.result),))
 
 
 def excitation_section(data: RunData) -> Section:
@@ -59,9 +65,9 @@ def excitation_section(data: RunData) -> Section:
 def fit_section(data: RunData) -> Section:
     """How the models follow the exciting trajectory, and how the search ended."""
     found = data.result["identification"]
-    text = f"The search took {found['iterations']} steps and ended because: {found['stop_reason']}."
+    text = f"The search took {found['iterations']} steps; it ended because {spelled(found['stop_reason'])}."
     table = tables.excitation_error_table(data.result, data.beside_paper)
-    return Section("Fit", (text, *_paper_text(data)), ("fit_excitation",), (table,))
+    return Section("Fit", (text, *_paper_text(data)), ("fit_excitation",), tables=(table,))
 
 
 def parameter_section(data: RunData) -> Section:
@@ -73,8 +79,8 @@ def parameter_section(data: RunData) -> Section:
     text = [
         f"The record identifies {len(known)} of {len(parameters)} parameters"
         + (f", and {sum(bool(g['identifiable']) for g in sums)} of {len(sums)} sums of several." if sums else ".")
-        + " Identified means that it at least halves what the starting value left open, and leaves less than half of the "
-        "quantity in doubt.",
+        + " Identified means that it at least halves what the starting value left open, and leaves less than half of "
+        "the quantity in doubt.",
         *_prior_text(found),
         *_conditioning_text(found.get("conditioning")),
     ]
@@ -85,8 +91,8 @@ def parameter_section(data: RunData) -> Section:
     pairs = [parameter_tables.correlation_table(data.result)] if known else []
     shown = [table for table in (parameter_tables.parameter_table(data.result),) if table.rows]
     shown += [table for table in (parameter_tables.group_table(data.result),) if table.rows]
-    pictures = ("parameters", "groups", *(["correlation"] if known else []))
-    return Section("Parameters", tuple(text), pictures, (*shown, *pairs), tuple(folds))
+    folded = {"How the errors of the parameters go together": "correlation"} if known else {}
+    return Section("Parameters", tuple(text), ("parameters", "groups"), folded, (*shown, *pairs), tuple(folds))
 
 
 def validation_section(data: RunData) -> Section:
@@ -99,7 +105,7 @@ def validation_section(data: RunData) -> Section:
         return Section("Validation", (text,))
     both = (tables.validation_table(data.result, data.beside_paper), tables.prediction_table(data.result))
     text = f"{len(data.validation)} trajectories that had no part in the identification."
-    return Section("Validation", (text,), ("validation_errors", "fit_validation"), both)
+    return Section("Validation", (text,), ("validation_errors", "fit_validation"), tables=both)
 
 
 def provenance_section(data: RunData) -> Section:
@@ -112,9 +118,12 @@ def provenance_section(data: RunData) -> Section:
     return Section(
         "How it was made",
         tuple(text),
-        (),
-        (*([changed] if changed.rows else []), tables.seconds_table(data.result), tables.versions_table(data.result)),
-        (Fold("The whole scenario", data.scenario_toml, printed=False, verbatim=True),),
+        tables=(
+            *([changed] if changed.rows else []),
+            tables.seconds_table(data.result),
+            tables.versions_table(data.result),
+        ),
+        folds=(Fold("The whole scenario", data.scenario_toml, printed=False, verbatim=True),),
     )
 
 
@@ -145,8 +154,8 @@ def _conditioning_text(conditioning: dict[str, Any] | None) -> list[str]:
         return []
     directions, unshown = conditioning["directions"], conditioning["unshown"]
     return [
-        f"Poses can show {directions} independent quantities of this robot and its controller, but for one common factor "
-        f"of all of them. This record shows {directions - unshown} of them better than the starting values do."
+        f"Poses can show {directions} independent quantities of this robot and its controller, but for one common "
+        f"factor of all of them. This record shows {directions - unshown} of them better than the starting values do."
     ]
 
 
@@ -156,8 +165,8 @@ def _index_text(data: RunData) -> tuple[str, ...]:
     if chosen is None:
         return ()
     text = (
-        f"The observability index (eq. 39 of the paper; larger is better) is {number(chosen.first_index, 3)} for the first "
-        f"random candidate, {number(chosen.median_index, 3)} for the middle one, and "
+        f"The observability index (eq. 39 of the paper; larger is better) is {number(chosen.first_index, 3)} for the "
+        f"first random candidate, {number(chosen.median_index, 3)} for the middle one, and "
         f"{number(chosen.observability_index, 3)} for the trajectory that was used."
     )
     if data.beside_paper:
@@ -172,6 +181,6 @@ def _paper_text(data: RunData) -> tuple[str, ...]:
     if not data.beside_paper:
         return ()
     return (
-        "This run repeats the paper's experiment, with its settings, on a simulated robot of the same kind; the paper's "
-        "own figures stand beside. They are of a real robot whose truth nobody knows.",
+        "This run repeats the paper's experiment, with its settings, on a simulated robot of the same kind; the "
+        "paper's own figures stand beside. They are of a real robot whose truth nobody knows.",
     )

@@ -1,7 +1,9 @@
 """The tables of a run, and what it says of itself at the terminal; the paper's figures where it repeats the paper."""
 
 import math
-from dataclasses import dataclass
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,26 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     note: str = ""
     folded: bool = False
+
+    @property
+    def words(self) -> tuple[bool, ...]:
+        """Whether each column holds words and not numbers."""
+        numeric = re.compile(r"([-+−≤≥(]? ?[\d.]+.*|[-–]?|diverged)$")
+        columns = zip(*self.rows, strict=True)
+        return tuple(k == 0 or not all(numeric.match(cell) for cell in column) for k, column in enumerate(columns))
+
+    def without(self, hidden: Collection[int]) -> "Table":
+        """The table without some of its columns."""
+
+        def kept(cells: tuple[str, ...]) -> tuple[str, ...]:
+            return tuple(cell for k, cell in enumerate(cells) if k not in hidden)
+
+        return replace(self, header=kept(self.header), rows=tuple(map(kept, self.rows)))
+
+    def without_empty(self) -> "Table":
+        """The table without columns in which nothing stands."""
+        columns = enumerate(zip(*self.rows, strict=True)) if self.rows else ()
+        return self.without([k for k, column in columns if all(cell in ("", "-") for cell in column)])
 
     def markdown(self) -> str:
         """The table as Markdown, numbers aligned to the right."""
@@ -68,7 +90,8 @@ def excitation_error_table(result: dict[str, Any], beside_paper: bool = False) -
     """Model against measurement on the exciting trajectory before and after identification; beside the paper's table 3
     for a run that repeats its experiment."""
     before, after = _rms(rms_row(result.get("before"))), _rms(rms_row(result.get("after")))
-    header, columns = ("component", "before", "after"), [AXIS_HEADER, before, after]
+    header: tuple[str, ...] = ("component", "before", "after")
+    columns: list[Sequence[str]] = [AXIS_HEADER, before, after]
     if beside_paper:
         header += ("paper before", "paper after")
         columns += [list(map(number, paper.BEFORE)), list(map(number, paper.AFTER))]

@@ -63,8 +63,9 @@ def verdict(result: dict[str, Any], acquitted: bool | None) -> Verdict:
     every, unseen = check_goals(result), bool(result.get("validation"))
     missed = [goal for goal in every if not goal.passed]
     explained = all(goal.passed for goal in explanation_goals(result))
-    sentences = [_unseen_sentence(result)] if unseen else []
-    sentences.append(_residual_sentence(result, explained, acquitted))
+    sentences = [_residual_sentence(result, explained, acquitted)]
+    if unseen:
+        sentences.insert(0 if explained else 1, _unseen_sentence(result, explained))
     sentences += [f"Not met: {sentence(goal)}" for goal in missed if goal.name not in (goals.RESIDUALS, goals.CHANCE)]
     if not unseen:
         return Verdict(explained, _headline_without_truth(explained), (*sentences, NO_TRUTH))
@@ -77,9 +78,9 @@ def verdict(result: dict[str, Any], acquitted: bool | None) -> Verdict:
 
 
 NO_TRUTH = (
-    "No truth is known of this record. So nobody can tell here how far the measured poses, the estimates and the model's "
-    "predictions are from the real robot: an error that the cameras repeat in every frame, and an error of the model "
-    "that the parameters take up, leave no trace in the residuals."
+    "No truth is known of this record. So nobody can tell here how far the measured poses, the estimates and the "
+    "model's predictions are from the real robot: an error that the cameras repeat in every frame, and an error of "
+    "the model that the parameters take up, leave no trace in the residuals."
 )
 
 
@@ -95,11 +96,14 @@ def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
     identification = result["identification"]
     parameters, validation = identification["parameters"], result.get("validation")
     known = sum(bool(p["identifiable"]) for p in parameters.values())
-    shown = KeyNumber(f"{known}", f"of {len(parameters)}", "parameters are identified, each with an interval.")
+    meaning = "parameters are identified, each with an interval." if known else "parameters are identified."
+    shown = KeyNumber(f"{known}", f"of {len(parameters)}", meaning)
     if validation:
         rows = np.array([rms_row(run["true"])[:3] for run in validation])
         worst = KeyNumber(
-            number(float(rows.max()), 2), "µm", "from the true robot: the identified model, on motion that it never saw."
+            number(float(rows.max()), 2),
+            "µm",
+            "from the true robot: the identified model, on motion that it never saw.",
         )
         measured = max(rms_row(result["sensor"])[:3])
         seen = KeyNumber(number(measured, 2), "µm", "from the true pose: one pose as the cameras measure it.")
@@ -113,14 +117,14 @@ def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
     return [left, began, shown]
 
 
-def _unseen_sentence(result: dict[str, Any]) -> str:
+def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
     """How far both models are from the true robot on unseen trajectories."""
     runs = result["validation"]
     rows = np.array([rms_row(run["true"]) for run in runs])
     text = (
-        f"On {len(runs)} trajectories that it never saw, the identified model stays within "
-        f"{number(float(rows[:, :3].max()), 2)} µm and {number(float(rows[:, 3:].max()), 2)} µrad of the true robot "
-        "(RMS of the worst axis)"
+        f"{'On' if explained else 'All the same, on'} {len(runs)} trajectories that it never saw, the identified "
+        f"model stays within {number(float(rows[:, :3].max()), 2)} µm and {number(float(rows[:, 3:].max()), 2)} µrad "
+        "of the true robot (RMS of the worst axis)"
     )
     first = np.array([rms_row(run.get("initial_true")) for run in runs])
     if np.isfinite(first).all():
@@ -159,7 +163,9 @@ def _cause(acquitted: bool | None) -> str:
             "geometry, joints or friction are not those of the robot."
         )
     if acquitted is None:
-        return "The cause may be the model, or cameras with errors that they do not state; the record alone cannot tell."
+        return (
+            "The cause may be the model, or cameras with errors that they do not state; the record alone cannot tell."
+        )
     return "The cameras miss the truth by more than they state, or not by chance: they may be the cause, or the model."
 
 

@@ -121,6 +121,7 @@ def _entry(name: str, value: Any, field: FieldInfo) -> str:
 
 
 def toml_value(value: Any) -> str:
+    """A value as TOML text."""
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, (list, tuple)):

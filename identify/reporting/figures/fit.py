@@ -46,11 +46,11 @@ class Curve(NamedTuple):
     drawn: dict[str, Any]
 
 
-STARTING = {"color": GREEN, "linestyle": (0, (4, 2)), "linewidth": 1.0}
-IDENTIFIED = {"color": BLUE, "linestyle": "-"}
-MEASURED = {"color": INK, "linestyle": "none", "marker": "o", "markersize": 2.4, "fillstyle": "none"}
-NOISE = {"color": GREY, "linestyle": "-", "linewidth": 0.4}
-TRUE = {"color": RED, "linestyle": "-", "linewidth": 1.4}
+STARTING: dict[str, Any] = {"color": GREEN, "linestyle": (0, (4, 2)), "linewidth": 1.0}
+IDENTIFIED: dict[str, Any] = {"color": BLUE, "linestyle": "-"}
+MEASURED: dict[str, Any] = {"color": INK, "linestyle": "none", "marker": "o", "markersize": 2.4, "fillstyle": "none"}
+NOISE: dict[str, Any] = {"color": GREY, "linestyle": "-", "linewidth": 0.4}
+TRUE: dict[str, Any] = {"color": RED, "linestyle": "-", "linewidth": 1.4}
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,8 @@ class Fit:
     """What was measured of a run over its time (N,) [s], and what models do: poses (N, 6) [m, rad].
 
     NaN where a measurement was lost or a model has diverged. initial: of the starting model; std: predicted deviation
-    of the truth from the identified model; noise (6,): standard deviation of one measured pose, as the sensor states it.
+    of the truth from the identified model; noise (6,): standard deviation of one measured pose, as the sensor states
+    it.
     """
 
     time: Array
@@ -105,7 +106,10 @@ class Fit:
         """Length of the error of position (first = 0) [µm] or orientation (3) [µrad]: of both models, and of what the
         camera measured, against the truth; where none is known, of the models against the measurement."""
         goal, whose = (self.truth, "") if self.truth is not None else (self.measured, ", against the measurement")
-        poses = {f"starting model{whose}": (self.initial, STARTING), f"identified model{whose}": (self.identified, IDENTIFIED)}
+        poses: dict[str, tuple[Array | None, dict[str, Any]]] = {
+            f"starting model{whose}": (self.initial, STARTING),
+            f"identified model{whose}": (self.identified, IDENTIFIED),
+        }
         if self.truth is not None:
             poses = {"what the cameras measure": (self.measured, NOISE)} | poses
         return [
@@ -173,7 +177,9 @@ def _draw(axes: Axes, time: Array, curves: Sequence[Curve]) -> None:
 
 def _legend_of(figure: Figure, panels: Sequence[Axes]) -> None:
     """One legend above of what is in several panels, the measurement first."""
-    entries = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    entries = {
+        label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
     figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=3, handlelength=3.0)
 
 

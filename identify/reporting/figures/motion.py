@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from mpl_toolkits.mplot3d.axes3d import Axes3D
-from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from identify.arrays import Array
@@ -57,7 +58,8 @@ def path_figure(time: Array, poses: Array) -> Figure:
     shown = moving(poses)
     halves = [([i for i in shown if first <= i < first + 3], name, unit) for name, first, unit, _ in PARTS]
     halves = [half for half in halves if half[0]]
-    figure = Figure(figsize=(WIDTH if len(halves) > 1 else WIDTH / 1.6, 3.7), layout="constrained")
+    figure = Figure(figsize=(WIDTH if len(halves) > 1 else WIDTH / 1.6, 3.2))
+    figure.subplots_adjust(left=0.02, right=0.94, bottom=0.06, top=0.94, wspace=0.12)
     elapsed = time - time[0]
     marks = np.searchsorted(elapsed, np.arange(0, elapsed[-1], _round_up(elapsed[-1] / MARKED)) - 1e-9)
     for place, (columns, name, unit) in enumerate(halves, start=1):
@@ -73,12 +75,13 @@ def path_figure(time: Array, poses: Array) -> Figure:
         axes.set_title(f"({'ab'[place - 1]}) {name} from the start" if len(halves) > 1 else f"{name} from the start")
         if solid:
             _plain_box(axes)
-        elif len(columns) == 2:
-            axes.set_aspect("equal")
+        else:
+            figure.subplots_adjust(left=0.12, bottom=0.16)
+            axes.set_aspect("equal" if len(columns) == 2 else "auto", adjustable="datalim")
     return figure
 
 
-def _draw_path(axes: Any, path: Array, marks: Array, time: Array) -> None:
+def _draw_path(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> None:
     """A path (N, 2 or 3) with numbered times, its start as a square."""
     axes.plot(*path.T, color=BLUE, linewidth=1.0)
     axes.plot(*path[marks[1:]].T, linestyle="none", marker="o", color=INK, markersize=3, markerfacecolor=PAPER)
@@ -96,7 +99,7 @@ def _plain_box(axes: Axes3D) -> None:
         axis.pane.set_edgecolor(GREY)
         axis.set_major_locator(MaxNLocator(4))
     axes.set_aspect("equal")
-    axes.set_box_aspect(None, zoom=0.82)
+    axes.set_box_aspect(None, zoom=0.92)
     axes.view_init(elev=22, azim=-55)
     axes.tick_params(labelsize=6.5, pad=0)
 
@@ -118,29 +121,33 @@ def ellipse_figure(poses: Array, covariances: Array, shown: list[int], errors: A
     kept = np.flatnonzero(np.isfinite(poses).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2)))
     chosen = kept[np.linspace(0, len(kept) - 1, min(ELLIPSES, len(kept))).round().astype(int)]
     path = 1e3 * (poses - poses[kept[0]])
-    views = [(part, list(combinations([i for i in shown if part[1] <= i < part[1] + 3], 2))) for part in PARTS]
+    views = [
+        (part, [list(pair) for pair in combinations([i for i in shown if part[1] <= i < part[1] + 3], 2)])
+        for part in PARTS
+    ]
     views = [(part, pairs) for part, pairs in views if pairs]
     figure = Figure(figsize=(WIDTH, 0.4 + 2.5 * max(len(views), 1)), layout="constrained")
     grid = figure.subplots(max(len(views), 1), 3, squeeze=False)
     for row, ((name, first, unit, fine), pairs) in zip(grid, views, strict=False):
         half = slice(first, first + 3)
         largest = 1e3 * np.sqrt(REACH * np.linalg.eigvalsh(covariances[chosen, half, half]).max())
-        factor = _round_down(SHARE * float(np.ptp(path[kept, half], axis=0).max()) / largest)
+        factor = round_down(SHARE * float(np.ptp(path[kept, half], axis=0).max()) / largest)
         for axes, columns in zip(row, pairs, strict=False):
-            axes.plot(*path[np.ix_(kept, columns)].T, color=GREY, linewidth=0.5)
-            _draw_ellipses(axes, path[np.ix_(chosen, columns)], covariances[chosen][:, columns][:, :, columns], factor)
+            axes.plot(*path[kept][:, columns].T, color=GREY, linewidth=0.5)
+            _draw_ellipses(axes, path[chosen][:, columns], covariances[chosen][:, columns][:, :, columns], factor)
             if errors is not None:
-                ends = path[np.ix_(chosen, columns)] + 1e3 * factor * errors[np.ix_(chosen, columns)]
+                ends = path[chosen][:, columns] + 1e3 * factor * errors[chosen][:, columns]
                 axes.plot(*ends.T, linestyle="none", marker=".", color=RED, label="true pose, enlarged alike")
             axes.set_aspect("equal", adjustable="datalim")
             axes.set_xlabel(f"{COMPONENTS[columns[0]]} [{unit}]")
             axes.set_ylabel(f"{COMPONENTS[columns[1]]} [{unit}]")
         row[0].set_title(f"{name}, ellipses × {factor:g}")
-        _scale_bar(row[0], factor, _round_down(2e3 * largest), fine)
+        _scale_bar(row[0], factor, round_down(2e3 * largest), fine)
     for axes in (axes for axes in grid.ravel() if not axes.lines):
         axes.set_visible(False)
     if views:
         legend_above(figure, grid[0, 0], columns=3)
+    figure.draw_without_rendering()  # equal axes change their ticks once they have their place
     return figure
 
 
@@ -173,10 +180,10 @@ def _scale_bar(axes: Axes, factor: float, length: float, fine: str) -> None:
 
 def _round_up(value: float) -> float:
     """The next higher of 1, 2, 5 times a power of ten."""
-    return 1.0 / _round_down(1.0 / value)
+    return 1.0 / round_down(1.0 / value)
 
 
-def _round_down(value: float) -> float:
+def round_down(value: float) -> float:
     """The next lower of 1, 2, 5 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(power * max(step for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))

@@ -54,7 +54,9 @@ def parameter_figure(parameters: dict[str, dict[str, Any]]) -> Figure:
         rows, reach = np.arange(len(found.names)), 100 * PARAMETER_FRACTION
         axes.axvspan(-reach, reach, color=LINE, alpha=0.5, linewidth=0)
         axes.axvline(0, color=GREY, linewidth=0.8)
-        axes.errorbar(found.error, rows, xerr=(found.below, found.above), fmt="o", color=BLUE, capsize=2.5, elinewidth=1)
+        axes.errorbar(
+            found.error, rows, xerr=(found.below, found.above), fmt="o", color=BLUE, capsize=2.5, elinewidth=1
+        )
         axes.set_yticks(rows, found.names)
         axes.invert_yaxis()
         axes.set_xlabel("estimate − truth [% of the truth]" if known else "95 % interval [% of the estimate]")
@@ -92,8 +94,8 @@ def group_figure(groups: Mapping[str, dict[str, Any]], parameters: Mapping[str, 
 
 
 def correlation_figure(correlations: Array, names: Sequence[str]) -> Figure:
-    """Correlations (n, n) of estimates: the area of a dot its size, open where negative; a line of text where nothing is
-    identified."""
+    """Correlations (n, n) of estimates: the area of a dot its size, open where negative; a line of text where nothing
+    is identified."""
     side = min(WIDTH, max(3.0, 1.4 + 0.2 * len(names)))
     figure = Figure(figsize=(side + 0.3, side), layout="constrained")
     axes = figure.subplots()

@@ -36,7 +36,7 @@ PALETTE = {
 }
 INK, PAPER, GREY, LINE, BLUE, RED, GREEN, WINE, AMBER, INDIGO = PALETTE.values()
 
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 8,
     "axes.titlesize": 8.5,
@@ -81,9 +81,13 @@ STILL = 1e-9
 
 
 def drawn(draw: Callable[[], Figure]) -> Figure:
-    """A figure in this style."""
+    """A figure in this style, laid out once for all files that are made of it."""
     with mpl.rc_context(STYLE):
-        return draw()
+        figure = draw()
+        if figure.get_layout_engine():
+            figure.draw_without_rendering()
+            figure.set_layout_engine("none")
+        return figure
 
 
 def svg_text(figure: Figure, name: str) -> str:
@@ -94,7 +98,7 @@ def svg_text(figure: Figure, name: str) -> str:
     text = stream.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
-    text = re.sub(r'(\sid="|="#|url\(#)', rf"\g<1>{name}-", text)
+    text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{name}-", text)
     text = re.sub(r"(\d\.\d\d)\d+", r"\g<1>", text)  # hundredths of a point
     return re.sub(r"\s*\n\s*", "\n", text)
 
