@@ -83,17 +83,15 @@ def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]
     summed = {name for group in groups for name in group["coefficients"] if len(group["coefficients"]) > 1}
     left = [name for name, p in parameters.items() if not p["identifiable"]]
     if left and len(left) == len(parameters):
-        return [("The model does not explain the record, so that no estimate of it can be trusted:", left)]
+        return [("the model does not explain the record, so that no estimate can be trusted", left)]
     shown = alone | {name for name in parameters if name.startswith("joint_pid.")}
     kinds = {
-        "Motion shows them only in sums with others, and not one by one; the sums are what is known:": [
+        "motion shows them only in sums with others, and not one by one; the sums are what is known": [
             name for name in left if name in summed
         ],
-        "This record shows them too badly: it neither halves what the starting value left open, nor leaves less than "
-        "half of their size in doubt. More or faster motion may show them:": [n for n in left if n in shown],
-        "They move nothing: no motion of this robot depends on them:": [
-            name for name in left if name not in summed | shown
-        ],
+        "this record shows them too badly. It neither halves what the starting value left open, nor leaves less than "
+        "half of their size in doubt. More or faster motion may show them": [n for n in left if n in shown],
+        "no motion of this robot depends on them": [name for name in left if name not in summed | shown],
     }
     return [(reason, names) for reason, names in kinds.items() if names]
 

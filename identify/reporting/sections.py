@@ -39,7 +39,7 @@ def sensor_section(data: RunData) -> Section:
     ok = data.experiment["measured_ok"].values.astype(bool)
     note = data.scenario.sensor_note
     name = Path(data.scenario.sensor).stem
-    said = [f"The sensor is {name}{f': {note}' if note else '.'}"]
+    said = [] if data.truth is None else [f"The sensor is {name}{f': {note}' if note else '.'}"]
     if isinstance(data.scene, str):
         said.append(f"Robot and cameras are not drawn: {data.scene}.")
     if "sensor" not in data.result:
@@ -47,14 +47,16 @@ def sensor_section(data: RunData) -> Section:
             f"{len(ok)} frames were recorded at {data.scenario.timing.frame_rate_hz:g} Hz; in {int((~ok).sum())} of "
             "them the platform was lost. No truth is known here: what follows is what the sensor states of itself."
         )
-        return Section("Sensor", tuple(said), ("stereo_frame", "ellipses"))
+        return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"))
     if data.cameras_acquitted is not None:
         said.append(
             "Its errors are the noise that it states, new in every frame."
             if data.cameras_acquitted
             else "Its errors are larger than the noise that it states, or depend on those of the frames before."
         )
-    return Section("Sensor", tuple(said), ("stereo_frame", "ellipses"), tables=(tables.sensor_table(data.result),))
+    return Section(
+        "Sensor", (" ".join(said),), ("stereo_frame", "ellipses"), tables=(tables.sensor_table(data.result),)
+    )
 
 
 def excitation_section(data: RunData) -> Section:
@@ -85,7 +87,7 @@ def parameter_section(data: RunData) -> Section:
         *_conditioning_text(found.get("conditioning")),
     ]
     folds = [
-        Fold(f"{len(names)} parameters are not identified. {reason}", ", ".join(names))
+        Fold(f"Not identified, {len(names)} of {len(parameters)}: {reason}", ", ".join(names))
         for reason, names in parameter_tables.unidentified(found)
     ]
     pairs = [parameter_tables.correlation_table(data.result)] if known else []

@@ -29,7 +29,10 @@ def changed_settings(recorded: str, estimator: Mapping[str, Any] | None = None) 
     base = name if name in scenario_names() else BUILT_IN_PAPER
     theirs = _settings(load_scenario(base).to_toml())
     for key, value in (estimator or {}).items():
-        ours[key] = (toml_value(value), (ours.get(key) or theirs.get(key) or ("", ""))[1])
+        recorded_value, meaning = ours.get(key) or ("", theirs.get(key, ("", ""))[1])
+        if toml_value(value) != recorded_value:
+            when = f"when the record was made: {recorded_value or 'not set'}"
+            ours[key] = (toml_value(value), f"{meaning}; {when}" if meaning else when)
     return base, [
         Setting(key, ours.get(key, ("", ""))[0], theirs.get(key, ("", ""))[0], (ours.get(key) or theirs[key])[1])
         for key in (*ours, *(key for key in theirs if key not in ours))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.explanation import whiteness
 from identify.experiment.truth import true_poses
@@ -120,17 +121,26 @@ def key_numbers(result: dict[str, Any]) -> list[KeyNumber]:
 def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
     """How far both models are from the true robot on unseen trajectories."""
     runs = result["validation"]
-    rows = np.array([rms_row(run["true"]) for run in runs])
+    identified, started = (np.array([rms_row(run.get(key)) for run in runs]) for key in ("true", "initial_true"))
+    turns = bool((identified[:, 3:] != 0).any())
     text = (
-        f"{'On' if explained else 'All the same, on'} {len(runs)} trajectories that it never saw, the identified "
-        f"model stays within {number(float(rows[:, :3].max()), 2)} µm and {number(float(rows[:, 3:].max()), 2)} µrad "
-        "of the true robot (RMS of the worst axis)"
+        f"{'On' if explained else 'All the same, on'} {len(runs)} trajectories that it never saw, the identified model "
     )
-    first = np.array([rms_row(run.get("initial_true")) for run in runs])
-    if np.isfinite(first).all():
-        started = f"{number(float(first[:, :3].max()), 2)} µm and {number(float(first[:, 3:].max()), 2)} µrad"
-        return f"{text}; the model that it started from misses by {started}."
+    if np.isfinite(identified).all():
+        text += f"stays within {_distance(identified, turns)} of the true robot (RMS of the worst axis)"
+    else:
+        text += "is unstable"
+    if not all("initial_true" in run for run in runs):
+        return f"{text}."
+    if np.isfinite(started).all():
+        return f"{text}; the model that it started from misses by {_distance(started, turns)}."
     return f"{text}; the model that it started from is unstable."
+
+
+def _distance(rows: Array, turns: bool) -> str:
+    """The worst of errors (n, 6) [µm, µrad], of the orientation where the robot turns."""
+    position, orientation = float(rows[:, :3].max()), float(rows[:, 3:].max())
+    return f"{number(position, 2)} µm" + (f" and {number(orientation, 2)} µrad" if turns else "")
 
 
 def _residual_sentence(result: dict[str, Any], explained: bool, acquitted: bool | None) -> str:

@@ -151,7 +151,7 @@ def error_figure(fit: Fit) -> Figure:
     """In one look: how far both models are from the true robot over a run, beside what the cameras measure; from the
     measurement, beside the noise that the cameras state, where no truth is known."""
     parts = [first for first in (0, 3) if any(first <= i < first + 3 for i in moving(fit.identified))]
-    figure = Figure(figsize=(COLUMN, 0.9 + 1.4 * len(parts)), layout="constrained")
+    figure = Figure(figsize=(COLUMN, 0.9 + (1.4 if len(parts) > 1 else 2.4) * len(parts)), layout="constrained")
     panels = figure.subplots(len(parts), 1, sharex=True, squeeze=False)[:, 0]
     for axes, first in zip(panels, parts, strict=True):
         _draw(axes, fit.time, fit.distances(first))
