@@ -5,6 +5,7 @@ import io
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import jinja2
 from PIL import Image
@@ -41,7 +42,7 @@ def render(data: RunData, pictures: Mapping[str, Picture], drawings: Mapping[str
     goals = check_goals(data.result)
     return environment.get_template("report.html.j2").render(
         title=f"Identification of {data.robot}",
-        subtitle=f"scenario {data.result.get('scenario')}, seed {data.result.get('seed')}",
+        subtitle=_subtitle(data.result),
         verdict=said,
         numbers=key_numbers(data.result),
         goals=goals_table(data.result),
@@ -70,6 +71,12 @@ def painting(path: Path) -> str:
     width, height = whole.size
     data = base64.b64encode(stream.getvalue()).decode()
     return f'<img alt="" width="{width}" height="{height}" src="data:image/webp;base64,{data}">'
+
+
+def _subtitle(result: Mapping[str, Any]) -> str:
+    """Scenario and, of a simulated run, seed."""
+    seed = result.get("seed")
+    return f"scenario {result.get('scenario')}" + ("" if seed is None else f", seed {seed}")
 
 
 def _sentence(text: str) -> str:

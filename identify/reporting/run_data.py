@@ -17,16 +17,14 @@ from identify.experiment.truth import read_truth, true_poses
 from identify.files.dataset import group_names
 from identify.files.run_folder import RunFolder, check_entries, load_result
 from identify.record.provenance import RECORDS, RunFiles, recorded_scenario
-from identify.record.recorded_run import recorded_reference
-from identify.record.recording import EXCITATION, TRUTH_GROUP, build_model_run, poses, run_name
+from identify.record.recording import EXCITATION, TRUTH_GROUP, poses, run_name
 from identify.reporting.figures.fit import Fit
 from identify.reporting.paper import repeats_the_paper
-from identify.reporting.run_result import check_intervals, parameter_vector
+from identify.reporting.run_result import check_intervals
 from identify.reporting.verdict import cameras_acquitted
 from identify.scenario import Scenario
 from identify.scene import StereoView, Workcell, stereo_view, workcell, workcell_of_scenario
 from identify.trajectory import TrajectorySet, load_trajectories
-from identify.validation.unseen import model_run
 
 
 @dataclass(frozen=True)
@@ -139,8 +137,7 @@ def read_run(run: RunFolder) -> RunData:
     """
     run.require("result.json", "covariance.nc", "experiment.nc")
     files, simulated = RunFiles(run), TRUTH_GROUP in group_names(run.experiment)
-    if simulated:
-        run.require("validation.nc", "model.nc")
+    run.require(*(["validation.nc"] if simulated else []), "model.nc")
     result = _checked_result(run, files, simulated)
     data = RunData(
         result=result,
@@ -148,7 +145,7 @@ def read_run(run: RunFolder) -> RunData:
         truth=read_truth(run.experiment) if simulated else None,
         validation=files.validation if simulated else [],
         validation_truth=read_truth(run.validation, run_name(1)) if simulated else None,
-        models=files.model if simulated else _model_runs(files.experiment, result),
+        models=files.model,
         covariance=files.covariance,
         names=files.named_covariance[0],
         trajectories=load_trajectories(run.trajectories) if run.trajectories.is_file() else None,
@@ -165,19 +162,10 @@ def _checked_result(run: RunFolder, files: RunFiles, simulated: bool) -> dict[st
     """The whole result of a run, made of the files that are there."""
     result = load_result(run.result)
     check_entries(run.result, result, "identify", *(["validate"] if simulated else []))
-    later = ["validation.nc", "model.nc"] if simulated else []
-    files.check_made_of(*RECORDS, "covariance.nc", *later, result=result)
+    later = ["validation.nc"] if simulated else []
+    files.check_made_of(*RECORDS, "covariance.nc", *later, "model.nc", result=result)
     try:
         check_intervals(result["identification"])
     except RecordError as error:
         raise RecordError(f"{run.result}: {error}; run `cmmsim identify --out {run.path}` again") from None
     return result
-
-
-def _model_runs(record: xr.Dataset, result: dict[str, Any]) -> Mapping[str, xr.Dataset]:
-    """What both models do on the exciting trajectory, computed anew from the estimates: no stage has written it."""
-    scenario = recorded_scenario(record).with_overrides(result.get("settings", {}))
-    robot, reference = load_robot(scenario.robot), recorded_reference(record)
-    columns = (parameter_vector(robot, result["identification"], column) for column in ("initial", "estimate"))
-    initial, identified = (model_run(robot, scenario, values, reference) for values in columns)
-    return {EXCITATION: build_model_run(record["time"].values, initial, identified)}

@@ -28,9 +28,7 @@ from identify.reporting.sections import SECTIONS
 from identify.reporting.verdict import cameras_acquitted, key_numbers, verdict
 from identify.scenario import load_scenario
 from identify.trajectory import TrajectorySet, random_trajectory
-from tests.identify.conftest import parameter
-from tests.identify.synthetic import LAYOUT, NAMES, short_run, truth_of
-from tests.identify.synthetic import truth as true_values
+from tests.identify.synthetic import short_run, truth_of
 
 FIGURES = {"scene", "errors", "stereo_frame", "ellipses", "excitation", "path", "fit_excitation", "fit_validation"}
 FIGURES |= {"validation_errors", "parameters", "correlation"}
@@ -53,7 +51,7 @@ def no_images(monkeypatch):
 def without_truth(run_folder):
     """The folder as that of a record of a real robot: nothing but record, result and covariance, and no truth."""
     write(run_folder.experiment, read(run_folder.experiment))
-    for path in (run_folder.validation, run_folder.model, run_folder.trajectories):
+    for path in (run_folder.validation, run_folder.trajectories):
         path.unlink()
     result = load_result(run_folder.result)
     for name in ("sensor", "validation"):
@@ -302,12 +300,6 @@ def test_model_of_another_run_an_incomplete_result_and_a_missing_stage_are_refus
 
 def test_a_record_without_truth_has_a_report_that_says_what_nobody_can_tell(run_folder):
     """Beside the models' errors against the measurement; no column and no figure of a truth."""
-    result = load_result(run_folder.result)
-    result["identification"]["parameters"] = {
-        name: {"unit": LAYOUT.unit(name), **parameter(value, None, value, 0.1 * value)}
-        for name, value in zip(NAMES, true_values().tolist(), strict=True)
-    }
-    save_result(run_folder.result, result)
     data = read_run(without_truth(run_folder))
     text = page_of(data)
     assert "No truth is known of this record" in text
