@@ -7,35 +7,36 @@ from matplotlib.figure import Figure
 from identify.arrays import Array
 from identify.reporting.figures.motion import round_down
 from identify.reporting.figures.style import WIDTH
-from identify.scene import StereoView, Workcell, scene_figure, stereo_figure
-from identify.scene.figures import FOUND, show_image
+from identify.scene import StereoView, View, Workcell, stereo_figure
+from identify.scene.figures import FOUND, SIDES, draw_scene, show_image
 
 OVERVIEW = (4.8, 4.9)
 """Width and height of the overview, inches."""
 
-BESIDE = 0.4
+BENEATH = 0.4
 """Share of its height that the images take."""
 
 
 def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None) -> Figure:
-    """Robot, stickers and cameras with the platform at a pose (6,), and beneath it what both cameras see of it."""
+    """Robot, stickers and cameras with the platform at a pose (6,), and beneath it what both cameras see of it.
+
+    Higher than it is wide, as a phone is. Raises dynamics.UnreachablePoseError, dynamics.ChartError.
+    """
     width, height = OVERVIEW
-    if view is None:
-        return scene_figure(cell, pose, size=(width, (1 - BESIDE) * height))
-    figure = scene_figure(cell, pose, size=(width, height))
-    figure.set_layout_engine("none")
-    figure.axes[0].set_position((0.08, BESIDE, 0.87, 1 - BESIDE))
-    side = (BESIDE - 0.05) * height / width
-    for number, name in enumerate(("left", "right")):
-        axes = figure.add_axes((0.5 + (number - 1) * side + (number - 0.5) * 0.04, 0.0, side, BESIDE - 0.05))
-        show_image(axes, view, number)
-        for body, found in view.found.items():
-            x, y = found.centres[number].T
-            axes.scatter(x, y, s=9, facecolors="none", edgecolors=FOUND[body], linewidths=0.5)
-        axes.set_xticks([])
-        axes.set_yticks([])
-        axes.set_xlabel("")
-        axes.set_title(f"seen by the {name} camera", fontsize=8, pad=2)
+    beneath = 0.0 if view is None else BENEATH
+    figure = Figure(figsize=(width, height * (1 - BENEATH + beneath)))
+    axes = figure.add_axes((0.08, beneath, 0.87, 1 - beneath))
+    draw_scene(axes, cell, pose, View(), rays=True, labels=True)
+    if view is not None:
+        side = (beneath - 0.05) * height / width
+        for number, name in enumerate(SIDES):
+            axes = figure.add_axes((0.5 + (number - 1) * side + (number - 0.5) * 0.04, 0.0, side, beneath - 0.05))
+            show_image(axes, view, number)
+            for body, found in view.found.items():
+                x, y = found.centres[number].T
+                axes.scatter(x, y, s=9, facecolors="none", edgecolors=FOUND[body], linewidths=0.5)
+            axes.set(xticks=[], yticks=[], xlabel="")
+            axes.set_title(f"seen by the {name} camera", fontsize=8, pad=2)
     return figure
 
 
