@@ -148,22 +148,17 @@ def _residual_sentence(result: dict[str, Any], explained: bool, acquitted: bool 
     found = {goal.name: goal for goal in explanation_goals(result)}
     if not found:
         return "How well the model explains the record was not tested."
-    said = "; ".join(
-        [
-            f"the residuals are {number(goal.value, 3)} times the stated noise, where noise alone leaves up to "
-            f"{number(goal.limit, 3)}"
-            for name, goal in found.items()
-            if name == goals.RESIDUALS
-        ]
-        + [
-            f"the probability that noise alone makes them depend so much on each other is {share(goal.value / 100)}"
-            for name, goal in found.items()
-            if name == goals.CHANCE
-        ]
-    )
+    parts = []
+    if goals.RESIDUALS in found:
+        size, limit = number(found[goals.RESIDUALS].value, 3), number(found[goals.RESIDUALS].limit, 3)
+        parts.append(f"its mean square is {size} times what they state, where noise alone makes up to {limit}")
+    if goals.CHANCE in found:
+        chance = share(found[goals.CHANCE].value / 100)
+        parts.append(f"noise alone would look as regular in {chance} of cases")
+    said = "; ".join(parts)
     if explained:
         return f"What it leaves of the record is the cameras' noise: {said}."
-    return f"Noise does not explain what it leaves of the record: {said}. {_cause(acquitted)}"
+    return f"What it leaves of the record is more than the cameras' noise: {said}. {_cause(acquitted)}"
 
 
 def _cause(acquitted: bool | None) -> str:

@@ -209,7 +209,7 @@ def test_what_does_not_move_is_not_drawn():
 def test_ellipses_hold_95_percent_of_drawn_errors():
     """Of 4000 draws of a covariance, by the outline that is drawn."""
     covariance = np.array([[4.0, 1.5], [1.5, 1.0]])
-    outline = motion._ellipse(covariance)
+    outline = motion.ellipse_outline(covariance)
     reach = np.einsum("ni,ij,nj->n", outline, np.linalg.inv(covariance), outline)
     draws = np.random.default_rng(1).multivariate_normal(np.zeros(2), covariance, 4000)
     inside = np.einsum("ni,ij,nj->n", draws, np.linalg.inv(covariance), draws) < reach.mean()

@@ -154,7 +154,7 @@ def ellipse_figure(poses: Array, covariances: Array, shown: list[int], errors: A
 def _draw_ellipses(axes: Axes, centres: Array, covariances: Array, factor: float) -> None:
     """Ellipses of covariances (n, 2, 2) [SI], enlarged, about measured places (n, 2) [thousandths of it]."""
     gap = np.full((1, 2), np.nan)
-    rings = [c + 1e3 * factor * _ellipse(cov) for c, cov in zip(centres, covariances, strict=True)]
+    rings = [c + 1e3 * factor * ellipse_outline(cov) for c, cov in zip(centres, covariances, strict=True)]
     outline = np.concatenate([part for ring in rings for part in (ring, gap)])
     axes.plot(*outline.T, color=BLUE, linewidth=0.9, label=RING)
     axes.plot(*centres.T, linestyle="none", marker="+", color=BLUE, label="measured pose")
@@ -164,7 +164,7 @@ REACH = float(chi2.ppf(COVERED, 2))
 RING = f"holds {100 * COVERED:g} % of true poses"
 
 
-def _ellipse(covariance: Array) -> Array:
+def ellipse_outline(covariance: Array) -> Array:
     """Outline (n, 2) of the ellipse that covers `COVERED` of a covariance (2, 2)."""
     angle = np.linspace(0, 2 * np.pi, 49)
     root = np.linalg.cholesky(covariance + 1e-12 * np.trace(covariance) * np.eye(2))
