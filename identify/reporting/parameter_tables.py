@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from identify.estimation.identifiability import RESTS_ON_PRIOR
 from identify.reporting.numbers import interval, number, rounded, with_deviation
 from identify.reporting.tables import Table
 
@@ -24,10 +25,7 @@ def parameter_table(result: dict[str, Any]) -> Table:
         for name, p in identification["parameters"].items()
         if p["identifiable"]
     ]
-    note = (
-        f"The overall scale is fixed by {ANCHORS.get(identification['scale_anchor'], identification['scale_anchor'])}. "
-        "The interval holds the truth in 95 % of such experiments; it ends where no such value can exist. "
-    )
+    note = "The interval holds the truth in 95 % of such experiments; it ends where no such value can exist. "
     if any(row[-1] for row in rows):
         note += (
             f"One that {ON_GUESS} is shown only in sums with other parameters: it is right where their starting "
@@ -35,6 +33,19 @@ def parameter_table(result: dict[str, Any]) -> Table:
         )
     header = ("parameter", "unit", "start", "truth", "estimate ± standard deviation", "95 % interval", "error [%]", "")
     return Table(f"The {len(rows)} identified parameters", header, tuple(rows), note).without_empty()
+
+
+def scale_sentence(identification: Mapping[str, Any]) -> str:
+    """What fixes the common factor of all parameters, or that what was to fix it does not."""
+    anchor = identification["scale_anchor"]
+    said, gain = ANCHORS.get(anchor, anchor), identification["parameters"].get("joint_pid.lp", {})
+    share = gain.get("prior_share") or 0.0
+    if anchor == "prior" or share <= RESTS_ON_PRIOR:
+        return f"The overall scale is fixed by {said}."
+    return (
+        f"The overall scale should be fixed by {said}, but is not: {100 * share:.0f} % of the variance of joint_pid.lp "
+        "comes from the starting values, and all that is given in kg, N m or N is as good as those."
+    )
 
 
 ANCHORS = {

@@ -83,6 +83,7 @@ def parameter_section(data: RunData) -> Section:
         + (f", and {sum(bool(g['identifiable']) for g in sums)} of {len(sums)} sums of several." if sums else ".")
         + " Identified means that it at least halves what the starting value left open, and leaves less than half of "
         "the quantity in doubt.",
+        parameter_tables.scale_sentence(found),
         *_prior_text(found),
         *_conditioning_text(found.get("conditioning")),
     ]

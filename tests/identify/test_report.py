@@ -370,6 +370,15 @@ def test_numbers_have_the_digits_that_they_deserve_and_what_is_rounding_is_zero(
     assert spelled("cost changed by 3.35e-07 <= tol1 = 1e-06") == "cost changed by 3.35 × 10⁻⁷ ≤ tol1 = 1 × 10⁻⁶"
 
 
+def test_the_report_says_what_fixes_the_scale_or_that_its_anchor_does_not(result):
+    found = result["identification"]
+    assert parameter_tables.scale_sentence(found) == "The overall scale is fixed by the weighed mass of the platform."
+    found["parameters"]["joint_pid.lp"]["prior_share"] = 0.61
+    assert "but is not: 61 % of the variance" in parameter_tables.scale_sentence(found)
+    found["scale_anchor"] = "prior"
+    assert "off by one common factor" in parameter_tables.scale_sentence(found)
+
+
 def test_what_is_not_identified_has_its_reason():
     """One that is shown only in a sum, one that this record shows too badly, and one that moves nothing."""
     entries = {

@@ -86,7 +86,7 @@ def _draw_path(axes: Any, path: Array, marks: NDArray[np.int_], time: Array) -> 
     axes.plot(*path.T, color=BLUE, linewidth=1.0)
     axes.plot(*path[marks[1:]].T, linestyle="none", marker="o", color=INK, markersize=3, markerfacecolor=PAPER)
     axes.plot(*path[:1].T, linestyle="none", marker="s", color=RED, markersize=6)
-    lift = 0.03 * np.ptp(path, axis=0).max()
+    lift = 0.03 * np.ptp(path, axis=0)
     for k in marks:
         label = "start" if k == marks[0] else f"{time[k] - time[0]:.3g} s"
         axes.text(*(path[k] + lift), label, fontsize=6.5, color=RED if k == marks[0] else INK)
