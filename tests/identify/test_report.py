@@ -88,7 +88,7 @@ def test_report_is_one_page_that_people_can_read_on_any_screen_and_figures_for_p
     assert "<script" not in text
     drawn = {path.stem: imread(path) for path in run_folder.figures.glob("*.png")}
     assert set(drawn) == FIGURES == {path.stem for path in run_folder.figures.glob("*.pdf")}
-    assert min(min(image.shape[:2]) for image in drawn.values()) > 350
+    assert min(min(image.shape[:2]) for image in drawn.values()) > 300
     assert min(image[..., :3].std() for image in drawn.values()) > 0.02
 
 
