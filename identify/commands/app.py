@@ -296,7 +296,7 @@ def validate(out: RunFolderOption, workers: Workers = None, quiet: Quiet = False
 def report(out: RunFolderOption, quiet: Quiet = False) -> None:
     """Draw the figures and write report.html, one file that opens offline."""
     folder = RunFolder(out)
-    folder.require("result.json", "experiment.nc")
+    folder.require("result.json", "experiment.nc", "validation.nc", "model.nc")
     _pipeline().report(out, terminal_progress(quiet))
     if not quiet:
         _summary().print_goals(load_result(folder.result), folder.report)

@@ -160,7 +160,7 @@ def settings_table(result: dict[str, Any], recorded: str) -> Table:
     """What differs from the built-in scenario with which the recorded one (TOML) is to be compared, the settings that
     were changed for the identification among it."""
     base, changed = changed_settings(recorded, result.get("settings"))
-    rows = tuple((one.key, one.value or "-", one.built_in or "-", one.meaning) for one in changed)
+    rows = tuple((one.key, one.value, one.built_in, one.meaning) for one in changed)
     return Table(f"What differs from the scenario {base}", ("key", "value", f"in {base}", "meaning"), rows)
 
 

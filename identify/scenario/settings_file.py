@@ -97,7 +97,7 @@ def to_toml(model: BaseModel) -> str:
         if isinstance(value, BaseModel):
             sections += ["", f"[{name}]", *_entries(value)]
         elif isinstance(value, dict):
-            entries = [f"{key} = {toml_value(one)}" for key, one in value.items()]
+            entries = [f"{key} = {_toml_value(one)}" for key, one in value.items()]
             sections += ["", f"[{name}]  # {field.description or ''}", *entries]
         elif value is not None:
             lines.append(_entry(name, value, field))
@@ -116,20 +116,19 @@ def _entries(section: BaseModel) -> list[str]:
 
 def _entry(name: str, value: Any, field: FieldInfo) -> str:
     comment = "".join([f" [{unit}]" if (unit := _unit(field)) else "", f" {field.description or ''}"]).strip()
-    entry = f"{name} = {toml_value(value)}"
+    entry = f"{name} = {_toml_value(value)}"
     return f"{entry:<40} # {comment}" if comment else entry
 
 
-def toml_value(value: Any) -> str:
-    """A value as TOML text."""
+def _toml_value(value: Any) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, (list, tuple)):
-        return f"[{', '.join(toml_value(one) for one in value)}]"
+        return f"[{', '.join(_toml_value(one) for one in value)}]"
     if isinstance(value, BaseModel):
-        return toml_value(dict(value))
+        return _toml_value(dict(value))
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{json.dumps(key)} = {toml_value(one)}' for key, one in value.items())}}}"
+        return f"{{{', '.join(f'{json.dumps(key)} = {_toml_value(one)}' for key, one in value.items())}}}"
     return repr(value).lower() if isinstance(value, bool) else repr(value)
 
 

@@ -250,8 +250,8 @@ def test_a_setting_acts_and_is_kept_for_the_next_stages_and_the_reader(recorded_
     assert result["identification"]["searches"] == ["command_driven"]
     _, changed = changed_settings(read(recorded_folder.experiment).attrs["scenario"], result["settings"])
     method = next(one for one in changed if one.key == "identification.method")
-    assert (method.value, method.built_in) == ('"command_driven"', '"closed_loop"')
-    assert method.meaning.endswith('when the record was made: "closed_loop"')
+    assert (method.value, method.built_in) == ("command_driven", "closed_loop")
+    assert method.meaning.endswith("when the record was made: closed_loop")
     pipeline.identify(recorded_folder.path, SilentProgress())
     assert load_result(recorded_folder.result)["identification"]["searches"] == ["command_driven"]
 
