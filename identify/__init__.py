@@ -15,7 +15,9 @@ Identification
     identify(record, robot, scenario) -> IdentificationResult
     unseen_errors(parameters, robot, scenario, seed) -> ndarray   model against plant on trajectories it never saw
 
-Pictures: the room `identify.scene` draws robot, cameras and images, and writes the page that replays a run.
+Pictures
+    run_figures(folder) -> dict                 of a finished run, by name: functions that draw them for print
+    the room `identify.scene`                   draws robot, cameras and images, and the page that replays a run
 
 Every error that a user can cause is an IdentifyError, a `cmmsim.CmmError` or a `dynamics.DynamicsError`. Names are
 imported on first use: CasADi and OpenGL take seconds to load, and `cmmsim --help` must not wait for them.
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from identify.record.payload import payload_vector as payload_vector
     from identify.record.payload import store_payload as store_payload
     from identify.record.recording import build_record as build_record
+    from identify.reporting.pictures import run_figures as run_figures
     from identify.scenario import Scenario as Scenario
     from identify.scenario import load_scenario as load_scenario
     from identify.scenario import scenario_names as scenario_names
@@ -51,6 +54,7 @@ _HOME = {
     "IdentificationResult": "identify.estimation.result",
     "identify": "identify.estimation.identification",
     "unseen_errors": "identify.validation.unseen",
+    "run_figures": "identify.reporting.pictures",
 }
 
 __all__ = ["IdentifyError", *_HOME]

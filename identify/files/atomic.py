@@ -65,7 +65,7 @@ def write_text(path: Path | str, text: str) -> None:
 def write_figure(path: Path | str, figure: "Figure") -> None:
     """Write a figure as PNG, whole or not at all."""
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=120)
+        figure.savefig(temporary, dpi=150)
 
 
 def _umask() -> int:

@@ -13,10 +13,16 @@ VALIDATION_UM, VALIDATION_URAD = 2.0, 10.0
 SENSOR_UM, SENSOR_URAD = 20.0, 100.0
 PARAMETER_FRACTION, PARAMETER_STDS = 0.05, 3.0
 
+UNSEEN_POSITION, UNSEEN_ORIENTATION = "unseen motion, position", "unseen motion, orientation"
+SENSOR_POSITION, SENSOR_ORIENTATION = "cameras, position", "cameras, orientation"
+LOST, RESIDUALS, CHANCE = "lost frames", "residuals of the model", "chance of such residuals"
+FAR_OFF = "friction and gains far off"
+
 
 @dataclass(frozen=True)
 class Goal:
-    """One goal: ``value`` against ``limit`` in ``unit``; ``relation`` is ``<=`` or ``>=``."""
+    """One goal: ``value`` against ``limit`` in ``unit``; ``relation`` is ``<=`` or ``>=``; ``detail``: what the value
+    is, in words that continue its name."""
 
     name: str
     value: float
@@ -43,12 +49,15 @@ def explanation_goals(result: dict[str, Any]) -> list[Goal]:
     if "noise_ratio_std" in found:
         keys = ("noise_ratio", "expected_noise_ratio", "noise_ratio_std")
         ratio, expected, std = (math.nan if found[key] is None else found[key] for key in keys)
-        text = f"residuals {ratio:.3f} times the noise variance, noise alone gives {expected:.3f} ± {std:.3f}"
-        goals.append(Goal("misfit of the record", (ratio - expected) / std, "<=", SIGNIFICANT, "std", text))
+        text = (
+            "mean square of measured minus identified pose, in units of the noise that the cameras state; noise alone "
+            f"leaves {expected:.3f} ± {std:.3f}"
+        )
+        goals.append(Goal(RESIDUALS, ratio, "<=", expected + SIGNIFICANT * std, "× noise", text))
     if "whiteness" in found:
         chance = found["whiteness"]["p_value"]
-        text = "probability that chance correlates the residuals as much, of the model driven by the logged commands"
-        goals.append(Goal("white residuals", math.nan if chance is None else chance, ">=", SUSPICIOUS, "", text))
+        text = "probability that noise alone leaves residuals that depend as much on those of the frames before"
+        goals.append(Goal(CHANCE, math.nan if chance is None else 100 * chance, ">=", 100 * SUSPICIOUS, "%", text))
     return goals
 
 
@@ -56,10 +65,10 @@ def _validation(result: dict[str, Any]) -> list[Goal]:
     rows = np.array([rms_row(run["true"]) for run in result.get("validation", [])])
     if not len(rows):
         return []
-    text = f"identified model against the true plant, {len(rows)} unseen trajectories"
+    text = f"identified model against the true robot, RMS of the worst axis in the worst of {len(rows)} unseen runs"
     return [
-        Goal("unseen position", float(rows[:, :3].max()), "<=", VALIDATION_UM, "um", text),
-        Goal("unseen orientation", float(rows[:, 3:].max()), "<=", VALIDATION_URAD, "urad", text),
+        Goal(UNSEEN_POSITION, float(rows[:, :3].max()), "<=", VALIDATION_UM, "µm", text),
+        Goal(UNSEEN_ORIENTATION, float(rows[:, 3:].max()), "<=", VALIDATION_URAD, "µrad", text),
     ]
 
 
@@ -68,22 +77,24 @@ def _sensor(result: dict[str, Any]) -> list[Goal]:
     if not sensor:
         return []
     row = np.array(rms_row(sensor))
-    text = f"measured pose against truth, {sensor['frames']} frames"
+    text = f"measured against true pose, RMS of the worst axis over {sensor['frames']} frames"
+    lost = f"of {sensor['frames']}: the cameras did not find the platform"
     return [
-        Goal("sensor position", float(row[:3].max()), "<=", SENSOR_UM, "um", text),
-        Goal("sensor orientation", float(row[3:].max()), "<=", SENSOR_URAD, "urad", text),
-        Goal("lost frames", float(sensor["lost_frames"]), "<=", 0.0, "", text),
+        Goal(SENSOR_POSITION, float(row[:3].max()), "<=", SENSOR_UM, "µm", text),
+        Goal(SENSOR_ORIENTATION, float(row[3:].max()), "<=", SENSOR_URAD, "µrad", text),
+        Goal(LOST, float(sensor["lost_frames"]), "<=", 0.0, "", lost),
     ]
 
 
 def _parameters(result: dict[str, Any]) -> list[Goal]:
     parameters = result.get("identification", {}).get("parameters", {})
-    judged = {name: p for name, p in parameters.items() if is_friction_or_pid(name)}
+    judged = {name: p for name, p in parameters.items() if is_friction_or_pid(name) and p["true"] is not None}
     if not judged:
         return []
     outside = [name for name, p in judged.items() if not within_tolerance(p)]
-    text = f"of {len(judged)} within 5 % of truth or 3 std" + (f"; outside: {', '.join(outside)}" if outside else "")
-    return [Goal("friction and PID outside", float(len(outside)), "<=", 0.0, "", text)]
+    text = f"of {len(judged)}: estimates off the truth by more than 5 % and more than 3 standard deviations"
+    text += f", {', '.join(outside)}" if outside else ""
+    return [Goal(FAR_OFF, float(len(outside)), "<=", 0.0, "", text)]
 
 
 def is_friction_or_pid(name: str) -> bool:

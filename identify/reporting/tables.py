@@ -1,12 +1,9 @@
-"""Tables like the paper's 2, 3 and 4 beside the paper's own figures, and what a run says of itself at the terminal.
-
-The paper's figures, RMS of x, y, z [um], alpha, beta, gamma [urad], compare the identified model with the measurement
-of a real robot; no truth was known there.
-"""
+"""The tables of a run, and what it says of itself at the terminal; the paper's figures where it repeats the paper."""
 
 import math
-import tomllib
-from dataclasses import dataclass
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,45 +11,45 @@ import typer
 
 from identify.files.run_folder import AXES, predicted_row, rms_row
 from identify.progress import print_table
+from identify.reporting import paper
 from identify.reporting.goals import check_goals, explanation_goals
+from identify.reporting.numbers import number
+from identify.reporting.settings import changed_settings
 
-BEFORE = (1260.0, 1160.0, 1550.0, 2520.0, 3580.0, 2800.0)
-"""Table 3, starting model on the exciting trajectory."""
-
-AFTER = (408.0, 235.0, 494.0, 956.0, 797.0, 725.0)
-"""Table 3, identified model on the exciting trajectory."""
-
-VALIDATION = (
-    (517.0, 384.0, 709.0, 1091.0, 963.0, 966.0),
-    (273.0, 410.0, 522.0, 1157.0, 1071.0, 932.0),
-    (381.0, 403.0, 600.0, 1242.0, 830.0, 1143.0),
-    (341.0, 511.0, 617.0, 1136.0, 814.0, 1161.0),
-    (322.0, 394.0, 464.0, 1219.0, 877.0, 835.0),
-    (310.0, 301.0, 441.0, 1195.0, 1111.0, 1040.0),
-    (360.0, 402.0, 455.0, 1263.0, 1176.0, 1024.0),
-    (418.0, 483.0, 460.0, 1251.0, 1211.0, 1015.0),
-    (342.0, 510.0, 557.0, 1411.0, 1156.0, 711.0),
-    (318.0, 379.0, 473.0, 1219.0, 1023.0, 905.0),
-)
-"""Table 4, identified model on ten unseen trajectories. The 1411 is over the 1.4e-3 rad that the text states."""
-
-INDEX_FIRST, INDEX_BEST = 0.38, 1.345
-"""Observability index at the start and after 324 iterations of a genetic algorithm (section 4.2)."""
-
-AXIS_UNITS = ("um", "um", "um", "urad", "urad", "urad")
-NOT_SHOWN = "not identifiable"
-ON_GUESS = "rests on the starting guess"
+AXIS_UNITS = ("µm", "µm", "µm", "µrad", "µrad", "µrad")
 AXIS_HEADER = tuple(f"{axis} [{unit}]" for axis, unit in zip(AXES, AXIS_UNITS, strict=True))
 
 
 @dataclass(frozen=True)
 class Table:
-    """A titled table of text; ``note`` says what the reader must know to read it."""
+    """A titled table of text; ``note`` says what the reader must know to read it; ``folded``: whether only its title is
+    seen at first."""
 
     title: str
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     note: str = ""
+    folded: bool = False
+
+    @property
+    def words(self) -> tuple[bool, ...]:
+        """Whether each column holds words and not numbers."""
+        numeric = re.compile(r"([-+−≤≥(]? ?[\d.]+.*|[-–]?|diverged)$")
+        columns = zip(*self.rows, strict=True)
+        return tuple(k == 0 or not all(numeric.match(cell) for cell in column) for k, column in enumerate(columns))
+
+    def without(self, hidden: Collection[int]) -> "Table":
+        """The table without some of its columns."""
+
+        def kept(cells: tuple[str, ...]) -> tuple[str, ...]:
+            return tuple(cell for k, cell in enumerate(cells) if k not in hidden)
+
+        return replace(self, header=kept(self.header), rows=tuple(map(kept, self.rows)))
+
+    def without_empty(self) -> "Table":
+        """The table without columns in which nothing stands."""
+        columns = enumerate(zip(*self.rows, strict=True)) if self.rows else ()
+        return self.without([k for k, column in columns if all(cell in ("", "-") for cell in column)])
 
     def markdown(self) -> str:
         """The table as Markdown, numbers aligned to the right."""
@@ -72,7 +69,7 @@ def goals_table(result: dict[str, Any]) -> Table:
         )
         for goal in check_goals(result)
     )
-    note = "Accuracy: RMS of the worst axis and run. Speed has no limit: it is the machine's."
+    note = "Speed has no limit: it is the machine's."
     return Table("Goals", ("goal", "value", "limit", "", "what"), (*rows, *_speed_rows(result)), note)
 
 
@@ -89,72 +86,40 @@ def _speed_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
     return rows
 
 
-def parameter_table(result: dict[str, Any]) -> Table:
-    """Parameters, like table 2: starting guess, truth, estimate, standard deviation and interval."""
-    rows = []
-    for name, p in result["identification"]["parameters"].items():
-        remark = (ON_GUESS if p.get("rests_on_prior") else "") if p["identifiable"] else NOT_SHOWN
-        rows.append((name, p["unit"], number(p["initial"]), number(p["true"]), *_shown(p), remark))
-    anchor = result["identification"]["scale_anchor"]
-    return Table(
-        "Parameters (like the paper's table 2)",
-        ("parameter", "unit", "initial", "true", "estimate", "std", "95 % interval", "error [%]", ""),
-        tuple(rows),
-        f"The overall scale is fixed by: {anchor}. A parameter that no motion shows has no estimate. "
-        f"One that {ON_GUESS} is shown only in sums with others: it follows from what the guess says of those, and its "
-        "interval holds the truth where the guess's standard deviations do; the sums stand among the groups. "
-        "The interval ends where no such value can exist, and allows for bounds that hold the estimate; the standard "
-        "deviation knows of none. "
-        "With the scenario's default parameter sets, initial and true are the two columns of the paper's table 2.",
-    )
-
-
-def group_table(result: dict[str, Any]) -> Table:
-    """Base parameters: the combinations of parameters that motion can show, with truth, estimate and deviation."""
-    rows = tuple(
-        (g["expression"], number(g["initial"]), number(g["true"]), *_shown(g), "" if g["identifiable"] else NOT_SHOWN)
-        for g in result["identification"].get("groups", {}).values()
-        if len(g["coefficients"]) > 1
-    )
-    return Table(
-        "Groups of parameters that no motion can separate",
-        ("group", "initial", "true", "estimate", "std", "95 % interval", "error [%]", ""),
-        rows,
-        "In the SI unit of the first parameter of each sum. A group may be known where none of its members is; but for "
-        f"the common scale no group {ON_GUESS}. Its size is that of its members: of a difference that almost vanishes "
-        "the relative error says nothing.",
-    )
-
-
-def excitation_error_table(result: dict[str, Any]) -> Table:
-    """Model against measurement on the exciting trajectory before and after identification, like table 3."""
+def excitation_error_table(result: dict[str, Any], beside_paper: bool = False) -> Table:
+    """Model against measurement on the exciting trajectory before and after identification; beside the paper's table 3
+    for a run that repeats its experiment."""
     before, after = _rms(rms_row(result.get("before"))), _rms(rms_row(result.get("after")))
-    rows = tuple(
-        (f"{axis} [{unit}]", b, a, number(pb), number(pa))
-        for axis, unit, b, a, pb, pa in zip(AXES, AXIS_UNITS, before, after, BEFORE, AFTER, strict=True)
-    )
+    header: tuple[str, ...] = ("component", "before", "after")
+    columns: list[Sequence[str]] = [AXIS_HEADER, before, after]
+    if beside_paper:
+        header += ("paper before", "paper after")
+        columns += [list(map(number, paper.BEFORE)), list(map(number, paper.AFTER))]
     return Table(
-        "RMS of model against measurement, exciting trajectory (like the paper's table 3)",
-        ("component", "before", "after", "paper before", "paper after"),
-        rows,
+        "Model against measurement on the exciting trajectory, RMS",
+        header,
+        tuple(zip(*columns, strict=True)),
         "diverged: the loop of the starting model is unstable." if "diverged" in before else "",
     )
 
 
-def validation_table(result: dict[str, Any]) -> Table:
-    """Models against measurement and truth on the unseen trajectories, like table 4, and the paper's rows."""
+def validation_table(result: dict[str, Any], beside_paper: bool = False) -> Table:
+    """Models against measurement and truth on the unseen trajectories; with the paper's table 4 for a run that repeats
+    its experiment."""
     rows: list[tuple[str, ...]] = []
     for n, run in enumerate(result.get("validation", []), start=1):
-        rows.append((f"{n} true", *_rms(rms_row(run["true"]))))
-        rows.append((f"{n} measured", *_rms(rms_row(run["measured"]))))
+        rows.append((f"{n}: identified, true", *_rms(rms_row(run["true"]))))
+        rows.append((f"{n}: identified, measured", *_rms(rms_row(run["measured"]))))
         if "initial_true" in run:
-            rows.append((f"{n} starting model, true", *_rms(rms_row(run["initial_true"]))))
-    rows += [(f"paper {n} measured", *map(number, row)) for n, row in enumerate(VALIDATION, start=1)]
+            rows.append((f"{n}: starting, true", *_rms(rms_row(run["initial_true"]))))
+    if beside_paper:
+        rows += [(f"paper {n}: identified, measured", *map(number, row)) for n, row in enumerate(paper.VALIDATION, 1)]
     return Table(
-        "RMS on unseen trajectories (like the paper's table 4)",
-        ("run", *AXIS_HEADER),
+        "Each unseen trajectory, RMS",
+        ("run: model, against", *AXIS_HEADER),
         tuple(rows),
-        "true: identified model against the true plant; measured: against what the sensor saw of it.",
+        "true: against where the true robot was; measured: against what the cameras saw of it.",
+        folded=True,
     )
 
 
@@ -163,96 +128,66 @@ def prediction_table(result: dict[str, Any]) -> Table:
     rows: list[tuple[str, ...]] = []
     for n, run in enumerate(result.get("validation", []), start=1):
         ratio = run.get("predicted", {}).get("normalised_squared_error")
-        rows.append((f"{n} predicted std", *map(number, predicted_row(run)), ""))
-        rows.append((f"{n} found RMS", *_rms(rms_row(run["true"])), number(ratio)))
+        rows.append((f"{n}: predicted", *map(number, predicted_row(run)), ""))
+        rows.append((f"{n}: found", *_rms(rms_row(run["true"])), number(ratio)))
     return Table(
-        "Identified model against the true plant: predicted and found",
-        ("run", *AXIS_HEADER, "normalised"),
+        "How far the true robot was expected from the model, and how far it was, RMS",
+        ("run", *AXIS_HEADER, "found²/predicted²"),
         tuple(rows),
-        "Predicted from the covariance of the parameters through the exact sensitivities, and from what the sensor's "
-        "noise does to the plant through the servo. Normalised: squared error in units of the predicted covariance; "
-        "one on average where the prediction is right. The runs share one set of parameters, so they stray together, "
-        "and the frames that the sensor was taught, whose error moves the plant as a whole and is not predicted.",
-    )
-
-
-def correlation_table(result: dict[str, Any]) -> Table:
-    """The pairs of identified parameters that the record ties together most."""
-    pairs = result["identification"].get("strongest_correlations", [])
-    rows = tuple((f"{p['first']}, {p['second']}", f"{p['correlation']:+.4f}") for p in pairs)
-    return Table(
-        "Strongest correlations of identified parameters",
-        ("parameters", "correlation"),
-        rows,
-        "Poses show friction and gains relative to each other better than their common factor, which moves all of them "
-        "together: their ratios are known better than each of them.",
+        "Predicted from the uncertainty of the parameters, and from what the cameras' noise does to the robot through "
+        "the servo. The last column is the squared error in units of what was predicted: one on average where the "
+        "prediction is right. The runs share one set of parameters, so they stray together; and the frames that the "
+        "cameras were taught, whose error moves the robot as a whole, are not predicted.",
+        folded=True,
     )
 
 
 def sensor_table(result: dict[str, Any]) -> Table:
     """Measured pose against truth."""
-    sensor, header = result["sensor"], ("frames", "lost", "stereo frames a second", *AXIS_HEADER)
+    sensor, header = result["sensor"], ("frames", "lost", "frames a second", *AXIS_HEADER)
     frames, lost, rate = sensor["frames"], sensor["lost_frames"], sensor.get("stereo_frames_per_second")
     row = (str(frames), str(lost), number(rate), *_rms(rms_row(sensor)))
-    return Table("Sensor: RMS of measured pose against truth", header, (row,))
+    return Table("Measured against true pose, RMS over all frames", header, (row,))
 
 
 def seconds_table(result: dict[str, Any]) -> Table:
     """Time of each stage."""
     rows = tuple((name, number(value)) for name, value in result.get("seconds", {}).items())
-    return Table("Time of the stages", ("stage", "seconds"), rows)
+    return Table("Time of the stages", ("stage", "seconds"), rows, folded=True)
 
 
-def changed_settings_table(result: dict[str, Any], recorded: str) -> Table:
-    """The estimator's settings that are not those of the scenario (TOML) with which the record was made."""
-    settings = result.get("settings", {})
-    planned = tomllib.loads(recorded) if settings else {}
-    rows = []
-    for key, value in settings.items():
-        section, _, name = key.partition(".")
-        before = planned.get(section, {}).get(name)
-        if value != before:
-            rows.append((key, str(value), "-" if before is None else str(before)))
-    return Table("Set anew for the identification", ("key", "value", "when the record was made"), tuple(rows))
+def settings_table(result: dict[str, Any], recorded: str) -> Table:
+    """What differs from the built-in scenario with which the recorded one (TOML) is to be compared, the settings that
+    were changed for the identification among it."""
+    base, changed = changed_settings(recorded, result.get("settings"))
+    rows = tuple((one.key, one.value, one.built_in, one.meaning) for one in changed)
+    return Table(f"What differs from the scenario {base}", ("key", "value", f"in {base}", "meaning"), rows)
 
 
-def number(value: float | None) -> str:
-    """A number with four significant digits; a dash for one that does not exist."""
-    return "-" if value is None or not math.isfinite(value) else f"{value:.4g}"
+def versions_table(result: dict[str, Any]) -> Table:
+    """Versions of the software that identified."""
+    rows = tuple((name, str(value)) for name, value in result.get("versions", {}).items())
+    return Table("Software", ("package", "version"), rows, folded=True)
 
 
 def _rms(values: list[float]) -> list[str]:
     return [number(value) if math.isfinite(value) else "diverged" for value in values]
 
 
-def _shown(entry: dict[str, Any]) -> tuple[str, str, str, str]:
-    """Estimate, deviation, interval and error; dashes for what is not identified, so that nobody quotes it."""
-    if not entry["identifiable"]:
-        return "-", "-", "-", "-"
-    interval = " to ".join(map(number, entry.get("interval", [None])))
-    return number(entry["estimate"]), number(entry["std"]), interval, _percent(entry)
-
-
-def _percent(parameter: dict[str, Any]) -> str:
-    true, estimate = parameter["true"], parameter["estimate"]
-    if not true or estimate is None:
-        return "-"
-    return f"{100 * (estimate - true) / abs(true):+.2f}"
-
-
 def print_identification(result: dict[str, Any], path: Path) -> None:
     """What is identified, how well the model explains the record, the time it took, and where all of it is."""
     identification = result["identification"]
-    entries = {kind: identification.get(kind, {}).values() for kind in ("parameters", "groups")}
-    counts = [f"{sum(bool(one['identifiable']) for one in of)} of {len(of)} {kind}" for kind, of in entries.items()]
-    seconds = result["seconds"].get("identify")
-    typer.echo(f"identified: {' and '.join(counts)}, in {number(seconds)} s")
+    kinds = {"parameters": "parameters", "groups": "sums of them that motion shows"}
+    entries = {said: identification.get(kind, {}).values() for kind, said in kinds.items()}
+    counts = [f"{sum(bool(one['identifiable']) for one in of)} of {len(of)} {said}" for said, of in entries.items()]
+    typer.echo(f"identified: {' and '.join(counts)}, in {number(result['seconds'].get('identify'))} s")
     goals = explanation_goals(result)
     for goal in goals:
-        typer.echo(f"{goal.name}: {number(goal.value)} {goal.unit}".rstrip() + f": {goal.detail}")
-    if goals:
-        verdict = "explains" if all(goal.passed for goal in goals) else "does NOT explain"
-        typer.echo(f"the model {verdict} the record")
+        typer.echo(f"{goal.name}: {number(goal.value)} {goal.unit}: {goal.detail}")
+    if goals and all(goal.passed for goal in goals):
+        typer.echo("the model explains the record to within the cameras' noise")
+    elif goals:
+        typer.echo("the model does NOT explain the record: it is wrong, or the cameras err by more than they state")
     typer.echo(f"result: {path}")
 
 

@@ -55,16 +55,17 @@ def test_identify_says_whether_the_model_explains_the_record_and_warns_even_wher
     assert "the model explains the record" in out
     save_result(run_folder.result, warned(load_result(run_folder.result)))
     said = (
-        "identified: 4 of 5 parameters and 1 of 1 groups",
-        "1.356 times the noise variance, noise alone gives 1.100 ± 0.040",
-        "the model does NOT explain the record",
+        "identified: 4 of 5 parameters and 1 of 1 sums of them that motion shows",
+        "residuals of the model: 1.356 × noise: mean square of",
+        "noise alone leaves 1.100 ± 0.040",
+        "the model does NOT explain the record: it is wrong, or the cameras err by more than they state",
         str(run_folder.result),
     )
     for quiet in (True, False):
         assert command("identify", "--out", run_folder.path, *["--quiet"] * quiet) == 0
         out, err = capfd.readouterr()
         assert err == "warning: not white\nwarning: a b\n"
-        assert [text in out for text in said] == 4 * [not quiet]
+        assert [text in out for text in said] == 5 * [not quiet]
 
 
 def test_run_passes_its_arguments_on_warns_of_a_wrong_plant_and_names_the_goals_missed(
@@ -82,8 +83,8 @@ def test_run_passes_its_arguments_on_warns_of_a_wrong_plant_and_names_the_goals_
     out, err = capfd.readouterr()
     assert err == "warning: not white\nwarning: a b\n"
     missed = [line.split(":")[1] for line in out.splitlines() if line.startswith("missed: ")]
-    assert missed == [" misfit of the record", " white residuals"]
-    assert "missed: misfit of the record: residuals 1.356 times the noise variance" in out
+    assert missed == [" residuals of the model", " chance of such residuals"]
+    assert "missed: residuals of the model: mean square of measured minus identified pose" in out
 
 
 def test_stages_read_the_folder_that_the_one_before_wrote_and_identify_takes_settings(calls, run_folder, capfd):
@@ -107,8 +108,11 @@ def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_
     save_result(run_folder.result, result)
     assert command("report", "--out", run_folder.path) == 0
     shown = capsys.readouterr().out
-    assert "missed: friction and PID outside: of 3 within 5 % of truth or 3 std; outside: joint1.viscous\n" in shown
-    assert all(text in shown for text in ("unseen position", "urad", "stereo frames", str(run_folder.report)))
+    missed = (
+        "missed: friction and gains far off: of 3: estimates off the truth by more than 5 % and more than 3 standard"
+    )
+    assert f"{missed} deviations, joint1.viscous\n" in shown
+    assert all(text in shown for text in ("unseen motion, position", "µrad", "stereo frames", str(run_folder.report)))
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from identify.estimation.identifiability import (
 from identify.estimation.identification import identify
 from identify.estimation.prior import holding_torque, starting_guess
 from identify.estimation.scale_anchor import ScaleAnchor, read_anchor, store_anchor
-from identify.reporting.tables import ON_GUESS, parameter_table
+from identify.reporting.parameter_tables import ON_GUESS, parameter_table
 from tests.identify.commands import command
 from tests.identify.synthetic import (
     LAYOUT,

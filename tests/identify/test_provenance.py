@@ -11,7 +11,8 @@ from identify.files.run_folder import load_result, save_result
 from identify.progress import SilentProgress
 from identify.record.provenance import ENTRY, RunFiles, array_digest, digest
 from identify.record.recording import EXCITATION, read, read_model_runs, read_runs, write, write_model_runs, write_runs
-from identify.reporting.report import read_report_data, write_report
+from identify.reporting.report import write_report
+from identify.reporting.run_data import read_run
 from identify.reporting.run_result import parameter_vector
 from tests.identify.commands import command, one_line
 from tests.identify.synthetic import LAYOUT, NAMES, SHORT, rss6, short_run, truth
@@ -73,7 +74,7 @@ def test_a_report_takes_the_results_own_files_and_refuses_others_and_an_estimate
     bare = load_result(run_folder.result)
     made_of = RunFiles(run_folder).digests("experiment.nc", "covariance.nc", "validation.nc", "model.nc")
     save_result(run_folder.result, bare | {ENTRY: made_of})
-    assert len(read_report_data(run_folder).validation) == 2
+    assert len(read_run(run_folder).validation) == 2
     for replace, file, says, stage in (
         (other_experiment, "experiment.nc", "of another record than experiment.nc", "identify"),
         (other_covariance, "covariance.nc", "of another covariance.nc", "identify"),
@@ -89,7 +90,7 @@ def test_a_report_takes_the_results_own_files_and_refuses_others_and_an_estimate
     with pytest.raises(OutputFolderError, match=r"no payload\.nc; write it with: cmmsim record"):
         write_report(run_folder.path)
     save_result(run_folder.result, bare)
-    read_report_data(run_folder)  # a result that states no digest asks nothing
+    read_run(run_folder)  # a result that states no digest asks nothing
     bare["identification"]["parameters"]["joint1.coulomb"]["estimate"] = -5
     save_result(run_folder.result, bare)
     with pytest.raises(RecordError, match=r"json: the estimate -5 of joint1.coulomb is outside its interval 0.103"):

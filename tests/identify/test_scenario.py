@@ -17,9 +17,10 @@ from identify.experiment.sensor_in_loop import make_sensor
 from identify.files.run_folder import load_result
 from identify.progress import SilentProgress
 from identify.record.recording import read
-from identify.reporting.report import provenance_section, read_report_data
+from identify.reporting.run_data import read_run
 from identify.reporting.run_result import parameter_vector
-from identify.reporting.tables import changed_settings_table
+from identify.reporting.sections import provenance_section
+from identify.reporting.settings import changed_settings
 from identify.scenario import Scenario, load_scenario, scenario_from_toml, scenario_names
 from identify.scenario.scenario import SECTIONS, estimator_settings, with_estimator_settings
 from tests.identify.commands import command, one_line, refusal
@@ -247,8 +248,10 @@ def test_a_setting_acts_and_is_kept_for_the_next_stages_and_the_reader(recorded_
     expected = identify(read(recorded_folder.experiment), rss6(), SHORT.with_overrides(DRIVEN))
     np.testing.assert_array_equal(parameter_vector(rss6(), result["identification"], "estimate"), expected.estimate)
     assert result["identification"]["searches"] == ["command_driven"]
-    table = changed_settings_table(result, read(recorded_folder.experiment).attrs["scenario"])
-    assert table.rows == (("identification.method", "command_driven", "closed_loop"),)
+    _, changed = changed_settings(read(recorded_folder.experiment).attrs["scenario"], result["settings"])
+    method = next(one for one in changed if one.key == "identification.method")
+    assert (method.value, method.built_in) == ("command_driven", "closed_loop")
+    assert method.meaning.endswith("when the record was made: closed_loop")
     pipeline.identify(recorded_folder.path, SilentProgress())
     assert load_result(recorded_folder.result)["identification"]["searches"] == ["command_driven"]
 
@@ -265,8 +268,7 @@ def test_without_settings_the_scenario_is_left_as_it_is_and_by_an_identification
     assert recorded_folder.scenario.read_text(encoding="utf-8") == mine
     result = load_result(recorded_folder.result)
     assert result["settings"] == estimator_settings(SHORT)
-    assert changed_settings_table(result, SHORT.to_toml()).rows == ()
-    assert changed_settings_table({}, "").rows == ()
+    assert changed_settings(SHORT.to_toml(), result["settings"]) == changed_settings(SHORT.to_toml())
 
 
 def test_what_the_record_was_made_with_is_refused_in_one_line_and_every_setting_of_the_sections_is_listed(
@@ -286,10 +288,21 @@ def test_what_the_record_was_made_with_is_refused_in_one_line_and_every_setting_
     assert listed == set(SECTIONS) < set(Scenario.model_fields)
 
 
-def test_the_report_says_what_was_set_anew(run_folder):
-    data = read_report_data(run_folder)
-    assert [table.title for table in provenance_section(data).tables] == ["Time of the stages", "Scenario", "Software"]
+def test_the_report_says_what_differs_from_the_built_in_scenario_and_what_was_set_anew(run_folder):
+    """Beside it everything is folded: the times, the versions, and the scenario as a whole."""
+    assert changed_settings(load_scenario("quick").to_toml()) == ("quick", [])
+    mine = load_scenario("quick").with_overrides({"name": "mine", "timing.latency_s": 0.01})
+    base, changed = changed_settings(mine.to_toml())
+    assert base == "paper"
+    assert ("timing.latency_s", "0.01", "0.0") in [one[:3] for one in changed]
+    data = read_run(run_folder)
     data.result["settings"] = {"model.steps_per_frame": 9, "filter.order": 8, "identification.anchor_std": 0.1}
-    _, changed, scenario, _ = provenance_section(data).tables
-    assert changed.rows == (("model.steps_per_frame", "9", "4"), ("identification.anchor_std", "0.1", "-"))
-    assert ("model.steps_per_frame", "4") in [row[:2] for row in scenario.rows]
+    section = provenance_section(data)
+    rows = {row[0]: row for row in section.tables[0].rows}
+    assert section.tables[0].title == "What differs from the scenario quick"
+    assert rows["model.steps_per_frame"][1:3] == ("9", "4")
+    assert rows["model.steps_per_frame"][3].endswith("when the record was made: 4")
+    assert rows["identification.anchor_std"][1:3] == ("0.1", "-")
+    assert "filter.order" not in rows
+    assert [table.folded for table in section.tables] == [False, True, True]
+    assert section.folds[0].text == data.scenario_toml

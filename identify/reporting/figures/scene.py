@@ -1,0 +1,66 @@
+"""What an experiment looks like: the scene above both camera images, and the images with their residuals."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from identify.arrays import Array
+from identify.reporting.figures.motion import round_down
+from identify.reporting.figures.style import WIDTH
+from identify.scene import StereoView, View, Workcell, stereo_figure
+from identify.scene.figures import FOUND, SIDES, draw_scene, show_image
+
+OVERVIEW = (4.8, 4.9)
+"""Width and height of the overview, inches."""
+
+BENEATH = 0.4
+"""Share of its height that the images take."""
+
+
+def overview_figure(cell: Workcell, pose: Array, view: StereoView | None = None) -> Figure:
+    """Robot, stickers and cameras with the platform at a pose (6,), and beneath it what both cameras see of it.
+
+    Higher than it is wide, as a phone is. Raises dynamics.UnreachablePoseError, dynamics.ChartError.
+    """
+    width, height = OVERVIEW
+    beneath = 0.0 if view is None else BENEATH
+    figure = Figure(figsize=(width, height * (1 - BENEATH + beneath)))
+    axes = figure.add_axes((0.08, beneath, 0.87, 1 - beneath))
+    draw_scene(axes, cell, pose, View(), rays=True, labels=True)
+    if view is not None:
+        side = (beneath - 0.05) * height / width
+        for number, name in enumerate(SIDES):
+            axes = figure.add_axes((0.5 + (number - 1) * side + (number - 0.5) * 0.04, 0.0, side, beneath - 0.05))
+            show_image(axes, view, number)
+            for body, found in view.found.items():
+                x, y = found.centres[number].T
+                axes.scatter(x, y, s=9, facecolors="none", edgecolors=FOUND[body], linewidths=0.5)
+            axes.set(xticks=[], yticks=[], xlabel="")
+            axes.set_title(f"seen by the {name} camera", fontsize=8, pad=2)
+    return figure
+
+
+ARROW = 0.12
+"""Of the image's width: the longest arrow, at most."""
+
+
+def residual_figure(view: StereoView) -> Figure:
+    """Both camera images with the detected ellipses, and how far each detected centre is from the true one: arrows,
+    enlarged, beside one whose length is written in px."""
+    errors = np.concatenate([(found.centres - found.expected).reshape(-1, 2) for found in view.found.values()])
+    longest = float(np.linalg.norm(errors, axis=1).max(initial=1e-6))
+    width = view.images.shape[2]
+    factor = round_down(ARROW * width / longest)
+    figure = stereo_figure(view, size=(WIDTH, 0.66 * WIDTH), arrows=factor)
+    for axes in figure.axes:
+        axes.grid(visible=False)
+    _scale_arrow(figure.axes[0], width, factor, round_down(ARROW * width / factor))
+    return figure
+
+
+def _scale_arrow(axes: Axes, width: int, factor: float, length: float) -> None:
+    """An arrow that stands for a length, px, in the lower left corner of an image."""
+    (left, _), (low, high) = axes.get_xlim(), axes.get_ylim()
+    foot = left + 0.04 * width, low + 0.05 * (high - low)
+    axes.quiver(*foot, factor * length, 0.0, angles="xy", scale_units="xy", scale=1, color="white", width=0.004)
+    axes.annotate(f"{length:g} px", foot, xytext=(0, 4), textcoords="offset points", color="white", fontsize=7.5)

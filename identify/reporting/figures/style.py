@@ -1,0 +1,125 @@
+"""What all figures share: a size and fonts for print, and colours whose curves also differ without colour.
+
+Every curve has a line style or a marker of its own. A report replaces the colours by those of its reader's screen, so
+figures take theirs from `PALETTE`, and nowhere else.
+"""
+
+import io
+import re
+from collections.abc import Callable
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from identify.arrays import Array
+
+WIDTH = 7.1
+"""Inches: both columns of a journal's page."""
+
+COLUMN = 3.5
+"""Inches: one column."""
+
+PALETTE = {
+    "ink": "#000000",
+    "paper": "#ffffff",
+    "grey": "#5f6368",
+    "line": "#d4d4d4",
+    "blue": "#0067a5",
+    "red": "#b84a00",
+    "green": "#00704f",
+    "wine": "#8a2258",
+    "amber": "#7a6000",
+    "indigo": "#3b2a94",
+}
+INK, PAPER, GREY, LINE, BLUE, RED, GREEN, WINE, AMBER, INDIGO = PALETTE.values()
+
+STYLE: Any = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8,
+    "axes.titlesize": 8.5,
+    "axes.titlelocation": "left",
+    "axes.labelsize": 8,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "axes.edgecolor": GREY,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": LINE,
+    "grid.linewidth": 0.5,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "lines.linewidth": 1.1,
+    "lines.markersize": 3.5,
+    "hatch.linewidth": 0.6,
+    "pdf.fonttype": 42,  # text that stays text
+    "svg.fonttype": "none",
+}
+
+COMPONENTS = ("x", "y", "z", "α", "β", "γ")
+LETTERS = ("(a)", "(b)", "(c)", "(d)", "(e)", "(f)")
+UNITS = ("µm", "µm", "µm", "µrad", "µrad", "µrad")
+LINES: tuple[dict[str, Any], ...] = (
+    {"color": BLUE, "linestyle": "-"},
+    {"color": RED, "linestyle": "--"},
+    {"color": GREEN, "linestyle": "-."},
+    {"color": WINE, "linestyle": "-"},
+    {"color": AMBER, "linestyle": "--"},
+    {"color": INDIGO, "linestyle": "-."},
+)
+"""One for each component of a pose."""
+
+STILL = 1e-9
+"""m, rad: a component whose range is smaller does not move."""
+
+
+def drawn(draw: Callable[[], Figure]) -> Figure:
+    """A figure in this style, laid out once for all files that are made of it."""
+    with mpl.rc_context(STYLE):
+        figure = draw()
+        if figure.get_layout_engine():
+            figure.draw_without_rendering()
+            figure.set_layout_engine("none")
+        return figure
+
+
+def svg_text(figure: Figure, name: str) -> str:
+    """A figure as an <svg> element, whose identifiers begin with a name, so that several may share a page."""
+    with mpl.rc_context(STYLE | {"svg.hashsalt": name}):
+        stream = io.StringIO()
+        figure.savefig(stream, format="svg", transparent=True, metadata={"Date": None})
+    text = stream.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
+    text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{name}-", text)
+    text = re.sub(r"(\d\.\d\d)\d+", r"\g<1>", text)  # hundredths of a point
+    return re.sub(r"\s*\n\s*", "\n", text)
+
+
+def moving(poses: Array) -> list[int]:
+    """The components of poses (N, 6) [m, rad] that move, NaN being no place."""
+    return [i for i in range(6) if np.nanmax(poses[:, i]) - np.nanmin(poses[:, i]) > STILL]
+
+
+def panel_grid(count: int, width: float, height: float, above: float = 0.0, **shared: Any) -> tuple[Figure, list[Axes]]:
+    """A figure with so many panels of that size, inches, three beside each other, and room above them for a title."""
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(width * columns, above + height * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, **shared).ravel().tolist()
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    return figure, panels[:count]
+
+
+def legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:
+    """The legend of a panel above all of them."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper left", ncols=columns, handlelength=3.0)

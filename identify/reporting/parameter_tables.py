@@ -1,0 +1,144 @@
+"""Tables of the parameters: what is identified, what is not and why, and the sums that motion shows."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from identify.estimation.identifiability import RESTS_ON_PRIOR
+from identify.reporting.numbers import interval, number, rounded, with_deviation
+from identify.reporting.tables import Table
+
+ON_GUESS = "rests on starting values"
+
+Entry = dict[str, Any]
+
+
+def parameter_table(result: dict[str, Any]) -> Table:
+    """The identified parameters: starting value, truth where it is known, estimate with deviation and interval."""
+    identification = result["identification"]
+    rows = [
+        (
+            name,
+            p["unit"].replace("^2", "²"),
+            *_shown(p, abs(p["initial"] or 0.0)),
+            ON_GUESS if p.get("rests_on_prior") else "",
+        )
+        for name, p in identification["parameters"].items()
+        if p["identifiable"]
+    ]
+    note = "The interval holds the truth in 95 % of such experiments; it ends where no such value can exist. "
+    if any(row[-1] for row in rows):
+        note += (
+            f"One that {ON_GUESS} is shown only in sums with other parameters: it is right where their starting "
+            "values are, within the standard deviations that were stated for them."
+        )
+    header = ("parameter", "unit", "start", "truth", "estimate ± standard deviation", "95 % interval", "error [%]", "")
+    return Table(f"The {len(rows)} identified parameters", header, tuple(rows), note).without_empty()
+
+
+def scale_sentence(identification: Mapping[str, Any]) -> str:
+    """What fixes the common factor of all parameters, or that what was to fix it does not."""
+    anchor = identification["scale_anchor"]
+    said, gain = ANCHORS.get(anchor, anchor), identification["parameters"].get("joint_pid.lp", {})
+    share = gain.get("prior_share") or 0.0
+    if anchor == "prior" or share <= RESTS_ON_PRIOR:
+        return f"The overall scale is fixed by {said}."
+    return (
+        f"The overall scale should be fixed by {said}, but is not: {100 * share:.0f} % of the variance of joint_pid.lp "
+        "comes from the starting values, and all that is given in kg, N m or N is as good as those."
+    )
+
+
+ANCHORS = {
+    "platform_mass": "the weighed mass of the platform",
+    "joint_gain": "a known gain of the joint controller",
+    "payload": "a second run under a known load",
+    "prior": "the starting values alone: all of them may be off by one common factor",
+}
+
+
+def group_table(result: dict[str, Any]) -> Table:
+    """Base parameters: the combinations of parameters that motion can show, with truth, estimate and deviation."""
+    identification = result["identification"]
+    rows = []
+    for group in identification.get("groups", {}).values():
+        if len(group["coefficients"]) > 1:
+            known = _remark(group) if group["identifiable"] else "not identified"
+            shown = _shown(group, _size(group, identification["parameters"]))
+            rows.append((group["expression"].replace(" - ", " − "), *shown[:-1], _deviations(group), known))
+    note = (
+        "In the SI unit of the first parameter of each sum. A sum may be known where none of its members is: it "
+        "counts as identified when little of the size of its members is in doubt, though it may almost vanish itself."
+    )
+    header = ("sum", "start", "truth", "estimate ± standard deviation", "95 % interval", "error / deviation", "")
+    return Table(f"The {len(rows)} sums that motion shows", header, tuple(rows), note, folded=True).without_empty()
+
+
+def correlation_table(result: dict[str, Any]) -> Table:
+    """The pairs of identified parameters that the record ties together most."""
+    pairs = result["identification"].get("strongest_correlations", [])
+    rows = tuple((f"{p['first']}, {p['second']}", f"{p['correlation']:+.4f}".replace("-", "−")) for p in pairs)
+    return Table(
+        "Strongest correlations of identified parameters",
+        ("parameters", "correlation"),
+        rows,
+        "Poses show friction and gains relative to each other better than their common factor, which moves all of them "
+        "together: their ratios are known better than each of them.",
+        folded=True,
+    )
+
+
+def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
+    """Why parameters are not identified, in a sentence each, with the names of those that it is true of."""
+    parameters, groups = identification["parameters"], identification.get("groups", {}).values()
+    alone = {name for group in groups for name in group["coefficients"] if len(group["coefficients"]) == 1}
+    summed = {name for group in groups for name in group["coefficients"] if len(group["coefficients"]) > 1}
+    left = [name for name, p in parameters.items() if not p["identifiable"]]
+    if left and len(left) == len(parameters):
+        return [("the model does not explain the record, so that no estimate can be trusted", left)]
+    shown = alone | {name for name in parameters if name.startswith("joint_pid.")}
+    kinds = {
+        "motion shows them only in sums with others, and not one by one; the sums are what is known": [
+            name for name in left if name in summed
+        ],
+        "this record shows them too badly. It neither halves what the starting value left open, nor leaves less than "
+        "half of their size in doubt. More or faster motion may show them": [n for n in left if n in shown],
+        "no motion of this robot depends on them": [name for name in left if name not in summed | shown],
+    }
+    return [(reason, names) for reason, names in kinds.items() if names]
+
+
+def _remark(entry: Entry) -> str:
+    return ON_GUESS if entry.get("rests_on_prior") else ""
+
+
+def _shown(entry: Entry, size: float) -> tuple[str, ...]:
+    """Start, truth, estimate, interval and error; dashes for what is not identified, so that nobody quotes it.
+
+    size: of what the entry is made of; what is nothing but rounding beside it is zero.
+    """
+    start, true = (number(rounded(entry[key], size)) for key in ("initial", "true"))
+    if not entry["identifiable"] or entry["estimate"] is None:
+        return start, true, "-", "-", "-"
+    ends = entry.get("interval") or [None, None]
+    reach = "-" if None in ends else interval(*ends)
+    return start, true, with_deviation(entry["estimate"], entry["std"]), reach, _percent(entry, size)
+
+
+def _deviations(group: Entry) -> str:
+    """The error in standard deviations."""
+    true, estimate, std = group["true"], group["estimate"], group["std"]
+    if not group["identifiable"] or true is None or estimate is None or not std:
+        return "-"
+    return f"{(estimate - true) / std:+.1f}".replace("-", "−")
+
+
+def _size(group: Entry, parameters: Mapping[str, Entry]) -> float:
+    """Of the parts of a sum, by their starting values."""
+    return sum(abs(weight * (parameters[name]["initial"] or 0.0)) for name, weight in group["coefficients"].items())
+
+
+def _percent(entry: Entry, size: float) -> str:
+    true, estimate = rounded(entry["true"], size), entry["estimate"]
+    if not true or estimate is None:
+        return "-"
+    return f"{100 * (estimate - true) / abs(true):+.2f}".replace("-", "−")

@@ -1,0 +1,171 @@
+"""All that a report shows of a run, read from its files; of a record of a real robot there is less."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from cmmsim import CmmError
+from dynamics import DynamicsError, load_robot
+from identify.arrays import Array
+from identify.errors import IdentifyError, RecordError
+from identify.estimation.covariance import correlation_matrix
+from identify.experiment.truth import read_truth, true_poses
+from identify.files.dataset import group_names
+from identify.files.run_folder import RunFolder, check_entries, load_result
+from identify.record.provenance import RECORDS, RunFiles, recorded_scenario
+from identify.record.recording import EXCITATION, TRUTH_GROUP, poses, run_name
+from identify.reporting.figures.fit import Fit
+from identify.reporting.paper import repeats_the_paper
+from identify.reporting.run_result import check_intervals
+from identify.reporting.verdict import cameras_acquitted
+from identify.scenario import Scenario
+from identify.scene import StereoView, Workcell, stereo_view, workcell, workcell_of_scenario
+from identify.trajectory import TrajectorySet, load_trajectories
+
+
+@dataclass(frozen=True)
+class RunData:
+    """The result, the record with its truth, the unseen runs with the truth of the first one, what the models do on
+    both, the covariance (p, p) of the parameters with their names (p,), and the trajectories. What is not known of a
+    record of a real robot is None or empty: truth, unseen runs, trajectories."""
+
+    result: dict[str, Any]
+    experiment: xr.Dataset
+    truth: xr.Dataset | None
+    validation: list[xr.Dataset]
+    validation_truth: xr.Dataset | None
+    models: Mapping[str, xr.Dataset]
+    covariance: Array
+    names: tuple[str, ...]
+    trajectories: TrajectorySet | None = None
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot."""
+        return str(self.experiment.attrs.get("robot", "of an unknown name"))
+
+    @property
+    def scenario_toml(self) -> str:
+        """The scenario that the record was made with."""
+        return str(self.experiment.attrs.get("scenario", ""))
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """The same, read. Raises RecordError: the record states none, or one that cannot be read."""
+        return recorded_scenario(self.experiment)
+
+    @cached_property
+    def beside_paper(self) -> bool:
+        """Whether this run repeats the paper's experiment, so that its figures may stand beside the paper's."""
+        return repeats_the_paper(self.scenario_toml)
+
+    @cached_property
+    def cameras_acquitted(self) -> bool | None:
+        """Whether the cameras cannot be the cause of what a model leaves; None where no truth is known."""
+        return cameras_acquitted(self.experiment, self.truth)
+
+    @cached_property
+    def scene(self) -> Workcell | str:
+        """Robot and cameras as the scenario places them, the robot alone where the record is of a real one; why there
+        is nothing to draw where a file is gone."""
+        try:
+            robot = load_robot(self.scenario.robot)
+            return workcell(robot) if self.truth is None else workcell_of_scenario(self.scenario, robot)
+        except (CmmError, DynamicsError, IdentifyError) as error:
+            return str(error)
+
+    @cached_property
+    def stereo_view(self) -> StereoView | None:
+        """What both cameras of a simulated run see at its middle, drawn anew from scenario, seed and true pose."""
+        if self.truth is None or isinstance(self.scene, str):
+            return None
+        try:
+            return stereo_view(self.scene, self.middle, seed=int(self.experiment.attrs.get("seed", 0)))
+        except (CmmError, DynamicsError):
+            return None
+
+    @property
+    def middle(self) -> Array:
+        """Pose (6,) of the platform half way through the record, m and rad: the true one where it is known."""
+        measured = poses(self.experiment, "reference") if self.truth is None else true_poses(self.truth)
+        return measured[len(measured) // 2]
+
+    @cached_property
+    def excitation_fit(self) -> Fit:
+        """Measurement and models on the exciting trajectory."""
+        covariances = self.experiment["measured_covariance"].values
+        noise = np.sqrt(np.nanmean(np.diagonal(covariances, axis1=1, axis2=2), axis=0))
+        fit = replace(_fit(self.experiment, self.models[EXCITATION]), noise=noise)
+        return fit if self.truth is None else replace(fit, truth=true_poses(self.truth))
+
+    @cached_property
+    def validation_fit(self) -> Fit | None:
+        """Measurement, models and truth on the first unseen trajectory; None where there is none."""
+        if not self.validation or self.validation_truth is None:
+            return None
+        fit, model = _fit(self.validation[0], self.models[run_name(1)]), self.models[run_name(1)]
+        std = poses(model, "std") if "std_position" in model else None
+        return replace(fit, truth=true_poses(self.validation_truth), std=std)
+
+    @cached_property
+    def correlations(self) -> tuple[Array, list[str]]:
+        """Correlations (n, n) of the identified parameters, and their names."""
+        parameters = self.result["identification"]["parameters"]
+        chosen = [k for k, name in enumerate(self.names) if parameters.get(name, {}).get("identifiable")]
+        return correlation_matrix(self.covariance[np.ix_(chosen, chosen)]), [self.names[k] for k in chosen]
+
+
+def _fit(record: xr.Dataset, model: xr.Dataset) -> Fit:
+    initial = poses(model, "initial")
+    return Fit(
+        time=record["time"].values,
+        measured=poses(record, "measured"),
+        identified=poses(model, "identified"),
+        initial=initial if np.isfinite(initial).any() else None,
+    )
+
+
+def read_run(run: RunFolder) -> RunData:
+    """Read what the stages of a run wrote. A record without truth needs no validation.
+
+    Raises OutputFolderError: an earlier stage has not been run. Raises RecordError: a file is damaged, or the files are
+    not of one run.
+    """
+    run.require("result.json", "covariance.nc", "experiment.nc")
+    files, simulated = RunFiles(run), TRUTH_GROUP in group_names(run.experiment)
+    run.require(*(["validation.nc"] if simulated else []), "model.nc")
+    result = _checked_result(run, files, simulated)
+    data = RunData(
+        result=result,
+        experiment=files.experiment,
+        truth=read_truth(run.experiment) if simulated else None,
+        validation=files.validation if simulated else [],
+        validation_truth=read_truth(run.validation, run_name(1)) if simulated else None,
+        models=files.model,
+        covariance=files.covariance,
+        names=files.named_covariance[0],
+        trajectories=load_trajectories(run.trajectories) if run.trajectories.is_file() else None,
+    )
+    records = {EXCITATION: data.experiment}
+    records |= {run_name(number): record for number, record in enumerate(data.validation, start=1)}
+    for name, record in records.items():
+        if name not in data.models or data.models[name].sizes["time"] != record.sizes["time"]:
+            raise RecordError(f"{run.model} does not belong to the records of {run.path}: run {name} differs")
+    return data
+
+
+def _checked_result(run: RunFolder, files: RunFiles, simulated: bool) -> dict[str, Any]:
+    """The whole result of a run, made of the files that are there."""
+    result = load_result(run.result)
+    check_entries(run.result, result, "identify", *(["validate"] if simulated else []))
+    later = ["validation.nc"] if simulated else []
+    files.check_made_of(*RECORDS, "covariance.nc", *later, "model.nc", result=result)
+    try:
+        check_intervals(result["identification"])
+    except RecordError as error:
+        raise RecordError(f"{run.result}: {error}; run `cmmsim identify --out {run.path}` again") from None
+    return result
