@@ -103,6 +103,8 @@ class StereoRig:
 
     def moved(self, changes: Array) -> StereoRig:
         """The rig with changes (24,) of its parameters; its camera frame C stays that of the left camera."""
+        if not changes.any():
+            return self
         values = self.parameters + changes
         left, right = (
             camera_from(each, camera.width, camera.height)

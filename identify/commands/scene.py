@@ -51,7 +51,7 @@ def replay(
 
 
 def show(
-    names: Annotated[list[str], typer.Argument(metavar="NAME|FILE...", help="A robot, a sensor, or one of each.")],
+    names: Annotated[list[str], typer.Argument(metavar="NAME|FILE", help="A robot, a sensor, or one of each.")],
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="Page to write.", show_default="NAME.html")
     ] = None,
