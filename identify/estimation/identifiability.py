@@ -143,8 +143,8 @@ def scale_warnings(anchor: ScaleAnchor, share: float) -> tuple[str, ...]:
     if anchor.value is None or share <= RESTS_ON_PRIOR:
         return ()
     return (
-        f"the scale anchor {anchor.name} does not fix the scale of this robot: poses show what was measured only in sums "
-        f"with other parameters, and {share:.0%} of the variance of joint_pid.lp comes from the starting values; all "
+        f"the scale anchor {anchor.name} does not fix the scale of this robot: poses show what was measured only in "
+        f"sums with other parameters, and {share:.0%} of the variance of joint_pid.lp comes from the starting values; all "
         "that is given in kg, N m or N is as good as these: take identification.scale_anchor = joint_gain, or state "
         "what else was weighed in identification.prior",
     )
