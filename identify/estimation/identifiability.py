@@ -144,9 +144,9 @@ def scale_warnings(anchor: ScaleAnchor, share: float) -> tuple[str, ...]:
         return ()
     return (
         f"the scale anchor {anchor.name} does not fix the scale of this robot: poses show what was measured only in "
-        f"sums with other parameters, and {share:.0%} of the variance of joint_pid.lp comes from the starting values; all "
-        "that is given in kg, N m or N is as good as these: take identification.scale_anchor = joint_gain, or state "
-        "what else was weighed in identification.prior",
+        f"sums with other parameters, and {share:.0%} of the variance of joint_pid.lp comes from the starting values; "
+        "all that is given in kg, N m or N is as good as these: take identification.scale_anchor = joint_gain, or "
+        "state in identification.prior what else was weighed",
     )
 
 
