@@ -1,7 +1,8 @@
 """The stages of a run, each reading what the one before wrote into the run folder."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import xarray as xr
 import cmmsim
 from dynamics import Robot, load_robot
 from identify.arrays import Array
-from identify.errors import EstimationError, RecordError
+from identify.errors import EstimationError, OutputFolderError, RecordError
 from identify.estimation import identification
+from identify.estimation.result import IdentificationResult
 from identify.excitation.design import design_trajectories
 from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import compile_robots, excitation_run, taught_sensor, teach, untaught_sensor
@@ -25,6 +27,7 @@ from identify.loop_parameters import check_parameter_set
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.checks import check_length, check_trajectory
+from identify.record.own_record import read_own_records
 from identify.record.provenance import ENTRY, RECORDS, RunFiles, check_robot, digest
 from identify.record.recorded_run import recorded_reference
 from identify.record.recording import build_model_run, write_model_runs
@@ -97,36 +100,87 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
     holds them for the stages that follow.
     Raises as `identification.identify` does, and ScenarioError for a setting that the record was made with.
     """
-    run_folder, planned, trajectories, robot = _open(folder)
+    run_folder = RunFolder(folder)
+    if run_folder.holds_own_record:
+        planned, seed = load_scenario(run_folder.scenario), None
+    else:
+        _, planned, trajectories, _ = _open(folder)
+        seed = trajectories.seed
     scenario = with_estimator_settings(planned, settings or {})
-    began = time.perf_counter()
     files, names = RunFiles(run_folder), _record_files(scenario)
     run_folder.require(*names)
-    records = [files.content(name) for name in names]
-    for name, one in zip(names, records, strict=True):
-        _check_planned(run_folder.path / name, one, scenario, trajectories)
-    result = identification.identify(records, robot, scenario, progress)
-    seen = files.experiment
-    measured, ok = recording.poses(seen, "measured"), seen["measured_ok"].values.astype(bool)
-    reference = recorded_reference(seen)
-    before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))
-    seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
+    records = {name: files.content(name) for name in names}
+    if seed is not None:
+        for name, one in records.items():
+            _check_planned(run_folder.path / name, one, scenario, trajectories)
+    found = _identified(records, scenario, progress)
     if scenario != planned:
         write_text(run_folder.scenario, scenario.to_toml())
+    _write_identified(run_folder, found, scenario, seed)
+
+
+def identify_own(paths: Sequence[Path], folder: Path, progress: Progress, settings: Mapping[str, Any]) -> None:
+    """Estimate the parameters from records of one's own, `read_own_records`; writes a run folder without the truth.
+
+    Nothing is written where they cannot carry an identification. Raises as `identify`, and as `read_own_records`.
+    """
+    run_folder = RunFolder(folder)
+    contents, stated = read_own_records(list(paths))
+    scenario = with_estimator_settings(stated, settings)
+    records = dict(zip(RECORDS, contents, strict=False))
+    found = _identified(records, scenario, progress)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(run_folder.scenario, scenario.to_toml())
+    for name, one in records.items():
+        recording.write(run_folder.path / name, one)
+    _write_identified(run_folder, found, scenario, None)
+
+
+@dataclass(frozen=True)
+class _Identified:
+    """Records by file, what an identification made of them, the models' poses (N, 6) on the first, before and after,
+    and the time that it took."""
+
+    records: Mapping[str, xr.Dataset]
+    result: IdentificationResult
+    models: tuple[Array, Array]
+    seconds: float
+
+    @property
+    def record(self) -> xr.Dataset:
+        """The first record."""
+        return next(iter(self.records.values()))
+
+
+def _identified(records: Mapping[str, xr.Dataset], scenario: Scenario, progress: Progress) -> _Identified:
+    began, robot = time.perf_counter(), load_robot(scenario.robot)
+    result = identification.identify(list(records.values()), robot, scenario, progress)
+    reference = recorded_reference(next(iter(records.values())))
+    before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))
+    return _Identified(records, result, (before, after), time.perf_counter() - began)
+
+
+def _write_identified(run_folder: RunFolder, found: _Identified, scenario: Scenario, seed: int | None) -> None:
+    """Write covariance.nc and result.json; and of a record of one's own, which has no seed, model.nc: `validate`, which
+    writes it else, has nothing to judge it by."""
+    seen, result = found.record, found.result
+    measured, ok = recording.poses(seen, "measured"), seen["measured_ok"].values.astype(bool)
+    before, after = found.models
+    made_of = {name: digest(one) for name, one in found.records.items()} | {"covariance.nc": digest(result.covariance)}
+    if seed is None:
+        runs = write_model_runs(run_folder.model, build_model_run(seen["time"].values, before, after))
+        made_of["model.nc"] = digest(runs)
+    seconds = {f"identify.{stage}": value for stage, value in result.seconds.items()}
     write_covariance(run_folder.covariance, result.layout, result.covariance)
     save_result(
         run_folder.result,
         {
             "scenario": scenario.name,
-            "seed": trajectories.seed,
+            "seed": seed,
             "settings": estimator_settings(scenario),
             "versions": versions(),
-            ENTRY: files.digests(*names) | {"covariance.nc": digest(result.covariance)},
-            "seconds": {
-                "record": seen.attrs.get("record_seconds"),
-                "identify": time.perf_counter() - began,
-                **seconds,
-            },
+            ENTRY: made_of,
+            "seconds": {"record": seen.attrs.get("record_seconds"), "identify": found.seconds, **seconds},
             "identification": result.to_dict(),
             "before": rms_figures(before - measured, ok),
             "after": rms_figures(after - measured, ok),
@@ -137,8 +191,14 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
 def validate(folder: Path, progress: Progress, workers: int | None = None, taught: cmmsim.Taught | None = None) -> None:
     """Run plant and models on the unseen trajectories and open the truth: validation.nc, model.nc, result.json.
 
-    Raises RecordError for a result that is not whole, or was made of another record or covariance.
+    Raises RecordError for a result that is not whole, or was made of another record or covariance. Raises
+    OutputFolderError for a record of one's own, whose truth nobody knows.
     """
+    if RunFolder(folder).holds_own_record:
+        raise OutputFolderError(
+            f"{folder} holds a record of your own: no plant is there that could run unseen trajectories; go on with: "
+            f"cmmsim report --out {folder}"
+        )
     run_folder, scenario, trajectories, robot = _open(folder)
     began = time.perf_counter()
     run_folder.require("covariance.nc")

@@ -5,9 +5,11 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 import identify
 
@@ -87,6 +89,25 @@ def test_a_foreign_package_of_the_name_identify_is_named(tmp_path, rooms):
     assert command.returncode == 1
     assert command.stderr.startswith(f"error: {said}")
     assert command.stderr.count("\n") == 1
+
+
+def test_the_citation_names_this_version_its_licence_and_the_paper():
+    stated = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    assert (stated["version"], stated["license"]) == (project["version"], project["license"])
+    assert stated["authors"][0]["name"].lower() in (ROOT / "LICENSE").read_text("utf-8").lower()
+    assert set(stated["keywords"]) == set(project["keywords"])
+    assert stated["references"][0]["doi"] == "10.3390/electronics8080836"
+
+
+def test_every_file_that_the_packages_need_is_named_for_the_wheel():
+    """`sh .ci/wheel` builds and installs one; here what git knows is held against the patterns."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+    patterns = project["tool"]["setuptools"]["package-data"]["*"]
+    found = [path for name in PACKAGES for path in (ROOT / name).rglob("*") if path.is_file()]
+    others = [path for path in found if path.suffix != ".py" and path.parent.name != "__pycache__"]
+    assert len(others) > 30
+    assert [path for path in others if not any(path.match(pattern) for pattern in patterns)] == []
 
 
 def test_import_linter_keeps_every_contract():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
@@ -20,19 +20,19 @@ WIDEST_JITTER = 3.0  # standard deviations: no frame's latency is farther from t
 NARROWEST_PSF = 0.1  # px: a narrower point spread is lost between the points that images are drawn on
 
 
+def quantity(default: Any, unit: str, what: str) -> Any:
+    """A field with a unit, empty where it has none; ``...`` is no default."""
+    return Field(default, description=what, json_schema_extra={"unit": unit} if unit else None)
+
+
 class Timing(Section):
-    """When the sensor looks, and when its poses can be used.
+    """When the sensor looks, and when its poses can be used; a measured pose is that in the middle of its exposure."""
 
-    frame_rate Hz; exposure s: a measured pose is that in its middle; latency s, from the middle of the exposure to the
-    use of the pose, and latency_jitter s, its standard deviation from frame to frame; dropout: probability that a frame
-    is lost before anyone sees it.
-    """
-
-    frame_rate: Positive
-    exposure: NotNegative = 0.0
-    latency: NotNegative = 0.0
-    latency_jitter: NotNegative = 0.0
-    dropout: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    frame_rate: Positive = quantity(..., "Hz", "stereo frames a second")
+    exposure: NotNegative = quantity(0.0, "s", "time in which a picture gathers light; 0 is an instant")
+    latency: NotNegative = quantity(0.0, "s", "mean delay from the middle of the exposure to the use of the pose")
+    latency_jitter: NotNegative = quantity(0.0, "s", "standard deviation of the latency from frame to frame")
+    dropout: Annotated[float, Field(ge=0.0, le=1.0)] = quantity(0.0, "", "probability that a frame is lost")
 
     @model_validator(mode="after")
     def _possible(self) -> Timing:
@@ -65,36 +65,37 @@ class Timing(Section):
 
 
 class Calibrated(Section):
-    """A camera as calibrated: focal_px along x and y and centre_px, the principal point, px; distortion k1, k2, p1, p2,
-    k3 of Brown and Conrady in OpenCV's order and meaning."""
+    """A camera as calibrated; distortion in OpenCV's order and meaning."""
 
-    focal_px: tuple[Positive, Positive]
-    centre_px: tuple[float, float]
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    focal_px: tuple[Positive, Positive] = quantity(..., "px", "focal lengths along x and y")
+    centre_px: tuple[float, float] = quantity(..., "px", "principal point")
+    distortion: tuple[float, float, float, float, float] = quantity(
+        (0.0, 0.0, 0.0, 0.0, 0.0), "", "k1, k2, p1, p2, k3 of Brown and Conrady"
+    )
 
 
 class RightFromLeft(Section):
-    """Where the right camera stands: x_right = R(rotation_vector) x_left + translation; m and rad."""
+    """Where the right camera stands: x_right = R(rotation_vector) x_left + translation."""
 
-    translation: Vector3
-    rotation_vector: Vector3
+    translation: Vector3 = quantity(..., "m", "place of the left camera's origin in the right camera's frame")
+    rotation_vector: Vector3 = quantity(..., "rad", "rotation from the left camera's frame to the right one's")
 
 
 class Rig(Section):
-    """baseline m; focal_px, width, height px; position (the middle of the baseline) and target m in the base frame.
+    """Both cameras and where they stand.
 
-    distance m, where given: the position is moved along its line to the target to stand that far from it.
+    distance, where given: the position is moved along its line to the target to stand that far from it.
     left and right, where given, replace focal_px and the principal point in the middle of the image; right_from_left
     replaces the baseline and the toe-in towards the target.
     """
 
-    baseline: Positive
-    focal_px: Positive
-    width: Annotated[int, Field(ge=64)]
-    height: Annotated[int, Field(ge=64)]
-    position: Vector3
-    target: Vector3
-    distance: Positive | None = None
+    baseline: Positive = quantity(..., "m", "distance between the cameras")
+    focal_px: Positive = quantity(..., "px", "focal length")
+    width: Annotated[int, Field(ge=64)] = quantity(..., "px", "width of an image")
+    height: Annotated[int, Field(ge=64)] = quantity(..., "px", "height of an image")
+    position: Vector3 = quantity(..., "m", "middle of the baseline in the base frame")
+    target: Vector3 = quantity(..., "m", "point at which both cameras look, in the base frame")
+    distance: Positive | None = quantity(None, "m", "distance from the middle of the baseline to the target")
     left: Calibrated | None = None
     right: Calibrated | None = None
     right_from_left: RightFromLeft | None = None
@@ -108,21 +109,23 @@ class Rig(Section):
 
 
 class Camera(Section):
-    """EMVA 1288 figures: electrons, grey values per electron, grey values; prnu relative, dsnu electrons.
+    """EMVA 1288 figures.
 
     noise = false leaves out all noise, the pattern of prnu and dsnu too; pattern_seed makes another specimen.
     """
 
-    electrons_at_white: Positive
-    gain: Positive
-    dark_noise: NotNegative
-    full_well: Positive
-    black_level: NotNegative = 0.0
-    noise: bool = True
-    bit_depth: Literal[8, 10, 12] = 8
-    prnu: Annotated[float, Field(ge=0.0, le=0.2)] = 0.0
-    dsnu: NotNegative = 0.0
-    pattern_seed: Annotated[int, Field(ge=0)] = 0
+    electrons_at_white: Positive = quantity(..., "electrons", "electrons of a white pixel")
+    gain: Positive = quantity(..., "grey values per electron", "grey values per electron")
+    dark_noise: NotNegative = quantity(..., "electrons", "dark noise, rms")
+    full_well: Positive = quantity(..., "electrons", "electrons that a pixel holds")
+    black_level: NotNegative = quantity(0.0, "grey values", "grey value of black")
+    noise: bool = quantity(True, "", "whether pictures have noise")
+    bit_depth: Literal[8, 10, 12] = quantity(8, "bit", "bits of a grey value")
+    prnu: Annotated[float, Field(ge=0.0, le=0.2)] = quantity(
+        0.0, "", "relative differences between the gains of pixels, rms"
+    )
+    dsnu: NotNegative = quantity(0.0, "electrons", "differences between the dark levels of pixels, rms")
+    pattern_seed: Annotated[int, Field(ge=0)] = quantity(0, "", "which specimen of a camera")
 
     @model_validator(mode="after")
     def _black_below_white(self) -> Camera:
@@ -137,12 +140,15 @@ class Camera(Section):
 class Lens(Section):
     """What both lenses do beside the distortion that stands with each camera.
 
-    psf_px: standard deviation of the Gaussian point spread, px; vignetting: share of the light missing in the corner
-    farthest from the principal point, growing with the square of the distance.
+    The vignetting grows with the square of the distance from the principal point.
     """
 
-    psf_px: Annotated[float, Field(ge=0.0, le=4.0)] = 0.0
-    vignetting: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
+    psf_px: Annotated[float, Field(ge=0.0, le=4.0)] = quantity(
+        0.0, "px", "standard deviation of the Gaussian point spread"
+    )
+    vignetting: Annotated[float, Field(ge=0.0, le=0.9)] = quantity(
+        0.0, "", "share of the light missing in the farthest corner"
+    )
 
     @model_validator(mode="after")
     def _drawable(self) -> Lens:
@@ -157,25 +163,29 @@ class Detection(Section):
     Teaching always takes the maximum-likelihood one, whichever is named here; see :mod:`cmmsim.teaching`.
     """
 
-    detector: Annotated[str, AfterValidator(require_detector)] = DEFAULT_DETECTOR
+    detector: Annotated[str, AfterValidator(require_detector)] = quantity(
+        DEFAULT_DETECTOR, "", "what finds the centres of stickers"
+    )
 
 
 class Stickers(Section):
-    """Radii and placement distances m; levels of 255.
+    """Bright discs in dark rings.
 
     per_plane: that many stickers on each plane of the platform instead of those listed there, evenly on an ellipse.
     """
 
-    radius: Positive
-    ring_radius: Positive
-    placement: tuple[NotNegative, NotNegative] = (0.0, 0.0)
-    placement_seed: Annotated[int, Field(ge=0)] = 0
-    sticker_level: Level
-    ring_level: Level
-    body_level: Level
-    obstacle_level: Level
-    background_level: Level = 0
-    per_plane: Annotated[int, Field(ge=3)] | None = None
+    radius: Positive = quantity(..., "m", "radius of a sticker")
+    ring_radius: Positive = quantity(..., "m", "radius of the dark ring around a sticker")
+    placement: tuple[NotNegative, NotNegative] = quantity(
+        (0.0, 0.0), "m", "smallest and largest distance of a sticker from its nominal place"
+    )
+    placement_seed: Annotated[int, Field(ge=0)] = quantity(0, "", "which places of the stickers")
+    sticker_level: Level = quantity(..., "", "grey level of a sticker, of 255")
+    ring_level: Level = quantity(..., "", "grey level of its ring, of 255")
+    body_level: Level = quantity(..., "", "grey level of the bodies, of 255")
+    obstacle_level: Level = quantity(..., "", "grey level of what stands in the way, of 255")
+    background_level: Level = quantity(0, "", "grey level of the background, of 255")
+    per_plane: Annotated[int, Field(ge=3)] | None = quantity(None, "", "stickers on each plane of the platform")
 
     @model_validator(mode="after")
     def _bright_on_dark(self) -> Stickers:
@@ -228,7 +238,7 @@ class Body(Section):
 class Platform(Body):
     """The moving body; home is its pose at teaching, [m, rad]."""
 
-    home: tuple[float, float, float, float, float, float]
+    home: tuple[float, float, float, float, float, float] = quantity(..., "m, rad", "pose of the platform at teaching")
 
 
 class SensorFile(Section):
@@ -239,10 +249,12 @@ class SensorFile(Section):
     :mod:`cmmsim.plugins`; "auto" takes pyrender where OpenGL works, else analytic.
     """
 
-    name: str
-    based_on: str | None = None
-    note: str = ""
-    renderer: Annotated[str, AfterValidator(require_renderer)] = AUTO
+    name: str = quantity(..., "", "name of the sensor")
+    based_on: str | None = quantity(
+        None, "", "built-in sensor, or file beside this one, whose entries hold where this file has none"
+    )
+    note: str = quantity("", "", "what a user must know of the figures")
+    renderer: Annotated[str, AfterValidator(require_renderer)] = quantity(AUTO, "", "what draws the images")
     timing: Timing
     rig: Rig
     camera: Camera

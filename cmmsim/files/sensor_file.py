@@ -123,6 +123,21 @@ def read_sensor_file(name: str | Path, changes: Mapping[str, Any] | None = None)
     return _with_stickers(checked(SensorFile, content, source, SensorFileError), source)
 
 
+def sensor_schema() -> dict[str, Any]:
+    """JSON schema of sensor files, for editors; `sensors/sensor.schema.json` holds it.
+
+    A file that is based on another need have neither all tables nor all entries of one.
+    """
+    schema = SensorFile.model_json_schema()
+    tables = {name: one["$ref"].rpartition("/")[2] for name, one in schema["properties"].items() if "$ref" in one}
+    needed = {name: schema["$defs"][table].pop("required", []) for name, table in tables.items()}
+    whole = {
+        "required": schema["required"],
+        "properties": {name: {"required": entries} for name, entries in needed.items() if entries},
+    }
+    return schema | {"required": ["name"], "if": {"not": {"required": ["based_on"]}}, "then": whole}
+
+
 def _with_stickers(file: SensorFile, source: str) -> SensorFile:
     """The file with as many stickers on each plane of the platform as it asks for."""
     count, room = file.stickers.per_plane, 2.0 * file.stickers.ring_radius

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from identify.commands.options import JsonFile, Quiet, completion, tell
 from identify.errors import OutputFolderError, ScenarioError
 from identify.files.atomic import atomic_contents, atomic_path
 from identify.files.run_folder import new_run_folder, save_files
@@ -12,40 +13,6 @@ from identify.progress import Progress, print_table, print_warnings, terminal_pr
 
 if TYPE_CHECKING:
     from cmmsim.calibration import Board, Calibration, CalibrationOptions, SensorTemplate
-
-CALIBRATE_HELP = """
-Calibrate a stereo camera from pictures of a board: real photographs, or rendered ones.
-
-Both cameras take a picture of the board at the same time, 10 to 30 times. Move the board all over both images and
-into their corners, and tilt it by 30 degrees and more to all sides. LEFT and RIGHT are folders of the pictures; the
-first file name of one folder goes with the first of the other and so on, in lexicographic order: img10 stands before
-img2, so number them img02, img10. A picture may be PNG, JPEG, TIFF, BMP, PGM or WebP, grey or coloured, 8 or 16 bit.
-
-\b
-The board is a TOML file:
-  kind = "dots"         # chessboard, dots, or asymmetric_dots (every other row shifted)
-  columns = 13          # dots in a row; of a chessboard: inner corners, one less than squares
-  rows = 9
-  spacing = 0.038       # m between neighbours; asymmetric_dots: between rows
-  radius = 0.0095       # m, of dots only
-  dark = true           # dots darker than the board, of dots only
-
-\b
-Examples:
-  cmmsim calibrate photos/left photos/right --board board.toml --out mine
-  cmmsim calibrate photos/left photos/right --board board.toml --out mine --sensor ctrack780 --distortion radial2
-  cmmsim calibrate --render 20 --out pictures     render pictures to try it with, by the cameras of ctrack780
-  cmmsim calibrate --render 20 --sensor mine.toml --out pictures     the same by other cameras
-  cmmsim calibrate pictures/left pictures/right --board pictures/board.toml --out mine
-
-\b
-Writes into the folder:
-  calibration.json      estimates with standard deviations, covariance, residuals, images used and rejected
-                        (where the points of a picture err alike, the covariance is enlarged, with a warning)
-  rig.toml              tables [rig.left], [rig.right], [rig.right_from_left] for a sensor file
-  sensor.toml           with --sensor: that sensor file with the calibrated cameras, for load_sensor
-  residuals.png, coverage.png, distortion.png
-"""
 
 
 def calibrate(
@@ -62,6 +29,7 @@ def calibrate(
             metavar="NAME|FILE",
             help="Optional: sensor whose file takes the cameras; with --render, whose cameras render, ctrack780 "
             "where it is left out.",
+            autocompletion=completion("sensor"),
         ),
     ] = None,
     distortion: Annotated[
@@ -94,10 +62,46 @@ def calibrate(
             show_default=False,
         ),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary; warnings stay.")] = False,
+    json: JsonFile = None,
+    quiet: Quiet = False,
 ) -> None:
-    """Calibrate a stereo camera from pictures of a board, or render such pictures."""
-    from cmmsim.calibration import CalibrationOptions, read_board, sensor_template
+    """Calibrate a stereo camera from pictures of a board: photographs, or rendered ones.
+
+    Both cameras take a picture of the board at the same time, 10 to 30 times. Move the board all over both images and
+    into their corners, and tilt it by 30 degrees and more to all sides. LEFT and RIGHT are folders of the pictures; the
+    first file name of one folder goes with the first of the other and so on, in lexicographic order: img10 stands
+    before img2, so number them img02, img10. A picture may be PNG, JPEG, TIFF, BMP, PGM or WebP, grey or coloured, 8 or
+    16 bit.
+
+    Reads both folders and the description of the board:
+
+    \b
+      kind = "dots"         # or chessboard, or asymmetric_dots, whose every other
+                            # row is shifted
+      columns = 13          # dots in a row; of a chessboard: inner corners, one
+                            # less than squares
+      rows = 9
+      spacing = 0.038       # m between neighbours; asymmetric_dots: between rows
+      radius = 0.0095       # m, of dots only
+      dark = true           # dots darker than the board, of dots only
+
+    Writes into the folder calibration.json, which is also the JSON: estimates with standard deviations, covariance,
+    residuals, images used and rejected (where the points of a picture err alike, the covariance is enlarged, with a
+    warning); rig.toml, the tables of a sensor file's cameras; with --sensor also sensor.toml, that whole sensor file
+    with the calibrated cameras; and residuals.png, coverage.png, distortion.png.
+
+    \b
+    Examples:
+      cmmsim calibrate photos/left photos/right --board board.toml --out mine
+      cmmsim calibrate photos/left photos/right --board board.toml --out mine \\
+        --sensor ctrack780 --distortion radial2
+    Render pictures to try it with, and calibrate from them:
+      cmmsim calibrate --render 20 --out pictures
+      cmmsim calibrate --render 20 --sensor mine.toml --out pictures
+      cmmsim calibrate pictures/left pictures/right \\
+        --board pictures/board.toml --out mine
+    """
+    from cmmsim.calibration import CalibrationOptions, as_dict, read_board, sensor_template
 
     folder = new_run_folder(out).path
     progress = terminal_progress(quiet)
@@ -120,8 +124,7 @@ def calibrate(
     found = _calibrate(left, right, read_board(board), options, template, progress)
     refused = _write(folder, found, template)
     print_warnings([*found.warnings, *(template.disagreements(found) if template else []), *refused])
-    if not quiet:
-        _print_summary(found, folder)
+    tell(as_dict(found), json, quiet, lambda: _print_summary(found, folder))
 
 
 def _require_none(reason: str, **given: object) -> None:
@@ -215,8 +218,8 @@ def _print_summary(found: "Calibration", folder: Path) -> None:
         (name, f"{value:.6g}", f"{std:.2g}" if std > 0.0 else "fixed")
         for name, value, std in zip(PARAMETER_NAMES, found.values, found.std, strict=True)
     ]
-    title = f"{count} pairs, sigma {found.adjustment.sigma_px:.3g} px"
-    print_table(("parameter", "estimate", "std"), rows, ("parameter",), title)
+    title = f"{count} pairs of pictures; errors of the points in them: {found.adjustment.sigma_px:.3g} px"
+    print_table(("parameter", "estimate", "standard deviation"), rows, ("parameter",), title)
     for name, reason in found.rejected.items():
         typer.echo(f"not used: {name}: {reason}")
     typer.echo(f"calibration: {folder}")

@@ -1,42 +1,42 @@
 """The command ``check``: a robot file judged before anything is built or run. Heavy imports are late."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from identify.errors import OutputFolderError, VerificationError
-from identify.files.run_folder import save_result
+from identify.commands.options import JsonFile, Quiet, RobotArgument, completion, tell
+from identify.errors import VerificationError
 from identify.progress import print_table, terminal_progress
-
-CHECK_HELP = """
-Say in a page what a designer wants to know of a robot.
-
-Reach, travel and singularities at home and over the travel, assembly modes, holding torques, what its motion can show,
-inertias that no body has, whether its loop is stable, up to which gains and down to which frame rate, and whether the
-platform that the scenario's sensor sees is the robot's. Each with its number and limit, and with the leg that it
-concerns. Ends with status 1 where something is beyond its limit.
-
-\b
-Examples:
-  cmmsim check mine.toml
-  cmmsim check ups6 --scenario quick --json findings.json
-"""
 
 
 def check(
-    robot: Annotated[str, typer.Argument(help="Built-in robot or path of a TOML file.")],
-    scenario: Annotated[str, typer.Option(help="Scenario whose servo, timing and limits count.")] = "paper",
+    robot: RobotArgument,
+    scenario: Annotated[
+        str, typer.Option(help="Scenario whose servo, timing and limits count.", autocompletion=completion("scenario"))
+    ] = "paper",
     parameters: Annotated[
         str | None,
         typer.Option(
             metavar="SET", help="Parameter set of the robot.", show_default="the scenario's truth, else initial"
         ),
     ] = None,
-    json: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write the findings there.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no table.")] = False,
+    json: JsonFile = None,
+    quiet: Quiet = False,
 ) -> None:
-    """Judge a robot file."""
+    """Say in a page what a designer wants to know of a robot.
+
+    Reach, travel and singularities at home and over the travel, assembly modes, holding torques, what its motion can
+    show, inertias that no body has, whether its loop is stable, up to which gains and down to which frame rate, and
+    whether the platform that the scenario's sensor sees is the robot's: each with its number and limit, and with the
+    leg that it concerns.
+
+    Reads a robot file, and a scenario. Writes nothing but the JSON: whether all is well, and the findings.
+
+    \b
+    Examples:
+      cmmsim check mine.toml
+      cmmsim check ups6 --scenario quick --json findings.json
+    """
     from dynamics import load_robot
     from identify.loop_parameters import NOMINAL, check_parameter_set
     from identify.scenario import load_scenario
@@ -48,14 +48,10 @@ def check(
     values = chosen.parameter_sets[name].vector
     findings = check_robot(chosen, values, given, terminal_progress(quiet))
     failed = [finding for finding in findings if not finding.ok]
-    if json is not None:
-        try:
-            save_result(json, {"ok": not failed, "findings": [finding.entry() for finding in findings]})
-        except (OSError, ValueError) as error:
-            raise OutputFolderError(f"cannot write {json}: {error}; name another file with --json") from None
-    if not quiet:
-        rows = [("yes" if finding.ok else "NO", finding.check, finding.text) for finding in findings]
-        print_table(("ok", "check", "finding"), rows, ("ok", "check", "finding"), f"{chosen.name}, parameters `{name}`")
+    rows = [("yes" if finding.ok else "NO", finding.check, finding.text) for finding in findings]
+    header, title = ("ok", "check", "finding"), f"{chosen.name}, parameters `{name}`"
+    entry = {"ok": not failed, "findings": [finding.entry() for finding in findings]}
+    tell(entry, json, quiet, lambda: print_table(header, rows, header, title))
     if failed:
         said = "; ".join(f"{finding.check}: {finding.text}" for finding in failed)
         raise VerificationError(f"{len(failed)} of {len(findings)} findings about {chosen.name} fail: {said}")

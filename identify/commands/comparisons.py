@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from identify.commands import repeatable
+from identify.commands.options import JsonFile, Quiet, WholeRunOption, repeatable, tell
 from identify.files.run_folder import RunFolder, save_files
 from identify.progress import Progress, print_table, terminal_progress
 from identify.scenario import Scenario, load_scenario
@@ -24,20 +24,21 @@ ESTIMATORS_HEADER = (
     "groups\n%",
     "median\n%",
     "gains\n%",
-    "pos.\num",
-    "ori.\nurad",
+    "position\nµm",
+    "angle\nµrad",
     "time\ns",
-    "iter.",
-    "evals",
+    "iterations",
+    "runs",
 )
 
-METHODS_HEADER = ("method", "value", "eq. 39", "D", "seconds", "values", "gradients", "stopped")
+METHODS_HEADER = ("method", "maximised", "index", "narrows", "seconds", "values", "gradients", "stopped")
 
+PAPERS_ROBOT = "rss6"
 PAPER = "the paper, with its own robot and geometry: index 0.38 at the start, 1.345 after 324 generations"
 
 
 def estimators(
-    out: Annotated[Path, typer.Option("--out", help="Folder of a whole run: cmmsim run.")],
+    out: WholeRunOption,
     only: Annotated[
         list[str] | None, repeatable("Name of an estimator, or module:function of one's own", "all")
     ] = None,
@@ -59,15 +60,26 @@ def estimators(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the joint instruments' noise.")] = 0,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no table.")] = False,
+    json: JsonFile = None,
+    quiet: Quiet = False,
 ) -> None:
-    """Compare estimators on the record of a run: writes instruments.nc, estimators.json and figures/estimators.png.
+    """Compare nine estimators, and your own, on the record of a run.
 
     The paper's output error beside its variants and beside what the literature does with measured joint torques and
     encoders (inverse dynamics; poses from the camera, or by forward kinematics). The run has no such instruments: they
-    are simulated from its truth, with the noise given here. Where the PID is known it has the true gains. All are
-    judged by the truth of the record and of the unseen trajectories. An estimator of one's own is a function of the
-    evidence, see identify.estimators.estimator.
+    are simulated from its truth, with the noise given here. Where the joint controller is known it has the true gains.
+    All are judged by the truth of the record and of the unseen trajectories. An estimator of one's own is a function of
+    the evidence, see identify.estimators.estimator.
+
+    Reads scenario.toml, experiment.nc and validation.nc of the folder.
+
+    Writes instruments.nc, estimators.json, which is also the JSON, and figures/estimators.png there.
+
+    \b
+    Examples:
+      cmmsim estimators --out runs/paper-0
+      cmmsim estimators --out mine --only closed_loop --only torque_wls
+      cmmsim estimators --out mine --add my_module:my_estimator
     """
     from dynamics import load_robot
     from identify.estimators.estimator import find_estimators
@@ -85,8 +97,7 @@ def estimators(
     scores = compare_on_run(files, instruments, chosen, seed, terminal_progress(quiet))
     entry = {"seed": seed, "instruments": instruments.figures, "estimators": {s.name: _entry(s) for s in scores}}
     save_files(folder.path, {"estimators.json": entry, "figures/estimators.png": estimators_figure(scores)})
-    if not quiet:
-        _print_scores(scores, out)
+    tell(entry, json, quiet, lambda: _print_scores(scores, out))
 
 
 def _entry(score: "Score") -> dict[str, Any]:
@@ -106,9 +117,9 @@ def _print_scores(scores: list["Score"], out: Path) -> None:
         [(score.title, *_score_row(score)) for score in scores],
         ("estimator",),
         "estimators on one record, against one truth",
-        "groups: RMS and median relative error of the base parameters that the record shows; gains: RMS of "
-        "those of the joint PID; position, orientation: model against true plant on unseen trajectories, RMS of the "
-        "worst axis and run; evals: simulated runs of the model",
+        "groups: RMS and median relative error of the base parameters that the record shows; gains: RMS relative error "
+        "of those of the joint controller; position, angle: model against true plant on unseen trajectories, RMS of "
+        "the worst axis and run; runs: how often the model was simulated",
     )
     for score in scores:
         if score.note:
@@ -131,7 +142,7 @@ def _short(value: float) -> str:
 
 
 def variation(
-    out: Annotated[Path, typer.Option("--out", help="Folder of a whole run: cmmsim run.")],
+    out: WholeRunOption,
     designed: Annotated[
         int | None,
         typer.Option(
@@ -146,16 +157,24 @@ def variation(
         int | None,
         typer.Option("--workers", min=1, help="Processes that design and render.", show_default="one a core"),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no table.")] = False,
+    json: JsonFile = None,
+    quiet: Quiet = False,
 ) -> None:
     """Identify from each of several runs alone, and see how the estimates vary (the paper's table 5).
 
     As in the paper, from the unseen runs of validation.nc; or from newly recorded ones, which are kept as variation.nc.
-    Writes variation.json, variation.md and figures/variation.png.
+    The masses of the links vary most: only what accelerates shows them, so that fast trajectories tell more of them
+    than long ones.
 
-    The masses of the links vary most: only what accelerates shows them. Fast trajectories tell more of them than long
-    ones: cmmsim excite paper --set excitation.fundamental_hz=0.3 --out fast, then cmmsim variation --out fast
-    --designed 10.
+    Reads scenario.toml and validation.nc of the folder; with --designed trajectories.json in place of the latter.
+
+    Writes variation.json, which is also the JSON, variation.md and figures/variation.png there.
+
+    \b
+    Examples:
+      cmmsim variation --out runs/paper-0
+      cmmsim excite paper --set excitation.fundamental_hz=0.3 --out fast
+      cmmsim variation --out fast --designed 10
     """
     from dynamics import load_robot
     from identify.record import recording
@@ -179,20 +198,25 @@ def variation(
         seen.check_made_of("validation.nc")
         records, origin = seen.validation, "unseen"
     found = variation_of(identify_each(records, robot, scenario, progress))
-    table = tables.variation_table(found)
+    table, entry = tables.variation_table(found), tables.variation_entry(found, origin)
     files = {
-        "variation.json": tables.variation_entry(found, origin),
+        "variation.json": entry,
         "variation.md": f"# {table.title}\n\n{table.markdown()}\n\n{table.note}\n",
         "figures/variation.png": tables.variation_figure(found),
     }
     save_files(out, files)
-    if not quiet:
+
+    def say() -> None:
         name, worst = found.worst
         print_table(table.header, table.rows, ("parameter", "unit"), table.title, table.note)
         typer.echo(f"largest: {100 * worst:.3g} % of {name}; files: {out}")
 
+    tell(entry, json, quiet, say)
 
-def compare_excitation(scenario: Scenario, seed: int, folder: Path, progress: Progress, quiet: bool) -> None:
+
+def compare_excitation(
+    scenario: Scenario, seed: int, folder: Path, progress: Progress, json: Path | None, quiet: bool
+) -> None:
     """Search with every method: writes comparison.json and comparison.png into `folder`."""
     from dynamics import load_robot
     from identify.excitation.comparison import compare_methods, comparison_figure
@@ -202,22 +226,22 @@ def compare_excitation(scenario: Scenario, seed: int, folder: Path, progress: Pr
     figures = {**asdict(found), "scenario": scenario.name}
     figure = comparison_figure(robot, scenario, found)
     save_files(folder, {"comparison.json": figures, "comparison.png": figure})
-    if not quiet:
-        _print_methods(found, folder)
+    paper = PAPER if scenario.robot == PAPERS_ROBOT else None
+    tell(figures, json, quiet, lambda: _print_methods(found, folder, paper))
 
 
-def _print_methods(found: "Comparison", folder: Path) -> None:
+def _print_methods(found: "Comparison", folder: Path, note: str | None) -> None:
     """One row a method, and what is nearest to its limit."""
     title = f"criterion {found.criterion}, seed {found.seed}, {found.candidates} random candidates"
-    print_table(METHODS_HEADER, map(_method_row, found.entries), ("method", "stopped"), title, PAPER)
+    print_table(METHODS_HEADER, map(_method_row, found.entries), ("method", "stopped"), title, note)
     for entry in found.entries:
         nearest = sorted(entry.worst, key=lambda worst: -worst.share)
         used = ", ".join(f"{worst.name} {100 * worst.share:.2f} %" for worst in nearest)
         typer.echo(f"{entry.method}: share of each limit used: {used}")
     typer.echo(
-        f"value: what was maximised (information: D of the linearised loop). D: factor by which a run narrows the "
-        f"prior, simulated loop; - where it is unstable. Candidates and functions: {found.preparation_seconds:.1f} s. "
-        f"Files: {folder}"
+        f"maximised: the criterion (information: of the linearised loop). index: the paper's observability index, eq. "
+        f"39. narrows: factor by which a run narrows what is known before of the parameters, with the simulated loop; "
+        f"- where that is unstable. Candidates and functions took {found.preparation_seconds:.1f} s. Files: {folder}"
     )
 
 

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from identify.commands.help import Command, Commands
+from identify.commands.options import Quiet
 from identify.errors import OutputFolderError
 from identify.files.atomic import atomic_path
 
@@ -16,33 +18,34 @@ Read a robot from a file of another program, where its legs are of kinds that ar
 
 Writes a robot file: geometry, inertias and friction as they are there, in one parameter set `initial`. Joints are
 checked one by one; a mechanism that is no such robot is refused in one line that says why.
-
-\b
-Examples:
-  cmmsim import mjcf model.xml --out mine.toml
-  cmmsim import urdf robot.urdf --closures robot.yaml --out mine.toml
-  cmmsim check mine.toml
 """
 
-imports = typer.Typer(name="import", help=IMPORT_HELP, no_args_is_help=True, rich_markup_mode=None)
+imports = typer.Typer(name="import", cls=Commands, help=IMPORT_HELP, no_args_is_help=True, rich_markup_mode=None)
 
 Out = Annotated[Path, typer.Option(metavar="ROBOT.toml", help="Robot file to write; replaced if there.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="No summary.")]
 
 
-@imports.command()
+@imports.command(cls=Command)
 def mjcf(
     file: Annotated[Path, typer.Argument(help="MJCF file whose loops are connect or weld equalities.")],
     out: Out,
     quiet: Quiet = False,
 ) -> None:
-    """From MJCF, as MuJoCo compiles it: defaults, includes and masses of geoms count."""
+    """Read a robot from MJCF, as MuJoCo compiles it: defaults, includes and masses of geoms count.
+
+    Reads an MJCF file. Writes a robot file.
+
+    \b
+    Examples:
+      cmmsim import mjcf model.xml --out mine.toml
+      cmmsim check mine.toml
+    """
     from dynamics.engines.mjcf_import import robot_of_mjcf
 
     _write(*robot_of_mjcf(file), f"From {file.name}, imported by cmmsim.", out, quiet)
 
 
-@imports.command()
+@imports.command(cls=Command)
 def urdf(
     file: Annotated[Path, typer.Argument(help="URDF file, a tree of bodies.")],
     closures: Annotated[
@@ -51,7 +54,14 @@ def urdf(
     out: Out,
     quiet: Quiet = False,
 ) -> None:
-    """From URDF and a YAML file of its loop closures and motors."""
+    """Read a robot from URDF and a YAML file of its loop closures and motors.
+
+    Reads both files. Writes a robot file.
+
+    \b
+    Example:
+      cmmsim import urdf robot.urdf --closures robot.yaml --out mine.toml
+    """
     from dynamics.engines.urdf_import import robot_of_urdf
 
     _write(*robot_of_urdf(file, closures), f"From {file.name} with {closures.name}, imported by cmmsim.", out, quiet)

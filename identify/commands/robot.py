@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from identify.commands import new_folder
+from identify.commands.help import Command, Commands
+from identify.commands.options import JsonFile, Quiet, RobotArgument, new_folder, tell
 from identify.errors import OutputFolderError, VerificationError
 from identify.files.atomic import write_text
-from identify.files.run_folder import new_run_folder, save_files, save_result
+from identify.files.run_folder import new_run_folder, save_files
 from identify.progress import print_table, terminal_progress
 
 if TYPE_CHECKING:
@@ -19,24 +20,28 @@ if TYPE_CHECKING:
     from identify.arrays import Array
     from identify.estimation.base_parameters import BaseParameters
 
-RobotArgument = Annotated[str, typer.Argument(help="Built-in robot (rss6, ups6, ...) or path of a TOML file.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary.")]
-
 THRESHOLD = 1e-3
 """Entries of R below it count as zero in the paper (section 4.2)."""
+
+PAPERS = "rss6"
+"""The robot of the paper, beside which alone its numbers stand."""
 
 DECADES = (0, 3, 6)
 """Units in which the paper's threshold is tried: the regressor in N, kN, MN."""
 
 
-def base_parameters(
-    robot: RobotArgument = "rss6",
-    out: Annotated[Path | None, typer.Option("--out", help="Also write the groups to this JSON file.")] = None,
-) -> None:
-    """Which combinations of its dynamic parameters a robot's motion can show at all.
+def base_parameters(robot: RobotArgument = "rss6", json: JsonFile = None, quiet: Quiet = False) -> None:
+    """Print which combinations of its dynamic parameters a robot's motion can show at all.
 
     A parameter that stands alone can be identified by itself, one in a sum only as part of it, and the unseen ones by
     no motion. All of it up to one common factor where only poses are measured.
+
+    Reads a robot file. Writes nothing but the JSON, which has the coefficients of each combination.
+
+    \b
+    Examples:
+      cmmsim base-parameters rss6
+      cmmsim base-parameters mine.toml --json groups.json
     """
     from dynamics import load_robot
     from identify.estimation import base_parameters as base
@@ -46,21 +51,25 @@ def base_parameters(
     found = base.base_parameters(matrix, chosen.layout)
     singular, angle = base.rank_by_singular_values(matrix), base.angle_to_singular_vectors(matrix, found)
     counts = {10**d: base.rank_by_threshold(matrix / 10**d, THRESHOLD) for d in DECADES}
-    if out is not None:
-        save_result(out, _groups(found, singular, angle))
+    entry = _groups(found, singular, angle)
+    tell(entry, json, quiet, lambda: _print_groups(found, singular, angle, counts, chosen.name == PAPERS))
+
+
+def _print_groups(found: "BaseParameters", singular: int, angle: float, counts: dict[int, int], papers: bool) -> None:
     for expression in found.expressions():
         typer.echo(expression)
-    typer.echo(f"unseen: {', '.join(found.unseen) or 'none'}")
+    typer.echo(f"No motion shows: {', '.join(found.unseen) or 'none of them, all are shown'}.")
     typer.echo(
-        f"{found.rank} base parameters of {len(found.names)} by pivoted QR, {singular} by singular values; columns of "
-        f"length one leave {found.gap[1]:.1e} outside the others where independent, {found.gap[0]:.1e} where not"
+        f"The {len(found.names)} parameters make {found.rank} base parameters, which are all that a motion can show; "
+        f"singular values find {singular}. What is independent stands out of the others by {found.gap[1]:.1e} of its "
+        f"length or more, what is not by {found.gap[0]:.1e} at most; both ways find the same groups to {angle:.1e} rad."
     )
-    typer.echo(f"the same groups from singular vectors: largest angle between what both span {angle:.1e} rad")
     tried = ", ".join(f"{count} in units of {unit:g} N" for unit, count in counts.items())
     left = len(found.names) - len(found.unseen)
     typer.echo(
-        f"the paper's rule (|R_ii| > {THRESHOLD:g}, unscaled): {tried}: it depends on the units. Deleting only the "
-        f"unseen ones leaves {left}, {left + 3} with the joint PID's gains (the paper's table lists 49)"
+        f"The paper's rule, a diagonal of R above {THRESHOLD:g} without scaling, depends on the units, and finds "
+        f"{tried}. Deleting only what no motion shows leaves {left} parameters, {left + 3} with the gains of the joint "
+        f"controller{'; its table lists 49' if papers else ''}."
     )
 
 
@@ -81,9 +90,19 @@ def _groups(found: "BaseParameters", singular: int, angle: float) -> dict[str, A
 def workspace(
     robot: RobotArgument = "rss6",
     out: Annotated[Path | None, new_folder("runs/workspace-ROBOT")] = None,
+    json: JsonFile = None,
     quiet: Quiet = False,
 ) -> None:
-    """Map travel, reach and conditioning around home: writes workspace.json, travel.png and conditioning.png."""
+    """Map where a robot can go around home: travel, reach and conditioning.
+
+    Reads a robot file.
+
+    Writes workspace.json, which is also the JSON, travel.png and conditioning.png into the folder.
+
+    \b
+    Example:
+      cmmsim workspace mine.toml --out maps
+    """
     from dynamics import load_robot
     from identify.verification.workspace_map import conditioning_figure, map_workspace, travel_figure
 
@@ -93,29 +112,25 @@ def workspace(
     summary = found.summary()
     figures = {"travel.png": travel_figure(found), "conditioning.png": conditioning_figure(found)}
     save_files(folder, {**figures, "workspace.json": summary})
-    if quiet:
-        return
+    tell(summary, json, quiet, lambda: _print_workspace(summary, folder))
+
+
+def _print_workspace(summary: dict[str, Any], folder: Path) -> None:
     for axis, (low, high) in summary["range_from_home"].items():
         name, unit = axis.rsplit("_", 1)
-        typer.echo(f"{name}: {1e3 * low:+.1f} to {1e3 * high:+.1f} m{unit} from home within travel")
+        typer.echo(f"{name}: {1e3 * low:+.1f} to {1e3 * high:+.1f} m{unit} from home, within the joints' travel")
     worst = summary["whole_travel"]
     typer.echo(
-        f"whole travel: leverage (J_a1) at least {worst['least_leverage_J_a1']:.3f}, condition of J_a2 at most "
-        f"{worst['largest_condition_J_a2']:.2f}, of J_ad {worst['largest_condition_J_ad']:.2f}"
+        f"over the whole travel the actuators' leverage on their legs is at least {worst['least_leverage_J_a1']:.3f}; "
+        f"the condition number of the legs' directions (J_a2) is at most {worst['largest_condition_J_a2']:.2f}, and "
+        f"that of the whole Jacobian (J_ad) {worst['largest_condition_J_ad']:.2f}"
     )
     typer.echo(f"maps: {folder}")
 
 
-EXPORT_HELP = """
-Write a robot for another engine.
+EXPORT_HELP = "Write a robot for another engine."
 
-\b
-Examples:
-  cmmsim export mjcf rss6 --parameters runs/paper-0/result.json --allow-unphysical-inertia
-  cmmsim export mjcf mine.toml --parameters identified --out mine.xml
-"""
-
-export = typer.Typer(name="export", help=EXPORT_HELP, no_args_is_help=True, rich_markup_mode=None)
+export = typer.Typer(name="export", cls=Commands, help=EXPORT_HELP, no_args_is_help=True, rich_markup_mode=None)
 
 
 @export.callback()
@@ -123,7 +138,7 @@ def _export() -> None:
     pass
 
 
-@export.command()
+@export.command(cls=Command)
 def mjcf(
     robot: RobotArgument,
     parameters: Annotated[
@@ -146,7 +161,16 @@ def mjcf(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write the robot as MJCF, a closed chain that MuJoCo loads."""
+    """Write the robot as MJCF, a closed chain that MuJoCo loads.
+
+    Reads a robot file, and where --parameters names one the result.json of a run. Writes one XML file.
+
+    \b
+    Examples:
+      cmmsim export mjcf mine.toml --parameters identified --out mine.xml
+      cmmsim export mjcf rss6 --parameters runs/paper-0/result.json \\
+        --allow-unphysical-inertia
+    """
     from dynamics import load_robot
     from dynamics.engines.mjcf import mjcf_text
     from identify.loop_parameters import choose_parameters
@@ -186,9 +210,19 @@ def _changes(robot: "Robot", parameters: "Array") -> list[str]:
 def verify_model(
     robot: RobotArgument = "rss6",
     out: Annotated[Path | None, new_folder("runs/verify-ROBOT")] = None,
+    json: JsonFile = None,
     quiet: Quiet = False,
 ) -> None:
-    """Compare the model with MuJoCo in the paper's loop (figure 7): writes verification.json and figure8.png."""
+    """Compare the model of a robot with MuJoCo in the paper's loop (its figure 7).
+
+    Reads a robot file.
+
+    Writes verification.json, which is also the JSON, and figure8.png into the folder.
+
+    \b
+    Example:
+      cmmsim verify-model rss6
+    """
     from dynamics import load_robot
     from identify.verification.against_mujoco import figure_8, verification_entry, verify
 
@@ -197,8 +231,7 @@ def verify_model(
     runs = verify(chosen, terminal_progress(quiet))
     entry = verification_entry(chosen, runs)
     save_files(folder, {"verification.json": entry, "figure8.png": figure_8(runs)})
-    if not quiet:
-        _print_verdict(entry, folder)
+    tell(entry, json, quiet, lambda: _print_verdict(entry, folder))
     if not entry["met"]:
         found, goal = entry["difference"], entry["goal"]
         raise VerificationError(

@@ -11,15 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from identify.commands import new_folder, repeatable
+from identify.commands.options import JsonFile, Quiet, SensorArgument, new_folder, repeatable, tell
 from identify.errors import VerificationError
 from identify.files.run_folder import new_run_folder, save_files
 from identify.progress import print_table, terminal_progress
 
 if TYPE_CHECKING:
     from cmmsim.detector_leaderboard import Condition, Score
-
-SensorArgument = Annotated[str, typer.Argument(help="Built-in sensor or path of a TOML file.")]
 
 DEFAULT_LIMIT_UM = 50.0  # published static limit of the C-Track 780
 
@@ -43,9 +41,10 @@ def acceptance(
     limit_um: Annotated[
         float, typer.Option("--limit-um", help="Largest length error in um that is accepted.")
     ] = DEFAULT_LIMIT_UM,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no summary.")] = False,
+    json: JsonFile = None,
+    quiet: Quiet = False,
 ) -> None:
-    """Test a sensor like a real one: writes acceptance.md, acceptance.json and figures/*.png.
+    """Test a sensor like a real instrument: lengths, a moving bar, latency.
 
     The sensor's own cameras take noisy pictures of artefacts in its measuring volume, its own detection and
     triangulation measure them, and what is true of the artefacts judges the result.
@@ -56,6 +55,11 @@ def acceptance(
     e3064  a rigid bar with markers at both ends, standing and moved through
            the volume: relative pose error of its ends (ASTM E3064-16)
     e3124  a body on a circle: latency of the reported poses (ASTM E3124)
+
+    Reads a sensor file.
+
+    Writes acceptance.md, acceptance.json, which is also the JSON, and figures/*.png into the folder. The limit is that
+    of the length error.
 
     \b
     Examples:
@@ -73,8 +77,7 @@ def acceptance(
     entry = acceptance_entry(run)
     figures = {f"figures/{name}.png": figure for name, figure in acceptance_figures(run).items()}
     save_files(folder, {"acceptance.json": entry, "acceptance.md": acceptance_markdown(entry), **figures})
-    if not quiet:
-        _print_acceptance(entry, folder)
+    tell(entry, json, quiet, lambda: _print_acceptance(entry, folder))
     lengths = entry.get("vdi_2634_1")
     if lengths and not lengths["met"]:
         raise VerificationError(
@@ -107,7 +110,7 @@ RADII_PX, NOISES_PERCENT, TILTS_DEG = (2.5, 5.0, 10.0), (0.2, 1.0, 5.0), (0.0, 3
 
 
 def detectors(
-    sensor: Annotated[str, typer.Argument(help="Built-in sensor (ctrack780) or path of a TOML file.")] = "ctrack780",
+    sensor: SensorArgument = "ctrack780",
     radius: Annotated[list[float] | None, repeatable("Long half axis of the disc, 1 to 50 px", "2.5, 5, 10")] = None,
     noise: Annotated[
         list[float] | None, repeatable("Noise half-way up the edge, % of the contrast", "0.2, 1, 5")
@@ -117,11 +120,21 @@ def detectors(
     draws: Annotated[int, typer.Option(min=2, help="Discs drawn for each row of the table.")] = 400,
     seed: Annotated[int, typer.Option(min=0, help="Seed of places, directions and noise.")] = 0,
     out: Annotated[Path | None, new_folder("runs/detectors-SENSOR")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars and no table.")] = False,
+    json: JsonFile = None,
+    quiet: Quiet = False,
 ) -> None:
-    """Compare the detectors of sticker centres with the Cramer-Rao bound: writes detectors.csv, .json and .png.
+    """Compare the detectors of sticker centres with the Cramer-Rao bound, which no detector can beat.
 
     The first row is what the sensor sees of the platform at home; the others are all combinations of the options.
+
+    Reads a sensor file.
+
+    Writes detectors.csv, detectors.json, which is also the JSON, and detectors.png into the folder.
+
+    \b
+    Examples:
+      cmmsim detectors
+      cmmsim detectors --radius 5 --tilt 0 --noise 1 --draws 1000
     """
     import numpy as np
     import pandas as pd
@@ -144,8 +157,7 @@ def detectors(
     figure = detectors_figure(scores, at_work)
     table = pd.DataFrame(rows).to_csv(index=False, na_rep="nan", lineterminator="\r\n")
     save_files(folder, {"detectors.csv": table, "detectors.json": entry, "detectors.png": figure})
-    if not quiet:
-        _print_scores(scores, file.name, folder)
+    tell(entry, json, quiet, lambda: _print_scores(scores, file.name, folder))
 
 
 def _columns(condition: "Condition") -> dict[str, float]:

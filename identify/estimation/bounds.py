@@ -161,8 +161,8 @@ class BoundedEstimate:
             f"{self.bounds.statements[k]} ({max(beyond[k] / std[k], 0):.2g})" for k in np.flatnonzero(self.at_bound)
         )
         return (
-            f"the estimate is held at {self.at_bound.sum()} bounds; in brackets the standard deviations by which "
-            f"record and starting guess would go beyond: {said}; the intervals allow for it",
+            f"the estimate is held at {self.at_bound.sum()} bounds, beyond which no robot is: {said}; in brackets how "
+            "far record and starting values would go beyond, in standard deviations; the intervals allow for it",
         )
 
 

@@ -64,8 +64,8 @@ class Uncertainty:
             return self.misfit.warnings()
         return (
             *self.misfit.warnings(),
-            f"{self.unstable} of {DRAWS} repeated experiments on the identified model were unstable and are left "
-            "out of the intervals",
+            f"of {DRAWS} simulated repetitions of the experiment on the identified model {self.unstable} were "
+            "unstable, and are left out of the intervals: the loop is close to instability",
         )
 
 

@@ -54,7 +54,10 @@ class Misfit:
     std: float
 
     def __str__(self) -> str:
-        return f"{self.found:.3f} times the noise variance, noise alone gives {self.expected:.3f} ± {self.std:.3f}"
+        return (
+            f"the mean squared residual is {self.found:.3f} times the variance that the sensor states, where noise "
+            f"alone would make it {self.expected:.3f} ± {self.std:.3f}"
+        )
 
     @property
     def significant(self) -> bool:
@@ -73,19 +76,22 @@ class Misfit:
 
     def warnings(self, model: str = "the model") -> tuple[str, ...]:
         """One line where noise does not explain the residual: a local minimum, or a model or covariance is wrong."""
-        says = f"{model} misses the record by {self}: "
+        wrong = "either this model of the robot or the covariance that the sensor states is wrong"
         if self.decides:
-            says += "the model or the stated covariance is wrong, its error decides, and nothing counts as identified"
-        elif self.significant:
-            says += (
-                "the model or the stated covariance is wrong; the intervals are widened by what the residuals show, "
-                "and cannot know what the parameters took up"
+            return (
+                f"{model} does not explain the record: {self}; {wrong}, by so much that nothing counts as identified",
             )
-        elif self.found < self.expected - MISFIT_STDS * self.std:
-            says += "the stated covariance is wrong, and the intervals are too wide"
-        else:
-            return ()
-        return (says,)
+        if self.significant:
+            return (
+                f"{model} does not explain all of the record: {self}; {wrong}; the intervals are widened by what the "
+                "residuals show, but cannot know of errors that the parameters have taken up",
+            )
+        if self.found < self.expected - MISFIT_STDS * self.std:
+            return (
+                f"{model} is nearer to the record than its noise allows: {self}; the covariance that the sensor states "
+                "is too large, and so are the intervals",
+            )
+        return ()
 
 
 def misfit_of_white(residuals: Array) -> Misfit:
@@ -142,8 +148,9 @@ class Whiteness:
             return ()
         parts = ", ".join(f"{name} {p:.1g}" for name, p in zip(POSE, self.p_values, strict=True))
         return (
-            "the residuals of the model driven by the logged commands are not white (probability "
-            f"{self.p_value:.1g}, by component {parts}): the model is wrong",
+            "the model, driven by the logged commands, leaves residuals that follow each other from frame to frame: "
+            f"noise would do so with a probability of {self.p_value:.1g} (by component {parts}); either this model of "
+            "the robot is wrong, or the errors of the camera last for several frames",
         )
 
 

@@ -176,9 +176,10 @@ class Conditioning:
         if not self.poor:
             return ()
         return (
-            f"the record is poorly conditioned: the condition number of the poses' information is "
-            f"{self.poses_alone:.1e}, more than {POOR:.0e}; {self.unshown} of {self.directions} directions of base "
-            "parameters and gains come from the starting guess: excite more, or longer",
+            f"the record is poorly conditioned: of {self.directions} independent combinations of parameters and gains, "
+            f"{self.unshown} are known from the starting values rather than from the poses (the condition number of "
+            f"what the poses tell is {self.poses_alone:.1e}, more than {POOR:.0e}); move the robot faster, farther or "
+            "longer",
         )
 
 

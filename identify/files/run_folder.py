@@ -45,6 +45,11 @@ class RunFolder:
         self.report = path / "report.html"
         self.figures = path / "figures"
 
+    @property
+    def holds_own_record(self) -> bool:
+        """Whether the record is one of the user's own: it follows no trajectories that were designed here."""
+        return self.experiment.is_file() and not self.trajectories.exists()
+
     def require(self, *names: str) -> None:
         """Refuse to go on without files of earlier stages, such as ``require("experiment.nc")``.
 
@@ -88,7 +93,12 @@ ENTRIES = {"identify": ("identification", "before", "after", "seconds"), "valida
 
 def save_result(path: Path | str, result: dict[str, Any]) -> None:
     """Write a result, whole or not at all; arrays become lists, and numbers that are not finite become null."""
-    write_text(path, json.dumps(_plain(result), indent=2, allow_nan=False) + "\n")
+    write_text(path, as_json(result))
+
+
+def as_json(result: dict[str, Any]) -> str:
+    """A result as the text that its file holds."""
+    return json.dumps(_plain(result), indent=2, allow_nan=False) + "\n"
 
 
 def save_files(folder: Path, files: Mapping[str, Any]) -> None:

@@ -22,6 +22,7 @@ from identify.record.checks import (
     checked_covariance,
 )
 from identify.record.payload import recorded_payload
+from identify.record.plausibility import check_plausible
 from identify.record.recording import poses
 from identify.scenario import Scenario
 
@@ -109,13 +110,15 @@ def recorded_run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> Record
     """A record that can carry an identification, with the model side of the scenario.
 
     Raises RecordError, EstimationError: as `watched_run` does. Raises EstimationError: too short, a constant channel, a
-    reference that stands still or is faster than the frames can show.
+    reference that stands still or is faster than the frames can show, that does not begin at rest, or that is in other
+    units or frames than the robot's.
     """
     check_origin(record, robot, scenario)
     check_length(record.sizes["time"], scenario)
     run = _run(record, robot, scenario)
     check_reference(run.reference, scenario)
     check_channels(robot.geometry.chart, run.measured, run.logged, run.ok)
+    check_plausible(robot, run.reference, run.measured, run.ok, run.logged)
     return run
 
 

@@ -182,6 +182,11 @@ def scenario_from_toml(text: str, source: str = "scenario") -> Scenario:
     return SCENARIOS.from_toml(text, source)
 
 
+def scenario_schema() -> dict[str, Any]:
+    """JSON schema of scenario files, for editors; `built_in/scenario.schema.json` holds it."""
+    return Scenario.model_json_schema()
+
+
 def _replace(data: dict[str, Any], path: str, value: Any) -> None:
     *sections, key = path.split(".", 1 if path.startswith("sensor_changes.") else -1)
     for section in sections:

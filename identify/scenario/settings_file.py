@@ -41,16 +41,20 @@ class SettingsFiles(Generic[Settings]):
 
         Raises IdentifyError: of this kind: neither a built-in name nor a file (with the names), no TOML, wrong content.
         """
+        text, path = self.text(name_or_path)
+        built_in = path.parent == self.folder
+        source = f"{self.kind} {path.stem!r}" if built_in else f"{self.kind} file {name_or_path}"
+        return self.from_toml(text, source, path.parent)
+
+    def text(self, name_or_path: str | Path) -> tuple[str, Path]:
+        """The text of a built-in file by name, or of a user's own by path, and where it stands. Raises as `load`."""
         name, built_in = str(name_or_path), self.names()
-        path, source = Path(name), f"{self.kind} file {name}"
-        if name in built_in:
-            path, source = self.folder / f"{name}.toml", f"{self.kind} {name!r}"
+        path = self.folder / f"{name}.toml" if name in built_in else Path(name)
         try:
-            text = path.read_text(encoding="utf-8")
+            return path.read_text(encoding="utf-8"), path
         except (OSError, UnicodeDecodeError) as error:
             reason = f", and {error}" if path.exists() else " nor a file"
             raise self.error(f"{self.kind} {name!r} is neither built in ({', '.join(built_in)}){reason}") from error
-        return self.from_toml(text, source, path.parent)
 
     def from_toml(self, text: str, source: str, folder: Path = Path()) -> Settings:
         """Settings from TOML text; `source` names it in messages, its paths start from `folder`. Raises as `load`."""
@@ -91,16 +95,39 @@ def to_toml(model: BaseModel) -> str:
 
     Fields whose value is None have no TOML form and are left out.
     """
+    return _text(model, lambda owner, name: None if getattr(owner, name) is None else "")
+
+
+def starting_toml(model: BaseModel, only: Collection[str] | None = None) -> str:
+    """The same text to start from: what is not stated is a comment, with the value that holds so, or with none.
+
+    only: the fields and sections that are written, all by default.
+    """
+    return _text(model, lambda owner, name: "" if name in owner.model_fields_set else "# ", only)
+
+
+def _text(model: BaseModel, before: Callable[[BaseModel, str], str | None], only: Collection[str] | None = None) -> str:
+    """TOML text; before: what stands before the entry of a field, None where it has no entry."""
+
+    def entries(section: BaseModel) -> list[str]:
+        fields = type(section).model_fields.items()
+        return [
+            f"{mark}{_entry(n, getattr(section, n), f)}" for n, f in fields if (mark := before(section, n)) is not None
+        ]
+
     lines, sections = [], []
     for name, field in type(model).model_fields.items():
         value = getattr(model, name)
+        mark = before(model, name)
+        if mark is None or (only is not None and name not in only):
+            continue
         if isinstance(value, BaseModel):
-            sections += ["", f"[{name}]", *_entries(value)]
+            sections += ["", f"[{name}]", *entries(value)]
         elif isinstance(value, dict):
-            entries = [f"{key} = {_toml_value(one)}" for key, one in value.items()]
-            sections += ["", f"[{name}]  # {field.description or ''}", *entries]
-        elif value is not None:
-            lines.append(_entry(name, value, field))
+            listed = [f"{key} = {_toml_value(one)}" for key, one in value.items()]
+            sections += ["", f"[{name}]  # {field.description or ''}", *listed]
+        else:
+            lines.append(f"{mark}{_entry(name, value, field)}")
     return "\n".join(lines + sections) + "\n"
 
 
@@ -109,14 +136,9 @@ def one_line(error: ValidationError, model: type[BaseModel]) -> str:
     return "; ".join(_complaint(details, model) for details in error.errors())
 
 
-def _entries(section: BaseModel) -> list[str]:
-    fields = type(section).model_fields
-    return [_entry(n, getattr(section, n), f) for n, f in fields.items() if getattr(section, n) is not None]
-
-
 def _entry(name: str, value: Any, field: FieldInfo) -> str:
     comment = "".join([f" [{unit}]" if (unit := _unit(field)) else "", f" {field.description or ''}"]).strip()
-    entry = f"{name} = {_toml_value(value)}"
+    entry = f"{name} = {_toml_value(value)}" if value is not None else f"{name} ="
     return f"{entry:<40} # {comment}" if comment else entry
 
 

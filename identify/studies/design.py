@@ -156,6 +156,9 @@ def prepare(study: Study) -> Setup:
     row_scenario, row_options = setup.row_scenario(first), kind.checked(setup.row_options(first))
     if kind.reads is not None:
         check_read(study, kind.reads, row_scenario, row_options)
+    for name in study.figures or [] if kind.columns else []:
+        if name not in kind.columns:
+            raise StudyError(f"figures has {name!r}, no figure of {study.kind}; {_nearest(name, kind.columns)}")
     for place, law in enumerate(study.theory, start=1):
         try:
             _check_law(law, study, list(kind.columns))

@@ -1,51 +1,96 @@
-"""PNG figures of a study: figures against each factor with bands, two factors as a map, and the laws."""
+"""Figures of a study, PNG, PDF and SVG: its figures against each factor with bands, two factors as a map, the laws."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
 from identify.arrays import Array
 from identify.files.atomic import write_figure
 from identify.reporting.figures import panel_grid
+from identify.studies.labels import axis_label, number, setting
 from identify.studies.study_file import Law, Study
-from identify.studies.table import labelled
 from identify.studies.theory import BAND_CONFIDENCE as BANDS
 from identify.studies.theory import CONFIDENCE as LAWS
 from identify.studies.theory import Verdict, law_data, point_statistics, with_data
 
-PANEL = (5.0, 3.8)
-"""Size of a panel, inches."""
+PANEL = (3.4, 2.8)
+"""Size of a panel, inches: a column of a journal."""
+STYLE: Any = {
+    "font.size": 8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.framealpha": 0.8,
+    "legend.edgecolor": "none",
+    "pdf.fonttype": 42,  # letters stay letters
+    "svg.fonttype": "none",
+}
+CURVES: list[dict[str, Any]] = [
+    {"fmt": f"{marker}{line}", "color": color}
+    for marker, line, color in zip(
+        "osD^vP", ("-", "--", "-.", ":", "-", "--"), ("C0", "C1", "C2", "C3", "C4", "C5"), strict=True
+    )
+]
+"""Markers, lines and colours, so that curves differ without colour."""
+FORMATS = ("png", "pdf", "svg")
 LEAST_SPAN = 2.0
 """Smallest ratio of the ends of a logarithmic axis: small differences shall look small."""
-LETTERS_PER_INCH = 10.0
+WIDEST_BAND = 3.0
+"""Factor by which a logarithmic axis goes beyond what is drawn for the sake of bands; wider ones run out of it."""
+LETTERS_PER_INCH = 14.0
 """Letters of a title, a little fewer than there is room for."""
+BESIDE = 1.02
+"""Ratio of the places of two curves that have the same levels."""
 MOST_CURVES = 6
 """Settings of the other factors that are drawn as curves of their own; more are drawn as one."""
+NEAREST_TICKS, LETTER = 0.09, 0.034
+"""Shares of an axis: that two numbers above each other are apart, at least; of a letter of a number."""
+TICKS: list[list[float]] = [
+    [1 + k / 10 for k in range(90)],
+    [1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8],
+    [1, 2, 3, 5],
+    [1, 2, 5],
+    [1, 3],
+    [1],
+]
+"""Numbers within each decade that may stand on a logarithmic axis, as many as find room."""
+MOST_TICKS = 7
 
 
 def draw(folder: Path, study: Study, done: pd.DataFrame, shown: list[str], verdicts: list[Verdict]) -> None:
     """Write the figures of a study's finished rows; `shown`: the figures of the rows that are drawn."""
     if not len(done) or not shown:
         return
+    with mpl.rc_context(STYLE):
+        for name, figure in _figures(study, done, shown, verdicts):
+            for kind in FORMATS:
+                write_figure(folder / f"{name}.{kind}", figure)
+
+
+def _figures(
+    study: Study, done: pd.DataFrame, shown: list[str], verdicts: list[Verdict]
+) -> Iterator[tuple[str, Figure]]:
+    """All figures of a study, by the names of their files."""
     for path in study.factors:
-        write_figure(folder / f"by_{path}.png", factor_figure(study, done, path, shown))
+        yield f"by_{path}", factor_figure(study, done, path, shown)
     grid = [path for path, values in study.factors.items() if isinstance(values, list)]
     if study.sample is None and len(grid) >= 2:
-        write_figure(folder / "map.png", map_figure(study, done, (grid[0], grid[1]), shown[:2]))
+        yield "map", map_figure(study, done, (grid[0], grid[1]), shown[:2])
     laws = [
         (law, verdict)
         for law, verdict in zip(study.theory, verdicts, strict=True)
         if law.exponent is not None and verdict.measured is not None
     ]
     if laws:
-        write_figure(folder / "laws.png", laws_figure(study, done, laws))
+        yield "laws", laws_figure(study, done, laws)
 
 
 def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str]) -> Figure:
@@ -57,17 +102,18 @@ def factor_figure(study: Study, done: pd.DataFrame, path: str, shown: list[str])
         if study.sample is not None:
             axes.plot(_shown(have[path]), have[name], ".", markersize=4)
         else:
-            for label, rows in _curves(have, others):
-                _curve(axes, rows[path], rows[name].to_numpy(dtype=float), label)
+            curves = _curves(have, others)
+            for place, (label, rows) in enumerate(curves):
+                _curve(axes, _beside(rows[path], place, len(curves)), rows[name].to_numpy(dtype=float), label, place)
         law = next((one for one in study.theory if (one.figure, one.per, one.factor) == (name, None, path)), None)
         if law is not None and law.exponent is not None:
             _theory_line(axes, have[path], have[name].to_numpy(dtype=float), law.exponent)
-        _scale(axes, have[path], have[name])
-        axes.set_xlabel(labelled(path, study))
-        axes.set_ylabel(labelled(name, study))
-        if axes.get_legend_handles_labels()[1]:
+        _scale(axes, have[path])
+        axes.set_xlabel(axis_label(path, study))
+        axes.set_ylabel(axis_label(name, study))
+        if any(label != "rows" for label in axes.get_legend_handles_labels()[1]):
             axes.legend(fontsize="small")
-    what = f"rms over rows, {BANDS:.0%} band" if study.sample is None else "single rows"
+    what = f"rms over rows, {100 * BANDS:.0f} % band" if study.sample is None else "single rows"
     _title(figure, f"{study.title or study.name}: {what}")
     return figure
 
@@ -84,11 +130,12 @@ def map_figure(study: Study, done: pd.DataFrame, paths: tuple[str, str], shown: 
         for (row, column), value in np.ndenumerate(rms):
             ink = "black" if value > bright else "white"
             axes.text(column, row, f"{value:.3g}", ha="center", va="center", color=ink, fontsize="small")
-        axes.set_xticks(range(table.shape[1]), [str(value) for value in table.columns])
-        axes.set_yticks(range(table.shape[0]), [str(value) for value in table.index])
-        axes.set_xlabel(labelled(paths[1], study))
-        axes.set_ylabel(labelled(paths[0], study))
-        figure.colorbar(picture, ax=axes, label=labelled(name, study))
+        axes.set_xticks(range(table.shape[1]), [number(value) for value in table.columns])
+        axes.set_yticks(range(table.shape[0]), [number(value) for value in table.index])
+        axes.set_xlabel(axis_label(paths[1], study))
+        axes.set_ylabel(axis_label(paths[0], study))
+        axes.spines[:].set_visible(False)
+        figure.colorbar(picture, ax=axes, label=axis_label(name, study))
     _title(figure, f"{study.title or study.name}: rms over rows")
     return figure
 
@@ -100,17 +147,19 @@ def laws_figure(study: Study, done: pd.DataFrame, laws: list[tuple[Law, Verdict]
         factor = str(law.factor)
         others = [path for path in study.factors if path != factor and factor in study.factors]
         have = with_data(law, done)
-        for label, rows in _curves(have, others):
-            _curve(axes, _levels(study, rows, factor), law_data(law, rows), label)
+        curves = _curves(have, others)
+        for place, (label, rows) in enumerate(curves):
+            levels = _beside(_levels(study, rows, factor), place, len(curves))
+            _curve(axes, levels, law_data(law, rows), label, place)
         _theory_line(axes, have[factor], law_data(law, have), law.exponent or 0.0)
-        _scale(axes, have[factor], pd.Series(law_data(law, have)))
+        _scale(axes, _levels(study, have, factor))
         axes.set_title(
-            f"{verdict.verdict}: {verdict.measured:.4g} ({verdict.low:.4g} to {verdict.high:.4g})", fontsize="small"
+            f"{verdict.verdict}: {verdict.measured:.4g} ({verdict.low:.4g} to {verdict.high:.4g})", fontsize="medium"
         )
-        axes.set_xlabel(labelled(factor, study))
-        axes.set_ylabel(labelled(law.quantity, study))
+        axes.set_xlabel(axis_label(factor, study))
+        axes.set_ylabel(axis_label(law.figure, study, law.per))
         axes.legend(fontsize="small")
-    _title(figure, f"{study.title or study.name}: measured exponent and its {LAWS:.0%} interval")
+    _title(figure, f"{study.title or study.name}: measured exponent and its {100 * LAWS:.0f} % interval")
     return figure
 
 
@@ -123,7 +172,7 @@ def _levels(study: Study, rows: pd.DataFrame, factor: str) -> pd.Series:
 
 def _title(figure: Figure, text: str) -> None:
     """A title above all panels, in as many lines as the width of the figure asks for."""
-    figure.suptitle("\n".join(wrap(text, round(LETTERS_PER_INCH * figure.get_figwidth()))))
+    figure.suptitle("\n".join(wrap(text, round(LETTERS_PER_INCH * figure.get_figwidth()))), fontsize=9)
 
 
 def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFrame]]:
@@ -134,18 +183,34 @@ def _curves(done: pd.DataFrame, others: list[str]) -> list[tuple[str, pd.DataFra
     if len(groups) < 2:
         return [("", done)]
     return [
-        (", ".join(f"{path.rpartition('.')[2]} {value}" for path, value in zip(others, values, strict=True)), rows)
+        (", ".join(setting(path, value) for path, value in zip(others, values, strict=True)), rows)
         for values, rows in groups
     ]
 
 
-def _curve(axes: Axes, levels: pd.Series, values: Array, label: str) -> None:
+def _beside(levels: pd.Series, place: int, count: int) -> pd.Series:
+    """Levels of one of several curves, moved a little, so that their bands do not cover each other."""
+    if count == 1 or not pd.api.types.is_numeric_dtype(levels) or not (levels > 0).all():
+        return levels
+    return levels * BESIDE ** (place - (count - 1) / 2)
+
+
+def _curve(axes: Axes, levels: pd.Series, values: Array, label: str, place: int) -> None:
     """Rms at each level with its band."""
     groups = pd.Series(values, index=levels.index).groupby(levels, sort=pd.api.types.is_numeric_dtype(levels))
     places, points = zip(*[(level, point_statistics(one.to_numpy())) for level, one in groups], strict=True)
     shown, rms = _shown(pd.Series(places)), np.array([point.rms for point in points])
     low, high = np.array([point.rms_band or (point.rms, point.rms) for point in points]).T
-    axes.errorbar(shown, rms, yerr=(rms - low, high - rms), fmt="o-", capsize=3, markersize=4, label=label or "rows")
+    axes.errorbar(
+        shown,
+        rms,
+        yerr=(rms - low, high - rms),
+        capsize=3,
+        markersize=4,
+        linewidth=1.2,
+        label=label or "rows",
+        **CURVES[place],
+    )
 
 
 def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) -> None:
@@ -158,29 +223,52 @@ def _theory_line(axes: Axes, factor: pd.Series, values: Array, exponent: float) 
     axes.plot(ends, level * ends**exponent, "--", color="black", linewidth=1, label=f"theory, power {exponent:g}")
 
 
-def _scale(axes: Axes, factor: pd.Series, values: pd.Series) -> None:
-    """Logarithmic axes where everything is positive."""
-    numeric = pd.api.types.is_numeric_dtype(factor)
-    if numeric and (factor > 0).all() and factor.nunique() > 1:
+def _scale(axes: Axes, factor: pd.Series) -> None:
+    """Logarithmic axes where everything is positive, with numbers that do not touch each other."""
+    if pd.api.types.is_numeric_dtype(factor) and (factor > 0).all() and factor.nunique() > 1:
         axes.set_xscale("log")
-        if factor.nunique() <= 12:
-            axes.set_xticks(sorted(factor.unique()), [f"{value:.4g}" for value in sorted(factor.unique())], minor=False)
-            axes.xaxis.set_minor_locator(NullLocator())
-        else:
-            _plain_ticks(axes.xaxis)
-    if (values > 0).all():
+        levels = sorted(factor.unique()) if factor.nunique() <= MOST_TICKS else _log_ticks(*axes.get_xlim())
+        letters = max(len(number(float(value))) for value in levels)
+        _set_ticks(axes.xaxis, _far_apart(levels, *axes.get_xlim(), 0.02 + LETTER * letters))
+    drawn = np.concatenate([np.asarray(line.get_ydata(), dtype=float).ravel() for line in axes.lines])
+    if (drawn > 0).all():
         axes.set_yscale("log")
-        low, high = axes.get_ylim()
-        widen = max(1.0, np.sqrt(LEAST_SPAN * low / high))
+        curves = [np.asarray(line.get_ydata(), dtype=float) for line in axes.lines if line.get_linestyle() != "None"]
+        middle = np.concatenate(curves or [drawn])
+        low, high = max(drawn.min(), middle.min() / WIDEST_BAND), min(drawn.max(), middle.max() * WIDEST_BAND)
+        widen = 1.08 * max(1.0, np.sqrt(LEAST_SPAN * low / high))
         axes.set_ylim(low / widen, high * widen)
-        _plain_ticks(axes.yaxis)
-    axes.grid(alpha=0.3, which="both")
+        _set_ticks(axes.yaxis, _log_ticks(*axes.get_ylim()))
+    else:
+        axes.yaxis.set_major_locator(MaxNLocator(MOST_TICKS))
+    axes.grid(alpha=0.3)
 
 
-def _plain_ticks(axis: Axis) -> None:
-    """Numbers as one writes them, where matplotlib would write powers of ten."""
-    for ticks in (axis.set_major_formatter, axis.set_minor_formatter):
-        ticks(FuncFormatter(lambda value, place: f"{value:.4g}"))
+def _log_ticks(low: float, high: float) -> list[float]:
+    """Round numbers between the ends of a logarithmic axis, as many as find room."""
+    decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    inside: list[float] = []
+    for places in TICKS:
+        found = [place * 10.0**decade for decade in decades for place in places]
+        inside = [value for value in found if low <= value <= high]
+        if len(inside) <= MOST_TICKS and _far_apart(inside, low, high) == inside:
+            return inside
+    return inside[:: -(-len(inside) // MOST_TICKS)]
+
+
+def _set_ticks(axis: Axis, values: list[float]) -> None:
+    axis.set_major_locator(FixedLocator(values))
+    axis.set_major_formatter(FuncFormatter(lambda value, place: number(float(value))))
+    axis.set_minor_locator(NullLocator())
+
+
+def _far_apart(values: list[float], low: float, high: float, share: float = NEAREST_TICKS) -> list[float]:
+    """Those of ascending values that are this share of a logarithmic axis from the last that was kept, or more."""
+    kept: list[float] = []
+    for value in values:
+        if not kept or np.log(value / kept[-1]) >= share * np.log(high / low):
+            kept.append(value)
+    return kept
 
 
 def _shown(values: pd.Series) -> Any:

@@ -33,7 +33,7 @@ from identify.studies.table import study_in, written
 STUDY, JOURNAL, TABLE, VIEW, LOCK = "study.json", "rows.jsonl", "study.parquet", "study.nc", ".lock"
 VERSIONS = "versions"
 
-MAY_CHANGE = ("study.title", "study.theory", "study.repeats", "scenario.description")
+MAY_CHANGE = ("study.title", "study.theory", "study.figures", "study.repeats", "scenario.description")
 """What may change in a study that is continued: it decides no row that is there. Further repeats have rows of their own
 after all others; with fewer, the rows beyond stay in the journal and count for nothing."""
 

@@ -103,6 +103,9 @@ class Study(Section):
     seed: int = Field(0, description="seed of all randomness", ge=0)
     theory: list[Law] = Field([], description="laws with which the summary compares")
     options: dict[str, Any] = Field({}, description="options of the kind")
+    figures: list[str] | None = Field(
+        None, description="figures of the rows that are drawn and tabulated; none: the main ones of the kind"
+    )
 
     @field_validator("changes", mode="before")
     @classmethod
@@ -138,6 +141,33 @@ class Study(Section):
         """Number of rows: each point once a repeat."""
         return self.points * self.repeats
 
+    def with_settings(self, settings: Mapping[str, Any]) -> "Study":
+        """Copy with entries replaced by dotted path, such as ``{"repeats": 5, "scenario.timing.latency_s": 0.01}``.
+
+        A key of the scenario, of the sensor or of the options with a list of values, or with a table of low and high,
+        becomes a factor; with any other value it holds in every row.
+
+        Raises StudyError: no such entry (with the valid names), or a value that does not fit.
+        """
+        data = {"factors": {}, "changes": {}, "options": {}} | self.model_dump(exclude_unset=True)
+        single = [name for name in Study.model_fields if name not in ("factors", "changes", "options", "theory")]
+        for path, value in settings.items():
+            root, _, key = path.partition(".")
+            if path in single:
+                data[path] = value
+            elif root in ("scenario", "sensor", "options") and key:
+                place, name = ("options", key) if root == "options" else ("changes", path)
+                data["factors"].pop(path, None)
+                data[place].pop(name, None)
+                table, name = ("factors", path) if isinstance(value, (list, dict)) else (place, name)
+                data[table][name] = value
+            else:
+                raise StudyError(
+                    f"unknown key {path!r} of study {self.name!r}; valid names: {', '.join(single)}, and scenario.*, "
+                    "sensor.* and options.* for what its rows vary"
+                )
+        return STUDIES.from_dict(data, f"study {self.name!r}")
+
 
 _VARIED = {
     f"{table}.scenario.{key}": names for table in ("changes", "factors") for key, names in SCENARIOS.files.items()
@@ -147,6 +177,10 @@ STUDIES = SettingsFiles(
 )
 
 
+STARTING = Path(__file__).parent / "starting.toml"
+"""A study file that shows what one may have."""
+
+
 def load_study(name_or_path: str | Path) -> Study:
     """Load a built-in study by name, or one from a TOML file, from whose folder its paths start.
 
@@ -154,6 +188,23 @@ def load_study(name_or_path: str | Path) -> Study:
     changes are checked by `identify.studies.design`.
     """
     return STUDIES.load(name_or_path)
+
+
+def study_schema() -> dict[str, Any]:
+    """JSON schema of study files, for editors; `built_in/study.schema.json` holds it.
+
+    What is varied stands in tables in tables, whose keys are those of scenarios, sensors and kinds of row.
+    """
+    schema = Study.model_json_schema()
+    for name in ("changes", "factors"):
+        known = schema["properties"][name]
+        schema["properties"][name] = {
+            "type": "object",
+            "description": known["description"],
+            "propertyNames": {"pattern": r"^(scenario|sensor|options)(\.|$)"},
+        }
+    del schema["$defs"]["Range"]
+    return schema
 
 
 def _factor(path: str, value: Any) -> Any:

@@ -10,14 +10,16 @@ from typing import Any
 
 import pandas as pd
 
+from identify.errors import StudyError
 from identify.files.atomic import write_text
 from identify.files.run_folder import save_result
 from identify.files.versions import versions
 from identify.studies import theory
 from identify.studies.figures import draw
+from identify.studies.labels import labelled, unit_of
 from identify.studies.rows import KINDS
 from identify.studies.study_file import Study
-from identify.studies.table import figure_names, labelled, unit_of
+from identify.studies.table import figure_names
 from identify.studies.theory import Statistics, Verdict, check_laws
 
 JSON, MARKDOWN = "summary.json", "summary.md"
@@ -63,17 +65,26 @@ def write(folder: Path, study: Study, frame: pd.DataFrame) -> dict[str, Any]:
     }
     folder.mkdir(parents=True, exist_ok=True)
     save_result(folder / JSON, entry)
-    shown = main_figures(study.kind, names)
+    shown = main_figures(study, names)
     write_text(folder / MARKDOWN, _markdown(study, entry, verdicts, points, shown))
     draw(folder / "figures", study, done, shown, verdicts)
     return entry
 
 
-def main_figures(kind: str, names: list[str]) -> list[str]:
-    """The figures that are shown first: a built-in kind's own choice, or the first six of one's own kind."""
-    if kind not in KINDS:
+def main_figures(study: Study, names: list[str]) -> list[str]:
+    """The figures, of those that the rows have, that are drawn and tabulated: those that the study chooses; else the
+    main ones of a built-in kind, or the first six of one's own kind.
+
+    Raises StudyError: the study chooses one that no row has.
+    """
+    if study.figures is not None:
+        missing = [name for name in study.figures if names and name not in names]
+        if missing:
+            raise StudyError(f"figures has {missing[0]!r}, and the rows have {', '.join(names)}")
+        return [name for name in study.figures if name in names]
+    if study.kind not in KINDS:
         return names[:6]
-    return [name for name, column in KINDS[kind].columns.items() if column.main and name in names]
+    return [name for name, column in KINDS[study.kind].columns.items() if column.main and name in names]
 
 
 def _points(study: Study, done: pd.DataFrame, names: list[str]) -> Points:

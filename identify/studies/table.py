@@ -22,9 +22,8 @@ from identify.errors import StudyError
 from identify.files.atomic import atomic_path
 from identify.files.dataset import write_groups
 from identify.files.versions import versions
-from identify.scenario import Scenario
 from identify.studies.design import Design, Finished
-from identify.studies.rows import KINDS
+from identify.studies.labels import unit_of
 from identify.studies.study_file import Study
 
 FIRST = ("row", "repeat", "seed_entropy", "seed_spawn_key")
@@ -32,51 +31,6 @@ LAST = ("seconds", "error")
 """Columns of a study's table before its factors and behind its figures."""
 
 STUDY_KEY, VERSIONS_KEY = b"cmmsim.study", b"cmmsim.versions"
-
-SENSOR_UNITS = {
-    **dict.fromkeys(("rig.baseline", "rig.distance", "rig.position", "rig.target"), "m"),
-    **dict.fromkeys(("rig.focal_px", "rig.width", "rig.height", "lens.psf_px"), "px"),
-    **{f"rig.{side}.{key}": "px" for side in ("left", "right") for key in ("focal_px", "centre_px")},
-    "rig.right_from_left.translation": "m",
-    "rig.right_from_left.rotation_vector": "rad",
-    **dict.fromkeys(("stickers.radius", "stickers.ring_radius", "stickers.placement"), "m"),
-    **{f"camera.{key}": "electrons" for key in ("dark_noise", "electrons_at_white", "full_well", "dsnu")},
-    "camera.gain": "grey values per electron",
-    "camera.black_level": "grey values",
-    "camera.bit_depth": "bit",
-    "timing.frame_rate": "Hz",
-    **dict.fromkeys(("timing.exposure", "timing.latency", "timing.latency_jitter"), "s"),
-}
-"""Units of the sensor file's keys that have one, but for the shapes of the bodies."""
-
-
-def factor_unit(path: str) -> str:
-    """Unit of a factor by dotted path; empty where it has none."""
-    root, _, key = path.partition(".")
-    if root == "sensor":
-        return SENSOR_UNITS.get(key, "")
-    if root == "scenario" and key.count(".") == 1:
-        section, _, name = key.partition(".")
-        extra = getattr(Scenario.model_fields[section].annotation, "model_fields", {})[name].json_schema_extra
-        unit = str(extra["unit"]) if isinstance(extra, dict) and "unit" in extra else ""
-        return "" if unit == "1" else unit
-    return "s" if key.endswith("_s") else ""
-
-
-def unit_of(name: str, study: Study) -> str:
-    """Unit of a column of a study's table, a factor or a figure; empty where it has none, or where nobody says it."""
-    if name == "seconds":
-        return "s"
-    if name in study.factors:
-        return factor_unit(name)
-    columns = KINDS[study.kind].columns if study.kind in KINDS else {}
-    unit = columns[name].unit if name in columns else ""
-    return "" if unit == "1" else unit
-
-
-def labelled(name: str, study: Study) -> str:
-    """A column's name with its unit in brackets."""
-    return f"{name} [{unit}]" if (unit := unit_of(name, study)) else name
 
 
 def tidy_table(study: Study, finished: Iterable[Finished]) -> pd.DataFrame:

@@ -7,6 +7,7 @@ from functools import partial
 import pytest
 
 from cmmsim.acceptance.moving_bar import SECONDS
+from identify.commands.help import BEYOND_LIMIT
 from identify.verification.acceptance import STANDARDS
 from identify.verification.acceptance_report import acceptance_markdown
 from tests.identify.commands import command
@@ -31,7 +32,7 @@ def read(out):
 
 def test_missed_limit_is_the_exit_status_and_all_is_written(accepted):
     status, out = accepted
-    assert status == 1
+    assert status == BEYOND_LIMIT
     test = read(out)["vdi_2634_1"]
     assert test["met"] is False
     errors = [length["error_um"] for line in test["lines"] for length in line["lengths"]]

@@ -12,7 +12,8 @@ from rich.console import Console
 
 from cmmsim.errors import OpenGLMissingError
 from dynamics.errors import RobotFileError
-from identify.commands import app as command_line
+from identify.commands import experiment as command_line
+from identify.commands.options import parse_settings
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import RunFolder, load_result, save_result
 from identify.progress import RichProgress, print_table
@@ -182,28 +183,19 @@ def test_known_errors_of_every_package_are_one_line_and_others_keep_their_traceb
 
 def test_settings_are_toml_or_text_behind_a_key():
     texts = ["30", "0.5", "true", "planes", '"30"', "a=b", ""]
-    parsed = command_line.parse_settings([f"x{number}={text}" for number, text in enumerate(texts)])
+    parsed = parse_settings([f"x{number}={text}" for number, text in enumerate(texts)])
     assert [*parsed.values()] == [30, 0.5, True, "planes", "30", "a=b", ""]
     assert [*parsed] == [f"x{number}" for number in range(len(texts))]
     with pytest.raises(ScenarioError, match="KEY=VALUE"):
-        command_line.parse_settings(["=30"])
+        parse_settings(["=30"])
 
 
-def test_help_teaches_and_the_command_starts_in_a_process_of_its_own_and_waits_for_nothing_heavy(capsys):
+def test_the_command_starts_in_a_process_of_its_own_and_waits_for_nothing_heavy():
     heavy = "casadi", "cv2", "matplotlib", "numba", "pandas", "scipy.optimize"
     loaded = f"import identify.commands.app, sys; print(sorted(set({heavy}) & sys.modules.keys()))"
     for words, shown in ((["-m", "identify", "--version"], "cmmsim 0."), (["-c", loaded], "[]\n")):
         made = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True)
         assert made.stdout.startswith(shown)
-    for words, shown in (
-        (["--help"], "identify --out mine --set identification.method=command_driven"),
-        (["run", "--help"], "paper, quick"),
-        (["identify", "--help"], "stays in scenario.toml"),
-        (["acceptance", "--help"], "cmmsim acceptance mine.toml"),
-        (["calibrate", "--help"], "asymmetric_dots"),
-    ):
-        assert command(*words) == 0
-        assert shown in capsys.readouterr().out
 
 
 def shown(terminal, fail=False, rate=""):

@@ -62,7 +62,7 @@ def test_of_chance_nothing_is_the_models_a_large_misfit_decides_and_a_small_one_
     assert Misfit(3.3, 1.05, 0.02).decides
     assert not Misfit(3.1, 1.05, 0.02).decides
     assert "nothing counts as identified" in Misfit(3.3, 1.05, 0.02).warnings()[0]
-    assert "too wide" in Misfit(0.8, 1.0, 0.03).warnings()[0]
+    assert "too large, and so are the intervals" in Misfit(0.8, 1.0, 0.03).warnings()[0]
     assert not Misfit(0.8, 1.0, 0.03).significant
 
 

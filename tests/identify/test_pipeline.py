@@ -135,7 +135,7 @@ def test_a_plant_that_the_model_cannot_be_is_said_and_judged(tmp_path, capfd):
     out, err = capfd.readouterr()
     assert out == ""
     assert all(line.startswith("warning: ") for line in err.splitlines())
-    assert "are not white" in err
+    assert "leaves residuals that follow each other" in err
     result = load_result(run.result)
     assert "white residuals" in missed(result)
     assert result["identification"]["noise_ratio"] > 1.05

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dynamics import load_robot
+from identify.commands.help import BEYOND_LIMIT
 from tests.identify.commands import command, one_line
 
 
@@ -44,7 +45,7 @@ def test_a_spoilt_robot_fails_by_number_and_leg(tmp_path, capfd):
         assert old in text
         text = text.replace(old, new)
     (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
-    assert command("check", tmp_path / "mine.toml", "--json", tmp_path / "found.json", "--quiet") == 1
+    assert command("check", tmp_path / "mine.toml", "--json", tmp_path / "found.json", "--quiet") == BEYOND_LIMIT
     found = _found(tmp_path / "found.json")
     failed = {name for name, entry in found.items() if not entry["ok"]}
     assert {"inertias", "loop", "gain margin", "frame rate"} <= failed

@@ -9,6 +9,7 @@ import pytest
 
 from dynamics import load_robot
 from dynamics.errors import UnreachablePoseError
+from identify.commands.help import BEYOND_LIMIT
 from identify.errors import RecordError, TrajectoryError
 from identify.files.run_folder import load_result, save_result
 from identify.loop_parameters import choose_parameters
@@ -97,7 +98,7 @@ def test_exciting_trajectory_starts_at_home_at_rest_and_stays_inside_the_travel(
 def test_command_fails_in_one_line_where_a_goal_is_missed(made_runs, monkeypatch, capfd, tmp_path):
     off = replace(made_runs, mujoco_pose=made_runs.mujoco_pose + 1e-4)
     monkeypatch.setattr("identify.verification.against_mujoco.verify", lambda *_: off)
-    assert command("verify-model", "--out", tmp_path / "new", "--quiet") == 1
+    assert command("verify-model", "--out", tmp_path / "new", "--quiet") == BEYOND_LIMIT
     said = one_line(capfd.readouterr().err)
     assert "model and MuJoCo differ by 174 um and 171 urad, more than 10 um and 20 urad" in said
     assert json.loads((tmp_path / "new" / "verification.json").read_text())["met"] is False

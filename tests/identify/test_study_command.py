@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from identify.commands import study as study_command
+from identify.commands.help import BEYOND_LIMIT, ROWS_FAILED
 from identify.studies import dask_cluster, summary
 from identify.studies.rows import KINDS
 from identify.studies.study_file import STUDIES, load_study
@@ -51,10 +52,10 @@ def test_study_leaves_its_files_adds_repeats_in_the_same_folder_and_says_nothing
     ("fails", "figure", "exponent", "status", "says"),
     [
         ([], "spread_um", 0.0, 0, ""),
-        ([], "spread_um", 3.0, study_command.A_LAW_FAILED, "1 of 1 laws failed; failed: spread_um ~"),
+        ([], "spread_um", 3.0, BEYOND_LIMIT, "1 of 1 laws failed; failed: spread_um ~"),
         ([], "error_um", 1.0, 0, ""),
-        ([1], "spread_um", 0.0, study_command.SOME_ROWS_FAILED, "1 of 8 rows failed; row 1: ValueError: row 1 has no"),
-        ([1], "spread_um", 9.0, study_command.SOME_ROWS_FAILED, "1 of 1 laws failed"),
+        ([1], "spread_um", 0.0, ROWS_FAILED, "1 of 8 rows failed; row 1: ValueError: row 1 has no"),
+        ([1], "spread_um", 9.0, ROWS_FAILED, "1 of 1 laws failed"),
     ],
 )
 def test_rows_or_laws_that_fail_make_an_exit_status_of_their_own(mine, capsys, fails, figure, exponent, status, says):
@@ -84,6 +85,29 @@ def test_studies_are_listed_with_their_rows_and_kinds_with_options_figures_and_w
             assert any(line[: len(start)] == start for line in lines), name
         assert {f"options.{name}" for name in kind.options.model_fields} <= {one[0] for one in lines}
     assert ["options.stretch_s", "0.5", "s"] in [line[:3] for line in lines]
+
+
+def test_a_file_is_shown_and_single_entries_are_replaced(mine, capsys):
+    assert command("study", "--show", "pixel_noise") == 0
+    Path("theirs.toml").write_text(capsys.readouterr().out)
+    assert load_study("theirs.toml") == load_study("pixel_noise")
+    changes = ("--set", "sensor.camera.dark_noise=[1.0,2.0,3.0]", "--set", "sensor.rig.baseline=0.9", "--seed", 5)
+    assert command("study", mine, "--workers", 0, "--out", "a", "--quiet", "--set", "repeats=1", *changes) == 0
+    frame, study = read_table("a/study.parquet")
+    assert frame["sensor.camera.dark_noise"].tolist() == [1.0, 2.0, 3.0]
+    assert (study.seed, study.changes, study.repeats) == (5, {"sensor.rig.baseline": 0.9}, 1)
+    for setting, says in (
+        ("reapeats=2", "unknown key 'reapeats' of study 'mine'; valid names: name, title, kind, scenario, sample, "),
+        ("sensor.camera.darkness=2", "unknown key 'sensor.camera.darkness'; the nearest are sensor.camera.dark_noise"),
+        ("repeats=many", "repeats = 'many': input should be a valid integer"),
+        ("scenario.timing.latency_s=late", "scenario.timing.latency_s = 'late': input should be a valid number"),
+        ("repeats", "is not of the form KEY=VALUE"),
+    ):
+        assert command("study", mine, "--workers", 0, "--out", "b", "--set", setting) == 1
+        assert says in one_line(capsys.readouterr().err)
+    assert command("study", "--show", "none") == 1
+    assert "neither built in (baseline, " in one_line(capsys.readouterr().err)
+    assert not Path("b").exists()
 
 
 def test_ten_million_rows_are_refused_at_once_and_many_are_run_where_confirmed(mine, capsys, monkeypatch):

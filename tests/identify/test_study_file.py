@@ -12,10 +12,10 @@ from identify.errors import IdentifyError, StudyError
 from identify.plugins import CRITERIA
 from identify.scenario import load_scenario
 from identify.studies.design import Design, overrides, prepare, valid_keys
+from identify.studies.labels import factor_unit
 from identify.studies.rows import find_kind
 from identify.studies.runner import compute
 from identify.studies.study_file import STUDIES, Law, load_study
-from identify.studies.table import SENSOR_UNITS
 from tests.identify.commands import refusal
 from tests.identify.study_rows import DARK, KIND, METHOD, small_study
 
@@ -82,14 +82,17 @@ def test_a_sample_is_spread_as_its_factors_say():
 
 
 def test_every_key_of_a_sensor_has_its_unit_or_needs_none():
-    """So that a new key is not drawn without its unit, and no unit stands for a key that is gone."""
+    """So that a new key is not drawn without its unit, nor without words."""
     without = {"timing.dropout", "camera.noise", "camera.prnu", "camera.pattern_seed", "lens.vignetting"}
     without |= {"stickers.placement_seed", "stickers.per_plane", "rig.left.distortion", "rig.right.distortion"}
     without |= {f"stickers.{what}_level" for what in ("sticker", "ring", "body", "obstacle", "background")}
     sections = ("timing", "rig", "camera", "lens", "stickers")
-    keys = {path.removeprefix("sensor.") for path in valid_keys(None) if path.startswith("sensor.")}
-    assert {key for key in keys if key.partition(".")[0] in sections} == {*SENSOR_UNITS} | without
-    assert all(SENSOR_UNITS[key] == "px" for key in SENSOR_UNITS if key.endswith("_px"))
+    fields = {path: field for path, field in valid_keys(None).items() if path.startswith("sensor.")}
+    keys = {path.removeprefix("sensor.") for path in fields}
+    units = {key: factor_unit(f"sensor.{key}") for key in keys if key.partition(".")[0] in sections}
+    assert {key for key, unit in units.items() if not unit} == without
+    assert all(unit == "px" for key, unit in units.items() if key.endswith("_px"))
+    assert all(fields[f"sensor.{key}"].description for key in units)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Summaries of studies against numpy and scipy, and laws against figures drawn with a known exponent or ratio."""
 
 import json
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import pandas as pd
@@ -10,9 +10,10 @@ from matplotlib.image import imread
 from scipy import stats
 
 from identify.errors import StudyError
+from identify.studies import figures as figures_of_studies
 from identify.studies import summary
-from identify.studies.design import Design, Finished
-from identify.studies.figures import laws_figure
+from identify.studies.design import Design, Finished, prepare
+from identify.studies.figures import FORMATS, factor_figure, laws_figure
 from identify.studies.study_file import Law, Range, Study
 from identify.studies.table import tidy_table
 from identify.studies.theory import CONFIDENCE, check_laws, point_statistics, scale_regression
@@ -119,10 +120,48 @@ def test_points_and_laws_are_those_of_the_rows_that_have_the_figure_and_the_fail
 
 def test_figures_show_each_factor_two_as_a_map_and_the_laws(written):
     folder = written[2] / "figures"
-    names = {f"by_{DARK}.png", f"by_{BASELINE}.png", "map.png", "laws.png"}
-    assert {path.name for path in folder.iterdir()} == names
+    names = {f"by_{DARK}", f"by_{BASELINE}", "map", "laws"}
+    assert {path.name for path in folder.iterdir()} == {f"{name}.{kind}" for name in names for kind in FORMATS}
     for name in names:
-        assert np.ptp(imread(folder / name)[..., :3]) > 0.5
+        assert np.ptp(imread(folder / f"{name}.png")[..., :3]) > 0.5
+        assert (folder / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+        assert "dark noise" in (folder / f"{name}.svg").read_text().lower()
+
+
+@pytest.mark.parametrize("levels", [[1.0, 1.05, 1.1, 9.0], [0.001, 5e4], np.geomspace(1, 7, 7)])
+@pytest.mark.parametrize("spread", [1.0001, 5.0, 1e7])
+def test_numbers_on_axes_never_touch_and_labels_are_words_with_units(levels, spread):
+    """Of rows whose rms spans a little or seven decades, with bands as wide as few repeats leave them."""
+    study = made_study(factors={DARK: list(levels), BASELINE: [0.5, 1.0]}, repeats=2, theory=[])
+    share = {level: place / (len(levels) - 1) for place, level in enumerate(levels)}
+
+    def figures(case, rng):
+        return {POSITION: spread ** share[case[DARK]] * np.sqrt(rng.chisquare(1)), ORIENTATION: 1.0}
+
+    figure = factor_figure(study, made_table(study, figures=figures), DARK, [POSITION])
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    assert axes.get_xlabel() == "Dark noise, rms [electrons]"
+    assert axes.get_ylabel().replace("\n", " ") == "Error of the measured position, rms over pictures and axes [µm]"
+    for labels in (axes.get_xticklabels(), axes.get_yticklabels()):
+        boxes = [label.get_window_extent() for label in labels if label.get_text()]
+        assert len(boxes) >= 2
+        assert not any(one.overlaps(other) for one, other in pairwise(boxes))
+
+
+def test_figures_chosen_in_the_file_are_drawn_and_tabulated_and_others_are_refused(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(summary, "draw", lambda *arguments: drawn.append(arguments[3]))
+    chosen = made_study(figures=[ORIENTATION], theory=[])
+    summary.write(tmp_path, chosen, made_table(chosen))
+    assert "| orientation_rms_urad [urad] |" in (tmp_path / "summary.md").read_text()
+    assert "position_rms_um" not in (tmp_path / "summary.md").read_text()
+    assert drawn == [[ORIENTATION]]
+    with pytest.raises(StudyError, match="figures has 'speed', no figure of static_pose; the nearest are"):
+        prepare(made_study(figures=["speed"]))
+    own = made_study(kind="my_rows:count", figures=["speed"], theory=[])
+    with pytest.raises(StudyError, match=f"figures has 'speed', and the rows have {POSITION}"):
+        summary.write(tmp_path, own, made_table(own))
 
 
 def test_long_title_stays_within_the_figure_of_a_single_law():
@@ -152,7 +191,11 @@ def test_what_a_study_lacks_is_said(tmp_path, monkeypatch):
     assert entry["points"][0]["figures"][ORIENTATION]["rows"] == 4
 
 
-def test_law_against_a_figure_needs_no_factor_and_one_of_a_texts_power_is_undecided_and_not_drawn(tmp_path):
+def test_law_against_a_figure_needs_no_factor_and_one_of_a_texts_power_is_undecided_and_not_drawn(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(figures_of_studies, "FORMATS", ("png",))
+
     def figures(_, rng):
         sight = rng.uniform(1.0, 4.0)
         return {"sight_m": sight, POSITION: sight**2 * np.sqrt(rng.chisquare(12) / 12)}
@@ -166,7 +209,10 @@ def test_law_against_a_figure_needs_no_factor_and_one_of_a_texts_power_is_undeci
     assert (tmp_path / "figures" / f"by_{METHOD}.png").exists()
 
 
-def test_random_sample_is_summarised_as_a_whole_and_its_points_stand_in_order_with_digits_to_read(tmp_path):
+def test_random_sample_is_summarised_as_a_whole_and_its_points_stand_in_order_with_digits_to_read(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(figures_of_studies, "FORMATS", ("png",))
     study = made_study(sample=200, repeats=1, factors={DARK: Range(low=10.0, high=40.0), BASELINE: [0.5, 1.0]})
     entry = summary.write(tmp_path, study, made_table(study))
     assert [point["factors"] for point in entry["points"]] == [{}]

@@ -27,8 +27,10 @@ EXPERIMENT, TRAJECTORY = 0, 1
 COLUMNS = {
     "frames": Column("1", "frames of the run"),
     "lost_frames": Column("1", "frames without a pose; they do not count in the sensor's error", main=True),
-    "tracking_position_rms_um": Column("um", "true against desired position, rms over frames and axes", main=True),
-    "tracking_orientation_rms_urad": Column("urad", "true against desired orientation, rms likewise", main=True),
+    "tracking_position_rms_um": Column("um", "deviation of the true from the desired position, rms", main=True),
+    "tracking_orientation_rms_urad": Column(
+        "urad", "deviation of the true from the desired orientation, rms", main=True
+    ),
     **POSE_COLUMNS,
     "torque_rms_N_m": Column("N m", "torque of the joint controllers, rms over frames and joints", main=True),
 }

@@ -53,15 +53,21 @@ COLUMNS = {
         for name, (what, _) in CHOSEN.items()
     },
     "identified_groups": Column("1", "base parameters that the record identifies"),
-    "group_std_percent": Column("%", "stated standard deviation of those, relative to the truth, median", main=True),
-    "normalised_error": Column("1", "error of those over its stated standard deviation, rms; 1 where stated well"),
-    "noise_ratio": Column("1", "mean squared whitened residual; 1 where noise is all that is left"),
+    "group_std_percent": Column("%", "stated standard deviation of identified groups, relative, median", main=True),
+    "normalised_error": Column("1", "error of identified groups over the stated one, rms; 1 where stated well"),
+    "noise_ratio": Column(
+        "1", "mean squared residual over the variance of the noise; 1 where noise is all that is left"
+    ),
     "iterations": Column("1", "iterations of all searches"),
-    "prediction_rms_um": Column("um", "identified against true model on unseen trajectories, without noise: position"),
-    "stated_prediction_rms_um": Column("um", "the same, as the covariance of the parameters states it"),
-    "unseen_position_rms_um": Column("um", "model against true plant on unseen trajectories, rms over axes", main=True),
+    "prediction_rms_um": Column("um", "error of the identified model's position on unseen trajectories, without noise"),
+    "stated_prediction_rms_um": Column(
+        "um", "error of the model's position, as the covariance of the parameters states it"
+    ),
+    "unseen_position_rms_um": Column(
+        "um", "error of the model's position on unseen trajectories, rms over axes", main=True
+    ),
     "unseen_orientation_rms_urad": Column(
-        "urad", "model against true plant on unseen trajectories, rms over axes", main=True
+        "urad", "error of the model's orientation on unseen trajectories, rms over axes", main=True
     ),
 }
 

@@ -30,8 +30,12 @@ COLUMNS = {
     "lost_frames": Column("1", "frames without a pose; they count in no other figure but the pose in use"),
     "speed_rms_mm_s": Column("mm/s", "speed of the platform along each axis, rms over the frames"),
     **POSE_COLUMNS,
-    "used_position_rms_um": Column("um", "last position that had arrived against the true one at all times", main=True),
-    "used_orientation_rms_urad": Column("urad", "last orientation that had arrived, likewise", main=True),
+    "used_position_rms_um": Column(
+        "um", "error of the position in use at all times, the last that had arrived", main=True
+    ),
+    "used_orientation_rms_urad": Column(
+        "urad", "error of the orientation in use at all times, the last that had arrived", main=True
+    ),
 }
 
 

@@ -104,10 +104,12 @@ def stated_um(covariances: Array) -> tuple[float, float]:
 
 
 POSE_COLUMNS = {
-    "position_rms_um": Column("um", "measured against true position, rms over pictures and axes", main=True),
-    "orientation_rms_urad": Column("urad", "measured against true orientation, rms over pictures and axes", main=True),
-    "stated_position_rms_um": Column("um", "the same, as the sensor's own covariance states it"),
-    "stated_orientation_rms_urad": Column("urad", "the same, as the sensor's own covariance states it"),
+    "position_rms_um": Column("um", "error of the measured position, rms over pictures and axes", main=True),
+    "orientation_rms_urad": Column("urad", "error of the measured orientation, rms over pictures and axes", main=True),
+    "stated_position_rms_um": Column("um", "error of the measured position, as the sensor's covariance states it"),
+    "stated_orientation_rms_urad": Column(
+        "urad", "error of the measured orientation, as the sensor's covariance states it"
+    ),
 }
 """What every row says that has measured poses in it."""
 

@@ -36,8 +36,8 @@ COLUMNS = {
         "urad", "error of the orientation averaged over the pictures of a pose", main=True
     ),
     "sight_m": Column("m", "distance of the stickers from the middle of the baseline, mean"),
-    "point_depth_rms_um": Column("um", "error of single stickers along the line from there to the sticker", main=True),
-    "point_lateral_rms_um": Column("um", "error of single stickers across that line, rms over both axes"),
+    "point_depth_rms_um": Column("um", "error of single stickers along the line of sight", main=True),
+    "point_lateral_rms_um": Column("um", "error of single stickers across the line of sight, rms over both axes"),
     "centre_rms_px": Column(
         "px", "error of sticker centres in the images, rms over stickers, cameras and axes", main=True
     ),

@@ -1,0 +1,264 @@
+"""The commands of an experiment: a whole run, or its stages one by one. Heavy imports are late."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from identify.commands.comparisons import compare_excitation
+from identify.commands.options import (
+    EstimatorSettings,
+    JsonFile,
+    NewFolder,
+    Quiet,
+    RobotOption,
+    RunFolderOption,
+    ScenarioArgument,
+    Seed,
+    Settings,
+    Workers,
+    parse_settings,
+    tell,
+)
+from identify.files.run_folder import RunFolder, load_result, new_run_folder
+from identify.progress import print_warnings, terminal_progress
+from identify.scenario import Scenario, load_scenario
+
+PLANNED = ("scenario.toml", "trajectories.json", "experiment.nc")
+"""What the first two stages leave."""
+
+
+def run(
+    scenario: ScenarioArgument = "paper",
+    out: NewFolder = None,
+    seed: Seed = 0,
+    robot: RobotOption = None,
+    settings: Settings = None,
+    workers: Workers = None,
+    json: JsonFile = None,
+    quiet: Quiet = False,
+) -> None:
+    """Do a whole experiment, from designing the motion to the report.
+
+    Chooses an exciting trajectory, moves the simulated robot along it with images in the loop, identifies the robot
+    from the record, judges the model on unseen trajectories, and writes the report. A goal that is missed is said, and
+    does not change the exit status.
+
+    Reads a scenario, and the robot and sensor that it names.
+
+    Writes into the folder: scenario.toml, trajectories.json, experiment.nc, result.json, covariance.nc, validation.nc,
+    model.nc, report.html and figures. The JSON is result.json.
+
+    \b
+    Examples:
+      cmmsim run quick                        a one-minute run into runs/quick-0
+      cmmsim run                              the paper's experiment
+      cmmsim run paper --seed 7 --out mine    other noise and trajectories
+      cmmsim run quick --robot ups6           another robot, or your own file
+      cmmsim run quick --set timing.latency_s=0.0167 --set pose_method=planes
+      cmmsim run quick --set plant.geometry_error_m=1e-4
+                                              joints off by 0.1 mm: the model
+                                              is wrong, and the residuals tell
+    """
+    chosen = _scenario(scenario, settings, robot)
+    folder = new_run_folder(out or Path("runs") / f"{chosen.name}-{seed}")
+    _pipeline().run(chosen, seed, folder.path, terminal_progress(quiet), workers)
+    result = _warned(folder)
+    tell(result, json, quiet, lambda: _summary().print_goals(result, folder.report))
+
+
+def warm_up(
+    scenario: ScenarioArgument = "paper",
+    robot: RobotOption = None,
+    settings: Settings = None,
+    all_robots: Annotated[bool, typer.Option("--all-robots", help="Compile every built-in robot, too.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compile once, for this user, all that runs of a scenario need, so that no run waits for it later.
+
+    A robot is compiled for itself, and one with another number of joints or freedoms compiles the loop anew.
+
+    Reads a scenario and its robot. Writes machine code into the cache of this user (CMMSIM_CACHE names another folder).
+
+    \b
+    Examples:
+      cmmsim warm-up
+      cmmsim warm-up quick --robot mine.toml
+    """
+    from dynamics import built_in_robots, load_robot
+    from identify.experiment.run import warm_up
+
+    others = tuple(load_robot(name) for name in built_in_robots()) if all_robots else ()
+    warm_up(_scenario(scenario, settings, robot), terminal_progress(quiet), others)
+
+
+def excite(
+    scenario: ScenarioArgument = "paper",
+    out: NewFolder = None,
+    seed: Seed = 0,
+    robot: RobotOption = None,
+    settings: Settings = None,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Only compare the methods: writes comparison.json and comparison.png.")
+    ] = False,
+    json: JsonFile = None,
+    quiet: Quiet = False,
+) -> None:
+    """Choose the exciting trajectory and the unseen ones: the first stage of an experiment.
+
+    Reads a scenario and its robot.
+
+    Writes scenario.toml and trajectories.json into the folder; with --compare, what each method of search finds
+    instead. The JSON is trajectories.json or comparison.json.
+
+    \b
+    Examples:
+      cmmsim excite quick --out mine
+      cmmsim excite paper --compare           random, evolutionary and gradient
+                                              search side by side
+    """
+    chosen = _scenario(scenario, settings, robot)
+    name = f"excite-{chosen.name}-{seed}" if compare else f"{chosen.name}-{seed}"
+    folder = new_run_folder(out or Path("runs") / name)
+    if compare:
+        compare_excitation(chosen, seed, folder.path, terminal_progress(quiet), json, quiet)
+        return
+    _pipeline().excite(chosen, seed, folder.path, terminal_progress(quiet))
+    tell(load_result(folder.trajectories), json, quiet, lambda: None)
+
+
+def record(out: RunFolderOption, workers: Workers = None, quiet: Quiet = False) -> None:
+    """Move the simulated robot along the exciting trajectory with images in the loop: the second stage.
+
+    Reads scenario.toml and trajectories.json of the folder.
+
+    Writes experiment.nc there: the record, and the truth in a group of its own; payload.nc too, where a known load is
+    what fixes the scale.
+
+    \b
+    Example:
+      cmmsim record --out mine
+    """
+    RunFolder(out).require("scenario.toml", "trajectories.json")
+    _pipeline().record(out, terminal_progress(quiet), workers)
+
+
+def identify(
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help="Folder of the run, as the stage before left it; with --record a new one.",
+            show_default="with --record: runs/NAME-OF-THE-RECORD",
+        ),
+    ] = None,
+    record: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--record",
+            metavar="FILE",
+            help="Identify from a record of your own, netCDF or CSV; a second one of the same robot under a known "
+            "load, where that fixes the scale.",
+            show_default=False,
+        ),
+    ] = None,
+    settings: EstimatorSettings = None,
+    json: JsonFile = None,
+    quiet: Quiet = False,
+) -> None:
+    """Estimate the robot's parameters from the record: the third stage.
+
+    Reads scenario.toml, trajectories.json and experiment.nc of the folder; or a record of your own, netCDF as
+    experiment.nc is, or a CSV table with a TOML file of the same name beside it, which says what it is a record of.
+    cmmsim new record mine.csv writes both, with comments that say which columns there are, and these rules:
+
+    A record begins at rest: before its first row the robot has stood still at the first reference pose. It has one row
+    a frame, without gaps; a lost frame keeps its row, with empty measured columns. Units are m, rad and s. What breaks
+    a rule is refused with its line or frame.
+
+    Writes result.json and covariance.nc there, and from a record of your own also scenario.toml, experiment.nc and
+    model.nc: go on with cmmsim report, since nothing is known of the truth that could be validated. What is set here
+    stays in scenario.toml, so that validate, report and the next identify go on with it; result.json, which is also the
+    JSON, lists all settings of its estimator.
+
+    \b
+    Examples:
+      cmmsim identify --out mine
+      cmmsim identify --record mine.csv
+      cmmsim identify --out mine --set identification.method=command_driven
+      cmmsim identify --out mine --set identification.physical_consistency=true
+      cmmsim identify --out mine \\
+        --set 'identification.prior={"platform.mass"={value=23.5,std=0.1}}'
+    """
+    chosen, progress = parse_settings(settings), terminal_progress(quiet)
+    if record:
+        folder = new_run_folder(out or Path("runs") / record[0].stem)
+        _pipeline().identify_own(record, folder.path, progress, chosen)
+    elif out is None:
+        raise typer.BadParameter("name the folder of a run, or a record of your own with --record", param_hint="--out")
+    else:
+        folder = RunFolder(out)
+        folder.require(*(PLANNED[:1] if folder.holds_own_record else PLANNED))
+        _pipeline().identify(out, progress, chosen)
+    result = _warned(folder)
+    tell(result, json, quiet, lambda: _summary().print_identification(result, folder.result))
+
+
+def validate(out: RunFolderOption, workers: Workers = None, json: JsonFile = None, quiet: Quiet = False) -> None:
+    """Judge the identified model on trajectories that it has never seen: the fourth stage.
+
+    Reads scenario.toml, trajectories.json, experiment.nc, result.json and covariance.nc of the folder.
+
+    Writes validation.nc and model.nc there, and completes result.json, which is also the JSON.
+
+    \b
+    Example:
+      cmmsim validate --out mine
+    """
+    folder = RunFolder(out)
+    if not folder.holds_own_record:
+        folder.require(*PLANNED, "result.json")
+    _pipeline().validate(out, terminal_progress(quiet), workers)
+    tell(load_result(folder.result), json, quiet, lambda: None)
+
+
+def report(out: RunFolderOption, quiet: Quiet = False) -> None:
+    """Draw the figures of a run and write its report, one file that opens without a network.
+
+    Reads result.json, the records and model.nc of the folder. Writes report.html and figures there.
+
+    \b
+    Example:
+      cmmsim report --out mine
+    """
+    folder = RunFolder(out)
+    folder.require("result.json", "experiment.nc")
+    _pipeline().report(out, terminal_progress(quiet))
+    if not quiet:
+        _summary().print_goals(load_result(folder.result), folder.report)
+
+
+def _scenario(name: str, settings: list[str] | None, robot: str | None) -> Scenario:
+    chosen = {} if robot is None else {"robot": robot}
+    return load_scenario(name).with_overrides(chosen | parse_settings(settings))
+
+
+def _warned(folder: RunFolder) -> dict[str, Any]:
+    """The result of a run; says what its identification warns of."""
+    result = load_result(folder.result)
+    print_warnings(result["identification"].get("warnings", []))
+    return result
+
+
+def _summary() -> Any:
+    """What a run says of itself, imported late as the stages are."""
+    from identify.reporting import tables as run_summary
+
+    return run_summary
+
+
+def _pipeline() -> Any:
+    """The stages, imported late: ``cmmsim --help`` must not wait for CasADi and OpenGL."""
+    from identify import pipeline
+
+    return pipeline

@@ -1,0 +1,152 @@
+"""Arguments and options that several commands share, what a shell completes of them, and how figures are handed out."""
+
+import tomllib
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from identify.errors import OutputFolderError, ScenarioError
+from identify.files.run_folder import as_json, save_result
+
+BUILT_IN = {
+    "robot": ("dynamics", "robots"),
+    "sensor": ("cmmsim", "files/sensors"),
+    "scenario": ("identify", "scenario/built_in"),
+    "study": ("identify", "studies/built_in"),
+}
+"""Package and folder of the built-in files of each kind."""
+
+STANDARD_OUTPUT = "-"
+"""What stands for standard output in place of a file."""
+
+
+def built_in_folder(kind: str) -> Path:
+    """Folder of the built-in files of a kind; its package is not imported, since a shell waits for completions."""
+    package, folder = BUILT_IN[kind]
+    spec = find_spec(package)
+    return Path(str(spec and spec.origin)).parent / folder
+
+
+def built_in_names(kind: str) -> list[str]:
+    """Names of the built-in files of a kind, sorted."""
+    return sorted(path.stem for path in built_in_folder(kind).glob("*.toml"))
+
+
+def completion(kind: str) -> Callable[[str], list[str]]:
+    """What a shell offers for a name or path of this kind: built-in names, TOML files, and folders to look into."""
+
+    def offered(incomplete: str) -> list[str]:
+        typed = Path(incomplete)
+        folder = typed if incomplete.endswith("/") else typed.parent
+        beside = sorted(folder.glob("*")) if folder.is_dir() else []
+        paths = [
+            f"{path}/" if path.is_dir() else str(path) for path in beside if path.is_dir() or path.suffix == ".toml"
+        ]
+        return [name for name in [*built_in_names(kind), *paths] if name.startswith(incomplete)]
+
+    return offered
+
+
+def named(kind: str, help_: str | None = None, **more: Any) -> Any:
+    """The argument that is a built-in name of a kind or the path of a TOML file."""
+    said = help_ or f"Built-in {kind} ({', '.join(built_in_names(kind))}), or the path of a TOML file."
+    return typer.Argument(help=said, autocompletion=completion(kind), **more)
+
+
+def new_folder(default: str) -> Any:
+    """The option of a folder to write into; default: how the help calls the one that is taken where it is left out."""
+    return typer.Option("--out", help="Output folder, new or empty.", show_default=default)
+
+
+def repeatable(what: str, default: str) -> Any:
+    """An option that may be given several times; default: how the help calls what holds without it."""
+    return typer.Option(help=f"{what}; repeatable.", show_default=default)
+
+
+RobotArgument = Annotated[str, named("robot")]
+SensorArgument = Annotated[str, named("sensor")]
+ScenarioArgument = Annotated[str, named("scenario")]
+RobotOption = Annotated[
+    str | None,
+    typer.Option(
+        "--robot",
+        metavar="NAME|FILE",
+        help="Another robot than the scenario's.",
+        show_default="scenario's",
+        autocompletion=completion("robot"),
+    ),
+]
+NewFolder = Annotated[Path | None, new_folder("runs/SCENARIO-SEED")]
+RunFolderOption = Annotated[Path, typer.Option("--out", help="Folder of the run, as the stage before left it.")]
+WholeRunOption = Annotated[Path, typer.Option("--out", help="Folder of a whole run, as cmmsim run leaves it.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness: trajectories and sensor noise.")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Replace a value of the scenario: timing.frame_rate_hz=30; repeatable."
+    ),
+]
+EstimatorSettings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Replace a setting of the estimator, in the sections identification, model or filter of the scenario: "
+        "identification.method=command_driven; repeatable. The record was made with the rest.",
+    ),
+]
+Workers = Annotated[
+    int | None, typer.Option("--workers", min=1, help="Processes that render.", show_default="one a core")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars and no tables; warnings stay.")]
+JsonFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        help="Also write the figures as JSON into this file, replaced if there; - prints them in place of the tables.",
+    ),
+]
+
+
+def tell(entry: dict[str, Any], json_file: Path | None, quiet: bool, say: Callable[[], None]) -> None:
+    """Hand out a command's figures: as JSON where that is asked for, and in words unless it is to be quiet.
+
+    Raises OutputFolderError: the file cannot be written.
+    """
+    if str(json_file) == STANDARD_OUTPUT:
+        typer.echo(as_json(entry), nl=False)
+        return
+    if json_file is not None:
+        try:
+            save_result(json_file, entry)
+        except OSError as error:
+            raise OutputFolderError(
+                f"cannot write {json_file}: {error.strerror or error}; name another file with --json"
+            ) from None
+    if not quiet:
+        say()
+
+
+def parse_settings(settings: list[str] | None) -> dict[str, Any]:
+    """Overrides from ``KEY=VALUE`` texts; a value is TOML, and what is no TOML is a string.
+
+    Raises ScenarioError: a text without ``=``.
+    """
+    overrides = {}
+    for text in settings or []:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            raise ScenarioError(f"--set {text!r} is not of the form KEY=VALUE, such as timing.frame_rate_hz=30")
+        overrides[key.strip()] = _toml_or_text(value.strip())
+    return overrides
+
+
+def _toml_or_text(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text

@@ -1,0 +1,186 @@
+"""Records of one's own, from netCDF or CSV, with all that an identification must know of them.
+
+A netCDF record states its scenario and its scale anchor itself. A CSV table has a TOML file of the same name beside it:
+a scenario, of which robot, timing, servo, model, filter, identification and payload count, with a table `[record]` for
+what was measured beside the poses.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError
+from scipy.interpolate import make_interp_spline
+
+from dynamics import Robot, load_robot
+from identify.arrays import Array
+from identify.errors import RecordError
+from identify.files.dataset import POSE
+from identify.record.csv_record import Table, read_table
+from identify.record.payload import payload_vector, store_payload
+from identify.record.provenance import recorded_scenario
+from identify.record.recording import build_record, read
+from identify.scenario import Scenario
+from identify.scenario.scenario import SCENARIOS, scenario_schema
+from identify.scenario.sections import LOAD_UNITS, Section, quantity
+from identify.scenario.settings_file import one_line
+
+DESCRIPTION = "record"
+"""Table of the file beside a CSV record that is not the scenario's."""
+
+
+class Measured(Section):
+    """What was measured beside the poses: what fixes the scale, and how exact a measured pose is."""
+
+    anchor_value: float | None = quantity(
+        None, "kg, N m/rad or N/m", "what identification.scale_anchor measured: platform_mass or joint_gain", gt=0
+    )
+    position_std_m: float | None = quantity(
+        None, "m", "standard deviation of a measured position, where the table has no covariance columns", gt=0
+    )
+    orientation_std_rad: float | None = quantity(
+        None, "rad", "standard deviation of a measured angle, where the table has no covariance columns", gt=0
+    )
+    under_payload: bool = Field(False, description="whether the platform carried the load of [payload]")
+
+
+def read_own_records(paths: list[Path]) -> tuple[list[xr.Dataset], Scenario]:
+    """Records by file, and the scenario of the first; further ones are of the same robot under a known load.
+
+    Raises RecordError: a file that cannot be read, or breaks a rule of records (`csv_record.RULES`), with its line.
+    Raises ScenarioError: no robot, timing or servo that can be. Raises dynamics.RobotFileError: no such robot.
+    """
+    pairs = [_of_csv(path) if path.suffix.lower() == ".csv" else _of_netcdf(path) for path in paths]
+    return [record for record, _ in pairs], pairs[0][1]
+
+
+def description_file(path: Path) -> Path:
+    """The file beside a CSV record that says what it is a record of."""
+    return path.with_suffix(".toml")
+
+
+def _of_netcdf(path: Path) -> tuple[xr.Dataset, Scenario]:
+    record = read(path)
+    return record, recorded_scenario(record)
+
+
+def _of_csv(path: Path) -> tuple[xr.Dataset, Scenario]:
+    scenario, measured = read_description(description_file(path), path)
+    robot = load_robot(scenario.robot)
+    table = read_table(path, robot)
+    table.check_times(scenario.timing.frame_rate_hz)
+    poses, ok = table.groups["measured"], _measured_ok(table)
+    record = build_record(
+        time=table.groups["time"][:, 0] - table.groups["time"][0, 0],
+        reference_pose=table.groups["reference"],
+        reference_rate=_rates(table, scenario),
+        measured_pose=np.where(ok[:, None], poses, np.nan),
+        measured_covariance=_covariances(table, measured, ok),
+        measured_ok=ok,
+        command=table.groups["command"],
+        robot=robot.name,
+        scenario_toml=scenario.to_toml(),
+        frame_rate_hz=scenario.timing.frame_rate_hz,
+        title=f"Record of {path.name}",
+        prismatic=robot.layout.prismatic,
+    )
+    _state_anchor(record, scenario, measured, description_file(path))
+    if measured.under_payload:
+        _state_payload(record, robot, scenario)
+    return record, scenario
+
+
+def read_description(path: Path, table: Path) -> tuple[Scenario, Measured]:
+    """What a CSV table is a record of. Raises RecordError, ScenarioError: no such file, no TOML, wrong content."""
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RecordError(
+            f"cannot read {path}, which says what {table.name} is a record of ({error.strerror or error}); cmmsim new "
+            "record writes both"
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RecordError(f"{path} is not valid TOML: {error}") from error
+    own = content.pop(DESCRIPTION, {})
+    try:
+        measured = Measured.model_validate(own)
+    except ValidationError as error:
+        raise RecordError(f"{path}: [{DESCRIPTION}] {one_line(error, Measured)}") from error
+    return SCENARIOS.from_dict({"name": path.stem} | content, str(path), path.parent), measured
+
+
+def record_schema() -> dict[str, Any]:
+    """JSON schema of the files beside CSV records, for editors; `record.schema.json` holds it."""
+    schema, own = scenario_schema(), Measured.model_json_schema()
+    schema["required"].remove("name")
+    schema["properties"][DESCRIPTION] = {"$ref": "#/$defs/Measured"}
+    schema["$defs"]["Measured"] = own
+    return schema
+
+
+def _measured_ok(table: Table) -> NDArray[np.bool_]:
+    """Which rows (N,) hold a measured pose: as the table says, or those with no empty cell."""
+    whole = np.asarray(np.isfinite(table.groups["measured"]).all(axis=1))
+    if "ok" not in table.groups:
+        return whole
+    stated = table.groups["ok"][:, 0]
+    for wrong, why in (
+        (~np.isin(stated, (0, 1)), "measured_ok must be 1 or 0"),
+        ((stated == 1) & ~whole, "measured_ok is 1, and a measured column is empty"),
+    ):
+        if wrong.any():
+            raise RecordError(f"{table.path} line {table.lines[int(np.argmax(wrong))]}: {why}")
+    return whole & (stated == 1)
+
+
+def _rates(table: Table, scenario: Scenario) -> Array:
+    """Rates (N, 6) of the reference: stated, or of a spline through its poses that begins at rest."""
+    poses = table.groups["reference"]
+    if "rate" in table.groups or len(poses) < 6:
+        return table.groups.get("rate", np.zeros_like(poses))
+    times = np.arange(len(poses)) * scenario.timing.frame_period_s
+    return np.asarray(make_interp_spline(times, poses, k=5).derivative()(times), dtype=float)
+
+
+def _covariances(table: Table, measured: Measured, ok: NDArray[np.bool_]) -> Array:
+    """Covariances (N, 6, 6) of the measured poses: the table's, or those of the stated standard deviations."""
+    if "covariance" in table.groups:
+        rows, columns = np.triu_indices(len(POSE))
+        values = np.empty((len(ok), 6, 6))
+        values[:, rows, columns] = values[:, columns, rows] = table.groups["covariance"]
+        return values
+    if measured.position_std_m is None or measured.orientation_std_rad is None:
+        raise RecordError(
+            f"{table.path} has no covariance columns, so {description_file(table.path)} must state position_std_m and "
+            f"orientation_std_rad in [{DESCRIPTION}]: how exact a measured pose is"
+        )
+    std = np.repeat([measured.position_std_m, measured.orientation_std_rad], 3)
+    return np.tile(np.diag(std**2), (len(ok), 1, 1))
+
+
+def _state_anchor(record: xr.Dataset, scenario: Scenario, measured: Measured, source: Path) -> None:
+    """Keep with a record what fixes the scale of its parameters."""
+    settings = scenario.identification
+    record.attrs["scale_anchor"] = settings.scale_anchor
+    if settings.scale_anchor in ("payload", "prior"):
+        return
+    if measured.anchor_value is None or settings.anchor_std is None:
+        raise RecordError(
+            f"{source}: the scale anchor {settings.scale_anchor} needs what was measured, anchor_value in "
+            f"[{DESCRIPTION}], and how exactly, anchor_std in [identification]"
+        )
+    record.attrs |= {"scale_anchor_value": measured.anchor_value, "scale_anchor_std": settings.anchor_std}
+
+
+def _state_payload(record: xr.Dataset, robot: Robot, scenario: Scenario) -> None:
+    """Keep with a record the load that the platform carried, and how well it is known."""
+    load: Mapping[str, Any] = scenario.payload.model_dump()
+    values, deviations = (
+        [load[f"{figure}{std}_{unit}"] for figure, unit in LOAD_UNITS.items()] for std in ("", "_std")
+    )
+    vectors = [payload_vector(robot.layout, one[0], (one[1], one[2], one[3])) for one in (values, deviations)]
+    store_payload(record, robot.layout, *vectors)

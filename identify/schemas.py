@@ -1,0 +1,29 @@
+"""The JSON schemas of all files that a user writes, for editors; `python -m identify.schemas` writes them anew."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from cmmsim.files.sensor_file import sensor_schema
+from dynamics.robot_file import robot_schema
+from identify.files.atomic import write_text
+from identify.record.own_record import record_schema
+from identify.scenario.scenario import scenario_schema
+from identify.studies.study_file import study_schema
+
+ROOT = Path(__file__).parents[1]
+
+SCHEMAS: dict[Path, Callable[[], dict[str, Any]]] = {
+    ROOT / "dynamics/robots/robot.schema.json": robot_schema,
+    ROOT / "cmmsim/files/sensors/sensor.schema.json": sensor_schema,
+    ROOT / "identify/scenario/built_in/scenario.schema.json": scenario_schema,
+    ROOT / "identify/studies/built_in/study.schema.json": study_schema,
+    ROOT / "identify/record/record.schema.json": record_schema,
+}
+"""Where each is kept, and what it is made by: from the models that read the files."""
+
+
+if __name__ == "__main__":
+    for path, schema in SCHEMAS.items():
+        write_text(path, json.dumps(schema(), indent=1) + "\n")

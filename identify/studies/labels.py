@@ -1,0 +1,102 @@
+"""What the columns of a study are called: by their keys with units in tables, and in words in figures."""
+
+import re
+from textwrap import wrap
+
+from identify.studies.design import valid_keys
+from identify.studies.rows import KINDS
+from identify.studies.study_file import Study
+
+PRINTED = {"um": "µm", "urad": "µrad"}
+"""Units as a figure shows them."""
+
+SUFFIXES = {
+    "_um": "um",
+    "_urad": "urad",
+    "_px": "px",
+    "_hz": "Hz",
+    "_s": "s",
+    "_m": "m",
+    "_rad": "rad",
+    "_percent": "%",
+}
+"""Units in the ends of names; those of one's own kinds of row say theirs only so."""
+
+WIDEST = 36
+"""Letters in a line of a label."""
+
+
+def factor_unit(path: str) -> str:
+    """Unit of a factor by dotted path; empty where it has none."""
+    field = valid_keys(None).get(path)
+    if field is None:
+        return "s" if path.startswith("options.") and path.endswith("_s") else ""
+    extra = field.json_schema_extra
+    unit = str(extra["unit"]) if isinstance(extra, dict) and "unit" in extra else ""
+    return "" if unit == "1" else unit
+
+
+def unit_of(name: str, study: Study) -> str:
+    """Unit of a column of a study's table, a factor or a figure; empty where it has none, or where nobody says it."""
+    if name == "seconds":
+        return "s"
+    if name in study.factors:
+        return factor_unit(name)
+    columns = KINDS[study.kind].columns if study.kind in KINDS else {}
+    unit = columns[name].unit if name in columns else ""
+    return "" if unit == "1" else unit
+
+
+def labelled(name: str, study: Study) -> str:
+    """A column's name with its unit in brackets."""
+    return f"{name} [{unit}]" if (unit := unit_of(name, study)) else name
+
+
+def axis_label(name: str, study: Study, per: str | None = None) -> str:
+    """What a column, or one divided by another, is in words, with its unit in brackets, in lines of WIDEST letters."""
+    words, unit = _words(name, study), _unit(name, study)
+    if per is not None:  # both in words would be a paragraph
+        words = f"{_plain_name(name)} / {_plain_name(per)}"
+        unit = "/".join(filter(None, (unit, _unit(per, study))))
+    lines = wrap(words[:1].upper() + words[1:] + (f" [{unit}]" if unit else ""), WIDEST, break_long_words=False)
+    return "\n".join(lines)
+
+
+def setting(path: str, value: object) -> str:
+    """A factor and its value, as a legend shows them: "frame rate 10 Hz"."""
+    return " ".join(filter(None, (_plain_name(path), number(value), factor_unit(path))))
+
+
+def number(value: object) -> str:
+    """A number as one writes it, in four digits or all before the point; anything else as it is."""
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.4g}" if not 1e4 <= abs(value) < 1e7 else f"{value:.0f}"
+
+
+def _words(name: str, study: Study) -> str:
+    """The first statement of what is said of a column; its name in plain letters where nothing is."""
+    columns = KINDS[study.kind].columns if study.kind in KINDS else {}
+    if name in columns:
+        said = columns[name].meaning
+    else:
+        kind = KINDS.get(study.kind)
+        field = valid_keys(kind.options if kind else None).get(name)
+        said = (field.description if field is not None else None) or ""
+    first = re.split(r"[;:]", said)[0]
+    return _plain_name(name) if not first or first.startswith("the same") else first
+
+
+def _unit(name: str, study: Study) -> str:
+    unit = unit_of(name, study) or ("" if study.kind in KINDS or name in study.factors else _suffix(name)[1])
+    return PRINTED.get(unit, unit)
+
+
+def _plain_name(name: str) -> str:
+    return _suffix(name.rpartition(".")[2])[0].replace("_", " ")
+
+
+def _suffix(name: str) -> tuple[str, str]:
+    """A name without the unit at its end, and that unit."""
+    end = next((end for end in sorted(SUFFIXES, key=len, reverse=True) if name.endswith(end)), "")
+    return name.removesuffix(end) if end else name, SUFFIXES.get(end, "")
