@@ -23,7 +23,14 @@ extensions = [
     "mathml",  # formulas without a script from outside
     "generated_pages",  # commands, file formats, figures and the API, from the code and from .readme/*.json
 ]
-exclude_patterns = ["_ext", "_static", "examples", "generated/*.md", "generated/tour/*.md5", "generated/**/sg_execution_times.rst"]
+exclude_patterns = [
+    "_ext",
+    "_static",
+    "examples",
+    "generated/*.md",
+    "generated/tour/*.md5",
+    "generated/**/sg_execution_times.rst",
+]
 suppress_warnings = ["config.cache"]  # what sphinx-gallery is told cannot be pickled
 
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence", "substitution", "attrs_inline"]

@@ -1,4 +1,4 @@
-"""Figures of kept runs, for the text: `{{ name }}` in a page is a figure of .readme/*.json, so no page can be out of date.
+"""Figures of kept runs, for the text: `{{ name }}` in a page is a figure of .readme/*.json, and none is out of date.
 
 Pages take single figures as substitutions; the tables of the page of results are written whole.
 """
@@ -89,11 +89,13 @@ def sensor_speed(folder: Path) -> str:
     """Stereo frames a second, and against the straightforward pipeline."""
     found = figures_of(kept(folder, "speeds"), "test_sensor_speed")
     renderers = ("analytic", "pyrender")
+    titles = {
+        "frames_a_second": "stereo frames a second, drawn and measured",
+        "times_straightforward": "times as fast as the straightforward pipeline",
+    }
     rows = [
-        ("stereo frames a second, drawn and measured", *(f"{found[f'{name}_frames_a_second']:.0f}" for name in renderers)),
-        ("times as fast as the straightforward pipeline",
-         *(f"{found[f'{name}_times_straightforward']:.0f}" for name in renderers)),
-    ]  # fmt: skip
+        (title, *(f"{found[f'{renderer}_{name}']:.0f}" for renderer in renderers)) for name, title in titles.items()
+    ]
     return _table(("renderer", "`analytic`", "`pyrender`"), rows) + _measured(folder, "test_sensor_speed")
 
 
@@ -138,7 +140,9 @@ def _measured(folder: Path, part: str) -> str:
     entries = [content | entry for test, entry in content["tests"].items() if part in test]
     versions = {name: version for entry in entries for name, version in entry["versions"].items()}
     with_what = ", ".join(
-        f"{name} {versions[name]}" for name in ("pin", "mujoco", "opencv-python-headless", "pyrender") if name in versions
+        f"{name} {versions[name]}"
+        for name in ("pin", "mujoco", "opencv-python-headless", "pyrender")
+        if name in versions
     )
     return f"\n\nMeasured {date_of(content, part)} with {with_what}, on {content['cores']} cores.\n"
 

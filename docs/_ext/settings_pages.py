@@ -53,9 +53,7 @@ def _page(schema: dict[str, Any]) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def _tables(
-    schema: dict[str, Any], definitions: dict[str, Any], path: str, parts: list[str], seen: set[str]
-) -> None:
+def _tables(schema: dict[str, Any], definitions: dict[str, Any], path: str, parts: list[str], seen: set[str]) -> None:
     """A heading and a table for each section, once, where it is first met."""
     extra = schema.get("additionalProperties")
     properties = dict(schema.get("properties", {}))

@@ -24,12 +24,18 @@ frame = sensor.capture(pose)
 print(frame.left.shape, frame.left.dtype)
 
 measured = sensor.measure(pose)
-figure, panels = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+figure, panels = plt.subplots(1, 2, figsize=(9, 4), layout="constrained")
 for axes, image, centres, side in zip(
-    panels, (frame.left, frame.right), (measured.left_pixels, measured.right_pixels), ("left", "right"), strict=True
+    panels,
+    (frame.left, frame.right),
+    (measured.left_pixels, measured.right_pixels),
+    ("left", "right"),
+    strict=True,
 ):
-    axes.imshow(image, cmap="gray")
-    axes.plot(centres[:, 0], centres[:, 1], "o", mfc="none", mec="tab:orange", ms=9)
+    axes.imshow(image, cmap="gray", interpolation="antialiased")
+    axes.plot(centres[:, 0], centres[:, 1], "o", mfc="none", mec="tab:orange", ms=11)
+    around = centres.mean(axis=0)
+    axes.set(xlim=around[0] + np.array([-520, 520]), ylim=around[1] + np.array([620, -300]))
     axes.set(title=f"{side} camera", xticks=[], yticks=[])
 plt.show()
 
@@ -51,7 +57,9 @@ shown = axes.imshow(
     extent=(column - 11.5, column + 11.5, row + 11.5, row - 11.5),
 )
 axes.plot(x, y, "+", color="tab:orange", ms=14, mew=2)
-axes.set(xlabel="x [px]", ylabel="y [px]", title=f"sticker {measured.target_ids[0]}, left image")
+axes.set(
+    xlabel="x [px]", ylabel="y [px]", title=f"sticker {measured.target_ids[0]}, left image"
+)
 figure.colorbar(shown, label="grey value")
 plt.show()
 
@@ -63,7 +71,11 @@ plt.show()
 error = measured.pose - pose
 claimed = np.sqrt(np.diag(measured.covariance))
 for name, unit, e, s in zip(
-    ("x", "y", "z", "alpha", "beta", "gamma"), ["µm"] * 3 + ["µrad"] * 3, 1e6 * error, 1e6 * claimed, strict=True
+    ("x", "y", "z", "alpha", "beta", "gamma"),
+    ["µm"] * 3 + ["µrad"] * 3,
+    1e6 * error,
+    1e6 * claimed,
+    strict=True,
 ):
     print(f"{name:6s} error {e:7.2f} {unit:5s} claimed standard deviation {s:6.2f} {unit}")
 
@@ -80,7 +92,14 @@ for axes, part, unit, names in (
 ):
     places = np.arange(3)
     axes.bar(places - 0.2, 1e6 * claimed[part], 0.4, label="claimed", color="tab:blue")
-    axes.bar(places + 0.2, 1e6 * spread[part], 0.4, label="seen in 300 repeats", color="tab:orange", hatch="//")
+    axes.bar(
+        places + 0.2,
+        1e6 * spread[part],
+        0.4,
+        label="seen in 300 repeats",
+        color="tab:orange",
+        hatch="//",
+    )
     axes.set_xticks(places, names)
     axes.set_ylabel(f"standard deviation [{unit}]")
 panels[0].legend()

@@ -26,7 +26,14 @@ POSE = ("x", "y", "z", "alpha", "beta", "gamma")
 scenario = identify.load_scenario("quick").with_overrides({"renderer": "analytic"})
 robot = dynamics.load_robot(scenario.robot)
 record = identify.run_experiment(scenario, seed=0)
-print(record.title, "-", record.sizes["time"], "stereo frames,", int((record.measured_ok == 0).sum()), "of them lost")
+print(
+    record.title,
+    "-",
+    record.sizes["time"],
+    "stereo frames,",
+    int((record.measured_ok == 0).sum()),
+    "of them lost",
+)
 
 # %%
 # What was logged: where the platform should be, where the sensor saw it, and the commands to the joints. The servo lags
@@ -35,11 +42,19 @@ print(record.title, "-", record.sizes["time"], "stereo frames,", int((record.mea
 time = record["time"]
 figure, panels = plt.subplots(1, 3, figsize=(10, 3.1), layout="constrained")
 for axis, colour in zip("xyz", ("tab:blue", "tab:orange", "tab:green"), strict=True):
-    panels[0].plot(time, 1e3 * record["reference_position"].sel(axis=axis), "--", color=colour, lw=1)
-    panels[0].plot(time, 1e3 * record["measured_position"].sel(axis=axis), color=colour, label=axis)
-panels[0].set(xlabel="time [s]", ylabel="position [mm]", title="desired (dashed) and measured")
+    panels[0].plot(
+        time, 1e3 * record["reference_position"].sel(axis=axis), "--", color=colour, lw=1
+    )
+    panels[0].plot(
+        time, 1e3 * record["measured_position"].sel(axis=axis), color=colour, label=axis
+    )
+panels[0].set(
+    xlabel="time [s]", ylabel="position [mm]", title="desired (dashed) and measured"
+)
 panels[0].legend(ncols=3, fontsize="small", loc="center right")
-panels[1].plot(time, 1e3 * (record["measured_position"] - record["reference_position"].values))
+panels[1].plot(
+    time, 1e3 * (record["measured_position"] - record["reference_position"].values)
+)
 panels[1].set(xlabel="time [s]", ylabel="lag [mm]", title="measured minus desired")
 panels[2].plot(time, record["command"])
 panels[2].set(xlabel="time [s]", ylabel="command [rad]", title="commands to the six joints")
@@ -63,9 +78,11 @@ table.loc[table["identifiable"], ["unit", "initial", "estimate", "low", "high"]]
 # which are estimated as well as if they were parameters:
 
 groups = result.groups
-order = [k for k in np.argsort(groups.std / np.abs(groups.estimate)) if groups.identifiable[k]][:6]
-for k in order:
-    print(f"{groups.estimate[k]:9.5f} ± {groups.std[k]:.5f}   {groups.expressions[k][:90]}")
+sums = [k for k in range(len(groups.names)) if np.count_nonzero(groups.combinations[k]) > 1]
+for k in sums[:6]:
+    print(
+        f"{groups.estimate[k]:9.5f} ± {groups.std[k]:.5f}  =  {groups.expressions[k][:70]} ..."
+    )
 
 # %%
 # Beside the truth
@@ -75,17 +92,22 @@ for k in order:
 
 truth = robot.parameter_sets[scenario.plant.parameters].vector
 shown = np.flatnonzero(result.identifiable)
-scale = np.abs(truth[shown])
-figure, axes = plt.subplots(figsize=(9, 3.8), layout="constrained")
-places = np.arange(len(shown))
 low, high = (result.intervals[shown, side] for side in (0, 1))
-axes.vlines(places, 100 * (low / scale - 1), 100 * (high / scale - 1), color="tab:blue", lw=5, alpha=0.5)
-axes.plot(places, 100 * (result.estimate[shown] / scale - 1), "o", color="tab:blue", ms=5, label="estimate, 95 % interval")
-axes.axhline(0, color="black", lw=1, label="truth")
-axes.set_xticks(places, [result.names[k] for k in shown], rotation=60, ha="right", fontsize="small")
-axes.set(ylabel="difference from the truth [%]", yscale="symlog")
-axes.set_yticks([-100, -10, -1, 0, 1, 10, 100], ["-100", "-10", "-1", "0", "1", "10", "100"])
-axes.legend()
+percent = 100 / np.abs(truth[shown])
+links = np.array(["link" in result.names[k] for k in shown])
+
+figure, panels = plt.subplots(
+    1, 2, figsize=(10, 3.8), layout="constrained", width_ratios=(1, 2.6)
+)
+for axes, chosen in zip(panels, (links, ~links), strict=True):
+    middle = (result.estimate[shown] - truth[shown]) * percent
+    span = np.stack([result.estimate[shown] - low, high - result.estimate[shown]]) * percent
+    places = np.arange(chosen.sum())
+    axes.errorbar(places, middle[chosen], span[:, chosen], fmt="o", ms=4, capsize=3)
+    axes.axhline(0, color="black", lw=1)
+    names = [result.names[k] for k in shown[chosen]]
+    axes.set_xticks(places, names, rotation=60, ha="right", fontsize="small")
+panels[0].set_ylabel("estimate less truth, 95 % interval [%]")
 plt.show()
 
 inside = (low <= truth[shown]) & (truth[shown] <= high)
@@ -107,14 +129,23 @@ print("warnings:", *(result.warnings or ["none"]))
 # The last judge is a motion that played no part in the estimate. ``unseen_errors`` lets the true robot and a model run
 # the same unseen trajectories, and gives the difference of their true poses.
 
-for who, parameters in (("starting guess", result.initial), ("identified", result.estimate)):
+for who, parameters in (
+    ("starting guess", result.initial),
+    ("identified", result.estimate),
+):
     errors = identify.unseen_errors(parameters, robot, scenario, seed=0)
     rms = 1e6 * np.sqrt(np.mean(errors**2, axis=(0, 1)))
-    print(f"{who:15s}", ", ".join(f"{name} {value:.1f}" for name, value in zip(POSE, rms, strict=True)), "[µm, µrad]")
+    print(
+        f"{who:15s}",
+        ", ".join(f"{name} {value:.1f}" for name, value in zip(POSE, rms, strict=True)),
+        "[µm, µrad]",
+    )
 
 # %%
 # The same from the command line, with a report to open in a browser: ``cmmsim run quick``.
 
 with xr.open_dataset(record.attrs["path"], group="truth") as true:
     difference = 1e6 * (true["position"] - record["measured_position"])
-    print(f"the sensor itself was off by {float(np.sqrt((difference**2).mean())):.1f} µm rms in this run")
+    print(
+        f"the sensor itself was off by {float(np.sqrt((difference**2).mean())):.1f} µm rms in this run"
+    )

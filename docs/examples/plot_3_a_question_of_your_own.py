@@ -29,7 +29,10 @@ cmmsim = Path(sys.executable).with_name("cmmsim")
 # cannot decide is called *undecided*, not proved.
 
 ran = subprocess.run(
-    [cmmsim, "study", "friction_against_frame_rate.toml", "--out", folder], capture_output=True, text=True, check=True
+    [cmmsim, "study", "friction_against_frame_rate.toml", "--out", folder],
+    capture_output=True,
+    text=True,
+    check=True,
 )
 print(ran.stdout.replace(str(folder), "FOLDER"))
 
@@ -41,13 +44,31 @@ print(ran.stdout.replace(str(folder), "FOLDER"))
 rows = pd.read_parquet(folder / "study.parquet")
 rate = "scenario.timing.frame_rate_hz"
 figure, panels = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained", sharex=True)
-for axes, kind, what in zip(panels, ("coulomb", "viscous"), ("Coulomb friction", "viscous friction"), strict=True):
+for axes, kind, what in zip(
+    panels, ("coulomb", "viscous"), ("Coulomb friction", "viscous friction"), strict=True
+):
     error, stated = f"{kind}_error_percent", f"{kind}_std_percent"
-    axes.plot(rows[rate], rows[error], "o", color="tab:blue", mfc="none", label="single experiments")
-    rms = rows.groupby(rate)[[error, stated]].agg(lambda values: np.sqrt(np.mean(values**2)))
+    axes.plot(
+        rows[rate],
+        rows[error],
+        "o",
+        color="tab:blue",
+        mfc="none",
+        label="single experiments",
+    )
+    rms = rows.groupby(rate)[[error, stated]].agg(
+        lambda values: np.sqrt(np.mean(values**2))
+    )
     axes.plot(rms.index, rms[error], "-", color="tab:blue", label="their rms")
-    axes.plot(rms.index, rms[stated], "--", color="tab:orange", label="stated standard deviation")
-    axes.set(xscale="log", yscale="log", xlabel="frame rate [Hz]", ylabel=f"error of the {what} [%]")
+    axes.plot(
+        rms.index, rms[stated], "--", color="tab:orange", label="stated standard deviation"
+    )
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel="frame rate [Hz]",
+        ylabel=f"error of the {what} [%]",
+    )
     axes.set_xticks(rms.index, [f"{value:g}" for value in rms.index])
     axes.minorticks_off()
 panels[0].legend(fontsize="small")
