@@ -13,6 +13,7 @@ import kept_figures  # noqa: E402  (found in _ext)
 
 project = "cmmsim"
 author = "the authors of cmmsim"
+copyright = "the authors of cmmsim; MIT licence"
 version = release = metadata.version("cmmsim")
 html_title = f"cmmsim {release}"
 

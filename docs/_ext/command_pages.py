@@ -8,28 +8,40 @@ from typing import Any
 import typer.main
 
 from identify.commands.app import app
+from identify.commands.help import STATUSES
 
 VALUES = {Path: "PATH", int: "N", float: "NUMBER"}
 """What stands for an option's value, by its type, where the option does not say."""
 
 
 def commands() -> str:
-    """All commands in Markdown, in the order of ``cmmsim --help``."""
+    """All commands in Markdown, by the groups of ``cmmsim --help``, each with a heading of its own."""
     root = typer.main.get_command(app)
-    parts = [_help(root.help)]
-    for words, command in _all(root, ("cmmsim",)):
-        parts += [f"## {' '.join(words)}", _usage(words, command), _help(command.help), _parameters(command)]
+    parts = [_help(root.help), _help(getattr(root, "epilog", None)), _statuses(STATUSES)]
+    panel = None
+    for words, command, group in _all(root, ("cmmsim",)):
+        if group != panel:
+            panel = group
+            parts.append(f"## {group}")
+        parts += [f"### {' '.join(words)}", _usage(words, command), _help(command.help), _parameters(command)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def _all(group: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+def _statuses(meanings: dict[int, str]) -> str:
+    rows = "\n".join(f"| {status} | {meaning} |" for status, meaning in sorted(meanings.items()))
+    return f"Every command ends with one of these exit statuses:\n\n| status | meaning |\n| --- | --- |\n{rows}"
+
+
+def _all(group: Any, words: tuple[str, ...], panel: str = "") -> Iterator[tuple[tuple[str, ...], Any, str]]:
+    """Name in words, command and group of each, in their order."""
     for name, command in group.commands.items():
+        inner = panel or getattr(command, "rich_help_panel", None) or "Commands"
         if getattr(command, "hidden", False):
             continue
         if hasattr(command, "commands"):
-            yield from _all(command, (*words, name))
+            yield from _all(command, (*words, name), inner)
         else:
-            yield (*words, name), command
+            yield (*words, name), command, inner
 
 
 def _usage(words: tuple[str, ...], command: Any) -> str:
@@ -47,7 +59,9 @@ def _help(text: str | None) -> str:
     """Paragraphs as Markdown; those that are set as they stand (behind a backspace) as text blocks."""
     parts = []
     for paragraph in inspect.cleandoc(text or "").split("\n\n"):
-        if paragraph.startswith("\b"):
+        if not paragraph:
+            continue
+        if paragraph.startswith("\b") or "\n  " in paragraph:
             lines = paragraph.lstrip("\b\n").split("\n")
             if len(lines) > 1 and lines[0].endswith(":"):
                 parts.append(lines.pop(0))

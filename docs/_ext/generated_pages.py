@@ -17,6 +17,9 @@ PAGES: dict[str, Callable[[], str]] = {
     "sensor.md": settings_pages.sensor,
     "robot.md": settings_pages.robot,
     "study.md": settings_pages.study,
+    "record.md": settings_pages.record,
+    "record_rules.md": settings_pages.record_rules,
+    "record_variables.md": settings_pages.record_variables,
     "api_cmmsim.md": lambda: api_pages.package("cmmsim"),
     "api_dynamics.md": lambda: api_pages.package("dynamics"),
     "api_identify.md": lambda: api_pages.package("identify"),
@@ -28,6 +31,7 @@ FIGURES: dict[str, Callable[[Path], str]] = {
     "sensor_speed.md": kept_figures.sensor_speed,
     "dynamics_speed.md": kept_figures.dynamics_speed,
     "robots.md": kept_figures.robots,
+    "laws.md": kept_figures.laws,
 }
 
 

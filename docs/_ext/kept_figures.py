@@ -11,7 +11,9 @@ from typing import Any
 from identify.accuracy.saved import read_saved
 from identify.accuracy.session import markdown_table
 from identify.reporting.tables import excitation_error_table, goals_table
+from identify.studies.study_file import STUDIES, load_study
 
+LAWS = "test_rows_of_a_study_follow_its_laws"
 WORST = "unseen_position_um_"
 
 
@@ -128,6 +130,23 @@ def robots(folder: Path) -> str:
     ]
     heads = ("robot", "unseen position, µm", "unseen orientation, µrad")
     return _table(heads, rows) + f"\n\nMeasured {date_of(thorough, 'test_families')}.\n"
+
+
+def laws(folder: Path) -> str:
+    """The laws of the built-in studies, with the exponents measured at full count."""
+    thorough = kept(folder, "thorough")
+    found = figures_of(thorough, LAWS)
+    rows = []
+    for name in STUDIES.names():
+        for number, law in enumerate(load_study(name).theory):
+            key = f"law {name} {number}"
+            measured = ""
+            if f"{key} measured" in found:
+                middle, low, high = (found[f"{key} {figure}"] for figure in ("measured", "low", "high"))
+                measured = f"{middle:.3f} ({low:.3f} to {high:.3f})"
+            rows.append((f"`{name}`", f"`{law.statement}`", law.why, measured))
+    when = f"\n\nMeasured {date_of(thorough, LAWS)}.\n"
+    return _table(("study", "law", "why", "measured exponent, 99 % interval"), rows) + when
 
 
 def _faster(value: float) -> str:

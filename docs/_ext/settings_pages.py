@@ -5,6 +5,9 @@ from typing import Any
 
 from cmmsim.files.schema import SensorFile
 from dynamics.robot_file import FAMILIES, robot_schema
+from identify.record.csv_record import RULES
+from identify.record.own_record import record_schema
+from identify.record.recording import VARIABLES
 from identify.scenario import Scenario
 from identify.studies.rows import KINDS
 from identify.studies.study_file import Study
@@ -45,11 +48,32 @@ def study() -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _page(schema: dict[str, Any]) -> str:
+def record() -> str:
+    """The TOML file beside a record as CSV."""
+    return _page(record_schema(), "###")
+
+
+def record_rules() -> str:
+    """The rules that a record keeps, one a line."""
+    sentences = _plain(RULES.replace("\n", " ")).split(". ")
+    return "\n".join(f"- {sentence.rstrip('.')}." for sentence in sentences) + "\n"
+
+
+def record_variables() -> str:
+    """What a record holds as netCDF."""
+    rows = "\n".join(
+        f"| `{name}` | {', '.join(sizes)} | {'' if unit == '1' else unit} | {_plain(what)} |"
+        for name, (sizes, unit, what) in VARIABLES.items()
+    )
+    return f"| variable | over | unit | what |\n| --- | --- | --- | --- |\n{rows}\n"
+
+
+def _page(schema: dict[str, Any], mark: str = "##") -> str:
     definitions = schema.get("$defs", {})
-    parts = ["## At the top of the file", _table(schema, definitions)]
+    parts = [f"{mark} At the top of the file", _table(schema, definitions)]
     seen: set[str] = set()
     _tables(schema, definitions, "", parts, seen)
+    parts = [part.replace("## ", f"{mark} ", 1) if part.startswith("## ") else part for part in parts]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
