@@ -37,6 +37,7 @@ suppress_warnings = ["config.cache"]  # what sphinx-gallery is told cannot be pi
 myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence", "substitution", "attrs_inline"]
 myst_heading_anchors = 4
 myst_substitutions = kept_figures.substitutions(DOCS.parent / ".readme")
+smartquotes = False  # two dashes begin an option
 default_role = "literal"  # single backquotes in docstrings are code
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
