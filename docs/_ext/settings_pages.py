@@ -3,27 +3,27 @@
 import json
 from typing import Any
 
-from cmmsim.files.schema import SensorFile
+from cmmsim.files.sensor_file import sensor_schema
 from dynamics.robot_file import FAMILIES, robot_schema
 from identify.record.csv_record import RULES
 from identify.record.own_record import record_schema
 from identify.record.recording import VARIABLES
-from identify.scenario import Scenario
+from identify.scenario.scenario import scenario_schema
+from identify.studies.labels import factor_unit
 from identify.studies.rows import KINDS
-from identify.studies.study_file import Study
-from identify.studies.table import factor_unit
+from identify.studies.study_file import study_schema
 
 LIMITS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 
 
 def scenario() -> str:
     """Scenario files."""
-    return _page(Scenario.model_json_schema())
+    return _page(scenario_schema())
 
 
 def sensor() -> str:
     """Sensor files."""
-    return _page(SensorFile.model_json_schema())
+    return _page(sensor_schema())
 
 
 def robot() -> str:
@@ -35,7 +35,7 @@ def robot() -> str:
 
 def study() -> str:
     """Study files, and the kinds of row with their options and figures."""
-    parts = [_page(Study.model_json_schema())]
+    parts = [_page(study_schema())]
     for kind in KINDS.values():
         parts.append(f"## Rows of kind `{kind.name}`\n\n{_sentence(kind.what)}")
         if kind.options is not None:

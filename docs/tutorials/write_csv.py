@@ -17,5 +17,6 @@ for k in range(record.sizes["joint"]):
 pd.DataFrame(columns).to_csv("mine.csv", index=False)
 
 std = np.sqrt(np.einsum("nii->ni", record["measured_covariance"].values).mean(axis=0))
-print(f"position_std_m = {std[:3].mean():.2g}, orientation_std_rad = {std[3:].mean():.2g}")
-print(f"anchor_value = {record.attrs['scale_anchor_value']:.4f}   # kg, the platform as weighed")
+print(f"anchor_value = {record.attrs['scale_anchor_value']:.4f}")
+print(f"position_std_m = {std[:3].mean():.2e}")
+print(f"orientation_std_rad = {std[3:].mean():.2e}")
