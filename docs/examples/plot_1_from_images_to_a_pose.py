@@ -46,7 +46,7 @@ plt.show()
 # One sticker
 # -----------
 # A sticker has a radius of some four pixels. Its edge is blurred by the pixels, and all grey values carry noise. The
-# centre of the ellipse is found to a few thousandths of a pixel all the same, for hundreds of pixels tell of it.
+# centre of the ellipse is found to about a hundredth of a pixel all the same, for dozens of pixels tell of it.
 
 x, y = measured.left_pixels[0]
 column, row = round(x), round(y)
