@@ -42,6 +42,7 @@ default_role = "literal"  # single backquotes in docstrings are code
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
+autodoc_type_aliases = {name: name for name in ("ArrayLike", "Array", "NDArray")}
 autodoc_preserve_defaults = True
 python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 100
@@ -57,6 +58,7 @@ sphinx_gallery_conf = {
     "image_scrapers": ("matplotlib",),
     "reset_modules": ("matplotlib",),
     "min_reported_time": 1,
+    "write_computation_times": False,
     "show_signature": False,
     "doc_module": ("cmmsim", "dynamics", "identify"),
     "reference_url": {"cmmsim": None, "dynamics": None, "identify": None},

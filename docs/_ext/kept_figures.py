@@ -74,7 +74,8 @@ def substitutions(folder: Path) -> dict[str, str]:
 
 def goals(folder: Path) -> str:
     """Goals of the kept run of the scenario `paper`."""
-    return str(goals_table(kept(folder, "result")).markdown())
+    text = str(goals_table(kept(folder, "result")).markdown())
+    return text.replace("| --: |\n", "| --- |\n", 1)  # the last column holds sentences
 
 
 def excitation_errors(folder: Path) -> str:
@@ -144,9 +145,10 @@ def laws(folder: Path) -> str:
             if f"{key} measured" in found:
                 middle, low, high = (found[f"{key} {figure}"] for figure in ("measured", "low", "high"))
                 measured = f"{middle:.3f} ({low:.3f} to {high:.3f})"
-            rows.append((f"`{name}`", f"`{law.statement}`", law.why, measured))
+            statement = law.statement.replace("_", "\\_").replace("^", "\\^").replace("~", "\\~")
+            rows.append((f"`{name}`", f"{statement}: {law.why.replace('^', '&#94;')}", measured))
     when = f"\n\nMeasured {date_of(thorough, LAWS)}.\n"
-    return _table(("study", "law", "why", "measured exponent, 99 % interval"), rows) + when
+    return _table(("study", "law, and why", "measured exponent, 99 % interval"), rows, "---") + when
 
 
 def _faster(value: float) -> str:
@@ -166,6 +168,6 @@ def _measured(folder: Path, part: str) -> str:
     return f"\n\nMeasured {date_of(content, part)} with {with_what}, on {content['cores']} cores.\n"
 
 
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    lines = [head, ("---", *("--:" for _ in head[1:])), *rows]
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]], rule: str = "--:") -> str:
+    lines = [head, ("---", *(rule for _ in head[1:])), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
