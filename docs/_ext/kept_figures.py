@@ -40,9 +40,7 @@ def date_of(content: dict[str, Any], part: str = "") -> str:
 def substitutions(folder: Path) -> dict[str, str]:
     """Single figures as text, by the name that pages use."""
     result, speeds, thorough = (kept(folder, name) for name in ("result", "speeds", "thorough"))
-    found, proved = figures_of(speeds), figures_of(thorough)
-    unseen = [value for name, value in proved.items() if name.startswith("unseen_position_um_")]
-    turned = [value for name, value in proved.items() if name.startswith("unseen_orientation_urad_")]
+    proved = figures_of(thorough)
     faster = [
         entry["figures"]["forward_dynamics_over_lcaba"]
         for entry in speeds["tests"].values()
@@ -50,25 +48,15 @@ def substitutions(folder: Path) -> dict[str, str]:
     ]
     reached = [entry["figures"].get("starts_reaching_the_optimum", 25) for entry in thorough["tests"].values()]
     outcomes = [entry["outcome"] for entry in thorough["tests"].values()]
-    hours = sum(entry["seconds"] for entry in thorough["tests"].values()) / 3600
     identification = result["identification"]
     return {
         "covered": f"{100 * proved['covered']:.1f} ± {100 * proved['covered_std']:.1f} %",
         "starts_reached": f"{min(reached)} of 25",
         "thorough_date": date_of(thorough),
         "thorough_passed": f"{outcomes.count('passed')} of {len(outcomes)}",
-        "thorough_hours": f"{hours:.1f} hours",
-        "unseen_of_all_robots_um": f"{min(unseen):.1f} to {max(unseen):.1f} µm",
-        "unseen_of_all_robots_urad": f"{max(turned):.1f} µrad",
         "faster_than_recursion": f"{min(faster):.0f} to {max(faster):.0f} times",
-        "frames_analytic": f"{found['analytic_frames_a_second']:.0f}",
-        "frames_pyrender": f"{found['pyrender_frames_a_second']:.0f}",
-        "robot_compilation": f"{found['robot_compilation_s']:.0f} s",
-        "loop_compilation": f"{found['loop_compilation_s']:.0f} s",
         "noise_found": f"{identification['noise_ratio']:.3f}",
         "noise_expected": f"{identification['expected_noise_ratio']:.3f}",
-        "paper_seconds": f"{sum(result['seconds'].values()):.0f} s",
-        "result_date": str(result.get("created", ""))[:10],
     }
 
 
