@@ -178,6 +178,7 @@ def _write_identified(run_folder: RunFolder, found: _Identified, scenario: Scena
             "scenario": scenario.name,
             "seed": seed,
             "settings": estimator_settings(scenario),
+            "date": str(seen.attrs.get("created", ""))[:10] or None,
             "versions": versions(),
             ENTRY: made_of,
             "seconds": {"record": seen.attrs.get("record_seconds"), "identify": found.seconds, **seconds},

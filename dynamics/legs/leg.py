@@ -35,11 +35,18 @@ def _vector(value: object) -> np.ndarray:
     return array
 
 
+ROUNDED = 1e-4
+"""What directions may miss the length 1, or a right angle, by: they may be written with four decimals or more."""
+EXACT = 1e-12
+"""Below this nothing is to be set right."""
+
+
 def _direction(value: object) -> np.ndarray:
     array = _vector(value)
-    if abs(np.linalg.norm(array) - 1.0) > 1e-9:
-        raise ValueError(f"has length {np.linalg.norm(array):.9g}, must be 1")
-    return array
+    length = float(np.linalg.norm(array))
+    if abs(length - 1.0) > ROUNDED:
+        raise ValueError(f"has length {length:.9g}, must be 1")
+    return array if abs(length - 1.0) < EXACT else _vector(array / length)
 
 
 MOST_TURNING = 1e6

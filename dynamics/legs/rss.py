@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from dynamics.expressions import symmetric_from_lower
-from dynamics.legs.leg import Body, Direction, Leg, Length, Placement, Segment, link_axes
+from dynamics.legs.leg import EXACT, ROUNDED, Body, Direction, Leg, Length, Placement, Segment, link_axes
 
 Z = np.array([0.0, 0.0, 1.0])
 
@@ -63,11 +63,17 @@ class RssLeg(Leg):
 
     @model_validator(mode="after")
     def _normal(self) -> Self:
-        product = float(self.crank_axis @ self.crank_zero_direction)
-        if abs(product) > 1e-9:
+        zero, axis = self.crank_zero_direction, self.crank_axis
+        product = float(axis @ zero)
+        if abs(product) > ROUNDED:
             raise ValueError(
-                f"crank_zero_direction must be normal to the crank axis; their dot product is {product:.3g}, limit 1e-9"
+                f"crank_zero_direction must be normal to the crank axis; their dot product is {product:.3g}, limit "
+                f"{ROUNDED:g}"
             )
+        if abs(product) > EXACT:
+            normal = zero - product * axis
+            self.__dict__["crank_zero_direction"] = normal / np.linalg.norm(normal)
+            self.crank_zero_direction.setflags(write=False)
         return self
 
     def lengths(self) -> str:

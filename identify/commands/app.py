@@ -103,12 +103,13 @@ RECORDS = "More from a run"
 ROBOTS = "Robots"
 SENSORS = "Sensors"
 STUDIES = "Studies"
-PICTURES = "Pictures of a robot and a sensor"
+PICTURES = "What it looks like"
 SETTING_UP = "Setting up"
 
 _add(EXPERIMENT, run)
 _add(STAGES, excite, record, identify, validate, report)
-_add(RECORDS, replay, estimators, variation)
+_add(RECORDS, estimators, variation)
+_add(PICTURES, replay, show)
 _add(ROBOTS, check, cls=Judging)
 _add(ROBOTS, workspace, base_parameters)
 _add(ROBOTS, verify_model, cls=Judging)
@@ -118,5 +119,4 @@ _add(SENSORS, acceptance, cls=Judging)
 _add(SENSORS, detectors, calibrate)
 _add(STUDIES, stoppable(study), cls=StudyCommand)
 app.add_typer(new, name="new", rich_help_panel=SETTING_UP)
-_add(PICTURES, show)
 _add(SETTING_UP, warm_up)

@@ -111,7 +111,7 @@ def test_a_file_by_path_and_a_robot_sent_to_another_process_are_the_same_robot(l
         (
             "    [0.0, 0.0, 1.0],\n",
             "    [0.0, 0.6, 0.8],\n",
-            "leg 1: crank_zero_direction must be normal to the crank axis; .*limit 1e-9",
+            "leg 1: crank_zero_direction must be normal to the crank axis; .*limit 0.0001",
         ),
         ("mass = [0.671, ", "mass = [", r"crank.mass needs one value or 6 values, got 5"),
         ("crank = { mass = 0.685", "crank = { mass = -0.685", r"crank1.mass = -0.685 kg is not allowed"),
@@ -124,6 +124,18 @@ def test_robot_files_that_make_no_robot(load_changed, old, new, message):
     """Unknown keys list the valid ones; places, counts, values and legs are named; the file is named first."""
     with pytest.raises(RobotFileError, match=rf"robot file .*changed.toml.*{message}"):
         load_changed({old: new})
+
+
+def test_directions_may_be_rounded_to_six_decimals(load_changed, robot):
+    """The legs close as they do with all digits: at home, and at a pose found again from its own joint angles."""
+    exact = [leg.crank_zero_direction.tolist() for leg in robot.geometry.legs]
+    rounded = {repr(value): f"{value:.6f}" for direction in exact for value in direction[:2]}
+    tilted = {"    [0.0, 0.0, 1.0],\n": "    [0.0, 2e-6, 1.0],\n"}
+    changed = load_changed(rounded | tilted)
+    pose = robot.home_pose + 0.5 * BOX * [1, -1, 1, -1, 1, -1]
+    theta = changed.inverse_kinematics(pose)
+    np.testing.assert_allclose(theta, robot.inverse_kinematics(pose), atol=1e-5)
+    np.testing.assert_allclose(changed.forward_kinematics(theta), pose, atol=1e-9)
 
 
 ERROR = 1e-4

@@ -61,10 +61,14 @@ def test_few_rows_of_a_study_contradict_no_law(name):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", sorted(REPEATS))
-def test_rows_of_a_study_follow_its_laws(name):
+def test_rows_of_a_study_follow_its_laws(name, record_property):
     study, table = rows_of(name)
     assert not table["error"].any()
     found = check_laws(study, table)
+    for number, (law, one) in enumerate(zip(study.theory, found, strict=True)):
+        if law.exponent is not None:
+            for figure in ("measured", "low", "high"):
+                record_property(f"law {name} {number} {figure}", getattr(one, figure))
     assert {one.verdict for one in found} == {"passed"}, "\n".join(map(repr, found))
 
 

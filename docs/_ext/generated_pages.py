@@ -1,0 +1,63 @@
+"""Pages that are written from the code and from kept figures before each build, into docs/generated."""
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+
+import api_pages
+import command_pages
+import kept_figures
+import settings_pages
+from pydantic import BaseModel
+from sphinx.application import Sphinx
+
+PAGES: dict[str, Callable[[], str]] = {
+    "commands.md": command_pages.commands,
+    "scenario.md": settings_pages.scenario,
+    "sensor.md": settings_pages.sensor,
+    "robot.md": settings_pages.robot,
+    "study.md": settings_pages.study,
+    "record.md": settings_pages.record,
+    "record_rules.md": settings_pages.record_rules,
+    "record_variables.md": settings_pages.record_variables,
+    "api_cmmsim.md": lambda: api_pages.package("cmmsim"),
+    "api_dynamics.md": lambda: api_pages.package("dynamics"),
+    "api_identify.md": lambda: api_pages.package("identify"),
+}
+FIGURES: dict[str, Callable[[Path], str]] = {
+    "goals.md": kept_figures.goals,
+    "excitation_errors.md": kept_figures.excitation_errors,
+    "accuracy.md": kept_figures.accuracy,
+    "sensor_speed.md": kept_figures.sensor_speed,
+    "dynamics_speed.md": kept_figures.dynamics_speed,
+    "robots.md": kept_figures.robots,
+    "laws.md": kept_figures.laws,
+}
+
+
+def write_pages(app: Sphinx) -> None:
+    """Write what has changed, so that an unchanged page is not read again."""
+    folder, figures = Path(app.srcdir) / "generated", Path(app.srcdir).parent / ".readme"
+    folder.mkdir(exist_ok=True)
+    texts = {name: page() for name, page in PAGES.items()}
+    texts |= {name: figure(figures) for name, figure in FIGURES.items()}
+    for name, text in texts.items():
+        path = folder / name
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+def without_fields(
+    app: Sphinx, what: str, name: str, found: object, options: object, signature: str, returned: str
+) -> tuple[str, str] | None:
+    """The signature of settings is their file's page: here it would fill a screen."""
+    if inspect.isclass(found) and issubclass(found, BaseModel):
+        return "", ""
+    return None
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Write the pages when the build begins; they are included by others, and are no documents of their own."""
+    app.connect("builder-inited", write_pages, priority=100)
+    app.connect("autodoc-process-signature", without_fields)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,161 @@
+"""Figures of kept runs, for the text: `{{ name }}` in a page is a figure of .readme/*.json, and none is out of date.
+
+Pages take single figures as substitutions; the tables of the page of results are written whole.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from identify.accuracy.saved import read_saved
+from identify.accuracy.session import markdown_table
+from identify.reporting.tables import excitation_error_table, goals_table
+from identify.studies.study_file import STUDIES, load_study
+
+LAWS = "test_rows_of_a_study_follow_its_laws"
+WORST = "unseen_position_um_"
+
+
+def kept(folder: Path, name: str) -> dict[str, Any]:
+    """Content of a kept file."""
+    return dict(json.loads((folder / f"{name}.json").read_text(encoding="utf-8")))
+
+
+def figures_of(content: dict[str, Any], part: str = "") -> dict[str, float]:
+    """Figures by name of all tests that passed, of those whose name holds ``part``."""
+    return {
+        name: value
+        for test, entry in content["tests"].items()
+        if part in test and entry["outcome"] == "passed"
+        for name, value in entry["figures"].items()
+    }
+
+
+def date_of(content: dict[str, Any], part: str = "") -> str:
+    """Date of the last of the tests whose name holds ``part``."""
+    return max(entry["date"] for test, entry in content["tests"].items() if part in test)
+
+
+def substitutions(folder: Path) -> dict[str, str]:
+    """Single figures as text, by the name that pages use."""
+    result, speeds, thorough = (kept(folder, name) for name in ("result", "speeds", "thorough"))
+    proved = figures_of(thorough)
+    faster = [
+        entry["figures"]["forward_dynamics_over_lcaba"]
+        for entry in speeds["tests"].values()
+        if "forward_dynamics_over_lcaba" in entry["figures"]
+    ]
+    reached = [entry["figures"].get("starts_reaching_the_optimum", 25) for entry in thorough["tests"].values()]
+    outcomes = [entry["outcome"] for entry in thorough["tests"].values()]
+    identification = result["identification"]
+    return {
+        "covered": f"{100 * proved['covered']:.1f} ± {100 * proved['covered_std']:.1f} %",
+        "starts_reached": f"{min(reached)} of 25",
+        "thorough_date": date_of(thorough),
+        "thorough_passed": f"{outcomes.count('passed')} of {len(outcomes)}",
+        "faster_than_recursion": f"{min(faster):.0f} to {max(faster):.0f} times",
+        "noise_found": f"{identification['noise_ratio']:.3f}",
+        "noise_expected": f"{identification['expected_noise_ratio']:.3f}",
+    }
+
+
+def goals(folder: Path) -> str:
+    """Goals of the kept run of the scenario `paper`."""
+    text = str(goals_table(kept(folder, "result")).markdown())
+    return text.replace("| --: |\n", "| --- |\n", 1)  # the last column holds sentences
+
+
+def excitation_errors(folder: Path) -> str:
+    """Model against measurement on the exciting trajectory, beside the paper's table 3."""
+    return str(excitation_error_table(kept(folder, "result"), beside_paper=True).markdown())
+
+
+def accuracy(folder: Path) -> str:
+    """This project's own accuracy figures."""
+    return str(markdown_table(read_saved(folder / "accuracy.json").figures))
+
+
+def sensor_speed(folder: Path) -> str:
+    """Stereo frames a second, and against the straightforward pipeline."""
+    found = figures_of(kept(folder, "speeds"), "test_sensor_speed")
+    renderers = ("analytic", "pyrender")
+    titles = {
+        "frames_a_second": "stereo frames a second, drawn and measured",
+        "times_straightforward": "times as fast as the straightforward pipeline",
+    }
+    rows = [
+        (title, *(f"{found[f'{renderer}_{name}']:.0f}" for renderer in renderers)) for name, title in titles.items()
+    ]
+    return _table(("renderer", "`analytic`", "`pyrender`"), rows) + _measured(folder, "test_sensor_speed")
+
+
+def dynamics_speed(folder: Path) -> str:
+    """The dynamics against other engines."""
+    found = figures_of(kept(folder, "speeds"), "test_dynamics_speed")
+    shown: list[tuple[str, str, Callable[[float], str]]] = [
+        ("forward dynamics against Pinocchio's closed chain, relative difference", "pinocchio_relative_difference",
+         lambda value: f"{value:.0e}"),
+        ("forward dynamics against Pinocchio's `constraintDynamics`", "forward_dynamics_over_pinocchio", _faster),
+        ("forward dynamics against MuJoCo's `mj_step`", "forward_dynamics_over_mj_step", _faster),
+        ("closed loop with exact stick-slip friction, 60 Hz frames", "times_real_time",
+         lambda value: f"{value:.0f} times real time"),
+        ("all 67 sensitivities of a run", "sensitivities_plain_runs", lambda value: f"{value:.1f} plain runs"),
+        ("a batch of runs on two cores", "two_cores_gain", lambda value: f"{value:.2f} times faster than on one"),
+        ("compiling a robot, at first use", "robot_compilation_s", lambda value: f"{value:.0f} s"),
+        ("compiling the loop, once after installation", "loop_compilation_s", lambda value: f"{value:.0f} s"),
+    ]  # fmt: skip
+    rows = [(title, text(found[name])) for title, name, text in shown]
+    return _table(("figure", "measured"), rows) + _measured(folder, "test_dynamics_speed")
+
+
+def robots(folder: Path) -> str:
+    """What `cmmsim run quick` reached with each built-in robot."""
+    thorough = kept(folder, "thorough")
+    found = figures_of(thorough, "test_families")
+    names = sorted(name.removeprefix(WORST) for name in found if name.startswith(WORST))
+    rows = [
+        (f"`{name}`", f"{found[WORST + name]:.2f}", f"{found[f'unseen_orientation_urad_{name}']:.1f}") for name in names
+    ]
+    heads = ("robot", "unseen position, µm", "unseen orientation, µrad")
+    return _table(heads, rows) + f"\n\nMeasured {date_of(thorough, 'test_families')}.\n"
+
+
+def laws(folder: Path) -> str:
+    """The laws of the built-in studies, with the exponents measured at full count."""
+    thorough = kept(folder, "thorough")
+    found = figures_of(thorough, LAWS)
+    rows = []
+    for name in STUDIES.names():
+        for number, law in enumerate(load_study(name).theory):
+            key = f"law {name} {number}"
+            measured = ""
+            if f"{key} measured" in found:
+                middle, low, high = (found[f"{key} {figure}"] for figure in ("measured", "low", "high"))
+                measured = f"{middle:.3f} ({low:.3f} to {high:.3f})"
+            statement = law.statement.replace("_", "\\_").replace("^", "\\^").replace("~", "\\~")
+            rows.append((f"`{name}`", f"{statement}: {law.why.replace('^', '&#94;')}", measured))
+    when = f"\n\nMeasured {date_of(thorough, LAWS)}.\n"
+    return _table(("study", "law, and why", "measured exponent, 99 % interval"), rows, "---") + when
+
+
+def _faster(value: float) -> str:
+    return f"{value:.1f} times faster"
+
+
+def _measured(folder: Path, part: str) -> str:
+    """When, and with which versions of the packages that a benchmark names."""
+    content = kept(folder, "speeds")
+    entries = [content | entry for test, entry in content["tests"].items() if part in test]
+    versions = {name: version for entry in entries for name, version in entry["versions"].items()}
+    with_what = ", ".join(
+        f"{name} {versions[name]}"
+        for name in ("pin", "mujoco", "opencv-python-headless", "pyrender")
+        if name in versions
+    )
+    return f"\n\nMeasured {date_of(content, part)} with {with_what}, on {content['cores']} cores.\n"
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]], rule: str = "--:") -> str:
+    lines = [head, ("---", *(rule for _ in head[1:])), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -1,0 +1,110 @@
+"""The documentation can be followed: its commands exist with their options and settings, its links and files do."""
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from identify.commands.app import app
+from identify.commands.options import parse_settings
+from identify.scenario import load_scenario, scenario_names
+
+ROOT = Path(__file__).parent.parent
+PAGES = [path for path in sorted((ROOT / "docs").rglob("*.md")) if "generated" not in path.parts]
+TEXTS = {path: path.read_text(encoding="utf-8") for path in (*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md")}
+
+
+def commands(text):
+    """The command lines of ``cmmsim`` in blocks of a shell and between backquotes, as lists of words."""
+    blocks = re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    lines += re.findall(r"`((?:\.venv/bin/)?cmmsim [^`]+)`", text)
+    for line in lines:
+        for part in line.split("&&"):
+            words = shlex.split(part, comments=True)
+            if words and words[0].removeprefix(".venv/bin/") == "cmmsim":
+                yield words[1:]
+
+
+def parsed(words):
+    """Name and values of a command line. Raises what the command line itself refuses."""
+    command, name = typer.main.get_command(app), "cmmsim"
+    while hasattr(command, "commands") and words and not words[0].startswith("-"):
+        assert words[0] in command.commands, f"no command {words[0]!r}"
+        name, command, words = words[0], command.commands[words[0]], words[1:]
+    return name, command.make_context(name, list(words)).params if words else {}
+
+
+FOUND = [(path, words) for path, text in TEXTS.items() for words in commands(text)]
+
+
+def test_every_command_line_is_one_that_the_program_takes():
+    """A command alone, as it is mentioned in a sentence, must exist; one with arguments must parse."""
+    assert len(FOUND) > 100
+    wrong = []
+    for path, words in FOUND:
+        if {"--help", "COMMAND", "--install-completion"} & set(words):
+            continue
+        try:
+            name, values = parsed(words)
+            scenario = values.get("scenario")
+            if name in ("run", "excite") and scenario in scenario_names():
+                settings = parse_settings(values.get("settings"))
+                own = {key: value for key, value in settings.items() if str(value).endswith(".toml")}
+                load_scenario(scenario).with_overrides({k: v for k, v in settings.items() if k not in own})
+        except (Exception, SystemExit) as error:
+            wrong.append(f"{path.relative_to(ROOT)}: cmmsim {shlex.join(words)}: {error}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_link_and_every_file_that_is_named_exists():
+    """Links into what the build writes are checked by the build itself."""
+    wrong = []
+    for path, text in TEXTS.items():
+        targets = re.findall(r"\]\(([^)#\s]+)", text) + re.findall(
+            r"^```\{(?:literal)?include\} (\S+)", text, re.MULTILINE
+        )
+        wrong += [
+            f"{path.relative_to(ROOT)}: {target}"
+            for target in targets
+            if not target.startswith("http") and "generated/" not in target and not (path.parent / target).exists()
+        ]
+        named = re.findall(r"`(?:sh )?((?:cmmsim|dynamics|identify|tests|docs|\.ci|\.readme)/[\w./]*)`", text)
+        wrong += [f"{path.relative_to(ROOT)}: {name}" for name in named if not (ROOT / name).exists()]
+    assert [one for one in wrong if not one.endswith("tests/FILE.py")] == []
+
+
+def test_every_page_can_be_reached():
+    """From the first one, by the tables of contents."""
+    reached, waiting = set(), [ROOT / "docs" / "index.md"]
+    while waiting:
+        path = waiting.pop()
+        reached.add(path)
+        for block in re.findall(r"^```\{toctree\}\n(.*?)^```", TEXTS.get(path, ""), re.MULTILINE | re.DOTALL):
+            names = [line for line in block.split() if not line.startswith(":") and not line.isdecimal()]
+            found = [(path.parent / f"{name}.md").resolve() for name in names if not name.startswith("generated/")]
+            waiting += [one for one in found if one not in reached]
+    assert sorted(set(PAGES) - reached) == []
+
+
+@pytest.mark.slow
+def test_it_is_built_without_a_warning(tmp_path):
+    """Without running the examples, which `sh .ci/docs` does; on a copy, whose outputs are nobody else's."""
+    pytest.importorskip("sphinx_gallery")
+    for entry in ROOT.iterdir():
+        if entry.is_file():  # pages may include it, with links from its own place
+            shutil.copy(entry, tmp_path)
+        elif entry.name not in ("docs", "build", ".venv", ".git"):
+            (tmp_path / entry.name).symlink_to(entry)
+    shutil.copytree(ROOT / "docs", tmp_path / "docs", ignore=shutil.ignore_patterns("generated"))
+    ran = subprocess.run(
+        [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-D", "plot_gallery=0", "docs", "html"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    assert (tmp_path / "html" / "reference" / "commands.html").exists()
