@@ -22,7 +22,7 @@ from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import marked_body, require_corner, rig_from_file
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.known_rig import KnownRig, rig_changes
-from cmmsim.geometry.pose import Array, checked_pose, checked_transform, pose_to_transform
+from cmmsim.geometry.pose import Array, apply, checked_pose, checked_transform, pose_to_transform
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
 from cmmsim.imaging.formation import ImageFormation
@@ -120,7 +120,14 @@ class Sensor:
             optics=self.optics,
             centre_error_px=self.camera.centre_error_px(Quality()),
             exposed_share=self.timing.exposure * self.timing.frame_rate,
+            line_error_px=0.0 if self._known is None else self._known.line_std(self._stickers_at_home),
         )
+
+    @property
+    def _stickers_at_home(self) -> Array:
+        """Nominal places (n,3) of all stickers in the camera frame, with the platform at home."""
+        at_home = self._camera_from_base @ pose_to_transform(self.home)
+        return np.concatenate([apply(at_home, self.platform.nominal), apply(self._camera_from_base, self.base.nominal)])
 
     @cached_property
     def _window_sizes(self) -> WindowSizes:

@@ -161,11 +161,13 @@ class Teacher:
     def _require_rigid(self, places: Array, camera_from_body: Array, seen: StickerObservation) -> None:
         """Raise LostError when a sticker has moved against the others: it is partly hidden."""
         gaps = np.linalg.norm(apply(camera_from_body, places) - seen.points, axis=1)
-        if gaps.max() > LARGEST_GAP:
+        depth, focal = np.linalg.norm(seen.points, axis=1).max(), self.observer.rig.left.focal_px
+        limit = LARGEST_GAP + self.observer.settings.line_error_px * depth / focal
+        if gaps.max() > limit:
             worst = self.platform.sticker_ids[gaps.argmax()]
             raise LostError(
                 f"{self.platform.name}: sticker {worst} is {gaps.max() * 1e6:.0f} um off its place, "
-                f"at most {LARGEST_GAP * 1e6:.0f} um; it may be partly hidden"
+                f"at most {limit * 1e6:.0f} um; it may be partly hidden"
             )
 
 

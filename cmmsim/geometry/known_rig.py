@@ -52,6 +52,30 @@ class KnownRig:
         draw = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
         return cls(true.moved(-std * draw), covariance, exposure_std)
 
+    def line_std(self, points: Array) -> float:
+        """Largest standard deviation [px] by which what is not known of the rig moves images of points (n, 3), in the
+        camera frame, off the epipolar lines of the known rig."""
+        std = np.sqrt(np.diag(self.covariance))
+        moved = []
+        for k in np.flatnonzero(std):
+            step = std[k] * np.eye(len(std))[k]
+            more, less = (self._off_lines(self.rig.moved(end), points) for end in (step, -step))
+            moved.append((more - less) / (2.0 * std[k]))
+        if not moved:
+            return 0.0
+        kept = np.flatnonzero(std)
+        slopes = np.stack(moved)
+        return float(np.sqrt(np.einsum("jn,jk,kn->n", slopes, self.covariance[np.ix_(kept, kept)], slopes).max()))
+
+    def _off_lines(self, true: StereoRig, points: Array) -> Array:
+        """Signed distances (n,) px of the right images of points from the epipolar lines of their left ones."""
+        left, right = (
+            np.column_stack([camera.undistort(pixels)[0], np.ones(len(points))])
+            for camera, pixels in zip(self.rig.cameras, true.project(points)[0], strict=True)
+        )
+        lines = left @ self.rig.fundamental.T
+        return np.sum(lines * right, axis=1) / np.linalg.norm(lines[:, :2], axis=1)
+
 
 def rig_changes(changes: Mapping[str, float]) -> Array:
     """Changes (24,) of a rig's parameters from those that are named, in their units.

@@ -28,7 +28,8 @@ class DetectionSettings:
     """window_size and fit_size px; radius of a sticker m; limits of a good fit; largest_ray_gap: squared distance of
     the two rays of a sticker in units of its noise (one degree of freedom, so 25 is five sigma); centre_error_px: rms
     error of a centre that is not noise, such as the image formation's own; it is added to the noise's covariance, as
-    is the detector's; detector: name of the one that is taken;
+    is the detector's; line_error_px: std of how far what is not known of the rig takes images off their epipolar lines,
+    which the two rays of a sticker may miss each other by beside their noise; detector: name of the one that is taken;
     optics: point spread and vignetting of the cameras as known; exposed_share: share of the time from frame to frame
     during which the cameras are exposed."""
 
@@ -41,6 +42,7 @@ class DetectionSettings:
     detector: str = DEFAULT_DETECTOR
     optics: Optics = field(default_factory=Optics)
     exposed_share: float = 0.0
+    line_error_px: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -175,11 +177,15 @@ class StickerWindows:
         seen_at = fits.centres.reshape(2, -1, 2) - self.offsets
         systematic = settings.centre_error_px**2 + self.observer.detector.bias_px**2
         spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)
-        ideal, ideal_spread, found = rig.undistort(seen_at, spread)
+        # Weighed by noise alone, rays that a wrong rig parts would meet nearer to the image that happens to be sharper.
+        parted = settings.line_error_px**2
+        ideal, ideal_spread, found = rig.undistort(seen_at, spread + parted * np.eye(2))
         good = np.all(fits.good.reshape(2, -1) & found, axis=0)
         seen = triangulate(rig.ideal, *ideal, *ideal_spread)
+        noise = 0.25 * np.einsum("ckii->k", spread)
+        covariances = seen.covariances * (noise / (noise + parted))[:, None, None] if parted else seen.covariances
         outlines = _outlines(fits, settings.centre_error_px**2)
-        return StickerObservation(self.index, seen_at[0], seen_at[1], seen.points, seen.covariances, outlines).selected(
+        return StickerObservation(self.index, seen_at[0], seen_at[1], seen.points, covariances, outlines).selected(
             good & (seen.ray_gap < settings.largest_ray_gap)
         )
 

@@ -33,6 +33,7 @@ SMALLEST_WINDOW_PX = 24
 ROOM_PX = 8  # a bright spot's rough centre differs from a prediction of it
 FEWEST_TAUGHT = 4  # stickers by whose taught places a platform is found
 LINE_TOLERANCE_PX = 0.5
+LINE_STDS = 4.0  # of what is not known of the rig
 NEAREST, FURTHEST = 0.3, 6.0  # m
 SMALLEST_TRIANGLE = 0.002  # m² area
 MOST_TOGETHER = 64  # triangles judged together
@@ -64,7 +65,8 @@ def candidate_points(ellipses: tuple[EllipseFits, EllipseFits], observer: Observ
     for camera, centres in zip(observer.rig.cameras, (left, right), strict=True):
         pixels, found = camera.undistort(centres)
         ideal.append(pixels[found])
-    return candidate_pairs(observer.rig.ideal, *ideal)[1]
+    off_line = LINE_TOLERANCE_PX + LINE_STDS * observer.settings.line_error_px
+    return candidate_pairs(observer.rig.ideal, ideal[0], ideal[1], off_line)[1]
 
 
 def find_blobs(image: GreyImage, white_level: int, largest_side: int) -> Array:
@@ -94,13 +96,15 @@ def epipolar_distance(rig: StereoRig, left: Array, right: Array) -> Array:
     return np.abs(lines @ np.column_stack([right, np.ones(len(right))]).T)
 
 
-def candidate_pairs(rig: StereoRig, left: Array, right: Array) -> tuple[NDArray[np.int_], Array]:
+def candidate_pairs(
+    rig: StereoRig, left: Array, right: Array, off_line: float = LINE_TOLERANCE_PX
+) -> tuple[NDArray[np.int_], Array]:
     """All pairs (m, 2) of left and right spots that may be one point, and their points (m, 3) in the camera frame.
 
-    Parameters: left (k, 2) and right (l, 2) in ideal px. A spot may appear in several pairs; the known layout decides
-    later which of them is true.
+    Parameters: left (k, 2) and right (l, 2) in ideal px; off_line: how far, px, a spot may be off the other's line. A
+    spot may appear in several pairs; the known layout decides later which of them is true.
     """
-    pairs = np.argwhere(epipolar_distance(rig, left, right) < LINE_TOLERANCE_PX)
+    pairs = np.argwhere(epipolar_distance(rig, left, right) < off_line)
     points = linear_triangulation(rig, left[pairs[:, 0]], right[pairs[:, 1]])
     near = (points[:, 2] > NEAREST) & (np.linalg.norm(points, axis=1) < FURTHEST)
     return pairs[near], points[near]

@@ -15,6 +15,7 @@ from cmmsim.geometry.known_rig import KnownRig
 from identify.errors import RecordError
 from identify.estimation.identification import identify, output_error_problem
 from identify.record.common_errors import CommonErrors, Marginal, read_common_errors, store_common_errors
+from tests.cmmsim.sensors import PHOTOGRAPHED
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
 
 NAMES = ("left.fx_px", "left.cx_px", "right.cx_px", "taught.base.rz_rad", "taught.platform.tx_m")
@@ -92,10 +93,6 @@ def test_a_latency_that_is_known_to_two_milliseconds_is_found_beside_the_paramet
     z = ((result.estimate - truth()) / result.std)[result.identifiable]
     assert np.sqrt(np.mean(z**2)) < 1.5
     assert not result.warnings
-
-
-PHOTOGRAPHED = np.diag([*2 * (1.0, 1.0, 0.5, 0.5, 2e-3, 2e-3, 1e-4, 1e-4, 0.0), *3 * (5e-5,), *3 * (1e-4,)]) ** 2
-"""Covariance of a rig as fifteen photographs of a board leave it: focal lengths to 1 px, principal points to 0.5 px."""
 
 
 @pytest.mark.thorough
