@@ -11,6 +11,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from dynamics.checks import row_text
 from dynamics.compiled.machine_code import MachineFunction, compiled_functions
 from dynamics.errors import ConvergenceError
 from dynamics.expressions import function
@@ -29,20 +30,26 @@ class Closure:
     def poses(self, joints: np.ndarray, deviations: np.ndarray, start: np.ndarray) -> np.ndarray:
         """Poses (N, 6) at which the loops close with joint coordinates (N, n), searched from starts (N, 6).
 
-        Raises ConvergenceError, naming the first row whose loops stay open, with their gap.
+        Raises ConvergenceError, naming the first row whose loops stay open.
         """
+
+        found = self.nearest(joints, deviations, start)
+        if not np.isfinite(found).all():
+            row = int(np.argmin(np.isfinite(found).all(axis=1)))
+            raise ConvergenceError(
+                f"no pose near {row_text(start[row], 4)} closes the loops with the joint coordinates "
+                f"{row_text(joints[row], 4)} of pose {row + 1}"
+            )
+        return found
+
+    def nearest(self, joints: np.ndarray, deviations: np.ndarray, start: np.ndarray) -> np.ndarray:
+        """As `poses`, with NaN for rows whose loops stay open."""
 
         def gaps(poses: np.ndarray, theta: np.ndarray) -> list[np.ndarray]:
             return self._function(poses, theta, deviations[None])[:2]
 
         found, _ = close_loops(gaps, self.nominal.chart, joints, start)
-        left = np.abs(gaps(found, joints)[0]).max(axis=(1, 2))
-        if not (left < CLOSED).all():
-            row = int(np.argmax(~(left < CLOSED)))
-            raise ConvergenceError(
-                f"no pose near its start closes the loops with the joint coordinates of pose {row + 1}: they stay open "
-                f"by {left[row]:.3g} m^2 of squared length"
-            )
+        found[~(np.abs(gaps(found, joints)[0]).max(axis=(1, 2)) < CLOSED)] = np.nan
         return found
 
     def derivatives(

@@ -79,7 +79,9 @@ class RssLeg(Leg):
         return f"crank {self.crank_length:g} m, link {self.link_length:g} m"
 
     def shifted(self, by: float) -> Self:
-        zero = np.cos(by) * self.crank_zero_direction + np.sin(by) * np.cross(self.crank_axis, self.crank_zero_direction)
+        zero = np.cos(by) * self.crank_zero_direction + np.sin(by) * np.cross(
+            self.crank_axis, self.crank_zero_direction
+        )
         return self.model_copy(update={"crank_zero_direction": zero / np.linalg.norm(zero)})
 
     def vectors(self, position: ca.SX) -> LegVectors:

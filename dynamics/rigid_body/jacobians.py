@@ -75,13 +75,9 @@ def singularity_measures(geometry: RobotGeometry, pose: ca.SX) -> tuple[ca.SX, c
     return ca.vertcat(*leverages), ca.vertcat(*rows) @ ca.diag(ca.DM(scale)) @ freedoms(geometry)
 
 
-def loop_closure(
-    geometry: RobotGeometry, pose: ca.SX, joints: ca.SX, legs: Sequence[Leg] = ()
-) -> tuple[ca.SX, ca.SX]:
+def loop_closure(geometry: RobotGeometry, pose: ca.SX, joints: ca.SX, legs: Sequence[Leg] = ()) -> tuple[ca.SX, ca.SX]:
     """How far the loops of eq. 3 and 4 are from closed at a pose and joint coordinates chosen freely, and its
     derivative: gaps (n,) in m^2, and d(gaps)/d(coordinates of the platform) (n, n). legs: instead of the robot's."""
     rotation, legs = rotation_matrix(pose[3:6]), legs or geometry.legs
-    gap = ca.vertcat(
-        *[leg.gap(pose[0:3] + rotation @ leg.platform_joint, joints[k]) for k, leg in enumerate(legs)]
-    )
+    gap = ca.vertcat(*[leg.gap(pose[0:3] + rotation @ leg.platform_joint, joints[k]) for k, leg in enumerate(legs)])
     return gap, ca.jacobian(gap, pose) @ freedoms(geometry)

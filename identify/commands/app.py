@@ -13,6 +13,7 @@ from identify.commands import new_folder
 from identify.commands.calibrate import CALIBRATE_HELP, calibrate
 from identify.commands.check import CHECK_HELP, check
 from identify.commands.comparisons import compare_excitation, estimators, variation
+from identify.commands.geometry import GEOMETRY_HELP, geometry
 from identify.commands.importing import imports
 from identify.commands.robot import base_parameters, export, verify_model, workspace
 from identify.commands.sensor import acceptance, detectors
@@ -83,6 +84,10 @@ Which motion shows most:
 Where the robot can go:
   cmmsim check mine.toml                 what a designer wants to know of a robot
   cmmsim workspace rss6                  maps of travel, reach and conditioning
+
+\b
+Where its joints really are:
+  cmmsim geometry                        calibrate the geometry by static poses: robot.toml
 
 \b
 What its motion can show:
@@ -302,6 +307,7 @@ app.command()(detectors)
 app.command(help=CHECK_HELP)(check)
 app.command()(workspace)
 app.command(help=CALIBRATE_HELP)(calibrate)
+app.command(help=GEOMETRY_HELP)(geometry)
 app.command()(acceptance)
 app.command()(base_parameters)
 app.command()(estimators)

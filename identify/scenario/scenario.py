@@ -15,6 +15,7 @@ from identify.scenario.parameter_names import check_parameter_names
 from identify.scenario.sections import (
     Excitation,
     Filter,
+    Geometry,
     Identification,
     Model,
     Payload,
@@ -50,6 +51,7 @@ class Scenario(Section):
     identification: Identification = Identification()
     payload: Payload = Field(default_factory=Payload)  # made late: its check is one of dynamics, which loads CasADi
     validation: Validation = Validation()
+    geometry: Geometry = Geometry()
 
     @field_validator("renderer")
     @classmethod

@@ -1,0 +1,176 @@
+"""The simulated calibration: a robot whose geometry is off stands at poses, encoders and the optical CMM read it.
+
+Its joints go where they are told, in the coordinates of its encoders; so the platform stands where the true geometry
+puts it, and an encoder's offset is part of that geometry. Poses are measured through images, or drawn with the noise
+that the sensor states for one image.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+import cmmsim
+from dynamics import Robot
+from dynamics.closure import Closure
+from dynamics.errors import ConvergenceError
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.experiment.plant import misplaced
+from identify.experiment.sensor_in_loop import robot_transforms
+from identify.geometry.calibration import seen_between
+from identify.geometry.static_poses import FrameKnowledge, StaticPoses
+from identify.loop_parameters import of_actuators
+from identify.progress import Progress
+from identify.random_streams import ENCODER_OFFSETS, ENCODERS, NOISE, STATIC_NOISE, child, stream_seed
+from identify.scenario import Scenario
+from identify.scenario.sections import Geometry
+
+FIRST_POSE_RUN = 2_000_000
+"""Number of the sensor's run at the first pose, beyond those of all motions."""
+
+
+@dataclass(frozen=True)
+class Encoders:
+    """Encoders of a robot's joints: noise of one reading, step, and standard deviation of offsets, rad or m."""
+
+    noise: float
+    resolution: float
+    offset: float
+
+    def mean_std(self, readings: int) -> float:
+        """Standard deviation of the mean of readings of a joint that stands still, where the step stays the same."""
+        return float(np.sqrt(self.noise**2 / readings + self.resolution**2 / 12))
+
+    def read(self, joints: Array, readings: int, rng: np.random.Generator) -> Array:
+        """Means (N, n) of readings of joint coordinates (N, n)."""
+        each = joints + self.noise * rng.standard_normal((readings, *joints.shape))
+        step = self.resolution
+        return np.asarray((step * np.round(each / step) if step else each).mean(axis=0))
+
+
+def encoders_of(robot: Robot, settings: Geometry) -> Encoders:
+    """The encoders of a scenario's calibration, for a robot whose actuators turn or slide."""
+    return Encoders(*(of_actuators(robot, settings, f"encoder_{name}") for name in ("noise", "resolution", "offset")))
+
+
+def true_deviations(robot: Robot, scenario: Scenario, seed: int) -> Array:
+    """How far the true geometric numbers (g,) are from the robot's, m and rad, with the offsets of its encoders."""
+    encoders, true = encoders_of(robot, scenario.geometry), misplaced(robot, scenario.plant).geometry
+    drawn = np.random.default_rng(child(seed, ENCODER_OFFSETS)).standard_normal(robot.layout.joints)
+    return true.shifted(-encoders.offset * drawn).deviations_from(robot.geometry)
+
+
+def true_poses(robot: Robot, deviations: Array, joints: Array, start: Array) -> Array:
+    """Where the true robot stands (N, 6) when its encoders show joints (N, n).
+
+    Raises EstimationError, naming the pose, for one that it cannot reach.
+    """
+    try:
+        return Closure(robot.geometry).poses(joints, deviations, start)
+    except ConvergenceError as error:
+        raise EstimationError(f"the true robot does not reach a pose: {error}") from error
+
+
+@dataclass(frozen=True)
+class Sighted:
+    """Means of frames at poses (N, 6), their covariances (N, 6, 6), which poses were seen (N,), and lost frames."""
+
+    poses: Array
+    covariances: Array
+    seen: Array
+    lost: int
+
+
+def measured(sensor: cmmsim.Sensor, robot: Robot, poses: Array, frames: int, seed: int, progress: Progress) -> Sighted:
+    """Poses measured through images.
+
+    What an image's covariance holds beyond the scatter of repeated frames does not average: that part stays whole.
+    """
+    means, stated = np.full_like(poses, np.nan), np.full((len(poses), 6, 6), np.nan)
+    scatter, spare, counts = np.zeros((6, 6)), 0, np.zeros(len(poses), dtype=int)
+    with progress.stage("measure poses", len(poses) * frames) as advance:
+        for row, pose in enumerate(poses):
+            bodies = robot_transforms(robot, pose)
+            sensor.start_run(stream_seed(seed, NOISE, FIRST_POSE_RUN + row))
+            good = []
+            for _ in range(frames):
+                if (one := sensor.measure(pose, bodies)).ok:
+                    good.append(one)
+                advance()
+            if good:
+                values = np.array([one.pose for one in good])
+                means[row], counts[row] = values.mean(axis=0), len(good)
+                stated[row] = np.mean([one.covariance for one in good], axis=0)
+                scatter += (values - means[row]).T @ (values - means[row])
+                spare += len(good) - 1
+    seen = counts > 0
+    covariances = np.full_like(stated, np.nan)
+    for row in np.flatnonzero(seen):
+        covariances[row] = mean_covariance(stated[row], scatter / max(spare, 1), int(counts[row]), spare > 0)
+    return Sighted(means, covariances, seen, int(len(poses) * frames - counts.sum()))
+
+
+def mean_covariance(stated: Array, scatter: Array, count: int, known: bool = True) -> Array:
+    """Covariance (6, 6) of the mean of `count` frames, of what each states and of the scatter of frames at rest."""
+    if not known:
+        return stated
+    root = np.linalg.cholesky(stated)
+    inverse = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(inverse @ scatter @ inverse.T)
+    kept = np.maximum(1 - values * (1 - 1 / count), 1 / count)
+    spread = root @ vectors
+    return np.asarray(spread * kept @ spread.T)
+
+
+def drawn(sensor: cmmsim.Sensor, poses: Array, frames: int, rng: np.random.Generator, progress: Progress) -> Sighted:
+    """Poses without images: one frame a pose says the covariance, and the mean is drawn with a `frames`-th of it; and
+    so is one error of the frames with what teaching says of them."""
+    taught = sensor.taught
+    offset = FrameKnowledge(taught.base_covariance, taught.platform_covariance).root @ rng.standard_normal(12)
+    covariances, seen = np.full((len(poses), 6, 6), np.nan), np.zeros(len(poses), dtype=bool)
+    with progress.stage("draw poses", len(poses)) as advance:
+        for row, pose in enumerate(poses):
+            one = sensor.measure(pose)
+            seen[row] = one.ok
+            covariances[row] = one.covariance / frames
+            advance()
+    means = seen_between(poses, offset)
+    for row in np.flatnonzero(seen):
+        means[row] += np.linalg.cholesky(covariances[row]) @ rng.standard_normal(6)
+    return Sighted(means, covariances, seen, int((~seen).sum()) * frames)
+
+
+def stand_at(
+    robot: Robot,
+    scenario: Scenario,
+    sensor: cmmsim.Sensor,
+    deviations: Array,
+    joints: Array,
+    start: Array,
+    seed: int,
+    progress: Progress,
+) -> tuple[StaticPoses, int]:
+    """What encoders and sensor say at joint coordinates (N, n) of the true robot, near poses `start` (N, 6) of the
+    nominal one; and the number of frames that were lost. Poses of which none is left are left out.
+
+    Raises EstimationError, naming the pose, for one that the true robot cannot reach.
+    """
+    settings, taught = scenario.geometry, sensor.taught
+    encoders, frames = encoders_of(robot, settings), settings.frames_per_pose
+    true = true_poses(robot, deviations, joints, start)
+    if settings.measurement == "images":
+        found = measured(sensor, robot, true, frames, seed, progress)
+    else:
+        found = drawn(sensor, true, frames, np.random.default_rng(child(seed, STATIC_NOISE)), progress)
+    read = encoders.read(joints, frames, np.random.default_rng(child(seed, ENCODERS)))
+    known = FrameKnowledge(taught.base_covariance, taught.platform_covariance)
+    std = np.full(robot.layout.joints, encoders.mean_std(frames))
+    kept = found.seen
+    data = StaticPoses(
+        read[kept],
+        std,
+        found.poses[kept],
+        found.covariances[kept],
+        known if settings.frames == "taught" else FrameKnowledge.none(),
+    )
+    return data, found.lost

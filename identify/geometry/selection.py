@@ -1,0 +1,207 @@
+"""Which poses to measure: chosen by an observability index over candidates within the travel.
+
+The index is the determinant of the information about geometry and frames together (the D-optimal one, Borm and Menq's
+O1), or what the calibrated robot will miss poses by, on average over the candidates (the I-optimal one). Poses are
+taken one by one from the candidates (greedy), exchanged until none is better, and then moved in joint space along the
+index's gradient, all at once, within the travel.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from cmmsim.visibility import SightLines
+from dynamics import Robot
+from dynamics.workspace import measure
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.excitation.constraints import required_stickers
+from identify.geometry.calibration import PoseModel
+from identify.progress import Advance
+
+STEP = 1e-5
+"""Of joint coordinates, as a share of the travel: the differences behind the gradient."""
+GRADIENT_STEPS = 40
+EXCHANGES = 3
+"""Passes over all poses at most."""
+TRIALS = 40
+"""Random joint coordinates drawn a candidate that is wanted, at most."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Where a robot may stand to be measured: within its travel (rad or m), far from singularities, and in sight."""
+
+    robot: Robot
+    travel: float
+    least_leverage: float
+    most_condition: float
+    sight: SightLines
+
+    def allowed(self, poses: Array) -> NDArray[np.bool_]:
+        """Whether the robot may stand at each pose (N, 6)."""
+        measures, stickers = measure(self.robot, poses), required_stickers(self.sight, self.robot.home_pose)
+        good = measures.reachable & (np.abs(measures.theta).max(axis=1) <= self.travel * (1 + 1e-9))
+        good &= measures.leverage.min(axis=1) >= self.least_leverage
+        good &= measures.platform_condition <= self.most_condition
+        good[good] = [bool(self.sight.visible(pose)[stickers].all()) for pose in poses[good]]
+        return np.asarray(good)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Joint coordinates (N, n), rad or m, the nominal robot's poses (N, 6) there, and what each pose would tell:
+    whitened columns (N, m, u) of the unknowns in units of their prior."""
+
+    joints: Array
+    poses: Array
+    columns: Array
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def of(self, rows: Array | list[int]) -> "Candidates":
+        """Some of them."""
+        return Candidates(self.joints[rows], self.poses[rows], self.columns[rows])
+
+    @property
+    def information(self) -> Array:
+        """Of all together (u, u)."""
+        return np.asarray(np.einsum("nmu,nmv->uv", self.columns, self.columns))
+
+
+@dataclass(frozen=True)
+class Designer:
+    """Chooses poses for a model; covariance (6, 6): of a pose's mean, joint_std (n,): of its encoders' readings;
+    criterion: `determinant` or `prediction`."""
+
+    model: PoseModel
+    limits: Limits
+    covariance: Array
+    joint_std: Array
+    criterion: str = "determinant"
+
+    def candidates(self, count: int, rng: np.random.Generator) -> Candidates:
+        """Random joint coordinates within the travel, of which the poses are allowed.
+
+        Raises EstimationError where hardly any are.
+        """
+        kept_joints: list[Array] = []
+        kept_poses: list[Array] = []
+        robot, travel = self.limits.robot, self.limits.travel
+        for _ in range(TRIALS):
+            joints = rng.uniform(-travel, travel, (count, robot.layout.joints))
+            poses = self._poses(joints, np.tile(robot.home_pose, (count, 1)))
+            known = np.isfinite(poses).all(axis=1)
+            known[known] = self.limits.allowed(poses[known])
+            kept_joints.append(joints[known])
+            kept_poses.append(poses[known])
+            if sum(map(len, kept_joints)) >= count:
+                break
+        joints, poses = (np.concatenate(parts)[:count] for parts in (kept_joints, kept_poses))
+        if len(joints) < count:
+            raise EstimationError(
+                f"only {len(joints)} of {count * TRIALS} random joint coordinates of {robot.name} within its travel "
+                f"({travel:.3g} {robot.layout.joint_unit}) are poses where it may stand and be seen; {count} are wanted"
+            )
+        return self.seen(joints, poses)
+
+    def seen(self, joints: Array, poses: Array) -> Candidates:
+        """What poses (N, 6) of joint coordinates (N, n) would tell."""
+        none, free = np.zeros(len(self.model.scale)), list(self.limits.robot.geometry.chart.freedoms)
+        columns, by_joints = self.model.columns(joints, poses, none)
+        encoders = by_joints * self.joint_std
+        noise = self.covariance[np.ix_(free, free)] + encoders @ encoders.swapaxes(1, 2)
+        return Candidates(joints, poses, np.linalg.inv(np.linalg.cholesky(noise)) @ columns)
+
+    def greedy(self, among: Candidates, count: int, advance: Advance = lambda n=1: None) -> Candidates:
+        """The best candidates one by one, then exchanged until no other is better; the same one may stand twice."""
+        weight, covariance, chosen = self._weight(among), np.eye(len(self.model.scale)), list[int]()
+        for _ in range(count):
+            best = int(np.argmax(self._gains(among.columns, covariance, weight)))
+            chosen.append(best)
+            covariance = _updated(covariance, among.columns[best])
+            advance()
+        for _ in range(EXCHANGES):
+            before = list(chosen)
+            for place, old in enumerate(before):
+                without = _updated(covariance, among.columns[old], -1.0)
+                chosen[place] = int(np.argmax(self._gains(among.columns, without, weight)))
+                covariance = _updated(without, among.columns[chosen[place]])
+            if chosen == before:
+                break
+        return among.of(chosen)
+
+    def moved(self, chosen: Candidates, among: Candidates) -> Candidates:
+        """The poses after a search along the gradient of the index in joint space; where one would leave what is
+        allowed, it goes as far as it may."""
+        shape, travel = chosen.joints.shape, self.limits.travel
+        weight, start = self._weight(among), chosen
+
+        def index(values: Array) -> tuple[float, Array]:
+            nonlocal start
+            joints = values.reshape(shape) * travel
+            poses = self._poses(joints, start.poses)
+            if not np.isfinite(poses).all():
+                return np.inf, np.zeros(values.size)
+            start = at = self.seen(joints, poses)
+            covariance = np.linalg.inv(np.eye(len(self.model.scale)) + at.information)
+            if self.criterion == "determinant":
+                worth, spread = np.linalg.slogdet(covariance)[1], covariance
+            else:
+                worth = np.log(np.sum(weight * covariance))
+                spread = covariance @ weight @ covariance / np.sum(weight * covariance)
+            pull = np.einsum("uv,nmv->nmu", spread, at.columns)
+            gradient = np.empty(shape)
+            for joint in range(shape[1]):
+                step = STEP * travel * np.eye(shape[1])[joint]
+                ahead = self.seen(joints + step, self._poses(joints + step, poses)).columns
+                gradient[:, joint] = -2 * np.einsum("nmu,nmu->n", pull, (ahead - at.columns) / STEP)
+            return float(worth), gradient.ravel()
+
+        found = minimize(
+            index,
+            (chosen.joints / travel).ravel(),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=[(-1.0, 1.0)] * chosen.joints.size,
+            options={"maxiter": GRADIENT_STEPS},
+        )
+        return self._as_far_as_allowed(chosen, found.x.reshape(shape) * travel)
+
+    def _as_far_as_allowed(self, chosen: Candidates, joints: Array) -> Candidates:
+        reached, open_rows = chosen.joints.copy(), np.ones(len(chosen), dtype=bool)
+        poses = chosen.poses.copy()
+        for share in (1.0, 0.5, 0.25):
+            trial = chosen.joints + share * (joints - chosen.joints)
+            at = self._poses(trial, chosen.poses)
+            good = open_rows & np.isfinite(at).all(axis=1)
+            good[good] = self.limits.allowed(at[good])
+            reached[good], poses[good] = trial[good], at[good]
+            open_rows &= ~good
+        return self.seen(reached, poses)
+
+    def _gains(self, columns: Array, covariance: Array, weight: Array) -> Array:
+        """What each candidate (N, m, u) would add to the index."""
+        spread = columns @ covariance
+        inner = np.eye(columns.shape[1]) + spread @ columns.swapaxes(1, 2)
+        if self.criterion == "determinant":
+            return np.asarray(np.linalg.slogdet(inner)[1])
+        return np.asarray(np.einsum("nmu,nmu->n", np.linalg.solve(inner, spread), spread @ weight))
+
+    def _weight(self, among: Candidates) -> Array:
+        """What unknowns cost (u, u): mean square error of the candidates' coordinates, each in units of its noise."""
+        return among.information / len(among)
+
+    def _poses(self, joints: Array, start: Array) -> Array:
+        """The nominal robot's poses (N, 6); NaN where the loops do not close."""
+        return self.model.closure.nearest(joints, np.zeros(len(self.model.tolerance)), start)
+
+
+def _updated(covariance: Array, columns: Array, sign: float = 1.0) -> Array:
+    """The covariance (u, u) with one more pose (m, u), or with sign -1 without it."""
+    spread = columns @ covariance
+    inner = np.eye(len(columns)) + sign * spread @ columns.T
+    return np.asarray(covariance - sign * spread.T @ np.linalg.solve(inner, spread))
