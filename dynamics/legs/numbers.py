@@ -35,7 +35,8 @@ def moved(leg: AnyKind, deviations: ArrayLike | ca.SX) -> AnyKind:
 
     With symbols for deviations it is one of symbols, whose expressions have derivatives, and no more than these.
     """
-    off = dict(zip(leg.numbers, ca.vertsplit(ca.SX(deviations)), strict=True))
+    by = deviations if isinstance(deviations, ca.SX) else ca.SX(ca.DM(np.asarray(deviations, dtype=float)))
+    off = dict(zip(leg.numbers, ca.vertsplit(by), strict=True))
     changes: dict[str, Any] = {
         field: getattr(leg, field) + ca.vertcat(*[off.get(f"{field}.{axis}", ca.SX(0)) for axis in "xyz"])
         for field in POINTS

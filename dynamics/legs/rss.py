@@ -51,7 +51,7 @@ class RssLeg(Leg):
 
     bodies = (Body("crank", ("Izz",), driven="Izz"), Body("link", ("Ixx", "Iyy")))
     prismatic = False
-    numbers = (
+    numbers: ClassVar[tuple[str, ...]] = (
         *("base_joint.x", "base_joint.y", "base_joint.z", "crank_axis.u", "crank_axis.v", "crank_zero"),
         *("crank_length", "link_length", "platform_joint.x", "platform_joint.y", "platform_joint.z"),
     )
@@ -215,7 +215,7 @@ class RrrLeg(RssLeg):
     """A crank and a link in one plane, all three joints hinges normal to that (planar robots)."""
 
     bodies = (Body("crank", ("Izz",), driven="Izz"), Body("link", ("Iyy",)))
-    numbers = (
+    numbers: ClassVar[tuple[str, ...]] = (
         *("base_joint.x", "base_joint.y", "crank_zero", "crank_length", "link_length"),
         *("platform_joint.x", "platform_joint.y"),
     )

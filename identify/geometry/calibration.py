@@ -108,9 +108,10 @@ def frame_columns(robot: Robot, poses: Array) -> Array:
 class Calibration:
     """What static poses say of a robot's geometry.
 
-    deviations (g,) from the nominal geometry, frames (12,): errors of the two frames, and the covariance (g + 12, g +
-    12) of both, m and rad; prior_std (g,): the tolerance; noise_ratio: mean square of the residuals in units of the stated noise, near one
-    where that and the model are right, with its standard deviation.
+    deviations (g,) from the nominal geometry, errors of the two frames (12,), and joint_covariance (g + 12, g + 12) of
+    both, m and rad; prior_std (g,): the tolerance; noise_ratio: mean square of the residuals in units of the stated
+    noise, near one where that and the model are right, with its standard deviation; frames_known: whether anything was
+    known of the frames.
     """
 
     nominal: Robot

@@ -37,8 +37,8 @@ def check_encoders(robot: Robot, data: StaticPoses) -> None:
 
 
 def _what_fits(robot: Robot, moves: Array, readings: Array, joint: int) -> str:
-    factors = {"": 1.0} | UNITS[robot.layout.prismatic]
-    found = [
+    factors = {"": 1.0, **UNITS[robot.layout.prismatic]}
+    found: list[tuple[float, bool, bool, str, int]] = [
         (_left(sign * factor * moves[:, joint], readings[:, other]), other != joint, sign < 0, unit, other)
         for unit, factor in factors.items()
         for sign in (1, -1)
@@ -49,10 +49,10 @@ def _what_fits(robot: Robot, moves: Array, readings: Array, joint: int) -> str:
         return f"is {_left(moves[:, joint], readings[:, joint]):.0%} of its motion off, and no sign, unit or order fits"
     what = [f"with the readings of {robot.joint_names[other]}"] if swapped else []
     what += ["with the opposite sign"] if opposite else []
-    what += [f"as readings {unit}" if unit else ""] if unit else []
+    what += [f"as readings {unit}"] if unit else []
     return f"fits {' and '.join(what)}"
 
 
 def _left(expected: Array, read: Array) -> float:
     """What is left of readings, as a share of what is expected of them."""
-    return float(np.sqrt(np.mean((read - expected) ** 2) / max(np.mean(expected**2), 1e-300)))
+    return float(np.linalg.norm(read - expected) / max(float(np.linalg.norm(expected)), 1e-300))

@@ -5,11 +5,15 @@ puts it, and an encoder's offset is part of that geometry. Poses are measured th
 that the sensor states for one image.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 import cmmsim
+from cmmsim.errors import LostError
+from cmmsim.visibility import SightLines, sight_lines, stated_covariance
 from dynamics import Robot
 from dynamics.closure import Closure
 from dynamics.errors import ConvergenceError
@@ -29,6 +33,10 @@ FIRST_POSE_RUN = 2_000_000
 """Number of the sensor's run at the first pose, beyond those of all motions."""
 
 
+REST = 1e-3
+"""Share of the travel by which friction keeps joints from where they are sent; encoders say where that is."""
+
+
 @dataclass(frozen=True)
 class Encoders:
     """Encoders of a robot's joints: noise of one reading, step, and standard deviation of offsets, rad or m."""
@@ -38,8 +46,16 @@ class Encoders:
     offset: float
 
     def mean_std(self, readings: int) -> float:
-        """Standard deviation of the mean of readings of a joint that stands still, where the step stays the same."""
-        return float(np.sqrt(self.noise**2 / readings + self.resolution**2 / 12))
+        """Standard deviation of the mean of readings of a joint that stands still.
+
+        The step's error is that of a sawtooth, and noise smooths it: of its k-th wave, 1 / (pi k) steps high, readings
+        with noise of s steps keep exp(-2 (pi k s)^2) in their mean.
+        """
+        if not self.resolution:
+            return self.noise / readings**0.5
+        waves, steps = np.pi * np.arange(1, 30), self.noise / self.resolution
+        kept = self.resolution**2 * np.sum(np.exp(-4 * (waves * steps) ** 2) / waves**2) / 2
+        return float(np.sqrt(kept + (self.noise**2 + self.resolution**2 / 12 - kept) / readings))
 
     def read(self, joints: Array, readings: int, rng: np.random.Generator) -> Array:
         """Means (N, n) of readings of joint coordinates (N, n)."""
@@ -77,7 +93,7 @@ class Sighted:
 
     poses: Array
     covariances: Array
-    seen: Array
+    seen: NDArray[np.bool_]
     lost: int
 
 
@@ -105,7 +121,7 @@ def measured(sensor: cmmsim.Sensor, robot: Robot, poses: Array, frames: int, see
                 spare += len(good) - 1
     seen = counts > 0
     covariances = np.full_like(stated, np.nan)
-    for row in np.flatnonzero(seen):
+    for row in map(int, np.flatnonzero(seen)):
         covariances[row] = mean_covariance(stated[row], scatter / max(spare, 1), int(counts[row]), spare > 0)
     return Sighted(means, covariances, seen, int(len(poses) * frames - counts.sum()))
 
@@ -122,7 +138,9 @@ def mean_covariance(stated: Array, scatter: Array, count: int, known: bool = Tru
     return np.asarray(spread * kept @ spread.T)
 
 
-def drawn(sensor: cmmsim.Sensor, poses: Array, frames: int, rng: np.random.Generator, progress: Progress) -> Sighted:
+def drawn(
+    sensor: cmmsim.Sensor, sight: SightLines, poses: Array, frames: int, rng: np.random.Generator, progress: Progress
+) -> Sighted:
     """Poses without images: one frame a pose says the covariance, and the mean is drawn with a `frames`-th of it; and
     so is one error of the frames with what teaching says of them."""
     taught = sensor.taught
@@ -130,12 +148,12 @@ def drawn(sensor: cmmsim.Sensor, poses: Array, frames: int, rng: np.random.Gener
     covariances, seen = np.full((len(poses), 6, 6), np.nan), np.zeros(len(poses), dtype=bool)
     with progress.stage("draw poses", len(poses)) as advance:
         for row, pose in enumerate(poses):
-            one = sensor.measure(pose)
-            seen[row] = one.ok
-            covariances[row] = one.covariance / frames
+            with suppress(LostError):
+                covariances[row] = stated_covariance(sensor, sight, pose) / frames
+                seen[row] = True
             advance()
     means = seen_between(poses, offset)
-    for row in np.flatnonzero(seen):
+    for row in map(int, np.flatnonzero(seen)):
         means[row] += np.linalg.cholesky(covariances[row]) @ rng.standard_normal(6)
     return Sighted(means, covariances, seen, int((~seen).sum()) * frames)
 
@@ -150,19 +168,22 @@ def stand_at(
     seed: int,
     progress: Progress,
 ) -> tuple[StaticPoses, int]:
-    """What encoders and sensor say at joint coordinates (N, n) of the true robot, near poses `start` (N, 6) of the
-    nominal one; and the number of frames that were lost. Poses of which none is left are left out.
+    """What encoders and sensor say where the true robot stops that is sent to joint coordinates (N, n), near poses
+    `start` (N, 6) of the nominal one; and the number of frames that were lost. Poses without any are left out.
 
     Raises EstimationError, naming the pose, for one that the true robot cannot reach.
     """
     settings, taught = scenario.geometry, sensor.taught
     encoders, frames = encoders_of(robot, settings), settings.frames_per_pose
-    true = true_poses(robot, deviations, joints, start)
+    rng = np.random.default_rng(child(seed, ENCODERS))
+    stopped = joints + REST * robot.travel_limit * rng.uniform(-1, 1, joints.shape)
+    true = true_poses(robot, deviations, stopped, start)
     if settings.measurement == "images":
         found = measured(sensor, robot, true, frames, seed, progress)
     else:
-        found = drawn(sensor, true, frames, np.random.default_rng(child(seed, STATIC_NOISE)), progress)
-    read = encoders.read(joints, frames, np.random.default_rng(child(seed, ENCODERS)))
+        sight = sight_lines(scenario.sensor, scenario.sensor_changes)
+        found = drawn(sensor, sight, true, frames, np.random.default_rng(child(seed, STATIC_NOISE)), progress)
+    read = encoders.read(stopped, frames, rng)
     known = FrameKnowledge(taught.base_covariance, taught.platform_covariance)
     std = np.full(robot.layout.joints, encoders.mean_std(frames))
     kept = found.seen

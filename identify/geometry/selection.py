@@ -43,11 +43,11 @@ class Limits:
     def allowed(self, poses: Array) -> NDArray[np.bool_]:
         """Whether the robot may stand at each pose (N, 6)."""
         measures, stickers = measure(self.robot, poses), required_stickers(self.sight, self.robot.home_pose)
-        good = measures.reachable & (np.abs(measures.theta).max(axis=1) <= self.travel * (1 + 1e-9))
+        good = measures.reachable & (np.abs(measures.theta) <= self.travel * (1 + 1e-9)).all(axis=1)
         good &= measures.leverage.min(axis=1) >= self.least_leverage
         good &= measures.platform_condition <= self.most_condition
-        good[good] = [bool(self.sight.visible(pose)[stickers].all()) for pose in poses[good]]
-        return np.asarray(good)
+        in_sight = [ok and bool(self.sight.visible(pose)[stickers].all()) for ok, pose in zip(good, poses, strict=True)]
+        return np.array(in_sight, dtype=bool)
 
 
 @dataclass(frozen=True)
@@ -94,8 +94,8 @@ class Designer:
         for _ in range(TRIALS):
             joints = rng.uniform(-travel, travel, (count, robot.layout.joints))
             poses = self._poses(joints, np.tile(robot.home_pose, (count, 1)))
-            known = np.isfinite(poses).all(axis=1)
-            known[known] = self.limits.allowed(poses[known])
+            known = np.flatnonzero(np.isfinite(poses).all(axis=1))
+            known = known[self.limits.allowed(poses[known])]
             kept_joints.append(joints[known])
             kept_poses.append(poses[known])
             if sum(map(len, kept_joints)) >= count:
@@ -177,10 +177,10 @@ class Designer:
         for share in (1.0, 0.5, 0.25):
             trial = chosen.joints + share * (joints - chosen.joints)
             at = self._poses(trial, chosen.poses)
-            good = open_rows & np.isfinite(at).all(axis=1)
-            good[good] = self.limits.allowed(at[good])
+            good = np.flatnonzero(open_rows & np.isfinite(at).all(axis=1))
+            good = good[self.limits.allowed(at[good])]
             reached[good], poses[good] = trial[good], at[good]
-            open_rows &= ~good
+            open_rows[good] = False
         return self.seen(reached, poses)
 
     def _gains(self, columns: Array, covariance: Array, weight: Array) -> Array:
