@@ -1,7 +1,6 @@
 """What poses can tell of a geometry: combinations that they cannot, and how many poses it takes."""
 
 import numpy as np
-from scipy.linalg import qr
 
 from dynamics import Robot
 from identify.arrays import Array
@@ -10,6 +9,9 @@ from identify.geometry.calibration import OBSERVABLE
 
 SMALL = 0.05
 """Share of the largest coefficient below which a combination leaves a number out."""
+
+LONG_ENOUGH = 0.5
+"""A number names a combination if what is left of its share is at least this fraction of the largest one."""
 
 
 def untold(covariance: Array, prior_std: Array) -> Array:
@@ -25,13 +27,23 @@ def combinations(names: tuple[str, ...], covariance: Array, prior_std: Array) ->
     directions = untold(covariance, prior_std)
     if not len(directions):
         return ()
-    # Gauss-Jordan on well-conditioned pivots: each combination then has a number of its own.
-    pivots = np.sort(qr(directions, pivoting=True, mode="r")[1][: len(directions)])
-    rows = np.linalg.solve(directions[:, pivots], directions)
+    pivots = _pivots(directions)
+    rows = np.linalg.solve(directions[:, pivots], directions)  # each combination then has a number of its own
     return tuple(
         _expression(names, row * prior_std / prior_std[pivot], np.abs(row), pivot)
         for row, pivot in zip(rows, pivots, strict=True)
     )
+
+
+def _pivots(directions: Array) -> list[int]:
+    """As many columns as there are rows, which stand well apart: in their order, the first that is long enough."""
+    left, pivots = directions.copy(), list[int]()
+    while len(pivots) < len(directions):
+        lengths = np.linalg.norm(left, axis=0)
+        pivots.append(int(np.argmax(lengths >= LONG_ENOUGH * lengths.max())))
+        along = left[:, pivots[-1]] / lengths[pivots[-1]]
+        left -= np.outer(along, along @ left)
+    return sorted(pivots)
 
 
 def _expression(names: tuple[str, ...], coefficients: Array, sizes: Array, pivot: int) -> str:

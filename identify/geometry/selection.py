@@ -7,6 +7,7 @@ index's gradient, all at once, within the travel.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,12 +43,16 @@ class Limits:
 
     def allowed(self, poses: Array) -> NDArray[np.bool_]:
         """Whether the robot may stand at each pose (N, 6)."""
-        measures, stickers = measure(self.robot, poses), required_stickers(self.sight, self.robot.home_pose)
+        measures, stickers = measure(self.robot, poses), self._stickers
         good = measures.reachable & (np.abs(measures.theta) <= self.travel * (1 + 1e-9)).all(axis=1)
         good &= measures.leverage.min(axis=1) >= self.least_leverage
         good &= measures.platform_condition <= self.most_condition
         in_sight = [ok and bool(self.sight.visible(pose)[stickers].all()) for ok, pose in zip(good, poses, strict=True)]
         return np.array(in_sight, dtype=bool)
+
+    @cached_property
+    def _stickers(self) -> list[int]:
+        return required_stickers(self.sight, self.robot.home_pose)
 
 
 @dataclass(frozen=True)
