@@ -25,6 +25,8 @@ from identify.progress import Advance
 STEP = 1e-5
 """Of joint coordinates, as a share of the travel: the differences behind the gradient."""
 GRADIENT_STEPS = 40
+ROUNDS = 4
+"""Of such searches, each without the poses that the one before would have led astray."""
 EXCHANGES = 3
 """Passes over all poses at most."""
 TRIALS = 40
@@ -123,78 +125,82 @@ class Designer:
 
     def greedy(self, among: Candidates, count: int, advance: Advance = lambda n=1: None) -> Candidates:
         """The best candidates one by one, then exchanged until no other is better; the same one may stand twice."""
-        weight, covariance, chosen = self._weight(among), np.eye(len(self.model.scale)), list[int]()
+        weight, chosen = self._weight(among), list[int]()
+        own = among.columns.swapaxes(1, 2) @ among.columns
+        information = np.eye(len(weight))
         for _ in range(count):
-            best = int(np.argmax(self._gains(among.columns, covariance, weight)))
-            chosen.append(best)
-            covariance = _updated(covariance, among.columns[best])
+            chosen.append(self._best(among, information, weight))
+            information = information + own[chosen[-1]]
             advance()
         for _ in range(EXCHANGES):
             before = list(chosen)
-            for place, old in enumerate(before):
-                without = _updated(covariance, among.columns[old], -1.0)
-                chosen[place] = int(np.argmax(self._gains(among.columns, without, weight)))
-                covariance = _updated(without, among.columns[chosen[place]])
+            for place in range(count):
+                # Summed anew: the difference of two sums would hide what the other poses tell least.
+                information = np.eye(len(weight)) + own[chosen[:place] + chosen[place + 1 :]].sum(axis=0)
+                chosen[place] = self._best(among, information, weight)
             if chosen == before:
                 break
         return among.of(chosen)
 
     def moved(self, chosen: Candidates, among: Candidates) -> Candidates:
-        """The poses after a search along the gradient of the index in joint space; where one would leave what is
-        allowed, it goes as far as it may."""
-        shape, travel = chosen.joints.shape, self.limits.travel
-        weight, start = self._weight(among), chosen
+        """The poses after a search along the gradient of the index in joint space, at which it is no worse; those that
+        it would lead to where the robot may not stand are held where they were."""
+        weight, held, best = self._weight(among), np.zeros(len(chosen), dtype=bool), chosen
+        for _ in range(ROUNDS):
+            joints = self._along_gradient(chosen, held, weight)
+            poses = self._poses(joints, chosen.poses)
+            closed = np.flatnonzero(np.isfinite(poses).all(axis=1))
+            forbidden = np.ones(len(chosen), dtype=bool)
+            forbidden[closed] = ~self.limits.allowed(poses[closed])
+            joints[forbidden], poses[forbidden] = chosen.joints[forbidden], chosen.poses[forbidden]
+            best = min(best, self.seen(joints, poses), key=lambda found: self._index(found, weight)[0])
+            if not forbidden.any():
+                break
+            held |= forbidden
+        return best
+
+    def _along_gradient(self, chosen: Candidates, held: NDArray[np.bool_], weight: Array) -> Array:
+        """Joint coordinates (N, n) within the travel with the best index nearby, some poses held."""
+        shape, travel, near = chosen.joints.shape, self.limits.travel, chosen.poses
 
         def index(values: Array) -> tuple[float, Array]:
-            nonlocal start
+            nonlocal near
             joints = values.reshape(shape) * travel
-            poses = self._poses(joints, start.poses)
+            poses = self._poses(joints, near)
             if not np.isfinite(poses).all():
                 return np.inf, np.zeros(values.size)
-            start = at = self.seen(joints, poses)
-            covariance = np.linalg.inv(np.eye(len(self.model.scale)) + at.information)
-            if self.criterion == "determinant":
-                worth, spread = np.linalg.slogdet(covariance)[1], covariance
-            else:
-                worth = np.log(np.sum(weight * covariance))
-                spread = covariance @ weight @ covariance / np.sum(weight * covariance)
-            pull = np.einsum("uv,nmv->nmu", spread, at.columns)
-            gradient = np.empty(shape)
+            near, at = poses, self.seen(joints, poses)
+            worth, spread = self._index(at, weight)
+            pull, gradient = np.einsum("uv,nmv->nmu", spread, at.columns), np.empty(shape)
             for joint in range(shape[1]):
-                step = STEP * travel * np.eye(shape[1])[joint]
-                ahead = self.seen(joints + step, self._poses(joints + step, poses)).columns
-                gradient[:, joint] = -2 * np.einsum("nmu,nmu->n", pull, (ahead - at.columns) / STEP)
-            return float(worth), gradient.ravel()
+                ahead = joints + STEP * travel * np.eye(shape[1])[joint]
+                columns = self.seen(ahead, self._poses(ahead, poses)).columns
+                gradient[:, joint] = -2 * np.einsum("nmu,nmu->n", pull, (columns - at.columns) / STEP)
+            return worth, gradient.ravel()
 
-        found = minimize(
-            index,
-            (chosen.joints / travel).ravel(),
-            jac=True,
-            method="L-BFGS-B",
-            bounds=[(-1.0, 1.0)] * chosen.joints.size,
-            options={"maxiter": GRADIENT_STEPS},
-        )
-        return self._as_far_as_allowed(chosen, found.x.reshape(shape) * travel)
+        start, free = chosen.joints / travel, ~held[:, None]
+        low, high = np.where(free, -1.0, start), np.where(free, 1.0, start)
+        bounds = list(zip(low.ravel(), high.ravel(), strict=True))
+        steps = {"maxiter": GRADIENT_STEPS}
+        found = minimize(index, start.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options=steps)
+        return np.asarray(found.x.reshape(shape) * travel)
 
-    def _as_far_as_allowed(self, chosen: Candidates, joints: Array) -> Candidates:
-        reached, open_rows = chosen.joints.copy(), np.ones(len(chosen), dtype=bool)
-        poses = chosen.poses.copy()
-        for share in (1.0, 0.5, 0.25):
-            trial = chosen.joints + share * (joints - chosen.joints)
-            at = self._poses(trial, chosen.poses)
-            good = np.flatnonzero(open_rows & np.isfinite(at).all(axis=1))
-            good = good[self.limits.allowed(at[good])]
-            reached[good], poses[good] = trial[good], at[good]
-            open_rows[good] = False
-        return self.seen(reached, poses)
-
-    def _gains(self, columns: Array, covariance: Array, weight: Array) -> Array:
-        """What each candidate (N, m, u) would add to the index."""
-        spread = columns @ covariance
-        inner = np.eye(columns.shape[1]) + spread @ columns.swapaxes(1, 2)
+    def _index(self, poses: Candidates, weight: Array) -> tuple[float, Array]:
+        """The index of poses, smaller is better, and minus its derivative by their information (u, u)."""
+        covariance = np.asarray(np.linalg.inv(np.eye(len(weight)) + poses.information), dtype=float)
         if self.criterion == "determinant":
-            return np.asarray(np.linalg.slogdet(inner)[1])
-        return np.asarray(np.einsum("nmu,nmu->n", np.linalg.solve(inner, spread), spread @ weight))
+            return float(np.linalg.slogdet(covariance)[1]), covariance
+        cost = float(np.sum(weight * covariance))
+        return float(np.log(cost)), np.asarray(covariance @ weight @ covariance / cost, dtype=float)
+
+    def _best(self, among: Candidates, information: Array, weight: Array) -> int:
+        """The candidate that improves the index most."""
+        covariance = np.linalg.inv(information)
+        spread = among.columns @ covariance
+        inner = np.eye(among.columns.shape[1]) + spread @ among.columns.swapaxes(1, 2)
+        if self.criterion == "determinant":
+            return int(np.argmax(np.linalg.slogdet(inner)[1]))
+        return int(np.argmax(np.einsum("nmu,nmu->n", np.linalg.solve(inner, spread), spread @ weight)))
 
     def _weight(self, among: Candidates) -> Array:
         """What unknowns cost (u, u): mean square error of the candidates' coordinates, each in units of its noise."""
@@ -203,10 +209,3 @@ class Designer:
     def _poses(self, joints: Array, start: Array) -> Array:
         """The nominal robot's poses (N, 6); NaN where the loops do not close."""
         return self.model.closure.nearest(joints, np.zeros(len(self.model.tolerance)), start)
-
-
-def _updated(covariance: Array, columns: Array, sign: float = 1.0) -> Array:
-    """The covariance (u, u) with one more pose (m, u), or with sign -1 without it."""
-    spread = columns @ covariance
-    inner = np.eye(len(columns)) + sign * spread @ columns.T
-    return np.asarray(covariance - sign * spread.T @ np.linalg.solve(inner, spread))
