@@ -52,7 +52,7 @@ def geometry(
     """See `GEOMETRY_HELP`."""
     from dynamics import load_robot
     from identify.commands.app import parse_settings
-    from identify.geometry.run import run_geometry, write_outcome
+    from identify.geometry.run import run_geometry
     from identify.geometry.static_poses import read_static_poses
     from identify.scenario import load_scenario
 
@@ -61,7 +61,7 @@ def geometry(
     folder = new_run_folder(out or Path("runs") / f"geometry-{seed}").path
     own = None if poses is None else read_static_poses(poses, load_robot(chosen.robot))
     outcome = run_geometry(chosen, seed, terminal_progress(quiet), own)
-    write_outcome(outcome, chosen, folder)
+    outcome.write(folder)
     print_warnings(outcome.entry["warnings"])
     if not quiet:
         _print(outcome.entry, folder)
