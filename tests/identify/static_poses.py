@@ -27,8 +27,13 @@ def scenario():
 
 
 @cache
+def known_robot(name):
+    return load_robot(name)
+
+
+@cache
 def designer(robot, criterion="prediction", frames_per_pose=20):
-    known, settings = load_robot(robot), scenario().excitation
+    known, settings = known_robot(robot), scenario().excitation
     margin = settings.travel_margin_m if known.layout.prismatic else settings.travel_margin_rad
     limits = Limits(
         known, known.travel_limit - margin, settings.least_leverage, settings.most_condition, sight_lines("ctrack780")
@@ -52,12 +57,12 @@ class Drawn:
     deviations: np.ndarray
 
     def calibrated(self, robot, **changes):
-        return calibrate(load_robot(robot), StaticPoses(**vars(self.data) | changes), TOLERANCE)
+        return calibrate(known_robot(robot), StaticPoses(**vars(self.data) | changes), TOLERANCE)
 
 
 def drawn(robot, seed, chosen, frames_per_pose=20):
     """A calibration of a robot off by 0.1 mm and 1 mrad, at poses, with what encoders and sensor say drawn."""
-    known, rng = load_robot(robot), np.random.default_rng([1515, seed])
+    known, rng = known_robot(robot), np.random.default_rng([1515, seed])
     plant = scenario().plant.model_copy(update={"geometry_seed": seed})
     encoders = encoders_of(known, scenario().geometry)
     offsets = encoders.offset * rng.standard_normal(known.layout.joints)
@@ -73,6 +78,6 @@ def drawn(robot, seed, chosen, frames_per_pose=20):
 
 def unseen_errors(robot, found, deviations, count=200):
     """Errors (count, 6) of poses that were not measured, m and rad."""
-    known, unseen = load_robot(robot), poses_of(robot, count, 99)
+    known, unseen = known_robot(robot), poses_of(robot, count, 99)
     predicted = designer(robot).model.closure.poses(unseen.joints, found.deviations, unseen.poses)
     return seen_between(predicted, found.frames) - true_poses(known, deviations, unseen.joints, unseen.poses)
