@@ -3,8 +3,9 @@
 A measured pose is the pose at which the loops close with the joint coordinates that the encoders read, seen between two
 frames that teaching put a little off: z = base o f(joints, geometry) o platform + noise. Unknown are the geometric
 numbers (`dynamics.legs.numbers`) and the twelve of the frames, each with its prior: the stated tolerance of a machine
-part about its nominal value, and what teaching says. Errors of the encoders come through the loops into the pose's
-covariance. So what poses cannot tell stays where the drawing has it, with the tolerance for a standard deviation.
+part about its nominal value, and what teaching says; other errors that all poses have in common, such as those of the
+cameras, join them as columns. Errors of the encoders come through the loops into the pose's covariance. So what poses
+cannot tell stays where the drawing has it, with the tolerance for a standard deviation.
 
 A joint's offset is the twin of its zero angle, or of its base joint along its slide: the numbers of a calibrated robot
 are those with which its encoders are right.
@@ -153,18 +154,21 @@ def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibrat
     model = PoseModel(robot, tolerance.of(robot), data.frames)
     free, count = list(robot.geometry.chart.freedoms), len(model.tolerance)
     closed = data.poses
-    none = np.zeros(count + 12)
+    own, common = count + 12, data.common_errors
+    none = np.zeros(own + common.shape[2])
     try:
-        closed = model.closed(data.joints, none, closed)
-        whitener = whiteners(data, model.columns(data.joints, closed, none)[1], free)
+        closed = model.closed(data.joints, none[:own], closed)
+        whitener = whiteners(data, model.columns(data.joints, closed, none[:own])[1], free)
 
         def residuals(unknowns: Array) -> Array:
-            seen = seen_between(model.closed(data.joints, unknowns, data.poses), model.split(unknowns)[1])
+            closed = model.closed(data.joints, unknowns[:own], data.poses)
+            seen = seen_between(closed, model.split(unknowns[:own])[1]) + common @ unknowns[own:]
             return np.append((whitener @ (seen - data.poses)[:, free, None]).ravel(), unknowns)
 
         def jacobian(unknowns: Array) -> Array:
-            at = model.closed(data.joints, unknowns, data.poses)
-            columns = whitener @ model.columns(data.joints, at, unknowns)[0]
+            at = model.closed(data.joints, unknowns[:own], data.poses)
+            of_model = model.columns(data.joints, at, unknowns[:own])[0]
+            columns = whitener @ np.concatenate([of_model, common[:, free]], axis=2)
             return np.vstack([columns.reshape(-1, len(unknowns)), np.eye(len(unknowns))])
 
         found = least_squares(residuals, none, jacobian, method="lm", xtol=1e-10, ftol=1e-10, gtol=1e-10)
@@ -173,10 +177,10 @@ def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibrat
     if not found.success:
         raise EstimationError(f"the search for the geometry did not end: {found.message}")
     rows = found.jac[: -len(none)]
-    covariance = model.scale @ np.linalg.inv(rows.T @ rows + np.eye(len(none))) @ model.scale.T
-    hat = np.trace(np.linalg.solve(rows.T @ rows + np.eye(len(none)), rows.T @ rows))
-    spare = max(len(rows) - hat, 1.0)
-    deviations, frames = model.split(found.x)
+    spread = np.linalg.inv(rows.T @ rows + np.eye(len(none)))
+    covariance = model.scale @ spread[:own, :own] @ model.scale.T
+    spare = max(len(rows) - float(np.sum(spread * (rows.T @ rows))), 1.0)
+    deviations, frames = model.split(found.x[:own])
     return Calibration(
         robot,
         deviations,

@@ -41,17 +41,24 @@ class FrameKnowledge:
 @dataclass(frozen=True)
 class StaticPoses:
     """Poses at which a robot stood: joint coordinates that its encoders read (N, n) with their standard deviation
-    (n,), rad or m; measured poses (N, 6), each the mean of some frames, with covariances (N, 6, 6), m and rad; and how
-    well the frames of the measurement are known."""
+    (n,), rad or m; measured poses (N, 6), each the mean of some frames, with covariances (N, 6, 6), m and rad; how well
+    the frames of the measurement are known; and common (N, 6, k): what errors of variance one that all poses have in
+    common, beside those of the frames, add to each, as those of cameras that are known only so well; None: nothing."""
 
     joints: Array
     joint_std: Array
     poses: Array
     covariances: Array
     frames: FrameKnowledge
+    common: Array | None = None
 
     def __len__(self) -> int:
         return len(self.joints)
+
+    @property
+    def common_errors(self) -> Array:
+        """As `common`, with k = 0 where there is nothing."""
+        return np.zeros((len(self), 6, 0)) if self.common is None else self.common
 
     def entry(self, robot: Robot) -> dict[str, Any]:
         """What `read_static_poses` reads, as JSON holds it."""
@@ -64,6 +71,7 @@ class StaticPoses:
             "covariances": self.covariances,
             "base_covariance": self.frames.base,
             "platform_covariance": self.frames.platform,
+            "common": self.common,
         }
 
 
@@ -106,7 +114,10 @@ def read_static_poses(path: Path | str, robot: Robot) -> StaticPoses:
     std = array("joint_std", joints)
     if (std < 0).any():
         raise RecordError(f"{path}: joint_std of joint {int(np.argmin(std)) + 1} is {std.min():g}, must be >= 0")
-    return StaticPoses(array("joints", count, joints), std, array("poses", count, 6), covariances, frames)
+    common = None
+    if content.get("common") is not None:
+        common = array("common", count, 6, np.shape(content["common"])[-1] if np.ndim(content["common"]) == 3 else 1)
+    return StaticPoses(array("joints", count, joints), std, array("poses", count, 6), covariances, frames, common)
 
 
 def _check_covariances(name: str, matrices: Array, strictly: bool) -> None:

@@ -62,7 +62,7 @@ def judge(entry, errors):
 
 @pytest.mark.slow
 def test_a_geometry_is_found_through_images(tmp_path):
-    settings = {"poses": 20, "frames_per_pose": 4, "candidates": 100, "unseen": 50}
+    settings = {"poses": 15, "frames_per_pose": 3, "candidates": 60, "unseen": 30}
     chosen = [word for name, value in settings.items() for word in ("--set", f"geometry.{name}={value}")]
     judge(*through_images(tmp_path / "out", "rss6", *chosen, "--set", "renderer=analytic"))
 
