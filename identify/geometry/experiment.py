@@ -100,10 +100,11 @@ class Sighted:
 def measured(sensor: cmmsim.Sensor, robot: Robot, poses: Array, frames: int, seed: int, progress: Progress) -> Sighted:
     """Poses measured through images.
 
-    What an image's covariance holds beyond the scatter of repeated frames does not average: that part stays whole.
+    The share of the stated variance that frames at rest do not scatter by, such as the errors of drawing and of
+    detection, does not average: it stays whole in the covariance of a mean.
     """
     means, stated = np.full_like(poses, np.nan), np.full((len(poses), 6, 6), np.nan)
-    scatter, spare, counts = np.zeros((6, 6)), 0, np.zeros(len(poses), dtype=int)
+    scatter, spare, counts = 0.0, 0, np.zeros(len(poses), dtype=int)
     with progress.stage("measure poses", len(poses) * frames) as advance:
         for row, pose in enumerate(poses):
             bodies = robot_transforms(robot, pose)
@@ -117,25 +118,12 @@ def measured(sensor: cmmsim.Sensor, robot: Robot, poses: Array, frames: int, see
                 values = np.array([one.pose for one in good])
                 means[row], counts[row] = values.mean(axis=0), len(good)
                 stated[row] = np.mean([one.covariance for one in good], axis=0)
-                scatter += (values - means[row]).T @ (values - means[row])
+                away = values - means[row]
+                scatter += float(np.sum(away * np.linalg.solve(stated[row], away.T).T)) / away.shape[1]
                 spare += len(good) - 1
-    seen = counts > 0
-    covariances = np.full_like(stated, np.nan)
-    for row in map(int, np.flatnonzero(seen)):
-        covariances[row] = mean_covariance(stated[row], scatter / max(spare, 1), int(counts[row]), spare > 0)
-    return Sighted(means, covariances, seen, int(len(poses) * frames - counts.sum()))
-
-
-def mean_covariance(stated: Array, scatter: Array, count: int, known: bool = True) -> Array:
-    """Covariance (6, 6) of the mean of `count` frames, of what each states and of the scatter of frames at rest."""
-    if not known:
-        return stated
-    root = np.linalg.cholesky(stated)
-    inverse = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(inverse @ scatter @ inverse.T)
-    kept = np.maximum(1 - values * (1 - 1 / count), 1 / count)
-    spread = root @ vectors
-    return np.asarray(spread * kept @ spread.T)
+    seen, share = counts > 0, min(scatter / spare, 1.0) if spare else 0.0
+    kept = 1 - share * (1 - 1 / np.maximum(counts, 1))
+    return Sighted(means, stated * kept[:, None, None], seen, int(len(poses) * frames - counts.sum()))
 
 
 def drawn(

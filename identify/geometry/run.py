@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from cmmsim.visibility import expected_covariance, sight_lines
+from cmmsim.visibility import SightLines, expected_covariance, sight_lines
 from dynamics import Robot, load_robot
 from identify.arrays import Array
 from identify.experiment.run import taught_sensor
@@ -35,10 +35,11 @@ def run_geometry(
     if measurements is not None:
         data = measurements
         check_encoders(robot, data)
-        designer = _designer(robot, scenario, data.frames, data.covariances.mean(axis=0))
+        designer = _designer(robot, scenario, data.frames, data.covariances.mean(axis=0), None)
         among = designer.candidates(settings.candidates, np.random.default_rng(child(seed, STATIC_POSES)))
     else:
-        designer = _designer(robot, scenario, *_expected(robot, scenario))
+        sight = sight_lines(scenario.sensor, scenario.sensor_changes)
+        designer = _designer(robot, scenario, *_expected(robot, scenario), sight)
         chosen, among = _choose(designer, scenario, seed, progress)
         true = true_deviations(robot, scenario, seed)
         true_poses(robot, true, chosen.joints, chosen.poses)  # refused before the sensor is taught
@@ -53,11 +54,12 @@ def run_geometry(
     return GeometryOutcome(scenario, seed, designer.model, found, data, lost, true, unseen, chosen, among)
 
 
-def _designer(robot: Robot, scenario: Scenario, frames: FrameKnowledge, covariance: Array) -> Designer:
+def _designer(
+    robot: Robot, scenario: Scenario, frames: FrameKnowledge, covariance: Array, sight: SightLines | None
+) -> Designer:
     settings, excitation = scenario.geometry, scenario.excitation
     model = PoseModel(robot, Tolerance(settings.tolerance_m, settings.tolerance_rad).of(robot), frames)
     travel = robot.travel_limit - of_actuators(robot, excitation, "travel_margin")
-    sight = sight_lines(scenario.sensor, scenario.sensor_changes)
     limits = Limits(robot, travel, excitation.least_leverage, excitation.most_condition, sight)
     std = np.full(robot.layout.joints, encoders_of(robot, settings).mean_std(settings.frames_per_pose))
     return Designer(model, limits, covariance, std, settings.criterion)

@@ -35,26 +35,29 @@ TRIALS = 40
 
 @dataclass(frozen=True)
 class Limits:
-    """Where a robot may stand to be measured: within its travel (rad or m), far from singularities, and in sight."""
+    """Where a robot may stand to be measured: within its travel (rad or m), far from singularities, and in sight, where
+    that is asked for."""
 
     robot: Robot
     travel: float
     least_leverage: float
     most_condition: float
-    sight: SightLines
+    sight: SightLines | None
 
     def allowed(self, poses: Array) -> NDArray[np.bool_]:
         """Whether the robot may stand at each pose (N, 6)."""
-        measures, stickers = measure(self.robot, poses), self._stickers
+        measures = measure(self.robot, poses)
         good = measures.reachable & (np.abs(measures.theta) <= self.travel * (1 + 1e-9)).all(axis=1)
         good &= measures.leverage.min(axis=1) >= self.least_leverage
         good &= measures.platform_condition <= self.most_condition
-        in_sight = [ok and bool(self.sight.visible(pose)[stickers].all()) for ok, pose in zip(good, poses, strict=True)]
-        return np.array(in_sight, dtype=bool)
+        return np.array([ok and self._in_sight(pose) for ok, pose in zip(good, poses, strict=True)], dtype=bool)
+
+    def _in_sight(self, pose: Array) -> bool:
+        return self.sight is None or bool(self.sight.visible(pose)[self._stickers].all())
 
     @cached_property
     def _stickers(self) -> list[int]:
-        return required_stickers(self.sight, self.robot.home_pose)
+        return [] if self.sight is None else required_stickers(self.sight, self.robot.home_pose)
 
 
 @dataclass(frozen=True)

@@ -5,15 +5,17 @@ import json
 import numpy as np
 import pytest
 
+from cmmsim.pose_estimation.estimator import lost_measurement, measurement_without_stickers
 from dynamics import built_in_robots, load_robot
 from dynamics.errors import UnreachablePoseError
 from identify.errors import EstimationError, RecordError
 from identify.files.run_folder import rms_figures
 from identify.geometry.calibration import calibrate
 from identify.geometry.encoders import check_encoders
-from identify.geometry.experiment import Encoders, mean_covariance
+from identify.geometry.experiment import Encoders, measured
 from identify.geometry.observability import check_enough, combinations
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses, read_static_poses
+from identify.progress import SilentProgress
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.static_poses import TOLERANCE, designer, drawn, poses_of, unseen_errors
 
@@ -133,11 +135,30 @@ def test_the_mean_of_readings_is_as_uncertain_as_is_said():
         assert (encoders.read(joints, 20, rng) - joints).std() == pytest.approx(encoders.mean_std(20), rel=0.03)
 
 
-def test_what_does_not_scatter_does_not_average():
-    noise, lasting = np.diag([4.0] * 6), np.diag([1.0] * 6)
-    np.testing.assert_allclose(mean_covariance(noise + lasting, noise, 20), noise / 20 + lasting)
-    np.testing.assert_allclose(mean_covariance(noise, noise, 20), noise / 20)
-    np.testing.assert_allclose(mean_covariance(noise, 9 * noise, 20), noise / 20)
+class Eye:
+    """A sensor that is blind at one pose, and loses every other frame elsewhere; frames scatter by 1 um and 1 urad, and
+    are said to be off by that and by as much that lasts."""
+
+    def start_run(self, seed):
+        self.rng, self.frame = np.random.default_rng(seed), 0
+
+    def measure(self, pose, bodies):
+        assert set(bodies) == {f"{kind}{leg}" for kind in ("crank", "link") for leg in range(1, 7)}
+        self.frame += 1
+        if pose[0] > 0.01 or self.frame % 2:
+            return lost_measurement("dark")
+        return measurement_without_stickers(pose + 1e-6 * self.rng.standard_normal(6), 2e-12 * np.eye(6))
+
+
+def test_means_leave_lost_frames_out_and_do_not_average_what_does_not_scatter():
+    robot = load_robot("rss6")
+    poses = robot.home_pose + np.outer([0.0, 0.02, 0.005], [1, 0, 0, 0, 0, 0])
+    found = measured(Eye(), robot, poses, 40, 0, SilentProgress())
+    assert found.seen.tolist() == [True, False, True]
+    assert found.lost == 80
+    np.testing.assert_allclose(found.poses[found.seen], poses[found.seen], atol=1.5e-6)
+    expected = (1 + 1 / 20) * 1e-12 * np.eye(6)
+    np.testing.assert_allclose(found.covariances[found.seen], [expected] * 2, rtol=0.2)
 
 
 def test_encoders_that_read_something_else_are_named_by_what_fits(rss6):
