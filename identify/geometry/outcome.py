@@ -181,6 +181,8 @@ def geometry_markdown(entry: dict[str, Any]) -> str:
             "",
         ]
         lines += [f"- {text}" for text in entry["cannot_be_told"]]
+        if entry["frames"] == "unknown":
+            lines += ["", "Nothing was known of the frames of base and platform: their places are among these."]
     return "\n".join(lines) + "\n"
 
 

@@ -1,6 +1,5 @@
 """Static poses: what encoders read and what the optical CMM measured while a robot stood still; and their file."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import numpy as np
 from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import RecordError
+from identify.files.run_folder import load_result
 
 UNKNOWN_FRAME = np.repeat([0.1, 0.1], 3)
 """Standard deviation (6,) of a frame of which nothing is known, m and rad: more than where any robot is put."""
@@ -81,13 +81,8 @@ def read_static_poses(path: Path | str, robot: Robot) -> StaticPoses:
     Raises RecordError: unreadable, an entry that is missing or of another shape, numbers that are not finite, joints of
     another unit, or a covariance that is none.
     """
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RecordError(f"cannot read poses: {error}") from error
-    except ValueError as error:
-        raise RecordError(f"{path} is truncated or not JSON: {error}") from error
-    if not isinstance(content, dict) or not isinstance(content.get("joints"), list):
+    content = load_result(path)
+    if not isinstance(content.get("joints"), list):
         raise RecordError(f"{path} holds no poses: it needs joints, joint_std, poses and covariances")
     unit, count, joints = content.get("joint_unit"), len(content["joints"]), robot.layout.joints
     if unit not in (None, robot.layout.joint_unit):

@@ -175,6 +175,9 @@ def test_encoders_that_read_something_else_are_named_by_what_fits(rss6):
     swapped = data.joints[:, [1, 0, 2, 3, 4, 5]]
     said = refusal(RecordError, check_encoders, robot, changed(data, joints=swapped))
     assert "joint1 fits with the readings of joint2; joint2 fits with the readings of joint1" in said
+    still = changed(data, joints=data.joints[:10] + 0, poses=np.tile(robot.home_pose, (10, 1)))
+    still.joints[:] = 0.001 * np.random.default_rng(0).standard_normal((10, 6))
+    check_encoders(robot, still)
     none = data.joints.copy()
     none[:, 3] = np.random.default_rng(0).uniform(-1, 1, len(none))
     assert "joint4 is" in refusal(RecordError, check_encoders, robot, changed(data, joints=none))
