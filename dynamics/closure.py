@@ -32,7 +32,6 @@ class Closure:
 
         Raises ConvergenceError, naming the first row whose loops stay open.
         """
-
         found = self.nearest(joints, deviations, start)
         if not np.isfinite(found).all():
             row = int(np.argmin(np.isfinite(found).all(axis=1)))

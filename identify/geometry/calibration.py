@@ -146,56 +146,82 @@ class Calibration:
         return with_geometry(self.nominal, self.nominal.geometry.moved(self.deviations))
 
 
+@dataclass(frozen=True)
+class _Fit:
+    """Residuals of poses in units of their noise, below them the unknowns as residuals of their prior.
+
+    Unknowns are those of the model, then the errors that all poses have in common. What an encoder's error makes of a
+    pose is taken at the nominal geometry.
+    """
+
+    model: PoseModel
+    data: StaticPoses
+
+    @property
+    def nothing(self) -> Array:
+        """The unknowns before the poses: zero."""
+        return np.zeros(len(self.model.scale) + self.data.common_errors.shape[2])
+
+    def residuals(self, unknowns: Array) -> Array:
+        """(N m + u,)"""
+        of_model, common = np.split(unknowns, [len(self.model.scale)])
+        closed = self.model.closed(self.data.joints, of_model, self.data.poses)
+        seen = seen_between(closed, self.model.split(of_model)[1]) + self.data.common_errors @ common
+        return np.append((self._whiteners @ (seen - self.data.poses)[:, self._free, None]).ravel(), unknowns)
+
+    def jacobian(self, unknowns: Array) -> Array:
+        """(N m + u, u)"""
+        of_model = unknowns[: len(self.model.scale)]
+        closed = self.model.closed(self.data.joints, of_model, self.data.poses)
+        columns = self.model.columns(self.data.joints, closed, of_model)[0]
+        columns = self._whiteners @ np.concatenate([columns, self.data.common_errors[:, self._free]], axis=2)
+        return np.vstack([columns.reshape(-1, len(unknowns)), np.eye(len(unknowns))])
+
+    @property
+    def _free(self) -> list[int]:
+        return list(self.model.robot.geometry.chart.freedoms)
+
+    @cached_property
+    def _whiteners(self) -> Array:
+        """(N, m, m)"""
+        none = np.zeros(len(self.model.scale))
+        closed = self.model.closed(self.data.joints, none, self.data.poses)
+        by_joints = self.model.columns(self.data.joints, closed, none)[1]
+        return whiteners(self.data.covariances[:, self._free][:, :, self._free], by_joints, self.data.joint_std)
+
+
 def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibration:
     """Estimate the geometry of a robot, about its nominal one, from static poses.
 
     Raises EstimationError where the loops do not close with what the encoders read, or the search does not end.
     """
     model = PoseModel(robot, tolerance.of(robot), data.frames)
-    free, count = list(robot.geometry.chart.freedoms), len(model.tolerance)
-    closed = data.poses
-    own, common = count + 12, data.common_errors
-    none = np.zeros(own + common.shape[2])
+    fit, limit = _Fit(model, data), 1e-10
+    none = fit.nothing
     try:
-        closed = model.closed(data.joints, none[:own], closed)
-        whitener = whiteners(data, model.columns(data.joints, closed, none[:own])[1], free)
-
-        def residuals(unknowns: Array) -> Array:
-            closed = model.closed(data.joints, unknowns[:own], data.poses)
-            seen = seen_between(closed, model.split(unknowns[:own])[1]) + common @ unknowns[own:]
-            return np.append((whitener @ (seen - data.poses)[:, free, None]).ravel(), unknowns)
-
-        def jacobian(unknowns: Array) -> Array:
-            at = model.closed(data.joints, unknowns[:own], data.poses)
-            of_model = model.columns(data.joints, at, unknowns[:own])[0]
-            columns = whitener @ np.concatenate([of_model, common[:, free]], axis=2)
-            return np.vstack([columns.reshape(-1, len(unknowns)), np.eye(len(unknowns))])
-
-        found = least_squares(residuals, none, jacobian, method="lm", xtol=1e-10, ftol=1e-10, gtol=1e-10)
+        found = least_squares(fit.residuals, none, fit.jacobian, method="lm", xtol=limit, ftol=limit, gtol=limit)
     except DynamicsError as error:
         raise EstimationError(f"the poses do not fit robot {robot.name}: {error}") from error
     if not found.success:
         raise EstimationError(f"the search for the geometry did not end: {found.message}")
-    rows = found.jac[: -len(none)]
-    spread = np.linalg.inv(rows.T @ rows + np.eye(len(none)))
-    covariance = model.scale @ spread[:own, :own] @ model.scale.T
+    rows, own = found.jac[: -len(none)], len(model.scale)
+    spread = np.linalg.inv(found.jac.T @ found.jac)
     spare = max(len(rows) - float(np.sum(spread * (rows.T @ rows))), 1.0)
     deviations, frames = model.split(found.x[:own])
     return Calibration(
-        robot,
-        deviations,
-        frames,
-        covariance,
-        model.tolerance,
-        float(np.sum(found.fun[: -len(none)] ** 2) / spare),
-        float(np.sqrt(2 / spare)),
-        not np.array_equal(data.frames.base, FrameKnowledge.none().base),
+        nominal=robot,
+        deviations=deviations,
+        frames=frames,
+        joint_covariance=model.scale @ spread[:own, :own] @ model.scale.T,
+        prior_std=model.tolerance,
+        noise_ratio=float(np.sum(found.fun[: len(rows)] ** 2) / spare),
+        noise_ratio_std=float(np.sqrt(2 / spare)),
+        frames_known=not np.array_equal(data.frames.base, FrameKnowledge.none().base),
     )
 
 
-def whiteners(data: StaticPoses, by_joints: Array, free: list[int]) -> Array:
-    """Matrices (N, m, m) that make the residuals of the coordinates of variance one: noise of the pose, and errors of
-    the encoders through the loops."""
-    pose = data.covariances[:, free][:, :, free]
-    encoders = by_joints * data.joint_std
-    return np.linalg.inv(np.linalg.cholesky(pose + encoders @ encoders.swapaxes(1, 2)))
+def whiteners(covariances: Array, by_joints: Array, joint_std: Array) -> Array:
+    """Matrices (N, m, m) that make residuals of the coordinates of variance one: noise (N, m, m) of the pose, and
+    errors of the encoders through the loops, where coordinates change with joints by (N, m, n)."""
+    encoders = by_joints * joint_std
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances + encoders @ encoders.swapaxes(1, 2))))

@@ -19,7 +19,7 @@ from dynamics.workspace import measure
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.excitation.constraints import required_stickers
-from identify.geometry.calibration import PoseModel
+from identify.geometry.calibration import PoseModel, whiteners
 from identify.progress import Advance
 
 STEP = 1e-5
@@ -122,9 +122,9 @@ class Designer:
         """What poses (N, 6) of joint coordinates (N, n) would tell."""
         none, free = np.zeros(len(self.model.scale)), list(self.limits.robot.geometry.chart.freedoms)
         columns, by_joints = self.model.columns(joints, poses, none)
-        encoders = by_joints * self.joint_std
-        noise = self.covariance[np.ix_(free, free)] + encoders @ encoders.swapaxes(1, 2)
-        return Candidates(joints, poses, np.linalg.inv(np.linalg.cholesky(noise)) @ columns)
+        return Candidates(
+            joints, poses, whiteners(self.covariance[np.ix_(free, free)], by_joints, self.joint_std) @ columns
+        )
 
     def greedy(self, among: Candidates, count: int, advance: Advance = lambda n=1: None) -> Candidates:
         """The best candidates one by one, then exchanged until no other is better; the same one may stand twice."""

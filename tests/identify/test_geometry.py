@@ -97,9 +97,10 @@ def test_errors_that_all_poses_have_in_common_widen_intervals_and_are_allowed_fo
 
 
 @pytest.mark.slow
-def test_designed_poses_predict_as_well_as_twice_as_many_random_ones():
+@pytest.mark.parametrize("robot", ["rss6", "ups6", "delta3", "rrr3"])
+def test_designed_poses_predict_as_well_as_twice_as_many_random_ones(robot):
     """Judged by poses that neither were chosen from."""
-    design, among, judges = designer("rss6"), poses_of("rss6", 400), poses_of("rss6", 200, 99)
+    design, among, judges = designer(robot), poses_of(robot, 400), poses_of(robot, 200, 99)
     designed = design.moved(design.greedy(among, 30), among)
 
     def spread(poses):
