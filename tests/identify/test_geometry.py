@@ -45,7 +45,7 @@ def test_sixty_poses_find_a_geometry_within_its_intervals_and_predict_unseen_pos
     figures = rms_figures(unseen_errors(robot, found, off))
     assert max(figures["position_rms_um"]) < 5
     assert max(figures["orientation_rms_urad"]) < 20
-    assert np.abs(off).max() > 1e-3  # and the robot was off
+    assert np.abs(off).max() > 2e-4  # m or rad: the robot was off
 
 
 def test_what_no_pose_can_tell_stays_nominal_and_is_named():
