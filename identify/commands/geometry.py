@@ -10,7 +10,8 @@ from identify.files.run_folder import new_run_folder
 from identify.progress import print_table, print_warnings, terminal_progress
 
 GEOMETRY_HELP = """
-Calibrate the geometry of a robot with the optical CMM: writes geometry.json, geometry.md, robot.toml and poses.json.
+Calibrate the geometry of a robot with the optical CMM: writes geometry.json, geometry.md, robot.toml, covariance.nc and
+poses.json.
 
 The robot stands at poses that show most of its geometry. Joint encoders read its joints, the mean of some frames its
 pose; joint places, axes, zero angles and lengths follow, each with its standard deviation. Numbers and combinations

@@ -11,6 +11,7 @@ from dynamics.robot_file import RobotDescription
 from dynamics.robot_text import robot_text
 from identify.arrays import Array
 from identify.files.atomic import atomic_contents
+from identify.files.dataset import write_covariance_of
 from identify.files.run_folder import rms_figures, save_files
 from identify.files.versions import versions
 from identify.geometry.calibration import Calibration, PoseModel, frame_columns, seen_between
@@ -41,7 +42,7 @@ class GeometryOutcome:
     among: Candidates
 
     def write(self, folder: Path) -> None:
-        """Write geometry.json, geometry.md, poses.json, robot.toml and scenario.toml, all or none."""
+        """Write geometry.json, geometry.md, covariance.nc, poses.json, robot.toml and scenario.toml, all or none."""
         robot = self.calibration.robot
         description = RobotDescription(robot.name, robot.geometry, robot.parameter_sets)
         said = f"{robot.name} with the geometry of {len(self.data)} static poses; see geometry.json beside this file"
@@ -54,6 +55,8 @@ class GeometryOutcome:
         }
         with atomic_contents(folder) as temporary:
             save_files(temporary, files)
+            units = dict(zip(robot.geometry.number_names, robot.geometry.number_units, strict=True))
+            write_covariance_of(temporary / "covariance.nc", units, self.calibration.covariance)
 
     @cached_property
     def entry(self) -> dict[str, Any]:

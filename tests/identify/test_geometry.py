@@ -9,6 +9,7 @@ from cmmsim.pose_estimation.estimator import lost_measurement, measurement_witho
 from dynamics import built_in_robots, load_robot
 from dynamics.errors import UnreachablePoseError
 from identify.errors import EstimationError, RecordError
+from identify.files.dataset import read_covariance
 from identify.files.run_folder import rms_figures
 from identify.geometry.calibration import calibrate
 from identify.geometry.encoders import check_encoders
@@ -254,6 +255,9 @@ def test_own_poses_are_calibrated_into_a_robot_file_by_the_command(tmp_path, rss
     named = dict(zip(robot.geometry.number_names, robot.geometry.numbers + found.deviations, strict=True))
     assert {name: one["estimate"] for name, one in entry["parameters"].items()} == pytest.approx(named)
     assert all(one["true"] is None and one["observable"] for one in entry["parameters"].values())
+    names, covariance = read_covariance(out / "covariance.nc")
+    assert names == robot.geometry.number_names
+    np.testing.assert_allclose(covariance, found.covariance, rtol=1e-6, atol=1e-20)
     read = load_robot(out / "robot.toml")
     np.testing.assert_allclose(read.geometry.deviations_from(robot.geometry), found.deviations, rtol=0, atol=1e-14)
     assert read.parameter_sets.keys() == robot.parameter_sets.keys()
