@@ -169,7 +169,7 @@ def geometry_markdown(entry: dict[str, Any]) -> str:
     figures = {f"{text} (root mean square)": entry[key] for key, text in said.items() if key in entry}
     names = {"chosen": "chosen poses", "random": "random poses", "twice as many random": "random poses"}
     for key, one in entry.get("selection", {}).items():
-        figures[f"What {one['poses']} {names[key]} are expected to leave"] = one
+        figures[f"What {one['poses']} {names[key]} are expected to leave beside the error of teaching"] = one
     for text, one in figures.items():
         if np.isfinite(one["position_rms_um"]).all():
             lines += ["", f"{text}: {_figures(one)}."]
