@@ -19,7 +19,7 @@ from cmmsim.geometry.pose import Array, apply, compose_covariance, invert, pose_
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.pose_estimation.estimator import by_planes, by_registration
 from cmmsim.pose_estimation.observation import DetectionSettings, faces_camera
-from cmmsim.sensor import load_sensor
+from cmmsim.sensor import Sensor, load_sensor
 
 EDGE_PX = DetectionSettings().window_size
 
@@ -66,11 +66,17 @@ def expected_covariance(
 
     Taken as taught without error. Raises LostError where the stickers do not suffice, and what `load_sensor` raises.
     """
-    sensor, sight = load_sensor(name, 0, method, renderer="analytic", changes=changes), sight_lines(name, changes)
+    sensor = load_sensor(name, 0, method, renderer="analytic", changes=changes)
+    return stated_covariance(sensor, sight_lines(name, changes), pose)
+
+
+def stated_covariance(sensor: Sensor, sight: SightLines, pose: ArrayLike) -> Array:
+    """Covariance (6,6) that a sensor states for a pose (6,), m and rad, from one exposure whose stickers are where the
+    pose says: nothing is searched, and nothing taught. Raises as `expected_covariance`."""
     base_from_platform = pose_to_transform(pose)
     expected = sight.camera_from_base @ base_from_platform
     seen = sensor.observer.observe(sensor.look(pose), expected, sight.platform.nominal, sight.platform.sticker_normals)
-    if method == "planes":
+    if sensor.method == "planes":
         covariance = by_planes(seen, sight.platform, sight.platform.normals @ expected[:3, :3].T)[1]
     else:
         places = sight.platform.nominal.copy()

@@ -11,6 +11,7 @@ from dynamics.errors import RobotFileError
 from dynamics.kinematics.chart import FREEDOMS, Chart
 from dynamics.kinematics.platform import base_from_platform
 from dynamics.legs.leg import Leg
+from dynamics.legs.numbers import deviations, moved, unit_of, values
 
 SAME_PLACE = 1e-6
 """m: joints of two legs nearer than this are one."""
@@ -90,17 +91,39 @@ class RobotGeometry:
         """Platform joints A (legs, 3), base axes, m, with the platform at a pose (6,)."""
         return np.asarray(pose[:3] + self.platform_joints @ base_from_platform(pose).T)
 
-    def displaced(self, base: np.ndarray, platform: np.ndarray) -> "RobotGeometry":
-        """The geometry with its base and platform joints off by (legs, 3) each, m, and its joint coordinates set to
-        zero at home."""
-        shifts = zip(self.legs, base, platform, strict=True)
-        moved = [
-            leg.model_copy(update={"base_joint": leg.base_joint + b, "platform_joint": leg.platform_joint + a})
-            for leg, b, a in shifts
-        ]
-        geometry = replace(self, legs=tuple(moved))
-        at_home = zip(geometry.legs, geometry.joints_at(self.home_pose), strict=True)
-        return replace(geometry, legs=tuple(leg.zeroed(at) for leg, at in at_home))
+    @property
+    def number_names(self) -> tuple[str, ...]:
+        """Names of the geometric numbers of all legs (g), such as `leg1.base_joint.x`; see `legs.numbers`."""
+        return tuple(f"leg{k}.{name}" for k, leg in enumerate(self.legs, 1) for name in leg.numbers)
+
+    @property
+    def number_units(self) -> tuple[str, ...]:
+        """Units of the geometric numbers (g), m or rad."""
+        return tuple(unit_of(name) for leg in self.legs for name in leg.numbers)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The geometric numbers (g), m; turns, which are counted from this geometry, are zero."""
+        return np.concatenate([values(leg) for leg in self.legs])
+
+    def moved(self, deviations: np.ndarray) -> "RobotGeometry":
+        """The geometry with its geometric numbers off by deviations (g,), m and rad."""
+        ends = np.cumsum([len(leg.numbers) for leg in self.legs])[:-1]
+        parts = np.split(np.asarray(deviations, dtype=float), ends)
+        return replace(self, legs=tuple(moved(leg, part) for leg, part in zip(self.legs, parts, strict=True)))
+
+    def deviations_from(self, nominal: "RobotGeometry") -> np.ndarray:
+        """How far the geometric numbers are from those of a geometry with the same kinds of legs (g,), m and rad."""
+        return np.concatenate([deviations(leg, known) for leg, known in zip(self.legs, nominal.legs, strict=True)])
+
+    def shifted(self, joints: np.ndarray) -> "RobotGeometry":
+        """The geometry whose joint coordinates read that much less (n,), rad or m, everywhere."""
+        return replace(self, legs=tuple(leg.shifted(float(by)) for leg, by in zip(self.legs, joints, strict=True)))
+
+    def zeroed(self) -> "RobotGeometry":
+        """The geometry with its joint coordinates set to zero at home."""
+        at_home = zip(self.legs, self.joints_at(self.home_pose), strict=True)
+        return replace(self, legs=tuple(leg.zeroed(at) for leg, at in at_home))
 
     def _check_freedoms(self) -> None:
         if self.chart.name not in FREEDOMS:

@@ -16,6 +16,8 @@ EXCITATION, UNSEEN, SEARCH = 0, 1, 2
 """Exciting candidates, unseen trajectories, and the search from the candidates."""
 TEACHING, ANCHOR = 2, 3
 """The sensor's teaching, and the error of what fixes the scale."""
+STATIC_POSES, UNSEEN_POSES, ENCODER_OFFSETS, ENCODERS, STATIC_NOISE = 14, 15, 16, 17, 18
+"""Of a kinematic calibration: candidates and unseen poses, offsets of the encoders and their readings, drawn poses."""
 NOISE, LATENCY, PREDICTION = 4, 5, 6
 """Of each run: the sensor's noise, the latency of its frames, the noise in what is predicted of it."""
 DESIGN, LOAD, CALIBRATION, MEAN_LATENCY = 7, 8, 9, 10

@@ -4,7 +4,7 @@ The gaps of the loops are smooth in the pose whether or not a leg can reach it, 
 pose found this way may have a leg in another assembly; the closed-form inverse kinematics has the last word.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +30,10 @@ SAME = 1e-5
 
 Functions = Mapping[str, MachineFunction]
 """Compiled functions of a robot, of which `loop_closure` and `inverse_kinematics` are asked for."""
+
+Closure = Callable[[np.ndarray, np.ndarray], Sequence[np.ndarray]]
+"""Of poses (N, 6) and joint coordinates (N, n): gaps of the loops (N, n, 1), m^2, and how they change with the
+platform's coordinates (N, n, n)."""
 
 
 @dataclass(frozen=True)
@@ -90,28 +94,34 @@ def assembly_modes(
 
 
 def search(functions: Functions, chart: Chart, theta: np.ndarray, start: np.ndarray) -> ForwardSolution:
-    """Best poses (N, 6) for joint coordinates (N, n) from starts (N, 6).
+    """Best poses (N, 6) for joint coordinates (N, n) from starts (N, 6)."""
+    poses, iterations = close_loops(functions["loop_closure"], chart, theta, start)
+    found = functions["inverse_kinematics"](poses)[0][..., 0]
+    return ForwardSolution(poses, iterations, np.abs(theta - found))
+
+
+def close_loops(closure: Closure, chart: Chart, theta: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (N, 6) that close the loops best for joint coordinates (N, n) from starts (N, 6), and steps taken (N,).
 
     Newton's iteration with step halving; rows leave it when their step or what it gains is nil.
     """
     poses = np.array(start)
     active, iterations = np.arange(len(theta)), np.zeros(len(theta), dtype=int)
-    gaps, jacobians = functions["loop_closure"](poses, theta)
+    gaps, jacobians = closure(poses, theta)
     for _ in range(MAX_ITERATIONS):
         steps = -_solve_each(jacobians, gaps)[..., 0] @ chart.basis.T
-        trials, gaps, jacobians, better = _damped(functions, theta[active], poses[active], steps, gaps)
+        trials, gaps, jacobians, better = _damped(closure, theta[active], poses[active], steps, gaps)
         poses[active] = trials
         iterations[active] += 1
         going = better & (np.abs(steps).max(axis=1) > STEP_TOLERANCE)
         active, gaps, jacobians = active[going], gaps[going], jacobians[going]
         if not len(active):
             break
-    found = functions["inverse_kinematics"](poses)[0][..., 0]
-    return ForwardSolution(poses, iterations, np.abs(theta - found))
+    return poses, iterations
 
 
 def _damped(
-    functions: Functions, theta: np.ndarray, poses: np.ndarray, steps: np.ndarray, gaps: np.ndarray
+    closure: Closure, theta: np.ndarray, poses: np.ndarray, steps: np.ndarray, gaps: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Poses, gaps and Jacobians after the first of the full step and its halves that narrows the gaps, and for which
     rows one does; a last full step that rounding keeps from gaining is taken."""
@@ -120,7 +130,7 @@ def _damped(
     small = np.abs(steps).max(axis=1) <= STEP_TOLERANCE
     for _ in range(HALVINGS):
         trials = poses + scale[:, None] * steps
-        new_gaps, jacobians = functions["loop_closure"](trials, theta)
+        new_gaps, jacobians = closure(trials, theta)
         better = (np.linalg.norm(new_gaps[..., 0], axis=1) < before) | small
         if better.all():
             break

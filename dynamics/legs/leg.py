@@ -111,6 +111,10 @@ class Leg(BaseModel, ABC):
     prismatic: ClassVar[bool]
     chart: ClassVar[str] = "free"
     """What the platform's freedoms have to be for this leg to work."""
+    numbers: ClassVar[tuple[str, ...]]
+    """What decides where the leg lets A be: entries of its joints, lengths, turns; see `legs.numbers`."""
+    turned: ClassVar[tuple[str, ...]] = ()
+    """The fields that turns change: an axis, and a direction across it where the coordinate is zero."""
 
     base_joint: Point = Field(description="B, where the leg starts on the base; base axes, m")
     platform_joint: Point = Field(description="A, where it ends on the platform; platform axes, m")
@@ -154,9 +158,13 @@ class Leg(BaseModel, ABC):
     def lengths(self) -> str:
         """The leg's lengths, for messages."""
 
-    @abstractmethod
     def zeroed(self, joint: np.ndarray) -> Self:
         """The leg with its coordinate set to zero where A is at `joint` (3,)."""
+        return self.shifted(float(self.coordinate(ca.SX(joint))))
+
+    @abstractmethod
+    def shifted(self, by: float) -> Self:
+        """The leg whose coordinate reads that much less, rad or m, everywhere."""
 
     @abstractmethod
     def coordinate(self, position: ca.SX) -> ca.SX:

@@ -22,6 +22,11 @@ class PssLeg(Leg):
 
     bodies = (Body("slider", (), driven="mass"), Body("link", ("Ixx", "Iyy")))
     prismatic = True
+    numbers = (
+        *("base_joint.x", "base_joint.y", "base_joint.z", "slider_axis.u", "slider_axis.v", "link_length"),
+        *("platform_joint.x", "platform_joint.y", "platform_joint.z"),
+    )
+    turned = ("slider_axis",)
     link_joint: ClassVar[str] = "ball"
 
     type: Literal["pss"] = "pss"
@@ -39,9 +44,8 @@ class PssLeg(Leg):
     def lengths(self) -> str:
         return f"link {self.link_length:g} m"
 
-    def zeroed(self, joint: np.ndarray) -> Self:
-        there = float(self.coordinate(ca.SX(joint)))
-        return self.model_copy(update={"base_joint": self.base_joint + there * self.slider_axis})
+    def shifted(self, by: float) -> Self:
+        return self.model_copy(update={"base_joint": self.base_joint + by * self.slider_axis})
 
     def coordinate(self, position: ca.SX) -> ca.SX:
         along, across = self._parts(position)

@@ -51,6 +51,11 @@ class RssLeg(Leg):
 
     bodies = (Body("crank", ("Izz",), driven="Izz"), Body("link", ("Ixx", "Iyy")))
     prismatic = False
+    numbers: ClassVar[tuple[str, ...]] = (
+        *("base_joint.x", "base_joint.y", "base_joint.z", "crank_axis.u", "crank_axis.v", "crank_zero"),
+        *("crank_length", "link_length", "platform_joint.x", "platform_joint.y", "platform_joint.z"),
+    )
+    turned = ("crank_axis", "crank_zero_direction")
     link_joint: ClassVar[str] = "ball"
 
     type: Literal["rss"] = "rss"
@@ -79,9 +84,11 @@ class RssLeg(Leg):
     def lengths(self) -> str:
         return f"crank {self.crank_length:g} m, link {self.link_length:g} m"
 
-    def zeroed(self, joint: np.ndarray) -> Self:
-        crank = np.array(ca.DM(ca.evalf(self.vectors(ca.SX(joint)).crank))).ravel()
-        return self.model_copy(update={"crank_zero_direction": crank / self.crank_length})
+    def shifted(self, by: float) -> Self:
+        zero = np.cos(by) * self.crank_zero_direction + np.sin(by) * np.cross(
+            self.crank_axis, self.crank_zero_direction
+        )
+        return self.model_copy(update={"crank_zero_direction": zero / np.linalg.norm(zero)})
 
     def vectors(self, position: ca.SX) -> LegVectors:
         """The leg with A at a position: along cos(theta) + across sin(theta) = chord, on the leg's branch."""
@@ -106,8 +113,8 @@ class RssLeg(Leg):
 
     def gap(self, position: ca.SX, coordinate: ca.SX) -> ca.SX:
         """(|A - T|^2 - link_length^2) / 2."""
-        zero, axis = self.crank_zero_direction, self.crank_axis
-        crank = self.crank_length * (ca.cos(coordinate) * zero + ca.sin(coordinate) * np.cross(axis, zero))
+        zero, axis = ca.SX(self.crank_zero_direction), ca.SX(self.crank_axis)
+        crank = self.crank_length * (ca.cos(coordinate) * zero + ca.sin(coordinate) * ca.cross(axis, zero))
         link = position - self.base_joint - crank
         return (ca.dot(link, link) - self.link_length**2) / 2
 
@@ -214,6 +221,10 @@ class RrrLeg(RssLeg):
     """A crank and a link in one plane, all three joints hinges normal to that (planar robots)."""
 
     bodies = (Body("crank", ("Izz",), driven="Izz"), Body("link", ("Iyy",)))
+    numbers: ClassVar[tuple[str, ...]] = (
+        *("base_joint.x", "base_joint.y", "crank_zero", "crank_length", "link_length"),
+        *("platform_joint.x", "platform_joint.y"),
+    )
     chart: ClassVar[str] = "planar"
     link_joint: ClassVar[str] = "hinge"
     type: Literal["rrr"] = "rrr"  # type: ignore[assignment]

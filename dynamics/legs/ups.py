@@ -21,6 +21,10 @@ class UpsLeg(Leg):
 
     bodies = (Body("cylinder", ("Ixx", "Iyy", "Izz")), Body("rod", ("Ixx", "Iyy", "Izz")))
     prismatic = True
+    numbers = (
+        *("base_joint.x", "base_joint.y", "base_joint.z", "zero_length"),
+        *("platform_joint.x", "platform_joint.y", "platform_joint.z"),
+    )
 
     type: Literal["ups"] = "ups"
     joint_axis: Direction = Field(description="first axis of the universal joint, unit vector, base axes")
@@ -41,8 +45,8 @@ class UpsLeg(Leg):
         shortest, longest = self.stroke
         return f"leg {shortest:g} to {longest:g} m (cylinder {self.cylinder_length:g}, rod {self.rod_length:g})"
 
-    def zeroed(self, joint: np.ndarray) -> Self:
-        return self.model_copy(update={"zero_length": float(np.linalg.norm(joint - self.base_joint))})
+    def shifted(self, by: float) -> Self:
+        return self.model_copy(update={"zero_length": self.zero_length + by})
 
     def coordinate(self, position: ca.SX) -> ca.SX:
         beyond = ca.if_else(self.reach(position) > 0, 0, ca.DM.nan())

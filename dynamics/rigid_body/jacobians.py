@@ -4,11 +4,14 @@ J_a1 and J_a2 (eq. 7): diag(J_a1) theta_dot = J_a2 twist; J_ad = J_a1^-1 J_a2 (e
 (eq. 29). A pose has six entries also where the platform has fewer freedoms; see `kinematics.chart`.
 """
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 
 from dynamics.geometry import RobotGeometry
 from dynamics.kinematics.platform import pose_rate_to_twist, rotation_matrix
+from dynamics.legs.leg import Leg
 
 
 def freedoms(geometry: RobotGeometry) -> ca.DM:
@@ -72,11 +75,9 @@ def singularity_measures(geometry: RobotGeometry, pose: ca.SX) -> tuple[ca.SX, c
     return ca.vertcat(*leverages), ca.vertcat(*rows) @ ca.diag(ca.DM(scale)) @ freedoms(geometry)
 
 
-def loop_closure(geometry: RobotGeometry, pose: ca.SX, joints: ca.SX) -> tuple[ca.SX, ca.SX]:
+def loop_closure(geometry: RobotGeometry, pose: ca.SX, joints: ca.SX, legs: Sequence[Leg] = ()) -> tuple[ca.SX, ca.SX]:
     """How far the loops of eq. 3 and 4 are from closed at a pose and joint coordinates chosen freely, and its
-    derivative: gaps (n,) in m^2, and d(gaps)/d(coordinates of the platform) (n, n)."""
-    arms = platform_arms(geometry, pose)
-    gap = ca.vertcat(
-        *[leg.gap(pose[0:3] + arm, joints[k]) for k, (leg, arm) in enumerate(zip(geometry.legs, arms, strict=True))]
-    )
+    derivative: gaps (n,) in m^2, and d(gaps)/d(coordinates of the platform) (n, n). legs: instead of the robot's."""
+    rotation, legs = rotation_matrix(pose[3:6]), legs or geometry.legs
+    gap = ca.vertcat(*[leg.gap(pose[0:3] + rotation @ leg.platform_joint, joints[k]) for k, leg in enumerate(legs)])
     return gap, ca.jacobian(gap, pose) @ freedoms(geometry)

@@ -11,6 +11,7 @@ from identify.commands.calibrate import calibrate
 from identify.commands.check import check
 from identify.commands.comparisons import estimators, variation
 from identify.commands.experiment import excite, identify, record, report, run, validate, warm_up
+from identify.commands.geometry import geometry
 from identify.commands.help import BEYOND_LIMIT, NOT_DONE, Command, Commands, Judging, StudyCommand
 from identify.commands.importing import imports
 from identify.commands.new import new
@@ -111,7 +112,7 @@ _add(STAGES, excite, record, identify, validate, report)
 _add(RECORDS, estimators, variation)
 _add(PICTURES, replay, show)
 _add(ROBOTS, check, cls=Judging)
-_add(ROBOTS, workspace, base_parameters)
+_add(ROBOTS, workspace, base_parameters, geometry)
 _add(ROBOTS, verify_model, cls=Judging)
 app.add_typer(export, name="export", rich_help_panel=ROBOTS)
 app.add_typer(imports, name="import", rich_help_panel=ROBOTS)

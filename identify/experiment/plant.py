@@ -25,6 +25,7 @@ from identify.estimation.prior import starting_guess
 from identify.experiment.truth import build_truth
 from identify.loop_parameters import loop_settings, of_actuators
 from identify.record.payload import payload_vector
+from identify.scenario import Plant as PlantSwitches
 from identify.scenario import Scenario
 
 
@@ -116,10 +117,16 @@ def build_plant(scenario: Scenario, nominal: Robot | None = None) -> Plant:
     return Plant(
         scenario=scenario,
         nominal=nominal,
-        robot=with_geometry_error(nominal, switches.geometry_error_m, np.random.default_rng(switches.geometry_seed)),
+        robot=misplaced(nominal, switches),
         parameters=starting_guess(nominal, switches.parameters, 1.0).values,
         settings=settings,
     )
+
+
+def misplaced(nominal: Robot, plant: PlantSwitches) -> Robot:
+    """The true robot, with the errors of geometry of a scenario's plant."""
+    rng = np.random.default_rng(plant.geometry_seed)
+    return with_geometry_error(nominal, plant.geometry_error_m, rng, plant.length_error_m, plant.axis_error_rad)
 
 
 @dataclass(frozen=True)

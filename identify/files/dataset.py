@@ -191,10 +191,15 @@ DIMENSIONS = ("parameter", "parameter_2")
 
 def write_covariance(path: Path | str, layout: ParameterLayout, covariance: Array) -> None:
     """Write the covariance (p, p) of a robot's parameters."""
-    labels, units = {name: list(layout.names) for name in DIMENSIONS}, [layout.unit(name) for name in layout.names]
+    write_covariance_of(path, {name: layout.unit(name) for name in layout.names}, covariance)
+
+
+def write_covariance_of(path: Path | str, units: Mapping[str, str], covariance: Array) -> None:
+    """Write the covariance (p, p) of numbers by their names, each with its unit."""
+    labels = {name: list(units) for name in DIMENSIONS}
     described = {"units": "product of the units of both parameters", "long_name": "covariance of the estimates"}
     data = xr.Dataset({VARIABLE: (DIMENSIONS, covariance, described)}, coords=labels)
-    write_groups(path, {"": data.assign_coords(unit=(DIMENSIONS[0], units))})
+    write_groups(path, {"": data.assign_coords(unit=(DIMENSIONS[0], list(units.values())))})
 
 
 def read_covariance(path: Path | str) -> tuple[tuple[str, ...], Array]:

@@ -16,6 +16,7 @@ from identify.scenario.sections import (
     RIG_KNOWN,
     Excitation,
     Filter,
+    Geometry,
     Identification,
     Model,
     Payload,
@@ -53,6 +54,7 @@ class Scenario(Section):
     identification: Identification = Identification()
     payload: Payload = Field(default_factory=Payload)  # made late: its check is one of dynamics, which loads CasADi
     validation: Validation = Validation()
+    geometry: Geometry = Geometry()
 
     @field_validator("renderer")
     @classmethod

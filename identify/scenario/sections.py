@@ -52,6 +52,9 @@ ACTUATOR_KEYS = {
     "joint_damping": ("joint_damping_N_m_s_rad", "joint_damping_N_s_m"),
     "motor_inertia": ("motor_inertia_kg_m2", "motor_mass_kg"),
     "travel_margin": ("travel_margin_rad", "travel_margin_m"),
+    "encoder_noise": ("encoder_noise_rad", "encoder_noise_m"),
+    "encoder_resolution": ("encoder_resolution_rad", "encoder_resolution_m"),
+    "encoder_offset": ("encoder_offset_rad", "encoder_offset_m"),
     "max_joint_velocity": ("max_joint_velocity_rad_s", "max_joint_velocity_m_s"),
 }
 """Settings of the joints: their key where a robot's actuators turn, and where they slide."""
@@ -110,6 +113,12 @@ class Plant(_Friction):
     steps_per_frame: int = quantity(16, "1", "integration steps a frame; elastic joints take more", ge=1, le=10_000)
     geometry_error_m: float = quantity(
         0.0, "m", "standard deviation of each coordinate of the joint centres from the robot file's", ge=0, le=1e-3
+    )
+    length_error_m: float = quantity(
+        0.0, "m", "standard deviation of each length of the legs, as of cranks, from the robot file's", ge=0, le=1e-3
+    )
+    axis_error_rad: float = quantity(
+        0.0, "rad", "standard deviation of each turn of an axis of the legs, of which there are two", ge=0, le=1e-2
     )
     geometry_seed: int = quantity(0, "1", "which of the robots with such errors", ge=0)
     joint_stiffness_N_m_rad: float | None = quantity(
@@ -280,3 +289,32 @@ class Validation(Section):
 
     count: int = quantity(10, "1", "number of unseen trajectories", ge=1, le=1000)
     duration_s: float = quantity(10.0, "s", "length of each", gt=0, le=3600)
+
+
+class Geometry(Section):
+    """Kinematic calibration by static poses, `cmmsim geometry`."""
+
+    poses: int = quantity(60, "1", "number of poses that are measured", ge=1, le=10_000)
+    frames_per_pose: int = quantity(20, "1", "frames whose mean counts as a pose", ge=1, le=10_000)
+    selection: Literal["random", "greedy", "gradient"] = Field(
+        "gradient", description="random poses, the best of the candidates, or those moved along the index's gradient"
+    )
+    criterion: Literal["prediction", "determinant"] = Field(
+        "prediction", description="index: mean error of other poses, or determinant of the information"
+    )
+    candidates: int = quantity(400, "1", "random poses within the travel to choose from", ge=1, le=100_000)
+    measurement: Literal["images", "drawn"] = Field(
+        "images", description="poses through images, or drawn with the noise that the sensor states"
+    )
+    frames: Literal["taught", "unknown"] = Field(
+        "taught", description="base and platform frame as well as the sensor's teaching says, or not known at all"
+    )
+    tolerance_m: float = quantity(1e-3, "m", "standard deviation of places and lengths about the drawing's", gt=0)
+    tolerance_rad: float = quantity(1e-2, "rad", "standard deviation of axes and zero angles about it", gt=0)
+    encoder_noise_rad: float = quantity(1e-5, "rad", "standard deviation of one reading of an encoder", ge=0)
+    encoder_noise_m: float = quantity(1e-6, "m", "the same, where actuators slide", ge=0)
+    encoder_resolution_rad: float = quantity(4.8e-5, "rad", "its step, here of 17 bits; 0: none", ge=0)
+    encoder_resolution_m: float = quantity(1e-6, "m", "the same, where actuators slide", ge=0)
+    encoder_offset_rad: float = quantity(0.0, "rad", "standard deviation of what each reads at zero", ge=0, le=0.05)
+    encoder_offset_m: float = quantity(0.0, "m", "the same, where actuators slide", ge=0, le=0.01)
+    unseen: int = quantity(200, "1", "poses that are not measured and judge the result", ge=1, le=100_000)

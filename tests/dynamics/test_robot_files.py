@@ -154,6 +154,16 @@ def test_joint_centres_are_off_by_normal_errors_of_the_given_size_and_seed(robot
     assert with_geometry_error(robot, 0.0, np.random.default_rng(3)) is robot
 
 
+def test_lengths_and_axes_are_off_by_normal_errors_of_their_own(robot):
+    plants = [with_geometry_error(robot, 0.0, np.random.default_rng(k), 1e-4, 1e-3).geometry for k in range(10)]
+    off = np.array([plant.deviations_from(robot.geometry) for plant in plants])
+    for word, size in (("length", 1e-4), ("axis", 1e-3)):
+        own = off[:, [word in name for name in robot.geometry.number_names]]
+        assert own.shape == (10, 12)
+        assert 1e-3 < chi2.cdf(np.sum(own**2) / size**2, own.size) < 1 - 1e-3
+    assert not off[:, ["joint" in name for name in robot.geometry.number_names]].any()
+
+
 def _gaps(pose, theta, geometry):
     """|A - T| less the link length of every leg."""
     legs = place_legs(geometry, pose, theta)

@@ -6,7 +6,10 @@ import pytest
 from identify import random_streams
 from identify.random_streams import child, mixed_generator, stream_seed
 
-CHILDREN = ("EXCITATION", "UNSEEN", "SEARCH", "ANCHOR", "NOISE", "LATENCY", "PREDICTION", "DESIGN", "LOAD")
+CHILDREN = (
+    *("EXCITATION", "UNSEEN", "SEARCH", "ANCHOR", "NOISE", "LATENCY", "PREDICTION", "DESIGN", "LOAD"),
+    *("STATIC_POSES", "UNSEEN_POSES", "ENCODER_OFFSETS", "ENCODERS", "STATIC_NOISE"),
+)
 MIXED = ("UNCERTAINTY", "INSTRUMENTS", "RESAMPLING", "SAMPLED_POINTS")
 
 
@@ -38,7 +41,9 @@ def test_numbers_are_those_of_every_version():
     assert {name: getattr(random_streams, name) for name in names} == {
         "EXCITATION": 0, "UNSEEN": 1, "SEARCH": 2, "TEACHING": 2, "ANCHOR": 3, "NOISE": 4, "LATENCY": 5,
         "PREDICTION": 6, "DESIGN": 7, "LOAD": 8, "UNCERTAINTY": 5, "INSTRUMENTS": 20, "ROUTES_UNCERTAINTY": 21,
-        "DISTURBED_COPIES": 22, "SAMPLED_POINTS": 1, "RESAMPLING": 301,
+        "DISTURBED_COPIES": 22, "STATIC_POSES": 14,
+        "UNSEEN_POSES": 15, "ENCODER_OFFSETS": 16, "ENCODERS": 17, "STATIC_NOISE": 18, "SAMPLED_POINTS": 1,
+        "RESAMPLING": 301,
     }  # fmt: skip
     assert mixed_generator(21).integers(2**63) == np.random.default_rng(21).integers(2**63)
     assert mixed_generator(20, 7).integers(2**63) == np.random.default_rng([7, 20]).integers(2**63)

@@ -137,7 +137,7 @@ def test_scenario_is_that_of_a_file_and_what_is_none_is_named(tmp_path):
     bad.write_text("name = ", encoding="utf-8")
     with pytest.raises(ScenarioError, match=r"bad\.toml is not valid TOML"):
         load_scenario(bad)
-    with pytest.raises(ScenarioError, match=r"'nope' is neither built in \(paper, quick\) nor a file"):
+    with pytest.raises(ScenarioError, match=r"'nope' is neither built in \(geometry, paper, quick\) nor a file"):
         load_scenario("nope")
     with pytest.raises(ValueError, match="frozen"):
         load_scenario("paper").timing.latency_s = 1.0

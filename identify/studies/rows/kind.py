@@ -88,8 +88,11 @@ NOISE_OFF = Idle(
 PLANT = (
     Idle(
         ("scenario.plant.geometry_seed",),
-        {"scenario.plant.geometry_error_m": lambda error: error == 0},
-        "scenario.plant.geometry_error_m is 0",
+        {
+            f"scenario.plant.{name}": lambda error: error == 0
+            for name in ("geometry_error_m", "length_error_m", "axis_error_rad")
+        },
+        "scenario.plant.geometry_error_m is 0, and so are its other errors of geometry",
     ),
     Idle(
         ("scenario.plant.joint_damping_N_m_s_rad", "scenario.plant.motor_inertia_kg_m2"),

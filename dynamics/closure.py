@@ -1,0 +1,77 @@
+"""Where the loops close: poses of joint coordinates for a robot whose geometry is off, and how they change with that.
+
+The gaps of the loops (`rigid_body.jacobians.loop_closure`) with the geometric numbers as a third argument. A pose is
+where they vanish, so its derivatives follow implicitly: d(q)/d(numbers) = -(d(gaps)/dq)^-1 d(gaps)/d(numbers). One
+compiled function serves all geometries near a nominal one: a search over them compiles nothing.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from dynamics.checks import row_text
+from dynamics.compiled.machine_code import MachineFunction, compiled_functions
+from dynamics.errors import ConvergenceError
+from dynamics.expressions import function
+from dynamics.geometry import RobotGeometry
+from dynamics.kinematics.forward_kinematics import CLOSED, close_loops
+from dynamics.legs.numbers import moved
+from dynamics.rigid_body.jacobians import loop_closure
+
+
+@dataclass(frozen=True)
+class Closure:
+    """Loops of the geometries near a nominal one, which differ from it by deviations (g,), m and rad."""
+
+    nominal: RobotGeometry
+
+    def poses(self, joints: np.ndarray, deviations: np.ndarray, start: np.ndarray) -> np.ndarray:
+        """Poses (N, 6) at which the loops close with joint coordinates (N, n), searched from starts (N, 6).
+
+        Raises ConvergenceError, naming the first row whose loops stay open.
+        """
+        found = self.nearest(joints, deviations, start)
+        if not np.isfinite(found).all():
+            row = int(np.argmin(np.isfinite(found).all(axis=1)))
+            raise ConvergenceError(
+                f"no pose near {row_text(start[row], 4)} closes the loops with the joint coordinates "
+                f"{row_text(joints[row], 4)} of pose {row + 1}"
+            )
+        return found
+
+    def nearest(self, joints: np.ndarray, deviations: np.ndarray, start: np.ndarray) -> np.ndarray:
+        """As `poses`, with NaN for rows whose loops stay open."""
+
+        def gaps(poses: np.ndarray, theta: np.ndarray) -> list[np.ndarray]:
+            return self._function(poses, theta, deviations[None])[:2]
+
+        found, _ = close_loops(gaps, self.nominal.chart, joints, start)
+        found[~(np.abs(gaps(found, joints)[0]).max(axis=(1, 2)) < CLOSED)] = np.nan
+        return found
+
+    def derivatives(
+        self, poses: np.ndarray, joints: np.ndarray, deviations: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """How the platform's coordinates (m) at closed loops (poses (N, 6), joints (N, n)) change with deviations
+        (N, m, g) and with joint coordinates (N, m, n)."""
+        _, by_coordinates, by_joints, by_numbers = self._function(poses, joints, deviations[None])
+        return -np.linalg.solve(by_coordinates, by_numbers), -np.linalg.solve(by_coordinates, by_joints)
+
+    @cached_property
+    def _function(self) -> MachineFunction:
+        key = b"closure of the loops" + self.nominal.digest
+        return compiled_functions(key, lambda: [closure_function(self.nominal)])["closure"]
+
+
+def closure_function(nominal: RobotGeometry) -> ca.Function:
+    """(pose (6,), joints (n,), deviations (g,)) -> gaps of the loops (n,), m^2, and their derivatives with respect to
+    the platform's coordinates (n, m), joint coordinates (n, n) and deviations (n, g)."""
+    pose, joints = ca.SX.sym("pose", 6), ca.SX.sym("joints", len(nominal.legs))
+    parts = [ca.SX.sym(f"leg{k}", len(leg.numbers)) for k, leg in enumerate(nominal.legs, 1)]
+    deviations = ca.vertcat(*parts)
+    legs = [moved(leg, part) for leg, part in zip(nominal.legs, parts, strict=True)]
+    gaps, by_coordinates = loop_closure(nominal, pose, joints, legs)
+    outputs = [gaps, by_coordinates, ca.jacobian(gaps, joints), ca.jacobian(gaps, deviations)]
+    return function("closure", [pose, joints, deviations], outputs)

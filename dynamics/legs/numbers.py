@@ -1,0 +1,100 @@
+"""The geometric numbers of a leg: what decides where it lets its platform joint A be, and a leg with other ones.
+
+Each kind names its own (`Leg.numbers`): coordinates of its joints, lengths, and small turns of its axis, m and rad. A
+turn is counted from the leg at hand, about its own directions: `u` and `v` are across the axis, of a crank along its
+zero direction and across that, and `crank_zero` is about the axis. So the numbers of a leg are those of another plus a
+vector of deviations, and deviations may be symbols, whose leg has derivatives.
+"""
+
+from typing import Any, TypeVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from dynamics.kinematics.platform import rotation_matrix
+from dynamics.legs.leg import Leg
+
+AnyKind = TypeVar("AnyKind", bound=Leg)
+POINTS = ("base_joint", "platform_joint")
+
+
+def unit_of(number: str) -> str:
+    """Unit of a geometric number, rad or m."""
+    return "rad" if _is_turn(number) else "m"
+
+
+def values(leg: Leg) -> np.ndarray:
+    """The numbers (k,) of a leg, m; its turns are zero."""
+    return np.array([_value(leg, name) for name in leg.numbers])
+
+
+def moved(leg: AnyKind, deviations: ArrayLike | ca.SX) -> AnyKind:
+    """The leg with numbers that are off by deviations (k,), m and rad.
+
+    With symbols for deviations it is one of symbols, whose expressions have derivatives, and no more than these.
+    """
+    by = deviations if isinstance(deviations, ca.SX) else ca.SX(ca.DM(np.asarray(deviations, dtype=float)))
+    off = dict(zip(leg.numbers, ca.vertsplit(by), strict=True))
+    changes: dict[str, Any] = {
+        field: getattr(leg, field) + ca.vertcat(*[off.get(f"{field}.{axis}", ca.SX(0)) for axis in "xyz"])
+        for field in POINTS
+    }
+    changes |= {name: getattr(leg, name) + off[name] for name in leg.numbers if "." not in name and not _is_turn(name)}
+    if leg.turned:
+        turns = [off.get(name, ca.SX(0)) for name in _turns(leg)]
+        frame = ca.SX(_frame(leg)) @ rotation_matrix(ca.vertcat(*turns))
+        changes |= {field: frame[:, column] for field, column in zip(leg.turned, (2, 0), strict=False)}
+    return leg.model_copy(update={field: _number(value) for field, value in changes.items()})
+
+
+def deviations(leg: Leg, nominal: Leg) -> np.ndarray:
+    """How far the numbers of a leg are from those of a nominal one of its kind (k,), m and rad; undoes `moved`."""
+    off = dict(zip(leg.numbers, values(leg) - values(nominal), strict=True))
+    if leg.turned:
+        between = _frame(nominal).T @ _frame(leg)
+        if len(leg.turned) == 1:  # of an axis alone: Rx(u) Ry(v) z
+            x, y, z = between[:, 2]
+            turns = [np.arctan2(-y, z), np.arcsin(x), 0.0]
+        else:
+            turns = list(Rotation.from_matrix(between).as_euler("XYZ"))
+        off |= {name: turn for name, turn in zip(_turns(leg), turns, strict=True) if name in off}
+    return np.array(list(off.values()))
+
+
+def _turns(leg: Leg) -> tuple[str, str, str]:
+    return f"{leg.turned[0]}.u", f"{leg.turned[0]}.v", "crank_zero"
+
+
+def _is_turn(number: str) -> bool:
+    return number == "crank_zero" or number.endswith((".u", ".v"))
+
+
+def _value(leg: Leg, number: str) -> float:
+    field, _, entry = number.partition(".")
+    if _is_turn(number):
+        return 0.0
+    value = getattr(leg, field)
+    return float(value["xyz".index(entry)] if entry else value)
+
+
+def _frame(leg: Leg) -> np.ndarray:
+    """Right-handed axes (3, 3) as columns, the last one the leg's axis, the first one its zero direction if it has
+    one."""
+    axis = getattr(leg, leg.turned[0])
+    if len(leg.turned) == 2:
+        first = getattr(leg, leg.turned[1])
+    else:
+        across = np.cross(np.eye(3)[np.argmin(np.abs(axis))], axis)
+        first = across / np.linalg.norm(across)
+    return np.column_stack([first, np.cross(axis, first), axis])
+
+
+def _number(value: ca.SX) -> Any:
+    """An expression without symbols as what a field holds."""
+    if not value.is_constant():
+        return value
+    array = np.array(ca.DM(value)).ravel()
+    array.setflags(write=False)
+    return float(array[0]) if len(array) == 1 else array

@@ -1,0 +1,82 @@
+"""The command ``geometry``: where a robot's joints, axes and zero angles are. Heavy imports are late."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from identify.commands.options import (
+    JsonFile,
+    Quiet,
+    RobotOption,
+    ScenarioArgument,
+    Settings,
+    new_folder,
+    parse_settings,
+    tell,
+)
+from identify.files.run_folder import new_run_folder
+from identify.progress import print_table, print_warnings, terminal_progress
+
+
+def geometry(
+    scenario: ScenarioArgument = "geometry",
+    out: Annotated[Path | None, new_folder("runs/geometry-SEED")] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of poses, offsets and noise.")] = 0,
+    robot: RobotOption = None,
+    settings: Settings = None,
+    poses: Annotated[
+        Path | None, typer.Option("--poses", metavar="FILE", help="Your own poses in place of simulated ones.")
+    ] = None,
+    json: JsonFile = None,
+    quiet: Quiet = False,
+) -> None:
+    """Calibrate the geometry of a robot with the optical CMM.
+
+    The robot stands at poses that show most of its geometry. Joint encoders read its joints, the mean of some frames
+    its pose; joint places, axes, zero angles and lengths follow, each with its standard deviation. Numbers and
+    combinations that the poses cannot tell stay where the robot file has them, and are named. The scenario's [geometry]
+    says how; its [plant] how far the simulated robot is off.
+
+    Reads a scenario, or poses of your own: a JSON file with joints (N, n) in rad or m, joint_std (n,), poses (N, 6) in
+    m and rad and covariances (N, 6, 6), as poses.json is; base_covariance and platform_covariance (6, 6) say how well
+    the frames of the measurement are known, and are left out where they are not. It writes geometry.json, geometry.md,
+    covariance.nc, poses.json, and robot.toml, the calibrated robot, which every other command takes.
+
+    \b
+    Examples:
+      cmmsim geometry
+      cmmsim geometry --robot ups6 --set geometry.measurement=drawn
+      cmmsim geometry --set geometry.poses=30 --set geometry.selection=random
+      cmmsim geometry --robot mine.toml --poses measured.json
+      cmmsim run quick --robot runs/geometry-0/robot.toml
+    """
+    from dynamics import load_robot
+    from identify.geometry.run import run_geometry
+    from identify.geometry.static_poses import read_static_poses
+    from identify.scenario import load_scenario
+
+    changes = ({} if robot is None else {"robot": robot}) | parse_settings(settings)
+    chosen = load_scenario(scenario).with_overrides(changes)
+    folder = new_run_folder(out or Path("runs") / f"geometry-{seed}").path
+    own = None if poses is None else read_static_poses(poses, load_robot(chosen.robot))
+    outcome = run_geometry(chosen, seed, terminal_progress(quiet), own)
+    outcome.write(folder)
+    print_warnings(outcome.entry["warnings"])
+    tell(outcome.entry, json, quiet, lambda: _print(outcome.entry, folder))
+
+
+def _print(entry: dict[str, Any], folder: Path) -> None:
+    rows = [
+        (said, *(f"{value:.2f}" for value in (*entry[key]["position_rms_um"], *entry[key]["orientation_rms_urad"])))
+        for key, said in (("uncalibrated", "before"), ("unseen", "after"), ("expected", "expected after"))
+        if key in entry
+    ]
+    header = ("", "x\num", "y\num", "z\num", "alpha\nurad", "beta\nurad", "gamma\nurad")
+    print_table(header, rows, (), "rms error of poses that were not measured")
+    told = [name for name, one in entry["parameters"].items() if one["observable"]]
+    typer.echo(
+        f"{len(told)} of {len(entry['parameters'])} geometric numbers are told by {entry['poses']} poses; "
+        f"{len(entry['cannot_be_told'])} combinations cannot be told"
+    )
+    typer.echo(f"files: {folder}")

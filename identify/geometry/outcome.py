@@ -1,0 +1,196 @@
+"""What a calibration of geometry leaves: its figures, the calibrated robot, the poses, and a page in words."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dynamics.robot_file import RobotDescription
+from dynamics.robot_text import robot_text
+from identify.arrays import Array
+from identify.files.atomic import atomic_contents
+from identify.files.dataset import write_covariance_of
+from identify.files.run_folder import rms_figures, save_files
+from identify.files.versions import versions
+from identify.geometry.calibration import Calibration, PoseModel, frame_columns, seen_between
+from identify.geometry.experiment import true_poses
+from identify.geometry.observability import combinations
+from identify.geometry.selection import Candidates
+from identify.geometry.static_poses import StaticPoses
+from identify.scenario import Scenario
+
+NOISY = 4.0
+"""Standard deviations of the noise ratio above one at which the model or the stated noise is said to be wrong."""
+
+
+@dataclass(frozen=True)
+class GeometryOutcome:
+    """A calibration by poses; true deviations (g,) and the chosen poses where they are simulated, None otherwise;
+    unseen poses to judge it by, and the candidates among which the poses were chosen."""
+
+    scenario: Scenario
+    seed: int
+    model: PoseModel
+    calibration: Calibration
+    data: StaticPoses
+    lost_frames: int
+    true: Array | None
+    unseen: Candidates
+    chosen: Candidates | None
+    among: Candidates
+
+    def write(self, folder: Path) -> None:
+        """Write geometry.json, geometry.md, covariance.nc, poses.json, robot.toml and scenario.toml, all or none."""
+        robot = self.calibration.robot
+        description = RobotDescription(robot.name, robot.geometry, robot.parameter_sets)
+        said = f"{robot.name} with the geometry of {len(self.data)} static poses; see geometry.json beside this file"
+        files = {
+            "geometry.json": self.entry,
+            "geometry.md": geometry_markdown(self.entry),
+            "poses.json": self.data.entry(robot),
+            "robot.toml": robot_text(description, [said]),
+            "scenario.toml": self.scenario.to_toml(),
+        }
+        with atomic_contents(folder) as temporary:
+            save_files(temporary, files)
+            units = dict(zip(robot.geometry.number_names, robot.geometry.number_units, strict=True))
+            write_covariance_of(temporary / "covariance.nc", units, self.calibration.covariance)
+
+    @cached_property
+    def entry(self) -> dict[str, Any]:
+        """The content of geometry.json."""
+        found, names = self.calibration, self.calibration.nominal.geometry.number_names
+        entry: dict[str, Any] = {
+            "scenario": self.scenario.name,
+            "seed": self.seed,
+            "versions": versions(),
+            "robot": found.nominal.name,
+            "poses": len(self.data),
+            "frames_per_pose": self.scenario.geometry.frames_per_pose,
+            "lost_frames": self.lost_frames,
+            "frames": "taught" if found.frames_known else "unknown",
+            "frame_errors": {"base": found.frames[:6], "platform": found.frames[6:]},
+            "parameters": self._parameters(),
+            "cannot_be_told": list(combinations(names, found.covariance, found.prior_std)),
+            "noise_ratio": found.noise_ratio,
+            "noise_ratio_std": found.noise_ratio_std,
+            "warnings": self._warnings(),
+            **self._judged(),
+        }
+        if self.chosen is not None:
+            entry["selection"] = self._compared(self.chosen)
+        return entry
+
+    def _parameters(self) -> dict[str, dict[str, Any]]:
+        found, geometry = self.calibration, self.calibration.nominal.geometry
+        true = [None] * len(geometry.numbers) if self.true is None else (geometry.numbers + self.true).tolist()
+        columns = {
+            "unit": geometry.number_units,
+            "nominal": geometry.numbers.tolist(),
+            "true": true,
+            "estimate": (geometry.numbers + found.deviations).tolist(),
+            "std": found.std.tolist(),
+            "observable": found.observable.tolist(),
+        }
+        rows = zip(*columns.values(), strict=True)
+        return {
+            name: dict(zip(columns, row, strict=True)) for name, row in zip(geometry.number_names, rows, strict=True)
+        }
+
+    def _warnings(self) -> list[str]:
+        found, said = self.calibration, []
+        off = (found.noise_ratio - 1) / found.noise_ratio_std
+        if off > NOISY:
+            said.append(
+                f"the poses miss the calibrated robot by {np.sqrt(found.noise_ratio):.2f} times what is stated of "
+                f"sensor and encoders ({off:.0f} standard deviations more than chance): intervals are too short, or "
+                f"the robot is not what {found.nominal.name} says, as where legs bend or joints have play"
+            )
+        missing = 0 if self.chosen is None else len(self.chosen) - len(self.data)
+        if missing:
+            said.append(f"{missing} of {missing + len(self.data)} poses are left out: the sensor lost all their frames")
+        return said
+
+    def _judged(self) -> dict[str, Any]:
+        """By how much poses that were not measured are missed, as expected, and in truth where that is known."""
+        found, robot, closure = self.calibration, self.calibration.nominal, self.model.closure
+        joints, poses = self.unseen.joints, self.unseen.poses
+        columns, covariance = closure.derivatives(poses, joints, found.deviations)[0], found.covariance
+        if not found.frames_known:  # what the geometry lacks is then in the frames, and both together are known
+            of_frames = frame_columns(robot, poses)[:, list(robot.geometry.chart.freedoms)]
+            columns, covariance = np.concatenate([columns, of_frames], axis=2), found.joint_covariance
+        judged = {"expected": self._spread(columns, covariance)}
+        if self.true is None:
+            return judged | {"unseen": rms_figures(np.full((1, 6), np.nan))}
+        stands = true_poses(robot, self.true, joints, poses)
+        predicted = seen_between(closure.poses(joints, found.deviations, poses), found.frames)
+        return judged | {"unseen": rms_figures(predicted - stands), "uncalibrated": rms_figures(poses - stands)}
+
+    def _compared(self, chosen: Candidates) -> dict[str, Any]:
+        """What unseen poses are expected to be missed by after the chosen poses, after as many random ones, and after
+        twice as many."""
+        count, none = len(chosen), np.zeros(len(self.model.scale))
+        sets = {"chosen": chosen, "random": self.among.of(list(range(count)))}
+        if len(self.among) >= 2 * count:
+            sets["twice as many random"] = self.among.of(list(range(2 * count)))
+        columns = self.model.columns(self.unseen.joints, self.unseen.poses, none)[0]
+        return {
+            name: {"poses": len(one)}
+            | self._spread(columns, np.asarray(np.linalg.inv(one.information + np.eye(len(none)))))
+            for name, one in sets.items()
+        }
+
+    def _spread(self, columns: Array, covariance: Array) -> dict[str, list[float]]:
+        """Expected errors of the unseen poses, for columns (N, m, u) and a covariance (u, u) of the unknowns."""
+        spread = np.sqrt(np.einsum("nmu,uv,nmv->nm", columns, covariance, columns))
+        return rms_figures(self.calibration.nominal.geometry.chart.lifted(spread))
+
+
+def geometry_markdown(entry: dict[str, Any]) -> str:
+    """The result in words and a table."""
+    told = [name for name, one in entry["parameters"].items() if one["observable"]]
+    lines = [
+        f"# Geometry of {entry['robot']}",
+        "",
+        f"From {entry['poses']} static poses of {entry['frames_per_pose']} frames each; {entry['lost_frames']} frames "
+        f"were lost. The poses tell {len(told)} of {len(entry['parameters'])} geometric numbers; the others stay where "
+        "the robot file has them, give or take the stated tolerance.",
+        "",
+        f"Residuals are {np.sqrt(entry['noise_ratio']):.3f} times what is stated of sensor and encoders.",
+    ]
+    lines += [f"\nWarning: {text}." for text in entry["warnings"]]
+    said = {
+        "uncalibrated": "Before the calibration, poses that were not measured are missed by",
+        "unseen": "After it, they are missed by",
+        "expected": "Expected from the covariance of the geometry",
+    }
+    figures = {f"{text} (root mean square)": entry[key] for key, text in said.items() if key in entry}
+    names = {"chosen": "chosen poses", "random": "random poses", "twice as many random": "random poses"}
+    for key, one in entry.get("selection", {}).items():
+        figures[f"What {one['poses']} {names[key]} are expected to leave beside the error of teaching"] = one
+    for text, one in figures.items():
+        if np.isfinite(one["position_rms_um"]).all():
+            lines += ["", f"{text}: {_figures(one)}."]
+    lines += ["", "| number | nominal | true | estimate | standard deviation | told |", "|---|--:|--:|--:|--:|---|"]
+    for name, one in entry["parameters"].items():
+        values = ["" if one[key] is None else f"{1e3 * one[key]:.4f}" for key in ("nominal", "true", "estimate", "std")]
+        lines.append(f"| {name} [m{one['unit']}] | {' | '.join(values)} | {'yes' if one['observable'] else 'no'} |")
+    if entry["cannot_be_told"]:
+        lines += [
+            "",
+            "Combinations that these poses cannot tell (numbers that move together, and no pose shows it):",
+            "",
+        ]
+        lines += [f"- {text}" for text in entry["cannot_be_told"]]
+        if entry["frames"] == "unknown":
+            lines += ["", "Nothing was known of the frames of base and platform: their places are among these."]
+    return "\n".join(lines) + "\n"
+
+
+def _figures(figures: dict[str, Any]) -> str:
+    position, turn = (
+        ", ".join(f"{value:.2f}" for value in figures[key]) for key in ("position_rms_um", "orientation_rms_urad")
+    )
+    return f"{position} um in x, y, z and {turn} urad in alpha, beta, gamma"

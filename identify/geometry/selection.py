@@ -1,0 +1,214 @@
+"""Which poses to measure: chosen by an observability index over candidates within the travel.
+
+The index is the determinant of the information about geometry and frames together (the D-optimal one, Borm and Menq's
+O1), or what the calibrated robot will miss poses by, on average over the candidates (the I-optimal one). Poses are
+taken one by one from the candidates (greedy), exchanged until none is better, and then moved in joint space along the
+index's gradient, all at once, within the travel.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from cmmsim.visibility import SightLines
+from dynamics import Robot
+from dynamics.workspace import measure
+from identify.arrays import Array
+from identify.errors import EstimationError
+from identify.excitation.constraints import required_stickers
+from identify.geometry.calibration import PoseModel, whiteners
+from identify.progress import Advance
+
+STEP = 1e-5
+"""Of joint coordinates, as a share of the travel: the differences behind the gradient."""
+GRADIENT_STEPS = 40
+ROUNDS = 4
+"""Of such searches, each without the poses that the one before would have led astray."""
+EXCHANGES = 3
+"""Passes over all poses at most."""
+TRIALS = 40
+"""Random joint coordinates drawn a candidate that is wanted, at most."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Where a robot may stand to be measured: within its travel (rad or m), far from singularities, and in sight, where
+    that is asked for."""
+
+    robot: Robot
+    travel: float
+    least_leverage: float
+    most_condition: float
+    sight: SightLines | None
+
+    def allowed(self, poses: Array) -> NDArray[np.bool_]:
+        """Whether the robot may stand at each pose (N, 6)."""
+        measures = measure(self.robot, poses)
+        good = measures.reachable & (np.abs(measures.theta) <= self.travel * (1 + 1e-9)).all(axis=1)
+        good &= measures.leverage.min(axis=1) >= self.least_leverage
+        good &= measures.platform_condition <= self.most_condition
+        return np.array([ok and self._in_sight(pose) for ok, pose in zip(good, poses, strict=True)], dtype=bool)
+
+    def _in_sight(self, pose: Array) -> bool:
+        return self.sight is None or bool(self.sight.visible(pose)[self._stickers].all())
+
+    @cached_property
+    def _stickers(self) -> list[int]:
+        return [] if self.sight is None else required_stickers(self.sight, self.robot.home_pose)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Joint coordinates (N, n), rad or m, the nominal robot's poses (N, 6) there, and what each pose would tell:
+    whitened columns (N, m, u) of the unknowns in units of their prior."""
+
+    joints: Array
+    poses: Array
+    columns: Array
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def of(self, rows: Array | list[int]) -> "Candidates":
+        """Some of them."""
+        return Candidates(self.joints[rows], self.poses[rows], self.columns[rows])
+
+    @property
+    def information(self) -> Array:
+        """Of all together (u, u)."""
+        return np.asarray(np.einsum("nmu,nmv->uv", self.columns, self.columns))
+
+
+@dataclass(frozen=True)
+class Designer:
+    """Chooses poses for a model; covariance (6, 6): of a pose's mean, joint_std (n,): of its encoders' readings;
+    criterion: `determinant` or `prediction`."""
+
+    model: PoseModel
+    limits: Limits
+    covariance: Array
+    joint_std: Array
+    criterion: str = "determinant"
+
+    def candidates(self, count: int, rng: np.random.Generator) -> Candidates:
+        """Random joint coordinates within the travel, of which the poses are allowed.
+
+        Raises EstimationError where hardly any are.
+        """
+        kept_joints: list[Array] = []
+        kept_poses: list[Array] = []
+        robot, travel = self.limits.robot, self.limits.travel
+        for _ in range(TRIALS):
+            joints = rng.uniform(-travel, travel, (count, robot.layout.joints))
+            poses = self._poses(joints, np.tile(robot.home_pose, (count, 1)))
+            known = np.flatnonzero(np.isfinite(poses).all(axis=1))
+            known = known[self.limits.allowed(poses[known])]
+            kept_joints.append(joints[known])
+            kept_poses.append(poses[known])
+            if sum(map(len, kept_joints)) >= count:
+                break
+        joints, poses = (np.concatenate(parts)[:count] for parts in (kept_joints, kept_poses))
+        if len(joints) < count:
+            raise EstimationError(
+                f"only {len(joints)} of {count * TRIALS} random joint coordinates of {robot.name} within its travel "
+                f"({travel:.3g} {robot.layout.joint_unit}) are poses where it may stand and be seen; {count} are wanted"
+            )
+        return self.seen(joints, poses)
+
+    def seen(self, joints: Array, poses: Array) -> Candidates:
+        """What poses (N, 6) of joint coordinates (N, n) would tell."""
+        none, free = np.zeros(len(self.model.scale)), list(self.limits.robot.geometry.chart.freedoms)
+        columns, by_joints = self.model.columns(joints, poses, none)
+        return Candidates(
+            joints, poses, whiteners(self.covariance[np.ix_(free, free)], by_joints, self.joint_std) @ columns
+        )
+
+    def greedy(self, among: Candidates, count: int, advance: Advance = lambda n=1: None) -> Candidates:
+        """The best candidates one by one, then exchanged until no other is better; the same one may stand twice."""
+        weight, chosen = self._weight(among), list[int]()
+        own = among.columns.swapaxes(1, 2) @ among.columns
+        information = np.eye(len(weight))
+        for _ in range(count):
+            chosen.append(self._best(among, information, weight))
+            information = information + own[chosen[-1]]
+            advance()
+        for _ in range(EXCHANGES):
+            before = list(chosen)
+            for place in range(count):
+                # Summed anew: the difference of two sums would hide what the other poses tell least.
+                information = np.eye(len(weight)) + own[chosen[:place] + chosen[place + 1 :]].sum(axis=0)
+                chosen[place] = self._best(among, information, weight)
+            if chosen == before:
+                break
+        return among.of(chosen)
+
+    def moved(self, chosen: Candidates, among: Candidates) -> Candidates:
+        """The poses after a search along the gradient of the index in joint space, at which it is no worse; those that
+        it would lead to where the robot may not stand are held where they were."""
+        weight, held, best = self._weight(among), np.zeros(len(chosen), dtype=bool), chosen
+        for _ in range(ROUNDS):
+            joints = self._along_gradient(chosen, held, weight)
+            poses = self._poses(joints, chosen.poses)
+            closed = np.flatnonzero(np.isfinite(poses).all(axis=1))
+            forbidden = np.ones(len(chosen), dtype=bool)
+            forbidden[closed] = ~self.limits.allowed(poses[closed])
+            joints[forbidden], poses[forbidden] = chosen.joints[forbidden], chosen.poses[forbidden]
+            best = min(best, self.seen(joints, poses), key=lambda found: self._index(found, weight)[0])
+            if not forbidden.any():
+                break
+            held |= forbidden
+        return best
+
+    def _along_gradient(self, chosen: Candidates, held: NDArray[np.bool_], weight: Array) -> Array:
+        """Joint coordinates (N, n) within the travel with the best index nearby, some poses held."""
+        shape, travel, near = chosen.joints.shape, self.limits.travel, chosen.poses
+
+        def index(values: Array) -> tuple[float, Array]:
+            nonlocal near
+            joints = values.reshape(shape) * travel
+            poses = self._poses(joints, near)
+            if not np.isfinite(poses).all():
+                return np.inf, np.zeros(values.size)
+            near, at = poses, self.seen(joints, poses)
+            worth, spread = self._index(at, weight)
+            pull, gradient = np.einsum("uv,nmv->nmu", spread, at.columns), np.empty(shape)
+            for joint in range(shape[1]):
+                ahead = joints + STEP * travel * np.eye(shape[1])[joint]
+                columns = self.seen(ahead, self._poses(ahead, poses)).columns
+                gradient[:, joint] = -2 * np.einsum("nmu,nmu->n", pull, (columns - at.columns) / STEP)
+            return worth, gradient.ravel()
+
+        start, free = chosen.joints / travel, ~held[:, None]
+        low, high = np.where(free, -1.0, start), np.where(free, 1.0, start)
+        bounds = list(zip(low.ravel(), high.ravel(), strict=True))
+        steps = {"maxiter": GRADIENT_STEPS}
+        found = minimize(index, start.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options=steps)
+        return np.asarray(found.x.reshape(shape) * travel)
+
+    def _index(self, poses: Candidates, weight: Array) -> tuple[float, Array]:
+        """The index of poses, smaller is better, and minus its derivative by their information (u, u)."""
+        covariance = np.asarray(np.linalg.inv(np.eye(len(weight)) + poses.information), dtype=float)
+        if self.criterion == "determinant":
+            return float(np.linalg.slogdet(covariance)[1]), covariance
+        cost = float(np.sum(weight * covariance))
+        return float(np.log(cost)), np.asarray(covariance @ weight @ covariance / cost, dtype=float)
+
+    def _best(self, among: Candidates, information: Array, weight: Array) -> int:
+        """The candidate that improves the index most."""
+        covariance = np.linalg.inv(information)
+        spread = among.columns @ covariance
+        inner = np.eye(among.columns.shape[1]) + spread @ among.columns.swapaxes(1, 2)
+        if self.criterion == "determinant":
+            return int(np.argmax(np.linalg.slogdet(inner)[1]))
+        return int(np.argmax(np.einsum("nmu,nmu->n", np.linalg.solve(inner, spread), spread @ weight)))
+
+    def _weight(self, among: Candidates) -> Array:
+        """What unknowns cost (u, u): mean square error of the candidates' coordinates, each in units of its noise."""
+        return among.information / len(among)
+
+    def _poses(self, joints: Array, start: Array) -> Array:
+        """The nominal robot's poses (N, 6); NaN where the loops do not close."""
+        return self.model.closure.nearest(joints, np.zeros(len(self.model.tolerance)), start)
