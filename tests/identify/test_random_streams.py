@@ -8,6 +8,7 @@ from identify.random_streams import child, mixed_generator, stream_seed
 
 CHILDREN = (
     *("EXCITATION", "UNSEEN", "SEARCH", "ANCHOR", "NOISE", "LATENCY", "PREDICTION", "DESIGN", "LOAD"),
+    *("CALIBRATION", "MEAN_LATENCY"),
     *("STATIC_POSES", "UNSEEN_POSES", "ENCODER_OFFSETS", "ENCODERS", "STATIC_NOISE"),
 )
 MIXED = ("UNCERTAINTY", "INSTRUMENTS", "RESAMPLING", "SAMPLED_POINTS")
@@ -40,7 +41,7 @@ def test_numbers_are_those_of_every_version():
     names = [name for name in vars(random_streams) if name.isupper()]
     assert {name: getattr(random_streams, name) for name in names} == {
         "EXCITATION": 0, "UNSEEN": 1, "SEARCH": 2, "TEACHING": 2, "ANCHOR": 3, "NOISE": 4, "LATENCY": 5,
-        "PREDICTION": 6, "DESIGN": 7, "LOAD": 8, "UNCERTAINTY": 5, "INSTRUMENTS": 20, "ROUTES_UNCERTAINTY": 21,
+        "PREDICTION": 6, "DESIGN": 7, "LOAD": 8, "CALIBRATION": 9, "MEAN_LATENCY": 10, "UNCERTAINTY": 5, "INSTRUMENTS": 20, "ROUTES_UNCERTAINTY": 21,
         "DISTURBED_COPIES": 22, "STATIC_POSES": 14,
         "UNSEEN_POSES": 15, "ENCODER_OFFSETS": 16, "ENCODERS": 17, "STATIC_NOISE": 18, "SAMPLED_POINTS": 1,
         "RESAMPLING": 301,
