@@ -43,7 +43,7 @@ def mixed_robot(folder: Path) -> dynamics.Robot:
     lines += [
         *("[parameters.initial]", "platform = { mass = 24.0, Ixx = 0.178, Iyy = 0.19, Izz = 0.35 }"),
         *("slider = { mass = 1.4, Ixx = 0.1, Iyy = 0.1, Izz = 0.1 }", "joint = { coulomb = 1.5, viscous = 40.0 }"),
-        "joint_pid = { lp = 4000.0, li = 4300.0, ld = 170.0 }",
+        'joint_pid = { lp = 4000.0, li = 4300.0, ld = 170.0, unit = "N/m" }',
     ]
     for name in ("link", "cylinder", "rod"):
         lines.append(f"{name} = {{ mass = 1.1, Ixx = 0.0081, Iyy = 0.0079, Izz = 0.0006 }}")
