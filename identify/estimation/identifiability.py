@@ -137,16 +137,21 @@ def prior_share(rows: Array, uncertainty: Uncertainty) -> Array:
     return np.asarray((combined_std(rows, uncertainty.of_guess) / combined_std(rows, uncertainty.covariance)) ** 2)
 
 
-def scale_warnings(anchor: ScaleAnchor, share: float) -> tuple[str, ...]:
-    """One line where an instrument was to fix the scale, and the starting guess makes most of the variance, a `share`,
-    of the controller's gain."""
-    if anchor.value is None or share <= RESTS_ON_PRIOR:
+SCALE_KNOWN = 0.015
+"""Standard deviation of the common factor, as a share of it, that the starting values may leave where an instrument was
+to fix it."""
+
+
+def scale_warnings(anchor: ScaleAnchor, left: float) -> tuple[str, ...]:
+    """One line where an instrument was to fix the scale, and errors of the starting values alone leave the controller's
+    gain, which poses show but for the scale, uncertain by this share."""
+    if anchor.value is None or left <= SCALE_KNOWN:
         return ()
     return (
         f"the scale anchor {anchor.name} does not fix the scale of this robot: poses show what was measured only in "
-        f"sums with other parameters, and {share:.0%} of the variance of joint_pid.lp comes from the starting values; "
-        "all that is given in kg, N m or N is as good as these: take identification.scale_anchor = joint_gain, or "
-        "state in identification.prior what else was weighed",
+        f"sums with other parameters, and the starting values of these leave joint_pid.lp uncertain by {left:.1%}; all "
+        "that is given in kg, N m or N is as uncertain: take identification.scale_anchor = joint_gain, or state in "
+        "identification.prior what else was weighed",
     )
 
 
@@ -233,7 +238,7 @@ def judge(
     base, known = base_parameters(structural_regressor(robot), robot.layout), problem.known_information()
     criterion = identifiability(guess, robot, model_holds=explanation.model_holds)
     each = np.eye(len(estimate))
-    share = prior_share(each, uncertainty)
+    gain = robot.layout.names.index("joint_pid.lp")
     conditioned = conditioning(uncertainty.information, known, base, guess, estimate)
     bounded = bounded_estimate(
         estimate,
@@ -246,7 +251,7 @@ def judge(
     of_the_records = (warning for run in problem.runs for warning in run.warnings())
     return Judgement(
         identifiable=criterion.judge(each, uncertainty.covariance),
-        prior_share=share,
+        prior_share=prior_share(each, uncertainty),
         common_share=np.diag(uncertainty.of_common) / np.diag(uncertainty.covariance),
         intervals=bounded.intervals(each),
         groups=group_estimates(base, guess, criterion, estimate, uncertainty),
@@ -260,7 +265,7 @@ def judge(
             *explanation.warnings(),
             *bounded.warnings(),
             *conditioned.warnings(),
-            *scale_warnings(problem.anchor, share[robot.layout.names.index("joint_pid.lp")]),
+            *scale_warnings(problem.anchor, float(np.sqrt(uncertainty.of_guess[gain, gain]) / estimate[gain])),
         ),
     )
 
