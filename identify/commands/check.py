@@ -48,8 +48,16 @@ def check(
     values = chosen.parameter_sets[name].vector
     findings = check_robot(chosen, values, given, terminal_progress(quiet))
     failed = [finding for finding in findings if not finding.ok]
-    rows = [("yes" if finding.ok else "NO", finding.check, finding.text) for finding in findings]
-    header, title = ("ok", "check", "finding"), f"{chosen.name}, parameters `{name}`"
+    rows = [
+        (
+            "yes" if finding.ok else "NO",
+            finding.check,
+            "" if finding.limit is None else f"{finding.limit:.3g}",
+            finding.text,
+        )
+        for finding in findings
+    ]
+    header, title = ("ok", "check", "limit", "finding"), f"{chosen.name}, parameters `{name}`"
     entry = {"ok": not failed, "findings": [finding.entry() for finding in findings]}
     tell(entry, json, quiet, lambda: print_table(header, rows, header, title))
     if failed:

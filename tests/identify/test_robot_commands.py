@@ -181,7 +181,7 @@ def test_command_writes_numbers_and_figures(mapped, tmp_path, monkeypatch, capsy
     assert numbers["range_from_home"]["x_m"][1] == pytest.approx(0.0549, abs=1e-3)
     for name in ("travel.png", "conditioning.png"):
         assert (tmp_path / "map" / name).read_bytes().startswith(b"\x89PNG")
-    assert "from home within travel" in capsys.readouterr().out
+    assert "from home, within the joints' travel" in capsys.readouterr().out
 
 
 def test_import_writes_a_robot_file_that_every_command_takes_or_nothing(capfd, tmp_path):
