@@ -22,7 +22,7 @@ import cmmsim
 known_to = [0.0, 0.03, 0.1]  # px, standard deviation of each principal point
 
 # %%
-# ``shift_camera`` moves the true principal point of one camera. It is called before the first measurement, so the sensor
+# ``move_rig`` moves the true cameras, here their principal points. It is called before the first measurement, so the sensor
 # also teaches itself with the wrong cameras, as a real one would: what is wrong in base and platform alike cancels. The
 # platform then moves along a small closed path.
 
@@ -37,8 +37,8 @@ def run(std_px: float, draw: int) -> dict[str, float]:
     """Root mean square of the position errors, what was claimed, and the frames lost."""
     sensor = cmmsim.load_sensor("ctrack780", seed=draw, renderer="analytic")
     rng = np.random.default_rng(draw)
-    for side in (0, 1):
-        sensor.shift_camera(side, std_px * rng.standard_normal(2))
+    names = ("left.cx_px", "left.cy_px", "right.cx_px", "right.cy_px")
+    sensor.move_rig({name: std_px * rng.standard_normal() for name in names})
     poses = sensor.home + np.hstack([path, tilt])
     measured = [sensor.measure(pose) for pose in poses]
     seen = [(one, pose) for one, pose in zip(measured, poses, strict=True) if one.ok]
@@ -89,9 +89,6 @@ axes.legend()
 plt.show()
 
 # %%
-# So the covariance of a measurement knows the noise of the pixels, and not the cameras. That is how the testbed is today:
-#
-# - a sensor file holds *one* set of cameras; they draw the images, and the estimator takes them as they are;
-# - ``shift_camera`` moves a true principal point, in Python; no scenario can ask for it;
-# - what ``cmmsim calibrate`` leaves unknown stands in its ``calibration.json``, with covariance, and is part of no pose's
-#   covariance and of no parameter's interval.
+# So the covariance of a measurement knows the noise of the pixels, and not the cameras. A scenario can tell the estimator how
+# well it knows them: ``rig.known`` takes the covariance of a calibration, and its error, the same in all poses of a run, is
+# then estimated beside the robot's parameters. The tutorial of the same name shows how.

@@ -14,9 +14,10 @@ path = 0.01 * np.stack([np.cos(turn), np.sin(turn), np.sin(2 * turn)], axis=1)
 for draw in range(3):
     sensor = cmmsim.load_sensor("ctrack780", seed=draw, renderer="analytic")
     rng = np.random.default_rng(draw)
-    for side, name in enumerate(("left", "right")):
-        std = [found[f"{name}.{axis}_px"]["std"] for axis in ("cx", "cy")]
-        sensor.shift_camera(side, rng.normal(0, std))  # before anything is measured or taught
+    names = ("left.cx_px", "left.cy_px", "right.cx_px", "right.cy_px")
+    sensor.move_rig(
+        {name: rng.normal(0, found[name]["std"]) for name in names}
+    )  # before anything is measured
     poses = sensor.home + np.hstack([path, np.zeros_like(path)])
     measured = [sensor.measure(pose) for pose in poses]
     seen = [(one, pose) for one, pose in zip(measured, poses, strict=True) if one.ok]

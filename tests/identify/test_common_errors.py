@@ -20,7 +20,7 @@ from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
 
 NAMES = ("left.fx_px", "left.cx_px", "right.cx_px", "taught.base.rz_rad", "taught.platform.tx_m")
 REFERENCE = (("position", "orientation"), ("velocity", "orientation_rate"))
-KINDS = ("rig", "teaching", "exposure")
+KINDS = ("rig", "teaching")
 SIZES = 0.3 * SIGMA
 
 

@@ -47,7 +47,6 @@ READS = Reads(
         "scenario.robot",
         *PICTURES,
         "scenario.rig.errors",
-        "scenario.rig.right_later_s",
         "scenario.timing.",
         "sensor.timing.",
         "scenario.servo.",
