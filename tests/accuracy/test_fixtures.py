@@ -170,7 +170,7 @@ def test_markers_and_options_choose_built_in_names_or_files(project, pytester):
 WRONG_MARKERS = {
     "camera='mine'": "AccuracyError: marker cmmsim: 'camera' unknown; it takes scenario, robot, sensor",
     "'mine'": "AccuracyError: marker cmmsim: 'mine' unknown; it takes scenario, robot, sensor",
-    "scenario='papper'": "ScenarioError: scenario 'papper' is neither built in (paper, quick) nor a file",
+    "scenario='papper'": "ScenarioError: scenario 'papper' is neither built in (geometry, paper, quick) nor a file",
     "robot='rss7'": "RobotFileError: *rss7*rss6*",
     "sensor=5": "AccuracyError: marker cmmsim: sensor is 5, must be a built-in name or a file",
 }
@@ -187,7 +187,7 @@ def test_what_does_not_exist_is_one_line_with_the_valid_names(project):
 
 def test_options_are_checked_though_no_test_uses_them(project):
     for option, says in (
-        ("--accuracy-scenario", "scenario 'nosuch' is neither built in (paper, quick) nor a file"),
+        ("--accuracy-scenario", "scenario 'nosuch' is neither built in (geometry, paper, quick) nor a file"),
         ("--accuracy-robot", "unknown robot `nosuch`; built-in robots: delta3, *rss6, *"),
         ("--accuracy-sensor", "unknown sensor 'nosuch': neither a built-in name (ctrack780, ctrack780_29hz) nor *"),
     ):

@@ -79,7 +79,7 @@ def test_a_limit_that_is_missed_and_a_command_that_cannot_be_done_have_statuses_
 class Finding:
     """What `check_robot` finds of a robot that fails."""
 
-    ok, check, text = False, "reach", "too far"
+    ok, check, limit, text = False, "reach", None, "too far"
 
     def entry(self):
         return {"check": self.check, "ok": self.ok, "text": self.text}
