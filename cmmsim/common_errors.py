@@ -18,7 +18,16 @@ from scipy.linalg import block_diag
 
 from cmmsim.checks import finite_array
 from cmmsim.files.setup import MarkedBody
-from cmmsim.geometry.pose import Array, apply, euler_rates_matrix, invert, pose_to_transform, rotation_log, skew
+from cmmsim.geometry.pose import (
+    Array,
+    apply,
+    euler_rates_matrix,
+    invert,
+    pose_jacobian,
+    pose_to_transform,
+    rotation_log,
+    skew,
+)
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, PLACE_NAMES, StereoRig, triangulate
 from cmmsim.pose_estimation.estimator import by_planes
 from cmmsim.pose_estimation.observation import StickerObservation, faces_camera
@@ -88,7 +97,7 @@ class MeasuringGeometry:
         kept = np.flatnonzero(np.diag(covariance) > 0.0)
         view = _view(self, np.stack([pose_to_transform(pose) for pose in poses]))
         small = np.concatenate([self._by_rig(view), view.by_taught_frames(), view.by_delay(poses, rates)], axis=2)
-        changes = _of_pose_components(poses) @ small[:, :, kept]
+        changes = np.stack([pose_jacobian(pose) for pose in poses]) @ small[:, :, kept]
         return CommonErrors(tuple(NAMES[k] for k in kept), changes, covariance[np.ix_(kept, kept)])
 
     def _by_rig(self, view: _View) -> Array:
@@ -217,10 +226,3 @@ def _small_error(moved: Array, other: Array) -> Array:
     """[dt, dphi] (6,) with which points p of the output frame move by dt + dphi x p, from the other to the first."""
     turn = moved[:3, :3] @ other[:3, :3].T
     return np.concatenate([moved[:3, 3] - turn @ other[:3, 3], rotation_log(turn)])
-
-
-def _of_pose_components(poses: Array) -> Array:
-    """Change (N, 6, 6) of poses by the small error [dt, dphi] of their frames."""
-    jacobians = np.tile(np.eye(6), (len(poses), 1, 1))
-    jacobians[:, 3:, 3:] = np.linalg.inv(np.stack([euler_rates_matrix(pose) for pose in poses]))
-    return jacobians

@@ -29,8 +29,7 @@ class KnownRig:
     def __post_init__(self) -> None:
         size = (len(PARAMETER_NAMES),) * 2
         covariance = finite_array(self.covariance, size, "the covariance of a rig must be (24,24) and finite")
-        std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        unit = covariance / np.outer(*2 * (np.where(std > 0.0, std, 1.0),))
+        _, unit = _standardised(covariance)
         bad = np.flatnonzero((np.diag(covariance) < 0.0) | (np.abs(unit - unit.T) > ROUNDING).any(axis=1))
         if len(bad):
             raise CmmError(
@@ -45,9 +44,7 @@ class KnownRig:
     @classmethod
     def drawn(cls, true: StereoRig, covariance: Array, rng: np.random.Generator, exposure_std: float = 0.0) -> KnownRig:
         """What a calibration with this covariance (24,24) would have found of a true rig."""
-        known = cls(true, covariance)
-        std = np.sqrt(np.diag(known.covariance))
-        unit = known.covariance / np.outer(*2 * (np.where(std > 0.0, std, 1.0),))
+        std, unit = _standardised(cls(true, covariance).covariance)
         values, vectors = np.linalg.eigh(unit)
         draw = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
         return cls(true.moved(-std * draw), covariance, exposure_std)
@@ -75,6 +72,13 @@ class KnownRig:
         )
         lines = left @ self.rig.fundamental.T
         return np.sum(lines * right, axis=1) / np.linalg.norm(lines[:, :2], axis=1)
+
+
+def _standardised(covariance: Array) -> tuple[Array, Array]:
+    """Standard deviations (24,), and what is left of a covariance (24,24) in their units."""
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    scale = np.where(std > 0.0, std, 1.0)
+    return std, covariance / np.outer(scale, scale)
 
 
 def rig_changes(changes: Mapping[str, float]) -> Array:

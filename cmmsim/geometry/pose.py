@@ -120,11 +120,17 @@ def euler_rates_matrix(pose: Array) -> Array:
     return np.array([[1.0, 0.0, sb], [0.0, ca, -sa * cb], [0.0, sa, ca * cb]])
 
 
+def pose_jacobian(pose: Array) -> Array:
+    """Change (6,6) of a pose (6,) by the small error [dt, dphi] of its transform."""
+    jacobian = np.eye(6)
+    jacobian[3:, 3:] = np.linalg.inv(euler_rates_matrix(pose))
+    return jacobian
+
+
 def pose_covariance(transform: Array, covariance: Array) -> Array:
     """Covariance (6,6) of the pose from that of the transform's small error [dt, dphi] (first order)."""
-    jacobian = np.eye(6)
-    jacobian[3:, 3:] = np.linalg.inv(euler_rates_matrix(transform_to_pose(transform)))
-    return jacobian @ covariance @ jacobian.T
+    jacobian = pose_jacobian(transform_to_pose(transform))
+    return np.asarray(jacobian @ covariance @ jacobian.T)
 
 
 def compose_covariance(outer: Array, covariance: Array) -> Array:

@@ -17,12 +17,12 @@ from identify.commands.options import (
     Seed,
     Settings,
     Workers,
+    chosen_scenario,
     parse_settings,
     tell,
 )
 from identify.files.run_folder import RunFolder, load_result, new_run_folder
 from identify.progress import print_warnings, terminal_progress
-from identify.scenario import Scenario, load_scenario
 
 PLANNED = ("scenario.toml", "trajectories.json", "experiment.nc")
 """What the first two stages leave."""
@@ -60,7 +60,7 @@ def run(
                                               joints off by 0.1 mm: the model
                                               is wrong, and the residuals tell
     """
-    chosen = _scenario(scenario, settings, robot)
+    chosen = chosen_scenario(scenario, settings, robot)
     folder = new_run_folder(out or Path("runs") / f"{chosen.name}-{seed}")
     _pipeline().run(chosen, seed, folder.path, terminal_progress(quiet), workers)
     result = _warned(folder)
@@ -89,7 +89,7 @@ def warm_up(
     from identify.experiment.run import warm_up
 
     others = tuple(load_robot(name) for name in built_in_robots()) if all_robots else ()
-    warm_up(_scenario(scenario, settings, robot), terminal_progress(quiet), others)
+    warm_up(chosen_scenario(scenario, settings, robot), terminal_progress(quiet), others)
 
 
 def excite(
@@ -117,7 +117,7 @@ def excite(
       cmmsim excite paper --compare           random, evolutionary and gradient
                                               search side by side
     """
-    chosen = _scenario(scenario, settings, robot)
+    chosen = chosen_scenario(scenario, settings, robot)
     name = f"excite-{chosen.name}-{seed}" if compare else f"{chosen.name}-{seed}"
     folder = new_run_folder(out or Path("runs") / name)
     if compare:
@@ -236,11 +236,6 @@ def report(out: RunFolderOption, quiet: Quiet = False) -> None:
     _pipeline().report(out, terminal_progress(quiet))
     if not quiet:
         _summary().print_goals(load_result(folder.result), folder.report)
-
-
-def _scenario(name: str, settings: list[str] | None, robot: str | None) -> Scenario:
-    chosen = {} if robot is None else {"robot": robot}
-    return load_scenario(name).with_overrides(chosen | parse_settings(settings))
 
 
 def _warned(folder: RunFolder) -> dict[str, Any]:

@@ -11,8 +11,8 @@ from identify.commands.options import (
     RobotOption,
     ScenarioArgument,
     Settings,
+    chosen_scenario,
     new_folder,
-    parse_settings,
     tell,
 )
 from identify.files.run_folder import new_run_folder
@@ -54,10 +54,8 @@ def geometry(
     from dynamics import load_robot
     from identify.geometry.run import run_geometry
     from identify.geometry.static_poses import read_static_poses
-    from identify.scenario import load_scenario
 
-    changes = ({} if robot is None else {"robot": robot}) | parse_settings(settings)
-    chosen = load_scenario(scenario).with_overrides(changes)
+    chosen = chosen_scenario(scenario, settings, robot)
     folder = new_run_folder(out or Path("runs") / f"geometry-{seed}").path
     own = None if poses is None else read_static_poses(poses, load_robot(chosen.robot))
     outcome = run_geometry(chosen, seed, terminal_progress(quiet), own)

@@ -10,6 +10,7 @@ import typer
 
 from identify.errors import OutputFolderError, ScenarioError
 from identify.files.run_folder import as_json, save_result
+from identify.scenario import Scenario, load_scenario
 
 BUILT_IN = {
     "robot": ("dynamics", "robots"),
@@ -143,6 +144,15 @@ def parse_settings(settings: list[str] | None) -> dict[str, Any]:
             raise ScenarioError(f"--set {text!r} is not of the form KEY=VALUE, such as timing.frame_rate_hz=30")
         overrides[key.strip()] = _toml_or_text(value.strip())
     return overrides
+
+
+def chosen_scenario(name: str, settings: list[str] | None, robot: str | None) -> Scenario:
+    """The scenario of a name or path with values replaced, and with another robot where one is named.
+
+    Raises ScenarioError: no such scenario, or a setting that it cannot have.
+    """
+    chosen = {} if robot is None else {"robot": robot}
+    return load_scenario(name).with_overrides(chosen | parse_settings(settings))
 
 
 def _toml_or_text(text: str) -> Any:

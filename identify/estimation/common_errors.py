@@ -11,7 +11,6 @@ import numpy as np
 
 from identify.arrays import Array
 from identify.estimation.output_error import OutputErrorProblem
-from identify.record.recorded_run import RecordedRun
 
 
 @dataclass(frozen=True)
@@ -25,14 +24,16 @@ class CommonErrorEstimates:
 
 
 def common_error_estimates(problem: OutputErrorProblem, parameters: Array) -> CommonErrorEstimates:
-    """What the first record of a problem says at its optimum (p,) of what its poses have in common."""
+    """What the first record of a problem `with_common_errors` says at its optimum (p,) of what its poses have in
+    common."""
     run = problem.runs[0]
-    names, factor = run.common.all_names, run.common.whole_factor
-    if not names:
+    if run.marginal is None:
         nothing = np.zeros(0)
         return CommonErrorEstimates((), nothing, nothing, nothing)
-    residuals, jacobian, modes = _in_noise(run, parameters)
-    rows = np.column_stack([jacobian, modes])
+    names, factor, modes = run.common.all_names, run.common.whole_factor, run.marginal.modes
+    whitened, slopes = run.without_common_errors().residuals(parameters)  # in standard deviations of the noise alone
+    residuals = whitened.ravel()
+    rows = np.column_stack([slopes.reshape(residuals.size, -1), modes])
     information = rows.T @ rows
     count = len(parameters)
     information[:count, :count] += problem.known_information()
@@ -43,11 +44,3 @@ def common_error_estimates(problem: OutputErrorProblem, parameters: Array) -> Co
     spread = factor @ covariance[count:, count:] @ factor.T
     prior_std = np.sqrt(np.diag(factor @ factor.T))
     return CommonErrorEstimates(names, prior_std, factor @ found, np.sqrt(np.diag(spread)))
-
-
-def _in_noise(run: RecordedRun, parameters: Array) -> tuple[Array, Array, Array]:
-    """Residuals (m,), their Jacobian (m, p) and the modes (m, k), in standard deviations of the noise alone."""
-    residuals, jacobian = run.without_common_errors().residuals(parameters)
-    seen = run.modes(parameters)[run.ok]
-    modes = np.asarray(run.whitener @ seen)
-    return residuals.ravel(), jacobian.reshape(residuals.size, -1), modes.reshape(residuals.size, -1)

@@ -128,13 +128,13 @@ def group_estimates(
         estimate=rows @ estimate,
         std=combined_std(rows, uncertainty.covariance),
         identifiable=criterion.judge(rows, uncertainty.covariance),
-        prior_share=prior_share(rows, uncertainty),
+        prior_share=variance_share(rows, uncertainty.of_guess, uncertainty.covariance),
     )
 
 
-def prior_share(rows: Array, uncertainty: Uncertainty) -> Array:
-    """What share of the variance of each quantity rows (n, p) @ parameters is made by errors of the starting guess."""
-    return np.asarray((combined_std(rows, uncertainty.of_guess) / combined_std(rows, uncertainty.covariance)) ** 2)
+def variance_share(rows: Array, part: Array, covariance: Array) -> Array:
+    """What share of the variance of each quantity rows (n, p) @ parameters a part (p, p) of their covariance makes."""
+    return np.asarray((combined_std(rows, part) / combined_std(rows, covariance)) ** 2)
 
 
 SCALE_KNOWN = 0.015
@@ -142,10 +142,11 @@ SCALE_KNOWN = 0.015
 to fix it."""
 
 
-def scale_warnings(anchor: ScaleAnchor, left: float) -> tuple[str, ...]:
-    """One line where an instrument was to fix the scale, and errors of the starting values alone leave the controller's
-    gain, which poses show but for the scale, uncertain by this share."""
-    if anchor.value is None or left <= SCALE_KNOWN:
+def scale_warnings(anchor: ScaleAnchor, left: float, prior_share: float) -> tuple[str, ...]:
+    """One line where an instrument was to fix the scale, and the controller's gain, which poses show but for the scale,
+    rests on the prior: errors of the starting values leave it uncertain by this share, and make most of its variance.
+    """
+    if anchor.value is None or left <= SCALE_KNOWN or prior_share <= RESTS_ON_PRIOR:
         return ()
     return (
         f"the scale anchor {anchor.name} does not fix the scale of this robot: poses show what was measured only in "
@@ -239,6 +240,8 @@ def judge(
     criterion = identifiability(guess, robot, model_holds=explanation.model_holds)
     each = np.eye(len(estimate))
     gain = robot.layout.names.index("joint_pid.lp")
+    prior_share = variance_share(each, uncertainty.of_guess, uncertainty.covariance)
+    gain_left = float(np.sqrt(uncertainty.of_guess[gain, gain]) / estimate[gain])
     conditioned = conditioning(uncertainty.information, known, base, guess, estimate)
     bounded = bounded_estimate(
         estimate,
@@ -251,8 +254,8 @@ def judge(
     of_the_records = (warning for run in problem.runs for warning in run.warnings())
     return Judgement(
         identifiable=criterion.judge(each, uncertainty.covariance),
-        prior_share=prior_share(each, uncertainty),
-        common_share=np.diag(uncertainty.of_common) / np.diag(uncertainty.covariance),
+        prior_share=prior_share,
+        common_share=variance_share(each, uncertainty.of_common, uncertainty.covariance),
         intervals=bounded.intervals(each),
         groups=group_estimates(base, guess, criterion, estimate, uncertainty),
         group_intervals=bounded.intervals(group_rows(base)),
@@ -265,7 +268,7 @@ def judge(
             *explanation.warnings(),
             *bounded.warnings(),
             *conditioned.warnings(),
-            *scale_warnings(problem.anchor, float(np.sqrt(uncertainty.of_guess[gain, gain]) / estimate[gain])),
+            *scale_warnings(problem.anchor, gain_left, float(prior_share[gain])),
         ),
     )
 

@@ -54,13 +54,13 @@ def identify(
     warmed = time.perf_counter()
     searches = output_error_searches(problem, scenario, warm, progress)
     searched = time.perf_counter()
-    method, driven = scenario.identification.method, problem.driven_by_commands()
+    method = scenario.identification.method
     solution = searches[method]
     with progress.stage("uncertainty", DRAWS) as advance:
-        judged = (problem if method == "closed_loop" else driven).with_common_errors(solution.parameters)
+        judged = problem.of_method(method, solution.parameters)
         uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
     by_commands = searches["command_driven"].parameters
-    explained = explanation(driven.with_common_errors(by_commands), by_commands, uncertainty.misfit)
+    explained = explanation(problem.of_method("command_driven", by_commands), by_commands, uncertainty.misfit)
     judgement = judge(problem, scenario, solution, uncertainty, explained)
     ended = time.perf_counter()
     return IdentificationResult(

@@ -39,6 +39,12 @@ class OutputErrorProblem:
         """The same problem with the joints driven by the logged commands."""
         return replace(self, runs=tuple(run.driven_by_commands() for run in self.runs))
 
+    def of_method(self, method: str, parameters: Array) -> "OutputErrorProblem":
+        """The problem that a method of identification ("closed_loop" or "command_driven") has solved with these
+        parameters (p,), with what the poses have in common. Raises LoopFailure as `with_common_errors`."""
+        solved = self if method == "closed_loop" else self.driven_by_commands()
+        return solved.with_common_errors(parameters)
+
     def with_common_errors(self, parameters: Array) -> "OutputErrorProblem":
         """The same problem, which knows what the poses of each record have in common, as a model with these parameters
         (p,) shows it. Raises LoopFailure where that is unstable."""

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import cmmsim
 from cmmsim.calibration import PairView, board_poses, calibrate, default_board, render_pairs
 from cmmsim.calibration.detection import find_board
 from cmmsim.files import SensorFile
 from cmmsim.files.setup import rig_from_file
-from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.known_rig import KnownRig
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
 from cmmsim.imaging.renderer import choose_renderer
@@ -47,12 +47,11 @@ def known_rig(
 
 def calibrated_rig(file: SensorFile, pairs: int, rng: np.random.Generator, progress: Progress) -> KnownRig:
     """The rig of a sensor file as calibrated from pictures of a board of dots, drawn by the analytic renderer."""
-    rig, _ = rig_from_file(file.rig)
+    source = cmmsim.Sensor(file, renderer="analytic")
+    rig, noise = source.rig, source.noise
     board = default_board(rig)
-    figures = file.camera.model_dump(exclude={"pattern_seed"})
-    noise = CameraNoise(**{("enabled" if key == "noise" else key): value for key, value in figures.items()})
-    optics, poses = Optics(**file.lens.model_dump()), board_poses(rig, board, pairs, rng)
-    frames = render_pairs(rig, board, poses, choose_renderer("analytic"), optics, noise, rng)
+    poses = board_poses(rig, board, pairs, rng)
+    frames = render_pairs(rig, board, poses, choose_renderer("analytic"), source.optics, noise, rng)
     views = []
     with progress.stage("calibrate the cameras", pairs) as advance:
         for number, frame in enumerate(frames, start=1):

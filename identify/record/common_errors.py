@@ -8,6 +8,7 @@ the same as estimating d beside everything else, d known beforehand by its covar
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import xarray as xr
@@ -43,7 +44,7 @@ class CommonErrors:
         """`factor` of all errors, the latency among them."""
         return block_diag(self.factor, self.latency_std) if self.latency_std else self.factor
 
-    @property
+    @cached_property
     def factor(self) -> Array:
         """L (k, k) with L L^T the covariance."""
         if not self.names:
@@ -52,7 +53,7 @@ class CommonErrors:
         unit = self.covariance / np.outer(std, std)
         return std[:, None] * cholesky(unit + ROUNDING * np.eye(len(std)), lower=True)
 
-    @property
+    @cached_property
     def modes(self) -> Array:
         """Errors (N, 6, k) of the measured poses, for each of k independent numbers of standard deviation one."""
         return np.asarray(self.changes @ self.factor)
@@ -63,9 +64,10 @@ NONE = CommonErrors((), np.zeros((0, 6, 0)), np.zeros((0, 0)))
 
 @dataclass(frozen=True)
 class Marginal:
-    """What whitens residuals of unit covariance that have modes in common: directions U (m, k), and shares (k,) of
-    what residuals have along them to take away; seen: S (k,), standard deviations along them."""
+    """What whitens residuals of unit covariance that have modes M (m, k) in common: their directions U (m, k), and
+    seen: S (k,), the standard deviations along them."""
 
+    modes: Array
     directions: Array
     seen: Array
 
@@ -73,7 +75,7 @@ class Marginal:
     def of(cls, modes: Array) -> "Marginal":
         """From whitened modes (m, k) of m residuals."""
         directions, seen, _ = np.linalg.svd(modes, full_matrices=False)
-        return cls(directions, seen)
+        return cls(modes, directions, seen)
 
     @property
     def whitened_modes(self) -> Array:
