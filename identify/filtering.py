@@ -1,4 +1,4 @@
-"""Zero-phase Butterworth filter (section 4.2) and derivatives of filtered signals.
+"""Zero-phase Butterworth filter (section 4.2), derivatives of sampled signals, and gaps in them.
 
 Forward and reverse filtering squares the magnitude: ``order`` is that of one pass, as in Matlab's filtfilt, so the
 gain at the cutoff is 1/2. The parts of scipy are loaded on first use: every command reads scenarios, which ask here for
@@ -7,7 +7,7 @@ the padding.
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from identify.arrays import Array
 from identify.errors import FilterError
@@ -69,6 +69,12 @@ def spline_derivatives(samples: ArrayLike, rate_hz: float) -> tuple[Array, Array
     t = np.arange(len(values)) / rate_hz
     spline = scipy.interpolate.make_interp_spline(t, values, k=SPLINE_DEGREE)
     return spline(t, nu=1), spline(t, nu=2)
+
+
+def without_gaps(samples: Array, ok: NDArray[np.bool_]) -> Array:
+    """Samples (N, k) of which only those that are ok (N,) count, the others interpolated in time; one must be."""
+    frames = np.arange(len(ok))
+    return np.column_stack([np.interp(frames, frames[ok], column[ok]) for column in samples.T])
 
 
 def _finite(samples: ArrayLike) -> Array:

@@ -4,6 +4,7 @@ The cameras that take the pictures are the sensor file's in each case.
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,9 +41,12 @@ def known_rig(
     section, (rig, _) = scenario.rig, rig_from_file(file.rig)
     if section.exact:
         return None
+    exposure = section.right_later_std_s
+    if section.known == "exact":
+        return KnownRig(rig, np.zeros((len(PARAMETER_NAMES),) * 2), exposure)
     if section.known == "calibrated":
-        return calibrated_rig(file, section.pairs, rng, progress or SilentProgress())
-    return KnownRig.drawn(rig, stated_covariance(Path(section.known), rig), rng)
+        return replace(calibrated_rig(file, section.pairs, rng, progress or SilentProgress()), exposure_std=exposure)
+    return KnownRig.drawn(rig, stated_covariance(Path(section.known), rig), rng, exposure)
 
 
 def calibrated_rig(file: SensorFile, pairs: int, rng: np.random.Generator, progress: Progress) -> KnownRig:

@@ -19,6 +19,7 @@ from identify.excitation.design import design_trajectories
 from identify.experiment.known_rig import known_rig
 from identify.experiment.plant import Plant, PlatformLoad, build_plant, drawn_load
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, make_sensor, sensor_file, with_renderer
+from identify.filtering import spline_derivatives, without_gaps
 from identify.progress import Advance, Progress, SilentProgress
 from identify.random_streams import ANCHOR, CALIBRATION, LATENCY, LOAD, MEAN_LATENCY, NOISE, TEACHING, stream_seed
 from identify.record import recording
@@ -136,8 +137,9 @@ def run_plant(
     record, truth = _record(plant, reference, done, eye, seed), plant.truth(done)
     settings, rng = scenario.identification, np.random.default_rng(stream_seed(seed, ANCHOR))
     layout = plant.robot.layout
-    if not scenario.rig.exact and isinstance(sensor, cmmsim.Sensor):
-        found = sensor.common_errors(reference.poses, reference.rates)
+    if not scenario.rig.exact and isinstance(sensor, cmmsim.Sensor) and done.measured_ok.any():
+        poses = without_gaps(done.measured, done.measured_ok)
+        found = sensor.common_errors(poses, spline_derivatives(poses, scenario.timing.frame_rate_hz)[0])
         store_common_errors(record, CommonErrors(found.names, found.changes, found.covariance))
     store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, layout, plant.parameters, rng))
     if load is not None:

@@ -55,7 +55,7 @@ def make_sensor(
     file = sensor_file(scenario)
     check_platform(robot, file, scenario.sensor)
     sensor = cmmsim.Sensor(file, seed, scenario.pose_method, taught, renderer=scenario.renderer, known=known)
-    sensor.move_rig(scenario.rig.errors)
+    sensor.move_rig(scenario.rig.errors, scenario.rig.right_later_s)
     sensor.add_bodies(robot_meshes(robot))
     return sensor
 

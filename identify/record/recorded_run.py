@@ -3,6 +3,7 @@
 A record that cannot carry an identification is refused, see `identify.record.checks`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, LoopSettings, Reference, simulate
 from identify.arrays import Array
+from identify.filtering import without_gaps
 from identify.loop_parameters import model_settings
 from identify.record.checks import (
     check_channels,
@@ -76,27 +78,40 @@ class RecordedRun:
         A model driven by the logged commands moves as the plant did, and what is measured beside that is the error. A
         closed loop sees the error as well, and its servo takes the platform where the error does not show.
         """
-        modes = self.common.modes if self.common.names else np.zeros((len(self.ok), 6, 0))
         if not self.driven:
-            each = np.moveaxis(modes, 2, 0)
-            apart = [self._measured(parameters, mode) - self._measured(parameters, -mode) for mode in each]
-            modes = np.stack(apart, axis=2) / 2.0 if apart else modes
-        if not self.common.latency_std:
-            return modes
-        known, std = self.settings.timing.latency_s, self.common.latency_std
-        ends = known + std, max(known - std, 0.0)
-        late, early = (self.simulate(parameters, latency_s=end).pose for end in ends)
-        return np.concatenate([modes, std * ((late - early) / (ends[0] - ends[1]))[:, :, None]], axis=2)
+            return self._apart(parameters, lambda run: run.measured)
+        modes = self._apart(parameters, lambda run: run.pose)  # which only another latency changes
+        if self.common.names:
+            modes[:, :, : len(self.common.names)] = self.common.modes
+        return modes
 
-    def _measured(self, parameters: Array, error: Array) -> Array:
-        """Poses (N, 6) that the closed loop measures with an error (N, 6) in them."""
-        lost = ~self.ok
-        run = simulate(self.robot, parameters + self.payload, self.reference, self.settings, lost=lost, noise=error)
-        return run.measured
+    def pose_modes(self, parameters: Array) -> Array:
+        """How far (N, 6, k) the common errors, each of one standard deviation, take the platform from the model."""
+        return self._apart(parameters, lambda run: run.pose)
 
-    def simulate(self, parameters: Array, sensitivities: bool = False, latency_s: float | None = None) -> ClosedLoopRun:
-        """The model's run, with another latency of all its frames where one is given. Raises LoopFailure where it is
-        unstable."""
+    def _apart(self, parameters: Array, shown: Callable[[ClosedLoopRun], Array]) -> Array:
+        """What a run shows (N, 6) with each common error (N, 6, k), of one standard deviation, less that without."""
+        if self.driven:
+            columns = [np.zeros_like(self.measured)] * len(self.common.names)
+        else:
+            errors = np.moveaxis(self.common.modes, 2, 0)
+            ends = ([self.simulate(parameters, error=sign * error) for sign in (1.0, -1.0)] for error in errors)
+            columns = [(shown(more) - shown(less)) / 2.0 for more, less in ends]
+        if std := self.common.latency_std:
+            late, early = (known := self.settings.timing.latency_s) + std, max(known - std, 0.0)
+            more, less = (self.simulate(parameters, latency_s=end) for end in (late, early))
+            columns.append(std * (more.pose - less.pose) / (late - early))
+        return np.stack(columns, axis=2) if columns else np.zeros((*self.measured.shape, 0))
+
+    def simulate(
+        self,
+        parameters: Array,
+        sensitivities: bool = False,
+        latency_s: float | None = None,
+        error: Array | None = None,
+    ) -> ClosedLoopRun:
+        """The model's run, with another latency of all its frames and with an error (N, 6) in what its servo measures,
+        where they are given. Raises LoopFailure where it is unstable."""
         return simulate(
             self.robot,
             parameters + self.payload,
@@ -106,6 +121,7 @@ class RecordedRun:
             commands=self.logged if self.driven else None,
             lost=None if self.driven else ~self.ok,
             latencies=None if latency_s is None else np.full(len(self.ok), latency_s),
+            noise=error,
         )
 
     def model_poses(self, parameters: Array) -> Array:
@@ -131,8 +147,7 @@ class RecordedRun:
 
     def without_gaps(self) -> Array:
         """Measured poses (N, 6) with lost frames interpolated in time; for linear fits only."""
-        frames = np.arange(len(self.ok))
-        return np.column_stack([np.interp(frames, frames[self.ok], column[self.ok]) for column in self.measured.T])
+        return without_gaps(self.measured, self.ok)
 
     def warnings(self) -> tuple[str, ...]:
         """What in this record weakens the estimate."""

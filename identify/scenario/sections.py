@@ -206,11 +206,13 @@ class Rig(Section):
     errors: dict[str, float] = Field(
         {}, description='true minus known, of which no covariance knows: { "left.cx_px" = 0.1 }, px, m or rad'
     )
+    right_later_s: float = quantity(0.0, "s", "by how much the right camera truly exposes later", ge=-0.1, le=0.1)
+    right_later_std_s: float = quantity(0.0, "s", "how well that is known to be nothing", ge=0, le=0.1)
 
     @property
     def exact(self) -> bool:
         """Whether the estimator takes the rig, and what was taught with it, for exact."""
-        return self.known == "exact"
+        return self.known == "exact" and self.right_later_std_s == 0.0
 
 
 class Identification(Section):
@@ -227,8 +229,8 @@ class Identification(Section):
     prior: dict[str, PriorValue] = Field(
         {}, description="parameters known better than the starting guess: { name = { value, std } }"
     )
-    nuisances: list[Literal["rig", "teaching", "latency"]] = Field(
-        ["rig", "teaching", "latency"],
+    nuisances: list[Literal["rig", "teaching", "exposure", "latency"]] = Field(
+        ["rig", "teaching", "exposure", "latency"],
         description="of what all poses of a record have in common, what is estimated beside the parameters",
     )
     physical_consistency: bool = Field(

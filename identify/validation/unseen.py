@@ -86,11 +86,11 @@ class PosePrediction:
     """The model's poses (N, 6) [m, rad], and the covariance (N, 6, 6) of the plant's true ones about them, of a robot
     with this chart; zero where that forbids motion.
 
-    Two things keep the plant away from the model. The parameters are uncertain: their covariance C comes through the
-    exact sensitivities S of the model's poses as S C S^T. And the sensor's noise goes through the servo into the
-    plant's motion, which no model can foretell: its covariance is sampled by repeated experiments on the identified
-    model, and is taken to be the same all along the motion. What the sensor has wrong in every frame alike, such as the
-    frames it was taught, moves the whole motion with it and is not predicted: no record of this sensor shows it.
+    Three things keep the plant away from the model. The parameters are uncertain: their covariance C comes through the
+    exact sensitivities S of the model's poses as S C S^T. The sensor's noise goes through the servo into the plant's
+    motion, which no model can foretell: its covariance is sampled by repeated experiments on the identified model, and
+    is taken to be the same all along the motion. And what all measured poses have in common, as far as the record
+    states it: the servo takes the platform where such an error does not show, the whole motion with the same draw.
     """
 
     chart: Chart
@@ -125,7 +125,9 @@ def predict_poses(run: RecordedRun, parameters: Array, covariance: Array, rng: n
     drawn = [repeated_experiment(run, parameters, rng).pose - model.pose for _ in range(REPETITIONS)]
     noise = np.concatenate(drawn)
     from_parameters = model.pose_sensitivity @ covariance @ model.pose_sensitivity.transpose(0, 2, 1)
-    return PosePrediction(run.robot.geometry.chart, model.pose, from_parameters + noise.T @ noise / len(noise))
+    common = run.pose_modes(parameters)
+    covariance = from_parameters + noise.T @ noise / len(noise) + common @ common.transpose(0, 2, 1)
+    return PosePrediction(run.robot.geometry.chart, model.pose, covariance)
 
 
 def predicted_runs(

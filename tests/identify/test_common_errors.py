@@ -15,12 +15,13 @@ from cmmsim.geometry.known_rig import KnownRig
 from identify.errors import RecordError
 from identify.estimation.identification import identify, output_error_problem
 from identify.record.common_errors import CommonErrors, Marginal, read_common_errors, store_common_errors
+from identify.record.recording import poses
 from tests.cmmsim.sensors import PHOTOGRAPHED
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
 
 NAMES = ("left.fx_px", "left.cx_px", "right.cx_px", "taught.base.rz_rad", "taught.platform.tx_m")
 REFERENCE = (("position", "orientation"), ("velocity", "orientation_rate"))
-KINDS = ("rig", "teaching")
+KINDS = ("rig", "teaching", "exposure")
 SIZES = 0.3 * SIGMA
 
 
@@ -46,8 +47,7 @@ def experiment(seed, scenario):
     """A record of five seconds with one draw of the errors, with what it states of them; and the draw."""
     drawn = np.random.default_rng(seed + 100).multivariate_normal(np.zeros(5), COVARIANCE)
     record, _ = run_plant(scenario, seed, duration_s=5.0, bias=lambda frame, pose: changes(pose[None])[0] @ drawn)
-    reference = np.hstack([record[f"reference_{part}"].values for part in ("position", "orientation")])
-    store_common_errors(record, CommonErrors(NAMES, changes(reference), COVARIANCE))
+    store_common_errors(record, CommonErrors(NAMES, changes(poses(record, "measured")), COVARIANCE))
     return record, drawn
 
 
