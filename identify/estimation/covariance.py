@@ -18,7 +18,7 @@ load shows the scale, one that is a percent heavier than stated makes all parame
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -209,7 +209,11 @@ def repeated_experiment(run: RecordedRun, parameters: Array, rng: np.random.Gene
         latencies = np.full(len(noise), max(drawn, 0.0))
     parameters = parameters + run.payload
     lost = ~run.ok
-    return simulate(run.robot, parameters, run.reference, run.settings, lost=lost, noise=noise, latencies=latencies)
+    done = simulate(run.robot, parameters, run.reference, run.settings, lost=lost, noise=noise, latencies=latencies)
+    if run.moved_by_geometry is None:
+        return done
+    by_geometry = run.moved_by_geometry @ rng.standard_normal(run.moved_by_geometry.shape[2])
+    return replace(done, measured=done.measured + by_geometry)
 
 
 def correlation_matrix(covariance: Array) -> Array:

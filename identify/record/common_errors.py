@@ -17,6 +17,7 @@ from scipy.linalg import block_diag, cholesky
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
+from identify.record.geometry_errors import GeometryErrors
 
 CHANGES, COVARIANCE = "common_error", "common_error_covariance"
 LATENCY = "timing.latency_s"
@@ -27,22 +28,25 @@ ROUNDING = 1e-9
 class CommonErrors:
     """names of the errors, each ending with its unit; changes (N, 6, k) of the measured poses per unit of each;
     covariance (k, k) of what is true minus what is known. latency_std: of the mean latency of the frames, s, which only
-    a model of the loop can turn into poses; its name comes last."""
+    a model of the loop can turn into poses; and so it is with the geometry of the robot, None where that is exact."""
 
     names: tuple[str, ...]
     changes: Array
     covariance: Array
     latency_std: float = 0.0
+    geometry: GeometryErrors | None = None
 
     @property
     def all_names(self) -> tuple[str, ...]:
-        """Names of all errors, the latency's among them."""
-        return (*self.names, LATENCY) if self.latency_std else self.names
+        """Names of all errors, behind those of the poses the latency's and those of the geometry."""
+        latency = (LATENCY,) if self.latency_std else ()
+        return (*self.names, *latency, *(self.geometry.names if self.geometry else ()))
 
     @property
     def whole_factor(self) -> Array:
-        """`factor` of all errors, the latency among them."""
-        return block_diag(self.factor, self.latency_std) if self.latency_std else self.factor
+        """`factor` of all errors."""
+        latency = [np.full((1, 1), self.latency_std)] if self.latency_std else []
+        return np.asarray(block_diag(self.factor, *latency, *([self.geometry.factor] if self.geometry else [])))
 
     @cached_property
     def factor(self) -> Array:

@@ -22,6 +22,7 @@ from identify.record.checks import (
     checked_covariance,
 )
 from identify.record.common_errors import NONE, CommonErrors, Marginal, read_common_errors
+from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
 from identify.record.payload import recorded_payload
 from identify.record.plausibility import check_plausible
 from identify.record.recording import poses
@@ -38,7 +39,8 @@ class RecordedRun:
     measured: poses (N, 6), NaN where lost; ok (N,) bool; covariance (6, 6) of one measured pose; logged: the joint
     commands (N, n) as they were given; driven: whether the model's joints get these, or its own servo acts; payload
     (p,): what a known load on the platform adds to the parameters, with standard deviations payload_std (p,); common:
-    errors that all measured poses have in common, and marginal: what whitens residuals by them (`with_common_errors`).
+    errors that all measured poses have in common, and marginal: what whitens residuals by them (`with_common_errors`),
+    moved_by_geometry: the part (N, 6, g) of their modes that errors of the geometry make.
     """
 
     robot: Robot
@@ -53,6 +55,7 @@ class RecordedRun:
     common: CommonErrors = NONE
     driven: bool = False
     marginal: Marginal | None = None
+    moved_by_geometry: Array | None = None
 
     def driven_by_commands(self) -> "RecordedRun":
         """The same run with the model's joints driven by the logged commands."""
@@ -63,15 +66,18 @@ class RecordedRun:
         parameters (p,) shows it. Raises LoopFailure where that is unstable."""
         if not self.common.all_names:
             return self
-        seen = self.modes(parameters)[self.ok]
-        return replace(self, marginal=Marginal.of((self.whitener @ seen).reshape(-1, seen.shape[2])))
+        by_geometry = self.geometry_modes(parameters)
+        seen = np.concatenate([self.modes(parameters), by_geometry], axis=2)[self.ok]
+        marginal = Marginal.of((self.whitener @ seen).reshape(-1, seen.shape[2]))
+        return replace(self, marginal=marginal, moved_by_geometry=by_geometry)
 
     def without_common_errors(self) -> "RecordedRun":
         """The same run, whose residuals are whitened by the sensor's noise alone."""
         return replace(self, marginal=None)
 
     def modes(self, parameters: Array) -> Array:
-        """How far (N, 6, k) the common errors, each of one standard deviation, take what is measured from the model.
+        """How far (N, 6, k) the common errors but those of the geometry, each of one standard deviation, take what is
+        measured from the model.
 
         A model driven by the logged commands moves as the plant did, and what is measured beside that is the error. A
         closed loop sees the error as well, and its servo takes the platform where the error does not show.
@@ -81,12 +87,19 @@ class RecordedRun:
             each = np.moveaxis(modes, 2, 0)
             apart = [self._measured(parameters, mode) - self._measured(parameters, -mode) for mode in each]
             modes = np.stack(apart, axis=2) / 2.0 if apart else modes
-        if not self.common.latency_std:
-            return modes
-        known, std = self.settings.timing.latency_s, self.common.latency_std
-        ends = known + std, max(known - std, 0.0)
-        late, early = (self.simulate(parameters, latency_s=end).pose for end in ends)
-        return np.concatenate([modes, std * ((late - early) / (ends[0] - ends[1]))[:, :, None]], axis=2)
+        if self.common.latency_std:
+            known, std = self.settings.timing.latency_s, self.common.latency_std
+            ends = known + std, max(known - std, 0.0)
+            late, early = (self.simulate(parameters, latency_s=end).pose for end in ends)
+            modes = np.concatenate([modes, std * ((late - early) / (ends[0] - ends[1]))[:, :, None]], axis=2)
+        return modes
+
+    def geometry_modes(self, parameters: Array) -> Array:
+        """How far (N, 6, g) errors of the geometry, each of one standard deviation, take the poses of a model with
+        parameters (p,), whose servo does not know of them; g = 0 where it is exact."""
+        if self.common.geometry is None:
+            return np.zeros((len(self.ok), 6, 0))
+        return self.common.geometry.modes(lambda robot: self.simulate(parameters, robot=robot).pose)
 
     def _measured(self, parameters: Array, error: Array) -> Array:
         """Poses (N, 6) that the closed loop measures with an error (N, 6) in them."""
@@ -94,11 +107,17 @@ class RecordedRun:
         run = simulate(self.robot, parameters + self.payload, self.reference, self.settings, lost=lost, noise=error)
         return run.measured
 
-    def simulate(self, parameters: Array, sensitivities: bool = False, latency_s: float | None = None) -> ClosedLoopRun:
-        """The model's run, with another latency of all its frames where one is given. Raises LoopFailure where it is
-        unstable."""
+    def simulate(
+        self,
+        parameters: Array,
+        sensitivities: bool = False,
+        latency_s: float | None = None,
+        robot: Robot | None = None,
+    ) -> ClosedLoopRun:
+        """The model's run, with another latency of all its frames, or another robot than the servo knows, where they
+        are given. Raises LoopFailure where it is unstable."""
         return simulate(
-            self.robot,
+            robot or self.robot,
             parameters + self.payload,
             self.reference,
             self.settings,
@@ -106,6 +125,7 @@ class RecordedRun:
             commands=self.logged if self.driven else None,
             lost=None if self.driven else ~self.ok,
             latencies=None if latency_s is None else np.full(len(self.ok), latency_s),
+            servo_robot=self.robot if robot else None,
         )
 
     def model_poses(self, parameters: Array) -> Array:
@@ -192,7 +212,7 @@ def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
     ok = record["measured_ok"].values.astype(bool)
     check_good_share(ok)
     load, load_std = recorded_payload(record, robot.layout)
-    return RecordedRun(
+    run = RecordedRun(
         robot=robot,
         settings=model_settings(robot, scenario),
         reference=recorded_reference(record),
@@ -202,13 +222,14 @@ def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
         logged=np.asarray(record["command"].values, dtype=float),
         payload=load,
         payload_std=load_std,
-        common=_common_errors(record, scenario),
     )
+    return replace(run, common=_common_errors(record, scenario, run))
 
 
-def _common_errors(record: xr.Dataset, scenario: Scenario) -> CommonErrors:
+def _common_errors(record: xr.Dataset, scenario: Scenario, run: RecordedRun) -> CommonErrors:
     """What of the poses' common errors a scenario has estimated beside the parameters."""
-    kinds = tuple(scenario.identification.nuisances)
-    return replace(
-        read_common_errors(record, kinds), latency_std=scenario.timing.latency_std_s if "latency" in kinds else 0.0
-    )
+    kinds, geometry = tuple(scenario.identification.nuisances), None
+    if "geometry" in kinds and (covariance := read_geometry_covariance(record, run.robot)) is not None:
+        geometry = GeometryErrors(run.robot, covariance, run.reference.poses, run.whitener)
+    latency_std = scenario.timing.latency_std_s if "latency" in kinds else 0.0
+    return replace(read_common_errors(record, kinds), latency_std=latency_std, geometry=geometry)
