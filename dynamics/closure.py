@@ -15,9 +15,8 @@ from dynamics.checks import row_text
 from dynamics.compiled.machine_code import MachineFunction, compiled_functions
 from dynamics.errors import ConvergenceError
 from dynamics.expressions import function
-from dynamics.geometry import RobotGeometry
+from dynamics.geometry import MovableGeometry, RobotGeometry
 from dynamics.kinematics.forward_kinematics import CLOSED, close_loops
-from dynamics.legs.numbers import moved
 from dynamics.rigid_body.jacobians import loop_closure
 
 
@@ -69,9 +68,8 @@ def closure_function(nominal: RobotGeometry) -> ca.Function:
     """(pose (6,), joints (n,), deviations (g,)) -> gaps of the loops (n,), m^2, and their derivatives with respect to
     the platform's coordinates (n, m), joint coordinates (n, n) and deviations (n, g)."""
     pose, joints = ca.SX.sym("pose", 6), ca.SX.sym("joints", len(nominal.legs))
-    parts = [ca.SX.sym(f"leg{k}", len(leg.numbers)) for k, leg in enumerate(nominal.legs, 1)]
-    deviations = ca.vertcat(*parts)
-    legs = [moved(leg, part) for leg, part in zip(nominal.legs, parts, strict=True)]
-    gaps, by_coordinates = loop_closure(nominal, pose, joints, legs)
+    movable = MovableGeometry(nominal)
+    (deviations,) = movable.symbols
+    gaps, by_coordinates = loop_closure(movable, pose, joints)
     outputs = [gaps, by_coordinates, ca.jacobian(gaps, joints), ca.jacobian(gaps, deviations)]
     return function("closure", [pose, joints, deviations], outputs)

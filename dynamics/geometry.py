@@ -5,6 +5,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import casadi as ca
 import numpy as np
 
 from dynamics.errors import RobotFileError
@@ -83,6 +84,11 @@ class RobotGeometry:
         return hash(self.digest)
 
     @property
+    def symbols(self) -> tuple[ca.SX, ...]:
+        """None: all its numbers are known; see `MovableGeometry`."""
+        return ()
+
+    @property
     def characteristic_length(self) -> float:
         """Length in m that makes rotations comparable to translations: RMS distance of the joints A from the origin."""
         return float(np.sqrt(np.mean(np.sum(self.platform_joints**2, axis=1))))
@@ -157,6 +163,49 @@ class RobotGeometry:
                 )
                 if np.abs(ends).max() < SAME_PLACE:
                     raise RobotFileError(f"legs {b + 1} and {a + 1} are in one place: both joints agree to 1e-6 m")
+
+
+@dataclass(frozen=True)
+class MovableGeometry:
+    """All geometries near a nominal one at once, for expressions: their numbers differ from its own by symbols."""
+
+    nominal: RobotGeometry
+
+    @cached_property
+    def symbols(self) -> tuple[ca.SX, ...]:
+        """One, the deviations (g,) of the geometric numbers, m and rad; the last input of functions."""
+        return (ca.SX.sym("deviations", len(self.nominal.number_names)),)
+
+    @cached_property
+    def legs(self) -> tuple[Leg, ...]:
+        """Legs whose numbers are expressions."""
+        ends = np.cumsum([0, *(len(leg.numbers) for leg in self.nominal.legs)])
+        parts = ca.vertsplit(self.symbols[0], ends.tolist())
+        return tuple(moved(leg, part) for leg, part in zip(self.nominal.legs, parts, strict=True))
+
+    @property
+    def platform_joints(self) -> list[ca.SX]:
+        """a (3,) of each leg, platform axes, m."""
+        return [ca.SX(leg.platform_joint) for leg in self.legs]
+
+    @property
+    def chart(self) -> Chart:
+        """That of all."""
+        return self.nominal.chart
+
+    @property
+    def gravity(self) -> np.ndarray:
+        """(3,) m/s^2, that of all."""
+        return self.nominal.gravity
+
+    @property
+    def characteristic_length(self) -> float:
+        """The nominal one, m."""
+        return self.nominal.characteristic_length
+
+
+AnyGeometry = RobotGeometry | MovableGeometry
+"""What kinematics and dynamics are expressions of."""
 
 
 def _plain(value: object) -> object:

@@ -6,6 +6,7 @@ Also a robot whose joints do not sit where the drawing says, and forward dynamic
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from dynamics.errors import (
     SingularPoseError,
     UnreachablePoseError,
 )
-from dynamics.geometry import RobotGeometry
+from dynamics.geometry import MovableGeometry, RobotGeometry
 from dynamics.kinematics import forward_kinematics
 from dynamics.kinematics.chart import POSE_NAMES
 from dynamics.kinematics.forward_kinematics import ForwardSolution
@@ -57,17 +58,20 @@ class Robot:
     the place of N m and N m s/rad). Every method also takes batches with a leading axis (N, 6), and then returns one
     more axis. `parameters` (p,) or (N, p) follow `parameter_names`, such as "platform.mass" and "joint1.coulomb"; None
     means `nominal_parameters`, the set `initial`. `parameter_sets` has all sets of the file by name, `layout` where
-    each parameter stands and its unit, `geometry` joints, legs and chart.
+    each parameter stands and its unit, `geometry` joints, legs and chart, `functions_of` the geometry that
+    it was moved from, its own where it was not.
 
     Methods raise ShapeError for wrong shapes or entries that are not finite, ParameterError for parameters outside
     their range, ChartError for a pose or a twist that the platform cannot have, UnreachablePoseError for a pose beyond
     a leg's reach, SingularPoseError where a Jacobian is singular.
     """
 
-    def __init__(self, description: RobotDescription) -> None:
+    def __init__(self, description: RobotDescription, nominal: RobotGeometry | None = None) -> None:
+        """nominal: a geometry nearby, whose functions serve this one, too; None: it has functions of its own."""
         check_type("description", description, RobotDescription, RobotFileError)
         self.name = description.name
         self.geometry = description.geometry
+        self.functions_of = nominal or description.geometry
         self.parameter_sets: dict[str, ParameterSet] = description.parameter_sets
         self.layout = parameter_layout(self.geometry.legs)
         self.parameter_names = self.layout.dynamic_names
@@ -238,7 +242,17 @@ class Robot:
     @property
     def functions(self) -> dict[str, MachineFunction]:
         """Kinematics and dynamics by name, as machine code, compiled when first asked for."""
-        return _functions(self.geometry)
+        own = self.functions_of is self.geometry
+        return _functions(self.geometry) if own else _functions_near(self.functions_of, self.geometry)
+
+    def moved(self, deviations: ArrayLike) -> Robot:
+        """The robot with its geometric numbers off by deviations (g,), m and rad.
+
+        All robots that are moved from one share its functions, compiled once and a third slower than those of a robot
+        file. Raises RobotFileError where a leg does not reach the home pose any more.
+        """
+        geometry = self.geometry.moved(floats("deviations", deviations, (len(self.geometry.number_names),)))
+        return Robot(RobotDescription(self.name, geometry, self.parameter_sets), self.functions_of)
 
     def _poses(self, pose: ArrayLike) -> np.ndarray:
         poses = rows("pose", pose, 6)
@@ -306,6 +320,19 @@ def _functions(geometry: RobotGeometry) -> dict[str, MachineFunction]:
     return compiled_functions(geometry.digest, lambda: robot_functions(geometry) + motion_functions(geometry), HOT)
 
 
+@lru_cache(maxsize=4)
+def _movable_functions(nominal: RobotGeometry) -> dict[str, MachineFunction]:
+    """One set for all geometries near a nominal one, with deviations from it as the last argument."""
+    movable, key = MovableGeometry(nominal), b"movable" + nominal.digest
+    return compiled_functions(key, lambda: robot_functions(movable) + motion_functions(movable), HOT)
+
+
+@lru_cache(maxsize=64)
+def _functions_near(nominal: RobotGeometry, geometry: RobotGeometry) -> dict[str, MachineFunction]:
+    deviations = geometry.deviations_from(nominal)
+    return {name: replace(one, constants=deviations) for name, one in _movable_functions(nominal).items()}
+
+
 def with_geometry(robot: Robot, geometry: RobotGeometry) -> Robot:
     """The robot with another geometry of the same kinds of legs."""
     return Robot(RobotDescription(robot.name, geometry, robot.parameter_sets))
@@ -356,13 +383,14 @@ def fast_forward_dynamics(robot: Robot, parameters: np.ndarray | None = None) ->
     check_type("robot", robot, Robot, DynamicsError)
     fixed = robot.layout.check(robot.nominal_parameters if parameters is None else parameters)
     joints = robot.layout.joints
-    inputs, result = np.concatenate([np.zeros(12 + joints), fixed]), np.zeros(6)
+    function, result = robot.functions["forward_dynamics"], np.zeros(6)
+    inputs = np.concatenate([np.zeros(12 + joints), fixed, function.constants])
     # Assigning to a memoryview costs half of assigning to an array, and refuses other shapes and types. The stubs of
     # NumPy do not know of that.
     views: list[Any] = [memoryview(part.data) for part in (inputs[0:6], inputs[6:12], inputs[12 : 12 + joints])]
     pose_in, twist_in, torque_in = views
     values = memoryview(result.data)
-    call = robot.functions["forward_dynamics"].bound_to(inputs, result)
+    call = function.bound_to(inputs, result)
 
     def forward_dynamics(at_pose: np.ndarray, at_twist: np.ndarray, at_torque: np.ndarray) -> np.ndarray:
         try:

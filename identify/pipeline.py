@@ -9,7 +9,7 @@ from typing import Any
 import xarray as xr
 
 import cmmsim
-from dynamics import Robot, load_robot
+from dynamics import Robot
 from identify.arrays import Array
 from identify.errors import EstimationError, OutputFolderError, RecordError
 from identify.estimation import identification
@@ -23,10 +23,15 @@ from identify.files.atomic import write_text
 from identify.files.dataset import write_covariance
 from identify.files.run_folder import RunFolder, check_entries, load_result, rms_figures, save_result
 from identify.files.versions import versions
+from identify.geometry.outcome import GeometryOutcome
+from identify.geometry.run import calibrated_for_a_run
 from identify.loop_parameters import check_parameter_set
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.checks import check_length, check_trajectory
+from identify.record.geometry_errors import COVARIANCE as GEOMETRY_COVARIANCE
+from identify.record.geometry_errors import store_geometry_covariance
+from identify.record.known_geometry import FOLDER, KnownGeometry, known_geometry
 from identify.record.own_record import read_own_records
 from identify.record.provenance import ENTRY, RECORDS, RunFiles, check_robot, digest
 from identify.record.recorded_run import recorded_reference
@@ -42,7 +47,9 @@ from identify.validation.unseen import model_run, predicted_runs, run_unseen
 def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:
     """All stages: excite, record, identify, validate, report. What cannot work is refused before any file."""
     began, scenario = time.perf_counter(), with_renderer(scenario)
-    plant = build_plant(scenario)
+    calibration, known = _calibrated(scenario, seed, progress)
+    calibrated_at = time.perf_counter()
+    plant = build_plant(scenario, seed=seed, known=known)
     sensor = untaught_sensor(scenario, plant.nominal, seed)
     if scenario.renderer == "pyrender":
         cmmsim.require_opengl()
@@ -50,21 +57,25 @@ def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers
     excited_at = time.perf_counter()
     teach(sensor, progress)
     taught_at = time.perf_counter()
-    _write_plan(folder, scenario, trajectories)
+    _write_plan(folder, scenario, trajectories, calibration)
     taught = record(folder, progress, workers, sensor, plant)
     identify(folder, progress)
     validate(folder, progress, workers, taught)
     report(folder, progress)
-    seconds = {"excite": excited_at - began, "teach": taught_at - excited_at, "total": time.perf_counter() - began}
+    seconds = {"geometry": calibrated_at - began} if calibration else {}
+    seconds |= {"excite": excited_at - calibrated_at, "teach": taught_at - excited_at}
+    seconds["total"] = time.perf_counter() - began
     _add_seconds(RunFolder(folder), **seconds)
 
 
 def excite(scenario: Scenario, seed: int, folder: Path, progress: Progress) -> None:
-    """Choose the trajectories; writes scenario.toml and trajectories.json."""
+    """Choose the trajectories; writes scenario.toml and trajectories.json, and the folder geometry, where that is
+    calibrated."""
     scenario = with_renderer(scenario)
-    plant = build_plant(scenario)
+    calibration, known = _calibrated(scenario, seed, progress)
+    plant = build_plant(scenario, seed=seed, known=known)
     check_platform(plant.nominal, sensor_file(scenario), scenario.sensor)
-    _write_plan(folder, scenario, _designed(plant, seed, progress))
+    _write_plan(folder, scenario, _designed(plant, seed, progress), calibration)
 
 
 def record(
@@ -79,10 +90,11 @@ def record(
 
     sensor, plant: those of the scenario where they are at hand, the sensor taught.
     """
-    run_folder, scenario, trajectories, robot = _open(folder)
+    run_folder, scenario, trajectories, known = _open(folder)
     began = time.perf_counter()
-    sensor = sensor or taught_sensor(scenario, robot, trajectories.seed, progress)
-    plant, names = plant or build_plant(scenario, robot), _record_files(scenario)
+    sensor = sensor or taught_sensor(scenario, known.robot, trajectories.seed, progress)
+    plant = plant or build_plant(scenario, seed=trajectories.seed, known=known)
+    names = _record_files(scenario)
     frames = scenario.timing.frames(scenario.excitation.duration_s)
     with progress.stage("record", frames * len(names)) as advance:
         for name in names:
@@ -113,7 +125,7 @@ def identify(folder: Path, progress: Progress, settings: Mapping[str, Any] | Non
     if seed is not None:
         for name, one in records.items():
             _check_planned(run_folder.path / name, one, scenario, trajectories)
-    found = _identified(records, scenario, progress)
+    found = _identified(records, scenario, progress, folder)
     if scenario != planned:
         write_text(run_folder.scenario, scenario.to_toml())
     _write_identified(run_folder, found, scenario, seed)
@@ -127,7 +139,10 @@ def identify_own(paths: Sequence[Path], folder: Path, progress: Progress, settin
     run_folder = RunFolder(folder)
     contents, stated = read_own_records(list(paths))
     scenario = with_estimator_settings(stated, settings)
-    records = dict(zip(RECORDS, contents, strict=False))
+    records, known = dict(zip(RECORDS, contents, strict=False)), known_geometry(scenario)
+    for one in contents:
+        if known.covariance is not None and GEOMETRY_COVARIANCE not in one:
+            store_geometry_covariance(one, known.robot, known.covariance)
     found = _identified(records, scenario, progress)
     folder.mkdir(parents=True, exist_ok=True)
     write_text(run_folder.scenario, scenario.to_toml())
@@ -152,8 +167,10 @@ class _Identified:
         return next(iter(self.records.values()))
 
 
-def _identified(records: Mapping[str, xr.Dataset], scenario: Scenario, progress: Progress) -> _Identified:
-    began, robot = time.perf_counter(), load_robot(scenario.robot)
+def _identified(
+    records: Mapping[str, xr.Dataset], scenario: Scenario, progress: Progress, folder: Path | None = None
+) -> _Identified:
+    began, robot = time.perf_counter(), known_geometry(scenario, folder).robot
     result = identification.identify(list(records.values()), robot, scenario, progress)
     reference = recorded_reference(next(iter(records.values())))
     before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))
@@ -200,8 +217,8 @@ def validate(folder: Path, progress: Progress, workers: int | None = None, taugh
             f"{folder} holds a record of your own: no plant is there that could run unseen trajectories; go on with: "
             f"cmmsim report --out {folder}"
         )
-    run_folder, scenario, trajectories, robot = _open(folder)
-    began = time.perf_counter()
+    run_folder, scenario, trajectories, known = _open(folder)
+    began, robot = time.perf_counter(), known.robot
     run_folder.require("covariance.nc")
     files, result = RunFiles(run_folder), load_result(run_folder.result)
     check_robot(files.experiment, robot)
@@ -212,7 +229,7 @@ def validate(folder: Path, progress: Progress, workers: int | None = None, taugh
     covariance = files.covariance_of(robot)
     models = _identified_models(robot, run_folder, result)
     taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
-    runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, workers, progress)
+    runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, workers, progress, known)
     recording.write_runs(run_folder.validation, [(unseen.record, unseen.truth) for unseen in runs])
     records = [files.experiment, *(run.record for run in runs)]
     references = [recorded_reference(seen) for seen in records]
@@ -243,10 +260,17 @@ def report(folder: Path, progress: Progress) -> None:
     _add_seconds(RunFolder(folder), report=time.perf_counter() - began)
 
 
-def _open(folder: Path) -> tuple[RunFolder, Scenario, TrajectorySet, Robot]:
+def _open(folder: Path) -> tuple[RunFolder, Scenario, TrajectorySet, KnownGeometry]:
     run_folder = RunFolder(folder)
     scenario = load_scenario(run_folder.scenario)
-    return run_folder, scenario, load_trajectories(run_folder.trajectories), load_robot(scenario.robot)
+    return run_folder, scenario, load_trajectories(run_folder.trajectories), known_geometry(scenario, folder)
+
+
+def _calibrated(scenario: Scenario, seed: int, progress: Progress) -> tuple[GeometryOutcome | None, KnownGeometry]:
+    """The calibration of the geometry that precedes a run, where there is one, and what is known of the geometry."""
+    if scenario.geometry.known != "calibrated":
+        return None, known_geometry(scenario)
+    return calibrated_for_a_run(scenario, seed, progress)
 
 
 def _check_planned(file: Path, record: xr.Dataset, scenario: Scenario, trajectories: TrajectorySet) -> None:
@@ -274,8 +298,12 @@ def _designed(plant: Plant, seed: int, progress: Progress) -> TrajectorySet:
     return trajectories
 
 
-def _write_plan(folder: Path, scenario: Scenario, trajectories: TrajectorySet) -> None:
+def _write_plan(
+    folder: Path, scenario: Scenario, trajectories: TrajectorySet, calibration: GeometryOutcome | None
+) -> None:
     folder.mkdir(parents=True, exist_ok=True)
+    if calibration is not None:
+        calibration.write(folder / FOLDER)
     write_text(RunFolder(folder).scenario, scenario.to_toml())
     save_trajectories(RunFolder(folder).trajectories, trajectories)
 

@@ -18,6 +18,8 @@ TEACHING, ANCHOR = 2, 3
 """The sensor's teaching, and the error of what fixes the scale."""
 STATIC_POSES, UNSEEN_POSES, ENCODER_OFFSETS, ENCODERS, STATIC_NOISE = 14, 15, 16, 17, 18
 """Of a kinematic calibration: candidates and unseen poses, offsets of the encoders and their readings, drawn poses."""
+TRUE_GEOMETRY = 19
+"""The true geometry about one that was calibrated before."""
 NOISE, LATENCY, PREDICTION = 4, 5, 6
 """Of each run: the sensor's noise, the latency of its frames, the noise in what is predicted of it."""
 DESIGN, LOAD, CALIBRATION, MEAN_LATENCY = 7, 8, 9, 10

@@ -177,8 +177,16 @@ def _fill(
     )
     now.servo_integral, now.last_measured = start.servo_integral, chart.coordinates(start.last_measured)
     now.last_command = start.commands[-1]
-    for room in (now.known, now.served, now.derivatives):
-        room.inputs[-sizes.rigid :] = rigid
+    task.servo_knows = problem.servo_robot.geometry == problem.robot.geometry
+    for inputs, function, fixed in (
+        (now.known.inputs, own["equation_of_motion"], rigid),
+        (now.served.inputs, servo_motion, rigid),
+        (now.derivatives.inputs, own["motion_derivatives"], rigid),
+        (now.pose_and_rate, own["rate_map_derivative"], rigid[:0]),
+    ):
+        last = np.concatenate([fixed, function.constants])
+        end = sum(function.inputs)
+        inputs[end - len(last) : end] = last
     now.step_column, now.start_moves = sizes.parameters, problem.start_sensitivities
     now.width = sizes.parameters + 1 + (sizes.start if problem.start_sensitivities else 0)
 

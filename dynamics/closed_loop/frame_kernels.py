@@ -78,7 +78,7 @@ def serve(task: Record, now: Record, d: Record, plan: Record, measured: Array, k
     """The servo's command at one good frame, and its derivatives. The Jacobian that it knows, at the measured pose, is
     often the one where the motion is known."""
     size, known = len(measured), now.known
-    same = known.valid and task.servo_motion == task.equation_of_motion
+    same = known.valid and task.servo_knows
     for i in range(size):
         error = plan.reference[k, i] - measured[i]
         rate = (measured[i] - now.last_measured[i]) / now.elapsed

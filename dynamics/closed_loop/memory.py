@@ -65,8 +65,8 @@ class Memory(NamedTuple):
 
 LAYOUT = {
     "task": "equation_of_motion! motion_derivatives! rate_map_derivative! servo_motion! evaluate_terms! evaluate! "
-    "decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! measured! lp li ld kp kd ki stiffness "
-    "damping motor_inertia period rigid:r coulomb:n viscous:n friction=friction",
+    "decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! servo_knows! measured! lp li ld kp kd ki "
+    "stiffness damping motor_inertia period rigid:r coulomb:n viscous:n friction=friction",
     "now": "known=known served=known derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
     "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
     "command_rate:n last_command:n impulse:n last_measured:m servo_integral:m demand:m change:m rest:m "
@@ -88,8 +88,15 @@ its Cholesky factor; issued commands stay while they are on their way, the last 
 def record_type(name: str, sizes: Sizes) -> np.dtype:
     """Layout of a record for a robot."""
     n, m, r = sizes.joints, sizes.coordinates, sizes.rigid
-    length = {"n": n, "m": m, "r": r, "M": 2 * m, "s": 2 * m + 3 * n, "x": 2 * m + n, "4": 4, "i": 2 * m + r}
-    length |= {"d": 3 * m + n + r, "w": sizes.parameters + 1 + sizes.start, "c": MAX_DELAY_FRAMES + 3}
+    length = {"n": n, "m": m, "r": r, "s": 2 * m + 3 * n, "x": 2 * m + n, "4": 4}
+    g = sizes.geometry
+    length |= {
+        "M": 2 * m + g,
+        "i": 2 * m + r + g,
+        "d": 3 * m + n + r + g,
+        "w": sizes.parameters + 1 + sizes.start,
+        "c": MAX_DELAY_FRAMES + 3,
+    }
     fields: list[Any] = []
     for entry in LAYOUT[name].split():
         field, _, inner = entry.partition("=")

@@ -10,6 +10,7 @@ import numpy as np
 from dynamics.checks import Shape, check_choice, check_type, floats, real, whole
 from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
 from dynamics.errors import SimulationError
+from dynamics.legs.numbers import MOST_NUMBERS
 from dynamics.robot import Robot
 
 MAX_DELAY_FRAMES = 60
@@ -162,11 +163,14 @@ class StartState:
 
 @dataclass(frozen=True)
 class Sizes:
-    """Numbers of joints, of coordinates of the platform, and of parameters of the rigid bodies."""
+    """Numbers of joints, of coordinates of the platform, of parameters of the rigid bodies, and room for so many
+    geometric numbers, the last arguments of functions (see `Robot.moved`): the same for most robots, as kernels are
+    compiled for sizes."""
 
     joints: int
     coordinates: int
     rigid: int
+    geometry: int = 0
 
     @property
     def parameters(self) -> int:
@@ -216,8 +220,13 @@ class LoopProblem:
     @cached_property
     def sizes(self) -> Sizes:
         """Those of the robot's equation of motion."""
-        motion = self.robot.functions["equation_of_motion"]
-        return Sizes(joints=motion.outputs[2][0], coordinates=motion.inputs[0], rigid=motion.inputs[2])
+        motion, known = (robot.functions["equation_of_motion"] for robot in (self.robot, self.servo_robot))
+        return Sizes(
+            joints=motion.outputs[2][0],
+            coordinates=motion.inputs[0],
+            rigid=motion.inputs[2],
+            geometry=max(MOST_NUMBERS * motion.outputs[2][0], len(motion.constants), len(known.constants)),
+        )
 
 
 def checked_loop_parameters(robot: Robot, parameters: object) -> np.ndarray:

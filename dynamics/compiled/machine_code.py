@@ -3,7 +3,7 @@
 import ctypes
 import json
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
@@ -22,18 +22,21 @@ from dynamics.compiled.translation import llvm_text
 class MachineFunction:
     """A compiled function: called with batches (N or 1, columns) of its arguments it returns all outputs (N, rows,
     columns), NaN included. `address` is that of the code for a single call, see `translation`; it is valid as long as
-    the function lives."""
+    the function lives. constants (c,): values of the last argument, where callers leave that out."""
 
     inputs: list[int]
     outputs: list[tuple[int, int]]
     address: int
     over_rows: Callable[[int, int, int], None]
     engine: Any  # whose end is that of the code
+    constants: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def __call__(self, *batches: np.ndarray) -> list[np.ndarray]:
         """All outputs (N, rows, columns) over batches (N or 1, columns) of the arguments, NaN included."""
         count = max((len(batch) for batch in batches if len(batch) != 1), default=1)
         given = np.empty((count, sum(self.inputs)))
+        if len(self.constants):
+            batches = (*batches, self.constants[None])
         for batch, size, end in zip(batches, self.inputs, np.cumsum(self.inputs), strict=True):
             given[:, end - size : end] = batch
         sizes = [rows * columns for rows, columns in self.outputs]
@@ -43,7 +46,8 @@ class MachineFunction:
         return [part.reshape(count, *shape) for part, shape in zip(parts, self.outputs, strict=True)]
 
     def bound_to(self, inputs: np.ndarray, outputs: np.ndarray) -> Callable[[], None]:
-        """The code for one set of inputs and outputs, which the caller keeps alive, as a function without arguments."""
+        """The code for one set of inputs, with the constants, and outputs as a function without arguments; the caller
+        keeps both alive."""
         single = ctypes.PYFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(self.address)
         single.engine = self.engine  # type: ignore[attr-defined]
         return partial(single, ctypes.c_void_p(inputs.ctypes.data), ctypes.c_void_p(outputs.ctypes.data))

@@ -4,6 +4,8 @@ The coordinates are the pose [x y z alpha beta gamma] with R = Rx(alpha) Ry(beta
 turn their rates into a twist [h_dot, omega]. A platform with fewer freedoms would have its chart here. Base axes; SI.
 """
 
+from collections.abc import Sequence
+
 import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -58,7 +60,7 @@ class PlatformJointMotion:
     d(acceleration)/d(rate) is twice gradient_rate. Pose, rate and acceleration (`gain`) are symbols.
     """
 
-    def __init__(self, joints: np.ndarray, pose: ca.SX, rate: ca.SX, acceleration: ca.SX) -> None:
+    def __init__(self, joints: Sequence[ca.SX] | np.ndarray, pose: ca.SX, rate: ca.SX, acceleration: ca.SX) -> None:
         self.pose, self.rate, self.gain = pose, rate, acceleration
         angles, spin, spin_rate = pose[3:6], rate[3:6], acceleration[3:6]
         rotation = rotation_matrix(angles)

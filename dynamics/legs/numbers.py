@@ -18,6 +18,8 @@ from dynamics.legs.leg import Leg
 
 AnyKind = TypeVar("AnyKind", bound=Leg)
 POINTS = ("base_joint", "platform_joint")
+MOST_NUMBERS = 11
+"""A leg of any built-in kind has so many at most."""
 
 
 def unit_of(number: str) -> str:

@@ -99,7 +99,7 @@ class RssLeg(Leg):
         inverse = 1 / square
         cosine = (along * chord - across * root) * inverse
         sine = (across * chord + along * root) * inverse
-        crank = self.crank_length * (cosine * zero + sine * np.cross(axis, zero))
+        crank = self.crank_length * (cosine * zero + sine * ca.cross(ca.SX(axis), ca.SX(zero)))
         link = position - self.base_joint - crank
         return LegVectors(ca.atan2(sine, cosine), ca.SX(axis), crank, link, self.crank_length, self.link_length)
 
@@ -194,7 +194,7 @@ class RssLeg(Leg):
         """Components of B->A along and across the crank's zero direction, and the one that the link length asks for."""
         reach = position - self.base_joint
         zero = self.crank_zero_direction
-        across = np.cross(self.crank_axis, zero)
+        across = ca.cross(ca.SX(self.crank_axis), ca.SX(zero))
         radius, length = self.crank_length, self.link_length
         chord = (ca.dot(reach, reach) + radius**2 - length**2) / (2 * radius)
         return ca.dot(reach, zero), ca.dot(reach, across), chord

@@ -14,19 +14,19 @@ import casadi as ca
 import numpy as np
 
 from dynamics.expressions import function, symmetric_from_lower
-from dynamics.geometry import RobotGeometry
+from dynamics.geometry import AnyGeometry
 from dynamics.kinematics.platform import PlatformJointMotion, pose_rate_to_twist, twist_bias
 from dynamics.parameters import parameter_layout
 from dynamics.rigid_body.jacobians import freedoms
 from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 
 
-def motion_functions(geometry: RobotGeometry) -> list[ca.Function]:
+def motion_functions(geometry: AnyGeometry) -> list[ca.Function]:
     """What the closed loop integrates."""
     return [equation_of_motion(geometry), motion_derivatives(geometry), rate_map_derivative(geometry)]
 
 
-def equation_of_motion(geometry: RobotGeometry) -> ca.Function:
+def equation_of_motion(geometry: AnyGeometry) -> ca.Function:
     """(q, rate (m,), rigid (p,)) -> M (m, m), b (m,), J_theta (n, m), J_theta_dot rate (n,), theta (n,)."""
     layout, (q, rate) = parameter_layout(geometry.legs), _coordinates(geometry, "q", "rate")
     (pose, pose_rate, rest), free = _poses(geometry, q, rate, 0 * rate), freedoms(geometry)
@@ -51,10 +51,12 @@ def equation_of_motion(geometry: RobotGeometry) -> ca.Function:
         ca.vertcat(*accelerations),
         ca.vertcat(*coordinates),
     ]
-    return function("equation_of_motion", [q, rate, rigid], _at(joints, outputs, pose, pose_rate, rest))
+    return function(
+        "equation_of_motion", [q, rate, rigid, *geometry.symbols], _at(joints, outputs, pose, pose_rate, rest)
+    )
 
 
-def motion_derivatives(geometry: RobotGeometry) -> ca.Function:
+def motion_derivatives(geometry: AnyGeometry) -> ca.Function:
     """(q, rate, acceleration (m,), torque (n,), rigid (p,)) -> derivatives at fixed acceleration and net joint torque.
 
     Of the residual M q_ddot + b - J_theta^T torque: with respect to q (m, m), rate (m, m) and rigid (m, p). Of the
@@ -87,10 +89,12 @@ def motion_derivatives(geometry: RobotGeometry) -> ca.Function:
         ca.vertcat(*joint_by_pose) @ free,
         ca.vertcat(*joint_by_rate) @ free,
     ]
-    return function("motion_derivatives", [q, rate, acceleration, torque, rigid], _at(joints, outputs, *motion))
+    return function(
+        "motion_derivatives", [q, rate, acceleration, torque, rigid, *geometry.symbols], _at(joints, outputs, *motion)
+    )
 
 
-def rate_map_derivative(geometry: RobotGeometry) -> ca.Function:
+def rate_map_derivative(geometry: AnyGeometry) -> ca.Function:
     """(q, g) -> d(J_theta g)/dq (n, m) for a constant rate g (m,)."""
     q, rate = _coordinates(geometry, "q", "rate")
     motion, joints, rows = _poses(geometry, q, rate, 0 * rate), _joints(geometry), []
@@ -102,21 +106,21 @@ def rate_map_derivative(geometry: RobotGeometry) -> ca.Function:
         along = joints.velocity[number].T @ curvature @ joints.gradient[number]
         rows.append(at_joint.T @ joints.gradient_rate[number] + along)
     outputs = [ca.vertcat(*rows) @ freedoms(geometry)]
-    return function("rate_map_derivative", [q, rate], _at(joints, outputs, *motion))
+    return function("rate_map_derivative", [q, rate, *geometry.symbols], _at(joints, outputs, *motion))
 
 
-def _coordinates(geometry: RobotGeometry, *names: str) -> list[ca.SX]:
+def _coordinates(geometry: AnyGeometry, *names: str) -> list[ca.SX]:
     return [ca.SX.sym(name, len(geometry.chart.freedoms)) for name in names]
 
 
-def _poses(geometry: RobotGeometry, q: ca.SX, rate: ca.SX, acceleration: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
+def _poses(geometry: AnyGeometry, q: ca.SX, rate: ca.SX, acceleration: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Pose (6,), its rate and its acceleration of coordinates (m,) and theirs."""
     free = freedoms(geometry)
     at_home = ca.SX(ca.DM(geometry.chart.pose(np.zeros(free.shape[1]))))
     return at_home + free @ q, ca.densify(free @ rate), ca.densify(free @ acceleration)
 
 
-def _joints(geometry: RobotGeometry) -> PlatformJointMotion:
+def _joints(geometry: AnyGeometry) -> PlatformJointMotion:
     return PlatformJointMotion(geometry.platform_joints, *[ca.SX.sym(name, 6) for name in ("pose", "rate", "gain")])
 
 
@@ -126,7 +130,7 @@ def _at(joints: PlatformJointMotion, outputs: list[ca.SX], *motion: ca.SX) -> li
 
 
 def _leg_derivatives(
-    geometry: RobotGeometry, number: int, joints: PlatformJointMotion, torque: ca.SX, own: ca.SX
+    geometry: AnyGeometry, number: int, joints: PlatformJointMotion, torque: ca.SX, own: ca.SX
 ) -> tuple[ca.SX, ca.SX, list[ca.SX], list[ca.SX]]:
     """Columns (3, p) of the leg's own parameters, net force (3,), and derivatives of that force and of theta_ddot with
     respect to position, velocity and acceleration of A."""
@@ -167,7 +171,7 @@ def _by_rate(rows: list[ca.SX], joints: PlatformJointMotion, leg: int) -> ca.SX:
     return by_velocity @ joints.gradient[leg] + 2 * by_acceleration @ joints.gradient_rate[leg]
 
 
-def _platform_columns(geometry: RobotGeometry, joints: PlatformJointMotion) -> ca.SX:
+def _platform_columns(geometry: AnyGeometry, joints: PlatformJointMotion) -> ca.SX:
     to_twist = pose_rate_to_twist(joints.pose)
     twist_dot = to_twist @ joints.gain + twist_bias(joints.pose, joints.rate)
     return to_twist.T @ platform_columns(joints.pose, to_twist @ joints.rate, twist_dot, ca.DM(geometry.gravity))

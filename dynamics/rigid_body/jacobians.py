@@ -4,40 +4,37 @@ J_a1 and J_a2 (eq. 7): diag(J_a1) theta_dot = J_a2 twist; J_ad = J_a1^-1 J_a2 (e
 (eq. 29). A pose has six entries also where the platform has fewer freedoms; see `kinematics.chart`.
 """
 
-from collections.abc import Sequence
-
 import casadi as ca
 import numpy as np
 
-from dynamics.geometry import RobotGeometry
+from dynamics.geometry import AnyGeometry
 from dynamics.kinematics.platform import pose_rate_to_twist, rotation_matrix
-from dynamics.legs.leg import Leg
 
 
-def freedoms(geometry: RobotGeometry) -> ca.DM:
+def freedoms(geometry: AnyGeometry) -> ca.DM:
     """d(pose)/d(coordinates) (6, m), which also spans the twists, without its zeros."""
     return ca.sparsify(ca.DM(geometry.chart.basis))
 
 
-def platform_arms(geometry: RobotGeometry, pose: ca.SX) -> list[ca.SX]:
+def platform_arms(geometry: AnyGeometry, pose: ca.SX) -> list[ca.SX]:
     """Vectors a from the platform origin to its joints (3,), base axes, m."""
     rotation = rotation_matrix(pose[3:6])
     return [rotation @ leg.platform_joint for leg in geometry.legs]
 
 
-def joint_coordinates(geometry: RobotGeometry, pose: ca.SX) -> ca.SX:
+def joint_coordinates(geometry: AnyGeometry, pose: ca.SX) -> ca.SX:
     """Actuated coordinates (n,), rad or m, at a pose (6,). Entries of a leg that cannot reach are NaN."""
     arms = platform_arms(geometry, pose)
     return ca.vertcat(*[leg.coordinate(pose[0:3] + arm) for leg, arm in zip(geometry.legs, arms, strict=True)])
 
 
-def reach_margin(geometry: RobotGeometry, pose: ca.SX) -> ca.SX:
+def reach_margin(geometry: AnyGeometry, pose: ca.SX) -> ca.SX:
     """Reach margins (n,), dimensionless; negative: out of reach."""
     arms = platform_arms(geometry, pose)
     return ca.vertcat(*[leg.reach(pose[0:3] + arm) for leg, arm in zip(geometry.legs, arms, strict=True)])
 
 
-def joint_jacobian(geometry: RobotGeometry, pose: ca.SX) -> ca.SX:
+def joint_jacobian(geometry: AnyGeometry, pose: ca.SX) -> ca.SX:
     """J_ad (n, 6): theta_dot = J_ad twist (eq. 8)."""
     rows = []
     for leg, arm in zip(geometry.legs, platform_arms(geometry, pose), strict=True):
@@ -46,12 +43,12 @@ def joint_jacobian(geometry: RobotGeometry, pose: ca.SX) -> ca.SX:
     return ca.vertcat(*rows)
 
 
-def pose_jacobian(geometry: RobotGeometry, pose: ca.SX) -> ca.SX:
+def pose_jacobian(geometry: AnyGeometry, pose: ca.SX) -> ca.SX:
     """J_theta (n, 6): theta_dot = J_theta pose_dot (eq. 29)."""
     return joint_jacobian(geometry, pose) @ pose_rate_to_twist(pose)
 
 
-def placements(geometry: RobotGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:
+def placements(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:
     """Of the bodies of all legs, leg by leg (bodies, 15): centre of mass, m, axes (3, 3) row by row, and angular
     velocity, rad/s, base axes."""
     rows = []
@@ -62,7 +59,7 @@ def placements(geometry: RobotGeometry, pose: ca.SX, twist: ca.SX) -> ca.SX:
     return ca.vertcat(*rows)
 
 
-def singularity_measures(geometry: RobotGeometry, pose: ca.SX) -> tuple[ca.SX, ca.SX]:
+def singularity_measures(geometry: AnyGeometry, pose: ca.SX) -> tuple[ca.SX, ca.SX]:
     """Leverage of each actuator on its leg (n,), in 0..1; and J_a2 (n, n) without unit: for the twists that the
     platform can have, rows [d, a x d] of the unit vectors d along which the legs push, angular columns over the
     characteristic length."""
@@ -75,9 +72,10 @@ def singularity_measures(geometry: RobotGeometry, pose: ca.SX) -> tuple[ca.SX, c
     return ca.vertcat(*leverages), ca.vertcat(*rows) @ ca.diag(ca.DM(scale)) @ freedoms(geometry)
 
 
-def loop_closure(geometry: RobotGeometry, pose: ca.SX, joints: ca.SX, legs: Sequence[Leg] = ()) -> tuple[ca.SX, ca.SX]:
+def loop_closure(geometry: AnyGeometry, pose: ca.SX, joints: ca.SX) -> tuple[ca.SX, ca.SX]:
     """How far the loops of eq. 3 and 4 are from closed at a pose and joint coordinates chosen freely, and its
-    derivative: gaps (n,) in m^2, and d(gaps)/d(coordinates of the platform) (n, n). legs: instead of the robot's."""
-    rotation, legs = rotation_matrix(pose[3:6]), legs or geometry.legs
-    gap = ca.vertcat(*[leg.gap(pose[0:3] + rotation @ leg.platform_joint, joints[k]) for k, leg in enumerate(legs)])
+    derivative: gaps (n,) in m^2, and d(gaps)/d(coordinates of the platform) (n, n)."""
+    arms = platform_arms(geometry, pose)
+    legs = enumerate(zip(geometry.legs, arms, strict=True))
+    gap = ca.vertcat(*[leg.gap(pose[0:3] + arm, joints[k]) for k, (leg, arm) in legs])
     return gap, ca.jacobian(gap, pose) @ freedoms(geometry)

@@ -9,7 +9,7 @@ positive definite, G the wrench that holds the robot up, and tau_g = M twist_dot
 import casadi as ca
 
 from dynamics.expressions import function, symmetric_from_lower
-from dynamics.geometry import RobotGeometry
+from dynamics.geometry import AnyGeometry
 from dynamics.kinematics.platform import joint_motion, pose_rate_to_twist, rotation_matrix, twist_bias
 from dynamics.parameters import parameter_layout
 from dynamics.rigid_body.jacobians import (
@@ -25,7 +25,7 @@ from dynamics.rigid_body.jacobians import (
 )
 
 
-def rigid_body_regressor(geometry: RobotGeometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> ca.SX:
+def rigid_body_regressor(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX) -> ca.SX:
     """Columns of Gamma (6, p) for the inertial parameters of platform and legs (eq. 25)."""
     gravity, layout = ca.DM(geometry.gravity), parameter_layout(geometry.legs)
     columns = ca.SX.zeros(6, layout.rigid.stop)
@@ -51,7 +51,7 @@ def platform_columns(pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, gravity: ca.DM
     return ca.horzcat(mass, ca.vertcat(ca.SX.zeros(3, 3), ca.horzcat(*moments)))
 
 
-def inertial_wrench(geometry: RobotGeometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, rigid: ca.SX) -> ca.SX:
+def inertial_wrench(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, twist_dot: ca.SX, rigid: ca.SX) -> ca.SX:
     """M twist_dot + C twist + G (6,) for the inertial parameters `rigid`: the regressor times them, without it."""
     gravity, layout = ca.DM(geometry.gravity), parameter_layout(geometry.legs)
     total = platform_columns(pose, twist, twist_dot, gravity) @ rigid[0:4]
@@ -62,7 +62,7 @@ def inertial_wrench(geometry: RobotGeometry, pose: ca.SX, twist: ca.SX, twist_do
     return total
 
 
-def mass_matrix(geometry: RobotGeometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
+def mass_matrix(geometry: AnyGeometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
     """M (6, 6) of eq. 23, symmetric positive definite for positive parameters."""
     total, layout = platform_mass(pose, rigid[0:4]), parameter_layout(geometry.legs)
     for number, (leg, arm) in enumerate(zip(geometry.legs, platform_arms(geometry, pose), strict=True)):
@@ -72,7 +72,7 @@ def mass_matrix(geometry: RobotGeometry, pose: ca.SX, rigid: ca.SX) -> ca.SX:
     return symmetric_from_lower(total)
 
 
-def coriolis_matrix(geometry: RobotGeometry, pose: ca.SX, twist: ca.SX, rigid: ca.SX) -> ca.SX:
+def coriolis_matrix(geometry: AnyGeometry, pose: ca.SX, twist: ca.SX, rigid: ca.SX) -> ca.SX:
     """C (6, 6) of eq. 23: C twist is the Coriolis and centrifugal wrench."""
     frame, omega, layout = rotation_matrix(pose[3:6]), twist[3:6], parameter_layout(geometry.legs)
     total = ca.diagcat(ca.SX.zeros(3, 3), ca.skew(omega) @ frame @ ca.diag(rigid[1:4]) @ frame.T)
@@ -91,25 +91,33 @@ def platform_mass(pose: ca.SX, platform: ca.SX) -> ca.SX:
     return ca.diagcat(platform[0] * ca.SX.eye(3), frame @ ca.diag(platform[1:4]) @ frame.T)
 
 
-def kinematic_functions(geometry: RobotGeometry) -> list[ca.Function]:
+def kinematic_functions(geometry: AnyGeometry) -> list[ca.Function]:
     """Functions of pose and its rates alone: joint coordinates, reach, Jacobians, twist conversions."""
     pose, rate, acceleration = ca.SX.sym("pose", 6), ca.SX.sym("pose_rate", 6), ca.SX.sym("pose_acceleration", 6)
     twist, theta = ca.SX.sym("twist", 6), ca.SX.sym("theta", len(geometry.legs))
     to_twist = pose_rate_to_twist(pose)
     return [
-        function("inverse_kinematics", [pose], [joint_coordinates(geometry, pose), reach_margin(geometry, pose)]),
-        function("loop_closure", [pose, theta], list(loop_closure(geometry, pose, theta))),
-        function("singularity_measures", [pose], list(singularity_measures(geometry, pose))),
-        function("joint_jacobian", [pose], [joint_jacobian(geometry, pose)]),
-        function("pose_jacobian", [pose], [pose_jacobian(geometry, pose)]),
-        function("twist", [pose, rate], [to_twist @ rate]),
-        function("twist_dot", [pose, rate, acceleration], [to_twist @ acceleration + twist_bias(pose, rate)]),
-        function("pose_rate", [pose, twist], [ca.solve(to_twist, twist)]),
-        function("placements", [pose, twist], [placements(geometry, pose, twist)]),
+        function(
+            "inverse_kinematics",
+            [pose, *geometry.symbols],
+            [joint_coordinates(geometry, pose), reach_margin(geometry, pose)],
+        ),
+        function("loop_closure", [pose, theta, *geometry.symbols], list(loop_closure(geometry, pose, theta))),
+        function("singularity_measures", [pose, *geometry.symbols], list(singularity_measures(geometry, pose))),
+        function("joint_jacobian", [pose, *geometry.symbols], [joint_jacobian(geometry, pose)]),
+        function("pose_jacobian", [pose, *geometry.symbols], [pose_jacobian(geometry, pose)]),
+        function("twist", [pose, rate, *geometry.symbols], [to_twist @ rate]),
+        function(
+            "twist_dot",
+            [pose, rate, acceleration, *geometry.symbols],
+            [to_twist @ acceleration + twist_bias(pose, rate)],
+        ),
+        function("pose_rate", [pose, twist, *geometry.symbols], [ca.solve(to_twist, twist)]),
+        function("placements", [pose, twist, *geometry.symbols], [placements(geometry, pose, twist)]),
     ]
 
 
-def dynamic_functions(geometry: RobotGeometry) -> list[ca.Function]:
+def dynamic_functions(geometry: AnyGeometry) -> list[ca.Function]:
     """M, C, G, friction, regressor (eq. 23-26), inverse dynamics (eq. 17) and forward dynamics (eq. 40).
 
     Wrenches have six entries; those that the chart forbids are carried by the legs, and drop out where torques balance
@@ -134,16 +142,18 @@ def dynamic_functions(geometry: RobotGeometry) -> list[ca.Function]:
     regressor = ca.horzcat(rigid_body_regressor(geometry, pose, twist, twist_dot), *rubbing)
     torques = ca.solve((jacobian @ free).T, free.T @ inertial) + friction
     return [
-        function("mass_matrix", [pose, xi], [mass]),
-        function("coriolis_matrix", [pose, twist, xi], [coriolis_matrix(geometry, pose, twist, rigid)]),
-        function("gravity_wrench", [pose, xi], [holding]),
-        function("friction_wrench", [pose, twist, xi], [jacobian.T @ friction]),
-        function("regressor", [pose, twist, twist_dot], [regressor]),
-        function("inverse_dynamics", [pose, twist, twist_dot, xi], [torques]),
-        function("forward_dynamics", [pose, twist, torque, xi], [acceleration]),
+        function("mass_matrix", [pose, xi, *geometry.symbols], [mass]),
+        function(
+            "coriolis_matrix", [pose, twist, xi, *geometry.symbols], [coriolis_matrix(geometry, pose, twist, rigid)]
+        ),
+        function("gravity_wrench", [pose, xi, *geometry.symbols], [holding]),
+        function("friction_wrench", [pose, twist, xi, *geometry.symbols], [jacobian.T @ friction]),
+        function("regressor", [pose, twist, twist_dot, *geometry.symbols], [regressor]),
+        function("inverse_dynamics", [pose, twist, twist_dot, xi, *geometry.symbols], [torques]),
+        function("forward_dynamics", [pose, twist, torque, xi, *geometry.symbols], [acceleration]),
     ]
 
 
-def robot_functions(geometry: RobotGeometry) -> list[ca.Function]:
+def robot_functions(geometry: AnyGeometry) -> list[ca.Function]:
     """All that `Robot` evaluates."""
     return kinematic_functions(geometry) + dynamic_functions(geometry)

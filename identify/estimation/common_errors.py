@@ -11,6 +11,7 @@ import numpy as np
 
 from identify.arrays import Array
 from identify.estimation.output_error import OutputErrorProblem
+from identify.record.recorded_run import RecordedRun
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,22 @@ class CommonErrorEstimates:
     std: Array
 
 
+def most_likely(run: RecordedRun, parameters: Array) -> Array:
+    """The common errors (k,) of a run `with_common_errors` at the optimum (p,), in standard deviations beforehand."""
+    assert run.marginal is not None
+    modes, had = run.marginal.modes, run.marginal.had
+    missed = run.without_common_errors().misses(parameters).ravel() - had  # in standard deviations of the noise alone
+    return np.asarray(-np.linalg.solve(np.eye(modes.shape[1]) + modes.T @ modes, modes.T @ missed))
+
+
+def most_likely_errors(problem: OutputErrorProblem, parameters: Array) -> list[Array]:
+    """Of each run of a problem `with_common_errors`, the most likely ones (k,) of those that a model can have."""
+    return [
+        np.zeros(0) if run.marginal is None else most_likely(run, parameters)[: len(run.errors_had)]
+        for run in problem.runs
+    ]
+
+
 def common_error_estimates(problem: OutputErrorProblem, parameters: Array) -> CommonErrorEstimates:
     """What the first record of a problem `with_common_errors` says at its optimum (p,) of what its poses have in
     common."""
@@ -31,16 +48,14 @@ def common_error_estimates(problem: OutputErrorProblem, parameters: Array) -> Co
         nothing = np.zeros(0)
         return CommonErrorEstimates((), nothing, nothing, nothing)
     names, factor, modes = run.common.all_names, run.common.whole_factor, run.marginal.modes
-    whitened, slopes = run.without_common_errors().residuals(parameters)  # in standard deviations of the noise alone
-    residuals = whitened.ravel()
-    rows = np.column_stack([slopes.reshape(residuals.size, -1), modes])
+    slopes = run.without_common_errors().residuals(parameters)[1]
+    rows = np.column_stack([slopes.reshape(len(modes), -1), modes])
     information = rows.T @ rows
     count = len(parameters)
     information[:count, :count] += problem.known_information()
     information[count:, count:] += np.eye(len(names))
     scale = 1.0 / np.sqrt(np.diag(information))
     covariance = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
-    found = -np.linalg.solve(np.eye(len(names)) + modes.T @ modes, modes.T @ residuals)
     spread = factor @ covariance[count:, count:] @ factor.T
     prior_std = np.sqrt(np.diag(factor @ factor.T))
-    return CommonErrorEstimates(names, prior_std, factor @ found, np.sqrt(np.diag(spread)))
+    return CommonErrorEstimates(names, prior_std, factor @ most_likely(run, parameters), np.sqrt(np.diag(spread)))

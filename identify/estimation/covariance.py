@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from dynamics.closed_loop import ClosedLoopRun, LoopFailure, simulate
+from dynamics.closed_loop import ClosedLoopRun, LoopFailure
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.explanation import Misfit, coloured_score_covariance, misfit_of_white
@@ -180,7 +180,7 @@ def _repeated_scores(
         except LoopFailure:
             return None
         drawn = [
-            residual + run.whiten(run.measured - poses)
+            residual + run.whiten(run.measured - poses) + _drawn_in_common(run, draws).reshape(residual.shape)
             for run, (residual, _), poses in zip(problem.runs, found, repeated, strict=True)
         ]
         score = np.asarray(sum(np.tensordot(r, j, 2) for r, (_, j) in zip(drawn, found, strict=True)))
@@ -194,22 +194,21 @@ def _repeated_scores(
     return [score for score, _ in results], [square for _, square in results]
 
 
+def _drawn_in_common(run: RecordedRun, rng: np.random.Generator) -> Array:
+    """What one draw of the errors that all poses have in common is in whitened residuals (n * 6,)."""
+    if run.marginal is None:
+        return np.zeros(6 * np.count_nonzero(run.ok))
+    return run.marginal.whiten(run.marginal.modes @ rng.standard_normal(run.marginal.modes.shape[1]))
+
+
 def repeated_experiment(run: RecordedRun, parameters: Array, rng: np.random.Generator) -> ClosedLoopRun:
-    """A repeated experiment whose plant is the identified model and whose sensor has drawn noise and common errors; NaN
-    where lost.
+    """A repeated experiment whose plant is the identified model and whose sensor has drawn noise; NaN where lost.
 
     Raises LoopFailure where the loop is unstable.
     """
-    noise = rng.standard_normal(run.measured.shape) @ np.linalg.cholesky(run.covariance).T
-    common, latencies = run.common, None
-    if common.names:
-        noise = noise + common.modes @ rng.standard_normal(len(common.names))
-    if common.latency_std:
-        drawn = run.settings.timing.latency_s + common.latency_std * rng.standard_normal()
-        latencies = np.full(len(noise), max(drawn, 0.0))
-    parameters = parameters + run.payload
-    lost = ~run.ok
-    return simulate(run.robot, parameters, run.reference, run.settings, lost=lost, noise=noise, latencies=latencies)
+    return run.simulate(
+        parameters, noise=rng.standard_normal(run.measured.shape) @ np.linalg.cholesky(run.covariance).T
+    )
 
 
 def correlation_matrix(covariance: Array) -> Array:

@@ -215,7 +215,7 @@ def _residuals(driven: OutputErrorProblem, parameters: Array) -> tuple[Array, ND
     gap, residuals, ok = np.full((LAGS, 6), np.nan), [], []
     for run in driven.runs:
         rows = np.full(run.measured.shape, np.nan)
-        rows[run.ok] = run.whiten(run.model_poses(parameters) - run.measured)
+        rows[run.ok] = run.misses(parameters)
         residuals += [rows, gap]
         ok += [run.ok, np.zeros(LAGS, dtype=bool)]
     return np.concatenate(residuals), np.concatenate(ok)

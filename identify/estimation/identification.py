@@ -55,12 +55,11 @@ def identify(
     searches = output_error_searches(problem, scenario, warm, progress)
     searched = time.perf_counter()
     method = scenario.identification.method
-    solution = searches[method]
+    solution, judged = searches[method].solution, searches[method].linearised
     with progress.stage("uncertainty", DRAWS) as advance:
-        judged = problem.of_method(method, solution.parameters)
         uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
-    by_commands = searches["command_driven"].parameters
-    explained = explanation(problem.of_method("command_driven", by_commands), by_commands, uncertainty.misfit)
+    driven = searches["command_driven"]
+    explained = explanation(driven.linearised, driven.solution.parameters, uncertainty.misfit)
     judgement = judge(problem, scenario, solution, uncertainty, explained)
     ended = time.perf_counter()
     return IdentificationResult(
@@ -72,11 +71,11 @@ def identify(
         covariance=uncertainty.covariance,
         scale_anchor=problem.anchor,
         common_errors=common_error_estimates(judged, solution.parameters),
-        iterations=sum(one.iterations for one in searches.values()),
-        evaluations=sum(one.evaluations for one in searches.values()),
+        iterations=sum(one.solution.iterations for one in searches.values()),
+        evaluations=sum(one.solution.evaluations for one in searches.values()),
         stop_reason=solution.stop_reason,
         searches=tuple(searches),
-        costs=tuple(one.costs for one in searches.values()),
+        costs=tuple(one.solution.costs for one in searches.values()),
         noise_ratio=explained.misfit.found,
         expected_noise_ratio=explained.misfit.expected,
         noise_ratio_std=explained.misfit.std,

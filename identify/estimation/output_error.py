@@ -8,6 +8,7 @@ The residuals are the pose differences of all records, whitened by the sensor's 
 known beside the poses (`prior`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -39,11 +40,20 @@ class OutputErrorProblem:
         """The same problem with the joints driven by the logged commands."""
         return replace(self, runs=tuple(run.driven_by_commands() for run in self.runs))
 
-    def of_method(self, method: str, parameters: Array) -> "OutputErrorProblem":
-        """The problem that a method of identification ("closed_loop" or "command_driven") has solved with these
-        parameters (p,), with what the poses have in common. Raises LoopFailure as `with_common_errors`."""
-        solved = self if method == "closed_loop" else self.driven_by_commands()
-        return solved.with_common_errors(parameters)
+    @property
+    def bends(self) -> bool:
+        """Whether the model is not linear in what the poses have in common: within a servo, or where latency is part of
+        it."""
+        return any(run.common.latency_std or (run.common.names and not run.driven) for run in self.runs if run.marginal)
+
+    def has(self, errors: Sequence[Array], within: float) -> bool:
+        """Whether the model of each run has these common errors (k,), but for so many standard deviations."""
+        pairs = zip(self.runs, errors, strict=True)
+        return all(np.abs(run.errors_had - own).max(initial=0.0) <= within for run, own in pairs)
+
+    def having(self, errors: Sequence[Array]) -> "OutputErrorProblem":
+        """The same problem, the model of each run with these common errors (k,)."""
+        return replace(self, runs=tuple(run.having(own) for run, own in zip(self.runs, errors, strict=True)))
 
     def with_common_errors(self, parameters: Array) -> "OutputErrorProblem":
         """The same problem, which knows what the poses of each record have in common, as a model with these parameters
@@ -56,7 +66,7 @@ class OutputErrorProblem:
         total = float(known @ known)
         try:
             for run in self.runs:
-                total += float(np.sum(run.whiten(run.model_poses(parameters) - run.measured) ** 2))
+                total += float(np.sum(run.misses(parameters) ** 2))
         except DynamicsError:
             return np.inf
         return total

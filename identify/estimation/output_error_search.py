@@ -5,7 +5,7 @@ output error, whose stick-slip events make narrow ones. Where neither the warm s
 model that runs, multiple shooting finds one that does.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,36 +14,73 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.bounded_least_squares import Problem, Solution, StopCriteria, minimise
 from identify.estimation.bounds import InCoordinates
+from identify.estimation.common_errors import most_likely_errors
 from identify.estimation.multiple_shooting import MultipleShooting, measured_states, segments
 from identify.estimation.output_error import OutputErrorProblem
 from identify.progress import Advance, Progress
 from identify.scenario import Scenario
 
+LINEARISATIONS, SETTLED = 6, 0.02
+"""Of the common errors, at most, and how near the last ones the most likely must be, in standard deviations."""
+
 CLOSE_ENOUGH = 1e-2
 """Relative change of the cost at which multiple shooting ends: the searches after it go on from there."""
 
 
+@dataclass(frozen=True)
+class Search:
+    """A problem, with what its poses have in common where that is most likely, and what the search for its optimum
+    found."""
+
+    problem: OutputErrorProblem
+    solution: Solution
+
+    @property
+    def linearised(self) -> OutputErrorProblem:
+        """The problem with the common errors as the model shows them at the optimum. Raises LoopFailure."""
+        return self.problem.with_common_errors(self.solution.parameters)
+
+
 def output_error_searches(
     problem: OutputErrorProblem, scenario: Scenario, warm: Array, progress: Progress
-) -> dict[str, Solution]:
-    """What each search found, in their order, from the warm start (p,); the last is that of the scenario's method.
+) -> dict[str, Search]:
+    """The searches by name, in their order, from the warm start (p,); the last is that of the scenario's method.
 
     Raises EstimationError: no model that runs.
     """
     found = {}
-    driven = problem.driven_by_commands().with_common_errors(warm)
+    driven = problem.driven_by_commands()
     start = runnable_start(driven, warm)
     if start is None:
-        found["multiple_shooting"] = shoot(driven, scenario, warm, progress)
-        start = found["multiple_shooting"].parameters
+        found["multiple_shooting"] = Search(driven, shoot(driven, scenario, warm, progress))
+        start = found["multiple_shooting"].solution.parameters
     settings = scenario.identification
     closed_loop = settings.method == "closed_loop"
     with progress.stage("identify", (2 if closed_loop else 1) * settings.max_iterations) as advance:
-        found["command_driven"] = search(driven, start, scenario, advance)
+        found["command_driven"] = searched = search_with_common_errors(driven, start, scenario, advance)
         if closed_loop:
-            start = _closed_loop_start(problem, found["command_driven"].parameters)
-            found["closed_loop"] = search(problem.with_common_errors(start), start, scenario, advance)
+            problem = problem.having(most_likely_errors(searched.problem, searched.solution.parameters))
+            start = _closed_loop_start(problem, searched.solution.parameters)
+            found["closed_loop"] = search_with_common_errors(problem, start, scenario, advance)
     return found
+
+
+def search_with_common_errors(
+    problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance
+) -> Search:
+    """Minimise a problem from parameters (p,) with what its poses have in common, time and again until the most likely
+    errors, about which the model is taken as linear in them, settle."""
+    problem = problem.with_common_errors(start)
+    solution = search(problem, start, scenario, advance)
+    for _ in range(LINEARISATIONS if problem.bends else 0):
+        errors = most_likely_errors(problem, solution.parameters)
+        if problem.has(errors, SETTLED):
+            break
+        problem = problem.having(errors).with_common_errors(solution.parameters)
+        again = search(problem, solution.parameters, scenario, lambda n=1: None)
+        counted = solution.evaluations + again.evaluations
+        solution = replace(again, costs=solution.costs + again.costs[1:], evaluations=counted)
+    return Search(problem, solution)
 
 
 def search(problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance) -> Solution:

@@ -57,8 +57,7 @@ def _searched(evidence: Evidence, problem: OutputErrorProblem, method: str) -> E
     scenario = evidence.scenario.with_overrides({"identification.method": method})
     warm = linear_warm_start(problem, evidence.scenario)
     found = list(output_error_searches(problem, scenario, warm, SilentProgress()).values())
-    seconds, last = time.perf_counter() - began, found[-1]
-    judged = problem.of_method(method, last.parameters)
-    std = estimate_uncertainty(judged, last.parameters, mixed_generator(ROUTES_UNCERTAINTY)).std
-    counts = sum(one.iterations for one in found), sum(one.evaluations for one in found)
+    seconds, last = time.perf_counter() - began, found[-1].solution
+    std = estimate_uncertainty(found[-1].linearised, last.parameters, mixed_generator(ROUTES_UNCERTAINTY)).std
+    counts = sum(one.solution.iterations for one in found), sum(one.solution.evaluations for one in found)
     return Estimate(last.parameters, std, seconds, *counts, last.stop_reason)

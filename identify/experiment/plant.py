@@ -21,9 +21,13 @@ from dynamics.closed_loop import (
 from dynamics.parameters import ParameterLayout
 from dynamics.robot import with_geometry_error
 from identify.arrays import Array
+from identify.errors import ScenarioError
 from identify.estimation.prior import starting_guess
 from identify.experiment.truth import build_truth
 from identify.loop_parameters import loop_settings, of_actuators
+from identify.random_streams import ENCODER_OFFSETS, TRUE_GEOMETRY, child
+from identify.record.geometry_errors import factor
+from identify.record.known_geometry import KnownGeometry, known_geometry
 from identify.record.payload import payload_vector
 from identify.scenario import Plant as PlantSwitches
 from identify.scenario import Scenario
@@ -34,7 +38,8 @@ class Plant:
     """The true robot in its loop, made once by `build_plant`.
 
     nominal: the robot that servo and estimator know; robot: the true one, the same object where there is no geometry
-    error; parameters (p,): the true ones; settings: of its loop, whose joints may be elastic.
+    error; parameters (p,): the true ones; settings: of its loop, whose joints may be elastic; geometry_covariance (g,
+    g): of the true geometry about the known one, where that is calibrated.
     """
 
     scenario: Scenario
@@ -42,6 +47,7 @@ class Plant:
     robot: Robot
     parameters: Array
     settings: LoopSettings
+    geometry_covariance: Array | None = None
 
     def check(self) -> None:
         """Raise dynamics.DynamicsError, with the evidence, where it cannot be simulated."""
@@ -104,23 +110,54 @@ class Plant:
         return replace(settings, steps_per_frame=max(settings.steps_per_frame, needed))
 
 
-def build_plant(scenario: Scenario, nominal: Robot | None = None) -> Plant:
-    """The plant of a scenario, about its robot as it is known; None: loaded from the scenario's.
+def build_plant(
+    scenario: Scenario, nominal: Robot | None = None, seed: int = 0, known: KnownGeometry | None = None
+) -> Plant:
+    """The plant of a scenario; nominal: its robot, where it is at hand; seed: of the run, which decides what is true of
+    a geometry that is calibrated; known: what is known of it, where that is at hand.
 
-    Raises ScenarioError: no such parameter set (with the valid names).
+    Raises ScenarioError: no such parameter set (with the valid names), or as `known_geometry`.
     """
     nominal, switches = nominal or load_robot(scenario.robot), scenario.plant
+    known = known or known_geometry(scenario, nominal=nominal)
     settings, stiffness = loop_settings(nominal, scenario, switches), of_actuators(nominal, switches, "joint_stiffness")
     if stiffness is not None:
         inertia, damping = (of_actuators(nominal, switches, name) for name in ("motor_inertia", "joint_damping"))
         settings = replace(settings, elasticity=JointElasticity(stiffness, inertia, damping))
     return Plant(
         scenario=scenario,
-        nominal=nominal,
-        robot=misplaced(nominal, switches),
+        nominal=known.robot,
+        robot=true_robot(nominal, scenario, seed, known),
         parameters=starting_guess(nominal, switches.parameters, 1.0).values,
         settings=settings,
+        geometry_covariance=known.covariance,
     )
+
+
+def true_robot(nominal: Robot, scenario: Scenario, seed: int, known: KnownGeometry) -> Robot:
+    """The true robot: off the scenario's by the errors of its plant, or, where a calibration done before says what is
+    known, drawn about that with its covariance."""
+    if known.covariance is None:
+        return misplaced(nominal, scenario.plant)
+    if scenario.geometry.known == "calibrated":
+        return nominal.moved(true_deviations(nominal, scenario, seed))
+    for name in ("geometry_error_m", "length_error_m", "axis_error_rad"):
+        if getattr(scenario.plant, name):
+            raise ScenarioError(
+                f"plant.{name} = {getattr(scenario.plant, name):g} with geometry.known = {scenario.geometry.known!r}: "
+                "the true geometry is drawn from the covariance of that calibration; set one of both"
+            )
+    drawn = np.random.default_rng(child(seed, TRUE_GEOMETRY)).standard_normal(len(known.covariance))
+    return known.robot.moved(factor(known.covariance) @ drawn)
+
+
+def true_deviations(robot: Robot, scenario: Scenario, seed: int) -> Array:
+    """How far the true geometric numbers (g,) of a robot that is calibrated are from its own, m and rad, with the
+    offsets of its encoders, which are the seed's."""
+    drawn = np.random.default_rng(child(seed, ENCODER_OFFSETS)).standard_normal(robot.layout.joints)
+    true = misplaced(robot, scenario.plant).geometry
+    offset = of_actuators(robot, scenario.geometry, "encoder_offset")
+    return true.shifted(-offset * drawn).deviations_from(robot.geometry)
 
 
 def misplaced(nominal: Robot, plant: PlantSwitches) -> Robot:

@@ -24,6 +24,7 @@ from identify.progress import Advance, Progress, SilentProgress
 from identify.random_streams import ANCHOR, CALIBRATION, LATENCY, LOAD, MEAN_LATENCY, NOISE, TEACHING, stream_seed
 from identify.record import recording
 from identify.record.common_errors import CommonErrors, store_common_errors
+from identify.record.geometry_errors import store_geometry_covariance
 from identify.record.payload import store_payload
 from identify.record.provenance import store_robot
 from identify.scenario import Scenario
@@ -58,7 +59,7 @@ def run_experiment(
     Raises ScenarioError, TrajectoryError, cmmsim.CmmError, dynamics.DynamicsError.
     """
     progress, scenario = progress or SilentProgress(), with_renderer(scenario)
-    plant = build_plant(scenario)
+    plant = build_plant(scenario, seed=seed)
     trajectories = design_trajectories(plant.nominal, scenario, seed, progress)
     sensor = taught_sensor(scenario, plant.nominal, seed, progress)
     with progress.stage("record", scenario.timing.frames(scenario.excitation.duration_s)) as advance:
@@ -175,6 +176,8 @@ def _record(plant: Plant, reference: Reference, run: ClosedLoopRun, eye: SensorI
         prismatic=plant.nominal.layout.prismatic,
     )
     store_robot(record, plant.nominal)
+    if plant.geometry_covariance is not None:
+        store_geometry_covariance(record, plant.nominal, plant.geometry_covariance)
     return record.assign_attrs(sensor_seconds=eye.seconds, lost_frames="; ".join(eye.lost[:20]))
 
 

@@ -19,13 +19,12 @@ from dynamics.closure import Closure
 from dynamics.errors import ConvergenceError
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.experiment.plant import misplaced
 from identify.experiment.sensor_in_loop import robot_transforms
 from identify.geometry.calibration import seen_between
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 from identify.loop_parameters import of_actuators
 from identify.progress import Progress
-from identify.random_streams import ENCODER_OFFSETS, ENCODERS, NOISE, STATIC_NOISE, child, stream_seed
+from identify.random_streams import ENCODERS, NOISE, STATIC_NOISE, child, stream_seed
 from identify.scenario import Scenario
 from identify.scenario.sections import Geometry
 
@@ -67,13 +66,6 @@ class Encoders:
 def encoders_of(robot: Robot, settings: Geometry) -> Encoders:
     """The encoders of a scenario's calibration, for a robot whose actuators turn or slide."""
     return Encoders(*(of_actuators(robot, settings, f"encoder_{name}") for name in ("noise", "resolution", "offset")))
-
-
-def true_deviations(robot: Robot, scenario: Scenario, seed: int) -> Array:
-    """How far the true geometric numbers (g,) are from the robot's, m and rad, with the offsets of its encoders."""
-    encoders, true = encoders_of(robot, scenario.geometry), misplaced(robot, scenario.plant).geometry
-    drawn = np.random.default_rng(child(seed, ENCODER_OFFSETS)).standard_normal(robot.layout.joints)
-    return true.shifted(-encoders.offset * drawn).deviations_from(robot.geometry)
 
 
 def true_poses(robot: Robot, deviations: Array, joints: Array, start: Array) -> Array:

@@ -5,11 +5,12 @@ import numpy as np
 from cmmsim.visibility import SightLines, expected_covariance, sight_lines
 from dynamics import Robot, load_robot
 from identify.arrays import Array
+from identify.experiment.plant import true_deviations
 from identify.experiment.run import taught_sensor
 from identify.experiment.sensor_in_loop import with_renderer
 from identify.geometry.calibration import PoseModel, Tolerance, calibrate
 from identify.geometry.encoders import check_encoders
-from identify.geometry.experiment import encoders_of, stand_at, true_deviations, true_poses
+from identify.geometry.experiment import encoders_of, stand_at, true_poses
 from identify.geometry.observability import check_enough
 from identify.geometry.outcome import GeometryOutcome
 from identify.geometry.selection import Candidates, Designer, Limits
@@ -17,6 +18,7 @@ from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 from identify.loop_parameters import of_actuators
 from identify.progress import Progress
 from identify.random_streams import STATIC_POSES, UNSEEN_POSES, child
+from identify.record.known_geometry import KnownGeometry
 from identify.scenario import Scenario
 
 
@@ -52,6 +54,15 @@ def run_geometry(
         advance()
     unseen = designer.candidates(settings.unseen, np.random.default_rng(child(seed, UNSEEN_POSES)))
     return GeometryOutcome(scenario, seed, designer.model, found, data, lost, true, unseen, chosen, among)
+
+
+def calibrated_for_a_run(scenario: Scenario, seed: int, progress: Progress) -> tuple[GeometryOutcome, KnownGeometry]:
+    """The calibration that precedes a run whose geometry is `calibrated`, and what is known after it. Raises as
+    `run_geometry`."""
+    outcome = run_geometry(scenario, seed, progress)
+    nominal, found = outcome.calibration.nominal, outcome.calibration.robot.geometry
+    robot = nominal.moved(found.deviations_from(nominal.geometry))
+    return outcome, KnownGeometry(robot, outcome.calibration.covariance)
 
 
 def _designer(

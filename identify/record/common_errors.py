@@ -4,7 +4,8 @@ They are one draw d a run, with a covariance, and move the measured poses by J(p
 frame and the covariance beside its poses. An estimator that whitens poses by the noise alone takes such an error for
 one of the model. Here it is marginalised: with noise of unit covariance and modes M = J L, L L^T the covariance of d,
 residuals have the covariance 1 + M M^T, and with M = U S V^T their whitener is 1 - U (1 - (1 + S^2)^-1/2) U^T. That is
-the same as estimating d beside everything else, d known beforehand by its covariance.
+the same as estimating d beside everything else, d known beforehand by its covariance. Where M is not the same for all
+d, as of a latency, or of cameras within a servo, the model is given the most likely d, and M taken there.
 """
 
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from scipy.linalg import block_diag, cholesky
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
+from identify.record.geometry_errors import GeometryErrors
 
 CHANGES, COVARIANCE = "common_error", "common_error_covariance"
 LATENCY = "timing.latency_s"
@@ -27,22 +29,25 @@ ROUNDING = 1e-9
 class CommonErrors:
     """names of the errors, each ending with its unit; changes (N, 6, k) of the measured poses per unit of each;
     covariance (k, k) of what is true minus what is known. latency_std: of the mean latency of the frames, s, which only
-    a model of the loop can turn into poses; its name comes last."""
+    a model of the loop can turn into poses; and so it is with the geometry of the robot, None where that is exact."""
 
     names: tuple[str, ...]
     changes: Array
     covariance: Array
     latency_std: float = 0.0
+    geometry: GeometryErrors | None = None
 
     @property
     def all_names(self) -> tuple[str, ...]:
-        """Names of all errors, the latency's among them."""
-        return (*self.names, LATENCY) if self.latency_std else self.names
+        """Names of all errors, behind those of the poses the latency's and those of the geometry."""
+        latency = (LATENCY,) if self.latency_std else ()
+        return (*self.names, *latency, *(self.geometry.names if self.geometry else ()))
 
     @property
     def whole_factor(self) -> Array:
-        """`factor` of all errors, the latency among them."""
-        return block_diag(self.factor, self.latency_std) if self.latency_std else self.factor
+        """`factor` of all errors."""
+        latency = [np.full((1, 1), self.latency_std)] if self.latency_std else []
+        return np.asarray(block_diag(self.factor, *latency, *([self.geometry.factor] if self.geometry else [])))
 
     @cached_property
     def factor(self) -> Array:
@@ -65,17 +70,19 @@ NONE = CommonErrors((), np.zeros((0, 6, 0)), np.zeros((0, 0)))
 @dataclass(frozen=True)
 class Marginal:
     """What whitens residuals of unit covariance that have modes M (m, k) in common: their directions U (m, k), and
-    seen: S (k,), the standard deviations along them."""
+    seen: S (k,), the standard deviations along them. had (m,): what the model that leaves the residuals has of the
+    modes itself, which counts as none."""
 
     modes: Array
+    had: Array
     directions: Array
     seen: Array
 
     @classmethod
-    def of(cls, modes: Array) -> "Marginal":
-        """From whitened modes (m, k) of m residuals."""
+    def of(cls, modes: Array, had: Array | float = 0.0) -> "Marginal":
+        """From whitened modes (m, k) of m residuals, and what the model has of them (m,)."""
         directions, seen, _ = np.linalg.svd(modes, full_matrices=False)
-        return cls(modes, directions, seen)
+        return cls(modes, np.broadcast_to(had, len(modes)), directions, seen)
 
     @property
     def whitened_modes(self) -> Array:
@@ -135,5 +142,5 @@ def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErro
 
 
 def kind_of(name: str) -> str:
-    """Kind of a common error by its name: rig, teaching, or exposure."""
+    """Kind of a common error of measured poses by its name: rig, teaching, or exposure."""
     return {"taught": "teaching", "exposure": "exposure"}.get(name.split(".")[0], "rig")

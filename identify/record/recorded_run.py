@@ -24,6 +24,7 @@ from identify.record.checks import (
     checked_covariance,
 )
 from identify.record.common_errors import NONE, CommonErrors, Marginal, read_common_errors
+from identify.record.geometry_errors import GeometryErrors, read_geometry_covariance
 from identify.record.payload import recorded_payload
 from identify.record.plausibility import check_plausible
 from identify.record.recording import poses
@@ -40,7 +41,8 @@ class RecordedRun:
     measured: poses (N, 6), NaN where lost; ok (N,) bool; covariance (6, 6) of one measured pose; logged: the joint
     commands (N, n) as they were given; driven: whether the model's joints get these, or its own servo acts; payload
     (p,): what a known load on the platform adds to the parameters, with standard deviations payload_std (p,); common:
-    errors that all measured poses have in common, and marginal: what whitens residuals by them (`with_common_errors`).
+    errors that all measured poses have in common; drawn: those that a model's loop can have (k,), as it has them, in
+    their standard deviations, None: none; marginal: what whitens residuals by them (`with_common_errors`).
     """
 
     robot: Robot
@@ -54,19 +56,26 @@ class RecordedRun:
     payload_std: Array
     common: CommonErrors = NONE
     driven: bool = False
+    drawn: Array | None = None
     marginal: Marginal | None = None
 
     def driven_by_commands(self) -> "RecordedRun":
         """The same run with the model's joints driven by the logged commands."""
         return replace(self, driven=True, marginal=None)
 
+    def having(self, drawn: Array) -> "RecordedRun":
+        """The same run, whose model has these common errors (k,), in standard deviations."""
+        return replace(self, drawn=drawn if len(drawn) else None, marginal=None)
+
     def with_common_errors(self, parameters: Array) -> "RecordedRun":
         """The same run, whose residuals are whitened by what its poses have in common, too, as a model with these
-        parameters (p,) shows it. Raises LoopFailure where that is unstable."""
+        parameters (p,) shows it near what it has of that. Raises LoopFailure where that is unstable."""
         if not self.common.all_names:
             return self
         seen = self.modes(parameters)[self.ok]
-        return replace(self, marginal=Marginal.of((self.whitener @ seen).reshape(-1, seen.shape[2])))
+        modes = np.asarray(self.whitener @ seen).reshape(-1, seen.shape[2])
+        inside = slice(len(self.common.names) if self.driven else 0, len(self.errors_had))
+        return replace(self, marginal=Marginal.of(modes, modes[:, inside] @ self.errors_had[inside]))
 
     def without_common_errors(self) -> "RecordedRun":
         """The same run, whose residuals are whitened by the sensor's noise alone."""
@@ -78,42 +87,56 @@ class RecordedRun:
         A model driven by the logged commands moves as the plant did, and what is measured beside that is the error. A
         closed loop sees the error as well, and its servo takes the platform where the error does not show.
         """
-        if not self.driven:
-            return self._apart(parameters, lambda run: run.measured)
-        modes = self._apart(parameters, lambda run: run.pose)  # which only another latency changes
-        if self.common.names:
-            modes[:, :, : len(self.common.names)] = self.common.modes
-        return modes
+        beside = self.common.modes if self.driven else None
+        return self._apart(parameters, lambda run: run.pose if self.driven else run.measured, beside)
 
     def pose_modes(self, parameters: Array) -> Array:
         """How far (N, 6, k) the common errors, each of one standard deviation, take the platform from the model."""
-        return self._apart(parameters, lambda run: run.pose)
+        return self._apart(parameters, lambda run: run.pose, np.zeros_like(self.common.modes) if self.driven else None)
 
-    def _apart(self, parameters: Array, shown: Callable[[ClosedLoopRun], Array]) -> Array:
-        """What a run shows (N, 6) with each common error (N, 6, k), of one standard deviation, less that without."""
-        if self.driven:
-            columns = [np.zeros_like(self.measured)] * len(self.common.names)
-        else:
-            errors = np.moveaxis(self.common.modes, 2, 0)
-            ends = ([self.simulate(parameters, error=sign * error) for sign in (1.0, -1.0)] for error in errors)
-            columns = [(shown(more) - shown(less)) / 2.0 for more, less in ends]
-        if std := self.common.latency_std:
-            late, early = (known := self.settings.timing.latency_s) + std, max(known - std, 0.0)
-            more, less = (self.simulate(parameters, latency_s=end) for end in (late, early))
-            columns.append(std * (more.pose - less.pose) / (late - early))
-        return np.stack(columns, axis=2) if columns else np.zeros((*self.measured.shape, 0))
+    def _apart(self, parameters: Array, shown: Callable[[ClosedLoopRun], Array], beside: Array | None) -> Array:
+        """What a run shows (N, 6) with a standard deviation more of each common error, less that without; beside (N, 6,
+        k): of those that are in the measured poses, where the loop does not see them."""
+        drawn, columns = self.errors_had, []
+        lowest = np.full(len(drawn), -np.inf)
+        if self.common.latency_std:
+            lowest[-1] = -self.settings.timing.latency_s / self.common.latency_std  # no latency is negative
+        for k, step in enumerate(np.eye(len(drawn))):
+            if beside is not None and k < beside.shape[2]:
+                columns.append(beside[:, :, k])
+                continue
+            ends = [np.maximum(drawn + sign * step, lowest) for sign in (1.0, -1.0)]
+            more, less = (shown(self.having(end).simulate(parameters)) for end in ends)
+            columns.append((more - less) / (ends[0] - ends[1])[k])
+        modes = np.stack(columns, axis=2) if columns else np.zeros((*self.measured.shape, 0))
+        if (geometry := self.common.geometry) is None:
+            return modes
+        by_geometry = geometry.modes(lambda robot: self.simulate(parameters, robot=robot).pose)
+        return np.concatenate([modes, by_geometry], axis=2)
+
+    @property
+    def errors_had(self) -> Array:
+        """Common errors (k,) that the model has, of those that its loop can have: of the poses, and the latency's."""
+        count = len(self.common.names) + bool(self.common.latency_std)
+        return np.zeros(count) if self.drawn is None else self.drawn
 
     def simulate(
         self,
         parameters: Array,
         sensitivities: bool = False,
-        latency_s: float | None = None,
-        error: Array | None = None,
+        robot: Robot | None = None,
+        noise: Array | None = None,
     ) -> ClosedLoopRun:
-        """The model's run, with another latency of all its frames and with an error (N, 6) in what its servo measures,
-        where they are given. Raises LoopFailure where it is unstable."""
+        """The model's run with the common errors that it has; of another robot than the servo knows, or with noise (N,
+        6) in what that measures, where they are given. Raises LoopFailure where it is unstable."""
+        error = noise
+        if self.drawn is not None and self.common.names and not self.driven:
+            error = self.common.modes @ self.drawn[: len(self.common.names)] + (0.0 if noise is None else noise)
+        latency_s = None
+        if self.drawn is not None and self.common.latency_std:
+            latency_s = max(self.settings.timing.latency_s + self.common.latency_std * float(self.drawn[-1]), 0.0)
         return simulate(
-            self.robot,
+            robot or self.robot,
             parameters + self.payload,
             self.reference,
             self.settings,
@@ -122,18 +145,31 @@ class RecordedRun:
             lost=None if self.driven else ~self.ok,
             latencies=None if latency_s is None else np.full(len(self.ok), latency_s),
             noise=error,
+            servo_robot=self.robot if robot else None,
         )
 
     def model_poses(self, parameters: Array) -> Array:
         """Poses (N, 6) of the model. Raises LoopFailure where it is unstable."""
         return self.simulate(parameters).pose
 
+    def misses(self, parameters: Array) -> Array:
+        """Whitened pose residuals model - measurement (n, 6) of the good frames. Raises LoopFailure."""
+        return self._missed(self.simulate(parameters))
+
     def residuals(self, parameters: Array) -> tuple[Array, Array]:
-        """Whitened pose residuals model - measurement (n, 6) of the good frames, and their Jacobian (n, 6, p)."""
+        """`misses` (n, 6), and their Jacobian (n, 6, p)."""
         run = self.simulate(parameters, sensitivities=True)
         assert run.pose_sensitivity is not None
         jacobian = np.asarray(self.whitener @ run.pose_sensitivity[self.ok], dtype=float)
-        return self.whiten(run.pose - self.measured), self._without_common(jacobian)
+        return self._missed(run), self._without_common(jacobian)
+
+    def _missed(self, run: ClosedLoopRun) -> Array:
+        """What a run of the model misses of the measurements (n, 6); its common errors count as none."""
+        seen = run.pose if self.driven or self.drawn is None else run.measured
+        whitened = np.asarray((seen - self.measured)[self.ok] @ self.whitener.T, dtype=float)
+        if self.marginal is not None:
+            whitened = whitened - self.marginal.had.reshape(whitened.shape)
+        return self._without_common(whitened)
 
     def whiten(self, differences: Array) -> Array:
         """Pose differences (N, 6) at the good frames in standard deviations of the sensor, (n, 6)."""
@@ -207,7 +243,7 @@ def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
     ok = record["measured_ok"].values.astype(bool)
     check_good_share(ok)
     load, load_std = recorded_payload(record, robot.layout)
-    return RecordedRun(
+    run = RecordedRun(
         robot=robot,
         settings=model_settings(robot, scenario),
         reference=recorded_reference(record),
@@ -217,13 +253,14 @@ def _run(record: xr.Dataset, robot: Robot, scenario: Scenario) -> RecordedRun:
         logged=np.asarray(record["command"].values, dtype=float),
         payload=load,
         payload_std=load_std,
-        common=_common_errors(record, scenario),
     )
+    return replace(run, common=_common_errors(record, scenario, run))
 
 
-def _common_errors(record: xr.Dataset, scenario: Scenario) -> CommonErrors:
+def _common_errors(record: xr.Dataset, scenario: Scenario, run: RecordedRun) -> CommonErrors:
     """What of the poses' common errors a scenario has estimated beside the parameters."""
-    kinds = tuple(scenario.identification.nuisances)
-    return replace(
-        read_common_errors(record, kinds), latency_std=scenario.timing.latency_std_s if "latency" in kinds else 0.0
-    )
+    kinds, geometry = tuple(scenario.identification.nuisances), None
+    if "geometry" in kinds and (covariance := read_geometry_covariance(record, run.robot)) is not None:
+        geometry = GeometryErrors(run.robot, covariance, run.reference.poses, run.whitener)
+    latency_std = scenario.timing.latency_std_s if "latency" in kinds else 0.0
+    return replace(read_common_errors(record, kinds), latency_std=latency_std, geometry=geometry)

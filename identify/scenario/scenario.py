@@ -13,6 +13,7 @@ from identify.errors import ScenarioError
 from identify.filtering import padding_samples
 from identify.scenario.parameter_names import check_parameter_names
 from identify.scenario.sections import (
+    GEOMETRY_KNOWN,
     RIG_KNOWN,
     Excitation,
     Filter,
@@ -162,7 +163,12 @@ SCENARIOS = SettingsFiles(
     Path(__file__).parent / "built_in",
     Scenario,
     ScenarioError,
-    {"robot": _robot_names, "sensor": sensor_names, "rig.known": lambda: RIG_KNOWN},
+    {
+        "robot": _robot_names,
+        "sensor": sensor_names,
+        "rig.known": lambda: RIG_KNOWN,
+        "geometry.known": lambda: GEOMETRY_KNOWN,
+    },
 )
 
 

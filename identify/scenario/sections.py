@@ -215,6 +215,10 @@ class Rig(Section):
         return self.known == "exact" and self.right_later_std_s == 0.0
 
 
+GEOMETRY_KNOWN = ["exact", "calibrated"]
+"""How well a geometry may be known, beside the path of a calibrated robot."""
+
+
 class Identification(Section):
     """Output-error estimation and its stop criteria (eq. 35)."""
 
@@ -229,8 +233,8 @@ class Identification(Section):
     prior: dict[str, PriorValue] = Field(
         {}, description="parameters known better than the starting guess: { name = { value, std } }"
     )
-    nuisances: list[Literal["rig", "teaching", "exposure", "latency"]] = Field(
-        ["rig", "teaching", "exposure", "latency"],
+    nuisances: list[Literal["rig", "teaching", "exposure", "latency", "geometry"]] = Field(
+        ["rig", "teaching", "exposure", "latency", "geometry"],
         description="of what all poses of a record have in common, what is estimated beside the parameters",
     )
     physical_consistency: bool = Field(
@@ -292,8 +296,13 @@ class Validation(Section):
 
 
 class Geometry(Section):
-    """Kinematic calibration by static poses, `cmmsim geometry`."""
+    """Kinematic calibration by static poses, `cmmsim geometry`, and what servo and estimator of a run know of it."""
 
+    known: str = Field(
+        "exact",
+        description="exact: the robot file's; calibrated: by static poses, which the run measures first; or the "
+        "robot.toml of a calibration, with its covariance beside it",
+    )
     poses: int = quantity(60, "1", "number of poses that are measured", ge=1, le=10_000)
     frames_per_pose: int = quantity(20, "1", "frames whose mean counts as a pose", ge=1, le=10_000)
     selection: Literal["random", "greedy", "gradient"] = Field(
@@ -318,3 +327,8 @@ class Geometry(Section):
     encoder_offset_rad: float = quantity(0.0, "rad", "standard deviation of what each reads at zero", ge=0, le=0.05)
     encoder_offset_m: float = quantity(0.0, "m", "the same, where actuators slide", ge=0, le=0.01)
     unseen: int = quantity(200, "1", "poses that are not measured and judge the result", ge=1, le=100_000)
+
+    @property
+    def exact(self) -> bool:
+        """Whether servo and estimator take the robot file's geometry for exact."""
+        return self.known == "exact"

@@ -7,12 +7,12 @@ import numpy as np
 import xarray as xr
 
 from cmmsim.errors import CmmError
-from dynamics import load_robot
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.experiment.truth import read_truth, true_poses
 from identify.files.dataset import group_names
 from identify.files.run_folder import RunFolder, load_result
+from identify.record.known_geometry import known_geometry
 from identify.record.provenance import RunFiles, check_robot, recorded_seed
 from identify.record.recording import EXCITATION, TRUTH_GROUP, poses, run_name
 from identify.scenario import load_scenario
@@ -96,7 +96,7 @@ def read_motion(folder: Path | str, name: str = EXCITATION) -> Motion:
 def _cell(run: RunFolder, record: xr.Dataset, notes: list[str]) -> Workcell:
     """Robot and sensor of a run; the robot alone, with a note, where the sensor cannot be had."""
     scenario = load_scenario(run.scenario)
-    robot = load_robot(scenario.robot)
+    robot = known_geometry(scenario, run.path).robot
     check_robot(record, robot)
     try:
         return workcell_of_scenario(scenario, robot)

@@ -18,7 +18,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from dynamics import DynamicsError, Robot, load_robot
+from dynamics import DynamicsError, Robot
 from dynamics.errors import ParameterError, SimulationError
 from identify.arrays import Array
 from identify.errors import EstimationError
@@ -33,6 +33,7 @@ from identify.files.dataset import write_groups
 from identify.files.run_folder import rms_figures, rms_row
 from identify.progress import Progress
 from identify.random_streams import INSTRUMENTS, LATENCY, mixed_generator, stream_seed
+from identify.record.known_geometry import known_geometry
 from identify.record.provenance import RunFiles
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, load_scenario
@@ -112,7 +113,7 @@ def compare_on_run(
     latencies = scenario.timing.drawn_latencies(record.sizes["time"], draws)
     rng, channels = mixed_generator(INSTRUMENTS, seed), folder.path / "instruments.nc"
     write_groups(channels, {"": measure_joints(record, truth, scenario.timing, instruments, rng, latencies)})
-    known, robot = true_parameters(truth), load_robot(scenario.robot)
+    known, robot = true_parameters(truth), known_geometry(scenario, folder.path).robot
     true = np.array([known[name] for name in robot.layout.names])
     problem = output_error_problem([record], robot, scenario)
     gains = true[robot.layout.joint_pid]

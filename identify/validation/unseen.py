@@ -29,6 +29,7 @@ from identify.loop_parameters import model_settings
 from identify.progress import Advance, Progress
 from identify.random_streams import PREDICTION, stream_seed
 from identify.record.checks import TooFewFramesError
+from identify.record.known_geometry import KnownGeometry
 from identify.record.recorded_run import RecordedRun, watched_run
 from identify.runtime import cores
 from identify.scenario import Scenario
@@ -44,12 +45,14 @@ def run_unseen(
     taught: cmmsim.Taught,
     workers: int | None,
     progress: Progress,
+    known: KnownGeometry | None = None,
 ) -> list[Experiment]:
     """Run the plant with images in the loop on every trajectory, in `workers` processes, None: one a core.
 
     Every run has its own noise stream, and all share what the sensor was taught: results do not depend on the workers.
+    known: what is known of the geometry, where that is at hand.
     """
-    how, workers = (scenario, seed, taught), workers or cores()
+    how, workers = (scenario, seed, taught, known), workers or cores()
     numbers = range(1, len(trajectories) + 1)
     frames = scenario.timing.frames(scenario.validation.duration_s) * len(trajectories)
     with progress.stage("validate", frames) as advance:
@@ -90,7 +93,8 @@ class PosePrediction:
     exact sensitivities S of the model's poses as S C S^T. The sensor's noise goes through the servo into the plant's
     motion, which no model can foretell: its covariance is sampled by repeated experiments on the identified model, and
     is taken to be the same all along the motion. And what all measured poses have in common, as far as the record
-    states it: the servo takes the platform where such an error does not show, the whole motion with the same draw.
+    states it, and the geometry: the servo takes the platform where such an error does not show, the whole motion with
+    the same draw.
     """
 
     chart: Chart
@@ -164,8 +168,9 @@ def predicted_runs(
 class _Worker:
     """One process's plant and sensor; the renderer lives as long as the process."""
 
-    def __init__(self, scenario: Scenario, seed: int, taught: cmmsim.Taught) -> None:
-        self._plant, self._seed, self._duration_s = build_plant(scenario), seed, scenario.validation.duration_s
+    def __init__(self, scenario: Scenario, seed: int, taught: cmmsim.Taught, known: KnownGeometry | None) -> None:
+        self._plant = build_plant(scenario, seed=seed, known=known)
+        self._seed, self._duration_s = seed, scenario.validation.duration_s
         self._sensor = make_sensor(scenario, self._plant.nominal, seed, taught)
 
     def run(self, number: int, trajectory: FourierTrajectory, advance: Advance) -> Experiment:
@@ -176,9 +181,11 @@ _worker: _Worker
 _counter: Synchronized[int]
 
 
-def _start_worker(counter: Synchronized[int], scenario: Scenario, seed: int, taught: cmmsim.Taught) -> None:
+def _start_worker(
+    counter: Synchronized[int], scenario: Scenario, seed: int, taught: cmmsim.Taught, known: KnownGeometry | None
+) -> None:
     global _worker, _counter
-    _worker, _counter = _Worker(scenario, seed, taught), counter
+    _worker, _counter = _Worker(scenario, seed, taught, known), counter
 
 
 def _run_in_worker(number: int, trajectory: FourierTrajectory) -> Experiment:
@@ -221,7 +228,7 @@ def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed:
     Raises dynamics.DynamicsError: parameters of another shape, not finite, or outside their range. Raises
     TrajectoryError: no unseen trajectory keeps the robot's limits.
     """
-    values, plant = checked_loop_parameters(robot, parameters), build_plant(scenario, robot)
+    values, plant = checked_loop_parameters(robot, parameters), build_plant(scenario, robot, seed)
     times = scenario.timing.frame_times(scenario.validation.duration_s)
     references = [path.reference(times) for path in unseen_trajectories(robot, scenario, seed)]
     model = [model_run(robot, scenario, values, reference) for reference in references]

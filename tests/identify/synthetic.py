@@ -15,6 +15,7 @@ from identify.estimators.estimator import Evidence, joint_channels
 from identify.experiment.joint_instruments import JointInstruments, measure_joints
 from identify.experiment.plant import build_plant
 from identify.files.run_folder import RunFolder
+from identify.record.geometry_errors import store_geometry_covariance
 from identify.record.provenance import store_robot
 from identify.record.recording import build_record, write
 from identify.scenario import load_scenario
@@ -63,17 +64,19 @@ def run_plant(
     robot=None,
     bias=lambda frame, pose: 0.0,
     latency_s=None,
+    geometry=None,
     **stated,
 ):
     """(record, run of the plant) with Gaussian noise of `sigma` (6,) and the frames `lost` not measured.
 
     size: of the motion, as a share of the usual box; robot: another than the reference robot; bias: of the sensor in a
-    frame at a pose (6,); latency_s: the true one, where it is not the scenario's; stated: what
-    `build_record` is given in place of what was.
+    frame at a pose (6,); latency_s: the true one, where it is not the scenario's; geometry: the known robot with its
+    covariance, and the true robot; stated: what `build_record` is given in place of what was.
     """
     rng, robot = np.random.default_rng(seed), robot or rss6()
     plant = build_plant(scenario, robot)
     plant = plant if parameters is None else replace(plant, parameters=parameters)
+    plant = plant if geometry is None else replace(plant, nominal=geometry[0].robot, robot=geometry[1])
     times = scenario.timing.frame_times(duration_s)
     reference = trajectory(trajectory_seed, size, robot).reference(times)
 
@@ -100,6 +103,8 @@ def run_plant(
     }
     record = build_record(**(made | stated))
     store_anchor(record, ScaleAnchor("platform_mass", plant.parameters[0], 0.005))
+    if geometry is not None:
+        store_geometry_covariance(record, geometry[0].robot, geometry[0].covariance)
     return record, run
 
 

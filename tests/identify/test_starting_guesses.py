@@ -82,7 +82,7 @@ def test_the_optimum_does_not_depend_on_the_starting_guess(recorded, record_prop
     for seed in range(starts):
         problem = replace(stated, guess=drawn_guess(spread, seed))
         warm = linear_warm_start(problem, scenario)
-        found = output_error_searches(problem, scenario, warm, SilentProgress())["closed_loop"]
+        found = output_error_searches(problem, scenario, warm, SilentProgress())["closed_loop"].solution
         assert "max_iterations" not in found.stop_reason
         from_truth = search(problem, truth(), scenario, silent)
         excess.append(found.costs[-1] - from_truth.costs[-1])
@@ -232,7 +232,8 @@ def test_a_model_that_does_not_run_is_brought_to_the_optimum():
         search(commanded, unstable, scenario, silent)
     assert runnable_start(commanded, unstable) is None
     progress = Stages()
-    found = output_error_searches(problem, scenario, unstable, progress)
+    searches = output_error_searches(problem, scenario, unstable, progress)
+    found = {name: search.solution for name, search in searches.items()}
     assert [name for name, _, _ in progress.seen] == ["multiple shooting", "identify"]
     assert all(sum(steps) == total for _, total, steps in progress.seen)
     assert progress.seen[0][2][: found["multiple_shooting"].iterations] == [1] * found["multiple_shooting"].iterations

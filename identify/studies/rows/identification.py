@@ -109,7 +109,7 @@ READS = Reads(
 def compute(scenario: Scenario, seed: np.random.SeedSequence, options: IdentificationOptions) -> Row:
     """One row. Raises EstimationError and what experiment and sensor raise."""
     number = stream_seed(seed, EXPERIMENT)
-    plant = build_plant(scenario, _robot(scenario.robot))
+    plant = build_plant(scenario, _robot(scenario.robot), number)
     robot, truth = plant.nominal, plant.parameters
     trajectories = _trajectories(scenario.to_toml(), options.trajectory_seed)
     sensor = _drawn(scenario) if options.sensor == "drawn" else taught_sensor(scenario, robot, number, SilentProgress())
