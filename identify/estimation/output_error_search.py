@@ -1,10 +1,12 @@
 """The searches for the optimum of the output error, one after the other.
 
 From the linear warm start through the command-driven output error, which has few local minima, to the closed-loop
-output error, whose stick-slip events make narrow ones. Where neither the warm start nor the starting guess gives a
-model that runs, multiple shooting finds one that does.
+output error, whose stick-slip events make narrow ones. Errors that all poses have in common are left to the noise at
+first: what they hide, far from the optimum, is the way there. Where neither the warm start nor the starting guess gives
+a model that runs, multiple shooting finds one that does.
 """
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -31,14 +33,17 @@ def output_error_searches(
     Raises EstimationError: no model that runs.
     """
     found = {}
-    driven = problem.driven_by_commands().with_common_errors(warm)
+    driven = problem.driven_by_commands()
     start = runnable_start(driven, warm)
     if start is None:
         found["multiple_shooting"] = shoot(driven, scenario, warm, progress)
         start = found["multiple_shooting"].parameters
     settings = scenario.identification
-    closed_loop = settings.method == "closed_loop"
-    with progress.stage("identify", (2 if closed_loop else 1) * settings.max_iterations) as advance:
+    closed_loop, told = settings.method == "closed_loop", any(run.common.all_names for run in problem.runs)
+    with progress.stage("identify", (1 + closed_loop + told) * settings.max_iterations) as advance:
+        if told:
+            found["noise_alone"] = search(driven, start, scenario, advance)
+            driven, start = _with_common_errors(driven, [found["noise_alone"].parameters, start, problem.guess.values])
         found["command_driven"] = search(driven, start, scenario, advance)
         if closed_loop:
             start = _closed_loop_start(problem, found["command_driven"].parameters)
@@ -92,6 +97,18 @@ def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
             f"{_why(problem, driven)}"
         )
     return start
+
+
+def _with_common_errors(problem: OutputErrorProblem, starts: list[Array]) -> tuple[OutputErrorProblem, Array]:
+    """The problem that knows what poses have in common, as a model shows it that runs with the best of some parameters
+    (p,); and these."""
+    told = []
+    for start in map(problem.bounds.nearest, starts):
+        with suppress(DynamicsError):
+            one = problem.with_common_errors(start)
+            told.append((one.cost(start), one, start))
+    _, best, start = min(told, key=lambda entry: entry[0])
+    return best, start
 
 
 def _candidates(problem: OutputErrorProblem, warm: Array) -> list[Array]:
