@@ -1,10 +1,12 @@
 """The searches for the optimum of the output error, one after the other.
 
 From the linear warm start through the command-driven output error, which has few local minima, to the closed-loop
-output error, whose stick-slip events make narrow ones. Where neither the warm start nor the starting guess gives a
-model that runs, multiple shooting finds one that does.
+output error, whose stick-slip events make narrow ones. Errors that all poses have in common are left to the noise at
+first: what they hide, far from the optimum, is the way there. Where neither the warm start nor the starting guess gives
+a model that runs, multiple shooting finds one that does.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,22 +57,26 @@ def output_error_searches(
         found["multiple_shooting"] = Search(driven, shoot(driven, scenario, warm, progress))
         start = found["multiple_shooting"].solution.parameters
     settings = scenario.identification
-    closed_loop = settings.method == "closed_loop"
-    with progress.stage("identify", (2 if closed_loop else 1) * settings.max_iterations) as advance:
-        found["command_driven"] = searched = search_with_common_errors(driven, start, scenario, advance)
+    closed_loop, told = settings.method == "closed_loop", any(run.common.all_names for run in problem.runs)
+    with progress.stage("identify", (1 + closed_loop + told) * settings.max_iterations) as advance:
+        starts = [start]
+        if told:
+            found["noise_alone"] = Search(driven, search(driven, start, scenario, advance))
+            starts = [found["noise_alone"].solution.parameters, start, problem.guess.values]
+        found["command_driven"] = searched = search_with_common_errors(driven, starts, scenario, advance)
         if closed_loop:
             problem = problem.having(most_likely_errors(searched.problem, searched.solution.parameters))
             start = _closed_loop_start(problem, searched.solution.parameters)
-            found["closed_loop"] = search_with_common_errors(problem, start, scenario, advance)
+            found["closed_loop"] = search_with_common_errors(problem, [start], scenario, advance)
     return found
 
 
 def search_with_common_errors(
-    problem: OutputErrorProblem, start: Array, scenario: Scenario, advance: Advance
+    problem: OutputErrorProblem, starts: list[Array], scenario: Scenario, advance: Advance
 ) -> Search:
-    """Minimise a problem from parameters (p,) with what its poses have in common, time and again until the most likely
-    errors, about which the model is taken as linear in them, settle."""
-    problem = problem.with_common_errors(start)
+    """Minimise a problem from the best of some parameters (p,) with what its poses have in common, time and again until
+    the most likely errors, about which the model is taken as linear in them, settle."""
+    problem, start = _with_common_errors(problem, starts)
     solution = search(problem, start, scenario, advance)
     for _ in range(LINEARISATIONS if problem.bends else 0):
         errors = most_likely_errors(problem, solution.parameters)
@@ -129,6 +135,22 @@ def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
             f"{_why(problem, driven)}"
         )
     return start
+
+
+def _with_common_errors(problem: OutputErrorProblem, starts: list[Array]) -> tuple[OutputErrorProblem, Array]:
+    """The problem that knows what poses have in common, as a model shows it that runs with the best of some parameters
+    (p,); and these."""
+    if len(starts) == 1:
+        return problem.with_common_errors(starts[0]), starts[0]
+    told = []
+    for start in map(problem.bounds.nearest, starts):
+        with suppress(DynamicsError):
+            one = problem.with_common_errors(start)
+            told.append((one.cost(start), one, start))
+    if not told:
+        raise EstimationError("the model is unstable with what its poses have in common one standard deviation off")
+    _, best, start = min(told, key=lambda entry: entry[0])
+    return best, start
 
 
 def _candidates(problem: OutputErrorProblem, warm: Array) -> list[Array]:

@@ -8,9 +8,11 @@ with z the torque the integrators held at the start (n,). Poses are filtered and
 platform with fewer freedoms its coordinates count, along which the wrench Gamma Xi is balanced. Each row is the balance
 of one joint, whose dry friction is known only while it slips: rows of joints near rest are left out. The equation is
 homogeneous: the scale anchor, and weakly the starting guess, decide the common factor.
-"""
 
-from collections.abc import Sequence
+What all poses of a run have in common, or a geometry that is known only so well, moves theta by e d, with d of standard
+deviation one. That stands in the equation with lp and with li: as errors of the rows that go on along a run, lp0 e and
+li0 integral(e) with the gains of the starting guess, they are marginalised (`record.common_errors`).
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +25,7 @@ from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.prior import StartingGuess
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.filtering import filtered_derivatives, zero_phase_filter
+from identify.record.common_errors import Marginal
 from identify.record.recorded_run import RecordedRun
 from identify.scenario import Scenario
 
@@ -42,19 +45,22 @@ def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
     Each run has its own starting torques; what a known payload adds stands on the right side. The residual's size is
     estimated from the fit itself, so that the starting guess counts as much as it should.
     """
-    matrix, right = _stacked(problem.runs, scenario)
-    count = len(problem.guess.values)
+    matrix, right, common = _stacked(problem, scenario)
+    count, rows = len(problem.guess.values), np.column_stack([matrix, right])
     lower = np.concatenate([np.zeros(count), np.full(matrix.shape[1] - count, -np.inf)])
     noise = 0.1
     for _ in range(REWEIGHTINGS):
-        solution = bounded_fit(matrix / noise, right / noise, problem.guess, problem.anchor, lower)
-        noise = max(float(np.sqrt(np.mean((matrix @ solution - right) ** 2))), 1e-9)
+        whitened = rows / noise
+        if common.shape[1]:
+            whitened = Marginal.of(common / noise).whiten(whitened)
+        solution = bounded_fit(whitened[:, :-1], whitened[:, -1], problem.guess, problem.anchor, lower)
+        noise = max(noise * float(np.sqrt(np.mean((whitened @ np.append(solution, -1.0)) ** 2))), 1e-9)
     return np.maximum(solution[:count], 0.0)
 
 
-def _stacked(runs: Sequence[RecordedRun], scenario: Scenario) -> tuple[Array, Array]:
-    """Equations of all runs: matrix (rows, p + n runs) and right side (rows,), N m or N."""
-    matrices, right = [], []
+def _stacked(problem: OutputErrorProblem, scenario: Scenario) -> tuple[Array, Array, Array]:
+    """Equations of all runs: matrix (rows, p + n runs), right side (rows,) and common errors (rows, k), N m or N."""
+    matrices, right, common, runs = [], [], [], problem.runs
     layout = runs[0].robot.layout
     count, joints = len(layout.names), layout.joints
     for place, run in enumerate(runs):
@@ -65,7 +71,21 @@ def _stacked(runs: Sequence[RecordedRun], scenario: Scenario) -> tuple[Array, Ar
         matrix[:, count + joints * place :][:, :joints] = columns[:, count:]
         matrices.append(matrix)
         right.append(-columns[:, :count] @ run.payload)
-    return np.concatenate(matrices), np.concatenate(right)
+        common.append(_common_torques(run, problem.guess, scenario)[slipping])
+    return np.concatenate(matrices), np.concatenate(right), np.concatenate(common)
+
+
+def _common_torques(run: RecordedRun, guess: StartingGuess, scenario: Scenario) -> Array:
+    """What common errors of the poses and errors of the geometry, each of one standard deviation, add to the balance of
+    every joint (N, n, k), N m or N, with the gains of the starting guess."""
+    poses, (lp, li, _) = run.without_gaps(), guess.values[guess.layout.joint_pid]
+    by_pose = run.robot.pose_jacobian(run.reference.poses) @ run.common.modes if run.common.names else None
+    by_geometry = run.common.geometry.joints(poses) if run.common.geometry else None
+    moved = [part for part in (by_pose, by_geometry) if part is not None]
+    if not moved:
+        return np.zeros((*run.logged.shape, 0))
+    angle = np.concatenate(moved, axis=2)
+    return np.concatenate([lp * angle, li * running_integral(angle, scenario.timing.frame_rate_hz)], axis=2)
 
 
 def joint_balance(

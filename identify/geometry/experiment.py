@@ -25,6 +25,7 @@ from identify.geometry.static_poses import FrameKnowledge, StaticPoses
 from identify.loop_parameters import of_actuators
 from identify.progress import Progress
 from identify.random_streams import ENCODERS, NOISE, STATIC_NOISE, child, stream_seed
+from identify.record.common_errors import CommonErrors, kind_of
 from identify.scenario import Scenario
 from identify.scenario.sections import Geometry
 
@@ -122,7 +123,7 @@ def drawn(
     sensor: cmmsim.Sensor, sight: SightLines, poses: Array, frames: int, rng: np.random.Generator, progress: Progress
 ) -> Sighted:
     """Poses without images: one frame a pose says the covariance, and the mean is drawn with a `frames`-th of it; and
-    so is one error of the frames with what teaching says of them."""
+    so are one error of the frames with what teaching says of them, and one of the cameras where they are not exact."""
     taught = sensor.taught
     offset = FrameKnowledge(taught.base_covariance, taught.platform_covariance).root @ rng.standard_normal(12)
     covariances, seen = np.full((len(poses), 6, 6), np.nan), np.zeros(len(poses), dtype=bool)
@@ -133,9 +134,21 @@ def drawn(
                 seen[row] = True
             advance()
     means = seen_between(poses, offset)
+    if (by_cameras := camera_errors(sensor, poses)) is not None:
+        means = means + by_cameras @ rng.standard_normal(by_cameras.shape[2])
     for row in map(int, np.flatnonzero(seen)):
         means[row] += np.linalg.cholesky(covariances[row]) @ rng.standard_normal(6)
     return Sighted(means, covariances, seen, int((~seen).sum()) * frames)
+
+
+def camera_errors(sensor: cmmsim.Sensor, poses: Array) -> Array | None:
+    """What cameras that are known only so well add to poses (N, 6) at rest: (N, 6, k) for each of k independent errors
+    of variance one, the same for all poses; None where they are exact."""
+    found = sensor.common_errors(poses, np.zeros_like(poses)) if sensor.method == "registration" else None
+    if found is None or not (kept := [k for k, name in enumerate(found.names) if kind_of(name) == "rig"]):
+        return None
+    within = found.covariance[np.ix_(kept, kept)]
+    return CommonErrors(tuple(found.names[k] for k in kept), found.changes[:, :, kept], within).modes
 
 
 def stand_at(
@@ -173,5 +186,6 @@ def stand_at(
         found.poses[kept],
         found.covariances[kept],
         known if settings.frames == "taught" else FrameKnowledge.none(),
+        camera_errors(sensor, found.poses[kept]),
     )
     return data, found.lost

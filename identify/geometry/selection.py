@@ -1,9 +1,8 @@
 """Which poses to measure: chosen by an observability index over candidates within the travel.
 
-The index is the determinant of the information about geometry and frames together (the D-optimal one, Borm and Menq's
-O1), or what the calibrated robot will miss poses by, on average over the candidates (the I-optimal one). Poses are
-taken one by one from the candidates (greedy), exchanged until none is better, and then moved in joint space along the
-index's gradient, all at once, within the travel.
+The index (`indices`) is of the information about geometry and frames together. Poses are taken one by one from the
+candidates (greedy), exchanged until none is better, and then moved in joint space along the index's gradient, all at
+once, within the travel.
 """
 
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.excitation.constraints import required_stickers
 from identify.geometry.calibration import PoseModel, whiteners
+from identify.geometry.indices import ObservabilityIndex, chosen_index
 from identify.progress import Advance
 
 STEP = 1e-5
@@ -81,11 +81,16 @@ class Candidates:
         """Of all together (u, u)."""
         return np.asarray(np.einsum("nmu,nmv->uv", self.columns, self.columns))
 
+    @property
+    def with_prior(self) -> Array:
+        """The same with what is known before the poses."""
+        return self.information + np.eye(self.columns.shape[2])
+
 
 @dataclass(frozen=True)
 class Designer:
     """Chooses poses for a model; covariance (6, 6): of a pose's mean, joint_std (n,): of its encoders' readings;
-    criterion: `determinant` or `prediction`."""
+    criterion: the name of the index."""
 
     model: PoseModel
     limits: Limits
@@ -128,19 +133,19 @@ class Designer:
 
     def greedy(self, among: Candidates, count: int, advance: Advance = lambda n=1: None) -> Candidates:
         """The best candidates one by one, then exchanged until no other is better; the same one may stand twice."""
-        weight, chosen = self._weight(among), list[int]()
-        own = among.columns.swapaxes(1, 2) @ among.columns
-        information = np.eye(len(weight))
+        index, chosen = self.index(among), list[int]()
+        own, prior = among.columns.swapaxes(1, 2) @ among.columns, np.eye(among.columns.shape[2])
+        information = prior
         for _ in range(count):
-            chosen.append(self._best(among, information, weight))
+            chosen.append(index.best(among.columns, information))
             information = information + own[chosen[-1]]
             advance()
         for _ in range(EXCHANGES):
             before = list(chosen)
             for place in range(count):
                 # Summed anew: the difference of two sums would hide what the other poses tell least.
-                information = np.eye(len(weight)) + own[chosen[:place] + chosen[place + 1 :]].sum(axis=0)
-                chosen[place] = self._best(among, information, weight)
+                information = prior + own[chosen[:place] + chosen[place + 1 :]].sum(axis=0)
+                chosen[place] = index.best(among.columns, information)
             if chosen == before:
                 break
         return among.of(chosen)
@@ -148,66 +153,49 @@ class Designer:
     def moved(self, chosen: Candidates, among: Candidates) -> Candidates:
         """The poses after a search along the gradient of the index in joint space, at which it is no worse; those that
         it would lead to where the robot may not stand are held where they were."""
-        weight, held, best = self._weight(among), np.zeros(len(chosen), dtype=bool), chosen
+        index, held, best = self.index(among), np.zeros(len(chosen), dtype=bool), chosen
         for _ in range(ROUNDS):
-            joints = self._along_gradient(chosen, held, weight)
+            joints = self._along_gradient(chosen, held, index)
             poses = self._poses(joints, chosen.poses)
             closed = np.flatnonzero(np.isfinite(poses).all(axis=1))
             forbidden = np.ones(len(chosen), dtype=bool)
             forbidden[closed] = ~self.limits.allowed(poses[closed])
             joints[forbidden], poses[forbidden] = chosen.joints[forbidden], chosen.poses[forbidden]
-            best = min(best, self.seen(joints, poses), key=lambda found: self._index(found, weight)[0])
+            best = min(best, self.seen(joints, poses), key=lambda found: index.value(found.with_prior)[0])
             if not forbidden.any():
                 break
             held |= forbidden
         return best
 
-    def _along_gradient(self, chosen: Candidates, held: NDArray[np.bool_], weight: Array) -> Array:
+    def _along_gradient(self, chosen: Candidates, held: NDArray[np.bool_], index: ObservabilityIndex) -> Array:
         """Joint coordinates (N, n) within the travel with the best index nearby, some poses held."""
         shape, travel, near = chosen.joints.shape, self.limits.travel, chosen.poses
 
-        def index(values: Array) -> tuple[float, Array]:
+        def worth(values: Array) -> tuple[float, Array]:
             nonlocal near
             joints = values.reshape(shape) * travel
             poses = self._poses(joints, near)
             if not np.isfinite(poses).all():
                 return np.inf, np.zeros(values.size)
             near, at = poses, self.seen(joints, poses)
-            worth, spread = self._index(at, weight)
+            found, spread = index.value(at.with_prior)
             pull, gradient = np.einsum("uv,nmv->nmu", spread, at.columns), np.empty(shape)
             for joint in range(shape[1]):
                 ahead = joints + STEP * travel * np.eye(shape[1])[joint]
                 columns = self.seen(ahead, self._poses(ahead, poses)).columns
                 gradient[:, joint] = -2 * np.einsum("nmu,nmu->n", pull, (columns - at.columns) / STEP)
-            return worth, gradient.ravel()
+            return found, gradient.ravel()
 
         start, free = chosen.joints / travel, ~held[:, None]
         low, high = np.where(free, -1.0, start), np.where(free, 1.0, start)
         bounds = list(zip(low.ravel(), high.ravel(), strict=True))
         steps = {"maxiter": GRADIENT_STEPS}
-        found = minimize(index, start.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options=steps)
+        found = minimize(worth, start.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options=steps)
         return np.asarray(found.x.reshape(shape) * travel)
 
-    def _index(self, poses: Candidates, weight: Array) -> tuple[float, Array]:
-        """The index of poses, smaller is better, and minus its derivative by their information (u, u)."""
-        covariance = np.asarray(np.linalg.inv(np.eye(len(weight)) + poses.information), dtype=float)
-        if self.criterion == "determinant":
-            return float(np.linalg.slogdet(covariance)[1]), covariance
-        cost = float(np.sum(weight * covariance))
-        return float(np.log(cost)), np.asarray(covariance @ weight @ covariance / cost, dtype=float)
-
-    def _best(self, among: Candidates, information: Array, weight: Array) -> int:
-        """The candidate that improves the index most."""
-        covariance = np.linalg.inv(information)
-        spread = among.columns @ covariance
-        inner = np.eye(among.columns.shape[1]) + spread @ among.columns.swapaxes(1, 2)
-        if self.criterion == "determinant":
-            return int(np.argmax(np.linalg.slogdet(inner)[1]))
-        return int(np.argmax(np.einsum("nmu,nmu->n", np.linalg.solve(inner, spread), spread @ weight)))
-
-    def _weight(self, among: Candidates) -> Array:
-        """What unknowns cost (u, u): mean square error of the candidates' coordinates, each in units of its noise."""
-        return among.information / len(among)
+    def index(self, among: Candidates) -> ObservabilityIndex:
+        """The criterion's, with what these candidates can tell."""
+        return chosen_index(self.criterion, among.information, len(among))
 
     def _poses(self, joints: Array, start: Array) -> Array:
         """The nominal robot's poses (N, 6); NaN where the loops do not close."""

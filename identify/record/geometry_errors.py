@@ -60,6 +60,13 @@ class GeometryErrors:
             modes[:, :, place] = (more - less) / 2.0
         return modes
 
+    def joints(self, poses: Array) -> Array:
+        """Changes (N, n, k) of the joint coordinates at poses (N, 6) by each direction that is noticed."""
+        chart = self.robot.geometry.chart
+        held = chart.pose(chart.coordinates(poses))
+        apart = [more.inverse_kinematics(held) - less.inverse_kinematics(held) for more, less in self._moved]
+        return np.stack(apart, axis=2) / 2.0 if apart else np.zeros((len(poses), self.robot.layout.joints, 0))
+
     @cached_property
     def _noticed(self) -> tuple[Array, int]:
         """The factor, and how many of its directions are noticed."""

@@ -308,8 +308,9 @@ class Geometry(Section):
     selection: Literal["random", "greedy", "gradient"] = Field(
         "gradient", description="random poses, the best of the candidates, or those moved along the index's gradient"
     )
-    criterion: Literal["prediction", "determinant"] = Field(
-        "prediction", description="index: mean error of other poses, or determinant of the information"
+    criterion: Literal["prediction", "determinant", "noise_amplification"] = Field(
+        "prediction",
+        description="index: mean error of other poses, determinant of the information, or Nahvi and Hollerbach's",
     )
     candidates: int = quantity(400, "1", "random poses within the travel to choose from", ge=1, le=100_000)
     measurement: Literal["images", "drawn"] = Field(

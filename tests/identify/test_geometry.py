@@ -115,19 +115,28 @@ def test_designed_poses_predict_as_well_as_twice_as_many_random_ones(robot):
     assert design.limits.allowed(among.poses).all()
 
 
-@pytest.mark.parametrize("criterion", ["prediction", pytest.param("determinant", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "criterion", ["prediction", "noise_amplification", pytest.param("determinant", marks=pytest.mark.slow)]
+)
 def test_each_way_of_choosing_is_better_by_its_own_index(criterion):
     design, among = designer("rss6", criterion), poses_of("rss6", 60)
     greedy = design.greedy(among, 12)
     moved = design.moved(greedy, among)
 
-    def index(poses):
+    values, vectors = np.linalg.eigh(among.information)
+    told = vectors[:, values > 9]  # known to a third of what they were before
+
+    def worth(poses):
         covariance = np.linalg.inv(poses.information + np.eye(len(poses.information)))
+        if criterion == "noise_amplification":
+            rows = np.vstack([*poses.columns, np.eye(len(told))]) @ told
+            singular = np.linalg.svd(rows, compute_uv=False)
+            return -np.log(singular[-1] ** 2 / singular[0])
         if criterion == "determinant":
             return np.linalg.slogdet(covariance)[1]
         return np.log(np.sum(among.information * covariance))
 
-    assert index(moved) < index(greedy) < index(among.of(list(range(12))))
+    assert worth(moved) < worth(greedy) < worth(among.of(list(range(12))))
 
 
 def test_the_mean_of_readings_is_as_uncertain_as_is_said():
