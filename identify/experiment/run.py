@@ -129,6 +129,8 @@ def run_plant(
     scenario, times = plant.scenario, plant.scenario.timing.frame_times(duration_s)
     check_travel(plant.nominal, trajectory, times, **scenario.excitation.singularity_limits)
     reference = trajectory.reference(times)
+    if isinstance(sensor, cmmsim.Sensor):
+        sensor.drift_rig(scenario.rig.drift, len(times))
     eye = SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, run), advance)
     latencies = _true_latencies(scenario, len(times), seed, run)
     true_load = None if load is None else load.true

@@ -206,6 +206,11 @@ class Rig(Section):
     errors: dict[str, float] = Field(
         {}, description='true minus known, of which no covariance knows: { "left.cx_px" = 0.1 }, px, m or rad'
     )
+    drift: dict[str, float] = Field(
+        {},
+        description="how far the true cameras move, evenly from the first to the last frame of each run, and the "
+        'estimator is not told: { "right.cx_px" = 0.1 }, px, m or rad',
+    )
 
     @property
     def exact(self) -> bool:

@@ -47,6 +47,7 @@ READS = Reads(
         "scenario.robot",
         *PICTURES,
         "scenario.rig.errors",
+        "scenario.rig.drift",
         "scenario.timing.",
         "sensor.timing.",
         "scenario.servo.",
