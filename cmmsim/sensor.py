@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +165,19 @@ class Sensor:
     @property
     def estimator(self) -> PoseEstimator:
         """The part that turns images into poses; also for images from elsewhere, see measure_frame."""
-        return PoseEstimator(self.rig, self.noise, self.settings, self.platform, self.taught, self.method)
+        common = None if self._known is None else self._common_covariance(self._known)
+        return PoseEstimator(self.rig, self.noise, self.settings, self.platform, self.taught, self.method, common)
+
+    def _common_covariance(self, known: KnownRig) -> Callable[[Array], Array]:
+        """What all poses have in common at a pose (6,) where the rig is known only so well, (6,6)."""
+        if self.method != "registration":
+            return _not_known
+        return partial(self._geometry.pose_covariance, rig_covariance=known.covariance)
+
+    @cached_property
+    def _geometry(self) -> MeasuringGeometry:
+        """What is known of the set-up once it is taught."""
+        return MeasuringGeometry(self.rig, self.platform, self.base, self.taught, self.home)
 
     @property
     def observer(self) -> Observer:
@@ -227,9 +239,8 @@ class Sensor:
         if self.method != "registration":
             raise CmmError(f"common errors are known of poses by registration only, not by {self.method}")
         known = self._known or KnownRig(self.rig, np.zeros((len(PARAMETER_NAMES),) * 2))
-        geometry = MeasuringGeometry(self.rig, self.platform, self.base, self.taught, self.home)
         at, along = np.asarray(poses, dtype=float), np.asarray(rates, dtype=float)
-        return geometry.common_errors(at, along, known.covariance, known.exposure_std)
+        return self._geometry.common_errors(at, along, known.covariance, known.exposure_std)
 
     def look(
         self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
@@ -280,6 +291,11 @@ class Sensor:
     def camera(self) -> VirtualStereoCamera:
         """The two cameras before the true scene, as they are at teaching."""
         return self.true_cameras.at_rest
+
+
+def _not_known(pose: Array) -> Array:
+    """Covariance (6,6) of what nobody knows at a pose (6,)."""
+    return np.full((6, 6), np.nan)
 
 
 def _checked_seed(seed: int) -> int:
