@@ -16,7 +16,9 @@ from numpy.typing import ArrayLike
 from cmmsim.checks import finite_array, require_kind
 from cmmsim.common_errors import CommonErrors, MeasuringGeometry
 from cmmsim.detection.detector import FitLimits, find_detector
-from cmmsim.errors import CmmError, UnknownBodyError, UnknownOptionError
+from cmmsim.drift_watch import DriftWatch
+from cmmsim.drift_watch.watch import CHANCE
+from cmmsim.errors import CmmError, LostError, UnknownBodyError, UnknownOptionError
 from cmmsim.files.schema import SensorFile, Timing
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import marked_body, require_corner
@@ -27,8 +29,9 @@ from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
 from cmmsim.imaging.renderer import choose_renderer
 from cmmsim.plugins import is_own, require_renderer
+from cmmsim.pose_estimation.consistency import consistent
 from cmmsim.pose_estimation.estimator import METHODS, Measurement, PoseEstimator, lost_measurement
-from cmmsim.pose_estimation.observation import DetectionSettings, Observer
+from cmmsim.pose_estimation.observation import DetectionSettings, Observer, StickerObservation
 from cmmsim.pose_estimation.search import SMALLEST_STEP
 from cmmsim.pose_estimation.taught import Taught, require_taught_for, setup_of
 from cmmsim.radiometry.images import StereoFrame, StereoImages
@@ -84,6 +87,7 @@ class Sensor:
         self.rig = self.true_cameras.rig if self._known is None else self._known.rig
         self._taught = taught
         self._tracker: Tracker | None = None
+        self._watch: DriftWatch | None = None
         self.start_run(seed)
 
     def __repr__(self) -> str:
@@ -205,6 +209,8 @@ class Sensor:
         self._dropout_rng = np.random.default_rng([seed, DROPOUT_STREAM])
         if self._tracker is not None:
             self._tracker.forget()
+        if self._watch is not None:
+            self._watch.restart()
 
     def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
         """Register further rigid bodies (meshes in m) that may hide stickers; drawn where ``obstacles`` says.
@@ -236,8 +242,7 @@ class Sensor:
 
         Raises CmmError for the method "planes", ShapeError for anything but rows of six finite numbers.
         """
-        if self.method != "registration":
-            raise CmmError(f"common errors are known of poses by registration only, not by {self.method}")
+        self._require_registration("common errors are known of")
         known = self._known or KnownRig(self.rig, np.zeros((len(PARAMETER_NAMES),) * 2))
         at, along = np.asarray(poses, dtype=float), np.asarray(rates, dtype=float)
         return self._geometry.common_errors(at, along, known.covariance, known.exposure_std)
@@ -284,8 +289,39 @@ class Sensor:
             self._tracker = Tracker(self.estimator)
         if self._dropout_rng.random() < self.timing.dropout:
             self._tracker.miss()
-            return lost_measurement(f"dropped frame (a share of {self.timing.dropout:.3g} drops out)")
-        return self._tracker.measure(images)
+            measured = lost_measurement(f"dropped frame (a share of {self.timing.dropout:.3g} drops out)")
+        else:
+            measured = self._tracker.measure(images)
+        if self._watch is not None:
+            look = measured.ok and self._watch.watches_base
+            self._watch.add(measured, self._seen_of_base(images) if look else None)
+        return measured
+
+    def watch_drift(self, base: bool = False, chance: float = CHANCE) -> DriftWatch:
+        """Watch from now on whether the rig still is as it was taught; each run is judged for itself.
+
+        base: look at the base's stickers as well, which takes twice the time and sees smaller movements, and those of
+        the whole rig; chance of a false alarm in a run. Raises CmmError for the method "planes", and for a chance that
+        is none.
+        """
+        self._require_registration("drift is told from")
+        offset = float(np.hypot(self.settings.centre_error_px, self.observer.detector.bias_px))
+        period = 1.0 / self.timing.frame_rate
+        self._watch = DriftWatch(self._geometry, self._known, period, chance, offset, base)
+        return self._watch
+
+    def _seen_of_base(self, images: StereoImages) -> StickerObservation | None:
+        """The base's stickers in a frame; None where too few agree."""
+        expected, places = self._geometry.camera_from_base, self.taught.base_places
+        seen = self.observer.observe(images, expected, places, self.base.sticker_normals)
+        try:
+            return consistent(seen, self.observer, self.base, places)[0]
+        except LostError:
+            return None
+
+    def _require_registration(self, what: str) -> None:
+        if self.method != "registration":
+            raise CmmError(f"{what} poses by registration only, not by {self.method}")
 
     @property
     def camera(self) -> VirtualStereoCamera:

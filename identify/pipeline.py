@@ -27,6 +27,7 @@ from identify.loop_parameters import check_parameter_set
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.checks import check_length, check_trajectory
+from identify.record.drift import DRIFT, read_finding
 from identify.record.own_record import read_own_records
 from identify.record.provenance import ENTRY, RECORDS, RunFiles, check_robot, digest
 from identify.record.recorded_run import recorded_reference
@@ -182,6 +183,7 @@ def _write_identified(run_folder: RunFolder, found: _Identified, scenario: Scena
             "versions": versions(),
             ENTRY: made_of,
             "seconds": {"record": seen.attrs.get("record_seconds"), "identify": found.seconds, **seconds},
+            DRIFT: read_finding(seen),
             "identification": result.to_dict(),
             "before": rms_figures(before - measured, ok),
             "after": rms_figures(after - measured, ok),

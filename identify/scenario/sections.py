@@ -211,6 +211,11 @@ class Rig(Section):
         description="how far the true cameras move, evenly from the first to the last frame of each run, and the "
         'estimator is not told: { "right.cx_px" = 0.1 }, px, m or rad',
     )
+    watch: Literal["platform", "both", "none"] = Field(
+        "platform",
+        description="whose stickers tell a run whether the cameras still are as they were; both: the base's, too, "
+        "in twice the time",
+    )
 
     @property
     def exact(self) -> bool:
