@@ -9,8 +9,8 @@ wrong frames and sticker places, and much of its error cancels there: only what 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +48,6 @@ TEACHING_POSES = 8
 STEPS = np.diag([*2 * (0.1, 0.1, 0.1, 0.1, 1e-4, 1e-4, 1e-5, 1e-5, 1e-4), *3 * (1e-5,), *3 * (1e-5,)])
 """Changes of the rig's parameters for central differences: some ten times what a good calibration leaves."""
 
-POINT_STEPS = 1e-5 * np.eye(3)  # m
-
 
 @dataclass(frozen=True)
 class CommonErrors:
@@ -81,6 +79,11 @@ class MeasuringGeometry:
         """As it was taught (4,4)."""
         return invert(self.taught.base_from_camera)
 
+    def pose_covariance(self, pose: Array, rig_covariance: Array) -> Array:
+        """Covariance (6, 6) of what a pose (6,), measured by registration, has in common with all others: what is not
+        known of rig, with a covariance (24, 24), and taught frames."""
+        return self.common_errors(pose[None], np.zeros((1, 6)), rig_covariance).pose_covariances[0]
+
     def common_errors(
         self, poses: Array, rates: Array, rig_covariance: Array, exposure_std: float = 0.0
     ) -> CommonErrors:
@@ -102,11 +105,17 @@ class MeasuringGeometry:
 
     def _by_rig(self, view: _View) -> Array:
         """Small errors (N, 6, 24) of base_from_platform by each parameter of the rig, through teaching as well."""
+        frames, places = self.taught_by_rig
+        return view.registered(view.points_by_rig() - view.points_by_places(places)) + view.levers @ frames
+
+    @cached_property
+    def taught_by_rig(self) -> tuple[Array, Array]:
+        """Small error (6, 24) of base_from_camera as it was taught, and changes (24, n, 3) of the places of the
+        platform's stickers, by each parameter of the rig."""
         changes = [(self._teach(self.rig.moved(step)), self._teach(self.rig.moved(-step))) for step in STEPS]
-        frames = np.stack([_small_error(more[0], less[0]) for more, less in changes], axis=1)
-        places = np.stack([more[1] - less[1] for more, less in changes])
-        seen = view.registered(view.points_by_rig()) - view.registered(view.points_by_places(places))
-        return seen + view.levers @ (frames / (2.0 * np.diag(STEPS)))
+        twice = 2.0 * np.diag(STEPS)
+        frames = np.stack([_small_error(more[0], less[0]) for more, less in changes], axis=1) / twice
+        return frames, np.stack([more[1] - less[1] for more, less in changes]) / twice[:, None, None]
 
     def _teach(self, true: StereoRig) -> tuple[Array, Array]:
         """base_from_camera (4,4) and places (n,3) of the platform's stickers as the known rig teaches them, without
@@ -124,22 +133,23 @@ class MeasuringGeometry:
         pixels, unit = true.project(points)[0], np.tile(np.eye(2), (2, len(points), 1, 1))
         ideal, spread, _ = self.rig.undistort(pixels, unit)
         found = triangulate(self.rig, ideal[0], ideal[1], spread[0], spread[1])
-        return StickerObservation(np.arange(len(points)), pixels[0], pixels[1], found.points, found.covariances)
+        return StickerObservation(
+            np.arange(len(points)), pixels[0], pixels[1], found.points, found.covariances, np.ones(len(points))
+        )
 
 
 @dataclass(frozen=True)
 class _View:
     """Stickers seen at the poses of a run, by index (n,): base_from_platform (N,4,4); arms (N, n, 3) of the stickers
-    about the platform's origin and points (N, n, 3), both in camera axes; slopes (2, N, n, 2, 3) of their pixels by the
-    points."""
+    about the platform's origin, in camera axes; changes of their pixels: slopes (2, N, n, 2, 3) by their points, and
+    by_rig (2, N, n, 2, 24) by the rig's parameters."""
 
-    rig: StereoRig
     camera_from_base: Array
     frames: Array
     seen: NDArray[np.int_]
     arms: Array
-    points: Array
     slopes: Array
+    by_rig: Array
 
     @property
     def levers(self) -> Array:
@@ -165,13 +175,12 @@ class _View:
 
     def points_by_rig(self) -> Array:
         """Changes (N, n, 3, 24) of the triangulated points by each parameter of the rig behind the pixels."""
-        return self._points(_differences(lambda step: _pixels(self.rig.moved(step), self.points), STEPS))
+        return self._points(self.by_rig)
 
     def points_by_places(self, places: Array) -> Array:
-        """Changes (N, n, 3, 24) of where stickers are expected by changes (24, n, 3) of their taught places over twice
-        a step of each parameter of the rig."""
+        """Changes (N, n, 3, 24) of where stickers are expected by changes (24, n, 3) of their taught places."""
         turns = self.camera_from_base[:3, :3] @ self.frames[:, :3, :3]
-        return np.einsum("nij,pmj,p->nmip", turns, places[:, self.seen], 0.5 / np.diag(STEPS))
+        return np.einsum("nij,pmj->nmip", turns, places[:, self.seen])
 
     def registered(self, changes: Array) -> Array:
         """Small errors (N, 6, p) of base_from_platform, in base axes, by changes (N, n, 3, p) of the stickers' points
@@ -194,12 +203,14 @@ class _View:
 
 
 def _view(geometry: MeasuringGeometry, frames: Array) -> _View:
-    camera_from_base, rig = geometry.camera_from_base, geometry.rig
+    camera_from_base = geometry.camera_from_base
     seen = _seen_at_home(geometry)
     arms = np.einsum("nij,mj->nmi", frames[:, :3, :3], geometry.taught.platform_places[seen])
     points = apply(camera_from_base, arms + frames[:, None, :3, 3])
-    slopes = _differences(lambda step: _pixels(rig, points + step), POINT_STEPS)
-    return _View(rig, camera_from_base, frames, seen, arms @ camera_from_base[:3, :3].T, points, slopes)
+    slopes, by_rig = (
+        each.reshape(2, *points.shape[:-1], 2, -1) for each in geometry.rig.derivatives(points.reshape(-1, 3))
+    )
+    return _View(camera_from_base, frames, seen, arms @ camera_from_base[:3, :3].T, slopes, by_rig)
 
 
 def _seen_at_home(geometry: MeasuringGeometry) -> NDArray[np.int_]:
@@ -210,16 +221,6 @@ def _seen_at_home(geometry: MeasuringGeometry) -> NDArray[np.int_]:
         normals = geometry.platform.sticker_normals @ placed[:3, :3].T
         seen.append(faces_camera(apply(placed, geometry.taught.platform_places), normals))
     return np.flatnonzero(np.all(seen, axis=0))
-
-
-def _differences(function: Callable[[Array], Array], steps: Array) -> Array:
-    """Derivatives (..., p) of a function along steps (p, p), a diagonal matrix, by central differences."""
-    return np.stack([(function(step) - function(-step)) / (2.0 * step.sum()) for step in steps], axis=-1)
-
-
-def _pixels(rig: StereoRig, points: Array) -> Array:
-    """Pixels (2, ..., 2) of points (..., 3)."""
-    return rig.project(points.reshape(-1, 3))[0].reshape(2, *points.shape[:-1], 2)
 
 
 def _small_error(moved: Array, other: Array) -> Array:

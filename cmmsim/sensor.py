@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,27 +16,29 @@ from numpy.typing import ArrayLike
 from cmmsim.checks import finite_array, require_kind
 from cmmsim.common_errors import CommonErrors, MeasuringGeometry
 from cmmsim.detection.detector import FitLimits, find_detector
-from cmmsim.errors import CmmError, UnknownBodyError, UnknownOptionError
+from cmmsim.drift_watch import DriftWatch
+from cmmsim.drift_watch.watch import CHANCE
+from cmmsim.errors import CmmError, LostError, UnknownBodyError, UnknownOptionError
 from cmmsim.files.schema import SensorFile, Timing
 from cmmsim.files.sensor_file import read_sensor_file
-from cmmsim.files.setup import marked_body, require_corner, rig_from_file
+from cmmsim.files.setup import marked_body, require_corner
 from cmmsim.geometry.camera import Optics
-from cmmsim.geometry.known_rig import KnownRig, rig_changes
+from cmmsim.geometry.known_rig import KnownRig
 from cmmsim.geometry.pose import Array, apply, checked_pose, checked_transform, pose_to_transform
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
-from cmmsim.imaging.formation import ImageFormation
-from cmmsim.imaging.renderer import Drawable, Renderer, choose_renderer
-from cmmsim.imaging.scene import Mesh, scene_body, solid_mesh
+from cmmsim.imaging.renderer import choose_renderer
 from cmmsim.plugins import is_own, require_renderer
+from cmmsim.pose_estimation.consistency import consistent
 from cmmsim.pose_estimation.estimator import METHODS, Measurement, PoseEstimator, lost_measurement
-from cmmsim.pose_estimation.observation import DetectionSettings, Observer
+from cmmsim.pose_estimation.observation import DetectionSettings, Observer, StickerObservation
 from cmmsim.pose_estimation.search import SMALLEST_STEP
 from cmmsim.pose_estimation.taught import Taught, require_taught_for, setup_of
 from cmmsim.radiometry.images import StereoFrame, StereoImages
 from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.teaching import Progress, Teacher, WindowSizes, exactly_taught, largest_radius, radius_at, window_sizes
 from cmmsim.tracker import Tracker
+from cmmsim.true_cameras import TrueCameras
 
 TEACHING_STREAM, RUN_STREAM, DROPOUT_STREAM = 0, 1, 2
 
@@ -72,10 +74,7 @@ class Sensor:
             raise CmmError(f"progress must be a function of the steps done and their number, got {progress!r}")
         self._file, self._seed, self._progress = file, _checked_seed(seed), progress
         self.method = method
-        self._true_rig, self._camera_from_base = rig_from_file(file.rig)
-        self._right_later = 0.0
         self._known = taught.known if isinstance(taught, Taught) else known
-        self.rig = self._true_rig if self._known is None else self._known.rig
         figures = file.camera.model_dump(exclude={"pattern_seed"})
         self.noise = CameraNoise(**{("enabled" if k == "noise" else k): v for k, v in figures.items()})
         self.optics = Optics(**file.lens.model_dump())
@@ -83,13 +82,12 @@ class Sensor:
         if taught is not None:
             require_kind(taught, Taught, "taught must be what another sensor's teach() returned")
             require_taught_for(taught, file, len(self.platform.nominal))
-        self._scene = [
-            scene_body(body, section, file.stickers, stream)
-            for stream, (body, section) in enumerate(((self.platform, file.platform), (self.base, file.base)))
-        ]
-        self._obstacles: dict[str, Mesh] = {}
+        bodies = self.platform, self.base
+        self.true_cameras = TrueCameras(file, bodies, self.noise, self.optics, self._asked_renderer)
+        self.rig = self.true_cameras.rig if self._known is None else self._known.rig
         self._taught = taught
         self._tracker: Tracker | None = None
+        self._watch: DriftWatch | None = None
         self.start_run(seed)
 
     def __repr__(self) -> str:
@@ -104,7 +102,7 @@ class Sensor:
     @property
     def renderer(self) -> str:
         """Name of the renderer that draws; "auto" is decided on first use."""
-        return self._renderer.name
+        return self.true_cameras.renderer.name
 
     @cached_property
     def settings(self) -> DetectionSettings:
@@ -126,13 +124,14 @@ class Sensor:
     @property
     def _stickers_at_home(self) -> Array:
         """Nominal places (n,3) of all stickers in the camera frame, with the platform at home."""
-        at_home = self._camera_from_base @ pose_to_transform(self.home)
-        return np.concatenate([apply(at_home, self.platform.nominal), apply(self._camera_from_base, self.base.nominal)])
+        camera_from_base = self.true_cameras.camera_from_base
+        at_home = camera_from_base @ pose_to_transform(self.home)
+        return np.concatenate([apply(at_home, self.platform.nominal), apply(camera_from_base, self.base.nominal)])
 
     @cached_property
     def _window_sizes(self) -> WindowSizes:
         """Large and blurred stickers need a wider view."""
-        radius, place = self._file.stickers.radius, self._camera_from_base
+        radius, place = self._file.stickers.radius, self.true_cameras.camera_from_base
         at_target = radius_at(self.rig, place, np.array(self._file.rig.target), radius)
         at_teaching = max(
             largest_radius(self.rig, place, self.base, radius),
@@ -170,7 +169,19 @@ class Sensor:
     @property
     def estimator(self) -> PoseEstimator:
         """The part that turns images into poses; also for images from elsewhere, see measure_frame."""
-        return PoseEstimator(self.rig, self.noise, self.settings, self.platform, self.taught, self.method)
+        common = None if self._known is None else self._common_covariance(self._known)
+        return PoseEstimator(self.rig, self.noise, self.settings, self.platform, self.taught, self.method, common)
+
+    def _common_covariance(self, known: KnownRig) -> Callable[[Array], Array]:
+        """What all poses have in common at a pose (6,) where the rig is known only so well, (6,6)."""
+        if self.method != "registration":
+            return _not_known
+        return partial(self._geometry.pose_covariance, rig_covariance=known.covariance)
+
+    @cached_property
+    def _geometry(self) -> MeasuringGeometry:
+        """What is known of the set-up once it is taught."""
+        return MeasuringGeometry(self.rig, self.platform, self.base, self.taught, self.home)
 
     @property
     def observer(self) -> Observer:
@@ -198,19 +209,15 @@ class Sensor:
         self._dropout_rng = np.random.default_rng([seed, DROPOUT_STREAM])
         if self._tracker is not None:
             self._tracker.forget()
+        if self._watch is not None:
+            self._watch.restart()
 
     def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
         """Register further rigid bodies (meshes in m) that may hide stickers; drawn where ``obstacles`` says.
 
         Raises CmmError for anything but meshes by name.
         """
-        require_kind(meshes, Mapping, "bodies must be meshes by name, as {'link': rod(0.3, 0.01)}")
-        for name, mesh in meshes.items():
-            require_kind(name, str, "the name of a body must be text")
-            require_kind(mesh, trimesh.Trimesh, f"body {name!r} must be a trimesh.Trimesh")
-        level = self._file.stickers.obstacle_level / 255.0
-        self._obstacles.update({name: solid_mesh(mesh, level) for name, mesh in meshes.items()})
-        self.__dict__.pop("camera", None)  # it is built anew before the next picture
+        self.true_cameras.add_bodies(meshes)
 
     def move_rig(self, changes: Mapping[str, float], right_later: float = 0.0) -> None:
         """Change the true rig by named amounts, as ``{"right.cx_px": 0.1}``, and have the right camera expose later, s;
@@ -219,20 +226,26 @@ class Sensor:
         Raises CmmError for a name that a rig has not (``cmmsim.geometry.stereo_rig.PARAMETER_NAMES``), ShapeError for a
         number that is not finite.
         """
-        self._true_rig, self._right_later = self._true_rig.moved(rig_changes(changes)), right_later
-        self.__dict__.pop("camera", None)  # it is built anew before the next picture
+        self.true_cameras.move(changes, right_later)
+
+    def drift_rig(self, changes: Mapping[str, float], frames: int) -> None:
+        """Have the true rig change by named amounts, as ``{"right.cx_px": 0.1}``, evenly from the first to the last of
+        so many frames of each run from now on; the estimator is not told. No changes: no drift.
+
+        Raises CmmError for a name that a rig has not, fewer than two frames, or where the stickers leave an image;
+        ShapeError for a number that is not finite.
+        """
+        self.true_cameras.drift(changes, frames)
 
     def common_errors(self, poses: ArrayLike, rates: ArrayLike) -> CommonErrors:
         """What is not known exactly of rig and taught frames, and how it moves poses (N, 6) in motion at rates (N, 6).
 
         Raises CmmError for the method "planes", ShapeError for anything but rows of six finite numbers.
         """
-        if self.method != "registration":
-            raise CmmError(f"common errors are known of poses by registration only, not by {self.method}")
+        self._require_registration("common errors are known of")
         known = self._known or KnownRig(self.rig, np.zeros((len(PARAMETER_NAMES),) * 2))
-        geometry = MeasuringGeometry(self.rig, self.platform, self.base, self.taught, self.home)
         at, along = np.asarray(poses, dtype=float), np.asarray(rates, dtype=float)
-        return geometry.common_errors(at, along, known.covariance, known.exposure_std)
+        return self._geometry.common_errors(at, along, known.covariance, known.exposure_std)
 
     def look(
         self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
@@ -248,14 +261,15 @@ class Sensor:
         obstacles = {} if obstacles is None else obstacles
         require_kind(obstacles, Mapping, "obstacles must be transforms by name, as {'link': base_from_body}, or None")
         for name, place in obstacles.items():
-            if name not in self._obstacles:
-                raise UnknownBodyError(name, self._obstacles)
+            if name not in self.true_cameras.obstacles:
+                raise UnknownBodyError(name, self.true_cameras.obstacles)
             placed[name] = checked_transform(place, f"obstacle {name!r}: base_from_body")
         if pose_rate is not None:
             pose_rate = finite_array(pose_rate, (6,), "a pose rate is six finite numbers, m/s and rad/s")
         rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
+        camera = self.true_cameras.at(self._frame)
         self._frame += 1
-        return self.camera.look(checked, rng, placed, pose_rate=pose_rate)
+        return camera.look(checked, rng, placed, pose_rate=pose_rate)
 
     def capture(
         self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
@@ -275,32 +289,49 @@ class Sensor:
             self._tracker = Tracker(self.estimator)
         if self._dropout_rng.random() < self.timing.dropout:
             self._tracker.miss()
-            return lost_measurement(f"dropped frame (a share of {self.timing.dropout:.3g} drops out)")
-        return self._tracker.measure(images)
+            measured = lost_measurement(f"dropped frame (a share of {self.timing.dropout:.3g} drops out)")
+        else:
+            measured = self._tracker.measure(images)
+        if self._watch is not None:
+            look = measured.ok and self._watch.watches_base
+            self._watch.add(measured, self._seen_of_base(images) if look else None)
+        return measured
 
-    @cached_property
-    def _renderer(self) -> Renderer:
-        return choose_renderer(self._asked_renderer)
+    def watch_drift(self, base: bool = False, chance: float = CHANCE) -> DriftWatch:
+        """Watch from now on whether the rig still is as it was taught; each run is judged for itself.
 
-    @cached_property
+        base: look at the base's stickers as well, which takes twice the time and sees smaller movements, and those of
+        the whole rig; chance of a false alarm in a run. Raises CmmError for the method "planes", and for a chance that
+        is none.
+        """
+        self._require_registration("drift is told from")
+        offset = float(np.hypot(self.settings.centre_error_px, self.observer.detector.bias_px))
+        period = 1.0 / self.timing.frame_rate
+        self._watch = DriftWatch(self._geometry, self._known, period, chance, offset, base)
+        return self._watch
+
+    def _seen_of_base(self, images: StereoImages) -> StickerObservation | None:
+        """The base's stickers in a frame; None where too few agree."""
+        expected, places = self._geometry.camera_from_base, self.taught.base_places
+        seen = self.observer.observe(images, expected, places, self.base.sticker_normals)
+        try:
+            return consistent(seen, self.observer, self.base, places)[0]
+        except LostError:
+            return None
+
+    def _require_registration(self, what: str) -> None:
+        if self.method != "registration":
+            raise CmmError(f"{what} poses by registration only, not by {self.method}")
+
+    @property
     def camera(self) -> VirtualStereoCamera:
-        """The two cameras before the true scene. Stickers are drawn first: what they hide need not be drawn."""
-        patches = [p for body in self._scene for p in body.stickers] + [body.solid for body in self._scene]
-        owners = [k for k, body in enumerate(self._scene) for _ in body.stickers] + [0, 1]
-        owners += range(2, 2 + len(self._obstacles))
-        distance = float(np.linalg.norm(np.subtract(self._file.rig.position, self._file.rig.target)))
-        drawable = Drawable([*patches, *self._obstacles.values()], owners, distance)
-        formation = ImageFormation(self._renderer, drawable, self._file.stickers.background_level / 255.0, self.optics)
-        return VirtualStereoCamera(
-            self._true_rig,
-            self._camera_from_base,
-            formation,
-            self.noise,
-            list(self._obstacles),
-            self._file.timing.exposure,
-            self._file.camera.pattern_seed,
-            self._right_later,
-        )
+        """The two cameras before the true scene, as they are at teaching."""
+        return self.true_cameras.at_rest
+
+
+def _not_known(pose: Array) -> Array:
+    """Covariance (6,6) of what nobody knows at a pose (6,)."""
+    return np.full((6, 6), np.nan)
 
 
 def _checked_seed(seed: int) -> int:

@@ -29,6 +29,7 @@ from identify.loop_parameters import check_parameter_set
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.checks import check_length, check_trajectory
+from identify.record.drift import DRIFT, read_finding
 from identify.record.geometry_errors import COVARIANCE as GEOMETRY_COVARIANCE
 from identify.record.geometry_errors import store_geometry_covariance
 from identify.record.known_geometry import FOLDER, KnownGeometry, known_geometry
@@ -199,6 +200,7 @@ def _write_identified(run_folder: RunFolder, found: _Identified, scenario: Scena
             "versions": versions(),
             ENTRY: made_of,
             "seconds": {"record": seen.attrs.get("record_seconds"), "identify": found.seconds, **seconds},
+            DRIFT: read_finding(seen),
             "identification": result.to_dict(),
             "before": rms_figures(before - measured, ok),
             "after": rms_figures(after - measured, ok),

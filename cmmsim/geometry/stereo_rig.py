@@ -78,6 +78,20 @@ class StereoRig:
         ]
         return np.stack([s[0] for s in seen]), np.stack([s[1] for s in seen])
 
+    def derivatives(self, points: Array) -> tuple[Array, Array]:
+        """Derivatives (2, n, 2, 3) of both pixels of points (n, 3) in C by the points, and (2, n, 2, 24) by what the
+        rig is made of, in the order of PARAMETER_NAMES."""
+        by_points, by_rig = np.empty((2, len(points), 2, 3)), np.zeros((2, len(points), 2, len(PARAMETER_NAMES)))
+        for side, (camera, move) in enumerate(zip(self.cameras, self.from_camera, strict=True)):
+            known = rotation_log(move[:3, :3]), move[:3, 3], camera.matrix, camera.intrinsics[4:]
+            found = cv2.projectPoints(np.ascontiguousarray(points), *known)[1].reshape(len(points), 2, -1)
+            by_turn, by_shift, intrinsics = found[..., :3], found[..., 3:6], found[..., 6:]
+            by_points[side] = by_shift @ move[:3, :3]
+            by_rig[side, ..., 9 * side : 9 * side + 9] = intrinsics
+            if side == 1:
+                by_rig[side, ..., 18:] = np.concatenate([by_shift, by_turn], axis=-1)
+        return by_points, by_rig
+
     def undistort(self, pixels: Array, covariances: Array) -> tuple[Array, Array, NDArrayBool]:
         """Ideal pixels (2, n, 2) and their covariances (2, n, 2, 2) px² for those of the left and right image.
 

@@ -5,7 +5,7 @@ one that no moving body reaches is drawn once.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -187,6 +187,12 @@ class VirtualStereoCamera:
         lag = np.zeros(6) if pose_rate is None else self.right_later * pose_rate
         moments = [self._placed(p, p + lag, obstacles or {}) for p in poses]
         return LiveImages(self, moments, rng, quality or Quality())
+
+    def moved(self, changes: Array) -> "VirtualStereoCamera":
+        """The same cameras with changes (24,) of their rig's parameters; their pixels stay what they are."""
+        camera = replace(self, rig=self.rig.moved(changes))
+        camera.__dict__["patterns"] = self.patterns
+        return camera
 
     def radiance(
         self, placed: Sequence[Array], corners: NDArray[np.int_], size: int, supersampling: int

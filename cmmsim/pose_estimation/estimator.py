@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,10 +30,15 @@ Solution = tuple[Array, Array, StickerObservation]
 class Measurement:
     """Pose of the platform in the base frame, and what it was made from.
 
-    pose (6,) m, rad and covariance (6,6): observation noise only, the error of teaching is the same in every frame
-    and stands in ``Taught.calibration_covariance``. points (n,3) and point_covariances (n,3,3) in the camera frame, m;
-    left_pixels and right_pixels (n,2) sticker centres in the images as they are, distorted; target_ids (n,) such as
-    "A1". When nothing could be measured ok is False, reason says why, and pose and covariance are NaN.
+    Its error has two parts. covariance (6,6) of pose (6,), m and rad, is that of the noise, new in every frame.
+    common_covariance (6,6) is that of what is not known of rig and taught frames: one draw, the same in every frame, so
+    that no mean over frames makes it smaller; NaN where it is not known (poses by planes with a rig that is not exact).
+    They are never added in silence: the mean of N frames errs by covariance / N + common_covariance, a single one by
+    ``single_covariance``. ``Sensor.common_errors`` says how the common part of one pose goes with that of another.
+
+    points (n,3) and point_covariances (n,3,3) in the camera frame, m; left_pixels and right_pixels (n,2) sticker
+    centres in the images as they are, distorted, and pixel_variances (n,) of a coordinate, px²; target_ids (n,) such as
+    "A1". When nothing could be measured ok is False, reason says why, and pose and covariances are NaN.
     """
 
     pose: Array
@@ -44,6 +50,13 @@ class Measurement:
     target_ids: NDArray[np.str_]
     ok: bool
     reason: str = ""
+    common_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    pixel_variances: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def single_covariance(self) -> Array:
+        """Covariance (6,6) of this pose alone against the true one: noise and common part together."""
+        return self.covariance + self.common_covariance
 
     def __post_init__(self) -> None:
         if self.pose.shape != (6,) or self.covariance.shape != (6, 6):
@@ -58,10 +71,17 @@ class Measurement:
     def __repr__(self) -> str:
         if not self.ok:
             return f"Measurement(lost: {self.reason})"
-        shift, turn = (np.sqrt(np.trace(self.covariance[k : k + 3, k : k + 3])) for k in (0, 3))
         place = ", ".join(f"{value:.6f}" for value in self.pose)
-        spread = f"{1e6 * shift:.2g} um and {1e6 * turn:.2g} urad"
+        spread = f"{_shown(self.covariance)} by noise"
+        if self.common_covariance.any():
+            spread += f", {_shown(self.common_covariance)} in common"
         return f"Measurement(pose [{place}] m, rad to {spread}, {len(self.target_ids)} stickers)"
+
+
+def _shown(covariance: Array) -> str:
+    """Standard deviations of place and turn in words."""
+    shift, turn = (np.sqrt(np.trace(covariance[k : k + 3, k : k + 3])) for k in (0, 3))
+    return f"{1e6 * shift:.2g} um and {1e6 * turn:.2g} urad"
 
 
 def lost_measurement(reason: str) -> Measurement:
@@ -73,7 +93,8 @@ def measurement_without_stickers(pose: Array, covariance: Array, reason: str = "
     """A pose (6,) and its covariance (6,6) that no sticker stands behind; the reason why there is none where NaN."""
     points, covariances, pixels = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 2))
     names = np.array([], dtype=str)
-    return Measurement(pose, covariance, points, covariances, pixels, pixels, names, not reason, reason)
+    common = np.full((6, 6), np.nan) if reason else np.zeros((6, 6))
+    return Measurement(pose, covariance, points, covariances, pixels, pixels, names, not reason, reason, common)
 
 
 def by_registration(observation: StickerObservation, places: Array) -> Solution:
@@ -112,11 +133,15 @@ FEWEST_NOMINAL = 6  # stickers by whose nominal places a body is found
 
 @dataclass(frozen=True)
 class PoseEstimator(Observer):
-    """Everything that turns images into poses: an observer, the platform, and what was taught of it."""
+    """Everything that turns images into poses: an observer, the platform, and what was taught of it.
+
+    common_covariance: (6,6) that all poses have in common at a pose (6,); None: what teaching left.
+    """
 
     platform: MarkedBody
     taught: Taught
     method: str = "registration"
+    common_covariance: Callable[[Array], Array] | None = None
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
@@ -190,8 +215,13 @@ class PoseEstimator(Observer):
         camera_from_platform, covariance, used = self._solve(seen)
         base_from_platform = self.taught.base_from_camera @ camera_from_platform
         spread = compose_covariance(self.taught.base_from_camera, covariance)
+        pose = transform_to_pose(base_from_platform)
+        if self.common_covariance is None:
+            common = self.taught.calibration_covariance(pose, self.method)
+        else:
+            common = self.common_covariance(pose)
         measurement = Measurement(
-            transform_to_pose(base_from_platform),
+            pose,
             pose_covariance(base_from_platform, spread),
             used.points,
             used.covariances,
@@ -199,6 +229,8 @@ class PoseEstimator(Observer):
             used.right_pixels,
             self.platform.sticker_ids[used.index],
             True,
+            common_covariance=common,
+            pixel_variances=used.pixel_variances,
         )
         return measurement, camera_from_platform
 

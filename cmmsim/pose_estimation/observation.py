@@ -63,8 +63,9 @@ class StickerObservation:
     """k stickers seen by both cameras.
 
     index (k,) into the body's stickers; left_pixels and right_pixels (k,2) of the sticker centres in the images as they
-    are, distorted (eccentricity removed); points (k,3) and covariances (k,3,3) in the camera frame, m. outlines: the
-    ellipses' shapes, where the detector states them.
+    are, distorted (eccentricity removed); points (k,3) and covariances (k,3,3) in the camera frame, m; pixel_variances
+    (k,): mean variance of a coordinate of its two centres, px². outlines: the ellipses' shapes, where the detector
+    states them.
     """
 
     index: NDArray[np.int_]
@@ -72,6 +73,7 @@ class StickerObservation:
     right_pixels: Array
     points: Array
     covariances: Array
+    pixel_variances: Array
     outlines: Outlines | None = None
 
     def selected(self, keep: NDArray[np.bool_]) -> StickerObservation:
@@ -170,7 +172,7 @@ class StickerWindows:
         """The stickers in these windows; ``swept`` as of ``Observer.observe``."""
         if len(self.index) == 0:
             none = np.zeros((0, 3))
-            return StickerObservation(self.index, none[:, :2], none[:, :2], none, np.zeros((0, 3, 3)))
+            return StickerObservation(self.index, none[:, :2], none[:, :2], none, np.zeros((0, 3, 3)), none[:, 0])
         rig, settings = self.observer.rig, self.observer.settings
         smears = None if swept is None else self._smears(swept)
         fits = self._detected() if smears is None else _likelier(self._detected(), self._detected(smears))
@@ -185,9 +187,9 @@ class StickerWindows:
         noise = 0.25 * np.einsum("ckii->k", spread)
         covariances = seen.covariances * (noise / (noise + parted))[:, None, None] if parted else seen.covariances
         outlines = _outlines(fits, settings.centre_error_px**2)
-        return StickerObservation(self.index, seen_at[0], seen_at[1], seen.points, covariances, outlines).selected(
-            good & (seen.ray_gap < settings.largest_ray_gap)
-        )
+        return StickerObservation(
+            self.index, seen_at[0], seen_at[1], seen.points, covariances, noise, outlines
+        ).selected(good & (seen.ray_gap < settings.largest_ray_gap))
 
     def ellipses(self, smears: Array | None = None) -> EllipseFits:
         """Ellipses fitted to all 2k windows, good ones of any misfit; ``smears`` (2k,2) as of ``SpotWindows``."""

@@ -71,13 +71,17 @@ class Taught:
         stickers = f"{len(self.platform_places)} stickers of the platform, {len(self.base_places)} of the base"
         return f"Taught({self.sensor_name!r}, {stickers})"
 
-    def calibration_covariance(self, pose: Array) -> Array:
-        """Covariance (6,6) of the part of the pose error that teaching left; the same in every frame."""
+    def calibration_covariance(self, pose: Array, method: str = "registration") -> Array:
+        """Covariance (6,6) of the part of the pose error that teaching left; the same in every frame.
+
+        ``method`` "planes": the platform's frame is found anew in every frame, and only the base's was taught.
+        """
         base_from_platform = pose_to_transform(pose)
         lever = np.eye(6)
         lever[:3, 3:] = -skew(base_from_platform[:3, 3])
         total = lever @ self.base_covariance @ lever.T
-        total += compose_covariance(base_from_platform, self.platform_covariance)
+        if method == "registration":
+            total += compose_covariance(base_from_platform, self.platform_covariance)
         return pose_covariance(base_from_platform, total)
 
 

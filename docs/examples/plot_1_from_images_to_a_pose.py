@@ -110,9 +110,9 @@ plt.show()
 # -------------------------
 # Before its first measurement the sensor *teaches* itself the frames of base and platform and the places of the
 # stickers, from pictures of the platform at home. Teaching has an error, too. It is the same in every later frame, so no
-# repetition shows it, and the covariance above does not hold it. It stands on its own:
+# repetition shows it, and the covariance above does not hold it. It is the second part that a measurement states:
 
-taught = np.sqrt(np.diag(sensor.taught.calibration_covariance(pose)))
+taught = np.sqrt(np.diag(measured.common_covariance))
 offset = poses.mean(axis=0) - pose
 print("claimed error of teaching [µm, µrad]:", np.round(1e6 * taught, 2))
 print("mean of 300 errors        [µm, µrad]:", np.round(1e6 * offset, 2))

@@ -24,6 +24,7 @@ from identify.estimation.scale_anchor import read_anchor
 from identify.estimation.warm_start import linear_warm_start
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
+from identify.record.drift import drift_warnings
 from identify.record.provenance import recorded_seed
 from identify.record.recorded_run import recorded_run
 from identify.runtime import one_thread
@@ -81,7 +82,7 @@ def identify(
         noise_ratio_std=explained.misfit.std,
         whiteness=explained.whiteness,
         seconds={"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched},
-        **vars(judgement),
+        **vars(judgement) | {"warnings": (*drift_warnings(records), *judgement.warnings)},
     )
 
 

@@ -11,6 +11,7 @@ import platformdirs
 import xarray as xr
 
 import cmmsim
+from cmmsim.drift_watch import DriftWatch
 from dynamics import Robot
 from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference, prepare
 from identify.arrays import Array
@@ -24,6 +25,7 @@ from identify.progress import Advance, Progress, SilentProgress
 from identify.random_streams import ANCHOR, CALIBRATION, LATENCY, LOAD, MEAN_LATENCY, NOISE, TEACHING, stream_seed
 from identify.record import recording
 from identify.record.common_errors import CommonErrors, store_common_errors
+from identify.record.drift import store_finding
 from identify.record.geometry_errors import store_geometry_covariance
 from identify.record.payload import store_payload
 from identify.record.provenance import store_robot
@@ -131,6 +133,7 @@ def run_plant(
     scenario, times = plant.scenario, plant.scenario.timing.frame_times(duration_s)
     check_travel(plant.nominal, trajectory, times, **scenario.excitation.singularity_limits)
     reference = trajectory.reference(times)
+    watch = _watched(sensor, scenario, len(times))
     eye = SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, run), advance)
     latencies = _true_latencies(scenario, len(times), seed, run)
     true_load = None if load is None else load.true
@@ -142,11 +145,24 @@ def run_plant(
         poses = without_gaps(done.measured, done.measured_ok)
         found = sensor.common_errors(poses, spline_derivatives(poses, scenario.timing.frame_rate_hz)[0])
         store_common_errors(record, CommonErrors(found.names, found.changes, found.covariance))
+    if watch is not None:
+        store_finding(record, watch.finding.to_dict())
     store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, layout, plant.parameters, rng))
     if load is not None:
         store_payload(record, layout, load.stated, load.std)
         store_payload(truth, layout, load.true)
     return Experiment(record, truth)
+
+
+def _watched(sensor: PoseSensor, scenario: Scenario, frames: int) -> DriftWatch | None:
+    """What watches the cameras during a run of so many frames, in which they drift as the scenario says; None where
+    nothing can: poses by planes, or a sensor that draws no images."""
+    if not isinstance(sensor, cmmsim.Sensor):
+        return None
+    sensor.drift_rig(scenario.rig.drift, frames)
+    if scenario.rig.watch == "none" or sensor.method != "registration":
+        return None
+    return sensor.watch_drift(base=scenario.rig.watch == "both")
 
 
 def _true_latencies(scenario: Scenario, frames: int, seed: int, run: int) -> Array | None:

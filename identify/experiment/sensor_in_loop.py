@@ -56,6 +56,7 @@ def make_sensor(
     check_platform(robot, file, scenario.sensor)
     sensor = cmmsim.Sensor(file, seed, scenario.pose_method, taught, renderer=scenario.renderer, known=known)
     sensor.move_rig(scenario.rig.errors, scenario.rig.right_later_s)
+    sensor.drift_rig(scenario.rig.drift, scenario.timing.frames(scenario.excitation.duration_s))
     sensor.add_bodies(robot_meshes(robot))
     return sensor
 

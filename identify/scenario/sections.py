@@ -208,6 +208,16 @@ class Rig(Section):
     )
     right_later_s: float = quantity(0.0, "s", "by how much the right camera truly exposes later", ge=-0.1, le=0.1)
     right_later_std_s: float = quantity(0.0, "s", "how well that is known to be nothing", ge=0, le=0.1)
+    drift: dict[str, float] = Field(
+        {},
+        description="how far the true cameras move, evenly from the first to the last frame of each run, and the "
+        'estimator is not told: { "right.cx_px" = 0.1 }, px, m or rad',
+    )
+    watch: Literal["platform", "both", "none"] = Field(
+        "platform",
+        description="whose stickers tell a run whether the cameras still are as they were; both: the base's, too, "
+        "in twice the time",
+    )
 
     @property
     def exact(self) -> bool:

@@ -30,8 +30,8 @@ def random_poses(sensor, count, seed):
 
 def sticker_centres(sensor, pose):
     """True centres (2, n, 2) of the stickers in both images, px."""
-    camera_from_platform = sensor._camera_from_base @ pose_to_transform(pose)
-    return sensor.rig.project(apply(camera_from_platform, sensor._scene[0].sticker_places))[0]
+    camera_from_platform = sensor.true_cameras.camera_from_base @ pose_to_transform(pose)
+    return sensor.rig.project(apply(camera_from_platform, sensor.true_cameras.scene[0].sticker_places))[0]
 
 
 def test_sticker_centres_without_noise(accuracy, cmmsim_scenario, cmmsim_robot, cmmsim_sensor, cmmsim_seed):

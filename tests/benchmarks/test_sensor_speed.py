@@ -126,7 +126,7 @@ class StraightforwardSensor:
         self._sensor, self._rig = sensor, sensor.rig
         self._renderer = pyrender.OffscreenRenderer(self._rig.left.width, self._rig.left.height)
         self._scene = pyrender.Scene(bg_color=(0.0, 0.0, 0.0, 1.0))
-        self._bodies = [self._scene.add(pyrender.Mesh([self._primitive(body)])) for body in sensor._scene]
+        self._bodies = [self._scene.add(pyrender.Mesh([self._primitive(body)])) for body in sensor.true_cameras.scene]
         c = self._rig.left
         camera = pyrender.IntrinsicsCamera(
             c.focal_px, c.focal_px * c.aspect, c.centre_x_px + 0.5, c.centre_y_px + 0.5, 0.2, 10.0
@@ -152,7 +152,7 @@ class StraightforwardSensor:
     def _blobs(self, move):
         from pyrender import RenderFlags
 
-        camera_from_base = move @ self._sensor._camera_from_base
+        camera_from_base = move @ self._sensor.true_cameras.camera_from_base
         self._scene.set_pose(self._camera, np.linalg.inv(OPENGL_FROM_OPENCV @ camera_from_base))
         colour, _ = self._renderer.render(self._scene, RenderFlags.FLAT)
         grey = np.ascontiguousarray(colour[:, :, 0])

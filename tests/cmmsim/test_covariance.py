@@ -48,7 +48,7 @@ def observed(rng, pixels, spread, stickers):
         for q, s in zip(pixels, spread, strict=True)
     )
     seen = triangulate(RIG, left, right, *spread)
-    return StickerObservation(stickers, left, right, seen.points, seen.covariances)
+    return StickerObservation(stickers, left, right, seen.points, seen.covariances, np.full(len(stickers), np.nan))
 
 
 def drawn(pose, count):

@@ -118,7 +118,7 @@ def test_sensor_file_chooses_the_detector_and_poses_keep_their_covariance(detect
     assert all(m.ok for m in found)
     assert squared_errors(found, path).mean() == pytest.approx(6.0, rel=0.25)  # neighbours share places in a pixel
     errors = np.array([m.pose for m in found]) - path
-    stated = np.array([m.covariance + sensor.taught.calibration_covariance(m.pose) for m in found])
+    stated = np.array([m.single_covariance for m in found])
     squared = squares(errors, stated)
     assert 4.0 < squared.mean() < 8.0  # the mean scatters by 0.3, and one teaching is in all of them
     assert squared[0] < 22.5  # 1 in 1,000

@@ -92,8 +92,9 @@ def test_laid_windows_show_what_is_drawn_by_depths(monkeypatch):
 
 def crossed_by_links(sensor):
     """The sensor's left camera, and its bodies with two links beside them."""
-    patches = [p for body in sensor._scene for p in body.stickers] + [body.solid for body in sensor._scene]
-    owners = [k for k, body in enumerate(sensor._scene) for _ in body.stickers] + [0, 1, 2, 3]
+    scene = sensor.true_cameras.scene
+    patches = [p for body in scene for p in body.stickers] + [body.solid for body in scene]
+    owners = [k for k, body in enumerate(scene) for _ in body.stickers] + [0, 1, 2, 3]
     links = [solid_mesh(rod(0.5, radius), 0.24) for radius in (0.01, 0.02)]
     return sensor.rig.left, Drawable([*patches, *links], owners, 2.0)
 
@@ -103,9 +104,10 @@ def sticker_views(sensor, camera, rng):
     platform = pose_to_transform(sensor.home + rng.uniform(-1, 1, 6) * ([0.02] * 3 + [0.3] * 3))
     ends = sensor.home[:3] + rng.uniform([0.05, -0.25, -0.15], [0.55, 0.25, 0.35], (4, 3))
     placed = np.stack([platform, np.eye(4), rod_transform(*ends[:2]), rod_transform(*ends[2:])])
-    bodies = (sensor.rig.from_camera[0] @ sensor._camera_from_base) @ placed
+    scene = sensor.true_cameras.scene
+    bodies = (sensor.rig.from_camera[0] @ sensor.true_cameras.camera_from_base) @ placed
     points = np.concatenate(
-        [body.sticker_places @ move[:3, :3].T + move[:3, 3] for body, move in zip(sensor._scene, bodies, strict=False)]
+        [body.sticker_places @ move[:3, :3].T + move[:3, 3] for body, move in zip(scene, bodies, strict=False)]
     )
     pixels = camera.project(points)[0] - 7 + rng.integers(-4, 5, (len(points), 2))
     return [View(camera, bodies, (int(x), int(y)), (14, 14)) for x, y in pixels]

@@ -160,7 +160,7 @@ def test_larger_stickers_are_taught_and_measured_with_a_true_covariance(changes,
     found = [sensor.measure(pose) for pose in path]
     assert [m.reason for m in found if not m.ok] == []
     assert min(len(m.target_ids) for m in found) >= 17
-    spread = np.array([m.covariance for m in found]) + sensor.taught.calibration_covariance(sensor.home)
+    spread = np.array([m.single_covariance for m in found])
     squared = squares(np.array([m.pose for m in found]) - path, spread)
     assert squared.mean() == pytest.approx(6.0, abs=1.0), squared.mean()
 

@@ -220,7 +220,8 @@ ALONE = {
         "friction", "smoothing_velocity_rad_s", "smoothing_velocity_m_s", "static_ratio", "stribeck_velocity_rad_s",
         "stribeck_velocity_m_s")),
     "scenario.plant.parameters", "scenario.model.start_parameters",
-    "scenario.rig.known", "scenario.rig.errors", "scenario.identification.nuisances",
+    "scenario.rig.known", "scenario.rig.errors", "scenario.rig.drift",
+    "scenario.identification.nuisances",
 }  # fmt: skip
 """Keys whose other values are names, or stand with others: not tried by `with_others`."""
 

@@ -1,0 +1,136 @@
+"""The watch itself: takes measurements frame after frame, and says what it has found."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.common_errors import MeasuringGeometry
+from cmmsim.drift_watch.blocks import RIG, Sightings, base_rows, platform_rows, stacked
+from cmmsim.drift_watch.evidence import SIZES, Evidence
+from cmmsim.drift_watch.finding import Finding, movements, unseen_directions
+from cmmsim.errors import CmmError
+from cmmsim.geometry.known_rig import KnownRig
+from cmmsim.geometry.pose import Array, apply, pose_to_transform
+from cmmsim.pose_estimation.estimator import Measurement
+from cmmsim.pose_estimation.observation import StickerObservation
+
+CHANCE = 0.01  # of a false alarm in a run
+BLOCK = 6  # frames at most whose residuals are averaged before they count
+FEWEST = 4  # stickers of a frame that can say something
+TAUGHT_OFFSET_PX = 3e-4
+"""What teaching and the image of a sticker leave of a centre, the same while it stands still."""
+
+
+class DriftWatch:
+    """Tells from measurements whether the rig still is as it was calibrated and taught.
+
+    Parameters: geometry that is known; known: how well its rig is, None for exactly; frame_period s; chance of a false
+    alarm in a run, however long; offset_px: what a centre may be off for reasons that are not noise; base: whether the
+    base's stickers are given as well. Raises CmmError for a chance that is none.
+    """
+
+    def __init__(
+        self,
+        geometry: MeasuringGeometry,
+        known: KnownRig | None = None,
+        frame_period: float = 1.0 / 60.0,
+        chance: float = CHANCE,
+        offset_px: float = 0.0,
+        base: bool = False,
+    ) -> None:
+        if not 0.0 < chance < 1.0:
+            raise CmmError(f"the chance of a false alarm lies between 0 and 1, got {chance!r}")
+        self.geometry, self.chance, self.watches_base = geometry, chance, base
+        self._period, self._known = frame_period, known
+        self._offset_std = float(np.hypot(offset_px, TAUGHT_OFFSET_PX))
+        self.restart()
+
+    def restart(self) -> None:
+        """A new run begins; what was found is forgotten."""
+        taught, known = self.geometry.taught, self._known
+        centres = len(taught.platform_places) + (len(taught.base_places) if self.watches_base else 0)
+        covariance = np.zeros((RIG, RIG)) if known is None else known.covariance / np.outer(SIZES[:RIG], SIZES[:RIG])
+        values, vectors = np.linalg.eigh(covariance)
+        kept = values > 1e-12 * max(float(values[-1]), 1e-300)
+        delay_std = 0.0 if known is None else known.exposure_std
+        offsets = np.full(4 * centres, self._offset_std)
+        calibration = vectors[:, kept] * np.sqrt(values[kept])
+        self._evidence = Evidence(calibration, delay_std, offsets, self.watches_base)
+        self._frames = self._counted = 0
+        self._platform: Sightings | None = None
+        self._base: Sightings | None = None
+        self._largest = 0.0
+        self._noticed: int | None = None
+
+    def add(self, measurement: Measurement, base: StickerObservation | None = None) -> None:
+        """The next frame; a lost one, or one without stickers, says nothing but that time passes. base: what is seen of
+        the base's stickers."""
+        time = self._frames * self._period
+        self._frames += 1
+        if not measurement.ok or len(measurement.target_ids) < FEWEST:
+            return
+        index = np.flatnonzero(np.isin(self.geometry.platform.sticker_ids, measurement.target_ids))
+        if not self._goes_on(index, base):
+            self._close()
+            self._platform = Sightings(index)
+            self._base = None if base is None or not self.watches_base else Sightings(base.index)
+        assert self._platform is not None
+        move = self.geometry.camera_from_base @ pose_to_transform(measurement.pose)
+        pixels = np.stack([measurement.left_pixels, measurement.right_pixels])
+        places = self.geometry.taught.platform_places[index]
+        self._platform.add(time, move, self._residuals(pixels, move, places), measurement.pixel_variances)
+        if self._base is not None and base is not None:
+            pixels, at = np.stack([base.left_pixels, base.right_pixels]), self.geometry.camera_from_base
+            residuals = self._residuals(pixels, at, self.geometry.taught.base_places[base.index])
+            self._base.add(time, at, residuals, base.pixel_variances)
+        if len(self._platform.times) == BLOCK:
+            self._close()
+
+    @property
+    def finding(self) -> Finding:
+        """What the frames since the last ``restart`` say."""
+        self._close()
+        told = self._evidence.told
+        moved, share = movements(told) if self._noticed is not None else ((), 0.0)
+        return Finding(
+            None if self._noticed is None else self._noticed * self._period,
+            self._noticed,
+            self._largest,
+            float(-np.log(self.chance)),
+            self.chance,
+            self._frames,
+            moved,
+            share,
+            self._noticed is not None and told.from_start,
+            unseen_directions(self._evidence.sensitivity),
+        )
+
+    def _residuals(self, pixels: Array, camera_from_body: Array, places: Array) -> Array:
+        """Pixels (2, k, 2) less those that are expected of places (k, 3) in body axes."""
+        return np.asarray(pixels - self.geometry.rig.project(apply(camera_from_body, places))[0])
+
+    def _goes_on(self, index: NDArray[np.int_], base: StickerObservation | None) -> bool:
+        """Whether the same stickers are seen as in the frames that wait to be counted."""
+        if self._platform is None or not np.array_equal(self._platform.index, index):
+            return False
+        seen = None if base is None or not self.watches_base else base.index
+        if self._base is None or seen is None:
+            return self._base is None and seen is None
+        return np.array_equal(self._base.index, seen)
+
+    def _close(self) -> None:
+        """Count the frames that wait."""
+        if self._platform is None:
+            return
+        rows = [platform_rows(self.geometry, self._platform)]
+        if self._base is not None:
+            rows.append(base_rows(self.geometry, self._base))
+        stickers = len(self.geometry.taught.platform_places), len(self.geometry.taught.base_places)
+        self._evidence.step(stacked(rows, stickers[: 1 + self.watches_base]), self._frames - self._counted)
+        self._platform = self._base = None
+        self._counted = self._frames
+        ratio = self._evidence.log_ratio
+        self._largest = max(self._largest, ratio)
+        if self._noticed is None and ratio > -np.log(self.chance):
+            self._noticed = self._frames - 1

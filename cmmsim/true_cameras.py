@@ -1,0 +1,136 @@
+"""The true side of a sensor: its cameras as they are, what stands before them, and how a camera moves during a run.
+
+The estimator knows nothing of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import trimesh
+
+from cmmsim.checks import require_kind
+from cmmsim.errors import CmmError
+from cmmsim.files.schema import SensorFile
+from cmmsim.files.setup import MarkedBody, rig_from_file
+from cmmsim.geometry.camera import Optics
+from cmmsim.geometry.known_rig import rig_changes
+from cmmsim.geometry.pose import Array, apply, pose_to_transform
+from cmmsim.imaging.exposure import VirtualStereoCamera
+from cmmsim.imaging.formation import ImageFormation
+from cmmsim.imaging.renderer import Drawable, Renderer, choose_renderer
+from cmmsim.imaging.scene import Mesh, scene_body, solid_mesh
+from cmmsim.radiometry.noise import CameraNoise
+
+
+@dataclass(frozen=True)
+class Drift:
+    """changes (24,) of the rig's parameters, which come evenly from the first to the last of so many frames."""
+
+    changes: Array
+    frames: int
+
+    def after(self, frame: int) -> Array:
+        """Changes (24,) at a frame, counted from 0; the cameras stay where the last one leaves them."""
+        return min(frame / (self.frames - 1), 1.0) * self.changes
+
+
+class TrueCameras:
+    """Both cameras, and platform and base with their stickers at their true places."""
+
+    def __init__(
+        self,
+        file: SensorFile,
+        bodies: tuple[MarkedBody, MarkedBody],
+        noise: CameraNoise,
+        optics: Optics,
+        renderer: str,
+    ) -> None:
+        self._file, self._noise, self._optics, self._asked_renderer = file, noise, optics, renderer
+        self._bodies = bodies
+        self.rig, self.camera_from_base = rig_from_file(file.rig)
+        self.scene = [
+            scene_body(body, section, file.stickers, stream)
+            for stream, (body, section) in enumerate(zip(bodies, (file.platform, file.base), strict=True))
+        ]
+        self.obstacles: dict[str, Mesh] = {}
+        self._right_later = 0.0
+        self._drift: Drift | None = None
+
+    def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
+        """As ``Sensor.add_bodies``."""
+        require_kind(meshes, Mapping, "bodies must be meshes by name, as {'link': rod(0.3, 0.01)}")
+        for name, mesh in meshes.items():
+            require_kind(name, str, "the name of a body must be text")
+            require_kind(mesh, trimesh.Trimesh, f"body {name!r} must be a trimesh.Trimesh")
+        level = self._file.stickers.obstacle_level / 255.0
+        self.obstacles.update({name: solid_mesh(mesh, level) for name, mesh in meshes.items()})
+        self._draw_anew()
+
+    def move(self, changes: Mapping[str, float], right_later: float) -> None:
+        """As ``Sensor.move_rig``."""
+        self.rig, self._right_later = self.rig.moved(rig_changes(changes)), right_later
+        self._draw_anew()
+
+    def drift(self, changes: Mapping[str, float], frames: int) -> None:
+        """As ``Sensor.drift_rig``."""
+        drift = Drift(rig_changes(changes), frames)
+        if not drift.changes.any():
+            self._drift = None
+            return
+        if frames < 2:
+            raise CmmError(f"cameras drift from the first to the last of some frames, at least 2, got {frames}")
+        self._require_in_sight(drift.changes, ", ".join(f"{name} by {value:g}" for name, value in changes.items()))
+        self._drift = drift
+
+    def at(self, frame: int) -> VirtualStereoCamera:
+        """Both cameras before the scene, as they are at a frame of a run, counted from 0."""
+        return self.at_rest if self._drift is None else self.at_rest.moved(self._drift.after(frame))
+
+    @cached_property
+    def renderer(self) -> Renderer:
+        """What draws; decided on first use."""
+        return choose_renderer(self._asked_renderer)
+
+    @cached_property
+    def at_rest(self) -> VirtualStereoCamera:
+        """Both cameras before the scene, without drift. Stickers are drawn first: what they hide need not be drawn."""
+        file = self._file
+        patches = [p for body in self.scene for p in body.stickers] + [body.solid for body in self.scene]
+        owners = [k for k, body in enumerate(self.scene) for _ in body.stickers] + [0, 1]
+        owners += range(2, 2 + len(self.obstacles))
+        distance = float(np.linalg.norm(np.subtract(file.rig.position, file.rig.target)))
+        drawable = Drawable([*patches, *self.obstacles.values()], owners, distance)
+        return VirtualStereoCamera(
+            self.rig,
+            self.camera_from_base,
+            ImageFormation(self.renderer, drawable, file.stickers.background_level / 255.0, self._optics),
+            self._noise,
+            list(self.obstacles),
+            file.timing.exposure,
+            file.camera.pattern_seed,
+            self._right_later,
+        )
+
+    def _draw_anew(self) -> None:
+        """Build the cameras before the next picture."""
+        self.__dict__.pop("at_rest", None)
+
+    def _require_in_sight(self, changes: Array, what: str) -> None:
+        """Raise CmmError where changes (24,) of the rig take stickers out of an image that shows them at home."""
+        moved = self.rig.moved(changes)
+        places = (pose_to_transform(self._file.platform.home), np.eye(4))
+        for body, scene, place in zip(self._bodies, self.scene, places, strict=True):
+            points = apply(self.camera_from_base @ place, scene.sticker_places)
+            there, shown = moved.project(points)
+            gone = np.argwhere(self.rig.project(points)[1] & ~shown)
+            if len(gone):
+                side, sticker = gone[0]
+                camera, (x, y) = moved.cameras[side], there[side, sticker]
+                raise CmmError(
+                    f"a drift of {what} takes sticker {body.sticker_ids[sticker]} of the {body.name} out of the "
+                    f"{('left', 'right')[side]} image, to ({x:.0f}, {y:.0f}) of {camera.width} x {camera.height} px"
+                )
