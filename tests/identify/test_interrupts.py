@@ -78,7 +78,7 @@ def test_ctrl_c_in_a_row_is_no_error_of_it_whatever_became_of_it_and_one_that_wa
 
 def test_ctrl_c_in_a_command_is_one_line_whatever_became_of_it_and_other_errors_stay_what_they_are(monkeypatch, capsys):
     study = "studies.study_file.load_study"
-    scenario = ("scenario.scenario.load_scenario", "commands.experiment.load_scenario")
+    scenario = ("scenario.scenario.load_scenario", "commands.options.load_scenario")
     for happens in (ctrl_c, broken_import):
         for name in (study, *scenario):
             monkeypatch.setattr(f"identify.{name}", lambda _, happens=happens: happens())
