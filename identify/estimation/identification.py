@@ -60,7 +60,8 @@ def identify(
         judged = problem.of_method(method, solution.parameters)
         uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
     by_commands = searches["command_driven"].parameters
-    explained = explanation(problem.of_method("command_driven", by_commands), by_commands, uncertainty.misfit)
+    driven = judged if method == "command_driven" else problem.of_method("command_driven", by_commands)
+    explained = explanation(driven, by_commands, uncertainty.misfit)
     judgement = judge(problem, scenario, solution, uncertainty, explained)
     ended = time.perf_counter()
     return IdentificationResult(
