@@ -41,7 +41,8 @@ def geometry(
     Reads a scenario, or poses of your own: a JSON file with joints (N, n) in rad or m, joint_std (n,), poses (N, 6) in
     m and rad and covariances (N, 6, 6), as poses.json is; base_covariance and platform_covariance (6, 6) say how well
     the frames of the measurement are known, and are left out where they are not. It writes geometry.json, geometry.md,
-    covariance.nc, poses.json, and robot.toml, the calibrated robot, which every other command takes.
+    geometry.png and geometry.svg, covariance.nc, poses.json, and robot.toml, the calibrated robot, which every other
+    command takes; cmmsim run --set geometry.known=FILE takes it with its covariance.
 
     \b
     Examples:
@@ -49,17 +50,20 @@ def geometry(
       cmmsim geometry --robot ups6 --set geometry.measurement=drawn
       cmmsim geometry --set geometry.poses=30 --set geometry.selection=random
       cmmsim geometry --robot mine.toml --poses measured.json
-      cmmsim run quick --robot runs/geometry-0/robot.toml
+      cmmsim run quick --set geometry.known=runs/geometry-0/robot.toml
     """
     from dynamics import load_robot
     from identify.geometry.run import run_geometry
     from identify.geometry.static_poses import read_static_poses
+    from identify.reporting.figures.geometry import geometry_figure
+    from identify.reporting.figures.style import drawn, svg_text
 
     chosen = chosen_scenario(scenario, settings, robot)
     folder = new_run_folder(out or Path("runs") / f"geometry-{seed}").path
     own = None if poses is None else read_static_poses(poses, load_robot(chosen.robot))
     outcome = run_geometry(chosen, seed, terminal_progress(quiet), own)
-    outcome.write(folder)
+    picture = drawn(lambda: geometry_figure(outcome.entry))
+    outcome.write(folder, {"geometry.png": picture, "geometry.svg": svg_text(picture, "geometry")})
     print_warnings(outcome.entry["warnings"])
     tell(outcome.entry, json, quiet, lambda: _print(outcome.entry, folder))
 

@@ -59,8 +59,9 @@ def identify(
     solution, judged = searches[method].solution, searches[method].linearised
     with progress.stage("uncertainty", DRAWS) as advance:
         uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
-    driven = searches["command_driven"]
-    explained = explanation(driven.linearised, driven.solution.parameters, uncertainty.misfit)
+    by_commands = searches["command_driven"]
+    driven = judged if method == "command_driven" else by_commands.linearised
+    explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit)
     judgement = judge(problem, scenario, solution, uncertainty, explained)
     ended = time.perf_counter()
     return IdentificationResult(

@@ -6,7 +6,6 @@ first: what they hide, far from the optimum, is the way there. Where neither the
 a model that runs, multiple shooting finds one that does.
 """
 
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -140,17 +139,10 @@ def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
 def _with_common_errors(problem: OutputErrorProblem, starts: list[Array]) -> tuple[OutputErrorProblem, Array]:
     """The problem that knows what poses have in common, as a model shows it that runs with the best of some parameters
     (p,); and these."""
-    if len(starts) == 1:
-        return problem.with_common_errors(starts[0]), starts[0]
-    told = []
-    for start in map(problem.bounds.nearest, starts):
-        with suppress(DynamicsError):
-            one = problem.with_common_errors(start)
-            told.append((one.cost(start), one, start))
-    if not told:
-        raise EstimationError("the model is unstable with what its poses have in common one standard deviation off")
-    _, best, start = min(told, key=lambda entry: entry[0])
-    return best, start
+    inside = [start for start in map(problem.bounds.nearest, starts) if np.isfinite(problem.cost(start))]
+    told = problem.with_common_errors(inside[0])
+    best = min(inside, key=told.cost)
+    return (told if best is inside[0] else problem.with_common_errors(best)), best
 
 
 def _candidates(problem: OutputErrorProblem, warm: Array) -> list[Array]:

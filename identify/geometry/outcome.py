@@ -1,5 +1,6 @@
 """What a calibration of geometry leaves: its figures, the calibrated robot, the poses, and a page in words."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +22,8 @@ from identify.geometry.selection import Candidates
 from identify.geometry.static_poses import StaticPoses
 from identify.scenario import Scenario
 
+CURVE = 12
+"""Numbers of random poses whose worth is told."""
 NOISY = 4.0
 """Standard deviations of the noise ratio above one at which the model or the stated noise is said to be wrong."""
 
@@ -41,8 +44,11 @@ class GeometryOutcome:
     chosen: Candidates | None
     among: Candidates
 
-    def write(self, folder: Path) -> None:
-        """Write geometry.json, geometry.md, covariance.nc, poses.json, robot.toml and scenario.toml, all or none."""
+    def write(self, folder: Path, pictures: Mapping[str, Any] | None = None) -> None:
+        """Write geometry.json, geometry.md, covariance.nc, poses.json, robot.toml and scenario.toml, all or none.
+
+        pictures: figures and texts that are written with them, by the names of their files.
+        """
         robot = self.calibration.robot
         description = RobotDescription(robot.name, robot.geometry, robot.parameter_sets)
         said = f"{robot.name} with the geometry of {len(self.data)} static poses; see geometry.json beside this file"
@@ -52,6 +58,7 @@ class GeometryOutcome:
             "poses.json": self.data.entry(robot),
             "robot.toml": robot_text(description, [said]),
             "scenario.toml": self.scenario.to_toml(),
+            **(pictures or {}),
         }
         with atomic_contents(folder) as temporary:
             save_files(temporary, files)
@@ -81,6 +88,7 @@ class GeometryOutcome:
         }
         if self.chosen is not None:
             entry["selection"] = self._compared(self.chosen)
+            entry["random_poses"] = self._by_count(2 * len(self.chosen))
         return entry
 
     def _parameters(self) -> dict[str, dict[str, Any]]:
@@ -92,6 +100,7 @@ class GeometryOutcome:
             "true": true,
             "estimate": (geometry.numbers + found.deviations).tolist(),
             "std": found.std.tolist(),
+            "tolerance": found.prior_std.tolist(),
             "observable": found.observable.tolist(),
         }
         rows = zip(*columns.values(), strict=True)
@@ -131,16 +140,21 @@ class GeometryOutcome:
     def _compared(self, chosen: Candidates) -> dict[str, Any]:
         """What unseen poses are expected to be missed by after the chosen poses, after as many random ones, and after
         twice as many."""
-        count, none = len(chosen), np.zeros(len(self.model.scale))
+        count = len(chosen)
         sets = {"chosen": chosen, "random": self.among.of(list(range(count)))}
         if len(self.among) >= 2 * count:
             sets["twice as many random"] = self.among.of(list(range(2 * count)))
-        columns = self.model.columns(self.unseen.joints, self.unseen.poses, none)[0]
-        return {
-            name: {"poses": len(one)}
-            | self._spread(columns, np.asarray(np.linalg.inv(one.information + np.eye(len(none)))))
-            for name, one in sets.items()
-        }
+        return {name: self._left_by(one) for name, one in sets.items()}
+
+    def _by_count(self, most: int) -> list[dict[str, Any]]:
+        """What unseen poses are expected to be missed by after so many random poses, up to a number of these."""
+        fewest = -(-len(self.calibration.deviations) // len(self.calibration.nominal.coordinate_names))
+        counts = np.unique(np.geomspace(fewest, max(fewest, min(most, len(self.among))), CURVE).astype(int))
+        return [self._left_by(self.among.of(list(range(count)))) for count in counts.tolist()]
+
+    def _left_by(self, poses: Candidates) -> dict[str, Any]:
+        columns = self.model.columns(self.unseen.joints, self.unseen.poses, np.zeros(len(self.model.scale)))[0]
+        return {"poses": len(poses)} | self._spread(columns, np.asarray(np.linalg.inv(poses.with_prior), dtype=float))
 
     def _spread(self, columns: Array, covariance: Array) -> dict[str, list[float]]:
         """Expected errors of the unseen poses, for columns (N, m, u) and a covariance (u, u) of the unknowns."""

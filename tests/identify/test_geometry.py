@@ -1,10 +1,13 @@
 """Kinematic calibration: what poses tell of a geometry, how well, which poses tell most, and what is refused."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import cmmsim
+from cmmsim.geometry.known_rig import KnownRig
 from cmmsim.pose_estimation.estimator import lost_measurement, measurement_without_stickers
 from dynamics import built_in_robots, load_robot
 from dynamics.errors import UnreachablePoseError
@@ -13,12 +16,13 @@ from identify.files.dataset import read_covariance
 from identify.files.run_folder import rms_figures
 from identify.geometry.calibration import calibrate
 from identify.geometry.encoders import check_encoders
-from identify.geometry.experiment import Encoders, measured
+from identify.geometry.experiment import Encoders, measured, stand_at
 from identify.geometry.observability import check_enough, combinations
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses, read_static_poses
 from identify.progress import SilentProgress
+from tests.cmmsim.sensors import PHOTOGRAPHED
 from tests.identify.commands import command, one_line, refusal
-from tests.identify.static_poses import TOLERANCE, designer, drawn, poses_of, unseen_errors
+from tests.identify.static_poses import TOLERANCE, designer, drawn, poses_of, scenario, unseen_errors
 
 ROBOTS = [
     name if name in ("rss6", "delta3") else pytest.param(name, marks=pytest.mark.slow) for name in built_in_robots()
@@ -95,6 +99,29 @@ def test_errors_that_all_poses_have_in_common_widen_intervals_and_are_allowed_fo
     assert 0.5 < normalised_squared_error(found) < 1.7  # three standard deviations of 66 numbers
     assert normalised_squared_error(blind) > 10
     assert (found.std >= blind.std * (1 - 1e-6)).all()
+
+
+@pytest.mark.slow
+def test_cameras_that_are_not_exact_are_handed_to_the_calibration():
+    robot, chosen, nothing = load_robot("rss6"), poses_of("rss6", 12), np.zeros(66)
+    drawing = scenario().with_overrides({"geometry.measurement": "drawn"})
+    exact, frames = cmmsim.load_sensor("ctrack780", renderer="analytic"), 1e-12 * np.eye(6)
+    found = []
+    for known in (None, KnownRig(exact.rig, PHOTOGRAPHED)):
+        taught = replace(exact.truth, base_covariance=frames, platform_covariance=frames, known=known)
+        sensor = cmmsim.load_sensor("ctrack780", renderer="analytic", taught=taught)
+        how = robot, drawing, sensor, nothing, chosen.joints, chosen.poses, 0, SilentProgress()
+        found.append(stand_at(*how)[0])
+    exactly, inexactly = found
+    assert exactly.common is None
+    expected = sensor.common_errors(inexactly.poses, np.zeros_like(inexactly.poses))
+    rig = [k for k, name in enumerate(expected.names) if not name.startswith("taught")]
+    changes = expected.changes[:, :, rig]
+    by_rig = changes @ expected.covariance[np.ix_(rig, rig)] @ changes.swapaxes(1, 2)
+    stated = inexactly.common @ inexactly.common.swapaxes(1, 2)
+    np.testing.assert_allclose(stated, by_rig, rtol=1e-4, atol=1e-6 * by_rig.max())
+    apart = np.abs(inexactly.poses - exactly.poses)[:, :3].max()
+    assert 1e-6 < apart < 6 * np.sqrt(by_rig[:, range(3), range(3)].max())  # m
 
 
 @pytest.mark.slow
@@ -271,6 +298,8 @@ def test_own_poses_are_calibrated_into_a_robot_file_by_the_command(tmp_path, rss
     np.testing.assert_allclose(read.geometry.deviations_from(robot.geometry), found.deviations, rtol=0, atol=1e-14)
     assert read.parameter_sets.keys() == robot.parameter_sets.keys()
     assert (out / "geometry.md").read_text().startswith("# Geometry of rss6\n")
+    assert (out / "geometry.svg").read_text().startswith("<svg")
+    assert (out / "geometry.png").stat().st_size > 10_000
     turned = rss6.data.entry(robot) | {"joints": -rss6.data.joints}
     save_result(tmp_path / "turned.json", turned)
     assert command("geometry", "--poses", tmp_path / "turned.json", "--out", tmp_path / "no", *settings) == 1
