@@ -11,6 +11,10 @@ Images from elsewhere
     measure_frame(StereoFrame(left, right), sensor.estimator) -> Measurement    of a PoseEstimator
     Tracker(sensor.estimator).measure(images) -> Measurement                    frame after frame
 
+Cameras that drift
+    Sensor.drift_rig({"right.cx_px": 0.1}, frames)      the true rig moves in each run, and the estimator is not told
+    Sensor.watch_drift() -> DriftWatch                  its `finding` says when the rig ceased to fit, and how it moved
+
 Geometry
     pose_to_transform(pose), transform_to_pose(transform)       poses (6,) and transforms (4,4)
     PinholeCamera, StereoRig                                    cameras with lenses, as in `sensor.rig`
@@ -43,6 +47,7 @@ from cmmsim.errors import (
 )
 
 if TYPE_CHECKING:
+    from cmmsim.drift_watch import DriftWatch as DriftWatch
     from cmmsim.fault_images import Fault as Fault
     from cmmsim.fault_images import FaultyImages as FaultyImages
     from cmmsim.faults import FaultGenerator as FaultGenerator
@@ -73,6 +78,7 @@ _HOME = {
     "require_opengl": "cmmsim.imaging.pyrender_renderer",
     **dict.fromkeys(("measure_frame", "PoseEstimator"), "cmmsim.pose_estimation.estimator"),
     "Tracker": "cmmsim.tracker",
+    "DriftWatch": "cmmsim.drift_watch",
     **dict.fromkeys(("pose_to_transform", "transform_to_pose"), "cmmsim.geometry.pose"),
     "PinholeCamera": "cmmsim.geometry.camera",
     "StereoRig": "cmmsim.geometry.stereo_rig",

@@ -121,5 +121,7 @@ class Evidence:
 
 def _without_prior(filtered: Filter, size: int, prior_variance: float) -> tuple[Array, Array]:
     """Information (d, d) and score (d,) that residuals gave about the first d unknowns, from what they are after it."""
+    if not filtered.covariance[:size, :size].any():  # nothing has been seen, and nothing has walked
+        return np.zeros((size, size)), np.zeros(size)
     precise = np.linalg.inv(filtered.covariance[:size, :size])
     return precise - np.eye(size) / prior_variance, precise @ filtered.mean[:size]

@@ -63,7 +63,8 @@ class Finding:
         since = "was wrong from the start" if self.from_start else "moved during the run"
         return (
             f"the cameras {since}: noticed after {self.noticed_s:.2f} s; at the end, {100 * self.explained:.0f} % of "
-            f"what the stickers show is explained by {moved} (a false alarm has a chance of {self.chance:g} a run)"
+            f"what the stickers show is explained by a movement of {moved} (a false alarm has a chance of "
+            f"{self.chance:g} a run)"
         )
 
     def to_dict(self) -> dict[str, Any]:
