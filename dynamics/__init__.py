@@ -19,7 +19,8 @@ in base-frame axes. The crank is what the paper calls the wrench.
 from dynamics import closed_loop
 from dynamics.closed_loop.simulate import simulate_batch
 from dynamics.errors import DynamicsError
-from dynamics.robot import Robot, fast_forward_dynamics, load_robot
+from dynamics.fast_dynamics import fast_forward_dynamics
+from dynamics.robot import Robot, load_robot
 from dynamics.robot_file import built_in_robots
 
 __all__ = [

@@ -1,21 +1,14 @@
-"""A robot as its users call it: kinematics and dynamics on NumPy arrays, one pose or a batch of them.
-
-Also a robot whose joints do not sit where the drawing says, and forward dynamics for inner loops.
-"""
+"""A robot as its users call it: kinematics and dynamics on NumPy arrays, one pose or a batch of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dynamics.checks import check_type, floats, real, row_text, rows, shown, whole
-from dynamics.compiled.machine_code import MachineFunction, compiled_functions
+from dynamics.checks import check_type, floats, row_text, rows, whole
+from dynamics.compiled.machine_code import MachineFunction
 from dynamics.errors import (
     ChartError,
     DynamicsError,
@@ -24,24 +17,19 @@ from dynamics.errors import (
     SingularPoseError,
     UnreachablePoseError,
 )
-from dynamics.geometry import MovableGeometry, RobotGeometry
+from dynamics.geometry import RobotGeometry
 from dynamics.kinematics import forward_kinematics
 from dynamics.kinematics.chart import POSE_NAMES
 from dynamics.kinematics.forward_kinematics import ForwardSolution
-from dynamics.legs.numbers import POINTS
 from dynamics.parameters import parameter_layout
-from dynamics.rigid_body.equation_of_motion import motion_functions
-from dynamics.rigid_body.virtual_work import robot_functions
 from dynamics.robot_file import ParameterSet, RobotDescription, read_robot_file
+from dynamics.robot_functions import nearby_functions, own_functions
 
 # Below this the solution of M a = f loses all digits; a healthy robot is near 1e2 (poses in m and rad).
 CONDITION_LIMIT = 1e10
 
 # m or rad, and m/s or rad/s: a pose or a twist farther from what the chart allows contradicts it.
 CHART_TOLERANCE = 1e-9
-
-
-StateToAcceleration = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def load_robot(name_or_path: str | Path) -> Robot:
@@ -243,7 +231,7 @@ class Robot:
     def functions(self) -> dict[str, MachineFunction]:
         """Kinematics and dynamics by name, as machine code, compiled when first asked for."""
         own = self.functions_of is self.geometry
-        return _functions(self.geometry) if own else _functions_near(self.functions_of, self.geometry)
+        return own_functions(self.geometry) if own else nearby_functions(self.functions_of, self.geometry)
 
     def moved(self, deviations: ArrayLike) -> Robot:
         """The robot with its geometric numbers off by deviations (g,), m and rad.
@@ -308,107 +296,3 @@ class Robot:
             said = ", ".join(row_text(argument) for argument in arguments)
             raise SingularPoseError(f"{name} is not finite for {said}: singular pose or mass matrix")
         return values if batched else values[0]
-
-
-HOT = ("equation_of_motion", "motion_derivatives", "rate_map_derivative", "forward_dynamics")
-"""What inner loops evaluate."""
-
-
-@lru_cache(maxsize=16)
-def _functions(geometry: RobotGeometry) -> dict[str, MachineFunction]:
-    """One set for all robots of a geometry; not kept in the robot, so that robots can be pickled."""
-    return compiled_functions(geometry.digest, lambda: robot_functions(geometry) + motion_functions(geometry), HOT)
-
-
-@lru_cache(maxsize=4)
-def _movable_functions(nominal: RobotGeometry) -> dict[str, MachineFunction]:
-    """One set for all geometries near a nominal one, with deviations from it as the last argument."""
-    movable, key = MovableGeometry(nominal), b"movable" + nominal.digest
-    return compiled_functions(key, lambda: robot_functions(movable) + motion_functions(movable), HOT)
-
-
-@lru_cache(maxsize=64)
-def _functions_near(nominal: RobotGeometry, geometry: RobotGeometry) -> dict[str, MachineFunction]:
-    deviations = geometry.deviations_from(nominal)
-    return {name: replace(one, constants=deviations) for name, one in _movable_functions(nominal).items()}
-
-
-def with_geometry(robot: Robot, geometry: RobotGeometry) -> Robot:
-    """The robot with another geometry of the same kinds of legs."""
-    return Robot(RobotDescription(robot.name, geometry, robot.parameter_sets))
-
-
-def with_geometry_error(
-    robot: Robot, std: float, rng: np.random.Generator, length_std: float = 0.0, turn_std: float = 0.0
-) -> Robot:
-    """The robot with every coordinate of its base joints B and platform joints A off by a normal error of `std`, m, its
-    lengths off by `length_std`, m, and its axes turned by `turn_std`, rad.
-
-    Joint coordinates are set to zero at the home pose as those of a real robot are, so home keeps them where they are
-    zero there. Errors of zero give the robot itself; the same state of `rng` gives the same robot.
-    Raises RobotFileError for a negative error, and where a leg does not reach the home pose any more.
-    """
-    check_type("robot", robot, Robot, RobotFileError)
-    real("geometry error", std, RobotFileError, least=0, unit=" m")
-    real("error of lengths", length_std, RobotFileError, least=0, unit=" m")
-    real("error of axes", turn_std, RobotFileError, least=0, unit=" rad")
-    if std == length_std == turn_std == 0:
-        return robot
-    drawn = dict(zip(POINTS, std * rng.standard_normal((2, robot.layout.joints, 3)), strict=True))
-    names, units = robot.geometry.number_names, robot.geometry.number_units
-    deviations = rng.standard_normal(len(names)) * [length_std if unit == "m" else turn_std for unit in units]
-    for place, (leg, field, entry) in enumerate(f"{name}.".split(".")[:3] for name in names):
-        if field in drawn:
-            deviations[place] = drawn[field][int(leg.removeprefix("leg")) - 1, "xyz".index(entry)]
-    try:
-        geometry = robot.geometry.moved(deviations).zeroed()
-    except RobotFileError as error:
-        raise RobotFileError(f"with joints off by {std:g} m: {error}") from error
-    return with_geometry(robot, geometry)
-
-
-def fast_forward_dynamics(robot: Robot, parameters: np.ndarray | None = None) -> StateToAcceleration:
-    """A function of pose (6,), twist (6,), torque (n,) that returns twist_dot (6,), as `Robot.forward_dynamics`.
-
-    Parameters (p,) are fixed and checked once; None means the robot's nominal ones. Some 80 times faster than the
-    robot's own method, which checks shapes, reach and conditioning on every call. The array returned is the function's
-    own and is overwritten by the next call (copy it to keep it); so the function is not thread safe.
-    It raises ShapeError unless its inputs are float64 arrays of these shapes, and SingularPoseError where the
-    result is not finite: a leg out of reach, a singular mass matrix, or NaN in the input.
-
-    Where J_a2 alone is singular (the platform moves with all cranks locked) eq. 40 still holds, since M is regular:
-    the result is the acceleration. `Robot.forward_dynamics` refuses such poses, since a controller cannot hold them;
-    `workspace.check_motion` says how near they are.
-    """
-    check_type("robot", robot, Robot, DynamicsError)
-    fixed = robot.layout.check(robot.nominal_parameters if parameters is None else parameters)
-    joints = robot.layout.joints
-    function, result = robot.functions["forward_dynamics"], np.zeros(6)
-    inputs = np.concatenate([np.zeros(12 + joints), fixed, function.constants])
-    # Assigning to a memoryview costs half of assigning to an array, and refuses other shapes and types. The stubs of
-    # NumPy do not know of that.
-    views: list[Any] = [memoryview(part.data) for part in (inputs[0:6], inputs[6:12], inputs[12 : 12 + joints])]
-    pose_in, twist_in, torque_in = views
-    values = memoryview(result.data)
-    call = function.bound_to(inputs, result)
-
-    def forward_dynamics(at_pose: np.ndarray, at_twist: np.ndarray, at_torque: np.ndarray) -> np.ndarray:
-        try:
-            pose_in[:] = at_pose
-            twist_in[:] = at_twist
-            torque_in[:] = at_torque
-        except (TypeError, ValueError):
-            given = {"pose": (at_pose, 6), "twist": (at_twist, 6), "torque": (at_torque, joints)}
-            for name, (value, size) in given.items():
-                if floats(name, value, (size,), finite=False) is not value:
-                    raise ShapeError(f"{name} must be a float64 array of shape ({size},), got {shown(value)}") from None
-            raise ShapeError(f"pose and twist (6,) and torque ({joints},) must be float64 arrays") from None
-        call()
-        first = values[0]  # the mass matrix couples all entries: one that is not finite makes all of them so
-        if not first - first == 0.0:
-            raise SingularPoseError(
-                f"forward dynamics is not finite at pose {at_pose}, twist {at_twist}, torque {at_torque}"
-            )
-        return result
-
-    return forward_dynamics

@@ -18,8 +18,8 @@ from dynamics.closed_loop import (
     simulate,
     stability,
 )
+from dynamics.geometry_error import with_geometry_error
 from dynamics.parameters import ParameterLayout
-from dynamics.robot import with_geometry_error
 from identify.arrays import Array
 from identify.errors import ScenarioError
 from identify.estimation.prior import starting_guess

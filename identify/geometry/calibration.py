@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from dynamics import Robot
 from dynamics.closure import Closure
 from dynamics.errors import DynamicsError
-from dynamics.robot import with_geometry
+from dynamics.geometry_error import with_geometry
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses

@@ -13,7 +13,7 @@ import pytest
 from dynamics import closed_loop, simulate_batch
 from dynamics.closed_loop.frame_kernels import run_frames
 from dynamics.errors import DynamicsError, SimulationError
-from dynamics.robot import with_geometry_error
+from dynamics.geometry_error import with_geometry_error
 from tests.dynamics.conftest import Loop, assert_same, at_rest
 
 PERIOD, FRAMES, TWIN_FRAMES = 1 / 60, 32, 8

@@ -6,10 +6,10 @@ The oracle is code of their own: compiled with the numbers as constants.
 import numpy as np
 import pytest
 
-from dynamics import load_robot
+from dynamics import fast_forward_dynamics, load_robot
 from dynamics.closed_loop import FrameTiming, LoopSettings, Reference, ServoGains, simulate
 from dynamics.errors import RobotFileError, ShapeError
-from dynamics.robot import fast_forward_dynamics, with_geometry
+from dynamics.geometry_error import with_geometry
 
 ROBOTS = [
     "rrr3",

@@ -31,7 +31,8 @@ from dynamics.errors import (
     TravelError,
     UnreachablePoseError,
 )
-from dynamics.robot import Robot, with_geometry_error
+from dynamics.geometry_error import with_geometry_error
+from dynamics.robot import Robot
 from dynamics.workspace import check_motion, measure
 from tests.dynamics.conftest import METHODS
 

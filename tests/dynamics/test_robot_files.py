@@ -16,7 +16,7 @@ from scipy.stats import chi2
 import dynamics
 from dynamics.errors import ChartError, RobotFileError
 from dynamics.geometry import RobotGeometry
-from dynamics.robot import with_geometry_error
+from dynamics.geometry_error import with_geometry_error
 from dynamics.robot_file import robot_schema
 from tests.dynamics.conftest import BOX, of_legs, place_legs
 
