@@ -7,6 +7,7 @@ adjustment of both cameras with its covariance.
 from cmmsim.calibration.board import Board, read_board
 from cmmsim.calibration.calibrate import CalibrationOptions, calibrate
 from cmmsim.calibration.detection import BoardView, find_board
+from cmmsim.calibration.halves import Halves, compare_halves
 from cmmsim.calibration.rendered_boards import board_poses, default_board, render_pairs
 from cmmsim.calibration.result import (
     Calibration,
@@ -27,12 +28,14 @@ __all__ = [
     "Calibration",
     "CalibrationError",
     "CalibrationOptions",
+    "Halves",
     "ImagePair",
     "PairView",
     "SensorTemplate",
     "as_dict",
     "board_poses",
     "calibrate",
+    "compare_halves",
     "default_board",
     "find_board",
     "pair_images",

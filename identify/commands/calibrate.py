@@ -12,7 +12,7 @@ from identify.files.run_folder import new_run_folder, save_files
 from identify.progress import Progress, print_table, print_warnings, terminal_progress
 
 if TYPE_CHECKING:
-    from cmmsim.calibration import Board, Calibration, CalibrationOptions, SensorTemplate
+    from cmmsim.calibration import Board, Calibration, Halves, PairView, SensorTemplate
 
 
 def calibrate(
@@ -50,6 +50,15 @@ def calibrate(
             show_default=False,
         ),
     ] = None,
+    halves: Annotated[
+        int | None,
+        typer.Option(
+            "--halves",
+            min=1,
+            help="Also calibrate so often from two random halves of the pictures, and say whether these agree as they "
+            "state: ten times tell.",
+        ),
+    ] = None,
     render: Annotated[
         int | None, typer.Option("--render", min=1, help="Render this many pairs of pictures instead, and stop.")
     ] = None,
@@ -58,7 +67,7 @@ def calibrate(
         typer.Option(
             "--seed",
             min=0,
-            help="Seed of the rendered poses and of their noise, 0 where it is left out.",
+            help="Seed of the rendered poses and of their noise, or of the halves; 0 where it is left out.",
             show_default=False,
         ),
     ] = None,
@@ -95,13 +104,18 @@ def calibrate(
       cmmsim calibrate photos/left photos/right --board board.toml --out mine
       cmmsim calibrate photos/left photos/right --board board.toml --out mine \\
         --sensor ctrack780 --distortion radial2
+      cmmsim calibrate photos/left photos/right --board board.toml --out mine \\
+        --halves 10                       and whether halves of them agree
     Render pictures to try it with, and calibrate from them:
       cmmsim calibrate --render 20 --out pictures
       cmmsim calibrate --render 20 --sensor mine.toml --out pictures
       cmmsim calibrate pictures/left pictures/right \\
         --board pictures/board.toml --out mine
     """
-    from cmmsim.calibration import CalibrationOptions, as_dict, read_board, sensor_template
+    import numpy as np
+
+    from cmmsim.calibration import CalibrationOptions, as_dict, compare_halves, read_board, sensor_template
+    from cmmsim.calibration import calibrate as calibrate_from
 
     folder = new_run_folder(out).path
     progress = terminal_progress(quiet)
@@ -110,21 +124,29 @@ def calibrate(
         _require_none(
             "--render makes pictures and calibrates nothing",
             **{"--distortion": distortion, "--fix-aspect": fix_aspect or None, "--min-images": min_images},
+            **{"--halves": halves},
         )
         chosen = None if board is None else read_board(board)
         _render(folder, sensor or "ctrack780", chosen, render, seed or 0, progress, quiet)
         return
-    _require_none("a calibration draws no random numbers without --render", **{"--seed": seed})
+    if halves is None:
+        _require_none("a calibration draws no random numbers without --render or --halves", **{"--seed": seed})
     if left is None or right is None or board is None:
         missing = ["LEFT"] * (left is None) + ["RIGHT"] * (right is None) + ["--board FILE"] * (board is None)
         raise ScenarioError(f"missing {', '.join(missing)}; cmmsim calibrate --help shows examples")
     given: dict[str, Any] = {"distortion": distortion, "min_images": min_images}
     options = CalibrationOptions(fix_aspect=fix_aspect, **{k: v for k, v in given.items() if v is not None})
     template = None if sensor is None else sensor_template(sensor, folder)
-    found = _calibrate(left, right, read_board(board), options, template, progress)
-    refused = _write(folder, found, template)
+    pairs, size = _view(left, right, read_board(board), template, progress)
+    with progress.stage("adjust", 1 + 2 * (halves or 0)) as advance:
+        found = calibrate_from(read_board(board), pairs, size, options)
+        advance()
+        rng = np.random.default_rng(seed or 0)
+        apart = compare_halves(found.board, pairs, size, options, halves, rng, advance) if halves else None
+    content = as_dict(found) | ({} if apart is None else {"halves": apart.to_dict()})
+    refused = _write(folder, found, template, content)
     print_warnings([*found.warnings, *(template.disagreements(found) if template else []), *refused])
-    tell(as_dict(found), json, quiet, lambda: _print_summary(found, folder))
+    tell(content, json, quiet, lambda: _print_summary(found, apart, folder))
 
 
 def _require_none(reason: str, **given: object) -> None:
@@ -133,38 +155,30 @@ def _require_none(reason: str, **given: object) -> None:
         raise ScenarioError(f"{reason}: leave out {' and '.join(names)}")
 
 
-def _calibrate(
-    left: Path,
-    right: Path,
-    board: "Board",
-    options: "CalibrationOptions",
-    template: "SensorTemplate | None",
-    progress: Progress,
-) -> "Calibration":
-    from cmmsim.calibration import calibrate, pair_images, read_grey, view_pairs
+def _view(
+    left: Path, right: Path, board: "Board", template: "SensorTemplate | None", progress: Progress
+) -> "tuple[list[PairView], tuple[int, int]]":
+    """What all pairs of pictures show of the board, and their size."""
+    from cmmsim.calibration import pair_images, read_grey, view_pairs
 
     files = pair_images(left, right)
     if template is not None:  # what cannot be written is refused before the search, which takes minutes
         height, width = read_grey(files[0].left).shape
         template.require_size((width, height))
     with progress.stage("find the board", len(files)) as advance:
-        pairs, size = view_pairs(files, board, advance)
-    with progress.stage("adjust", 1) as advance:
-        found = calibrate(board, pairs, size, options)
-        advance()
-    return found
+        return view_pairs(files, board, advance)
 
 
-def _write(folder: Path, found: "Calibration", template: "SensorTemplate | None") -> list[str]:
+def _write(folder: Path, found: "Calibration", template: "SensorTemplate | None", content: dict[str, Any]) -> list[str]:
     """All files, made before the first is written; a line where no sensor can have these cameras."""
-    from cmmsim.calibration import as_dict, require_sensor, rig_tables
+    from cmmsim.calibration import require_sensor, rig_tables
     from cmmsim.errors import SensorFileError
     from identify.verification.sensor_figures import coverage_figure, distortion_figure, residual_figure
 
     sensor = None if template is None else template.filled(found)
     figures = {"residuals": residual_figure, "coverage": coverage_figure, "distortion": distortion_figure}
     drawn = {f"{name}.png": draw(found) for name, draw in figures.items()}
-    save_files(folder, {"rig.toml": rig_tables(found), "calibration.json": as_dict(found), **drawn})
+    save_files(folder, {"rig.toml": rig_tables(found), "calibration.json": content, **drawn})
     if sensor is None:
         return []
     try:
@@ -210,7 +224,7 @@ def _render(
         )
 
 
-def _print_summary(found: "Calibration", folder: Path) -> None:
+def _print_summary(found: "Calibration", apart: "Halves | None", folder: Path) -> None:
     from cmmsim.calibration import PARAMETER_NAMES
 
     count = sum(len(view.rms_px) == 2 for view in found.used)
@@ -222,4 +236,9 @@ def _print_summary(found: "Calibration", folder: Path) -> None:
     print_table(("parameter", "estimate", "standard deviation"), rows, ("parameter",), title)
     for name, reason in found.rejected.items():
         typer.echo(f"not used: {name}: {reason}")
+    if apart is not None:
+        typer.echo(
+            f"halves of the pictures differ by {apart.mean_square:.2f} times the variance that they state, on average "
+            f"over {len(apart.squares)} splits; 1 is expected, give or take {apart.chance:.2f} in a single split"
+        )
     typer.echo(f"calibration: {folder}")

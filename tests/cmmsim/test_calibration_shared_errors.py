@@ -4,17 +4,24 @@ The errors are made here: a smooth Gaussian field over the board, drawn anew for
 drawn anew for each view, which moves both images.
 """
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from cmmsim.calibration import PairView, calibrate
+from cmmsim.calibration import CalibrationOptions, PairView, calibrate, compare_halves
 from cmmsim.calibration.adjustment import RigState, adjust, free_directions
 from cmmsim.calibration.board import Board
 from cmmsim.calibration.detection import BoardView
+from cmmsim.calibration.halves import squared_differences
 from cmmsim.calibration.shared_errors import CHANCE, shared_errors
 from cmmsim.calibration.sightings import sightings_of
+from cmmsim.errors import CalibrationError
+from cmmsim.files import read_sensor_file
+from cmmsim.files.setup import rig_from_file
+from cmmsim.geometry.known_rig import KnownRig
 from tests.cmmsim.sensors import require_regions, require_true, squares
 from tests.cmmsim.test_calibration_adjustment import LEFT, RIGHT, RIGHT_FROM_LEFT, SHIFT, SIZE, board_poses, seen_pairs
 
@@ -118,6 +125,32 @@ def test_intervals_hold_over_hundreds_of_calibrations(kind, before, worst, views
     assert coverage(errors, covariances).min() > worst
     assert coverage(errors, independent).mean() < before
     assert 0.6 < squares(errors, covariances).mean() / 24 < 1.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_halves_of_the_pictures_agree_as_they_state(kind):
+    """Of 24 pairs."""
+    pairs = KINDS[kind](board_poses(24, np.random.default_rng(6), board=BOARD), np.random.default_rng(7))
+    compare = partial(compare_halves, BOARD, size=SIZE, options=CalibrationOptions(), splits=6)
+    apart = compare(pairs, rng=np.random.default_rng(8))
+    assert apart.squares.shape == (6, 24)
+    assert 0.6 < apart.mean_square < 1.5
+    with pytest.raises(CalibrationError, match="halves of 5 pairs of pictures are fewer than 3 each"):
+        compare(pairs[:5], rng=np.random.default_rng(8))
+
+
+def test_differences_of_rigs_are_judged_along_independent_directions():
+    """Of two rigs drawn with full covariances, one of them with parameters that are fixed."""
+    rig, _ = rig_from_file(read_sensor_file("ctrack780").rig)
+    rng, root = np.random.default_rng(0), np.diag([1e-2] * 24) @ np.random.default_rng(1).standard_normal((24, 24))
+    root[6:9] = 0.0
+    covariance = root @ root.T
+    found = [
+        squared_differences(*(KnownRig.drawn(rig, covariance * share, rng) for share in (0.3, 2.0))) for _ in range(300)
+    ]
+    assert np.shape(found) == (300, 21)
+    require_true(np.sum(found, axis=1), 21)
 
 
 def shared_errors_of(jacobians, noise, variance):

@@ -1,0 +1,78 @@
+"""Whether two halves of the pictures, calibrated each for itself, agree within what they state: the one proof of a
+stated covariance that needs no truth."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cmmsim.calibration.board import Board
+from cmmsim.calibration.calibrate import FEWEST_PAIRS, CalibrationOptions, calibrate
+from cmmsim.calibration.sightings import PairView
+from cmmsim.errors import CalibrationError
+from cmmsim.geometry.known_rig import KnownRig
+from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
+
+
+@dataclass(frozen=True)
+class Halves:
+    """squares (n, p): of n splits, squared differences of the halves' p free parameters, each of independent directions
+    divided by the variance that both state; 1 is expected of each."""
+
+    squares: np.ndarray
+
+    @property
+    def mean_square(self) -> float:
+        """Mean over splits and directions; well above 1 where the stated covariance is too small."""
+        return float(self.squares.mean())
+
+    @property
+    def chance(self) -> float:
+        """Standard deviation of the mean of one split, were the covariance right; splits of the same pictures are not
+        independent, so that more of them help less than their number says."""
+        return float(np.sqrt(2.0 / self.squares.shape[1]))
+
+    def to_dict(self) -> dict[str, float | int]:
+        """For JSON."""
+        return {"splits": len(self.squares), "mean_square": self.mean_square, "chance_of_one": self.chance}
+
+
+def compare_halves(
+    board: Board,
+    pairs: Sequence[PairView],
+    size: tuple[int, int],
+    options: CalibrationOptions,
+    splits: int,
+    rng: np.random.Generator,
+    advance: Callable[[], None] = lambda: None,
+) -> Halves:
+    """Split pairs of pictures at random into two halves, time and again, and compare what the halves calibrate to.
+
+    Raises CalibrationError where halves are too few pictures, or do not determine the cameras.
+    """
+    half = len(pairs) // 2
+    least = max(options.min_images, FEWEST_PAIRS)
+    if half < least:
+        raise CalibrationError(f"halves of {len(pairs)} pairs of pictures are fewer than {least} each")
+    squares = []
+    for _ in range(splits):
+        order = rng.permutation(len(pairs))
+        chosen = (sorted(order[:half]), sorted(order[half:]))
+        known = []
+        for part in chosen:
+            known.append(calibrate(board, [pairs[k] for k in part], size, options).known)
+            advance()
+        squares.append(squared_differences(*known))
+    return Halves(np.array(squares))
+
+
+def squared_differences(one: KnownRig, other: KnownRig) -> np.ndarray:
+    """Squared differences (p,) of two rigs along independent directions, over the sum of their variances."""
+    covariance = one.covariance + other.covariance
+    free = np.flatnonzero(np.diag(covariance) > 0.0)
+    std = np.sqrt(np.diag(covariance)[free])
+    apart = (one.rig.parameters - other.rig.parameters)[free] / std
+    values, vectors = np.linalg.eigh(covariance[np.ix_(free, free)] / np.outer(std, std))
+    # fx = fy, where asked for, leaves directions without variance; both halves agree in them
+    kept = values > len(PARAMETER_NAMES) * np.finfo(float).eps * values[-1]
+    return np.asarray((vectors.T @ apart)[kept] ** 2 / values[kept])
