@@ -48,7 +48,7 @@ VARIABLES: Variables = {
     "measured_covariance": (
         ("time", "pose_component", "pose_component_2"),
         "m2, m rad and rad2",
-        "covariance of the measured pose as the sensor reports it",
+        "covariance of the measured pose's noise, new in every frame, as the sensor states it",
     ),
     "measured_ok": (("time",), "1", "1 where the sensor measured the pose, 0 where it was lost"),
     "command": (("time", "joint"), "rad", "joint command of the visual servo from this frame on"),
