@@ -54,9 +54,9 @@ def sensor_section(data: RunData) -> Section:
             if data.cameras_acquitted
             else "Its errors are larger than the noise that it states, or depend on those of the frames before."
         )
-    return Section(
-        "Sensor", (" ".join(said),), ("stereo_frame", "ellipses"), tables=(tables.sensor_table(data.result),)
-    )
+    common = [table for table in (tables.common_error_table(data.result),) if table.rows]
+    shown = (tables.sensor_table(data.result), *common)
+    return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"), tables=shown)
 
 
 def excitation_section(data: RunData) -> Section:

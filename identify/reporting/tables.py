@@ -13,7 +13,7 @@ from identify.files.run_folder import AXES, predicted_row, rms_row
 from identify.progress import print_table
 from identify.reporting import paper
 from identify.reporting.goals import check_goals, explanation_goals
-from identify.reporting.numbers import number
+from identify.reporting.numbers import number, with_deviation
 from identify.reporting.settings import changed_settings
 
 AXIS_UNITS = ("µm", "µm", "µm", "µrad", "µrad", "µrad")
@@ -84,6 +84,21 @@ def _speed_rows(result: dict[str, Any]) -> list[tuple[str, ...]]:
         total = seconds.get("total") or sum(stages)
         rows.append(("whole run", f"{number(total)} s", "", "", "all stages so far, compiling included"))
     return rows
+
+
+def common_error_table(result: dict[str, Any]) -> Table:
+    """What all poses of the record have in common: how well it was known, what the record says of it, and how well."""
+    found = result["identification"]
+    rows = tuple(
+        (name, number(before, 2), with_deviation(found["nuisance_estimates"][name], found["nuisances"][name]))
+        for name, before in found.get("nuisance_prior_std", {}).items()
+    )
+    note = (
+        "True minus known, in the unit that ends the name. Where a servo acts, it takes the platform to where such an "
+        "error does not show; then little is learnt of it."
+    )
+    header = ("error", "standard deviation beforehand", "found ± standard deviation")
+    return Table("What is wrong in all frames alike", header, rows, note, folded=True)
 
 
 def excitation_error_table(result: dict[str, Any], beside_paper: bool = False) -> Table:

@@ -16,6 +16,7 @@ from identify.errors import RecordError
 from identify.estimation.identification import identify, output_error_problem
 from identify.record.common_errors import CommonErrors, Marginal, read_common_errors, store_common_errors
 from identify.record.recording import poses
+from identify.reporting.tables import common_error_table
 from tests.cmmsim.sensors import PHOTOGRAPHED
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
 
@@ -90,6 +91,9 @@ def test_a_latency_that_is_known_to_two_milliseconds_is_found_beside_the_paramet
     found = result.common_errors
     assert found.names == ("timing.latency_s",)
     assert abs(found.estimate[0] - 0.0015) < 4.0 * found.std[0] < 0.002
+    (row,) = common_error_table({"identification": result.to_dict()}).rows
+    assert row[:2] == ("timing.latency_s", "0.002")
+    assert " ± 0.000" in row[2]
     z = ((result.estimate - truth()) / result.std)[result.identifiable]
     assert np.sqrt(np.mean(z**2)) < 1.5
     assert not result.warnings
