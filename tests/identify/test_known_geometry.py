@@ -58,7 +58,7 @@ def test_modes_of_the_geometry_are_how_the_poses_of_a_model_change_with_it(metho
     problem = output_error_problem([record], robot, scenario)
     run = (problem if method == "closed_loop" else problem.driven_by_commands()).runs[0]
     values = robot.parameter_sets["identified"].vector
-    modes, geometry = run.geometry_modes(values), run.common.geometry
+    modes, geometry = run.pose_modes(values), run.common.geometry
     np.testing.assert_allclose(geometry.factor @ geometry.factor.T, known.covariance, atol=1e-22)
     drawn_numbers = np.linalg.solve(geometry.factor, errors)
     moved = run.simulate(values, robot=robot.moved(errors)).pose - run.simulate(values).pose
