@@ -8,7 +8,7 @@ the same as estimating d beside everything else, d known beforehand by its covar
 d, as of a latency, or of cameras within a servo, the model is given the most likely d, and M taken there.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +18,7 @@ from scipy.linalg import block_diag, cholesky
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
-from identify.record.geometry_errors import GeometryErrors
+from identify.record.geometry_errors import NOTICED, GeometryErrors
 
 CHANGES, COVARIANCE = "common_error", "common_error_covariance"
 LATENCY = "timing.latency_s"
@@ -29,13 +29,25 @@ ROUNDING = 1e-9
 class CommonErrors:
     """names of the errors, each ending with its unit; changes (N, 6, k) of the measured poses per unit of each;
     covariance (k, k) of what is true minus what is known. latency_std: of the mean latency of the frames, s, which only
-    a model of the loop can turn into poses; and so it is with the geometry of the robot, None where that is exact."""
+    a model of the loop can turn into poses; and so it is with the geometry of the robot, None where that is exact.
+    turned (k, k): another factor of the covariance, of whose directions so many are `noticed` (`ordered`)."""
 
     names: tuple[str, ...]
     changes: Array
     covariance: Array
     latency_std: float = 0.0
     geometry: GeometryErrors | None = None
+    turned: Array | None = None
+    noticed: int | None = None
+
+    def ordered(self, whitener: Array) -> "CommonErrors":
+        """The same errors by independent directions of which those come first that poses show most, in deviations of
+        their noise (`whitener` (6, 6)), and how many of them are noticed at all."""
+        if not self.names:
+            return self
+        seen = (whitener @ self.modes).reshape(-1, len(self.names))
+        sizes, turns = np.linalg.svd(np.linalg.qr(seen, mode="r"))[1:]
+        return replace(self, turned=self.factor @ turns.T, noticed=int(np.sum(sizes > NOTICED)))
 
     @property
     def all_names(self) -> tuple[str, ...]:
@@ -54,6 +66,8 @@ class CommonErrors:
         """L (k, k) with L L^T the covariance."""
         if not self.names:
             return np.zeros((0, 0))
+        if self.turned is not None:
+            return self.turned
         std = np.sqrt(np.diag(self.covariance))
         unit = self.covariance / np.outer(std, std)
         return std[:, None] * cholesky(unit + ROUNDING * np.eye(len(std)), lower=True)

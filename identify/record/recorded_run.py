@@ -4,6 +4,7 @@ A record that cannot carry an identification is refused, see `identify.record.ch
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +29,7 @@ from identify.record.geometry_errors import GeometryErrors, read_geometry_covari
 from identify.record.payload import recorded_payload
 from identify.record.plausibility import check_plausible
 from identify.record.recording import poses
+from identify.runtime import cores
 from identify.scenario import Scenario
 
 LONG_GAP_S = 0.5
@@ -87,28 +89,34 @@ class RecordedRun:
         A model driven by the logged commands moves as the plant did, and what is measured beside that is the error. A
         closed loop sees the error as well, and its servo takes the platform where the error does not show.
         """
-        beside = self.common.modes if self.driven else None
-        return self._apart(parameters, lambda run: run.pose if self.driven else run.measured, beside)
+        if not self.driven:
+            return self._apart(parameters, lambda run: run.measured)
+        return self._apart(parameters, lambda run: run.pose, self.common.modes if self.common.names else 0.0)
 
     def pose_modes(self, parameters: Array) -> Array:
         """How far (N, 6, k) the common errors, each of one standard deviation, take the platform from the model."""
-        return self._apart(parameters, lambda run: run.pose, np.zeros_like(self.common.modes) if self.driven else None)
+        return self._apart(parameters, lambda run: run.pose, 0.0 if self.driven else None)
 
-    def _apart(self, parameters: Array, shown: Callable[[ClosedLoopRun], Array], beside: Array | None) -> Array:
+    def _apart(
+        self, parameters: Array, shown: Callable[[ClosedLoopRun], Array], beside: Array | float | None = None
+    ) -> Array:
         """What a run shows (N, 6) with a standard deviation more of each common error, less that without; beside (N, 6,
         k): of those that are in the measured poses, where the loop does not see them."""
-        drawn, columns = self.errors_had, []
+        drawn = self.errors_had
         lowest = np.full(len(drawn), -np.inf)
         if self.common.latency_std:
             lowest[-1] = -self.settings.timing.latency_s / self.common.latency_std  # no latency is negative
-        for k, step in enumerate(np.eye(len(drawn))):
-            if beside is not None and k < beside.shape[2]:
-                columns.append(beside[:, :, k])
-                continue
-            ends = [np.maximum(drawn + sign * step, lowest) for sign in (1.0, -1.0)]
-            more, less = (shown(self.having(end).simulate(parameters)) for end in ends)
-            columns.append((more - less) / (ends[0] - ends[1])[k])
-        modes = np.stack(columns, axis=2) if columns else np.zeros((*self.measured.shape, 0))
+        modes, count = np.zeros((*self.measured.shape, len(drawn))), len(self.common.names)
+        if beside is not None:
+            modes[:, :, :count] = beside
+        moving = [] if beside is not None else list(range(count))[: self.common.noticed]
+        moving += range(count, len(drawn))
+        ends = [np.maximum(drawn + sign * np.eye(len(drawn))[k], lowest) for k in moving for sign in (1.0, -1.0)]
+        with ThreadPoolExecutor(cores()) as pool:  # the compiled loop runs without Python's lock
+            found = list(pool.map(lambda end: shown(self.having(end).simulate(parameters)), ends))
+        for place, k in enumerate(moving):
+            (more, less), (high, low) = (each[2 * place : 2 * place + 2] for each in (found, ends))
+            modes[:, :, k] = (more - less) / (high - low)[k]
         if (geometry := self.common.geometry) is None:
             return modes
         by_geometry = geometry.modes(lambda robot: self.simulate(parameters, robot=robot).pose)
@@ -263,4 +271,5 @@ def _common_errors(record: xr.Dataset, scenario: Scenario, run: RecordedRun) -> 
     if "geometry" in kinds and (covariance := read_geometry_covariance(record, run.robot)) is not None:
         geometry = GeometryErrors(run.robot, covariance, run.reference.poses, run.whitener)
     latency_std = scenario.timing.latency_std_s if "latency" in kinds else 0.0
-    return replace(read_common_errors(record, kinds), latency_std=latency_std, geometry=geometry)
+    of_poses = read_common_errors(record, kinds).ordered(run.whitener)
+    return replace(of_poses, latency_std=latency_std, geometry=geometry)
