@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from cmmsim.common_errors import CommonErrors, MeasuringGeometry
 from cmmsim.detection.detector import FitLimits, find_detector
 from cmmsim.drift_watch import DriftWatch
 from cmmsim.drift_watch.watch import CHANCE
-from cmmsim.errors import CmmError, LostError, UnknownBodyError, UnknownOptionError
+from cmmsim.errors import CmmError, UnknownBodyError, UnknownOptionError
 from cmmsim.files.schema import SensorFile, Timing
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import marked_body, require_corner
@@ -29,9 +29,8 @@ from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
 from cmmsim.imaging.renderer import choose_renderer
 from cmmsim.plugins import is_own, require_renderer
-from cmmsim.pose_estimation.consistency import consistent
 from cmmsim.pose_estimation.estimator import METHODS, Measurement, PoseEstimator, lost_measurement
-from cmmsim.pose_estimation.observation import DetectionSettings, Observer, StickerObservation
+from cmmsim.pose_estimation.observation import DetectionSettings, Observer
 from cmmsim.pose_estimation.search import SMALLEST_STEP
 from cmmsim.pose_estimation.taught import Taught, require_taught_for, setup_of
 from cmmsim.radiometry.images import StereoFrame, StereoImages
@@ -169,14 +168,10 @@ class Sensor:
     @property
     def estimator(self) -> PoseEstimator:
         """The part that turns images into poses; also for images from elsewhere, see measure_frame."""
-        common = None if self._known is None else self._common_covariance(self._known)
+        common = None
+        if self._known is not None:
+            common = partial(self._geometry.pose_covariance, rig_covariance=self._known.covariance, method=self.method)
         return PoseEstimator(self.rig, self.noise, self.settings, self.platform, self.taught, self.method, common)
-
-    def _common_covariance(self, known: KnownRig) -> Callable[[Array], Array]:
-        """What all poses have in common at a pose (6,) where the rig is known only so well, (6,6)."""
-        if self.method != "registration":
-            return _not_known
-        return partial(self._geometry.pose_covariance, rig_covariance=known.covariance)
 
     @cached_property
     def _geometry(self) -> MeasuringGeometry:
@@ -293,8 +288,7 @@ class Sensor:
         else:
             measured = self._tracker.measure(images)
         if self._watch is not None:
-            look = measured.ok and self._watch.watches_base
-            self._watch.add(measured, self._seen_of_base(images) if look else None)
+            self._watch.look(measured, images, self.observer)
         return measured
 
     def watch_drift(self, base: bool = False, chance: float = CHANCE) -> DriftWatch:
@@ -310,15 +304,6 @@ class Sensor:
         self._watch = DriftWatch(self._geometry, self._known, period, chance, offset, base)
         return self._watch
 
-    def _seen_of_base(self, images: StereoImages) -> StickerObservation | None:
-        """The base's stickers in a frame; None where too few agree."""
-        expected, places = self._geometry.camera_from_base, self.taught.base_places
-        seen = self.observer.observe(images, expected, places, self.base.sticker_normals)
-        try:
-            return consistent(seen, self.observer, self.base, places)[0]
-        except LostError:
-            return None
-
     def _require_registration(self, what: str) -> None:
         if self.method != "registration":
             raise CmmError(f"{what} poses by registration only, not by {self.method}")
@@ -327,11 +312,6 @@ class Sensor:
     def camera(self) -> VirtualStereoCamera:
         """The two cameras before the true scene, as they are at teaching."""
         return self.true_cameras.at_rest
-
-
-def _not_known(pose: Array) -> Array:
-    """Covariance (6,6) of what nobody knows at a pose (6,)."""
-    return np.full((6, 6), np.nan)
 
 
 def _checked_seed(seed: int) -> int:
