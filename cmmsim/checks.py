@@ -1,5 +1,6 @@
 """What users pass as arguments and in TOML files: taken as it is meant, or refused with what was got and wanted."""
 
+import operator
 import tomllib
 from copy import deepcopy
 from functools import lru_cache
@@ -102,3 +103,14 @@ def _shown(values: object) -> str:
     """Values on one line, cut where they are many."""
     text = " ".join(str(values).split())
     return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."
+
+
+def checked_seed(seed: int) -> int:
+    """The seed. Raises CmmError unless it is a whole number from 0 on."""
+    try:
+        number = operator.index(seed)
+    except TypeError:
+        number = -1
+    if number < 0:
+        raise CmmError(f"a seed is a whole number from 0 on, got {seed!r}")
+    return number

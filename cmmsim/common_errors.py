@@ -79,9 +79,11 @@ class MeasuringGeometry:
         """As it was taught (4,4)."""
         return invert(self.taught.base_from_camera)
 
-    def pose_covariance(self, pose: Array, rig_covariance: Array) -> Array:
+    def pose_covariance(self, pose: Array, rig_covariance: Array, method: str = "registration") -> Array:
         """Covariance (6, 6) of what a pose (6,), measured by registration, has in common with all others: what is not
-        known of rig, with a covariance (24, 24), and taught frames."""
+        known of rig, with a covariance (24, 24), and taught frames. NaN for another method: of that it is not known."""
+        if method != "registration":
+            return np.full((6, 6), np.nan)
         return self.common_errors(pose[None], np.zeros((1, 6)), rig_covariance).pose_covariances[0]
 
     def common_errors(

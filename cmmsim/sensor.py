@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -13,30 +12,29 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from cmmsim.checks import finite_array, require_kind
+from cmmsim.checks import checked_seed, finite_array, require_kind
 from cmmsim.common_errors import CommonErrors, MeasuringGeometry
-from cmmsim.detection.detector import FitLimits, find_detector
+from cmmsim.detection.detector import find_detector
+from cmmsim.detection_settings import StickerView
 from cmmsim.drift_watch import DriftWatch
 from cmmsim.drift_watch.watch import CHANCE
-from cmmsim.errors import CmmError, LostError, UnknownBodyError, UnknownOptionError
+from cmmsim.errors import CmmError, UnknownBodyError, UnknownOptionError
 from cmmsim.files.schema import SensorFile, Timing
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import marked_body, require_corner
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.known_rig import KnownRig
-from cmmsim.geometry.pose import Array, apply, checked_pose, checked_transform, pose_to_transform
+from cmmsim.geometry.pose import Array, checked_pose, checked_transform
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
 from cmmsim.imaging.renderer import choose_renderer
 from cmmsim.plugins import is_own, require_renderer
-from cmmsim.pose_estimation.consistency import consistent
 from cmmsim.pose_estimation.estimator import METHODS, Measurement, PoseEstimator, lost_measurement
-from cmmsim.pose_estimation.observation import DetectionSettings, Observer, StickerObservation
-from cmmsim.pose_estimation.search import SMALLEST_STEP
+from cmmsim.pose_estimation.observation import DetectionSettings, Observer
 from cmmsim.pose_estimation.taught import Taught, require_taught_for, setup_of
 from cmmsim.radiometry.images import StereoFrame, StereoImages
 from cmmsim.radiometry.noise import CameraNoise
-from cmmsim.teaching import Progress, Teacher, WindowSizes, exactly_taught, largest_radius, radius_at, window_sizes
+from cmmsim.teaching import Progress, Teacher, exactly_taught
 from cmmsim.tracker import Tracker
 from cmmsim.true_cameras import TrueCameras
 
@@ -72,7 +70,7 @@ class Sensor:
             choose_renderer(self._asked_renderer)
         if progress is not None and not callable(progress):
             raise CmmError(f"progress must be a function of the steps done and their number, got {progress!r}")
-        self._file, self._seed, self._progress = file, _checked_seed(seed), progress
+        self._file, self._seed, self._progress = file, checked_seed(seed), progress
         self.method = method
         self._known = taught.known if isinstance(taught, Taught) else known
         figures = file.camera.model_dump(exclude={"pattern_seed"})
@@ -105,40 +103,15 @@ class Sensor:
         return self.true_cameras.renderer.name
 
     @cached_property
-    def settings(self) -> DetectionSettings:
-        """How stickers are looked for in windows."""
-        limits = FitLimits(smallest_contrast=SMALLEST_STEP * self.noise.white_level)
-        sizes = self._window_sizes
-        return DetectionSettings(
-            sizes.window,
-            sizes.fit,
-            radius=self._file.stickers.radius,
-            detector=self._file.detection.detector,
-            limits=limits,
-            optics=self.optics,
-            centre_error_px=self.camera.centre_error_px(Quality()),
-            exposed_share=self.timing.exposure * self.timing.frame_rate,
-            line_error_px=0.0 if self._known is None else self._known.line_std(self._stickers_at_home),
-        )
-
-    @property
-    def _stickers_at_home(self) -> Array:
-        """Nominal places (n,3) of all stickers in the camera frame, with the platform at home."""
-        camera_from_base = self.true_cameras.camera_from_base
-        at_home = camera_from_base @ pose_to_transform(self.home)
-        return np.concatenate([apply(at_home, self.platform.nominal), apply(camera_from_base, self.base.nominal)])
+    def _view(self) -> StickerView:
+        """The stickers as the known rig should see them."""
+        place = self.true_cameras.camera_from_base
+        return StickerView(self._file, self.platform, self.base, self.rig, self._known, place, self.optics)
 
     @cached_property
-    def _window_sizes(self) -> WindowSizes:
-        """Large and blurred stickers need a wider view."""
-        radius, place = self._file.stickers.radius, self.true_cameras.camera_from_base
-        at_target = radius_at(self.rig, place, np.array(self._file.rig.target), radius)
-        at_teaching = max(
-            largest_radius(self.rig, place, self.base, radius),
-            largest_radius(self.rig, place @ pose_to_transform(self.home), self.platform, radius),
-        )
-        blurred = self.optics.psf_px > 0.0 or self.timing.exposure > 0.0
-        return window_sizes(at_target, at_teaching, self.optics.psf_px, blurred)
+    def settings(self) -> DetectionSettings:
+        """How stickers are looked for in windows."""
+        return self._view.settings(self.noise, self.camera.centre_error_px(Quality()))
 
     @property
     def timing(self) -> Timing:
@@ -169,14 +142,10 @@ class Sensor:
     @property
     def estimator(self) -> PoseEstimator:
         """The part that turns images into poses; also for images from elsewhere, see measure_frame."""
-        common = None if self._known is None else self._common_covariance(self._known)
+        common = None
+        if self._known is not None:
+            common = partial(self._geometry.pose_covariance, rig_covariance=self._known.covariance, method=self.method)
         return PoseEstimator(self.rig, self.noise, self.settings, self.platform, self.taught, self.method, common)
-
-    def _common_covariance(self, known: KnownRig) -> Callable[[Array], Array]:
-        """What all poses have in common at a pose (6,) where the rig is known only so well, (6,6)."""
-        if self.method != "registration":
-            return _not_known
-        return partial(self._geometry.pose_covariance, rig_covariance=known.covariance)
 
     @cached_property
     def _geometry(self) -> MeasuringGeometry:
@@ -193,7 +162,7 @@ class Sensor:
         if self._taught is None:
             for body in (self.platform, self.base):
                 require_corner(body)
-            teacher = Teacher(self.camera, self.observer, self.platform, self.base, self._window_sizes.plan())
+            teacher = Teacher(self.camera, self.observer, self.platform, self.base, self._view.sizes.plan())
             rng = np.random.default_rng([self._seed, TEACHING_STREAM])
             found = teacher.teach(self.name, self.home, rng, progress or self._progress)
             self._taught = replace(found, setup=setup_of(self._file), known=self._known)
@@ -205,7 +174,7 @@ class Sensor:
         Every frame has a noise stream of its own, so that a dropped one changes nothing in the others.
         Raises CmmError for a seed that is no whole number from 0 on.
         """
-        self._run_seed, self._frame = _checked_seed(seed), 0
+        self._run_seed, self._frame = checked_seed(seed), 0
         self._dropout_rng = np.random.default_rng([seed, DROPOUT_STREAM])
         if self._tracker is not None:
             self._tracker.forget()
@@ -293,8 +262,7 @@ class Sensor:
         else:
             measured = self._tracker.measure(images)
         if self._watch is not None:
-            look = measured.ok and self._watch.watches_base
-            self._watch.add(measured, self._seen_of_base(images) if look else None)
+            self._watch.look(measured, images, self.observer)
         return measured
 
     def watch_drift(self, base: bool = False, chance: float = CHANCE) -> DriftWatch:
@@ -310,15 +278,6 @@ class Sensor:
         self._watch = DriftWatch(self._geometry, self._known, period, chance, offset, base)
         return self._watch
 
-    def _seen_of_base(self, images: StereoImages) -> StickerObservation | None:
-        """The base's stickers in a frame; None where too few agree."""
-        expected, places = self._geometry.camera_from_base, self.taught.base_places
-        seen = self.observer.observe(images, expected, places, self.base.sticker_normals)
-        try:
-            return consistent(seen, self.observer, self.base, places)[0]
-        except LostError:
-            return None
-
     def _require_registration(self, what: str) -> None:
         if self.method != "registration":
             raise CmmError(f"{what} poses by registration only, not by {self.method}")
@@ -327,22 +286,6 @@ class Sensor:
     def camera(self) -> VirtualStereoCamera:
         """The two cameras before the true scene, as they are at teaching."""
         return self.true_cameras.at_rest
-
-
-def _not_known(pose: Array) -> Array:
-    """Covariance (6,6) of what nobody knows at a pose (6,)."""
-    return np.full((6, 6), np.nan)
-
-
-def _checked_seed(seed: int) -> int:
-    """The seed. Raises CmmError unless it is a whole number from 0 on."""
-    try:
-        number = operator.index(seed)
-    except TypeError:
-        number = -1
-    if number < 0:
-        raise CmmError(f"a seed is a whole number from 0 on, got {seed!r}")
-    return number
 
 
 def load_sensor(

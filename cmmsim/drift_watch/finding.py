@@ -37,10 +37,11 @@ class Finding:
 
     noticed_s: time at which it no longer fitted, and noticed_frame; None where it did all along. evidence: largest
     logarithm of the likelihood ratio, and its limit, which a rig that fits exceeds with at most that chance in a run,
-    however long. movements: the fewest parameters that explain what is seen at the end of the run, the first one most,
-    and the share that they explain; other parameters of nearly the same effect may be the true cause; none where
-    nothing was noticed. from_start: the rig was wrong at teaching already. unseen: directions in which a drift of a
-    tenth of a pixel, 20 um or 20 urad could not have been seen, named by the parameters that move together.
+    however long. judged_frames: those of all frames in which enough stickers were seen. movements: the fewest
+    parameters that explain what is seen at the end of the run, the first one most, and the share that they explain;
+    other parameters of nearly the same effect may be the true cause; none where nothing was noticed. from_start: the
+    rig was wrong at teaching already. unseen: directions in which a drift of a tenth of a pixel, 20 um or 20 urad could
+    not have been seen, named by the parameters that move together.
     """
 
     noticed_s: float | None
@@ -49,6 +50,7 @@ class Finding:
     limit: float
     chance: float
     frames: int
+    judged_frames: int
     movements: tuple[Movement, ...]
     explained: float
     from_start: bool

@@ -9,11 +9,13 @@ from cmmsim.common_errors import MeasuringGeometry
 from cmmsim.drift_watch.blocks import RIG, Sightings, base_rows, platform_rows, stacked
 from cmmsim.drift_watch.evidence import SIZES, Evidence
 from cmmsim.drift_watch.finding import Finding, movements, unseen_directions
-from cmmsim.errors import CmmError
+from cmmsim.errors import CmmError, LostError
 from cmmsim.geometry.known_rig import KnownRig
 from cmmsim.geometry.pose import Array, apply, pose_to_transform
+from cmmsim.pose_estimation.consistency import consistent
 from cmmsim.pose_estimation.estimator import Measurement
-from cmmsim.pose_estimation.observation import StickerObservation
+from cmmsim.pose_estimation.observation import Observer, StickerObservation
+from cmmsim.radiometry.images import StereoImages
 
 CHANCE = 0.01  # of a false alarm in a run
 BLOCK = 6  # frames at most whose residuals are averaged before they count
@@ -57,11 +59,26 @@ class DriftWatch:
         offsets = np.full(4 * centres, self._offset_std)
         calibration = vectors[:, kept] * np.sqrt(values[kept])
         self._evidence = Evidence(calibration, delay_std, offsets, self.watches_base)
-        self._frames = self._counted = 0
+        self._frames = self._counted = self._judged = 0
         self._platform: Sightings | None = None
         self._base: Sightings | None = None
         self._largest = 0.0
         self._noticed: int | None = None
+
+    def look(self, measurement: Measurement, images: StereoImages, observer: Observer) -> None:
+        """The next frame, as ``add``: the base's stickers are looked for in its images where they are watched."""
+        self.add(measurement, self._base_in(images, observer) if len(measurement.target_ids) else None)
+
+    def _base_in(self, images: StereoImages, observer: Observer) -> StickerObservation | None:
+        """The base's stickers in a frame; None where nobody watches them, or too few agree."""
+        if not self.watches_base:
+            return None
+        body, places = self.geometry.base, self.geometry.taught.base_places
+        seen = observer.observe(images, self.geometry.camera_from_base, places, body.sticker_normals)
+        try:
+            return consistent(seen, observer, body, places)[0]
+        except LostError:
+            return None
 
     def add(self, measurement: Measurement, base: StickerObservation | None = None) -> None:
         """The next frame; a lost one, or one without stickers, says nothing but that time passes. base: what is seen of
@@ -70,6 +87,7 @@ class DriftWatch:
         self._frames += 1
         if not measurement.ok or len(measurement.target_ids) < FEWEST:
             return
+        self._judged += 1
         index = np.flatnonzero(np.isin(self.geometry.platform.sticker_ids, measurement.target_ids))
         if not self._goes_on(index, base):
             self._close()
@@ -100,6 +118,7 @@ class DriftWatch:
             float(-np.log(self.chance)),
             self.chance,
             self._frames,
+            self._judged,
             moved,
             share,
             self._noticed is not None and told.from_start,

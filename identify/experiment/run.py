@@ -145,8 +145,8 @@ def run_plant(
         poses = without_gaps(done.measured, done.measured_ok)
         found = sensor.common_errors(poses, spline_derivatives(poses, scenario.timing.frame_rate_hz)[0])
         store_common_errors(record, CommonErrors(found.names, found.changes, found.covariance))
-    if watch is not None:
-        store_finding(record, watch.finding.to_dict())
+    if watch is not None and (finding := watch.finding).judged_frames:
+        store_finding(record, finding.to_dict())
     store_anchor(record, measured_anchor(settings.scale_anchor, settings.anchor_std, layout, plant.parameters, rng))
     if load is not None:
         store_payload(record, layout, load.stated, load.std)

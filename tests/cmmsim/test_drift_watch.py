@@ -155,7 +155,8 @@ def test_lost_frames_say_nothing_but_that_time_passes(geometry):
     watch = DriftWatch(geometry, frame_period=0.1)
     for _ in range(20):
         watch.add(lost_measurement("dark"))
-    assert (watch.finding.noticed_s, watch.finding.frames) == (None, 20)
+    found = watch.finding
+    assert (found.noticed_s, found.frames, found.judged_frames) == (None, 20, 0)
     eye = Projected(geometry, geometry.taught, np.random.default_rng(5))
     for _ in range(12):
         watch.add(eye.measured(geometry.rig.moved(rig_changes({"right.cy_px": 0.5})), geometry.home))
