@@ -206,13 +206,14 @@ def calibrate(robot: Robot, data: StaticPoses, tolerance: Tolerance) -> Calibrat
         raise EstimationError(f"the search for the geometry did not end: {found.message}")
     rows, own = found.jac[: -len(none)], len(model.scale)
     spread = np.linalg.inv(found.jac.T @ found.jac)
+    covariance = model.scale @ spread[:own, :own] @ model.scale.T
     spare = max(len(rows) - float(np.sum(spread * (rows.T @ rows))), 1.0)
     deviations, frames = model.split(found.x[:own])
     return Calibration(
         nominal=robot,
         deviations=deviations,
         frames=frames,
-        joint_covariance=model.scale @ spread[:own, :own] @ model.scale.T,
+        joint_covariance=(covariance + covariance.T) / 2,
         prior_std=model.tolerance,
         noise_ratio=float(np.sum(found.fun[: len(rows)] ** 2) / spare),
         noise_ratio_std=float(np.sqrt(2 / spare)),

@@ -339,6 +339,15 @@ class Geometry(Section):
     encoder_offset_m: float = quantity(0.0, "m", "the same, where actuators slide", ge=0, le=0.01)
     unseen: int = quantity(200, "1", "poses that are not measured and judge the result", ge=1, le=100_000)
 
+    @model_validator(mode="after")
+    def _stands_where_it_is_known(self) -> "Geometry":
+        if self.known == "calibrated" and self.frames == "unknown":
+            raise ValueError(
+                "known = 'calibrated' with frames = 'unknown': the geometry would be known up to where the robot "
+                "stands, and a run needs frames = 'taught'"
+            )
+        return self
+
     @property
     def exact(self) -> bool:
         """Whether servo and estimator take the robot file's geometry for exact."""

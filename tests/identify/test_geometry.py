@@ -20,6 +20,7 @@ from identify.geometry.experiment import Encoders, measured, stand_at
 from identify.geometry.observability import check_enough, combinations
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses, read_static_poses
 from identify.progress import SilentProgress
+from identify.record.geometry_errors import covariance_fault
 from tests.cmmsim.sensors import PHOTOGRAPHED
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.static_poses import TOLERANCE, designer, drawn, poses_of, scenario, unseen_errors
@@ -63,6 +64,7 @@ def test_what_no_pose_can_tell_stays_nominal_and_is_named():
     assert set(groups) == {
         f"leg{leg}.base_joint.{axis} + leg{leg}.platform_joint.{axis}" for leg in (1, 2, 3) for axis in "xyz"
     }
+    assert covariance_fault(found.covariance) == ""
     gauge = found.deviations[names.index("leg1.base_joint.x")] + found.deviations[names.index("leg1.platform_joint.x")]
     assert abs(gauge) < 1e-6  # m: along it, the nominal geometry is kept
     told = combinations(load_robot("rss6").geometry.number_names, np.eye(66), 10 * np.ones(66))

@@ -20,6 +20,7 @@ from identify.experiment.plant import build_plant
 from identify.files.dataset import write_covariance_of
 from identify.record.geometry_errors import read_geometry_covariance, store_geometry_covariance
 from identify.record.known_geometry import KnownGeometry, known_geometry
+from identify.record.recording import write
 from identify.scenario import load_scenario
 from identify.validation.unseen import model_run
 from tests.identify.commands import command, refusal
@@ -174,6 +175,8 @@ def test_what_is_no_calibration_of_this_robot_is_refused_in_one_line(tmp_path):
 
     assert "is neither exact, calibrated, nor a robot.toml" in said(**{"geometry.known": str(tmp_path / "none.toml")})
     assert "rrr3 has other legs than delta3" in said(robot="delta3")
+    adrift = {"geometry.known": "calibrated", "geometry.frames": "unknown"}
+    assert "up to where the robot stands" in refusal(ScenarioError, scenario.with_overrides, adrift)
     assert "is for a run with a folder" in said(**{"geometry.known": "calibrated"})
     far = written(tmp_path / "far", replace(known, robot=known.robot.moved(1500 * np.abs(errors))))
     assert "off that of rrr3, limit 0.02" in said(**{"geometry.known": str(far)})
@@ -226,3 +229,17 @@ def test_a_run_calibrates_its_robot_first_and_the_truth_stays_where_no_estimator
     true = [one["true"] - one["nominal"] for one in parameters]
     np.testing.assert_allclose(plant.robot.geometry.deviations_from(load_robot("rrr3").geometry), true, atol=1e-12)
     assert np.abs(true).max() > 1e-4
+
+
+@pytest.mark.slow
+def test_a_record_of_ones_own_is_told_how_well_its_geometry_is_known_by_its_scenario(tmp_path):
+    known, errors = off_by("rrr3", 4e-6)
+    known = replace(known, robot=known.robot.moved(10 * errors))
+    path = str(written(tmp_path, known))
+    scenario = quick(robot="rrr3", **{"geometry.known": path, "identification.method": "command_driven"})
+    record = record_of(known, known.robot.moved(errors), scenario, 0, load_robot("rrr3"))
+    write(tmp_path / "mine.nc", record.drop_dims(["geometric_number", "geometric_number_2"]))
+    assert command("identify", "--record", tmp_path / "mine.nc", "--out", tmp_path / "out", "--quiet") == 0
+    found = json.loads((tmp_path / "out" / "result.json").read_text())["identification"]
+    assert list(found["nuisances"]) == [f"geometry.{name}" for name in known.robot.geometry.number_names]
+    assert found["noise_ratio"] < 1.15
