@@ -11,6 +11,8 @@ a run before them.
 from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
 from dynamics.closed_loop.problem import (
     Controller,
+    Drives,
+    EveryFrame,
     FrameTiming,
     LoopSettings,
     PoseSensor,
@@ -26,6 +28,8 @@ from dynamics.closed_loop.simulate import prepare, simulate, simulate_batch
 __all__ = [
     "ClosedLoopRun",
     "Controller",
+    "Drives",
+    "EveryFrame",
     "FrameTiming",
     "FrictionLaw",
     "JointElasticity",

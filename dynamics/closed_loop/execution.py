@@ -22,7 +22,7 @@ from dynamics.closed_loop.motion_kernels import (
     evaluate,
     evaluate_terms,
 )
-from dynamics.closed_loop.problem import LoopProblem, RateSensor, Sizes
+from dynamics.closed_loop.problem import EveryFrame, LoopProblem, RateSensor, Sizes
 from dynamics.closed_loop.run import ClosedLoopRun, LoopFailure
 from dynamics.closed_loop.sensitivity_kernels import slope_tangent, stop_tangent
 from dynamics.closed_loop.stick_slip_kernels import stop_joints
@@ -103,14 +103,19 @@ def _consult(
         what = f"what the pose sensor returned at frame {frame}"
         measured[frame] = np.nan if given is None else floats(what, given, (6,), error=SimulationError)
         record.measured[frame] = chart.coordinates(measured[frame])
-    if problem.controller is None:
+    controller = problem.controller
+    if controller is None:
         return
     commands[frame] = commands[frame - 1] if frame else problem.start.commands[-1]
-    if record.measured_ok[frame]:
-        desired = problem.reference.poses[frame], problem.reference.rates[frame]
-        command = problem.controller(frame, time, measured[frame].copy(), *desired)
-        what = f"what the controller returned at frame {frame}"
-        commands[frame] = floats(what, command, (problem.sizes.joints,), error=SimulationError)
+    seen = measured[frame].copy() if record.measured_ok[frame] else None
+    if isinstance(controller, EveryFrame):
+        command = controller.command(frame, time, seen)
+    elif seen is not None:
+        command = controller(frame, time, seen, problem.reference.poses[frame], problem.reference.rates[frame])
+    else:
+        return
+    what = f"what the controller returned at frame {frame}"
+    commands[frame] = floats(what, command, (problem.sizes.joints,), error=SimulationError)
 
 
 def _failure(problem: LoopProblem, status: int, frame: int, memory: Memory, record: Any) -> LoopFailure:
@@ -132,6 +137,7 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
         "reference": chart.coordinates(problem.reference.poses),
         "reference_rate": chart.coordinates(problem.reference.rates),
         "commands": commands,
+        "feedforward": np.zeros((0, 0)) if problem.feedforward is None else problem.feedforward,
         "lost": np.zeros(0, bool) if problem.lost is None else np.ascontiguousarray(problem.lost),
         "noise": np.zeros((0, 0)) if problem.noise is None else chart.coordinates(problem.noise),
         "start_commands": start.commands,
@@ -164,6 +170,7 @@ def _fill(
     task.period = problem.period
     task.sensitivities = problem.sensitivities
     task.measured = problem.asked
+    task.torques, task.torque_limit = settings.drives.torques, settings.drives.torque_limit or 0.0
     if settings.elasticity is not None:
         rigid = settings.elasticity.beyond_the_springs(problem.robot.layout, rigid)
         task.stiffness, task.damping = settings.elasticity.stiffness, settings.elasticity.damping
@@ -176,7 +183,7 @@ def _fill(
         [chart.coordinates(start.pose), chart.coordinates(start.pose_rate), start.joint_integral, *motor]
     )
     now.servo_integral, now.last_measured = start.servo_integral, chart.coordinates(start.last_measured)
-    now.last_command = start.commands[-1]
+    now.last_command = start.commands[-1] if problem.feedforward is None else 0.0
     task.servo_knows = problem.servo_robot.geometry == problem.robot.geometry
     for inputs, function, fixed in (
         (now.known.inputs, own["equation_of_motion"], rigid),

@@ -2,7 +2,7 @@
 
 The servo: U = J_theta [kp e + kd e_dot + ki integral(e)], the error e taken at the time of exposure. The pose rate is
 the difference of the last two good measurements (before the first: what the start names); the integral is the sum of
-the errors times the frame period. Lost frames leave both alone.
+the errors times the frame period. Lost frames leave both alone. A feedforward comes on top, of lost frames, too.
 """
 
 import numpy as np
@@ -126,6 +126,9 @@ def issue_command(task: Record, now: Record, d: Record, plan: Record, record: Re
     elif record.measured_ok[k]:
         serve(task, now, d, plan, record.measured[k], k)
     copy(now.last_command[:], record.command[k])
+    if len(plan.feedforward) > 0:
+        for i in range(len(now.mode)):
+            record.command[k, i] += plan.feedforward[k, i]
     if task.sensitivities:
         copy_rows(d.last_command[:], d.issued[k % (len(d.issued) - 1)], now.width)
     return OK if all_finite(record.command[k : k + 1]) else MEASURED_OUT_OF_REACH

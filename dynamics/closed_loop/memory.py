@@ -20,6 +20,7 @@ class Plan(NamedTuple):
     reference: np.ndarray
     reference_rate: np.ndarray
     commands: np.ndarray
+    feedforward: np.ndarray
     lost: np.ndarray
     noise: np.ndarray
     start_commands: np.ndarray
@@ -66,7 +67,7 @@ class Memory(NamedTuple):
 LAYOUT = {
     "task": "equation_of_motion! motion_derivatives! rate_map_derivative! servo_motion! evaluate_terms! evaluate! "
     "decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! servo_knows! measured! lp li ld kp kd ki "
-    "stiffness damping motor_inertia period rigid:r coulomb:n viscous:n friction=friction",
+    "stiffness damping motor_inertia period torques! torque_limit rigid:r coulomb:n viscous:n friction=friction",
     "now": "known=known served=known derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
     "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
     "command_rate:n last_command:n impulse:n last_measured:m servo_integral:m demand:m change:m rest:m "

@@ -120,6 +120,10 @@ def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> 
         at.error[i] = now.command[i] + now.command_slope[i] * at.time - at.angle[i]
         damped = task.ld * (now.command_rate[i] - at.velocity[i])
         at.torque[i] = task.lp * at.error[i] + damped + task.li * state[first + i]
+        if task.torques:
+            at.torque[i], at.error[i] = now.command[i] + now.command_slope[i] * at.time, 0.0
+        if task.torque_limit > 0:
+            at.torque[i] = min(max(at.torque[i], -task.torque_limit), task.torque_limit)
     return OK
 
 

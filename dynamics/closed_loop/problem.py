@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from dynamics.checks import Shape, check_choice, check_type, floats, real, whole
+from dynamics.checks import Shape, check_choice, check_type, flag, floats, real, whole
 from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
 from dynamics.errors import SimulationError
 from dynamics.legs.numbers import MOST_NUMBERS
@@ -30,6 +30,14 @@ class RateSensor:
     """A pose sensor that depends on the motion too: measure(frame, time s, true pose (6,), true pose rate (6,))."""
 
     measure: Callable[[int, float, np.ndarray, np.ndarray], np.ndarray | None]
+
+
+@dataclass(frozen=True)
+class EveryFrame:
+    """A controller that is asked where the measurement is lost, too: command(frame, time s, measured pose (6,) or None)
+    -> joint command (n,)."""
+
+    command: Callable[[int, float, np.ndarray | None], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -71,18 +79,34 @@ class FrameTiming:
 
 
 @dataclass(frozen=True)
+class Drives:
+    """What the actuators take and give: joint commands, which the joint PID follows, or torques themselves; the largest
+    torque, N m or N (None: no limit)."""
+
+    torques: bool = False
+    torque_limit: float | None = None
+
+    def __post_init__(self) -> None:
+        flag("torques", self.torques, SimulationError)
+        if self.torque_limit is not None:
+            real("torque limit", self.torque_limit, SimulationError, above=0, unit=" N m or N")
+
+
+@dataclass(frozen=True)
 class LoopSettings:
-    """What the loop is made of besides the robot: servo, timing, friction law, Runge-Kutta steps per frame, and the
-    elasticity of the joints (None: rigid)."""
+    """What the loop is made of besides the robot: servo, timing, friction law, Runge-Kutta steps per frame, the
+    elasticity of the joints (None: rigid), and the drives."""
 
     servo: ServoGains
     timing: FrameTiming
     friction: FrictionLaw = field(default_factory=FrictionLaw)
     steps_per_frame: int = 4
     elasticity: JointElasticity | None = None
+    drives: Drives = field(default_factory=Drives)
 
     def __post_init__(self) -> None:
-        for name, kind in (("servo", ServoGains), ("timing", FrameTiming), ("friction", FrictionLaw)):
+        kinds = {"servo": ServoGains, "timing": FrameTiming, "friction": FrictionLaw, "drives": Drives}
+        for name, kind in kinds.items():
             check_type(name, getattr(self, name), kind, SimulationError)
         if self.elasticity is not None:
             check_type("elasticity", self.elasticity, JointElasticity, SimulationError)
@@ -200,7 +224,8 @@ class LoopProblem:
     noise: np.ndarray | None
     latencies: np.ndarray | None
     servo_robot: Robot
-    controller: Controller | None = None
+    controller: Controller | EveryFrame | None = None
+    feedforward: np.ndarray | None = None
 
     @property
     def frames(self) -> int:
@@ -254,8 +279,10 @@ def equilibrium(
     servo: ServoGains,
     servo_robot: Robot | None = None,
     elasticity: JointElasticity | None = None,
+    fed_forward: bool = False,
 ) -> StartState:
     """State of rest at a pose (6,), friction unloaded, for all parameters; servo_robot as in `closed_loop.simulate`.
+    fed_forward: whether a feedforward commands the joints where they are, so that the servo's part is none.
 
     The holding torque is linear in the dynamic parameters. Raises what that raises before a run.
     """
@@ -275,6 +302,6 @@ def equilibrium(
         motors = {"motor_angle": angles, "motor_rate": np.zeros(len(integral))}
     known = servo_robot or robot
     servo_integral = np.zeros(free.shape[1])
-    if servo.ki:
+    if servo.ki and not fed_forward:
         servo_integral = np.linalg.solve(known.coordinate_jacobian(pose), angles) / servo.ki
     return StartState(pose, rest, integral, servo_integral, angles[None], pose, sensitivity, **motors)

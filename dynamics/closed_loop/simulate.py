@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import lru_cache
 from typing import TypeVar, cast
 
@@ -13,6 +14,8 @@ import numpy as np
 from dynamics.checks import Shape, check_type, flag, floats, mask, shown, whole
 from dynamics.closed_loop.problem import (
     Controller,
+    Drives,
+    EveryFrame,
     FrameTiming,
     LoopProblem,
     LoopSettings,
@@ -43,11 +46,12 @@ def simulate(
     sensitivities: bool = False,
     start_sensitivities: bool = False,
     commands: np.ndarray | None = None,
+    feedforward: np.ndarray | None = None,
     lost: np.ndarray | None = None,
     noise: np.ndarray | None = None,
     latencies: np.ndarray | None = None,
     servo_robot: Robot | None = None,
-    controller: Controller | None = None,
+    controller: Controller | EveryFrame | None = None,
     compiled: bool = True,
 ) -> ClosedLoopRun:
     """Run the closed loop for all parameters of a robot: the dynamic ones, then lp, li, ld.
@@ -57,10 +61,13 @@ def simulate(
     parameters; start_sensitivities: those and the ones with respect to the start (ideal sensor only).
     commands (frames, n): drive the joints with these instead of the servo's; what is measured is then recorded and
     steers nothing.
+    feedforward (frames, n), rad or m: joint commands to which the servo adds its own, so that it corrects only;
+    before the run they were where the joints are.
     latencies (frames,), s: of each frame's command, instead of the settings' for all; see `command_schedule`.
     servo_robot: the robot whose kinematics the servo knows, where that is another (no sensitivities then).
     controller: takes the place of the servo: (frame, time s, measured pose (6,), desired pose (6,), desired rate (6,))
-    -> joint command (n,), rad or m, at every frame that is measured.
+    -> joint command (n,), rad or m, at every frame that is measured; or an `EveryFrame`.
+    Where the settings' drives take torques, commands, those of a controller and those of the start are torques.
     lost (frames,) bool: frames at which the ideal sensor measures nothing, so that a model loses what its plant lost.
     noise (frames, 6), m and rad: added to the poses that the ideal sensor measures elsewhere.
     compiled: False runs the same lines in plain Python, thousands of times slower.
@@ -74,15 +81,18 @@ def simulate(
         check_type("servo_robot", servo_robot, Robot, SimulationError)
     if sensor is not None and not callable(sensor) and not isinstance(sensor, RateSensor):
         raise SimulationError(f"sensor must be a function of frame, time and pose, or None, got {shown(sensor)}")
-    if controller is not None and not callable(controller):
+    if controller is not None and not callable(controller) and not isinstance(controller, EveryFrame):
         raise SimulationError(f"controller must be a function, or None for the servo, got {shown(controller)}")
     start_sensitivities = flag("start_sensitivities", start_sensitivities, SimulationError)
     sensitivities = flag("sensitivities", sensitivities, SimulationError) or start_sensitivities
     compiled = flag("compiled", compiled, SimulationError)
     _check_reach(robot, reference)
     frames, parameters = len(reference.poses), checked_loop_parameters(robot, parameters)
+    feedforward = _checked_rows("feedforward", feedforward, (frames, robot.layout.joints))
     if start is None:
-        start = equilibrium(robot, parameters, reference.poses[0], settings.servo, servo_robot, settings.elasticity)
+        known, fed = (servo_robot, settings.elasticity), feedforward is not None
+        start = equilibrium(robot, parameters, reference.poses[0], settings.servo, *known, fed)
+        start = _driven(robot, parameters, settings, start)
     else:
         check_type("start", start, StartState, SimulationError)
         start.check_sizes(robot)
@@ -101,6 +111,7 @@ def simulate(
         sensitivities,
         start_sensitivities,
         commands=_checked_rows("commands", commands, (frames, robot.layout.joints)),
+        feedforward=feedforward,
         lost=None if lost is None else mask("lost", lost, frames, SimulationError),
         noise=_checked_rows("noise", noise, (frames, 6)),
         latencies=latencies,
@@ -166,6 +177,13 @@ def prepare(robot: Robot) -> None:
     simulate(robot, next(iter(robot.parameter_sets.values())).vector, reference, settings)
 
 
+def _driven(robot: Robot, parameters: np.ndarray, settings: LoopSettings, rest: StartState) -> StartState:
+    """The state of rest of drives that take torques: the command is what holds the robot."""
+    if not settings.drives.torques:
+        return rest
+    return replace(rest, commands=robot.static_torque(rest.pose, parameters[robot.layout.dynamic])[None])
+
+
 def _cores() -> int:
     """Cores that this process may use; where only Linux can say so, all of the machine."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -195,6 +213,7 @@ def _checked_rows(name: str, rows: object, shape: tuple[int, int]) -> np.ndarray
 def _check_together(problem: LoopProblem, servo_robot: Robot | None) -> None:
     """Raise SimulationError for options of a run that exclude each other; servo_robot as the caller gave it."""
     sensed, controlled, derived = problem.sensor is not None, problem.controller is not None, problem.sensitivities
+    driven = problem.settings.drives.torques
     if problem.servo_robot.geometry.chart != problem.robot.geometry.chart:
         raise SimulationError(f"servo_robot {problem.servo_robot.name} has other coordinates than {problem.robot.name}")
     refusals = {
@@ -206,6 +225,13 @@ def _check_together(problem: LoopProblem, servo_robot: Robot | None) -> None:
         "sensitivities are those of rigid joints: pass settings with elasticity=None": derived
         and problem.settings.elasticity is not None,
         "sensitivities are those of the servo: pass controller=None": controlled and derived,
+        "feedforward is for the servo: pass commands=None and controller=None": problem.feedforward is not None
+        and (controlled or problem.commands is not None),
+        "drives that take torques need a controller or commands: the servo commands joints": driven
+        and not controlled
+        and problem.commands is None,
+        "sensitivities are those of the joint PID: pass settings with the usual drives": derived
+        and problem.settings.drives != Drives(),
         "commands take the place of any controller: pass controller=None": controlled and problem.commands is not None,
     }
     for words, excluded in refusals.items():

@@ -1,0 +1,231 @@
+"""Where the robot is and will be: an extended Kalman filter of the robot in its drives, on the logged commands.
+
+The state: coordinates q (m,), their rates (m,), integral of the joint PID (n,), and a disturbance, a torque at each
+joint (n,), which is what the model has wrong and walks at random. Between two frames it follows the model's equation of
+motion under the commands that have arrived by then; a frame that is lost only makes it less certain. Of dry friction
+the expectation counts, given how well the joint's velocity is known: coulomb erf(velocity / sqrt(2) deviation).
+
+How fast the disturbance walks, and how far the sensor's noise is from what the sensor says, is learnt on the way: the
+scales of both covariances climb the likelihood of the innovations, by its exact gradient.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.special import erf
+
+from dynamics.closed_loop.problem import LoopSettings
+from dynamics.control.inverse_dynamics import Model
+
+LONGEST_STEP = 4.2e-3
+"""Of the integration, s: what dry friction does to a joint that turns back takes some milliseconds."""
+
+WALK = 0.01
+"""What the disturbance walks in a second before anything has been learnt, relative to the torques at rest."""
+
+KNOWN_BEFORE = (2.0, 200.0)
+"""Information about the logarithms of the two scales, of the walk and of the sensor's noise, before the run."""
+
+SAME_TIME = 1e-9
+"""Frames within which two instants are one."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Coordinates and rates (m,) at an instant, with the covariance (m, m) of the coordinates."""
+
+    coordinates: np.ndarray
+    rates: np.ndarray
+    covariance: np.ndarray
+
+
+class Observer:
+    """Follows one run. `see` a frame, ask `ahead`, `issue` the command; all times in s.
+
+    model: of the robot; pose (6,) at which it stands, held by the command (n,), as the run begins; latencies (frames,):
+    when the command of each frame acts, which is known as it is issued; noise(frame): covariance (6, 6) of its pose.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        settings: LoopSettings,
+        pose: np.ndarray,
+        holding: np.ndarray,
+        latencies: np.ndarray,
+        noise: Callable[[int], np.ndarray],
+    ) -> None:
+        robot, timing = model.robot, settings.timing
+        self._model, self._noise, self._latencies = model, noise, latencies
+        self._drives, self._linear = settings.drives, timing.hold == "linear"
+        self._period, self._time = 1 / timing.frame_rate_hz, 0.0
+        self._motion = robot.functions["equation_of_motion"]
+        self._derivatives = robot.functions["motion_derivatives"]
+        rigid, self._coulomb, self._viscous, self._gains = robot.layout.split(model.parameters)
+        self._rigid = rigid[None]
+        self._m, self._n = len(robot.coordinate_names), robot.layout.joints
+        self._arrivals, self._commands = [-np.inf, -np.inf], [holding, holding]
+        self._start(pose, holding)
+
+    def _start(self, pose: np.ndarray, holding: np.ndarray) -> None:
+        m, n, robot = self._m, self._n, self._model.robot
+        torque = robot.static_torque(pose, self._model.dynamic)
+        self._state = np.zeros(2 * m + 2 * n)
+        self._state[:m] = robot.coordinates(pose)
+        if self._drives.torques:
+            self._state[2 * m + n :] = torque - holding
+        else:
+            self._state[2 * m : 2 * m + n] = torque / self._gains[1]
+        scale = np.full(n, np.abs(torque).mean())
+        self._walk = np.diag(np.concatenate([np.zeros(2 * m + n), (WALK * scale) ** 2]))
+        doubt = np.concatenate([np.full(m, 1e-4), np.full(m, 1e-5), np.zeros(n), 1e-3 * scale])
+        self._covariance = np.diag(doubt**2)
+        self._by_scale = np.zeros((2, 2 * m + 2 * n, 2 * m + 2 * n))
+        self._scale, self._information = np.zeros(2), np.diag(KNOWN_BEFORE)
+
+    @property
+    def scales(self) -> np.ndarray:
+        """Factors (2,) that were learnt: of the covariances of the walk and of the sensor's noise."""
+        return np.exp(self._scale)
+
+    @property
+    def disturbance(self) -> np.ndarray:
+        """Torque (n,) at the joints that the model does not know of."""
+        return self._state[2 * self._m + self._n :].copy()
+
+    def see(self, frame: int, pose: np.ndarray | None) -> Estimate:
+        """Go on to a frame, and take in its measured pose (6,), if it is not lost; what was expected before that."""
+        time = frame * self._period
+        self._state, self._covariance = self._moved(time, self._state, self._covariance, self._by_scale)
+        self._time = time
+        expected = self._estimate(self._state, self._covariance)
+        if pose is not None:
+            self._learn(self._model.robot.coordinates(pose), self._noise(frame))
+        return expected
+
+    def arrival(self, frame: int) -> float:
+        """When the command of a frame acts, s: not before the one before it."""
+        return max(frame * self._period + float(self._latencies[frame]), self._arrivals[-1])
+
+    def ahead(self, time: float) -> Estimate:
+        """What is expected at a later time, s, with the commands that are on their way."""
+        return self._estimate(*self._moved(time, self._state, self._covariance, None))
+
+    def issue(self, frame: int, command: np.ndarray) -> None:
+        """Note the command (n,) of a frame."""
+        self._arrivals.append(self.arrival(frame))
+        self._commands.append(np.array(command))
+        del self._arrivals[: -self._kept()], self._commands[: -self._kept()]
+
+    def _kept(self) -> int:
+        return 4 + sum(1 for arrival in self._arrivals if arrival > self._time - 2 * self._period)
+
+    def _estimate(self, state: np.ndarray, covariance: np.ndarray) -> Estimate:
+        m = self._m
+        return Estimate(state[:m].copy(), state[m : 2 * m].copy(), covariance[:m, :m].copy())
+
+    def _learn(self, measured: np.ndarray, noise: np.ndarray) -> None:
+        m, free = self._m, self._model.robot.geometry.chart.basis
+        seen = np.exp(self._scale[1]) * free.T @ noise @ free
+        innovation = measured - self._state[:m]
+        inverse = np.linalg.inv(self._covariance[:m, :m] + seen)
+        by_scale = self._by_scale[:, :m, :m].copy()
+        by_scale[1] += seen
+        told = inverse @ innovation
+        shares = inverse @ by_scale
+        gradient = 0.5 * (np.einsum("i,kij,j->k", told, by_scale, told) - np.trace(shares, axis1=1, axis2=2))
+        self._information += 0.5 * np.einsum("aij,bji->ab", shares, shares)
+        gain = self._covariance[:, :m] @ inverse
+        self._state = self._state + gain @ innovation
+        kept = np.eye(len(gain))
+        kept[:, :m] -= gain
+        self._covariance = kept @ self._covariance @ kept.T + gain @ seen @ gain.T
+        self._by_scale = kept @ self._by_scale @ kept.T
+        self._by_scale[1] += gain @ seen @ gain.T
+        self._scale = self._scale + np.clip(np.linalg.solve(self._information, gradient), -0.5, 0.5)
+
+    def _moved(
+        self, time: float, state: np.ndarray, covariance: np.ndarray, by_scale: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """State and covariance at a later time; the derivatives of the covariance by the scales move in place."""
+        at, m = self._time, self._m
+        while at < time - SAME_TIME * self._period:
+            begins = [*self._arrivals, *(arrival + self._period for arrival in self._arrivals)]
+            later = [begin for begin in begins if at + SAME_TIME * self._period < begin < time]
+            end = min([time, at + LONGEST_STEP, *later])
+            command, rate = self._acting((at + end) / 2)
+            state, map_, rubbed = self._step(state, covariance, command, rate, end - at)
+            walked = np.exp(self._scale[0]) * (end - at) * self._walk
+            covariance = map_ @ covariance @ map_.T + walked
+            covariance[m : 2 * m, m : 2 * m] += rubbed
+            if by_scale is not None:
+                by_scale[:] = map_ @ by_scale @ map_.T
+                by_scale[0] += walked
+            at = end
+        return state, covariance
+
+    def _acting(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """The command at a time, and what the joint PID takes for its rate."""
+        newest = max(k for k, arrival in enumerate(self._arrivals) if arrival <= time)
+        before = self._commands[max(newest - 1, 0)]
+        change = self._commands[newest] - before
+        done = min((time - self._arrivals[newest]) / self._period, 1.0) if self._linear else 1.0
+        return before + done * change, change / self._period
+
+    def _step(
+        self, state: np.ndarray, covariance: np.ndarray, command: np.ndarray, rate: np.ndarray, length: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The state after a time, s, its derivative by the state: an exponential step, exact for linear motion; and the
+        covariance (m, m) of the rates that dry friction adds."""
+        slope, by_state, unsure = self._slope(state, covariance, command, rate)
+        size = len(state)
+        augmented = np.zeros((size + 1, size + 1))
+        augmented[:size, :size], augmented[:size, size] = by_state, slope
+        moved = expm(length * augmented)
+        push = by_state[self._m : 2 * self._m, 2 * self._m + self._n :]
+        return state + moved[:size, size], moved[:size, :size], length**2 * (push * unsure) @ push.T
+
+    def _slope(
+        self, state: np.ndarray, covariance: np.ndarray, command: np.ndarray, command_rate: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        m, n, (lp, li, ld) = self._m, self._n, self._gains
+        q, rate, integral, disturbance = np.split(state, [m, 2 * m, 2 * m + n])
+        found = self._motion(q[None], rate[None], self._rigid)
+        mass, bias, jacobian, _, angle = (part[0] for part in found)
+        velocity, error = jacobian @ rate, command - angle[:, 0]
+        level, by_velocity, unsure = self._expected_friction(velocity, jacobian, covariance[m : 2 * m, m : 2 * m])
+        pid = not self._drives.torques
+        torque = lp * error + ld * (command_rate - velocity) + li * integral if pid else command
+        limit = self._drives.torque_limit
+        torque = torque if limit is None else np.clip(torque, -limit, limit)
+        net = torque + disturbance - self._viscous * velocity - self._coulomb * level
+        acceleration = np.linalg.solve(mass, jacobian.T @ net - bias[:, 0])
+        given = (q[None], rate[None], acceleration[None], net[None], self._rigid)
+        by_q, by_rate, _, _, turning = (part[0] for part in self._derivatives(*given))
+        damping = (ld * pid + self._viscous + self._coulomb * by_velocity)[:, None]
+        net_by_q = -lp * pid * jacobian - damping * (turning / 2)
+        push = np.linalg.solve(mass, jacobian.T)
+        by_state = np.zeros((len(state), len(state)))
+        by_state[:m, m : 2 * m] = np.eye(m)
+        by_state[m : 2 * m, :m] = push @ net_by_q - np.linalg.solve(mass, by_q)
+        by_state[m : 2 * m, m : 2 * m] = -push @ (damping * jacobian) - np.linalg.solve(mass, by_rate)
+        by_state[m : 2 * m, 2 * m : 2 * m + n] = li * pid * push
+        by_state[m : 2 * m, 2 * m + n :] = push
+        by_state[2 * m : 2 * m + n, :m] = -pid * jacobian
+        return np.concatenate([rate, acceleration, pid * error, 0 * disturbance]), by_state, unsure
+
+    def _expected_friction(
+        self, velocity: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Expectation of dry friction over the Coulomb torque, its derivative by the velocity, and the variance of its
+        torque about this line."""
+        law = self._model.friction
+        smooth = np.sqrt(2 / np.pi) * (law.smoothing_velocity or 0.0)
+        width = np.sqrt(np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian) + smooth**2 + 1e-12)
+        more = np.abs(law.level(velocity)) if law.name == "stribeck" else 1.0
+        ratio = velocity / width
+        level, slope = more * erf(ratio / np.sqrt(2)), np.sqrt(2 / np.pi) / width * np.exp(-(ratio**2) / 2)
+        unsure = self._coulomb**2 * np.maximum(more**2 - level**2 - (slope * width) ** 2, 0.0)
+        return level, slope, unsure
