@@ -30,6 +30,14 @@ ESTIMATORS = {
 """Estimators that `cmmsim estimators` compares, in the order of its table, see `identify.estimators.estimator`."""
 
 
+LAWS = {
+    "pid": "dynamics.control.pid:pid",
+    "feedforward": "dynamics.control.feedforward:feedforward",
+    "computed_torque": "dynamics.control.computed_torque:computed_torque",
+}
+"""Laws that make a robot follow a motion, see `dynamics.control.law`."""
+
+
 def check_choice(given: str, what: str, built_in: Mapping[str, str], error: type[Exception] = ScenarioError) -> None:
     """Refuse what is neither a built-in name nor ``module:function``. Raises `error` with the valid names."""
     if given not in built_in and not is_own(given):

@@ -2,11 +2,11 @@
 
     torque = ID(q, q_dot, r_ddot + Kd (r_dot - q_dot) + Kp (r - q)),   Kp = bandwidth^2, Kd = 2 damping bandwidth
 
-so that a model that is right leaves r - q as a linear oscillator, each coordinate for itself. A torque acts for a frame,
-which is why the part that the desired motion takes is its mean over that time, and dry friction is that of the desired
-motion: that of the measured velocity chatters. With an observer q and q_dot are those at which the torque arrives, and
-what the observer finds that the model does not know is taken off; without, q is the last measured pose, q_dot the
-difference of the last two, and an integral takes the place of the disturbance.
+so that a model that is right leaves r - q as a linear oscillator, each coordinate for itself. A torque acts for one
+frame, which is why the part that the desired motion takes is its mean over that time, and dry friction is that of the
+desired motion: that of the measured velocity chatters. With an observer q and q_dot are those at which the torque
+arrives, and what the observer finds that the model does not know is taken off; without, q is the last measured pose,
+q_dot the difference of the last two, and an integral takes the place of the disturbance.
 """
 
 from collections.abc import Callable
@@ -76,8 +76,8 @@ def _planned(assignment: Assignment, time: float) -> np.ndarray:
 def _correction(
     assignment: Assignment, time: float, q: np.ndarray, rates: np.ndarray, integral: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """What the torque (n,) at coordinates and rates (m,) has to be beside that of the desired motion at a time; integral
-    (m,): of the error."""
+    """What the torque (n,) at coordinates and rates (m,) has to be beside that of the desired motion at a time;
+    integral (m,): of the error."""
     chart, feedback, model = assignment.model.robot.geometry.chart, assignment.feedback, assignment.model
     pose, rate, acceleration = assignment.desired(time)
     error, error_rate, w = chart.coordinates(pose) - q, chart.coordinates(rate) - rates, feedback.bandwidth

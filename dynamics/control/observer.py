@@ -17,6 +17,7 @@ from scipy.linalg import expm
 from scipy.special import erf
 
 from dynamics.closed_loop.problem import LoopSettings
+from dynamics.closed_loop.run import LoopFailure
 from dynamics.control.inverse_dynamics import Model
 
 LONGEST_STEP = 4.2e-3
@@ -164,6 +165,9 @@ class Observer:
                 by_scale[:] = map_ @ by_scale @ map_.T
                 by_scale[0] += walked
             at = end
+        if not np.isfinite(state).all():
+            frame = round(time / self._period)
+            raise LoopFailure(f"the observer has lost the robot at frame {frame} (t = {time:.3f} s)", frame)
         return state, covariance
 
     def _acting(self, time: float) -> tuple[np.ndarray, np.ndarray]:

@@ -19,6 +19,7 @@ from identify.commands.robot import base_parameters, export, verify_model, works
 from identify.commands.scene import replay, show
 from identify.commands.sensor import acceptance, detectors
 from identify.commands.study import study
+from identify.commands.track import track
 from identify.errors import IdentifyError, VerificationError
 from identify.runtime import stoppable
 
@@ -109,7 +110,7 @@ SETTING_UP = "Setting up"
 
 _add(EXPERIMENT, run)
 _add(STAGES, excite, record, identify, validate, report)
-_add(RECORDS, estimators, variation)
+_add(RECORDS, estimators, variation, track)
 _add(PICTURES, replay, show)
 _add(ROBOTS, check, cls=Judging)
 _add(ROBOTS, workspace, base_parameters, geometry)

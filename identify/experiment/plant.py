@@ -1,6 +1,7 @@
 """The simulated real robot of a scenario: what it is, does and carries, and where it is not the robot that is known."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -18,6 +19,7 @@ from dynamics.closed_loop import (
     simulate,
     stability,
 )
+from dynamics.control.law import LawInLoop
 from dynamics.geometry_error import with_geometry_error
 from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
@@ -59,18 +61,23 @@ class Plant:
         sensor: PoseSensor | RateSensor | None = None,
         latencies: Array | None = None,
         load: Array | None = None,
+        law: LawInLoop | None = None,
     ) -> ClosedLoopRun:
         """Follow a reference under a servo that knows the nominal robot; sensor None: an ideal one.
 
-        load (p,): what the platform carries, as it adds to the parameters. Raises what `dynamics.closed_loop.simulate`
-        does, and says of a loop that is lost what its linear map says.
+        load (p,): what the platform carries, as it adds to the parameters; law: None for the servo alone. Raises what
+        `dynamics.closed_loop.simulate` does, and says of a loop that is lost what its linear map says.
         """
         parameters = self.parameters if load is None else self.parameters + load
         settings = self._settings_at(parameters, reference.poses[0])
-        known = None if self.robot is self.nominal else self.nominal
+        known, law = None if self.robot is self.nominal else self.nominal, law or LawInLoop(drives=settings.drives)
+        asked: dict[str, Any] = {"feedforward": law.feedforward, "controller": law.controller}
+        asked |= {"latencies": latencies, "servo_robot": known}
         try:
-            return simulate(self.robot, parameters, reference, settings, sensor, latencies=latencies, servo_robot=known)
+            return simulate(self.robot, parameters, reference, replace(settings, drives=law.drives), sensor, **asked)
         except LoopFailure as error:
+            if law.controller is not None:
+                raise
             said = stability.verdict(self.nominal, parameters, settings, reference.poses[0])
             raise LoopFailure(f"{error}; {said}", error.frame) from None
 

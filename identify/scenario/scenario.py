@@ -15,6 +15,7 @@ from identify.scenario.parameter_names import check_parameter_names
 from identify.scenario.sections import (
     GEOMETRY_KNOWN,
     RIG_KNOWN,
+    Control,
     Excitation,
     Filter,
     Geometry,
@@ -48,6 +49,7 @@ class Scenario(Section):
     rig: Rig = Rig()
     timing: Timing = Timing()
     servo: Servo = Servo()
+    control: Control = Control()
     plant: Plant = Plant()
     model: Model = Model()
     excitation: Excitation = Excitation()

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from identify.plugins import CRITERIA, check_choice
+from identify.plugins import CRITERIA, LAWS, check_choice
 
 ROUNDING = 1e-9
 """Share by which the moments of a flat body may miss their sum."""
@@ -55,6 +55,7 @@ ACTUATOR_KEYS = {
     "encoder_noise": ("encoder_noise_rad", "encoder_noise_m"),
     "encoder_resolution": ("encoder_resolution_rad", "encoder_resolution_m"),
     "encoder_offset": ("encoder_offset_rad", "encoder_offset_m"),
+    "torque_limit": ("torque_limit_N_m", "torque_limit_N"),
     "max_joint_velocity": ("max_joint_velocity_rad_s", "max_joint_velocity_m_s"),
 }
 """Settings of the joints: their key where a robot's actuators turn, and where they slide."""
@@ -77,6 +78,28 @@ class Servo(Section):
     kp: float = quantity(0.3, "1", "proportional gain", ge=0)
     kd: float = quantity(0.001, "s", "derivative gain", ge=0)
     ki: float = quantity(2.4, "1/s", "integral gain", ge=0)
+
+
+class Control(Section):
+    """The law by which `cmmsim track` makes the robot follow a motion. All other runs are under the law pid."""
+
+    law: str = Field("pid", description=f"{', '.join(LAWS)}, or module:function")
+    observer: bool = Field(
+        True, description="whether a law that knows a model predicts the pose over latency, jitter and lost frames"
+    )
+    torque_access: bool = Field(True, description="whether the drives take torques, or joint commands only")
+    torque_limit_N_m: float | None = quantity(None, "N m", "largest torque of an actuator", gt=0)
+    torque_limit_N: float | None = quantity(None, "N", "the same, where actuators slide", gt=0)
+    bandwidth_rad_s: float | None = quantity(
+        None, "rad/s", "of the loop of computed_torque; by default as fast as frame rate and latency allow", gt=0
+    )
+    damping: float = quantity(1.0, "1", "of that loop", gt=0, le=10)
+
+    @field_validator("law")
+    @classmethod
+    def _can_be_found(cls, law: str) -> str:
+        check_choice(law, "law", LAWS, ValueError)
+        return law
 
 
 class _Friction(Section):

@@ -1,0 +1,107 @@
+"""The command ``track``: what a model is worth to a controller. Heavy imports are late."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from identify.commands.options import (
+    JsonFile,
+    Quiet,
+    RobotOption,
+    ScenarioArgument,
+    Seed,
+    Settings,
+    chosen_scenario,
+    new_folder,
+    repeatable,
+    tell,
+)
+from identify.errors import ScenarioError
+from identify.files.run_folder import new_run_folder, save_files
+from identify.plugins import LAWS
+from identify.progress import print_table, terminal_progress
+
+ALL = "all"
+
+
+def track(
+    scenario: ScenarioArgument = "quick",
+    law: Annotated[
+        list[str] | None, repeatable(f"Law: {', '.join(LAWS)}, module:function, or {ALL}", "the scenario's")
+    ] = None,
+    model: Annotated[
+        list[str] | None, repeatable(f"Model that the law knows: initial, identified, true, or {ALL}", ALL)
+    ] = None,
+    run: Annotated[
+        Path | None,
+        typer.Option(
+            "--run", metavar="DIR", help="Folder of a run whose estimates are the identified model; else it is made."
+        ),
+    ] = None,
+    motion: Annotated[
+        Path | None,
+        typer.Option("--motion", metavar="FILE", help="CSV file of poses to follow instead of the usual motions."),
+    ] = None,
+    out: Annotated[Path | None, new_folder("runs/track-SCENARIO-SEED")] = None,
+    seed: Seed = 0,
+    robot: RobotOption = None,
+    settings: Settings = None,
+    json: JsonFile = None,
+    quiet: Quiet = False,
+) -> None:
+    """Follow motions under control laws that know a model of the robot.
+
+    The simulated robot follows the scenario's unseen trajectories, a circle and a square, with images in the loop:
+    under the paper's servo (pid), with joint commands shaped by the inverse dynamics (feedforward), or with torques
+    (computed_torque). The law knows the starting model, the identified one, or the truth. Told are the errors of the
+    true poses, the effort, and how much of the squared error would go if the sensor, the model or the latency were
+    exact. The scenario's [control] says whether an observer predicts the pose, and what the actuators take and give.
+
+    Reads a scenario; the folder of a whole run, if one is named; and, if named, a CSV file of poses with the columns t,
+    x, y, z, alpha, beta, gamma in s, m and rad. It writes track.json and scenario.toml.
+
+    \b
+    Examples:
+      cmmsim track quick --law all --model all
+      cmmsim track quick --law feedforward --model identified --run runs/quick-0
+      cmmsim track quick --law computed_torque --model true --set control.observer=false
+      cmmsim track quick --law feedforward --model true --motion poses.csv
+    """
+    from identify.tracking.track import MODELS
+    from identify.tracking.track import track as follow_all
+
+    chosen = chosen_scenario(scenario, settings, robot)
+    laws = _each(law or [chosen.control.law], tuple(LAWS))
+    models = _each(model or [ALL], MODELS)
+    unknown = [name for name in models if name not in MODELS]
+    if unknown:
+        raise ScenarioError(f"unknown model {unknown[0]!r}; valid: {', '.join(MODELS)}, or {ALL}")
+    folder = new_run_folder(out or Path("runs") / f"track-{chosen.name}-{seed}").path
+    entry = follow_all(chosen, laws, models, seed, terminal_progress(quiet), run, motion)
+    save_files(folder, {"track.json": entry, "scenario.toml": chosen.to_toml()})
+    tell(entry, json, quiet, lambda: _print(entry, folder))
+
+
+def _each(given: list[str], every: tuple[str, ...]) -> list[str]:
+    return list(dict.fromkeys(name for one in given for name in (every if one == ALL else (one,))))
+
+
+def _print(entry: dict[str, Any], folder: Path) -> None:
+    rows, failed = [], []
+    for run in entry["runs"]:
+        if "failed" in run:
+            failed.append(f"{run['law']} with the {run['model']} model: {run['failed']}")
+        figures = (*run["position_rms_um"], *run["orientation_rms_urad"])
+        shares = [run["shares"][what]["position"] for what in ("sensor", "model", "latency")] if "shares" in run else []
+        effort = f"{run['effort_rms']:.3g}" if "effort_rms" in run else ""
+        shown = [f"{100 * share:.0f} %" for share in shares] or [""] * 3
+        rows.append((run["law"], run["model"], *(f"{value:.1f}" for value in figures), effort, *shown))
+    header = ("law", "model", "x\num", "y\num", "z\num", "alpha\nurad", "beta\nurad", "gamma\nurad", "effort")
+    print_table((*header, "sensor", "model\nexact", "latency"), rows, header[:2], "rms error of the followed poses")
+    for said in failed:
+        typer.echo(f"lost: {said}")
+    saturated = {run["law"]: run["saturated_frames"] for run in entry["runs"] if run.get("saturated_frames")}
+    for name, frames in saturated.items():
+        typer.echo(f"{name}: an actuator is at its limit in {frames} frames")
+    typer.echo(f"files: {folder}")

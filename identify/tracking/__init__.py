@@ -1,0 +1,1 @@
+"""Tracking: how well the robot follows motions under a law and a model, with images in the loop (`cmmsim track`)."""

@@ -1,0 +1,177 @@
+"""Motions to follow, all from rest: unseen Fourier trajectories, a circle, a square with corners, poses of one's own.
+
+Circle and square lie in the first two coordinates of the platform, within the box of the scenario's excitation, and
+start at home.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+
+from dynamics import Robot
+from dynamics.control.inverse_dynamics import Motion
+from dynamics.errors import DynamicsError
+from dynamics.kinematics.chart import POSE_NAMES, Chart
+from identify.arrays import Array
+from identify.errors import TrajectoryError
+from identify.excitation.design import unseen_trajectories
+from identify.scenario import Scenario
+from identify.trajectory import box_of
+
+COLUMNS = ("t", *POSE_NAMES)
+FEWEST_ROWS = 6
+"""That a spline of fifth degree needs."""
+
+
+@dataclass(frozen=True)
+class NamedMotion:
+    """A motion, how it is called, and how long it takes, s."""
+
+    name: str
+    motion: Motion
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class AlongCoordinates:
+    """A motion by its coordinates (N, m) at times (N,), s, given as functions: them and their first two derivatives."""
+
+    chart: Chart
+    coordinates: tuple  # of three functions
+
+    def pose(self, t: Array) -> Array:
+        """Poses (N, 6), m and rad."""
+        return self.chart.pose(self.coordinates[0](t))
+
+    def pose_rate(self, t: Array) -> Array:
+        """Their time derivatives (N, 6)."""
+        return self.chart.lifted(self.coordinates[1](t))
+
+    def pose_acceleration(self, t: Array) -> Array:
+        """Their second time derivatives (N, 6)."""
+        return self.chart.lifted(self.coordinates[2](t))
+
+
+def motions(robot: Robot, scenario: Scenario, seed: int, own: Path | None = None) -> list[NamedMotion]:
+    """The scenario's unseen trajectories, a circle and a square; or only the poses of a file, `read_motion`.
+
+    Raises TrajectoryError.
+    """
+    if own is not None:
+        return [read_motion(own, robot)]
+    duration = scenario.validation.duration_s
+    unseen = unseen_trajectories(robot, scenario, seed)
+    found: list[NamedMotion] = [NamedMotion(f"unseen {k}", path, duration) for k, path in enumerate(unseen, start=1)]
+    limits = scenario.excitation
+    box = box_of(robot.geometry.chart, limits.position_amplitude_m, limits.orientation_amplitude_rad)
+    turn_s = 1 / (limits.fundamental_hz * limits.harmonics)
+    found.append(NamedMotion("circle", circle(robot, float(box[0]) / 2, turn_s), duration))
+    found.append(NamedMotion("corner", square(robot, float(box[:2].min()), duration / 5), duration))
+    return found
+
+
+def circle(robot: Robot, radius: float, turn_s: float) -> AlongCoordinates:
+    """Round and round through home with a time for each turn, s, which it reaches smoothly within the first."""
+    home = robot.coordinates(robot.home_pose)
+    speed = 2 * np.pi / turn_s
+
+    def angle(t: Array) -> tuple[Array, Array, Array]:
+        share = np.clip(t / turn_s, 0.0, 1.0)
+        travelled = share**4 * (2.5 - 3 * share + share**2)  # the integral of the smooth step of fifth degree
+        step = share**3 * (10 - 15 * share + 6 * share**2)
+        rising = 30 * share**2 * (1 - share) ** 2 / turn_s
+        return speed * (turn_s * travelled + np.maximum(t - turn_s, 0.0)), speed * step, speed * rising
+
+    def laid(first: Array, second: Array, base: Array) -> Array:
+        rows = np.tile(base, (len(first), 1))
+        rows[:, 0] += radius * first
+        rows[:, 1] += radius * second
+        return rows
+
+    def place(t: Array) -> Array:
+        phi = angle(np.asarray(t))[0]
+        return laid(np.cos(phi) - 1, np.sin(phi), home)
+
+    def rate(t: Array) -> Array:
+        phi, w, _ = angle(np.asarray(t))
+        return laid(-np.sin(phi) * w, np.cos(phi) * w, 0 * home)
+
+    def acceleration(t: Array) -> Array:
+        phi, w, rising = angle(np.asarray(t))
+        return laid(-np.cos(phi) * w**2 - np.sin(phi) * rising, np.cos(phi) * rising - np.sin(phi) * w**2, 0 * home)
+
+    return AlongCoordinates(robot.geometry.chart, (place, rate, acceleration))
+
+
+def square(robot: Robot, side: float, edge_s: float) -> AlongCoordinates:
+    """From home along the first coordinate, then the second, and back, each edge from rest to rest in a time, s: as a
+    polynomial of fifth degree, whose jerk is at most 60 side / edge_s^3."""
+    home = robot.coordinates(robot.home_pose)
+    corners = side * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.0, 0.0]])
+
+    def rows(t: Array, along: Array, base: Array, whole: float) -> Array:
+        edge = np.clip(np.floor(np.asarray(t) / edge_s).astype(int), 0, 3)
+        laid = np.tile(base, (len(edge), 1))
+        laid[:, :2] += whole * corners[edge] + along[:, None] * np.diff(corners, axis=0)[edge]
+        return laid
+
+    def share(t: Array) -> Array:
+        edge = np.clip(np.floor(np.asarray(t) / edge_s), 0, 3)
+        return np.clip(np.asarray(t) / edge_s - edge, 0.0, 1.0)
+
+    def place(t: Array) -> Array:
+        s = share(t)
+        return rows(t, s**3 * (10 - 15 * s + 6 * s**2), home, 1.0)
+
+    def rate(t: Array) -> Array:
+        s = share(t)
+        return rows(t, 30 * s**2 * (1 - s) ** 2 / edge_s, 0 * home, 0.0)
+
+    def acceleration(t: Array) -> Array:
+        s = share(t)
+        return rows(t, 60 * s * (1 - s) * (1 - 2 * s) / edge_s**2, 0 * home, 0.0)
+
+    return AlongCoordinates(robot.geometry.chart, (place, rate, acceleration))
+
+
+def read_motion(path: Path, robot: Robot) -> NamedMotion:
+    """A motion through the poses of a CSV file with the columns t, x, y, z, alpha, beta, gamma, s, m and rad: a spline
+    of fifth degree, at rest and without acceleration at both ends.
+
+    Raises TrajectoryError: unreadable, columns missing, too few rows, times that do not begin at 0 or do not increase,
+    numbers that are not finite, or poses that the platform cannot have.
+    """
+    try:
+        lines = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise TrajectoryError(f"cannot read the motion {path}: {error}") from None
+    header = [name.strip() for name in lines[0]] if lines else []
+    missing = [name for name in COLUMNS if name not in header]
+    if missing:
+        raise TrajectoryError(f"{path} lacks the columns {', '.join(missing)}; it needs {', '.join(COLUMNS)}")
+    table = np.empty((len(lines) - 1, len(COLUMNS)))
+    for row, line in enumerate(lines[1:]):
+        try:
+            table[row] = [float(line[header.index(name)]) for name in COLUMNS]
+        except (ValueError, IndexError):
+            raise TrajectoryError(f"{path}, row {row + 1}: {','.join(line)!r} are not {len(COLUMNS)} numbers") from None
+    times, poses = table[:, 0], table[:, 1:]
+    if len(table) < FEWEST_ROWS or not np.isfinite(table).all():
+        raise TrajectoryError(f"{path} has {len(table)} rows; it needs at least {FEWEST_ROWS}, of finite numbers")
+    if times[0] != 0 or not (np.diff(times) > 0).all():
+        raise TrajectoryError(f"{path}: times must begin at 0 and increase")
+    try:
+        robot.charted(poses)
+    except DynamicsError as error:
+        raise TrajectoryError(f"{path}: {error}") from None
+    still = [(1, np.zeros(len(robot.coordinate_names))), (2, np.zeros(len(robot.coordinate_names)))]
+    spline = make_interp_spline(times, robot.coordinates(poses), k=5, bc_type=(still, still))
+    end = float(times[-1])
+
+    def held(order: int):
+        derivative = spline.derivative(order)
+        return lambda t: derivative(np.clip(t, 0.0, end)) * (1.0 if order == 0 else (np.asarray(t) <= end)[:, None])
+
+    return NamedMotion(path.stem, AlongCoordinates(robot.geometry.chart, (held(0), held(1), held(2))), end)

@@ -1,0 +1,203 @@
+"""Laws and models side by side on the same motions: tracking error, effort, and what has which share of the error."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import cmmsim
+from dynamics.errors import DynamicsError
+from identify.arrays import Array
+from identify.errors import RecordError, ScenarioError
+from identify.estimation.identification import identify
+from identify.estimation.prior import starting_guess
+from identify.excitation.design import design_trajectories
+from identify.experiment.plant import Plant, build_plant
+from identify.experiment.run import excitation_run, taught_sensor
+from identify.experiment.sensor_in_loop import SensorInLoop, with_renderer
+from identify.files.run_folder import load_result, rms_figures
+from identify.files.versions import versions
+from identify.loop_parameters import parameter_column
+from identify.progress import Progress
+from identify.random_streams import LATENCY, NOISE, TRACKED, child, stream_seed
+from identify.scenario import Scenario
+from identify.tracking.following import Seen, by_drawing, by_images, follow, prepared
+from identify.tracking.motions import NamedMotion, motions
+
+MODELS = ("initial", "identified", "true")
+"""The scenario's starting model, the identified one, and the plant's parameters."""
+
+FIRST_RUN = 2_000_000
+"""Number of the first run, beyond all others."""
+
+EXACT = ("sensor", "model", "latency")
+"""What is made exact, one by one, to know its share of the error."""
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """What is followed how: all laws with all models (p,) by name on all motions."""
+
+    plant: Plant
+    sensor: cmmsim.Sensor
+    motions: Sequence[NamedMotion]
+    models: dict[str, Array]
+    laws: Sequence[str]
+    seed: int
+
+
+def track(
+    scenario: Scenario,
+    laws: Sequence[str],
+    models: Sequence[str],
+    seed: int,
+    progress: Progress,
+    run_folder: Path | None = None,
+    own: Path | None = None,
+) -> dict[str, Any]:
+    """The content of track.json. run_folder: of a whole run, whose estimates are the identified model; None: the robot
+    is identified first, as the scenario says. own: a CSV file with poses to follow instead of the usual motions.
+
+    Raises ScenarioError, TrajectoryError, RecordError and what an identification raises.
+    """
+    scenario = with_renderer(scenario)
+    plant = build_plant(scenario)
+    followed = motions(plant.nominal, scenario, seed, own)
+    known = {name: _parameters(plant, name, run_folder) for name in models if name != "identified" or run_folder}
+    unseen = Seen(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
+    for law in laws:  # refused before the sensor is taught
+        for motion in followed:
+            prepared(plant, law, plant.parameters, motion, unseen)
+    sensor = taught_sensor(scenario, plant.nominal, seed, progress)
+    if "identified" in models and not run_folder:
+        known["identified"] = _identified(plant, sensor, seed, progress)
+    task = Tracking(plant, sensor, followed, {name: known[name] for name in models}, laws, seed)
+    return {
+        "scenario": scenario.name,
+        "seed": seed,
+        "robot": plant.nominal.name,
+        "versions": versions(),
+        "frame_rate_hz": scenario.timing.frame_rate_hz,
+        "latency_s": scenario.timing.latency_s,
+        "motions": [motion.name for motion in followed],
+        "runs": _runs(task, progress),
+    }
+
+
+def _parameters(plant: Plant, model: str, run_folder: Path | None) -> Array:
+    robot = plant.nominal
+    if model == "true":
+        return plant.parameters
+    if model == "initial":
+        return starting_guess(robot, plant.scenario.model.start_parameters, 1.0).values
+    assert run_folder is not None
+    path = run_folder / "result.json"
+    try:
+        column = parameter_column(load_result(path).get("identification"), "estimate", robot.layout.names)
+    except RecordError as error:
+        raise RecordError(f"{path}: {error}") from None
+    return np.array(column)
+
+
+def _identified(plant: Plant, sensor: cmmsim.Sensor, seed: int, progress: Progress) -> Array:
+    """Estimates (p,) from the scenario's excitation, which runs under the law pid."""
+    scenario = plant.scenario
+    if scenario.identification.scale_anchor == "payload":
+        raise ScenarioError("identification.scale_anchor = payload needs two runs: identify first, and pass --run DIR")
+    trajectories = design_trajectories(plant.nominal, scenario, seed, progress)
+    with progress.stage("record", scenario.timing.frames(scenario.excitation.duration_s)) as advance:
+        experiment = excitation_run(plant, sensor, trajectories.excitation, seed, advance)
+    return identify(experiment.record, plant.nominal, scenario, progress).estimate
+
+
+def _runs(task: Tracking, progress: Progress) -> list[dict[str, Any]]:
+    timing = task.plant.scenario.timing
+    frames = sum(timing.frames(motion.duration_s) for motion in task.motions)
+    without_model: dict[str, Any] = {}
+    runs = []
+    with progress.stage(
+        "track", frames * (sum(1 if law == "pid" else len(task.models) for law in task.laws))
+    ) as advance:
+        for law in task.laws:
+            for model in task.models:
+                if law == "pid" and without_model:  # the same whatever the model
+                    entry = without_model
+                else:
+                    entry = _entry(task, law, model, advance)
+                without_model = entry if law == "pid" else without_model
+                runs.append({"law": law, "model": model} | entry)
+    return runs
+
+
+def _entry(task: Tracking, law: str, model: str, advance: Any) -> dict[str, Any]:
+    """One law with one model on all motions."""
+    robot, parameters = task.plant.robot, task.models[model]
+    errors, rows, effort, normalised, covariances, lost = [], [], [], [], [], 0
+    for number, motion in enumerate(task.motions):
+        latencies = _latencies(task, number, motion)
+        eye = SensorInLoop(task.sensor, robot, stream_seed(task.seed, NOISE, FIRST_RUN + number), advance)
+        seen = by_images(task.sensor, eye)
+        try:
+            done = follow(task.plant, law, parameters, motion, seen, latencies)
+        except DynamicsError as error:
+            return {"failed": f"{motion.name}: {error}"} | rms_figures(np.full((1, 6), np.nan))
+        errors.append(done.errors)
+        lost += int((~done.run.measured_ok).sum())
+        effort.append(done.run.torque)
+        covariances += [seen.noise(frame) for frame in np.flatnonzero(done.run.measured_ok)]
+        found = done.normalised_squared_error(robot.coordinates(done.run.pose))
+        normalised += [] if found is None else [found]
+        rows.append({"motion": motion.name, **rms_figures(done.errors), "saturated_frames": done.saturated})
+    torque = np.concatenate(effort)
+    return {
+        **rms_figures(np.concatenate(errors)),
+        "effort_rms": float(np.sqrt(np.mean(torque**2))),
+        "effort_largest": float(np.abs(torque).max()),
+        "effort_unit": robot.layout.unit("joint1.coulomb"),
+        "saturated_frames": sum(row["saturated_frames"] for row in rows),
+        "lost_frames": lost,
+        "observer_normalised_error": float(np.mean(normalised)) if normalised else None,
+        "shares": _shares(task, law, parameters, np.mean(covariances, axis=0)),
+        "motions": rows,
+    }
+
+
+def _shares(task: Tracking, law: str, parameters: Array, covariance: Array) -> dict[str, Any]:
+    """Shares of the squared error that go when sensor, model or latency is made exact, of positions and orientations;
+    by runs whose poses are drawn with the noise that the sensor stated."""
+    base = _drawn(task, law, parameters, covariance, None)
+    shares = {}
+    for what in EXACT:
+        exact = _drawn(task, law, parameters, covariance, what)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            left = [np.nansum(exact[part]) / np.nansum(base[part]) for part in (slice(0, 3), slice(3, 6))]
+        shares[what] = dict(zip(("position", "orientation"), (1 - np.array(left)).tolist(), strict=True))
+    return shares
+
+
+def _drawn(task: Tracking, law: str, parameters: Array, covariance: Array, exact: str | None) -> Array:
+    """Mean squared errors (6,) over all motions, with one thing exact."""
+    plant = task.plant
+    if exact == "latency":
+        still = {"timing.latency_s": 0.0, "timing.latency_jitter_s": 0.0, "timing.dropout": 0.0}
+        plant = build_plant(plant.scenario.with_overrides(still), plant.nominal)
+    dropout, squares = plant.scenario.timing.dropout, []
+    for number, motion in enumerate(task.motions):
+        rng = np.random.default_rng(child(task.seed, TRACKED, number))
+        lost = rng.random(plant.scenario.timing.frames(motion.duration_s)) < dropout
+        seen = by_drawing(covariance, lost, rng, exact == "sensor")
+        known = plant.parameters if exact == "model" else parameters
+        latencies = None if exact == "latency" else _latencies(task, number, motion)
+        try:
+            squares.append(follow(plant, law, known, motion, seen, latencies).errors ** 2)
+        except DynamicsError:
+            return np.full(6, np.nan)
+    return np.asarray(np.concatenate(squares).mean(axis=0))
+
+
+def _latencies(task: Tracking, number: int, motion: NamedMotion) -> Array | None:
+    timing = task.plant.scenario.timing
+    rng = np.random.default_rng(stream_seed(task.seed, LATENCY, FIRST_RUN + number))
+    return timing.drawn_latencies(timing.frames(motion.duration_s), rng)
