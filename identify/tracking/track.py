@@ -117,9 +117,8 @@ def _runs(task: Tracking, progress: Progress) -> list[dict[str, Any]]:
     frames = sum(timing.frames(motion.duration_s) for motion in task.motions)
     without_model: dict[str, Any] = {}
     runs = []
-    with progress.stage(
-        "track", frames * (sum(1 if law == "pid" else len(task.models) for law in task.laws))
-    ) as advance:
+    followed = sum(1 if law == "pid" else len(task.models) for law in task.laws)
+    with progress.stage("track", frames * followed) as advance:
         for law in task.laws:
             for model in task.models:
                 if law == "pid" and without_model:  # the same whatever the model
@@ -135,10 +134,12 @@ def _entry(task: Tracking, law: str, model: str, advance: Any) -> dict[str, Any]
     """One law with one model on all motions."""
     robot, parameters = task.plant.robot, task.models[model]
     errors, rows, effort, normalised, covariances, lost = [], [], [], [], [], 0
+    free = robot.geometry.chart.basis
+    common = free.T @ task.sensor.taught.calibration_covariance(robot.home_pose) @ free
     for number, motion in enumerate(task.motions):
         latencies = _latencies(task, number, motion)
         eye = SensorInLoop(task.sensor, robot, stream_seed(task.seed, NOISE, FIRST_RUN + number), advance)
-        seen = by_images(task.sensor, eye)
+        seen = by_images(eye)
         try:
             done = follow(task.plant, law, parameters, motion, seen, latencies)
         except DynamicsError as error:
@@ -147,7 +148,7 @@ def _entry(task: Tracking, law: str, model: str, advance: Any) -> dict[str, Any]
         lost += int((~done.run.measured_ok).sum())
         effort.append(done.run.torque)
         covariances += [seen.noise(frame) for frame in np.flatnonzero(done.run.measured_ok)]
-        found = done.normalised_squared_error(robot.coordinates(done.run.pose))
+        found = done.normalised_squared_error(robot.coordinates(done.run.pose), common)
         normalised += [] if found is None else [found]
         rows.append({"motion": motion.name, **rms_figures(done.errors), "saturated_frames": done.saturated})
     torque = np.concatenate(effort)
