@@ -41,16 +41,42 @@ def frame_map(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose
     return _frame_map(_near_rest(robot, parameters, pose), settings)
 
 
+def pose_response(
+    robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray
+) -> Callable[[float], np.ndarray]:
+    """What the coordinates do when the desired ones oscillate by a little about a pose (6,): a function of the angular
+    frequency, rad/s, that gives the matrix (m, m) from the desired to the true ones, at the frames.
+
+    Raises what `closed_loop.equilibrium` raises.
+    """
+    near = _near_rest(robot, parameters, pose)
+    joints, size = near.jacobian.shape
+    map_, by_desired = np.split(_with_desired(near, settings), [-size], axis=1)
+    one, period = np.eye(len(map_)), 1 / settings.timing.frame_rate_hz
+
+    def response(frequency: float) -> np.ndarray:
+        return np.linalg.solve(np.exp(1j * frequency * period) * one - map_, by_desired)[:size]
+
+    return response
+
+
 def _frame_map(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
+    return _with_desired(robot, settings)[:, : -robot.jacobian.shape[1]]
+
+
+def _with_desired(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
+    """The frame map (s, s), and beside it (s, m) what the desired coordinates of the frame do."""
     (joints, size), timing = robot.jacobian.shape, settings.timing
     period, servo = 1 / timing.frame_rate_hz, _servo(robot, settings)
     whole = floor(timing.latency_s / period + 1e-9)
     rest = max(0.0, timing.latency_s - whole * period)
     inner, kept = 2 * size + joints, whole + 2
-    start = np.eye(inner + 2 * size + kept * joints)
-    coordinates, integral = start[:size], start[inner + size : inner + 2 * size]
+    states = inner + 2 * size + kept * joints
+    start, desired = np.eye(states, states + size), np.eye(size, states + size, states)
+    coordinates, integral = start[:size] - desired, start[inner + size : inner + 2 * size]
     seen = np.vstack([coordinates, start[inner : inner + size], integral])
-    commands = [servo @ seen, *np.split(start[inner + 2 * size :], kept)]
+    turned = (robot.turning if settings.servo.ki else 0 * robot.turning) @ start[:size]  # without: no demand at rest
+    commands = [servo @ seen + turned, *np.split(start[inner + 2 * size :], kept)]
     state = start[:inner]
     for age, begin, end in ((whole + 1, 0.0, rest), (whole, rest, period)):
         newer, older = commands[age], commands[age + 1] if age + 1 <= kept else commands[age]
@@ -76,7 +102,7 @@ def gain_margin(robot: Robot, parameters: np.ndarray, settings: LoopSettings, po
         servo = ServoGains(factor * gains.kp, factor * gains.kd, factor * gains.ki)
         return _radius(near, replace(settings, servo=servo))
 
-    return _last_stable(radius, 1.0, MOST_GAIN, 1 / MOST_GAIN)
+    return last_stable(radius, 1.0, MOST_GAIN, 1 / MOST_GAIN)
 
 
 def lowest_frame_rate(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> float:
@@ -91,7 +117,7 @@ def lowest_frame_rate(robot: Robot, parameters: np.ndarray, settings: LoopSettin
         return _radius(near, replace(settings, timing=timing))
 
     fastest = min(100 * rate, 50 / settings.timing.latency_s if settings.timing.latency_s else np.inf)
-    return _last_stable(radius, rate, SLOWEST_HZ, fastest)
+    return last_stable(radius, rate, SLOWEST_HZ, fastest)
 
 
 def verdict(robot: Robot, parameters: np.ndarray, settings: LoopSettings, pose: np.ndarray) -> str:
@@ -153,18 +179,31 @@ def _joint_loop(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> np.nd
 
 
 def _servo(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
-    """The command of a frame by [coordinates, those measured before, servo integral before]."""
+    """The command of a frame by [coordinates less the desired, those of the frame before, servo integral before]."""
     gains, period, jacobian = settings.servo, 1 / settings.timing.frame_rate_hz, robot.jacobian
-    turning = robot.turning if gains.ki else 0 * robot.turning  # without integral the servo demands nothing at rest
-    by_now = turning - (gains.kp + gains.kd / period + gains.ki * period) * jacobian
+    by_now = -(gains.kp + gains.kd / period + gains.ki * period) * jacobian
     return np.hstack([by_now, gains.kd / period * jacobian, gains.ki * jacobian])
+
+
+def torque_motion(robot: Robot, parameters: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Near rest at a pose (6,), of a robot whose drives hold torques: d/dt (2 m, 2 m) of coordinates and rates, and the
+    accelerations (m, n) of torques beside those that hold it."""
+    q, rest = robot.coordinates(pose), np.zeros(len(robot.coordinate_names))
+    rigid, _, viscous, _ = robot.layout.split(parameters)
+    mass, _, jacobian, *_ = _values(robot, "equation_of_motion", q, rest, rigid)
+    holding = robot.static_torque(pose, parameters[robot.layout.dynamic])
+    by_pose, by_rate, *_ = _values(robot, "motion_derivatives", q, rest, rest, holding, rigid)
+    damped = by_rate + jacobian.T @ (viscous[:, None] * jacobian)
+    push = np.linalg.solve(mass, jacobian.T)
+    below = -np.linalg.solve(mass, np.hstack([by_pose, damped]))
+    return np.vstack([np.eye(len(q), 2 * len(q), len(q)), below]), push
 
 
 def _values(robot: Robot, name: str, *inputs: np.ndarray) -> list[np.ndarray]:
     return [output[0] for output in robot.functions[name](*[value[None] for value in inputs])]
 
 
-def _last_stable(radius: Callable[[float], float], start: float, stable_end: float, other_end: float) -> float:
+def last_stable(radius: Callable[[float], float], start: float, stable_end: float, other_end: float) -> float:
     """Where the radius first passes 1 on the way from start to an end: the first of these if it is stable at the start,
     which is then returned where all the way is; else the other, and NaN where no way is."""
     stable, value = radius(start) < 1, start

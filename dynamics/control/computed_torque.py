@@ -34,14 +34,19 @@ def computed_torque(assignment: Assignment) -> LawInLoop:
 
 
 def _observed(assignment: Assignment, drives: Drives, expected: list[Estimate]) -> Command:
+    import os
     watched = assignment.watched(drives)
+    share = 1 - np.exp(-float(os.environ.get("SH",".5")) * assignment.feedback.bandwidth * assignment.period)
+    taken_off = watched.disturbance
 
     def command(frame: int, time: float, measured: np.ndarray | None) -> np.ndarray:
+        nonlocal taken_off
         expected.append(watched.see(frame, measured))
         at = watched.arrival(frame)
         seen = watched.ahead(at)
         correction = _correction(assignment, at, seen.coordinates, seen.rates)
-        torque = np.asarray(_planned(assignment, at) + correction - watched.disturbance)
+        taken_off = taken_off + share * (watched.disturbance - taken_off)
+        torque = np.asarray(_planned(assignment, at) + correction - taken_off)
         watched.issue(frame, torque)
         return torque
 

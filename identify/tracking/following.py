@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dynamics.closed_loop import ClosedLoopRun, Drives, RateSensor, Reference
+from dynamics.control.gains import check_torque_gains
 from dynamics.control.inverse_dynamics import Model
 from dynamics.control.law import Assignment, Feedback, Law, LawInLoop
 from dynamics.errors import DynamicsError
@@ -20,9 +21,9 @@ from identify.scenario import Scenario
 from identify.tracking.motions import NamedMotion
 
 FASTEST = 0.5
-"""Bandwidth of computed_torque with an observer, times the time between two frames."""
+"""Bandwidth of computed_torque with an observer, times the time between two frames: its gains may then double."""
 
-FASTEST_UNSEEN = 0.75
+FASTEST_UNSEEN = 0.5
 """The same without, times the delay from the motion to its torque: the latency, half a frame of hold, one frame of
 difference."""
 
@@ -109,7 +110,7 @@ def prepared(
     """A law ready to follow a motion.
 
     Raises ScenarioError: a law that is none, or needs torques which the drives do not take. Raises TrajectoryError: a
-    motion beyond reach or travel, with time and leg.
+    motion beyond reach or travel, with time and leg. Raises SimulationError: gains that are unstable with this model.
     """
     scenario, robot = plant.scenario, plant.nominal
     chosen_law: Law = chosen(law, "law", LAWS)
@@ -121,14 +122,15 @@ def prepared(
         raise TrajectoryError(f"the robot may not follow {motion.name}: {error}") from error
     limit = of_actuators(robot, scenario.control, "torque_limit")
     settings = replace(model_settings(robot, scenario), drives=Drives(torque_limit=limit))
+    model, asked = Model(robot, parameters, settings.friction), feedback(scenario)
     usual = np.full(len(times), scenario.timing.latency_s)
     found = chosen_law(
         Assignment(
-            model=Model(robot, parameters, settings.friction),
+            model=model,
             motion=motion.motion,
             frames=len(times),
             settings=settings,
-            feedback=feedback(scenario),
+            feedback=asked,
             holding=plant.robot.static_torque(desired[0], plant.parameters[plant.robot.layout.dynamic]),
             latencies=usual if latencies is None else latencies,
             noise=seen.noise,
@@ -141,6 +143,8 @@ def prepared(
             f"law {law} sets torques, which the drives of {robot.name} do not take: control.torque_access = false; "
             "feedforward needs joint commands only"
         )
+    if law == "computed_torque":
+        check_torque_gains(model, settings, desired[0], asked)
     return found
 
 
