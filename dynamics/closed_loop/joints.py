@@ -65,12 +65,12 @@ class FrictionLaw:
     def level(self, velocity: np.ndarray) -> np.ndarray:
         """Dry friction over the Coulomb torque at joint velocities, rad/s or m/s, of any shape; 0 at rest."""
         if self.name == "smoothed":
-            return np.tanh(velocity / self.smoothing_velocity)
-        excess = 0.0
+            return np.asarray(np.tanh(velocity / self.smoothing_velocity))
+        excess = np.zeros_like(velocity)
         if self.name == "stribeck":
             assert self.static_ratio is not None
             excess = (self.static_ratio - 1) * np.exp(-((velocity / self.stribeck_velocity) ** 2))
-        return np.sign(velocity) * (1 + excess)
+        return np.asarray(np.sign(velocity) * (1 + excess))
 
     @property
     def record(self) -> np.record:

@@ -22,6 +22,9 @@ from dynamics.control.observer import Estimate
 INTEGRAL = 0.2
 """Of the gain Ki = INTEGRAL bandwidth^3, without observer."""
 
+FOLLOWED = 0.5
+"""How fast the disturbance is taken off, over the bandwidth: what dry friction does is over before it is seen."""
+
 Command = Callable[[int, float, np.ndarray | None], np.ndarray]
 
 
@@ -34,9 +37,8 @@ def computed_torque(assignment: Assignment) -> LawInLoop:
 
 
 def _observed(assignment: Assignment, drives: Drives, expected: list[Estimate]) -> Command:
-    import os
-    watched = assignment.watched(drives)
-    share = 1 - np.exp(-float(os.environ.get("SH",".5")) * assignment.feedback.bandwidth * assignment.period)
+    watched, robot = assignment.watched(drives), assignment.model.robot
+    share = 1 - np.exp(-FOLLOWED * assignment.feedback.bandwidth * assignment.period)
     taken_off = watched.disturbance
 
     def command(frame: int, time: float, measured: np.ndarray | None) -> np.ndarray:
@@ -46,7 +48,8 @@ def _observed(assignment: Assignment, drives: Drives, expected: list[Estimate]) 
         seen = watched.ahead(at)
         correction = _correction(assignment, at, seen.coordinates, seen.rates)
         taken_off = taken_off + share * (watched.disturbance - taken_off)
-        torque = np.asarray(_planned(assignment, at) + correction - taken_off)
+        turning = robot.coordinate_jacobian(robot.geometry.chart.pose(seen.coordinates)) @ seen.rates
+        torque = np.asarray(_planned(assignment, at) + correction - taken_off + watched.viscous * turning)
         watched.issue(frame, torque)
         return torque
 

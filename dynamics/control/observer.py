@@ -1,7 +1,7 @@
 """Where the robot is and will be: an extended Kalman filter of the robot in its drives, on the logged commands.
 
-The state: coordinates q (m,), their rates (m,), integral of the joint PID (n,), and a disturbance, a torque at each
-joint (n,), which is what the model has wrong and walks at random. Between two frames it follows the model's equation of
+The state: coordinates q (m,), their rates (m,), integral of the joint PID (n,), and what the model has wrong: a torque
+at each joint (n,), which walks at random, and viscous friction of each (n,), which stays. Between two frames it follows the model's equation of
 motion under the commands that have arrived by then; a frame that is lost only makes it less certain. Of dry friction
 the expectation counts, given how well the joint's velocity is known: coulomb erf(velocity / sqrt(2) deviation).
 
@@ -25,6 +25,12 @@ LONGEST_STEP = 4.2e-3
 
 WALK = 0.01
 """What the disturbance walks in a second before anything has been learnt, relative to the torques at rest."""
+
+PLACE_DOUBT, RATE_DOUBT, TORQUE_DOUBT = 1e-4, 1e-5, 1e-3
+"""Standard deviations at the start, where the robot rests: m and rad, m/s and rad/s, relative to the torques at rest."""
+
+VISCOUS_DOUBT = 5.0
+"""Standard deviation of the viscous friction that the model does not know of, over the inertia at the joint, 1/s."""
 
 KNOWN_BEFORE = (2.0, 200.0)
 """Information about the logarithms of the two scales, of the walk and of the sensor's noise, before the run."""
@@ -73,17 +79,21 @@ class Observer:
     def _start(self, pose: np.ndarray, holding: np.ndarray) -> None:
         m, n, robot = self._m, self._n, self._model.robot
         torque = robot.static_torque(pose, self._model.dynamic)
-        self._state = np.zeros(2 * m + 2 * n)
+        self._state = np.zeros(2 * m + 3 * n)
         self._state[:m] = robot.coordinates(pose)
         if self._drives.torques:
-            self._state[2 * m + n :] = torque - holding
+            self._state[2 * m + n : 2 * m + 2 * n] = torque - holding
         else:
             self._state[2 * m : 2 * m + n] = torque / self._gains[1]
         scale = np.full(n, np.abs(torque).mean())
-        self._walk = np.diag(np.concatenate([np.zeros(2 * m + n), (WALK * scale) ** 2]))
-        doubt = np.concatenate([np.full(m, 1e-4), np.full(m, 1e-5), np.zeros(n), 1e-3 * scale])
+        self._walk = np.diag(np.concatenate([np.zeros(2 * m + n), (WALK * scale) ** 2, np.zeros(n)]))
+        jacobian, free = robot.coordinate_jacobian(pose), robot.geometry.chart.basis
+        mass = free.T @ robot.mass_matrix(pose, self._model.dynamic) @ free
+        felt = 1 / np.diag(jacobian @ np.linalg.solve(mass, jacobian.T))
+        at_rest = [np.full(m, PLACE_DOUBT), np.full(m, RATE_DOUBT), np.zeros(n)]
+        doubt = np.concatenate([*at_rest, TORQUE_DOUBT * scale, VISCOUS_DOUBT * felt])
         self._covariance = np.diag(doubt**2)
-        self._by_scale = np.zeros((2, 2 * m + 2 * n, 2 * m + 2 * n))
+        self._by_scale = np.zeros((2, 2 * m + 3 * n, 2 * m + 3 * n))
         self._scale, self._information = np.zeros(2), np.diag(KNOWN_BEFORE)
 
     @property
@@ -94,7 +104,12 @@ class Observer:
     @property
     def disturbance(self) -> np.ndarray:
         """Torque (n,) at the joints that the model does not know of."""
-        return self._state[2 * self._m + self._n :].copy()
+        return self._state[2 * self._m + self._n : 2 * self._m + 2 * self._n].copy()
+
+    @property
+    def viscous(self) -> np.ndarray:
+        """Viscous friction (n,) of the joints that the model does not know of."""
+        return self._state[2 * self._m + 2 * self._n :].copy()
 
     def see(self, frame: int, pose: np.ndarray | None) -> Estimate:
         """Go on to a frame, and take in its measured pose (6,), if it is not lost; what was expected before that."""
@@ -188,14 +203,14 @@ class Observer:
         augmented = np.zeros((size + 1, size + 1))
         augmented[:size, :size], augmented[:size, size] = by_state, slope
         moved = expm(length * augmented)
-        push = by_state[self._m : 2 * self._m, 2 * self._m + self._n :]
+        push = by_state[self._m : 2 * self._m, 2 * self._m + self._n : 2 * self._m + 2 * self._n]
         return state + moved[:size, size], moved[:size, :size], length**2 * (push * unsure) @ push.T
 
     def _slope(
         self, state: np.ndarray, covariance: np.ndarray, command: np.ndarray, command_rate: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         m, n, (lp, li, ld) = self._m, self._n, self._gains
-        q, rate, integral, disturbance = np.split(state, [m, 2 * m, 2 * m + n])
+        q, rate, integral, disturbance, more = np.split(state, [m, 2 * m, 2 * m + n, 2 * m + 2 * n])
         found = self._motion(q[None], rate[None], self._rigid)
         mass, bias, jacobian, _, angle = (part[0] for part in found)
         velocity, error = jacobian @ rate, command - angle[:, 0]
@@ -204,11 +219,11 @@ class Observer:
         torque = lp * error + ld * (command_rate - velocity) + li * integral if pid else command
         limit = self._drives.torque_limit
         torque = torque if limit is None else np.clip(torque, -limit, limit)
-        net = torque + disturbance - self._viscous * velocity - self._coulomb * level
+        net = torque + disturbance - (self._viscous + more) * velocity - self._coulomb * level
         acceleration = np.linalg.solve(mass, jacobian.T @ net - bias[:, 0])
         given = (q[None], rate[None], acceleration[None], net[None], self._rigid)
         by_q, by_rate, _, _, turning = (part[0] for part in self._derivatives(*given))
-        damping = (ld * pid + self._viscous + self._coulomb * by_velocity)[:, None]
+        damping = (ld * pid + self._viscous + more + self._coulomb * by_velocity)[:, None]
         net_by_q = -lp * pid * jacobian - damping * (turning / 2)
         push = np.linalg.solve(mass, jacobian.T)
         by_state = np.zeros((len(state), len(state)))
@@ -216,9 +231,10 @@ class Observer:
         by_state[m : 2 * m, :m] = push @ net_by_q - np.linalg.solve(mass, by_q)
         by_state[m : 2 * m, m : 2 * m] = -push @ (damping * jacobian) - np.linalg.solve(mass, by_rate)
         by_state[m : 2 * m, 2 * m : 2 * m + n] = li * pid * push
-        by_state[m : 2 * m, 2 * m + n :] = push
+        by_state[m : 2 * m, 2 * m + n : 2 * m + 2 * n] = push
+        by_state[m : 2 * m, 2 * m + 2 * n :] = -push * velocity
         by_state[2 * m : 2 * m + n, :m] = -pid * jacobian
-        return np.concatenate([rate, acceleration, pid * error, 0 * disturbance]), by_state, unsure
+        return np.concatenate([rate, acceleration, pid * error, np.zeros(2 * n)]), by_state, unsure
 
     def _expected_friction(
         self, velocity: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray

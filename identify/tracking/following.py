@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynamics.closed_loop import ClosedLoopRun, Drives, RateSensor, Reference
 from dynamics.control.gains import check_torque_gains
@@ -73,7 +74,7 @@ def by_images(eye: SensorInLoop) -> Seen:
     return Seen(eye.measure, lambda frame: eye.covariances[frame])
 
 
-def by_drawing(covariance: Array, lost: Array, rng: np.random.Generator, exact: bool = False) -> Seen:
+def by_drawing(covariance: Array, lost: NDArray[np.bool_], rng: np.random.Generator, exact: bool = False) -> Seen:
     """By poses drawn about the true ones with a covariance (6, 6), none at lost frames (N,); or by the true ones."""
     factor = np.linalg.cholesky(covariance)
     drawn = rng.standard_normal((len(lost), 6)) @ factor.T

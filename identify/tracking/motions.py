@@ -4,6 +4,7 @@ Circle and square lie in the first two coordinates of the platform, within the b
 start at home.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,7 +40,7 @@ class AlongCoordinates:
     """A motion by its coordinates (N, m) at times (N,), s, given as functions: them and their first two derivatives."""
 
     chart: Chart
-    coordinates: tuple  # of three functions
+    coordinates: tuple[Callable[[Array], Array], ...]
 
     def pose(self, t: Array) -> Array:
         """Poses (N, 6), m and rad."""
@@ -170,7 +171,7 @@ def read_motion(path: Path, robot: Robot) -> NamedMotion:
     spline = make_interp_spline(times, robot.coordinates(poses), k=5, bc_type=(still, still))
     end = float(times[-1])
 
-    def held(order: int):
+    def held(order: int) -> Callable[[Array], Array]:
         derivative = spline.derivative(order)
         return lambda t: derivative(np.clip(t, 0.0, end)) * (1.0 if order == 0 else (np.asarray(t) <= end)[:, None])
 

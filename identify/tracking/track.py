@@ -147,7 +147,7 @@ def _entry(task: Tracking, law: str, model: str, advance: Any) -> dict[str, Any]
         errors.append(done.errors)
         lost += int((~done.run.measured_ok).sum())
         effort.append(done.run.torque)
-        covariances += [seen.noise(frame) for frame in np.flatnonzero(done.run.measured_ok)]
+        covariances += [seen.noise(int(frame)) for frame in np.flatnonzero(done.run.measured_ok)]
         found = done.normalised_squared_error(robot.coordinates(done.run.pose), common)
         normalised += [] if found is None else [found]
         rows.append({"motion": motion.name, **rms_figures(done.errors), "saturated_frames": done.saturated})

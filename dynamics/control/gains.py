@@ -1,0 +1,166 @@
+"""Gains by design: what bandwidth and damping a loop has near rest, and the gains that give those asked for.
+
+Bandwidth, rad/s: the lowest frequency at which the error of an oscillating desired pose reaches 1/sqrt(2) of it, in the
+worst direction. Damping: the least damping ratio of the eigenvalues of the map from frame to frame. Both are of the
+linear loop (`closed_loop.stability`), without dry friction.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.optimize import brentq, minimize
+
+from dynamics.closed_loop import stability
+from dynamics.closed_loop.problem import LoopSettings, ServoGains
+from dynamics.control.computed_torque import INTEGRAL
+from dynamics.control.inverse_dynamics import Model
+from dynamics.control.law import Feedback
+from dynamics.errors import SimulationError
+
+HALF_POWER = 2**-0.5
+AT_ONCE = 1e-3
+"""Magnitude of eigenvalues below which a motion has died within a frame."""
+MET = 0.02
+"""Share by which a designed loop may miss what was asked."""
+
+
+@dataclass(frozen=True)
+class LoopFigures:
+    """Of a loop near rest: bandwidth, rad/s; damping, 1; largest magnitude of an eigenvalue; and the factor by which
+    its gains may grow."""
+
+    bandwidth: float
+    damping: float
+    radius: float
+    gain_margin: float
+
+
+def servo_figures(model: Model, settings: LoopSettings, pose: np.ndarray) -> LoopFigures:
+    """Figures of the visual servo around the joint PID, laws pid and feedforward, near rest at a pose (6,).
+
+    Raises what `closed_loop.equilibrium` raises.
+    """
+    arguments = model.robot, model.parameters, settings, pose
+    map_ = stability.frame_map(*arguments)
+    radius, rate = stability.spectral_radius(*arguments), settings.timing.frame_rate_hz
+    bandwidth = float("nan") if radius >= 1 else _bandwidth(stability.pose_response(*arguments), rate)
+    return LoopFigures(bandwidth, _damping(map_), radius, stability.gain_margin(*arguments))
+
+
+def design_servo(
+    model: Model, settings: LoopSettings, pose: np.ndarray, bandwidth: float, damping: float
+) -> ServoGains:
+    """Gains of the visual servo for a bandwidth, rad/s, and at least a damping, near rest at a pose (6,).
+
+    Raises SimulationError where none were found, with what can be had.
+    """
+
+    def servo(logs: np.ndarray) -> ServoGains:
+        kp, kd, ki = np.exp(logs)
+        return ServoGains(float(kp), float(kd), float(ki))
+
+    def figures(logs: np.ndarray) -> tuple[float, float]:
+        arguments = model.robot, model.parameters, replace(settings, servo=servo(logs)), pose
+        return _error_share(stability.pose_response(*arguments)(bandwidth)), _damping(stability.frame_map(*arguments))
+
+    def cost(logs: np.ndarray) -> float:
+        share, damped = figures(logs)
+        return 100 * (share / HALF_POWER - 1) ** 2 + 100 * max(damping - damped, 0.0) + 1e-4 * float(logs @ logs)
+
+    period = 1 / settings.timing.frame_rate_hz
+    start = np.log([0.3, 0.06 * period, bandwidth])
+    found = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-4, "fatol": 1e-8, "maxfev": 600})
+    share, damped = figures(found.x)
+    if abs(share / HALF_POWER - 1) > MET or damped < damping - MET:
+        raise SimulationError(
+            f"no gains of the servo give {model.robot.name} a bandwidth of {bandwidth:g} rad/s with a damping of "
+            f"{damping:g} at {settings.timing.frame_rate_hz:g} Hz: found were a damping of {damped:.3g} and an error of "
+            f"{share:.3g} of the motion there, {HALF_POWER:.3g} is wanted"
+        )
+    return servo(found.x)
+
+
+def torque_figures(model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback) -> LoopFigures:
+    """Figures of the law computed_torque near rest at a pose (6,): with an observer, which foresees the latency, of the
+    feedback of what it foresees; its bandwidth is the one asked for."""
+    period, delay = 1 / settings.timing.frame_rate_hz, 0.0 if feedback.observer else settings.timing.latency_s
+
+    def map_of(factor: float) -> np.ndarray:
+        return _torque_map(model, pose, feedback, factor, period, delay)
+
+    radius = float(np.abs(np.linalg.eigvals(map_of(1.0))).max())
+    margin = stability.last_stable(
+        lambda factor: float(np.abs(np.linalg.eigvals(map_of(factor))).max()), 1.0, 1e2, 1e-2
+    )
+    return LoopFigures(feedback.bandwidth, _damping(map_of(1.0)), radius, margin)
+
+
+def check_torque_gains(model: Model, settings: LoopSettings, pose: np.ndarray, feedback: Feedback) -> None:
+    """Raise SimulationError, with eigenvalue and limit, where the law computed_torque is unstable near rest."""
+    figures = torque_figures(model, settings, pose, feedback)
+    if figures.radius >= 1:
+        raise SimulationError(
+            f"computed_torque with a bandwidth of {feedback.bandwidth:.3g} rad/s is unstable with this model at "
+            f"{settings.timing.frame_rate_hz:g} Hz: its largest eigenvalue from frame to frame is {figures.radius:.4g}, "
+            f"must be below 1; its gains must be {figures.gain_margin:.3g} times as large"
+        )
+
+
+def _torque_map(
+    model: Model, pose: np.ndarray, feedback: Feedback, factor: float, period: float, delay: float
+) -> np.ndarray:
+    """From frame to frame: coordinates, rates; and without observer those measured before, the integral of the error,
+    and the torques on their way."""
+    motion, push = stability.torque_motion(model.robot, model.parameters, pose)
+    size, joints = len(motion) // 2, push.shape[1]
+    w, one = feedback.bandwidth, np.eye(size)
+    stiff, damp = motion[size:, :size], motion[size:, size:]
+    inverse = np.linalg.pinv(push)
+    by_place, by_rate = (
+        inverse @ (-factor * k * one - a) for k, a in ((w**2, stiff), (2 * feedback.damping * w, damp))
+    )
+    inner = np.zeros((2 * size + joints, 2 * size + joints))
+    inner[: 2 * size, : 2 * size], inner[size : 2 * size, 2 * size :] = motion, push
+
+    def over(time: float) -> tuple[np.ndarray, np.ndarray]:
+        moved = expm(inner * time)[: 2 * size]
+        return moved[:, : 2 * size], moved[:, 2 * size :]
+
+    if feedback.observer:
+        moved, pushed = over(period)
+        return moved + pushed @ np.hstack([by_place, by_rate])
+    whole = int(np.floor(delay / period + 1e-9))
+    rest = max(0.0, delay - whole * period)
+    states = 4 * size + (whole + 1) * joints
+    start = np.eye(states)
+    place, before, summed = start[:size], start[2 * size : 3 * size], start[3 * size : 4 * size]
+    integral = summed - period * place
+    torque = by_place @ place + by_rate @ (place - before) / period + factor * INTEGRAL * w**3 * inverse @ integral
+    torques = [torque, *np.split(start[4 * size :], whole + 1)]
+    state = start[: 2 * size]
+    for age, time in ((whole + 1, rest), (whole, period - rest)):
+        moved, pushed = over(time)
+        state = moved @ state + pushed @ torques[age]
+    return np.vstack([state, place, integral, *torques[: whole + 1]])
+
+
+def _bandwidth(response: Callable[[float], np.ndarray], rate_hz: float) -> float:
+    """Lowest frequency, rad/s, at which the error passes `HALF_POWER`; that of Nyquist where it never does."""
+    places = np.geomspace(1e-2, np.pi * rate_hz, 60)
+    beyond = [_error_share(response(w)) > HALF_POWER for w in places]
+    first = int(np.argmax(beyond))
+    if not any(beyond) or first == 0:
+        return float(places[0 if any(beyond) else -1])
+    return float(brentq(lambda w: _error_share(response(w)) - HALF_POWER, places[first - 1], places[first], rtol=1e-6))
+
+
+def _error_share(response: np.ndarray) -> float:
+    return float(np.abs(np.linalg.eigvals(np.eye(len(response)) - response)).max())
+
+
+def _damping(map_: np.ndarray) -> float:
+    values = np.linalg.eigvals(map_).astype(complex)
+    poles = np.log(values[np.abs(values) > AT_ONCE])
+    return float(np.min(-poles.real / np.abs(poles)))
