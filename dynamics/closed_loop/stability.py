@@ -50,7 +50,7 @@ def pose_response(
     Raises what `closed_loop.equilibrium` raises.
     """
     near = _near_rest(robot, parameters, pose)
-    joints, size = near.jacobian.shape
+    size = near.jacobian.shape[1]
     map_, by_desired = np.split(_with_desired(near, settings), [-size], axis=1)
     one, period = np.eye(len(map_)), 1 / settings.timing.frame_rate_hz
 

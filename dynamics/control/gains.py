@@ -76,8 +76,8 @@ def design_servo(
     if abs(share / HALF_POWER - 1) > MET or damped < damping - MET:
         raise SimulationError(
             f"no gains of the servo give {model.robot.name} a bandwidth of {bandwidth:g} rad/s with a damping of "
-            f"{damping:g} at {settings.timing.frame_rate_hz:g} Hz: found were a damping of {damped:.3g} and an error of "
-            f"{share:.3g} of the motion there, {HALF_POWER:.3g} is wanted"
+            f"{damping:g} at {settings.timing.frame_rate_hz:g} Hz: found were a damping of {damped:.3g} and an error "
+            f"of {share:.3g} of the motion there, {HALF_POWER:.3g} is wanted"
         )
     return servo(found.x)
 
@@ -103,8 +103,8 @@ def check_torque_gains(model: Model, settings: LoopSettings, pose: np.ndarray, f
     if figures.radius >= 1:
         raise SimulationError(
             f"computed_torque with a bandwidth of {feedback.bandwidth:.3g} rad/s is unstable with this model at "
-            f"{settings.timing.frame_rate_hz:g} Hz: its largest eigenvalue from frame to frame is {figures.radius:.4g}, "
-            f"must be below 1; its gains must be {figures.gain_margin:.3g} times as large"
+            f"{settings.timing.frame_rate_hz:g} Hz: its largest eigenvalue from frame to frame is "
+            f"{figures.radius:.4g}, must be below 1; its gains must be {figures.gain_margin:.3g} times as large"
         )
 
 

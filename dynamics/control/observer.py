@@ -1,9 +1,10 @@
 """Where the robot is and will be: an extended Kalman filter of the robot in its drives, on the logged commands.
 
 The state: coordinates q (m,), their rates (m,), integral of the joint PID (n,), and what the model has wrong: a torque
-at each joint (n,), which walks at random, and viscous friction of each (n,), which stays. Between two frames it follows the model's equation of
-motion under the commands that have arrived by then; a frame that is lost only makes it less certain. Of dry friction
-the expectation counts, given how well the joint's velocity is known: coulomb erf(velocity / sqrt(2) deviation).
+at each joint (n,), which walks at random, and viscous friction of each (n,), which stays. Between two frames it follows
+the model's equation of motion under the commands that have arrived by then; a frame that is lost only makes it less
+certain. Of dry friction the expectation counts, given how well the joint's velocity is known: coulomb erf(velocity /
+sqrt(2) deviation).
 
 How fast the disturbance walks, and how far the sensor's noise is from what the sensor says, is learnt on the way: the
 scales of both covariances climb the likelihood of the innovations, by its exact gradient.
@@ -27,7 +28,7 @@ WALK = 0.01
 """What the disturbance walks in a second before anything has been learnt, relative to the torques at rest."""
 
 PLACE_DOUBT, RATE_DOUBT, TORQUE_DOUBT = 1e-4, 1e-5, 1e-3
-"""Standard deviations at the start, where the robot rests: m and rad, m/s and rad/s, relative to the torques at rest."""
+"""Standard deviations at the start, where the robot rests: m and rad, m/s and rad/s, and of torques at rest."""
 
 VISCOUS_DOUBT = 5.0
 """Standard deviation of the viscous friction that the model does not know of, over the inertia at the joint, 1/s."""

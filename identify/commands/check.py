@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from identify.commands.options import JsonFile, Quiet, RobotArgument, completion, tell
+from identify.commands.options import JsonFile, Quiet, RobotArgument, Settings, chosen_scenario, completion, tell
 from identify.errors import VerificationError
 from identify.progress import print_table, terminal_progress
 
@@ -20,15 +20,17 @@ def check(
             metavar="SET", help="Parameter set of the robot.", show_default="the scenario's truth, else initial"
         ),
     ] = None,
+    settings: Settings = None,
     json: JsonFile = None,
     quiet: Quiet = False,
 ) -> None:
     """Say in a page what a designer wants to know of a robot.
 
     Reach, travel and singularities at home and over the travel, assembly modes, holding torques, what its motion can
-    show, inertias that no body has, whether its loop is stable, up to which gains and down to which frame rate, and
-    whether the platform that the scenario's sensor sees is the robot's: each with its number and limit, and with the
-    leg that it concerns.
+    show, inertias that no body has, whether its loop is stable, up to which gains and down to which frame rate, what
+    bandwidth and damping its gains give and which gains give those that the scenario's [control] asks for, and whether
+    the platform that the scenario's sensor sees is the robot's: each with its number and limit, and with the leg that
+    it concerns.
 
     Reads a robot file, and a scenario. Writes nothing but the JSON: whether all is well, and the findings.
 
@@ -36,13 +38,13 @@ def check(
     Examples:
       cmmsim check mine.toml
       cmmsim check ups6 --scenario quick --json findings.json
+      cmmsim check ups6 --set control.servo_bandwidth_rad_s=4.0 --set control.servo_damping=0.3
     """
     from dynamics import load_robot
     from identify.loop_parameters import NOMINAL, check_parameter_set
-    from identify.scenario import load_scenario
     from identify.verification.robot_check import check_robot
 
-    chosen, given = load_robot(robot), load_scenario(scenario)
+    chosen, given = load_robot(robot), chosen_scenario(scenario, settings, None)
     name = parameters or (given.plant.parameters if given.plant.parameters in chosen.parameter_sets else NOMINAL)
     check_parameter_set(chosen, name)
     values = chosen.parameter_sets[name].vector

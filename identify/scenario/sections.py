@@ -94,6 +94,10 @@ class Control(Section):
         None, "rad/s", "of the loop of computed_torque; by default as fast as frame rate and latency allow", gt=0
     )
     damping: float = quantity(1.0, "1", "of that loop", gt=0, le=10)
+    servo_bandwidth_rad_s: float | None = quantity(
+        None, "rad/s", "for which `cmmsim check` designs gains of the visual servo", gt=0
+    )
+    servo_damping: float = quantity(0.1, "1", "least damping of that design", ge=0, lt=1)
 
     @field_validator("law")
     @classmethod

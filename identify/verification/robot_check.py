@@ -5,7 +5,7 @@ from home. The loop is judged at home, by its linear map from frame to frame, wi
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from dynamics import Robot, closed_loop, workspace
 from dynamics.closed_loop import stability
-from dynamics.errors import DynamicsError
+from dynamics.control.gains import design_servo, servo_figures, torque_figures
+from dynamics.control.inverse_dynamics import Model
+from dynamics.errors import DynamicsError, SimulationError
 from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 from identify.arrays import Array
 from identify.estimation.base_parameters import base_parameters, structural_regressor
@@ -21,6 +23,7 @@ from identify.experiment.sensor_in_loop import OFF_PLATFORM_M, platform_distance
 from identify.loop_parameters import model_settings
 from identify.progress import Progress, SilentProgress
 from identify.scenario import Excitation, Scenario
+from identify.tracking.following import feedback
 
 SAMPLES = 2000
 """Joint coordinates over the travel."""
@@ -63,6 +66,7 @@ def check_robot(
         lambda: _visible(robot),
         lambda: _bodies(robot, parameters),
         lambda: _loop(robot, parameters, model_settings(robot, scenario)),
+        lambda: _designed(robot, parameters, scenario),
         lambda: _seen(robot, scenario),
     ]
     findings = []
@@ -174,6 +178,36 @@ def _loop(robot: Robot, parameters: Array, settings: closed_loop.LoopSettings) -
     rate = stability.lowest_frame_rate(*arguments)
     text = f"the loop holds from {rate:.3g} Hz on with this latency" if rate > 0 else "no frame rate makes it stable"
     yield Finding("frame rate", rate < timing.frame_rate_hz, rate, timing.frame_rate_hz, "Hz", None, text)
+
+
+def _designed(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[Finding]:
+    """What the gains of both loops give, and those of the servo for a bandwidth and a damping that are asked for."""
+    settings, home, control = model_settings(robot, scenario), robot.home_pose, scenario.control
+    model = Model(robot, parameters, settings.friction)
+    try:
+        found = servo_figures(model, settings, home)
+        asked = feedback(scenario)
+        torques = torque_figures(model, settings, home, asked)
+    except DynamicsError as error:
+        yield Finding("bandwidth", False, None, None, "rad/s", None, f"the loop cannot be judged at home: {error}")
+        return
+    text = f"the servo follows up to {found.bandwidth:.3g} rad/s, with a least damping of {found.damping:.3g}"
+    yield Finding("bandwidth", found.radius < 1, found.bandwidth, None, "rad/s", None, text)
+    wanted = control.servo_bandwidth_rad_s
+    if wanted is not None:
+        try:
+            gains = design_servo(model, settings, home, wanted, control.servo_damping)
+            made = servo_figures(model, replace(settings, servo=gains), home)
+            text = f"kp = {gains.kp:.4g}, kd = {gains.kd:.4g} s and ki = {gains.ki:.4g} 1/s give a bandwidth of "
+            text += f"{made.bandwidth:.3g} rad/s with a damping of {made.damping:.3g}, {made.gain_margin:.3g} times "
+            text += "these gains lose the loop"
+            yield Finding("servo by design", made.radius < 1, made.gain_margin, 1.0, "1", None, text)
+        except SimulationError as error:
+            yield Finding("servo by design", False, None, 1.0, "1", None, str(error))
+    w = asked.bandwidth
+    text = f"computed_torque at {w:.3g} rad/s, Kp = {w**2:.4g} 1/s^2 and Kd = {2 * asked.damping * w:.4g} 1/s, "
+    text += f"has the largest eigenvalue {torques.radius:.4g}; {torques.gain_margin:.3g} times these gains lose it"
+    yield Finding("computed torque", torques.radius < 1, torques.radius, 1.0, "1", None, text)
 
 
 def _seen(robot: Robot, scenario: Scenario) -> Iterator[Finding]:
