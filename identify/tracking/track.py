@@ -17,12 +17,12 @@ from identify.excitation.design import design_trajectories
 from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import excitation_run, taught_sensor
 from identify.experiment.sensor_in_loop import SensorInLoop, with_renderer
-from identify.files.run_folder import load_result, rms_figures
+from identify.files.run_folder import RunFolder, load_result, rms_figures
 from identify.files.versions import versions
 from identify.loop_parameters import parameter_column
 from identify.progress import Progress
 from identify.random_streams import LATENCY, NOISE, TRACKED, child, stream_seed
-from identify.scenario import Scenario
+from identify.scenario import Scenario, load_scenario
 from identify.tracking.following import Seen, by_drawing, by_images, follow, prepared
 from identify.tracking.motions import NamedMotion, motions
 
@@ -65,7 +65,7 @@ def track(
     scenario = with_renderer(scenario)
     plant = build_plant(scenario)
     followed = motions(plant.nominal, scenario, seed, own)
-    known = {name: _parameters(plant, name, run_folder) for name in models if name != "identified" or run_folder}
+    known = {name: model_parameters(plant, name, run_folder) for name in models if name != "identified" or run_folder}
     unseen = Seen(lambda frame, t, pose, rate: pose, lambda frame: np.eye(6))
     for law in laws:  # refused before the sensor is taught
         for motion in followed:
@@ -86,14 +86,22 @@ def track(
     }
 
 
-def _parameters(plant: Plant, model: str, run_folder: Path | None) -> Array:
+def model_parameters(plant: Plant, model: str, run_folder: Path | None) -> Array:
+    """Parameters (p,) of a model by its name in `MODELS`; the identified ones are those of a folder of a run.
+
+    Raises RecordError: no result with estimates in the folder, or a run of another robot.
+    """
     robot = plant.nominal
     if model == "true":
         return plant.parameters
     if model == "initial":
         return starting_guess(robot, plant.scenario.model.start_parameters, 1.0).values
     assert run_folder is not None
-    path = run_folder / "result.json"
+    path, own = run_folder / "result.json", plant.scenario.robot
+    RunFolder(run_folder).require("scenario.toml", "result.json")
+    other = load_scenario(run_folder / "scenario.toml").robot
+    if other != own:
+        raise RecordError(f"{run_folder} holds a run of {other}, not of {own}")
     try:
         column = parameter_column(load_result(path).get("identification"), "estimate", robot.layout.names)
     except RecordError as error:

@@ -1,0 +1,209 @@
+"""Tracking under laws and models: the motions, what is refused, and what `cmmsim track` writes."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dynamics import load_robot
+from dynamics.control.law import LawInLoop
+from dynamics.errors import SimulationError
+from identify.errors import RecordError, ScenarioError, TrajectoryError
+from identify.experiment.plant import build_plant
+from identify.files.run_folder import RunFolder, save_result
+from identify.scenario import load_scenario
+from identify.studies.rows.sensor import DrawnSensor
+from identify.tracking import track as tracking
+from identify.tracking.following import by_drawing, follow, prepared
+from identify.tracking.motions import NamedMotion, circle, read_motion, square
+from tests.identify.commands import command, one_line, refusal
+from tests.identify.synthetic import SIGMA, rss6, trajectory
+
+NOISE = np.diag(SIGMA**2)
+SHORT = {"validation.count": 1, "validation.duration_s": 2.0}
+
+
+class Taught:
+    """Nothing that all poses have in common."""
+
+    @staticmethod
+    def calibration_covariance(pose):
+        return np.zeros((6, 6))
+
+
+class Sensor(DrawnSensor):
+    """Poses drawn as a taught sensor would measure them."""
+
+    taught = Taught()
+
+
+def plant(**changes):
+    return build_plant(load_scenario("quick").with_overrides(SHORT | changes))
+
+
+def swing(seconds=2.0, size=1.0):
+    return NamedMotion("swing", trajectory(3, size), seconds)
+
+
+def seen(frames=120):
+    return by_drawing(NOISE, np.zeros(frames, bool), np.random.default_rng(0))
+
+
+def own(path, rows=40, end=2.0, height=0.004, at=20, to=None):
+    """A CSV file of poses: up and down above home, and one entry replaced."""
+    times = np.linspace(0, end, rows)
+    table = np.tile(rss6().home_pose, (rows, 1))
+    table[:, 2] += height * np.sin(np.pi * times / end) ** 2
+    lines = [",".join(f"{value:.9g}" for value in (t, *row)) for t, row in zip(times, table, strict=True)]
+    if to is not None:
+        lines[at] = to
+    path.write_text("t,x,y,z,alpha,beta,gamma\n" + "\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("name", ["circle", "square", "own"])
+def test_rates_and_accelerations_of_a_motion_are_its_derivatives(name, tmp_path):
+    """By central differences; it starts at home, at rest."""
+    robot = rss6()
+    made = {"circle": lambda: circle(robot, 0.005, 1.0), "square": lambda: square(robot, 0.01, 0.5)}
+    made["own"] = lambda: read_motion(own(tmp_path / "own.csv"), robot).motion
+    motion, t, h = made[name](), np.linspace(0.013, 1.93, 97), 1e-5
+    rate = (motion.pose(t + h) - motion.pose(t - h)) / (2 * h)
+    acceleration = (motion.pose_rate(t + h) - motion.pose_rate(t - h)) / (2 * h)
+    assert np.allclose(motion.pose_rate(t), rate, rtol=0, atol=1e-8)
+    assert np.allclose(motion.pose_acceleration(t), acceleration, rtol=0, atol=1e-6)
+    assert np.allclose(motion.pose(np.zeros(1))[0], robot.home_pose, rtol=0, atol=1e-15)
+    assert np.abs(motion.pose_rate(np.zeros(1))).max() < 1e-12
+
+
+def test_the_jerk_of_the_square_is_bounded():
+    motion, t = square(rss6(), 0.01, 0.5), np.linspace(0, 2, 20001)
+    jerk = np.diff(motion.pose_acceleration(t), axis=0) / np.diff(t)[:, None]
+    assert np.abs(jerk).max() <= 60 * 0.01 / 0.5**3 * (1 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"rows": 4}, "has 4 rows; it needs at least 6"),
+        ({"to": "1.0,0,0,zero,0,0,0"}, "row 21: '1.0,0,0,zero,0,0,0' are not 7 numbers"),
+        ({"to": "0.1,0,0,0.2,0,0,0"}, "times must begin at 0 and increase"),
+        ({"to": "nan,0,0,0.2,0,0,0"}, "of finite numbers"),
+    ],
+    ids=["few", "word", "back", "nan"],
+)
+def test_a_file_that_is_no_motion_is_refused(tmp_path, changes, said):
+    assert said in refusal(TrajectoryError, read_motion, own(tmp_path / "own.csv", **changes), rss6())
+
+
+def test_a_file_without_a_column_or_that_the_platform_cannot_follow_is_refused(tmp_path):
+    path = own(tmp_path / "own.csv")
+    path.write_text(path.read_text().replace("gamma", "yaw"))
+    assert "lacks the columns gamma" in refusal(TrajectoryError, read_motion, path, rss6())
+    tilted = own(tmp_path / "tilted.csv", at=20, to="1.02564103,0,0,0.204,0.01,0,0")
+    assert "alpha" in refusal(TrajectoryError, read_motion, tilted, load_robot("delta3"))
+
+
+def test_a_motion_beyond_the_travel_is_refused_with_time_and_leg(tmp_path):
+    motion = read_motion(own(tmp_path / "own.csv", height=0.05), rss6())
+    said = refusal(TrajectoryError, follow, plant(), "pid", rss6().nominal_parameters, motion, seen())
+    assert "the robot may not follow own" in said
+    assert "of leg" in said
+    assert "at t = " in said
+
+
+@pytest.mark.parametrize(
+    ("law", "changes", "error", "said"),
+    [
+        ("computed_torque", {"control.torque_access": False}, ScenarioError, "control.torque_access = false"),
+        ("computed_torque", {"control.bandwidth_rad_s": 120.0}, SimulationError, "largest eigenvalue"),
+        ("sliding_mode", {}, ScenarioError, "unknown law 'sliding_mode'; valid: pid, feedforward, computed_torque"),
+        ("builtins:repr", {}, ScenarioError, "must return a LawInLoop, returned str"),
+    ],
+    ids=["access", "gains", "name", "own"],
+)
+def test_a_law_that_cannot_be_is_refused(law, changes, error, said):
+    chosen = plant(**changes)
+    assert said in refusal(error, prepared, chosen, law, chosen.parameters, swing(), seen())
+
+
+def test_torque_beyond_the_limit_is_given_up_to_it_and_counted():
+    chosen = plant(**{"control.torque_limit_N_m": 3.0})
+    done = follow(chosen, "pid", chosen.parameters, swing(), seen())
+    torque = np.abs(done.run.torque)
+    assert torque.max() == 3.0
+    assert done.saturated == int((torque == 3.0).any(axis=1).sum()) > 0
+    free = plant()
+    assert follow(free, "pid", free.parameters, swing(), seen()).saturated == 0
+
+
+def holding(assignment):
+    """A law of one's own, by its module and name: joint commands of the desired pose, nothing else."""
+    robot, motion = assignment.model.robot, assignment.motion
+    times = np.arange(assignment.frames) * assignment.period
+    return LawInLoop(feedforward=robot.inverse_kinematics(motion.pose(times)), drives=assignment.settings.drives)
+
+
+def test_a_law_of_ones_own_is_a_function():
+    chosen = plant()
+    done = follow(chosen, "tests.identify.test_tracking:holding", chosen.parameters, swing(), seen())
+    alone = follow(chosen, "pid", chosen.parameters, swing(), seen())
+    assert np.abs(done.errors).max() < np.abs(alone.errors).max()
+
+
+def test_the_scale_of_all_parameters_makes_no_difference_to_feedforward():
+    """Pose and gains tell parameters up to a factor; the commands need no more."""
+    chosen = plant(**{"control.observer": False})
+    one, other = (follow(chosen, "feedforward", k * chosen.parameters, swing(), seen()).errors for k in (1.0, 1.15))
+    assert np.allclose(one, other, rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_track_writes_every_law_with_every_model(tmp_path, monkeypatch):
+    """By drawn poses; `pid`, which knows no model, is followed once. A model that is better leaves less error."""
+    monkeypatch.setattr(tracking, "taught_sensor", lambda *given: Sensor(NOISE))
+    out = tmp_path / "track"
+    settings = [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
+    settings += ["--set", "renderer=analytic", "--set", "control.observer=false"]
+    asked = ["--law", "pid", "--law", "feedforward", "--model", "initial", "--model", "true", "--out", out, "--quiet"]
+    assert command("track", "quick", *asked, *settings) == 0
+    told = json.loads((out / "track.json").read_text())
+    runs = {(run["law"], run["model"]): run for run in told["runs"]}
+    assert list(runs) == [(law, model) for law in ("pid", "feedforward") for model in ("initial", "true")]
+    size = {key: np.linalg.norm(run["position_rms_um"]) for key, run in runs.items()}
+    assert size["pid", "initial"] == size["pid", "true"]
+    assert size["feedforward", "true"] < size["feedforward", "initial"] / 4 < size["pid", "true"] / 8
+    assert runs["feedforward", "initial"]["shares"]["model"]["position"] > 0.9
+    assert runs["feedforward", "true"]["shares"]["model"]["position"] == 0
+    assert {row["motion"] for row in runs["pid", "true"]["motions"]} == {"unseen 1", "circle", "corner"}
+    assert (out / "scenario.toml").is_file()
+
+
+def test_the_identified_model_is_that_of_a_run(tmp_path):
+    """Of the same robot."""
+    chosen, run = plant(), RunFolder(tmp_path)
+    run.scenario.write_text(chosen.scenario.to_toml())
+    estimates = {name: {"estimate": float(k)} for k, name in enumerate(rss6().layout.names)}
+    save_result(run.result, {"identification": {"parameters": estimates}})
+    known = tracking.model_parameters(chosen, "identified", tmp_path)
+    assert np.array_equal(known, np.arange(len(estimates)))
+    said = refusal(RecordError, tracking.model_parameters, plant(robot="rus6"), "identified", tmp_path)
+    assert "holds a run of rss6, not of rus6" in said
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        (["--model", "best"], "unknown model 'best'; valid: initial, identified, true, or all"),
+        (["--law", "mpc"], "unknown law 'mpc'"),
+        (["--motion", "no.csv"], "cannot read the motion no.csv"),
+        (["--law", "computed_torque", "--set", "control.torque_access=false"], "do not take"),
+    ],
+    ids=["model", "law", "motion", "torques"],
+)
+def test_what_cannot_be_tracked_is_one_line_and_leaves_nothing(asked, said, tmp_path, capsys):
+    out = tmp_path / "out"
+    given = ["--model", "true", *asked] if "--model" not in asked else asked
+    assert command("track", "quick", "--set", "renderer=analytic", "--quiet", "--out", out, *given) == 1
+    assert said in one_line(capsys.readouterr().err)
+    assert not out.exists()
