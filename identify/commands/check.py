@@ -38,7 +38,7 @@ def check(
     Examples:
       cmmsim check mine.toml
       cmmsim check ups6 --scenario quick --json findings.json
-      cmmsim check ups6 --set control.servo_bandwidth_rad_s=4.0 --set control.servo_damping=0.3
+      cmmsim check ups6 --set control.servo_bandwidth_rad_s=4.0
     """
     from dynamics import load_robot
     from identify.loop_parameters import NOMINAL, check_parameter_set

@@ -64,9 +64,9 @@ def track(
     \b
     Examples:
       cmmsim track quick --law all --model all
-      cmmsim track quick --law feedforward --model identified --run runs/quick-0
-      cmmsim track quick --law computed_torque --model true --set control.observer=false
-      cmmsim track quick --law feedforward --model true --motion poses.csv
+      cmmsim track quick --law feedforward --model identified --run DIR
+      cmmsim track --law computed_torque --set control.observer=false
+      cmmsim track --law feedforward --model true --motion poses.csv
     """
     from identify.tracking.track import MODELS
     from identify.tracking.track import track as follow_all
