@@ -21,8 +21,11 @@ from dynamics.closed_loop.problem import LoopSettings
 from dynamics.closed_loop.run import LoopFailure
 from dynamics.control.inverse_dynamics import Model
 
-LONGEST_STEP = 4.2e-3
+SHORT_STEP, LONG_STEP = 4.2e-3, 2e-2
 """Of the integration, s: what dry friction does to a joint that turns back takes some milliseconds."""
+
+TURNING = 4.0
+"""Standard deviations of a joint's velocity from rest within which it may turn back."""
 
 WALK = 0.01
 """What the disturbance walks in a second before anything has been learnt, relative to the torques at rest."""
@@ -167,13 +170,14 @@ class Observer:
         self, time: float, state: np.ndarray, covariance: np.ndarray, by_scale: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """State and covariance at a later time; the derivatives of the covariance by the scales move in place."""
-        at, m = self._time, self._m
+        at, m, longest = self._time, self._m, SHORT_STEP
         while at < time - SAME_TIME * self._period:
             begins = [*self._arrivals, *(arrival + self._period for arrival in self._arrivals)]
             later = [begin for begin in begins if at + SAME_TIME * self._period < begin < time]
-            end = min([time, at + LONGEST_STEP, *later])
+            end = min([time, at + longest, *later])
             command, rate = self._acting((at + end) / 2)
-            state, map_, rubbed = self._step(state, covariance, command, rate, end - at)
+            state, map_, rubbed, until_turned = self._step(state, covariance, command, rate, end - at)
+            longest = SHORT_STEP if self._linear else float(np.clip(until_turned, SHORT_STEP, LONG_STEP))
             walked = np.exp(self._scale[0]) * (end - at) * self._walk
             covariance = map_ @ covariance @ map_.T + walked
             covariance[m : 2 * m, m : 2 * m] += rubbed
@@ -196,26 +200,29 @@ class Observer:
 
     def _step(
         self, state: np.ndarray, covariance: np.ndarray, command: np.ndarray, rate: np.ndarray, length: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The state after a time, s, its derivative by the state: an exponential step, exact for linear motion; and the
-        covariance (m, m) of the rates that dry friction adds."""
-        slope, by_state, unsure = self._slope(state, covariance, command, rate)
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        """The state after a time, s, its derivative by the state: an exponential step, exact for linear motion; the
+        covariance (m, m) of the rates that dry friction adds; and the time, s, that is left until a joint may turn."""
+        slope, by_state, unsure, until_turned = self._slope(state, covariance, command, rate)
         size = len(state)
         augmented = np.zeros((size + 1, size + 1))
         augmented[:size, :size], augmented[:size, size] = by_state, slope
         moved = expm(length * augmented)
         push = by_state[self._m : 2 * self._m, 2 * self._m + self._n : 2 * self._m + 2 * self._n]
-        return state + moved[:size, size], moved[:size, :size], length**2 * (push * unsure) @ push.T
+        rubbed = length**2 * (push * unsure) @ push.T
+        return state + moved[:size, size], moved[:size, :size], rubbed, until_turned - length
 
     def _slope(
         self, state: np.ndarray, covariance: np.ndarray, command: np.ndarray, command_rate: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         m, n, (lp, li, ld) = self._m, self._n, self._gains
         q, rate, integral, disturbance, more = np.split(state, [m, 2 * m, 2 * m + n, 2 * m + 2 * n])
         found = self._motion(q[None], rate[None], self._rigid)
         mass, bias, jacobian, _, angle = (part[0] for part in found)
         velocity, error = jacobian @ rate, command - angle[:, 0]
-        level, by_velocity, unsure = self._expected_friction(velocity, jacobian, covariance[m : 2 * m, m : 2 * m])
+        level, by_velocity, unsure, width = self._expected_friction(
+            velocity, jacobian, covariance[m : 2 * m, m : 2 * m]
+        )
         pid = not self._drives.torques
         torque = lp * error + ld * (command_rate - velocity) + li * integral if pid else command
         limit = self._drives.torque_limit
@@ -235,13 +242,15 @@ class Observer:
         by_state[m : 2 * m, 2 * m + n : 2 * m + 2 * n] = push
         by_state[m : 2 * m, 2 * m + 2 * n :] = -push * velocity
         by_state[2 * m : 2 * m + n, :m] = -pid * jacobian
-        return np.concatenate([rate, acceleration, pid * error, np.zeros(2 * n)]), by_state, unsure
+        until_turned = np.min((np.abs(velocity) - TURNING * width) / np.maximum(np.abs(jacobian @ acceleration), 1e-12))
+        slope = np.concatenate([rate, acceleration, pid * error, np.zeros(2 * n)])
+        return slope, by_state, unsure, float(until_turned)
 
     def _expected_friction(
         self, velocity: np.ndarray, jacobian: np.ndarray, covariance: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Expectation of dry friction over the Coulomb torque, its derivative by the velocity, and the variance of its
-        torque about this line."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Expectation of dry friction over the Coulomb torque, its derivative by the velocity, the variance of its
+        torque about this line, and how well the velocity is known, each (n,)."""
         law = self._model.friction
         smooth = np.sqrt(2 / np.pi) * (law.smoothing_velocity or 0.0)
         width = np.sqrt(np.einsum("ij,jk,ik->i", jacobian, covariance, jacobian) + smooth**2 + 1e-12)
@@ -249,4 +258,4 @@ class Observer:
         ratio = velocity / width
         level, slope = more * erf(ratio / np.sqrt(2)), np.sqrt(2 / np.pi) / width * np.exp(-(ratio**2) / 2)
         unsure = self._coulomb**2 * np.maximum(more**2 - level**2 - (slope * width) ** 2, 0.0)
-        return level, slope, unsure
+        return level, slope, unsure, width
