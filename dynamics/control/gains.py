@@ -163,4 +163,4 @@ def _error_share(response: np.ndarray) -> float:
 def _damping(map_: np.ndarray) -> float:
     values = np.linalg.eigvals(map_).astype(complex)
     poles = np.log(values[np.abs(values) > AT_ONCE])
-    return float(np.min(-poles.real / np.abs(poles)))
+    return float(np.min(-poles.real / np.maximum(np.abs(poles), np.finfo(float).tiny)))  # what stands still: none

@@ -192,7 +192,10 @@ def _designed(robot: Robot, parameters: Array, scenario: Scenario) -> Iterator[F
         yield Finding("bandwidth", False, None, None, "rad/s", None, f"the loop cannot be judged at home: {error}")
         return
     text = f"the servo follows up to {found.bandwidth:.3g} rad/s, with a least damping of {found.damping:.3g}"
-    yield Finding("bandwidth", found.radius < 1, found.bandwidth, None, "rad/s", None, text)
+    bandwidth: float | None = found.bandwidth
+    if found.radius >= 1:
+        bandwidth, text = None, "a loop that is lost has no bandwidth"
+    yield Finding("bandwidth", found.radius < 1, bandwidth, None, "rad/s", None, text)
     wanted = control.servo_bandwidth_rad_s
     if wanted is not None:
         try:

@@ -32,6 +32,19 @@ def test_a_gough_stewart_platform_is_found_sound_with_the_numbers_of_its_own_met
     assert "ups6, parameters `identified`" in capfd.readouterr().out
 
 
+def test_gains_are_designed_for_the_bandwidth_and_damping_that_are_asked_for(tmp_path, capfd):
+    asked = ["--set", "control.servo_bandwidth_rad_s=3.5", "--set", "control.servo_damping=0.3", "--quiet"]
+    assert command("check", "delta3", *asked, "--json", tmp_path / "found.json") == 0
+    found = _found(tmp_path / "found.json")
+    assert "give a bandwidth of 3.5 rad/s with a damping of 0.3" in found["servo by design"]["text"]
+    assert found["servo by design"]["value"] > 1
+    assert found["computed torque"]["value"] < 1
+    assert 3 < found["bandwidth"]["value"] < 5
+    beyond = ["--set", "control.servo_bandwidth_rad_s=60.0", "--quiet"]
+    assert command("check", "delta3", *beyond, "--json", tmp_path / "found.json") == BEYOND_LIMIT
+    assert "no gains of the servo give delta3 a bandwidth of 60 rad/s" in one_line(capfd.readouterr().err)
+
+
 @pytest.mark.slow
 def test_a_spoilt_robot_fails_by_number_and_leg(tmp_path, capfd):
     """A cylinder that no body is, a travel beyond what the legs can reach, and gains that no frame rate holds."""
