@@ -32,6 +32,7 @@ def test_a_gough_stewart_platform_is_found_sound_with_the_numbers_of_its_own_met
     assert "ups6, parameters `identified`" in capfd.readouterr().out
 
 
+@pytest.mark.slow
 def test_gains_are_designed_for_the_bandwidth_and_damping_that_are_asked_for(tmp_path, capfd):
     asked = ["--set", "control.servo_bandwidth_rad_s=3.5", "--set", "control.servo_damping=0.3", "--quiet"]
     assert command("check", "delta3", *asked, "--json", tmp_path / "found.json") == 0
