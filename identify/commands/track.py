@@ -88,20 +88,34 @@ def _each(given: list[str], every: tuple[str, ...]) -> list[str]:
 
 
 def _print(entry: dict[str, Any], folder: Path) -> None:
-    rows, failed = [], []
+    done = [run for run in entry["runs"] if "failed" not in run]
+    errors = [
+        (run["law"], run["model"], *map(_rounded, (*run["position_rms_um"], *run["orientation_rms_urad"])))
+        for run in done
+    ]
+    header = ("law", "model", "x\num", "y\num", "z\num", "alpha\nurad", "beta\nurad", "gamma\nurad")
+    print_table(header, errors, header[:2], "rms error of the followed poses")
+    shares = [
+        (
+            run["law"],
+            run["model"],
+            f"{run['effort_rms']:.3g}",
+            *(f"{100 * share['position']:.0f} %" for share in run["shares"].values()),
+        )
+        for run in done
+    ]
+    of_effort = ("law", "model", f"effort\n{entry['effort_unit']}", "sensor", "model", "latency")
+    print_table(of_effort, shares, header[:2], "rms effort, and what of the squared error an exact one would take away")
     for run in entry["runs"]:
         if "failed" in run:
-            failed.append(f"{run['law']} with the {run['model']} model: {run['failed']}")
-        figures = (*run["position_rms_um"], *run["orientation_rms_urad"])
-        shares = [run["shares"][what]["position"] for what in ("sensor", "model", "latency")] if "shares" in run else []
-        effort = f"{run['effort_rms']:.3g}" if "effort_rms" in run else ""
-        shown = [f"{100 * share:.0f} %" for share in shares] or [""] * 3
-        rows.append((run["law"], run["model"], *(f"{value:.1f}" for value in figures), effort, *shown))
-    header = ("law", "model", "x\num", "y\num", "z\num", "alpha\nurad", "beta\nurad", "gamma\nurad", "effort")
-    print_table((*header, "sensor", "model\nexact", "latency"), rows, header[:2], "rms error of the followed poses")
-    for said in failed:
-        typer.echo(f"lost: {said}")
-    saturated = {run["law"]: run["saturated_frames"] for run in entry["runs"] if run.get("saturated_frames")}
-    for name, frames in saturated.items():
-        typer.echo(f"{name}: an actuator is at its limit in {frames} frames")
+            typer.echo(f"lost: {run['law']} with the {run['model']} model: {run['failed']}")
+        elif run["saturated_frames"]:
+            typer.echo(
+                f"{run['law']} with the {run['model']} model: an actuator is at its limit in "
+                f"{run['saturated_frames']} frames"
+            )
     typer.echo(f"files: {folder}")
+
+
+def _rounded(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"

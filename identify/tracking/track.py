@@ -81,6 +81,7 @@ def track(
         "versions": versions(),
         "frame_rate_hz": scenario.timing.frame_rate_hz,
         "latency_s": scenario.timing.latency_s,
+        "effort_unit": plant.nominal.layout.unit("joint1.coulomb"),
         "motions": [motion.name for motion in followed],
         "runs": _runs(task, progress),
     }
@@ -164,7 +165,6 @@ def _entry(task: Tracking, law: str, model: str, advance: Any) -> dict[str, Any]
         **rms_figures(np.concatenate(errors)),
         "effort_rms": float(np.sqrt(np.mean(torque**2))),
         "effort_largest": float(np.abs(torque).max()),
-        "effort_unit": robot.layout.unit("joint1.coulomb"),
         "saturated_frames": sum(row["saturated_frames"] for row in rows),
         "lost_frames": lost,
         "observer_normalised_error": float(np.mean(normalised)) if normalised else None,
