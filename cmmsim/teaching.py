@@ -77,7 +77,7 @@ class Teacher:
         report(0, steps)
         try:
             path = teaching_path(home, self.plan.poses)
-            ellipses = bright_ellipses(self.camera.look(path[0], rng).full(), self.observer)
+            ellipses = bright_ellipses(self.camera.look(path[0], rng), self.observer)
             points = candidate_points(ellipses, self.observer, self.observer.settings.limits)
             start = [
                 find_layout(body.nominal, points, NOMINAL_TOLERANCE, FEWEST_NOMINAL, body.name)[0]

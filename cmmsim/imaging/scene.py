@@ -34,6 +34,11 @@ class ConvexSolid:
         faces = np.unique(np.round(hull.equations, 12), axis=0)
         self._normals, self._offsets = np.ascontiguousarray(faces[:, :3]), np.ascontiguousarray(faces[:, 3])
 
+    @property
+    def faces(self) -> tuple[Array, Array]:
+        """Normals (f,3), outwards, and offsets (f,) of its faces: normal . x + offset <= 0 inside."""
+        return self._normals, self._offsets
+
     def hides(self, camera_from_body: Array, points: Array) -> NDArray[np.bool_]:
         """Whether the solid stands between the camera and points (..., 3) in camera axes."""
         from cmmsim.imaging.kernels import hidden_points  # compiles, so it is loaded where it is first needed

@@ -155,7 +155,7 @@ class PoseEstimator(Observer):
 
         Where the cameras are exposed for some time and many stickers are missing, streaks are looked for as well.
         """
-        ellipses, limits = bright_ellipses(images.full(), self), self.settings.limits
+        ellipses, limits = bright_ellipses(images, self), self.settings.limits
         if self.settings.exposed_share == 0.0:
             return self._found(ellipses, limits)[0]
         streaks = replace(limits, largest_misfit=np.inf)
@@ -189,7 +189,7 @@ class PoseEstimator(Observer):
         if self.settings.exposed_share == 0.0:
             return self.measure(images, expected)
         read = self.read(images, expected, *self._stickers)
-        streaks = find_streaks(read)
+        streaks = None if read.found is not None else find_streaks(read)
         try:
             return self._measured(read.observed(None if streaks is None else streaks.swept))
         except LostError as error:

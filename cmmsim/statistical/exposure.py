@@ -1,0 +1,218 @@
+"""One exposure of two cameras without images: what the fit of ellipses would find in windows of them.
+
+A sticker that is seen whole in an image is found where the centre of its ellipse is, and with its shape, both with
+noise of the covariance that the fit states there: the inverse of its normal matrix at the true ellipse. What the noise
+does to the fit beyond the first order is left out; so is a sticker of which anything is hidden.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.detection.detector import DetectedCentres
+from cmmsim.detection.ellipse_fit import EllipseFits, fit_settings, lies_inside
+from cmmsim.errors import CmmError
+from cmmsim.geometry.camera import Optics, PinholeCamera
+from cmmsim.geometry.disc_image import SHAPE_BASIS, bending, project_discs, symmetric_root
+from cmmsim.geometry.pose import Array, pose_to_transform
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.imaging.exposure import Quality, placed_bodies
+from cmmsim.imaging.renderer import Renderer
+from cmmsim.plugins import RENDERERS
+from cmmsim.pose_estimation.observation import LONGEST_SMEAR_PX, Observer
+from cmmsim.radiometry.images import StereoFrame, Windows
+from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.statistical.scene import StickerScene
+
+NAME = "statistical"
+
+
+def refuse_images(*_: object, **__: object) -> NoReturn:
+    """Raise CmmError that names the renderers that draw."""
+    drawing = ", ".join(name for name in RENDERERS if name != NAME)
+    raise CmmError(f"renderer {NAME!r} draws no images, it only says what would be found in them; {drawing} draw them")
+
+
+STATISTICAL = Renderer(NAME, refuse_images)
+
+
+@dataclass(frozen=True)
+class Light:
+    """Radiance, 0 to 1, of stickers and of their rings, and what the lens leaves of it."""
+
+    sticker: float
+    ring: float
+    optics: Optics
+
+
+@dataclass(frozen=True)
+class StatisticalStereoCamera:
+    """Two cameras that look at the true scene and say what a fit would find; as `VirtualStereoCamera`, without images.
+
+    rig and camera_from_base (4,4), the true ones; light; exposure and right_later in s; obstacle_names: of the scene's
+    solids after platform and base.
+    """
+
+    rig: StereoRig
+    camera_from_base: Array
+    scene: StickerScene
+    light: Light
+    obstacle_names: Sequence[str] = ()
+    exposure: float = 0.0
+    right_later: float = 0.0
+
+    def look(
+        self,
+        pose: Array,
+        rng: np.random.Generator,
+        obstacles: Mapping[str, Array] | None = None,
+        quality: Quality | None = None,
+        pose_rate: Array | None = None,
+    ) -> "DrawnStickers":
+        """One exposure; parameters as of ``VirtualStereoCamera.look``. How many are averaged, the observer knows."""
+        rate = np.zeros(6) if pose_rate is None else pose_rate
+        half, lag = 0.5 * self.exposure * rate, self.right_later * rate
+        middle, *ends = (
+            self._placed(pose + share, pose + share + lag, obstacles or {})
+            for share in ((np.zeros(6), -half, half) if half.any() else (np.zeros(6),))
+        )
+        swept = [np.stack([self.scene.centres(moves) for moves in end]) for end in ends]
+        sides = [self._side(camera, moves) for camera, moves in zip(self.rig.cameras, middle, strict=True)]
+        centres, shapes, seen = (np.stack(values) for values in zip(*sides, strict=True))
+        smears = np.zeros_like(centres)
+        if swept:
+            smears = np.stack(
+                [c.project(last)[0] - c.project(first)[0] for c, first, last in zip(self.rig.cameras, *swept, strict=True)]
+            )
+        return DrawnStickers(self, centres, shapes, smears, seen, rng.standard_normal((*seen.shape, 5)))
+
+    def centre_error_px(self, quality: Quality) -> float:
+        """What drawing leaves in a sticker's centre: nothing is drawn."""
+        return 0.0
+
+    def greys(self, noise: CameraNoise, side: int, centres: Array) -> tuple[Array, float]:
+        """Contrasts (k,) of stickers at centres (k,2) px of one image, and the grey value of their ground."""
+        lit = self.light.optics.illumination(self.rig.cameras[side], centres)
+        rings = np.asarray(noise.mean_grey(self.light.ring * lit))
+        return np.asarray(noise.mean_grey(self.light.sticker * lit)) - rings, float(np.mean(rings))
+
+    @cached_property
+    def _from_base(self) -> list[Array]:
+        return [move @ self.camera_from_base for move in self.rig.from_camera]
+
+    def _placed(self, left: Array, right: Array, obstacles: Mapping[str, Array]) -> list[Array]:
+        """camera_from_body (b,4,4) of all bodies for both cameras."""
+        return placed_bodies(self._from_base, left, right, obstacles, self.obstacle_names)
+
+    def _side(self, camera: PinholeCamera, moves: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Centres (m,2) and shapes (m,2,2) of the ellipses that are fitted in one image, px, and which are seen whole."""
+        places, normals = self.scene.placed(moves)
+        facing = (np.einsum("ni,ni->n", places, normals) < 0.0) & (places[:, 2] > self.scene.radius)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            middles, shapes = project_discs(camera.ideal, places, normals, np.full(len(places), self.scene.radius))
+        facing &= np.isfinite(shapes).all(axis=(1, 2))
+        middles, shapes = np.where(facing[:, None], middles, 0.0), np.where(facing[:, None, None], shapes, np.eye(2))
+        if not camera.distortion.is_zero:
+            local = camera.distortion_jacobian(middles) @ shapes
+            bent, holds = camera.distort(middles)
+            middles, shapes = bent + bending(camera, middles, shapes), symmetric_root(local @ local.swapaxes(-1, -2))
+            facing &= holds
+        return middles, shapes, facing & ~self.scene.hidden(moves, places, normals, facing)
+
+
+class DrawnStickers:
+    """What a fit would find in one exposure: centres (2,m,2) px, shapes (2,m,2,2) px and smears (2,m,2) px of the
+    ellipses of m stickers, seen (2,m) whether whole, and unit normal noise (2,m,5) of their centres and shapes."""
+
+    full = windows = refuse_images
+
+    def __init__(
+        self,
+        camera: StatisticalStereoCamera,
+        centres: Array,
+        shapes: Array,
+        smears: Array,
+        seen: NDArray[np.bool_],
+        noise: Array,
+    ) -> None:
+        self._camera, self._centres, self._shapes, self._smears = camera, centres, shapes, smears
+        short = np.linalg.norm(smears, axis=-1) < LONGEST_SMEAR_PX
+        self._seen, self._noise = seen & short, noise
+
+    def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
+        """See ``StickerExposure``: in each window the sticker nearest to its middle."""
+        sides = [self._in_windows(side, corners[side], size, observer) for side in range(2)]
+        return EllipseFits(*(np.concatenate(values) for values in zip(*(vars(s).values() for s in sides), strict=True)))
+
+    def bright(self, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
+        """See ``StickerExposure``."""
+        found = []
+        for side, camera in enumerate(self._camera.rig.cameras):
+            reach = np.linalg.norm(self._shapes[side], axis=2)
+            whole = self._seen[side] & np.all(
+                (self._centres[side] - reach > 0.0)
+                & (self._centres[side] + reach < (camera.width - 1, camera.height - 1)),
+                axis=1,
+            )
+            index = np.flatnonzero(whole)
+            fit_size = observer.settings.fit_size
+            corners = np.rint(self._centres[side, index] - 0.5 * (fit_size - 1)).astype(int)
+            found.append(self._fitted(side, index, corners, whole[index], observer))
+        return found[0], found[1]
+
+    def _in_windows(self, side: int, corners: NDArray[np.int_], size: int, observer: Observer) -> EllipseFits:
+        """Of the k windows of one image."""
+        gaps = np.abs(self._centres[side] - corners[:, None] - 0.5 * (size - 1)).max(axis=2)
+        gaps[:, ~self._seen[side]] = np.inf
+        index, fit_size = gaps.argmin(axis=1), observer.settings.fit_size
+        centres = self._centres[side, index]
+        inner = np.rint(centres - 0.5 * (fit_size - 1)).astype(int)
+        inner = np.clip(inner, corners, corners + size - fit_size)
+        return self._fitted(side, index, inner, np.isfinite(gaps.min(axis=1, initial=0.0)), observer)
+
+    def _fitted(
+        self,
+        side: int,
+        index: NDArray[np.int_],
+        corners: NDArray[np.int_],
+        seen: NDArray[np.bool_],
+        observer: Observer,
+    ) -> EllipseFits:
+        """Stickers ``index`` (k,) fitted in parts of windows with first pixels ``corners`` (k,2) of one image."""
+        from cmmsim.statistical.kernels import fit_covariances  # compiles, so it is loaded where it is first needed
+
+        settings, noise = observer.settings, observer.noise
+        centres, shapes = self._centres[side, index], self._shapes[side, index]
+        within = lies_inside(centres - corners, shapes, settings.fit_size)
+        contrast, ground = self._camera.greys(noise, side, centres)
+        good = seen & within & (contrast >= settings.limits.smallest_contrast)
+        spread = np.tile(np.eye(5), (len(index), 1, 1))
+        chosen = np.empty((int(good.sum()), 5, 5))
+        fit_covariances(
+            (centres - corners)[good],
+            shapes[good],
+            self._smears[side, index[good]],
+            contrast[good],
+            ground,
+            settings.fit_size,
+            fit_settings(noise, settings.optics.psf_px),
+            chosen,
+        )
+        spread[good] = chosen
+        drawn = np.einsum("kij,kj->ki", np.linalg.cholesky(spread), self._noise[side, index])
+        return EllipseFits(
+            centres + drawn[:, :2],
+            spread[:, :2, :2],
+            good,
+            shapes + np.einsum("kp,pij->kij", drawn[:, 2:], SHAPE_BASIS),
+            spread[:, 2:, 2:],
+            np.ones(len(index)),
+            contrast,
+            np.full(len(index), ground),
+        )
+
+

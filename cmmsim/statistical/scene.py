@@ -1,0 +1,72 @@
+"""Where stickers really are, and the convex solids that may hide them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.geometry.disc_kernels import place_discs, probe_discs
+from cmmsim.geometry.pose import Array
+from cmmsim.imaging.scene import TOUCHING, ConvexSolid, Mesh, SceneBody
+
+PROBES = 12  # points about a sticker, asked with its middle whether a solid hides them
+CLEAR = 1.4  # radii of a sticker within which nothing may stand before it and its ring, or its fit is spoilt
+
+
+@dataclass(frozen=True)
+class StickerScene:
+    """m stickers of a radius, m, at places (m,3) with normals (m,3) in the axes of their owners (m,), bodies 0 and 1;
+    solids: of all bodies, those that carry no stickers last."""
+
+    places: Array
+    normals: Array
+    owners: NDArray[np.int_]
+    radius: float
+    solids: tuple[ConvexSolid, ...]
+
+    @classmethod
+    def of(cls, bodies: Sequence[SceneBody], obstacles: Sequence[Mesh]) -> "StickerScene":
+        """The scene of bodies with stickers and of further solids."""
+        discs = [(stack.discs[-1], owner) for owner, body in enumerate(bodies) for stack in body.stickers]
+        return cls(
+            np.array([disc.centre for disc, _ in discs]),
+            np.array([disc.normal for disc, _ in discs]),
+            np.array([owner for _, owner in discs]),
+            discs[0][0].radius,
+            tuple(ConvexSolid(mesh.vertices) for mesh in (*(body.solid for body in bodies), *obstacles)),
+        )
+
+    def placed(self, moves: Array) -> tuple[Array, Array]:
+        """Places and normals (m,3) in the axes of a camera at which bodies stand by ``moves`` (b,4,4)."""
+        places, normals = np.empty_like(self.places), np.empty_like(self.normals)
+        place_discs(moves, self.owners, self.places, self.normals, places, normals)
+        return places, normals
+
+    def centres(self, moves: Array) -> Array:
+        """Places alone."""
+        return self.placed(moves)[0]
+
+    def hidden(self, moves: Array, places: Array, normals: Array, asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Whether a solid stands before any part of the stickers (m,) with places and normals (m,3) in camera axes;
+        only those ``asked`` (m,) are looked at."""
+        from cmmsim.statistical.kernels import hidden_stickers
+
+        index = np.flatnonzero(asked)
+        probes, hidden = np.empty((len(index), PROBES + 1, 3)), np.zeros(len(asked), dtype=bool)
+        probe_discs(places[index], normals[index], np.full(len(index), CLEAR * self.radius), probes)
+        found = np.empty(len(index), dtype=bool)
+        hidden_stickers(moves, probes, self.owners[index], *self._faces, TOUCHING, found)
+        hidden[index] = found
+        return hidden
+
+    @cached_property
+    def _faces(self) -> tuple[NDArray[np.int_], Array, Array, Array, Array]:
+        """Solids as ``hidden_stickers`` takes them: starts, normals, offsets, middles and radii."""
+        faces = [solid.faces for solid in self.solids]
+        middles = np.array([solid.middle for solid in self.solids])
+        radii = [np.linalg.norm(s.vertices - m, axis=1).max() for s, m in zip(self.solids, middles, strict=True)]
+        starts = np.cumsum([0, *(len(normals) for normals, _ in faces)])
+        normals, offsets = (np.concatenate(values) for values in zip(*faces, strict=True))
+        return starts, normals, offsets, middles, np.array(radii)
