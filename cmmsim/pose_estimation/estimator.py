@@ -179,7 +179,7 @@ class PoseEstimator(Observer):
         ``swept``: expected ones at the beginning and the end of the exposure. Where stickers are smeared over more than
         half a pixel and it is not told, a pose without point spread is worse than its covariance: ``measure_anew``.
         """
-        return self._measured(self.observe(images, expected, *self._stickers, swept))
+        return self.measured(self.observe(images, expected, *self._stickers, swept))
 
     def measure_anew(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
         """As ``measure`` where nothing is known of the movement: it is told from the streaks of the stickers.
@@ -191,7 +191,7 @@ class PoseEstimator(Observer):
         read = self.read(images, expected, *self._stickers)
         streaks = None if read.found is not None else find_streaks(read)
         try:
-            return self._measured(read.observed(None if streaks is None else streaks.swept))
+            return self.measured(read.observed(None if streaks is None else streaks.swept))
         except LostError as error:
             if streaks is None:
                 raise
@@ -210,7 +210,7 @@ class PoseEstimator(Observer):
         )
         return place, len(stickers)
 
-    def _measured(self, seen: StickerObservation) -> tuple[Measurement, Array]:
+    def measured(self, seen: StickerObservation) -> tuple[Measurement, Array]:
         """Measurement, and measured camera_from_platform (4,4), from stickers. Raises LostError."""
         camera_from_platform, covariance, used = self._solve(seen)
         base_from_platform = self.taught.base_from_camera @ camera_from_platform

@@ -183,7 +183,7 @@ class DrawnStickers:
         observer: Observer,
     ) -> EllipseFits:
         """Stickers ``index`` (k,) fitted in parts of windows with first pixels ``corners`` (k,2) of one image."""
-        from cmmsim.statistical.kernels import fit_covariances  # compiles, so it is loaded where it is first needed
+        from cmmsim.statistical.sticker_kernels import fit_covariances  # compiles, so it is loaded where it is first needed
 
         settings, noise = observer.settings, observer.noise
         centres, shapes = self._centres[side, index], self._shapes[side, index]

@@ -7,11 +7,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.geometry.disc_kernels import place_discs, probe_discs
+from cmmsim.geometry.disc_kernels import place_discs
 from cmmsim.geometry.pose import Array
-from cmmsim.imaging.scene import TOUCHING, ConvexSolid, Mesh, SceneBody
+from cmmsim.imaging.scene import ConvexSolid, Mesh, SceneBody
+from cmmsim.statistical.sticker_kernels import Solids, hidden_stickers
 
-PROBES = 12  # points about a sticker, asked with its middle whether a solid hides them
 CLEAR = 1.4  # radii of a sticker within which nothing may stand before it and its ring, or its fit is spoilt
 
 
@@ -51,22 +51,16 @@ class StickerScene:
     def hidden(self, moves: Array, places: Array, normals: Array, asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Whether a solid stands before any part of the stickers (m,) with places and normals (m,3) in camera axes;
         only those ``asked`` (m,) are looked at."""
-        from cmmsim.statistical.kernels import hidden_stickers
-
-        index = np.flatnonzero(asked)
-        probes, hidden = np.empty((len(index), PROBES + 1, 3)), np.zeros(len(asked), dtype=bool)
-        probe_discs(places[index], normals[index], np.full(len(index), CLEAR * self.radius), probes)
-        found = np.empty(len(index), dtype=bool)
-        hidden_stickers(moves, probes, self.owners[index], *self._faces, TOUCHING, found)
-        hidden[index] = found
+        hidden = np.empty(len(asked), dtype=bool)
+        hidden_stickers(moves, places, normals, self.owners, CLEAR * self.radius, self.hiding, asked, hidden)
         return hidden
 
     @cached_property
-    def _faces(self) -> tuple[NDArray[np.int_], Array, Array, Array, Array]:
-        """Solids as ``hidden_stickers`` takes them: starts, normals, offsets, middles and radii."""
+    def hiding(self) -> Solids:
+        """The solids as ``hidden_stickers`` takes them."""
         faces = [solid.faces for solid in self.solids]
         middles = np.array([solid.middle for solid in self.solids])
         radii = [np.linalg.norm(s.vertices - m, axis=1).max() for s, m in zip(self.solids, middles, strict=True)]
         starts = np.cumsum([0, *(len(normals) for normals, _ in faces)])
         normals, offsets = (np.concatenate(values) for values in zip(*faces, strict=True))
-        return starts, normals, offsets, middles, np.array(radii)
+        return Solids(starts, normals, offsets, middles, np.array(radii))

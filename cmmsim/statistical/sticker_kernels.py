@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,11 @@ from cmmsim.detection.fit_kernels import (
     light_of_moving,
     mask_ring,
 )
+from cmmsim.geometry.disc_kernels import probe_discs
 from cmmsim.geometry.point_kernels import factor, invert_factored
+
+PROBES = 12  # points about a sticker, asked with its middle whether a solid hides them
+TOUCHING = 1e-6  # share of the way to a point in which meeting a solid is taken for lying on it
 
 
 @compiled
@@ -59,11 +63,12 @@ def reaches(eye: Array, point: Array, middle: Array, radius: float) -> bool:
 
 
 @compiled
-def enters(eye: Array, point: Array, normals: Array, offsets: Array, touching: float) -> bool:
-    """Whether the solid normal . x + offset <= 0 stands between ``eye`` and ``point`` (3,), all in its axes."""
+def enters(eye: Array, point: Array, normals: Array, offsets: Array, wider: float, touching: float) -> bool:
+    """Whether the solid normal . x + offset <= ``wider`` stands between ``eye`` and ``point`` (3,), all in its axes;
+    ``touching``: share of the way to the point in which meeting it is taken for lying on it."""
     enter, leave = -np.inf, np.inf
     for k in range(len(normals)):
-        distance, closing = -offsets[k], 0.0
+        distance, closing = wider - offsets[k], 0.0
         for i in range(3):
             distance -= normals[k, i] * eye[i]
             closing += normals[k, i] * (point[i] - eye[i])
@@ -87,42 +92,51 @@ def to_body(move: Array, point: Array, into: Array) -> None:
             into[i] += move[j, i] * (point[j] - move[j, 3])
 
 
+class Solids(NamedTuple):
+    """Convex solids b, in their own axes: faces ``starts[b]`` to ``starts[b + 1]`` of normals (f,3), outwards, and
+    offsets (f,); the ball of ``radii[b]`` about ``middles[b]`` (3,) holds all of it."""
+
+    starts: Array
+    normals: Array
+    offsets: Array
+    middles: Array
+    radii: Array
+
+
 @compiled
 def hidden_stickers(
-    moves: Array,
-    probes: Array,
-    owners: Array,
-    starts: Array,
-    normals: Array,
-    offsets: Array,
-    middles: Array,
-    radii: Array,
-    touching: float,
-    hidden: Array,
+    moves: Array, places: Array, normals: Array, owners: Array, clear: float, solids: Solids, asked: Array, hidden: Array
 ) -> None:
-    """Fill ``hidden`` (n,): whether one of b convex solids stands before any of a sticker's ``probes`` (n,k,3).
+    """Fill ``hidden`` (n,): whether a solid stands before any point within ``clear`` m of a sticker, in its plane.
 
-    moves (b,4,4) camera_from_body; probes in camera axes, the sticker's middle first; owners (n,) the solids that carry
-    the stickers, which do not hide them; solid b has the faces ``starts[b]`` to ``starts[b + 1]`` of normals (f,3) and
-    offsets (f,), and lies in the ball of ``radii[b]`` about ``middles[b]`` (3,), in its axes.
+    moves (b,4,4) camera_from_body of the solids; places and normals (n,3) of stickers in camera axes; owners (n,) the
+    solids that carry them, which do not hide them. Only stickers that are ``asked`` (n,) are looked at.
     """
-    camera, eye, point = np.zeros(3), np.empty(3), np.empty(3)
-    for n in range(len(probes)):
+    camera, eye, point, probes = np.zeros(3), np.empty(3), np.empty(3), np.empty((1, PROBES + 1, 3))
+    reach = np.full(1, clear)
+    for n in range(len(places)):
         hidden[n] = False
-        reach = 0.0
-        for i in range(3):
-            reach += (probes[n, 1, i] - probes[n, 0, i]) ** 2
-        reach = math.sqrt(reach)
+        if not asked[n]:
+            continue
+        probed = False
         for b in range(len(moves)):
             if b == owners[n] or hidden[n]:
                 continue
             to_body(moves[b], camera, eye)
-            to_body(moves[b], probes[n, 0], point)
-            if not reaches(eye, point, middles[b], radii[b] + reach):
+            to_body(moves[b], places[n], point)
+            faces, offsets = (
+                solids.normals[solids.starts[b] : solids.starts[b + 1]],
+                solids.offsets[solids.starts[b] : solids.starts[b + 1]],
+            )
+            if not reaches(eye, point, solids.middles[b], solids.radii[b] + clear):
                 continue
-            first, last = starts[b], starts[b + 1]
-            for k in range(probes.shape[1]):
-                to_body(moves[b], probes[n, k], point)
-                if enters(eye, point, normals[first:last], offsets[first:last], touching):
+            if not enters(eye, point, faces, offsets, clear, 0.0):
+                continue
+            if not probed:
+                probe_discs(places[n : n + 1], normals[n : n + 1], reach, probes)
+                probed = True
+            for k in range(PROBES + 1):
+                to_body(moves[b], probes[0, k], point)
+                if enters(eye, point, faces, offsets, 0.0, TOUCHING):
                     hidden[n] = True
                     break
