@@ -8,7 +8,7 @@ left or much contradicts, the estimator itself is asked with the same stickers.
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -156,9 +156,7 @@ class StatisticalMeasuring:
 
 def _cameras(rig: StereoRig, moves: Sequence[Array]) -> Cameras:
     return Cameras(
-        np.array([camera.focal_lengths for camera in rig.cameras]),
-        np.array([camera.centre for camera in rig.cameras]),
-        np.array([astuple(camera.distortion) for camera in rig.cameras]),
+        np.array([camera.intrinsics for camera in rig.cameras]),
         np.array([(camera.width, camera.height) for camera in rig.cameras], dtype=float),
         np.stack(moves),
     )

@@ -25,12 +25,10 @@ MEASURED, CAREFUL = 0, 1  # what became of a frame: a pose, or it must be looked
 
 
 class Cameras(NamedTuple):
-    """Both cameras: focal lengths and principal points (2,2) px, distortion (2,5), sizes (2,2) px, and their places
+    """Both cameras: ``figures`` (2,9), their intrinsics in the order of INTRINSIC_NAMES; sizes (2,2) px; and their places
     ``moves`` (2,4,4): from the base's axes those that look, from the camera frame's those that measure."""
 
-    focal: Array
-    centre: Array
-    distortion: Array
+    figures: Array
     size: Array
     moves: Array
 
@@ -93,6 +91,22 @@ class Frame(NamedTuple):
     arms: Array
 
 
+class Eyes(NamedTuple):
+    """What looks and what measures: cameras at their true and at their known places, the platform's stickers with their
+    owner (n,), body 0, what hides them, what noise does to centres, limits, and the taught base_from_camera and
+    camera_from_base (4,4)."""
+
+    looking: Cameras
+    measuring: Cameras
+    stickers: Stickers
+    owners: Array
+    solids: Solids
+    noise: CentreNoise
+    limits: Limits
+    base_from_camera: Array
+    camera_from_base: Array
+
+
 @compiled
 def pose_transform(pose: Array, transform: Array) -> None:
     """Fill the transform (4,4) of a pose (6,)."""
@@ -101,7 +115,7 @@ def pose_transform(pose: Array, transform: Array) -> None:
     transform[0, 0], transform[0, 1], transform[0, 2] = cb * cg, -cb * sg, sb
     transform[1, 0], transform[1, 1], transform[1, 2] = ca * sg + sa * sb * cg, ca * cg - sa * sb * sg, -sa * cb
     transform[2, 0], transform[2, 1], transform[2, 2] = sa * sg - ca * sb * cg, sa * cg + ca * sb * sg, ca * cb
-    transform[3, :3], transform[3, 3] = 0.0, 1.0
+    transform[3, 0], transform[3, 1], transform[3, 2], transform[3, 3] = 0.0, 0.0, 0.0, 1.0
     for i in range(3):
         transform[i, 3] = pose[i]
 
@@ -126,24 +140,20 @@ def carry(move: Array, point: Array, shift: float, carried: Array) -> None:
 
 
 @compiled
-def project(cameras: Cameras, side: int, point: Array, pixel: Array, lens: Array, slope: Array) -> None:
-    """Fill the pixel (2,) of a point (3,) in camera axes, its slope (2,3) by the point, and that of the image by the
-    ideal pixels, ``lens`` (2,2)."""
-    k1, k2, p1, p2, k3 = cameras.distortion[side]
-    x, y = point[0] / point[2], point[1] / point[2]
+def project(camera: Array, x_m: float, y_m: float, depth: float) -> tuple:
+    """Pixel u, v of a point in the axes of a camera with these figures (9,), and the slope xx, xy, yx, yy of the image by
+    ideal pixels there."""
+    x, y = x_m / depth, y_m / depth
+    k1, k2, p1, p2, k3 = camera[4], camera[5], camera[6], camera[7], camera[8]
     s = x * x + y * y
     radial = 1.0 + s * (k1 + s * (k2 + s * k3))
     growth = 2.0 * (k1 + s * (2.0 * k2 + s * 3.0 * k3))
-    focal = cameras.focal[side]
-    pixel[0] = focal[0] * (x * radial + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x)) + cameras.centre[side, 0]
-    pixel[1] = focal[1] * (y * radial + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y) + cameras.centre[side, 1]
+    u = camera[0] * (x * radial + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x)) + camera[2]
+    v = camera[1] * (y * radial + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y) + camera[3]
     across = growth * x * y + 2.0 * p1 * x + 2.0 * p2 * y
-    lens[0, 0] = radial + growth * x * x + 2.0 * p1 * y + 6.0 * p2 * x
-    lens[1, 1] = radial + growth * y * y + 6.0 * p1 * y + 2.0 * p2 * x
-    lens[0, 1], lens[1, 0] = across * focal[0] / focal[1], across * focal[1] / focal[0]
-    for i in range(2):
-        slope[i, 0], slope[i, 1] = lens[i, 0] * focal[0] / point[2], lens[i, 1] * focal[1] / point[2]
-        slope[i, 2] = -slope[i, 0] * x - slope[i, 1] * y
+    along_x = radial + growth * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+    along_y = radial + growth * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+    return u, v, along_x, across * camera[0] / camera[1], across * camera[1] / camera[0], along_y
 
 
 @compiled
@@ -157,220 +167,284 @@ def faces(point: Array, normal: Array, grazing: float) -> bool:
 
 
 @compiled
-def ellipse_of(point: Array, normal: Array, radius: float, focal: Array, lens: Array, shift: Array, shape: Array) -> None:
-    """Fill the shape A (2,2) px of a disc's ellipse in the image, and how far its centre lies from that of the disc,
-    ``shift`` (2,) px of a perfect lens; as ``disc_kernels.project_all``."""
-    depth = point[2] ** 2 - radius**2 * (1.0 - normal[2] ** 2)
-    square, bent, at = np.empty((2, 2)), np.empty((2, 2)), np.empty(2)
-    for i in range(2):
-        at[i] = (point[i] * point[2] + radius**2 * normal[i] * normal[2]) / depth
-        shift[i] = focal[i] * (at[i] - point[i] / point[2])
-    for i in range(2):
-        for j in range(2):
-            across = 1.0 if i == j else 0.0
-            dual = (point[i] * point[j] - radius**2 * (across - normal[i] * normal[j])) / depth
-            square[i, j] = focal[i] * focal[j] * (at[i] * at[j] - dual)
-    for i in range(2):
-        for j in range(2):
-            bent[i, j] = 0.0
-            for k in range(2):
-                for m in range(2):
-                    bent[i, j] += lens[i, k] * square[k, m] * lens[j, m]
-    d = math.sqrt(max(bent[0, 0] * bent[1, 1] - bent[0, 1] ** 2, 0.0))
-    scale = math.sqrt(bent[0, 0] + bent[1, 1] + 2.0 * d)
-    for i in range(2):
-        for j in range(2):
-            shape[i, j] = (bent[i, j] + (d if i == j else 0.0)) / scale
+def ellipse_of(point: Array, normal: Array, radius: float, focal: Array, lens: tuple) -> tuple:
+    """Of a disc in camera axes: how far the centre of its ellipse lies from its own, x and y px of a perfect lens, and
+    the shape A_xx, A_xy, A_yy px in the image, whose slope by ideal pixels is ``lens``; as ``disc_kernels``."""
+    squared = radius * radius
+    depth = point[2] * point[2] - squared * (1.0 - normal[2] * normal[2])
+    at_x = (point[0] * point[2] + squared * normal[0] * normal[2]) / depth
+    at_y = (point[1] * point[2] + squared * normal[1] * normal[2]) / depth
+    dual_xx = (point[0] * point[0] - squared * (1.0 - normal[0] * normal[0])) / depth
+    dual_xy = (point[0] * point[1] + squared * normal[0] * normal[1]) / depth
+    dual_yy = (point[1] * point[1] - squared * (1.0 - normal[1] * normal[1])) / depth
+    xx = focal[0] * focal[0] * (at_x * at_x - dual_xx)
+    xy = focal[0] * focal[1] * (at_x * at_y - dual_xy)
+    yy = focal[1] * focal[1] * (at_y * at_y - dual_yy)
+    a, b, c, d = lens
+    bent_xx = a * a * xx + 2.0 * a * b * xy + b * b * yy
+    bent_xy = a * c * xx + (a * d + b * c) * xy + b * d * yy
+    bent_yy = c * c * xx + 2.0 * c * d * xy + d * d * yy
+    root = math.sqrt(max(bent_xx * bent_yy - bent_xy * bent_xy, 0.0))
+    scale = 1.0 / math.sqrt(bent_xx + bent_yy + 2.0 * root)
+    shift_x, shift_y = focal[0] * (at_x - point[0] / point[2]), focal[1] * (at_y - point[1] / point[2])
+    return shift_x, shift_y, scale * (bent_xx + root), scale * bent_xy, scale * (bent_yy + root)
 
 
 @compiled
-def fits_inside(centre: Array, shape: Array, size: int, smallest: float) -> bool:
-    """Whether an ellipse about ``centre`` (2,) px is large enough and lies wholly in the part of ``size`` px that is
-    fitted about it."""
-    mean = 0.5 * (shape[0, 0] + shape[1, 1])
-    if mean - math.hypot(0.5 * (shape[0, 0] - shape[1, 1]), shape[0, 1]) <= smallest:
-        return False
-    for i in range(2):
-        local = centre[i] - np.rint(centre[i] - 0.5 * (size - 1))
-        reach = math.hypot(shape[i, 0], shape[i, 1])
-        if local - reach <= -0.5 or local + reach >= size - 0.5:
-            return False
-    return True
+def holds(centre: float, reach: float, size: int) -> bool:
+    """Whether what reaches so far about ``centre``, px along one axis, lies in the part of ``size`` px fitted about it."""
+    local = centre - np.rint(centre - 0.5 * (size - 1))
+    return local - reach > -0.5 and local + reach < size - 0.5
 
 
 @compiled
-def tabulated(noise: CentreNoise, shape: Array, light: float, spread: Array) -> None:
-    """Fill the covariance (2,2) px² of a centre from the table, linear between its entries."""
-    mean = 0.5 * (shape[0, 0] + shape[1, 1])
-    at, cell = np.empty(3), np.empty(3, np.int64)
-    at[0], at[1], at[2] = mean, 0.5 * (shape[0, 0] - shape[1, 1]) / mean, shape[0, 1] / mean
-    for i in range(3):
-        place = (at[i] - noise.first[i]) / noise.steps[i]
-        cell[i] = min(max(int(math.floor(place)), 0), noise.table.shape[i] - 2)
-        at[i] = min(max(place - cell[i], 0.0), 1.0)
-    scale = (noise.by_light[0] + light * (noise.by_light[1] + light * noise.by_light[2])) / mean
-    xx, xy, yy = 0.0, 0.0, 0.0
-    for a in range(2):
-        for b in range(2):
-            for c in range(2):
-                weight = (at[0] if a else 1.0 - at[0]) * (at[1] if b else 1.0 - at[1]) * (at[2] if c else 1.0 - at[2])
-                entry = noise.table[cell[0] + a, cell[1] + b, cell[2] + c]
-                xx += weight * entry[0]
-                xy += weight * entry[1]
-                yy += weight * entry[2]
-    spread[0, 0], spread[0, 1], spread[1, 0], spread[1, 1] = scale * xx, scale * xy, scale * xy, scale * yy
+def tabulated(table: Array, first: Array, steps: Array, by_light: Array, xx: float, xy: float, yy: float, light: float) -> tuple:
+    """Covariance xx, xy, yy px² of the centre of an ellipse, whose shape is given, linear between the table's entries;
+    first four parameters as of ``CentreNoise``."""
+    mean = 0.5 * (xx + yy)
+    a, b, c = (mean - first[0]) / steps[0], (0.5 * (xx - yy) / mean - first[1]) / steps[1], (xy / mean - first[2]) / steps[2]
+    i = min(max(int(math.floor(a)), 0), table.shape[0] - 2)
+    j = min(max(int(math.floor(b)), 0), table.shape[1] - 2)
+    k = min(max(int(math.floor(c)), 0), table.shape[2] - 2)
+    a, b, c = min(max(a - i, 0.0), 1.0), min(max(b - j, 0.0), 1.0), min(max(c - k, 0.0), 1.0)
+    found_xx, found_xy, found_yy = 0.0, 0.0, 0.0
+    for corner in range(8):
+        up, across, deep = corner & 1, (corner >> 1) & 1, corner >> 2
+        weight = (a if up else 1.0 - a) * (b if across else 1.0 - b) * (c if deep else 1.0 - c)
+        found_xx += weight * table[i + up, j + across, k + deep, 0]
+        found_xy += weight * table[i + up, j + across, k + deep, 1]
+        found_yy += weight * table[i + up, j + across, k + deep, 2]
+    scale = (by_light[0] + light * (by_light[1] + light * by_light[2])) / mean
+    return scale * found_xx, scale * found_xy, scale * found_yy
 
 
 @compiled
-def smeared(noise: CentreNoise, shape: Array, light: float, centre: Array, smear: Array, spread: Array) -> None:
-    """Fill the covariance (2,2) px² of the centre of an ellipse that moves by ``smear`` (2,) px, at its own place."""
+def smeared(noise: CentreNoise, shape: tuple, light: float, centre: tuple, smear: tuple) -> tuple:
+    """Covariance xx, xy, yy px² of the centre of an ellipse that moves by ``smear`` px, at its own place."""
     local, found, size = np.empty((1, 2)), np.empty((1, 5, 5)), noise.fit_size
+    one, moved, contrasts = np.empty((1, 2, 2)), np.empty((1, 2)), np.empty(1)
     for i in range(2):
         local[0, i] = centre[i] - np.rint(centre[i] - 0.5 * (size - 1))
-    contrasts = np.full(1, noise.contrast * light)
-    ground = noise.black + noise.ring * light
-    one, moved = np.empty((1, 2, 2)), np.empty((1, 2))
-    one[0], moved[0] = shape, smear
-    fit_covariances(local, one, moved, contrasts, ground, size, noise.settings, found)
-    spread[:] = found[0, :2, :2]
+        moved[0, i] = smear[i]
+        for j in range(2):
+            one[0, i, j] = shape[i + j]
+    contrasts[0] = noise.contrast * light
+    fit_covariances(local, one, moved, contrasts, noise.black + noise.ring * light, size, noise.settings, found)
+    return found[0, 0, 0], found[0, 0, 1], found[0, 1, 1]
 
 
 @compiled
-def light_at(cameras: Cameras, side: int, pixel: Array, vignetting: float) -> float:
-    """Relative illumination of a pixel (2,)."""
-    farthest, squared = 0.0, 0.0
-    for i in range(2):
-        low, high = cameras.centre[side, i] + 0.5, cameras.size[side, i] - 0.5 - cameras.centre[side, i]
-        farthest += max(abs(low), abs(high)) ** 2
-        squared += (pixel[i] - cameras.centre[side, i]) ** 2
-    return max(1.0 - vignetting / farthest * squared, 0.0)
+def light_at(camera: Array, size: Array, u: float, v: float, vignetting: float) -> float:
+    """Relative illumination of a pixel, by a camera with these figures (9,) and size (2,)."""
+    if vignetting == 0.0:
+        return 1.0
+    x, y = camera[2], camera[3]
+    farthest_x = max(x + 0.5, size[0] - 0.5 - x)
+    farthest_y = max(y + 0.5, size[1] - 0.5 - y)
+    share = ((u - x) ** 2 + (v - y) ** 2) / (farthest_x**2 + farthest_y**2)
+    return max(1.0 - vignetting * share, 0.0)
 
 
 @compiled
-def see(
-    side: int, looking: Cameras, stickers: Stickers, solids: Solids, noise: CentreNoise, limits: Limits, moves: Array,
-    ends: Array, normal_noise: Array, owners: Array, frame: Frame,
-) -> None:  # fmt: skip
+def see(side: int, eyes: Eyes, moves: Array, ends: Array, moving: bool, noise: Array, frame: Frame) -> None:
     """Fill one image's pixels and covariances of the stickers that are ``used`` so far, and take out what is not seen.
 
     moves (b,4,4) camera_from_body of all solids, the platform first; ends (2,4,4): of the platform at the beginning and
-    the end of the exposure; normal_noise (n,2).
+    the end of the exposure, where it is ``moving``; noise (n,2) unit normal.
     """
-    count = len(frame.used)
+    count, looking, stickers, limits = len(frame.used), eyes.looking, eyes.stickers, eyes.limits
     places, normals, hidden = np.empty((count, 3)), np.empty((count, 3)), np.empty(count, np.bool_)
     for n in range(count):
         carry(moves[0], stickers.true[n], 1.0, places[n])
         carry(moves[0], stickers.normals[n], 0.0, normals[n])
         frame.used[n] = frame.used[n] and faces(places[n], normals[n], 0.0)
-    hidden_stickers(moves, places, normals, owners, limits.clear, solids, frame.used, hidden)
-    lens, slope, shape, shift = np.empty((2, 2)), np.empty((2, 3)), np.empty((2, 2)), np.empty(2)
-    first, last, point, smear = np.empty(2), np.empty(2), np.empty(3), np.empty(2)
+    hidden_stickers(moves, places, normals, eyes.owners, limits.clear, eyes.solids, frame.used, hidden)
+    camera, focal, point, size = looking.figures[side], looking.figures[side, :2], np.empty(3), eyes.noise.fit_size
+    table, first_node, steps, by_light = eyes.noise.table, eyes.noise.first, eyes.noise.steps, eyes.noise.by_light
+    smear_step, true, pixels, spreads = eyes.noise.settings.smear_step, stickers.true, frame.pixels[side], frame.spreads[side]
     for n in range(count):
-        if not frame.used[n] or hidden[n]:
-            frame.used[n] = False
+        frame.used[n] = frame.used[n] and not hidden[n]
+        if not frame.used[n]:
             continue
-        pixel, spread = frame.pixels[side, n], frame.spreads[side, n]
-        carry(ends[0], stickers.true[n], 1.0, point)
-        project(looking, side, point, first, lens, slope)
-        carry(ends[1], stickers.true[n], 1.0, point)
-        project(looking, side, point, last, lens, slope)
-        project(looking, side, places[n], pixel, lens, slope)
-        ellipse_of(places[n], normals[n], stickers.radius, looking.focal[side], lens, shift, shape)
-        smear[:] = last - first
-        shift += pixel
-        length = math.hypot(smear[0], smear[1])
-        if length >= limits.longest_smear_px or not fits_inside(shift, shape, noise.fit_size, limits.smallest_px):
-            frame.used[n] = False
+        u, v, a, b, c, d = project(camera, places[n, 0], places[n, 1], places[n, 2])
+        along, down, xx, xy, yy = ellipse_of(
+            places[n], normals[n], stickers.radius, focal, (a, b, c, d)
+        )
+        smear_u, smear_v = 0.0, 0.0
+        if moving:
+            for end in range(2):
+                carry(ends[end], true[n], 1.0, point)
+                other_u, other_v, _, _, _, _ = project(camera, point[0], point[1], point[2])
+                sign = 1.0 if end else -1.0
+                smear_u += sign * other_u
+                smear_v += sign * other_v
+        length, smallest = math.hypot(smear_u, smear_v), 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)
+        frame.used[n] = (
+            length < limits.longest_smear_px
+            and smallest > limits.smallest_px
+            and holds(u + along, math.hypot(xx, xy), size)
+            and holds(v + down, math.hypot(xy, yy), size)
+        )
+        if not frame.used[n]:
             continue
-        light = light_at(looking, side, pixel, limits.vignetting)
-        if length > noise.settings.smear_step:
-            smeared(noise, shape, light, shift, smear, spread)
+        light = light_at(camera, looking.size[side], u, v, limits.vignetting)
+        if length > smear_step:
+            wide, tilt, high = smeared(
+                eyes.noise, (xx, xy, yy), light, (u + along, v + down), (smear_u, smear_v)
+            )
         else:
-            tabulated(noise, shape, light, spread)
-        low = math.sqrt(spread[0, 0])
-        across = spread[0, 1] / low
-        pixel[0] += low * normal_noise[n, 0]
-        pixel[1] += across * normal_noise[n, 0] + math.sqrt(spread[1, 1] - across * across) * normal_noise[n, 1]
+            wide, tilt, high = tabulated(table, first_node, steps, by_light, xx, xy, yy, light)
+        first = math.sqrt(wide)
+        across = tilt / first
+        pixels[n, 0] = u + first * noise[n, 0]
+        pixels[n, 1] = v + across * noise[n, 0] + math.sqrt(high - across * across) * noise[n, 1]
+        spread = spreads[n]
+        spread[0, 0], spread[0, 1], spread[1, 0], spread[1, 1] = wide, tilt, tilt, high
 
 
 @compiled
-def triangulate(measuring: Cameras, expected: Array, limits: Limits, frame: Frame, n: int) -> bool:
-    """Fill point, information, covariance and ``found`` of sticker n, expected at (3,) in the camera frame; whether its
-    two rays meet."""
-    lens, slope, pixel, residual = np.empty((2, 2)), np.empty((2, 3)), np.empty(2), np.empty(2)
-    weight, point, pulled, turned = np.empty((2, 2)), frame.points[n], np.empty(3), np.empty((2, 3))
-    normal, factored = np.empty((3, 3)), np.empty((3, 3))
-    point[:] = expected
-    trace, gap = 0.0, 0.0
-    for side in range(2):
-        trace += 0.25 * (frame.spreads[side, n, 0, 0] + frame.spreads[side, n, 1, 1])
-    for step in range(MOST_STEPS):
-        longest, gap = 0.0, 0.0
-        normal[:], pulled[:] = 0.0, 0.0
-        for side in range(2):
-            seen = np.empty(3)
-            carry(measuring.moves[side], point, 1.0, seen)
-            project(measuring, side, seen, pixel, lens, slope)
-            spread = frame.spreads[side, n]
-            xx, xy, yy = spread[0, 0] + limits.parted, spread[0, 1], spread[1, 1] + limits.parted
-            det = xx * yy - xy * xy
-            weight[0, 0], weight[0, 1], weight[1, 0], weight[1, 1] = yy / det, -xy / det, -xy / det, xx / det
-            for k in range(2):
-                residual[k] = frame.pixels[side, n, k] - pixel[k]
-                longest = max(longest, abs(residual[k]))
-                for j in range(3):
-                    turned[k, j] = 0.0
-                    for i in range(3):
-                        turned[k, j] += slope[k, i] * measuring.moves[side, i, j]
-            for k in range(2):
-                for m in range(2):
-                    gap += residual[k] * weight[k, m] * residual[m]
-                    for i in range(3):
-                        weighted = turned[k, i] * weight[k, m]
-                        pulled[i] += weighted * residual[m]
-                        for j in range(3):
-                            normal[i, j] += weighted * turned[m, j]
-        factored[:] = normal
-        factor(factored)
-        before = pulled.copy()
-        solve_factored(factored, pulled)
-        for i in range(3):
-            gap -= before[i] * pulled[i]
-            point[i] += pulled[i]
-        if longest < LONG_PX:
+def slope_by(move: Array, by_u: float, by_v: float, f_x: float, f_y: float, t_x: float, t_y: float) -> tuple:
+    """Slope of one coordinate of a pixel by a point in the camera frame: by_u and by_v by the ideal pixels, which go with
+    f_x and f_y, focal length over depth, and t_x and t_y, the tangents of the line of sight."""
+    in_x, in_y = by_u * f_x, by_v * f_y
+    in_z = -in_x * t_x - in_y * t_y
+    return (
+        in_x * move[0, 0] + in_y * move[1, 0] + in_z * move[2, 0],
+        in_x * move[0, 1] + in_y * move[1, 1] + in_z * move[2, 1],
+        in_x * move[0, 2] + in_y * move[1, 2] + in_z * move[2, 2],
+    )
+
+
+@compiled
+def pull(
+    camera: Array, move: Array, point: Array, pixel: Array, spread: Array, parted: float, normal: Array, right: Array
+) -> tuple:
+    """Add what one image says of a point (3,) in the camera frame to ``normal`` (6,), the entries 00, 01, 02, 11, 12, 22
+    of J' W J, and to ``right`` (3,), J' W r; returns r' W r and the longer side of r. The camera has figures (9,) and
+    stands at ``move`` (4,4)."""
+    x = move[0, 0] * point[0] + move[0, 1] * point[1] + move[0, 2] * point[2] + move[0, 3]
+    y = move[1, 0] * point[0] + move[1, 1] * point[1] + move[1, 2] * point[2] + move[1, 3]
+    z = move[2, 0] * point[0] + move[2, 1] * point[1] + move[2, 2] * point[2] + move[2, 3]
+    u, v, a, b, c, d = project(camera, x, y, z)
+    r, s = pixel[0] - u, pixel[1] - v
+    xx, xy, yy = spread[0, 0] + parted, spread[0, 1], spread[1, 1] + parted
+    det = xx * yy - xy * xy
+    w_xx, w_xy, w_yy = yy / det, -xy / det, xx / det
+    f_x, f_y, t_x, t_y = camera[0] / z, camera[1] / z, x / z, y / z
+    along, down = w_xx * r + w_xy * s, w_xy * r + w_yy * s
+    first_0, first_1, first_2 = slope_by(move, a, b, f_x, f_y, t_x, t_y)
+    second_0, second_1, second_2 = slope_by(move, c, d, f_x, f_y, t_x, t_y)
+    right[0] += first_0 * along + second_0 * down
+    right[1] += first_1 * along + second_1 * down
+    right[2] += first_2 * along + second_2 * down
+    pushed_0, pulled_0 = w_xx * first_0 + w_xy * second_0, w_xy * first_0 + w_yy * second_0
+    pushed_1, pulled_1 = w_xx * first_1 + w_xy * second_1, w_xy * first_1 + w_yy * second_1
+    pushed_2, pulled_2 = w_xx * first_2 + w_xy * second_2, w_xy * first_2 + w_yy * second_2
+    normal[0] += pushed_0 * first_0 + pulled_0 * second_0
+    normal[1] += pushed_0 * first_1 + pulled_0 * second_1
+    normal[2] += pushed_0 * first_2 + pulled_0 * second_2
+    normal[3] += pushed_1 * first_1 + pulled_1 * second_1
+    normal[4] += pushed_1 * first_2 + pulled_1 * second_2
+    normal[5] += pushed_2 * first_2 + pulled_2 * second_2
+    return r * along + s * down, max(abs(r), abs(s))
+
+
+@compiled
+def inverse_of(n: Array, into: Array) -> None:
+    """Fill the inverse (6,) of a symmetric (3,3) matrix ``n`` (6,), both as their entries 00, 01, 02, 11, 12, 22."""
+    c_00, c_01, c_02 = n[3] * n[5] - n[4] * n[4], n[2] * n[4] - n[1] * n[5], n[1] * n[4] - n[2] * n[3]
+    det = n[0] * c_00 + n[1] * c_01 + n[2] * c_02
+    into[0], into[1], into[2] = c_00 / det, c_01 / det, c_02 / det
+    into[3], into[4] = (n[0] * n[5] - n[2] * n[2]) / det, (n[1] * n[2] - n[0] * n[4]) / det
+    into[5] = (n[0] * n[3] - n[1] * n[1]) / det
+
+
+@compiled
+def spread_out(entries: Array, matrix: Array) -> None:
+    """Fill a symmetric matrix (3,3) from its entries 00, 01, 02, 11, 12, 22."""
+    matrix[0, 0], matrix[1, 1], matrix[2, 2] = entries[0], entries[3], entries[5]
+    matrix[0, 1] = matrix[1, 0] = entries[1]
+    matrix[0, 2] = matrix[2, 0] = entries[2]
+    matrix[1, 2] = matrix[2, 1] = entries[4]
+
+
+@compiled
+def triangulate(
+    figures: Array, moves: Array, pixels: Array, spreads: Array, n: int, parted: float, point: Array, scratch: Array
+) -> float:
+    """Move a point (3,) in the camera frame to where sticker n was found, and fill ``scratch`` (3,6) with the entries of
+    its information and of its covariance, those of noise alone; returns the squared gap of its two rays."""
+    normal, inverse, right, gap = scratch[0], scratch[1], scratch[2], 0.0
+    for _ in range(MOST_STEPS):
+        for k in range(6):
+            normal[k] = right[k] = 0.0
+        left_gap, left_px = pull(figures[0], moves[0], point, pixels[0, n], spreads[0, n], parted, normal, right)
+        right_gap, right_px = pull(figures[1], moves[1], point, pixels[1, n], spreads[1, n], parted, normal, right)
+        inverse_of(normal, inverse)
+        x = inverse[0] * right[0] + inverse[1] * right[1] + inverse[2] * right[2]
+        y = inverse[1] * right[0] + inverse[3] * right[1] + inverse[4] * right[2]
+        z = inverse[2] * right[0] + inverse[4] * right[1] + inverse[5] * right[2]
+        gap = left_gap + right_gap - (x * right[0] + y * right[1] + z * right[2])
+        point[0], point[1], point[2] = point[0] + x, point[1] + y, point[2] + z
+        if max(left_px, right_px) < LONG_PX:
             break
-    invert_factored(factored, frame.covariances[n])
-    share = trace / (trace + limits.parted)
-    for i in range(3):
-        frame.found[n, i] = point[i] - expected[i]
-        for j in range(3):
-            frame.covariances[n, i, j] *= share
-            frame.informations[n, i, j] = normal[i, j] / share
-    return gap < limits.largest_gap
+    trace = 0.25 * (spreads[0, n, 0, 0] + spreads[0, n, 1, 1] + spreads[1, n, 0, 0] + spreads[1, n, 1, 1])
+    share = trace / (trace + parted)
+    for k in range(6):
+        normal[k] /= share
+        inverse[k] *= share
+    return gap
 
 
 @compiled
-def register(frame: Frame, change: Array, covariance: Array) -> float:
+def register(frame: Frame, scratch: Array, change: Array, covariance: Array) -> float:
     """Fill ``change`` (6,) [dt, dphi] of the expected place in the camera frame and its ``covariance`` (6,6), from the
-    stickers used; returns the sum of their squared residuals in units of their noise."""
-    normal, rows, squared = np.zeros((6, 6)), np.zeros((3, 6)), 0.0
-    change[:] = 0.0
+    stickers used; returns the sum of their squared residuals in units of their noise. scratch (6,6) is overwritten."""
+    normal, squared = scratch, 0.0
+    for a in range(6):
+        change[a] = 0.0
+        for b in range(6):
+            normal[a, b] = 0.0
     for n in range(len(frame.used)):
         if not frame.used[n]:
             continue
-        arm, information = frame.arms[n], frame.informations[n]
-        fill_rows(arm, rows)
+        arm, info, found = frame.arms[n], frame.informations[n], frame.found[n]
+        x, y, z = arm[0], arm[1], arm[2]
         for i in range(3):
-            for j in range(3):
-                squared += frame.found[n, i] * information[i, j] * frame.found[n, j]
-                for a in range(6):
-                    if rows[i, a] == 0.0:
-                        continue
-                    weighted = rows[i, a] * information[i, j]
-                    change[a] += weighted * frame.found[n, j]
-                    for b in range(a + 1):
-                        normal[a, b] += weighted * rows[j, b]
-    before = change.copy()
+            push = info[i, 0] * found[0] + info[i, 1] * found[1] + info[i, 2] * found[2]
+            squared += found[i] * push
+            change[i] += push
+            # the row of information times the slope [1, -arm x]: of the turn about each axis
+            by_x, by_y, by_z = info[i, 2] * y - info[i, 1] * z, info[i, 0] * z - info[i, 2] * x, info[i, 1] * x - info[i, 0] * y
+            normal[3, i] += by_x
+            normal[4, i] += by_y
+            normal[5, i] += by_z
+            for j in range(i + 1):
+                normal[i, j] += info[i, j]
+            # and the slope's transpose times that
+            if i == 0:
+                lever_y, lever_z = z, -y
+                normal[4, 3] += lever_y * by_x
+                normal[5, 3] += lever_z * by_x
+                normal[4, 4] += lever_y * by_y
+                normal[5, 4] += lever_z * by_y
+                normal[5, 5] += lever_z * by_z
+                change[4] += lever_y * push
+                change[5] += lever_z * push
+            elif i == 1:
+                normal[3, 3] -= z * by_x
+                normal[5, 3] += x * by_x
+                normal[5, 4] += x * by_y
+                normal[5, 5] += x * by_z
+                change[3] -= z * push
+                change[5] += x * push
+            else:
+                normal[3, 3] += y * by_x
+                normal[4, 3] -= x * by_x
+                normal[4, 4] -= x * by_y
+                change[3] += y * push
+                change[4] -= x * push
+    before = (change[0], change[1], change[2], change[3], change[4], change[5])
     factor(normal)
     invert_factored(normal, covariance)
     solve_factored(normal, change)
@@ -380,54 +454,56 @@ def register(frame: Frame, change: Array, covariance: Array) -> float:
 
 
 @compiled
-def fill_rows(arm: Array, rows: Array) -> None:
-    """Slope (3,6) of a point by [dt, dphi] of its body, ``arm`` (3,) from the body's origin."""
-    for i in range(3):
-        rows[i, i] = 1.0
-    rows[0, 4], rows[0, 5], rows[1, 5] = arm[2], -arm[1], arm[0]
-    rows[1, 3], rows[2, 3], rows[2, 4] = -arm[2], arm[1], -arm[0]
+def left_noise(arm: Array, noise: Array, covariance: Array, half: Array, entries: Array) -> None:
+    """Fill the entries (6,) of the covariance of a sticker's residual: its noise (3,3) less what it pulls the pose by.
+
+    arm (3,) from the platform's origin; covariance (6,6) of the pose; half (3,6) is overwritten.
+    """
+    x, y, z = arm[0], arm[1], arm[2]
+    for b in range(6):
+        half[0, b] = covariance[0, b] + z * covariance[4, b] - y * covariance[5, b]
+        half[1, b] = covariance[1, b] - z * covariance[3, b] + x * covariance[5, b]
+        half[2, b] = covariance[2, b] + y * covariance[3, b] - x * covariance[4, b]
+    entries[0] = noise[0, 0] - (half[0, 0] + z * half[0, 4] - y * half[0, 5])
+    entries[1] = noise[0, 1] - (half[0, 1] - z * half[0, 3] + x * half[0, 5])
+    entries[2] = noise[0, 2] - (half[0, 2] + y * half[0, 3] - x * half[0, 4])
+    entries[3] = noise[1, 1] - (half[1, 1] - z * half[1, 3] + x * half[1, 5])
+    entries[4] = noise[1, 2] - (half[1, 2] + y * half[1, 3] - x * half[1, 4])
+    entries[5] = noise[2, 2] - (half[2, 2] + y * half[2, 3] - x * half[2, 4])
 
 
 @compiled
 def worst_place(frame: Frame, change: Array, covariance: Array, total: float, freedom: int, limits: Limits) -> int:
     """The sticker that differs most from where the others put it, -1 where all agree; as ``consistency``."""
     worst, largest = -1, limits.largest_misfit
-    rows, residual, spread, solved = np.zeros((3, 6)), np.empty(3), np.empty((3, 3)), np.empty(3)
+    entries, inverse, half = np.empty(6), np.empty(6), np.empty((3, 6))
     for n in range(len(frame.used)):
         if not frame.used[n]:
             continue
-        fill_rows(frame.arms[n], rows)
-        own = 0.0
-        for i in range(3):
-            residual[i] = frame.found[n, i]
-            for a in range(6):
-                residual[i] -= rows[i, a] * change[a]
-            for j in range(i + 1):
-                spread[i, j] = frame.covariances[n, i, j]
-                for a in range(6):
-                    for b in range(6):
-                        spread[i, j] -= rows[i, a] * covariance[a, b] * rows[j, b]
-        for i in range(3):
-            for j in range(3):
-                own += residual[i] * frame.informations[n, i, j] * residual[j]
-        factor(spread)
-        solved[:] = residual
-        solve_factored(spread, solved)
-        misfit = residual[0] * solved[0] + residual[1] * solved[1] + residual[2] * solved[2]
-        misfit /= excess_of(total - own, freedom - 3, limits)
+        arm, info, found = frame.arms[n], frame.informations[n], frame.found[n]
+        x = found[0] - change[0] - (change[4] * arm[2] - change[5] * arm[1])
+        y = found[1] - change[1] - (change[5] * arm[0] - change[3] * arm[2])
+        z = found[2] - change[2] - (change[3] * arm[1] - change[4] * arm[0])
+        own = info[0, 0] * x * x + info[1, 1] * y * y + info[2, 2] * z * z
+        own += 2.0 * (info[0, 1] * x * y + info[0, 2] * x * z + info[1, 2] * y * z)
+        left_noise(arm, frame.covariances[n], covariance, half, entries)
+        inverse_of(entries, inverse)
+        misfit = inverse[0] * x * x + inverse[3] * y * y + inverse[5] * z * z
+        misfit += 2.0 * (inverse[1] * x * y + inverse[2] * x * z + inverse[4] * y * z)
+        misfit /= excess_of(total - own, freedom - 3, limits.totals)
         if misfit > largest:
             worst, largest = n, misfit
     return worst
 
 
 @compiled
-def excess_of(total: float, freedom: int, limits: Limits) -> float:
+def excess_of(total: float, freedom: int, totals: Array) -> float:
     """Mean square of residuals where it is larger than noise makes it, else 1."""
-    return total / freedom if total > limits.totals[freedom] else 1.0
+    return total / freedom if total > totals[freedom] else 1.0
 
 
 @compiled
-def believed(frame: Frame, limits: Limits, change: Array, covariance: Array) -> float:
+def believed(frame: Frame, limits: Limits, scratch: Array, change: Array, covariance: Array) -> float:
     """``register`` the stickers that agree with each other, after those that do not were taken out; returns the factor
     by which covariances grow, 0 where too few are left or too much."""
     left_out = 0
@@ -438,8 +514,8 @@ def believed(frame: Frame, limits: Limits, change: Array, covariance: Array) -> 
         if count < limits.fewest + left_out:
             return 0.0
         freedom = 3 * count - 6
-        total = register(frame, change, covariance)
-        excess = excess_of(total, freedom, limits)
+        total = register(frame, scratch, change, covariance)
+        excess = excess_of(total, freedom, limits.totals)
         worst = worst_place(frame, change, covariance, total, freedom, limits)
         if worst < 0:
             return excess if excess <= limits.largest_excess else 0.0
@@ -450,15 +526,14 @@ def believed(frame: Frame, limits: Limits, change: Array, covariance: Array) -> 
 @compiled
 def move_by(transform: Array, change: Array) -> None:
     """Move a transform (4,4) by ``change`` (6,) [dt, dphi], in the axes of its output."""
-    turn, column = change[3:], np.empty(3)
+    turn = change[3:]
     angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
     first = math.sin(angle) / angle if angle > 1e-9 else 1.0
     second = 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2 if angle > 1e-9 else 0.5
     for j in range(3):
-        column[:] = transform[:3, j]
-        x = turn[1] * column[2] - turn[2] * column[1]
-        y = turn[2] * column[0] - turn[0] * column[2]
-        z = turn[0] * column[1] - turn[1] * column[0]
+        x = turn[1] * transform[2, j] - turn[2] * transform[1, j]
+        y = turn[2] * transform[0, j] - turn[0] * transform[2, j]
+        z = turn[0] * transform[1, j] - turn[1] * transform[0, j]
         transform[0, j] += first * x + second * (turn[1] * z - turn[2] * y)
         transform[1, j] += first * y + second * (turn[2] * x - turn[0] * z)
         transform[2, j] += first * z + second * (turn[0] * y - turn[1] * x)
@@ -499,22 +574,6 @@ def base_pose(place: Array, covariance: Array, base_from_camera: Array, pose: Ar
                 spread[i, j] += half[i, k] * slopes[j, k]
 
 
-class Eyes(NamedTuple):
-    """What looks and what measures: cameras at their true and at their known places, the platform's stickers with their
-    owner (n,), body 0, what hides them, what noise does to centres, limits, and the taught base_from_camera and
-    camera_from_base (4,4)."""
-
-    looking: Cameras
-    measuring: Cameras
-    stickers: Stickers
-    owners: Array
-    solids: Solids
-    noise: CentreNoise
-    limits: Limits
-    base_from_camera: Array
-    camera_from_base: Array
-
-
 @compiled
 def look(eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame) -> None:
     """Fill what both cameras find: pixels and covariances, and which stickers are used.
@@ -523,7 +582,11 @@ def look(eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, fra
     bodies (b,4,4): base_from_body of all solids but the platform; noise (2,n,2) unit normal; kept (n,) whether a sticker
     is not left out by chance.
     """
-    frame.used[:] = kept
+    moving = False
+    for i in range(6):
+        moving = moving or poses[1, i] != poses[2, i]
+    for n in range(len(kept)):
+        frame.used[n] = kept[n]
     platform, moves, ends = np.empty((4, 4)), np.empty((1 + len(bodies), 4, 4)), np.empty((2, 4, 4))
     for side in range(2):
         for end in range(2):
@@ -533,32 +596,36 @@ def look(eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, fra
         multiply(eyes.looking.moves[side], platform, moves[0])
         for b in range(len(bodies)):
             multiply(eyes.looking.moves[side], bodies[b], moves[1 + b])
-        see(
-            side, eyes.looking, eyes.stickers, eyes.solids, eyes.noise, eyes.limits, moves, ends, noise[side],
-            eyes.owners, frame,
-        )  # fmt: skip
+        see(side, eyes, moves, ends, moving, noise[side], frame)
 
 
 @compiled
 def expect(eyes: Eyes, place: Array, frame: Frame) -> None:
     """Take out stickers that nobody looks for with the platform at ``place`` (4,4), and triangulate the others."""
-    point, seen, normal = np.empty(3), np.empty(3), np.empty(3)
-    for n in range(len(frame.used)):
-        carry(place, eyes.stickers.taught[n], 1.0, point)
+    expected, seen, normal, scratch = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 6))
+    figures, moves, size = eyes.measuring.figures, eyes.measuring.moves, eyes.measuring.size
+    taught, normals, pixels, spreads = eyes.stickers.taught, eyes.stickers.normals, frame.pixels, frame.spreads
+    used, arms, points, found = frame.used, frame.arms, frame.points, frame.found
+    grazing, parted, largest_gap = eyes.limits.grazing, eyes.limits.parted, eyes.limits.largest_gap
+    for n in range(len(used)):
+        carry(place, taught[n], 1.0, expected)
+        carry(place, normals[n], 0.0, arms[n])
         for side in range(2):
-            move = eyes.measuring.moves[side]
-            carry(move, point, 1.0, seen)
-            carry(place, eyes.stickers.normals[n], 0.0, frame.arms[n])
-            carry(move, frame.arms[n], 0.0, normal)
-            frame.used[n] = frame.used[n] and faces(seen, normal, eyes.limits.grazing)
+            carry(moves[side], expected, 1.0, seen)
+            carry(moves[side], arms[n], 0.0, normal)
+            used[n] = used[n] and faces(seen, normal, grazing)
             for i in range(2):
-                inside = -0.5 < frame.pixels[side, n, i] < eyes.measuring.size[side, i] - 0.5
-                frame.used[n] = frame.used[n] and inside
-        if frame.used[n]:
+                used[n] = used[n] and -0.5 < pixels[side, n, i] < size[side, i] - 0.5
+        if used[n]:
             for i in range(3):
-                frame.arms[n, i] = point[i] - place[i, 3]
-            frame.used[n] = triangulate(eyes.measuring, point, eyes.limits, frame, n)
-        frame.seen[n] = frame.used[n]
+                arms[n, i] = expected[i] - place[i, 3]
+                points[n, i] = expected[i]
+            used[n] = triangulate(figures, moves, pixels, spreads, n, parted, points[n], scratch) < largest_gap
+            spread_out(scratch[0], frame.informations[n])
+            spread_out(scratch[1], frame.covariances[n])
+            for i in range(3):
+                found[n, i] = points[n, i] - expected[i]
+        frame.seen[n] = used[n]
 
 
 @compiled
@@ -571,9 +638,9 @@ def measure_frame(
     pose_transform(poses[0], platform)
     multiply(eyes.camera_from_base, platform, place)
     expect(eyes, place, frame)
-    change, covariance, excess = np.empty(6), np.empty((6, 6)), 1.0
+    scratch, change, covariance, excess = np.empty((6, 6)), np.empty(6), np.empty((6, 6)), 1.0
     for _ in range(MOST_STEPS):
-        excess = believed(frame, eyes.limits, change, covariance)
+        excess = believed(frame, eyes.limits, scratch, change, covariance)
         if excess == 0.0:
             return CAREFUL
         move_by(place, change)
@@ -587,7 +654,10 @@ def measure_frame(
     for i in range(6):
         for j in range(6):
             covariance[i, j] *= excess
-    frame.covariances[:] *= excess
+    for n in range(len(frame.used)):
+        for i in range(3):
+            for j in range(3):
+                frame.covariances[n, i, j] *= excess
     base_pose(place, covariance, eyes.base_from_camera, pose, spread)
     return MEASURED
 

@@ -112,8 +112,10 @@ def hidden_stickers(
     moves (b,4,4) camera_from_body of the solids; places and normals (n,3) of stickers in camera axes; owners (n,) the
     solids that carry them, which do not hide them. Only stickers that are ``asked`` (n,) are looked at.
     """
-    camera, eye, point, probes = np.zeros(3), np.empty(3), np.empty(3), np.empty((1, PROBES + 1, 3))
+    camera, eyes, point, probes = np.zeros(3), np.empty((len(moves), 3)), np.empty(3), np.empty((1, PROBES + 1, 3))
     reach = np.full(1, clear)
+    for b in range(len(moves)):
+        to_body(moves[b], camera, eyes[b])
     for n in range(len(places)):
         hidden[n] = False
         if not asked[n]:
@@ -122,14 +124,12 @@ def hidden_stickers(
         for b in range(len(moves)):
             if b == owners[n] or hidden[n]:
                 continue
-            to_body(moves[b], camera, eye)
+            eye = eyes[b]
             to_body(moves[b], places[n], point)
-            faces, offsets = (
-                solids.normals[solids.starts[b] : solids.starts[b + 1]],
-                solids.offsets[solids.starts[b] : solids.starts[b + 1]],
-            )
             if not reaches(eye, point, solids.middles[b], solids.radii[b] + clear):
                 continue
+            first, last = solids.starts[b], solids.starts[b + 1]
+            faces, offsets = solids.normals[first:last], solids.offsets[first:last]
             if not enters(eye, point, faces, offsets, clear, 0.0):
                 continue
             if not probed:
