@@ -24,6 +24,9 @@ from cmmsim.imaging.formation import ImageFormation
 from cmmsim.imaging.renderer import Drawable, Renderer, choose_renderer
 from cmmsim.imaging.scene import Mesh, scene_body, solid_mesh
 from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.statistical.conditions import require_proved
+from cmmsim.statistical.exposure import STATISTICAL, Light, StatisticalStereoCamera
+from cmmsim.statistical.scene import StickerScene
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,7 @@ class TrueCameras:
         self._require_in_sight(drift.changes, ", ".join(f"{name} by {value:g}" for name, value in changes.items()))
         self._drift = drift
 
-    def at(self, frame: int) -> VirtualStereoCamera:
+    def at(self, frame: int) -> VirtualStereoCamera | StatisticalStereoCamera:
         """Both cameras before the scene, as they are at a frame of a run, counted from 0."""
         return self.at_rest if self._drift is None else self.at_rest.moved(self._drift.after(frame))
 
@@ -96,8 +99,27 @@ class TrueCameras:
         return choose_renderer(self._asked_renderer)
 
     @cached_property
-    def at_rest(self) -> VirtualStereoCamera:
-        """Both cameras before the scene, without drift. Stickers are drawn first: what they hide need not be drawn."""
+    def at_rest(self) -> VirtualStereoCamera | StatisticalStereoCamera:
+        """Both cameras before the scene, without drift. Raises CmmError for a renderer that is not proved for them."""
+        return self._without_images() if self.renderer is STATISTICAL else self._drawing()
+
+    def _without_images(self) -> StatisticalStereoCamera:
+        """Cameras that say what would be found in their images."""
+        stickers = self._file.stickers
+        light = Light(stickers.sticker_level / 255.0, stickers.ring_level / 255.0, self._optics)
+        require_proved(self._file, self._noise, light)
+        return StatisticalStereoCamera(
+            self.rig,
+            self.camera_from_base,
+            StickerScene.of(self.scene, list(self.obstacles.values())),
+            light,
+            list(self.obstacles),
+            self._file.timing.exposure,
+            self._right_later,
+        )
+
+    def _drawing(self) -> VirtualStereoCamera:
+        """Cameras that draw. Stickers are drawn first: what they hide need not be drawn."""
         file = self._file
         patches = [p for body in self.scene for p in body.stickers] + [body.solid for body in self.scene]
         owners = [k for k, body in enumerate(self.scene) for _ in body.stickers] + [0, 1]

@@ -185,7 +185,7 @@ class VirtualStereoCamera:
         if pose_rate is not None and self.exposure > 0.0:
             poses = sub_frame_poses(pose, pose_rate, self.exposure, self._sticker_pixels)
         lag = np.zeros(6) if pose_rate is None else self.right_later * pose_rate
-        moments = [placed_bodies(self._from_base, p, p + lag, obstacles or {}, self.obstacle_names) for p in poses]
+        moments = [self._placed(p, p + lag, obstacles or {}) for p in poses]
         return LiveImages(self, moments, rng, quality or Quality())
 
     def moved(self, changes: Array) -> "VirtualStereoCamera":
@@ -226,6 +226,18 @@ class VirtualStereoCamera:
         shapes = [(camera.height, camera.width) for camera in self.rig.cameras]
         return [draw_pattern(shape, prnu, dsnu, rng) for shape, rng in zip(shapes, rngs, strict=True)]
 
+    def _placed(self, left: Array, right: Array, obstacles: Mapping[str, Array]) -> list[Array]:
+        """camera_from_body (b,4,4) of all bodies for the left and the right camera, each at its own pose (6,) of the
+        platform."""
+        absent = rigid(np.eye(3), (0.0, 0.0, -1e3))  # an obstacle without a place stands far behind both cameras
+        return [
+            np.stack(
+                [c @ pose_to_transform(pose), c]
+                + [c @ obstacles[n] if n in obstacles else absent for n in self.obstacle_names]
+            )
+            for c, pose in zip(self._from_base, (left, right), strict=True)
+        ]
+
     def _sticker_pixels(self, pose: Array) -> Array:
         """Pixels (2, n, 2) of the platform's stickers."""
         drawable = self.formation.drawable
@@ -237,20 +249,6 @@ class VirtualStereoCamera:
             ]
         )
         return self.rig.project(apply(self.camera_from_base @ pose_to_transform(pose), places))[0]
-
-
-def placed_bodies(
-    from_base: Sequence[Array], left: Array, right: Array, obstacles: Mapping[str, Array], names: Sequence[str]
-) -> list[Array]:
-    """camera_from_body (b,4,4) of platform, base and obstacles of these ``names`` for the left and the right camera,
-    each at its own pose (6,) of the platform and at ``from_base`` (4,4)."""
-    absent = rigid(np.eye(3), (0.0, 0.0, -1e3))  # an obstacle without a place stands far behind both cameras
-    return [
-        np.stack(
-            [c @ pose_to_transform(pose), c] + [c @ obstacles[n] if n in obstacles else absent for n in names]
-        )
-        for c, pose in zip(from_base, (left, right), strict=True)
-    ]
 
 
 class LiveImages:

@@ -216,10 +216,6 @@ class PoseEstimator(Observer):
         base_from_platform = self.taught.base_from_camera @ camera_from_platform
         spread = compose_covariance(self.taught.base_from_camera, covariance)
         pose = transform_to_pose(base_from_platform)
-        if self.common_covariance is None:
-            common = self.taught.calibration_covariance(pose, self.method)
-        else:
-            common = self.common_covariance(pose)
         measurement = Measurement(
             pose,
             pose_covariance(base_from_platform, spread),
@@ -229,10 +225,16 @@ class PoseEstimator(Observer):
             used.right_pixels,
             self.platform.sticker_ids[used.index],
             True,
-            common_covariance=common,
+            common_covariance=self.common_at(pose),
             pixel_variances=used.pixel_variances,
         )
         return measurement, camera_from_platform
+
+    def common_at(self, pose: Array) -> Array:
+        """Covariance (6,6) that all poses have in common at a pose (6,)."""
+        if self.common_covariance is None:
+            return self.taught.calibration_covariance(pose, self.method)
+        return self.common_covariance(pose)
 
     def _solve(self, seen: StickerObservation) -> Solution:
         used, result = consistent(seen, self, self.platform, self.taught.platform_places)

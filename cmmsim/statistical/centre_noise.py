@@ -36,9 +36,9 @@ def centre_noise(noise: CameraNoise, psf_px: float, fit_size: int, sticker: floa
         found, total = np.empty((len(shapes), 5, 5)), np.zeros((len(shapes), 2, 2))
         for phase in np.stack(np.meshgrid(within, within), axis=-1).reshape(-1, 2):
             centres = np.tile(0.5 * (fit_size - 1) + phase, (len(shapes), 1))
-            contrasts, ground = np.full(len(shapes), light * (bright - dark)), black + light * (dark - black)
+            greys = (np.full(len(shapes), grey) for grey in (light * (bright - dark), black + light * (dark - black)))
             still = np.zeros((len(shapes), 2))
-            fit_covariances(centres, shapes, still, contrasts, ground, fit_size, settings, found)
+            fit_covariances(centres, shapes, still, *greys, fit_size, settings, found)
             total += found[:, :2, :2]
         return total / phases**2
 

@@ -6,7 +6,7 @@ does to the fit beyond the first order is left out; so is a sticker of which any
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NoReturn
 
@@ -18,9 +18,9 @@ from cmmsim.detection.ellipse_fit import EllipseFits, fit_settings, lies_inside
 from cmmsim.errors import CmmError
 from cmmsim.geometry.camera import Optics, PinholeCamera
 from cmmsim.geometry.disc_image import SHAPE_BASIS, bending, project_discs, symmetric_root
-from cmmsim.geometry.pose import Array, pose_to_transform
+from cmmsim.geometry.pose import Array, pose_to_transform, rigid
 from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.imaging.exposure import Quality, placed_bodies
+from cmmsim.imaging.exposure import Quality
 from cmmsim.imaging.renderer import Renderer
 from cmmsim.plugins import RENDERERS
 from cmmsim.pose_estimation.observation import LONGEST_SMEAR_PX, Observer
@@ -74,41 +74,41 @@ class StatisticalStereoCamera:
         pose_rate: Array | None = None,
     ) -> "DrawnStickers":
         """One exposure; parameters as of ``VirtualStereoCamera.look``. How many are averaged, the observer knows."""
-        rate = np.zeros(6) if pose_rate is None else pose_rate
-        half, lag = 0.5 * self.exposure * rate, self.right_later * rate
-        middle, *ends = (
-            self._placed(pose + share, pose + share + lag, obstacles or {})
-            for share in ((np.zeros(6), -half, half) if half.any() else (np.zeros(6),))
-        )
-        swept = [np.stack([self.scene.centres(moves) for moves in end]) for end in ends]
-        sides = [self._side(camera, moves) for camera, moves in zip(self.rig.cameras, middle, strict=True)]
-        centres, shapes, seen = (np.stack(values) for values in zip(*sides, strict=True))
-        smears = np.zeros_like(centres)
-        if swept:
-            smears = np.stack(
-                [c.project(last)[0] - c.project(first)[0] for c, first, last in zip(self.rig.cameras, *swept, strict=True)]
-            )
-        return DrawnStickers(self, centres, shapes, smears, seen, rng.standard_normal((*seen.shape, 5)))
+        rates = None if pose_rate is None else pose_rate[None]
+        return DrawnStickers(self, self.exposed(pose[None], rates)[0], self.placed(obstacles or {}), rng)
+
+    def moved(self, changes: Array) -> "StatisticalStereoCamera":
+        """The same cameras with changes (24,) of their rig's parameters."""
+        return replace(self, rig=self.rig.moved(changes))
+
+    def exposed(self, poses: Array, rates: Array | None) -> Array:
+        """Poses (N,6,6) of the platform at poses (N,6) in motion at rates (N,6): in the middle, at the beginning and at
+        the end of the left camera's exposure, then of the right one's."""
+        rates = np.zeros_like(poses) if rates is None else rates
+        half, lag = 0.5 * self.exposure * rates, self.right_later * rates
+        return np.stack([poses + later + share for later in (0.0, lag) for share in (0.0, -half, half)], axis=1)
+
+    def placed(self, obstacles: Mapping[str, Array]) -> Array:
+        """base_from_body (b,4,4) of the base and of all obstacles; those without a place lie far below."""
+        absent = rigid(np.eye(3), (0.0, 0.0, -1e3))
+        return np.stack([np.eye(4), *(obstacles.get(name, absent) for name in self.obstacle_names)])
 
     def centre_error_px(self, quality: Quality) -> float:
         """What drawing leaves in a sticker's centre: nothing is drawn."""
         return 0.0
 
-    def greys(self, noise: CameraNoise, side: int, centres: Array) -> tuple[Array, float]:
-        """Contrasts (k,) of stickers at centres (k,2) px of one image, and the grey value of their ground."""
+    def greys(self, noise: CameraNoise, side: int, centres: Array) -> tuple[Array, Array]:
+        """Contrasts (k,) of stickers at centres (k,2) px of one image, and the grey values (k,) of their grounds."""
         lit = self.light.optics.illumination(self.rig.cameras[side], centres)
-        rings = np.asarray(noise.mean_grey(self.light.ring * lit))
-        return np.asarray(noise.mean_grey(self.light.sticker * lit)) - rings, float(np.mean(rings))
+        grounds = np.asarray(noise.mean_grey(self.light.ring * lit))
+        return np.asarray(noise.mean_grey(self.light.sticker * lit)) - grounds, grounds
 
     @cached_property
-    def _from_base(self) -> list[Array]:
+    def from_base(self) -> list[Array]:
+        """Places (4,4) of the base in the axes of both cameras."""
         return [move @ self.camera_from_base for move in self.rig.from_camera]
 
-    def _placed(self, left: Array, right: Array, obstacles: Mapping[str, Array]) -> list[Array]:
-        """camera_from_body (b,4,4) of all bodies for both cameras."""
-        return placed_bodies(self._from_base, left, right, obstacles, self.obstacle_names)
-
-    def _side(self, camera: PinholeCamera, moves: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def side(self, camera: PinholeCamera, moves: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Centres (m,2) and shapes (m,2,2) of the ellipses that are fitted in one image, px, and which are seen whole."""
         places, normals = self.scene.placed(moves)
         facing = (np.einsum("ni,ni->n", places, normals) < 0.0) & (places[:, 2] > self.scene.radius)
@@ -124,24 +124,48 @@ class StatisticalStereoCamera:
         return middles, shapes, facing & ~self.scene.hidden(moves, places, normals, facing)
 
 
+@dataclass(frozen=True)
+class _Ellipses:
+    """Centres (2,m,2) px, shapes (2,m,2,2) px and smears (2,m,2) px of the ellipses of m stickers, seen (2,m) whether
+    whole, and unit normal noise (2,m,5) of their centres and shapes."""
+
+    centres: Array
+    shapes: Array
+    smears: Array
+    seen: NDArray[np.bool_]
+    noise: Array
+
+
 class DrawnStickers:
-    """What a fit would find in one exposure: centres (2,m,2) px, shapes (2,m,2,2) px and smears (2,m,2) px of the
-    ellipses of m stickers, seen (2,m) whether whole, and unit normal noise (2,m,5) of their centres and shapes."""
+    """What a fit would find in one exposure, worked out as far as it is asked for.
+
+    camera; exposed (6,6) poses as of ``StatisticalStereoCamera.exposed``; bodies (b,4,4) as of its ``placed``; rng of
+    its noise.
+    """
 
     full = windows = refuse_images
 
     def __init__(
-        self,
-        camera: StatisticalStereoCamera,
-        centres: Array,
-        shapes: Array,
-        smears: Array,
-        seen: NDArray[np.bool_],
-        noise: Array,
+        self, camera: StatisticalStereoCamera, exposed: Array, bodies: Array, rng: np.random.Generator
     ) -> None:
-        self._camera, self._centres, self._shapes, self._smears = camera, centres, shapes, smears
+        self.camera, self.exposed, self.bodies, self.rng = camera, exposed, bodies, rng
+
+    @cached_property
+    def _found(self) -> "_Ellipses":
+        """The ellipses of all stickers."""
+        camera, centres, shapes, smears, seen = self.camera, [], [], [], []
+        for side, (lens, from_base) in enumerate(zip(camera.rig.cameras, camera.from_base, strict=True)):
+            middle, first, last = (
+                from_base @ np.stack([pose_to_transform(pose), *self.bodies])
+                for pose in self.exposed[3 * side : 3 * side + 3]
+            )
+            for values, found in zip((centres, shapes, seen), camera.side(lens, middle), strict=True):
+                values.append(found)
+            ends = (lens.project(camera.scene.placed(moves)[0])[0] for moves in (last, first))
+            smears.append(np.subtract(*ends))
         short = np.linalg.norm(smears, axis=-1) < LONGEST_SMEAR_PX
-        self._seen, self._noise = seen & short, noise
+        noise = self.rng.standard_normal((*short.shape, 5))
+        return _Ellipses(np.stack(centres), np.stack(shapes), np.stack(smears), np.stack(seen) & short, noise)
 
     def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
         """See ``StickerExposure``: in each window the sticker nearest to its middle."""
@@ -151,25 +175,25 @@ class DrawnStickers:
     def bright(self, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
         """See ``StickerExposure``."""
         found = []
-        for side, camera in enumerate(self._camera.rig.cameras):
-            reach = np.linalg.norm(self._shapes[side], axis=2)
-            whole = self._seen[side] & np.all(
-                (self._centres[side] - reach > 0.0)
-                & (self._centres[side] + reach < (camera.width - 1, camera.height - 1)),
+        for side, camera in enumerate(self.camera.rig.cameras):
+            reach = np.linalg.norm(self._found.shapes[side], axis=2)
+            whole = self._found.seen[side] & np.all(
+                (self._found.centres[side] - reach > 0.0)
+                & (self._found.centres[side] + reach < (camera.width - 1, camera.height - 1)),
                 axis=1,
             )
             index = np.flatnonzero(whole)
             fit_size = observer.settings.fit_size
-            corners = np.rint(self._centres[side, index] - 0.5 * (fit_size - 1)).astype(int)
+            corners = np.rint(self._found.centres[side, index] - 0.5 * (fit_size - 1)).astype(int)
             found.append(self._fitted(side, index, corners, whole[index], observer))
         return found[0], found[1]
 
     def _in_windows(self, side: int, corners: NDArray[np.int_], size: int, observer: Observer) -> EllipseFits:
         """Of the k windows of one image."""
-        gaps = np.abs(self._centres[side] - corners[:, None] - 0.5 * (size - 1)).max(axis=2)
-        gaps[:, ~self._seen[side]] = np.inf
+        gaps = np.abs(self._found.centres[side] - corners[:, None] - 0.5 * (size - 1)).max(axis=2)
+        gaps[:, ~self._found.seen[side]] = np.inf
         index, fit_size = gaps.argmin(axis=1), observer.settings.fit_size
-        centres = self._centres[side, index]
+        centres = self._found.centres[side, index]
         inner = np.rint(centres - 0.5 * (fit_size - 1)).astype(int)
         inner = np.clip(inner, corners, corners + size - fit_size)
         return self._fitted(side, index, inner, np.isfinite(gaps.min(axis=1, initial=0.0)), observer)
@@ -186,24 +210,24 @@ class DrawnStickers:
         from cmmsim.statistical.sticker_kernels import fit_covariances  # compiles, so it is loaded where it is first needed
 
         settings, noise = observer.settings, observer.noise
-        centres, shapes = self._centres[side, index], self._shapes[side, index]
+        centres, shapes = self._found.centres[side, index], self._found.shapes[side, index]
         within = lies_inside(centres - corners, shapes, settings.fit_size)
-        contrast, ground = self._camera.greys(noise, side, centres)
-        good = seen & within & (contrast >= settings.limits.smallest_contrast)
+        contrasts, grounds = self.camera.greys(noise, side, centres)
+        good = seen & within & (contrasts >= settings.limits.smallest_contrast)
         spread = np.tile(np.eye(5), (len(index), 1, 1))
         chosen = np.empty((int(good.sum()), 5, 5))
         fit_covariances(
             (centres - corners)[good],
             shapes[good],
-            self._smears[side, index[good]],
-            contrast[good],
-            ground,
+            self._found.smears[side, index[good]],
+            contrasts[good],
+            grounds[good],
             settings.fit_size,
             fit_settings(noise, settings.optics.psf_px),
             chosen,
         )
         spread[good] = chosen
-        drawn = np.einsum("kij,kj->ki", np.linalg.cholesky(spread), self._noise[side, index])
+        drawn = np.einsum("kij,kj->ki", np.linalg.cholesky(spread), self._found.noise[side, index])
         return EllipseFits(
             centres + drawn[:, :2],
             spread[:, :2, :2],
@@ -211,8 +235,8 @@ class DrawnStickers:
             shapes + np.einsum("kp,pij->kij", drawn[:, 2:], SHAPE_BASIS),
             spread[:, 2:, 2:],
             np.ones(len(index)),
-            contrast,
-            np.full(len(index), ground),
+            contrasts,
+            grounds,
         )
 
 

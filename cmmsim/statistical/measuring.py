@@ -9,7 +9,6 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ from cmmsim.pose_estimation.consistency import CHANCE, EXCESS_CHANCE, FEWEST, LA
 from cmmsim.pose_estimation.estimator import Measurement, PoseEstimator, lost_measurement
 from cmmsim.pose_estimation.observation import GRAZING, LONGEST_SMEAR_PX, StickerObservation
 from cmmsim.statistical.centre_noise import centre_noise
-from cmmsim.statistical.exposure import StatisticalStereoCamera
+from cmmsim.statistical.exposure import DrawnStickers, StatisticalStereoCamera
 from cmmsim.statistical.pose_kernels import CAREFUL, Cameras, Eyes, Frame, Limits, Stickers, measure_frame, measure_frames
 from cmmsim.statistical.scene import CLEAR
 
@@ -40,118 +39,140 @@ class MeasuredPoses:
     covariances: Array
     stickers: NDArray[np.int_]
 
+    def without(self, dropped: NDArray[np.bool_]) -> "MeasuredPoses":
+        """The same frames, of which those that are ``dropped`` (N,) are lost."""
+        gone = dropped[:, None]
+        return MeasuredPoses(
+            np.where(gone, np.nan, self.poses),
+            np.where(gone[:, None], np.nan, self.covariances),
+            np.where(dropped, 0, self.stickers),
+        )
 
-@dataclass(frozen=True)
-class StatisticalMeasuring:
-    """What a camera without images sees, and the estimator that measures."""
 
-    camera: StatisticalStereoCamera
-    estimator: PoseEstimator
+class StatisticalTracker:
+    """Measures frame after frame as a `Tracker` does. Nothing is predicted: what is lost is found again at once."""
 
-    def __post_init__(self) -> None:
-        if self.estimator.method != "registration":
-            raise CmmError(f"many poses are measured by registration only, not by {self.estimator.method}")
+    def __init__(self, estimator: PoseEstimator) -> None:
+        if estimator.method != "registration":
+            raise CmmError(f"poses are measured without images by registration only, not by {estimator.method}")
+        self._estimator = estimator
+        self._camera: StatisticalStereoCamera | None = None
 
-    def measure(self, pose: Array, rate: Array, bodies: Array, rng: np.random.Generator) -> Measurement:
-        """One frame of the platform at a pose (6,) in motion at a rate (6,), among ``bodies`` (b,4,4), base_from_body of
-        the base and of the obstacles."""
+    def forget(self) -> None:
+        """There is nothing to be forgotten."""
+
+    def miss(self) -> None:
+        """A frame passed that nobody saw."""
+
+    def measure(self, exposure: DrawnStickers) -> Measurement:
+        """Measure one frame, such as ``sensor.look`` returns."""
         frame, found, spread = self._frame(), np.empty(6), np.empty((6, 6))
-        noise, kept = self._draws(rng, 1)
-        state = measure_frame(self._eyes, self._exposed(pose[None], rate[None])[0], bodies, noise[0], kept[0], frame,
-                              found, spread)  # fmt: skip
+        noise, kept = self._draws(exposure.rng, 1)
+        eyes = self._eyes_of(exposure.camera)
+        state = measure_frame(eyes, exposure.exposed, exposure.bodies, noise[0], kept[0], frame, found, spread)
         if state == CAREFUL:
             return self._carefully(frame)
-        used = frame.used
+        used, estimator = frame.used, self._estimator
         return Measurement(
             found, spread, frame.points[used], frame.covariances[used], frame.pixels[0, used], frame.pixels[1, used],
-            self.estimator.platform.sticker_ids[used], True,
+            estimator.platform.sticker_ids[used], True, "", estimator.common_at(found), _variances(frame, used),
         )  # fmt: skip
 
-    def measure_many(self, poses: Array, rates: Array, bodies: Array, rng: np.random.Generator) -> MeasuredPoses:
-        """Frames (N,) of the platform at poses (N,6) in motion at rates (N,6), each with noise of its own."""
-        exposed, count = self._exposed(poses, rates), len(poses)
+    def measure_many(
+        self, camera: StatisticalStereoCamera, exposed: Array, bodies: Array, rng: np.random.Generator
+    ) -> MeasuredPoses:
+        """Frames (N,6,6), as of ``StatisticalStereoCamera.exposed``, among bodies (b,4,4) that stand still."""
+        count, eyes = len(exposed), self._eyes_of(camera)
         found, spreads = np.empty((count, 6)), np.empty((count, 6, 6))
         stickers, states = np.empty(count, dtype=int), np.empty(count, dtype=int)
         starts = range(0, count, BLOCK)
 
         def block(start: int, own: np.random.Generator) -> None:
-            part = slice(start, start + BLOCK)
+            part, frame = slice(start, start + BLOCK), self._frame()
             noise, kept = self._draws(own, len(exposed[part]))
-            frame = self._frame()
-            measure_frames(self._eyes, exposed[part], bodies, noise, kept, frame, found[part], spreads[part],
-                           stickers[part], states[part])  # fmt: skip
+            filled = (values[part] for values in (found, spreads, stickers, states))
+            measure_frames(eyes, exposed[part], bodies, noise, kept, frame, *filled)
             for k in np.flatnonzero(states[part] == CAREFUL):
-                measure_frame(self._eyes, exposed[start + k], bodies, noise[k], kept[k], frame, found[start + k],
-                              spreads[start + k])  # fmt: skip
+                at = start + k
+                measure_frame(eyes, exposed[at], bodies, noise[k], kept[k], frame, found[at], spreads[at])
                 careful = self._carefully(frame)
-                found[start + k], spreads[start + k] = careful.pose, careful.covariance
-                stickers[start + k] = len(careful.target_ids)
+                found[at], spreads[at], stickers[at] = careful.pose, careful.covariance, len(careful.target_ids)
 
         with ThreadPoolExecutor(min(len(starts) or 1, os.cpu_count() or 1)) as pool:
             list(pool.map(block, starts, rng.spawn(len(starts))))
         return MeasuredPoses(found, spreads, stickers)
 
-    @cached_property
-    def _eyes(self) -> Eyes:
-        camera, estimator = self.camera, self.estimator
-        settings, taught = estimator.settings, estimator.taught
-        own = camera.scene.owners == 0
-        count, light = int(own.sum()), camera.light
-        freedoms = np.arange(3 * count + 1)
-        limits = Limits(
-            GRAZING,
-            1.01 * SMALLEST_RADIUS_PX,
-            LONGEST_SMEAR_PX,
-            settings.largest_ray_gap,
-            LARGEST_MISFIT,
-            LARGEST_EXCESS,
-            PLAIN,
-            np.asarray(chi2.isf(EXCESS_CHANCE, np.maximum(freedoms, 1))),
-            CLEAR * camera.scene.radius,
-            light.optics.vignetting,
-            settings.line_error_px**2,
-        )
-        stickers = Stickers(
-            *(np.ascontiguousarray(v) for v in (camera.scene.places[own], taught.platform_places, camera.scene.normals[own])),
-            camera.scene.radius,
-        )
-        return Eyes(
-            _cameras(camera.rig, [move @ camera.camera_from_base for move in camera.rig.from_camera]),
-            _cameras(estimator.rig, estimator.rig.from_camera),
-            stickers,
-            np.zeros(count, dtype=int),
-            camera.scene.hiding,
-            centre_noise(estimator.noise, light.optics.psf_px, settings.fit_size, light.sticker, light.ring),
-            limits,
-            np.ascontiguousarray(taught.base_from_camera),
-            invert(taught.base_from_camera),
-        )
+    def _eyes_of(self, camera: StatisticalStereoCamera) -> Eyes:
+        """What looks and measures; where a camera has only moved since the last frame, the rest stays."""
+        if camera is not self._camera:
+            if self._camera is None or camera.scene is not self._camera.scene:
+                self._eyes = _eyes(camera, self._estimator)
+            else:
+                self._eyes = self._eyes._replace(looking=_cameras(camera.rig, camera.from_base))
+            self._camera = camera
+        return self._eyes
 
     def _frame(self) -> Frame:
-        n = len(self.estimator.platform.sticker_ids)
+        n = len(self._estimator.platform.sticker_ids)
         shapes = ((2, n, 2), (2, n, 2, 2), (n, 3), (n, 3, 3), (n, 3, 3), (n, 3), (n, 3))
         return Frame(*np.empty((2, n), dtype=bool), *(np.empty(shape) for shape in shapes))
 
     def _draws(self, rng: np.random.Generator, frames: int) -> tuple[Array, NDArray[np.bool_]]:
         """Unit normal noise (N,2,n,2) of centres, and which stickers (N,n) are not left out for their outlines."""
-        n = len(self.estimator.platform.sticker_ids)
+        n = len(self._estimator.platform.sticker_ids)
         return rng.standard_normal((frames, 2, n, 2)), rng.random((frames, n)) >= OUTLINE_CHANCE
-
-    def _exposed(self, poses: Array, rates: Array) -> Array:
-        """Poses (N,6,6) as ``pose_kernels.look`` takes them."""
-        half, lag = 0.5 * self.camera.exposure * rates, self.camera.right_later * rates
-        return np.stack([poses + share + later for later in (0.0, lag) for share in (0.0, -half, half)], axis=1)
 
     def _carefully(self, frame: Frame) -> Measurement:
         """What the estimator makes of all of a frame's stickers."""
         index = np.flatnonzero(frame.seen)
+        left, right = frame.pixels[:, index]
         seen = StickerObservation(
-            index, frame.pixels[0, index], frame.pixels[1, index], frame.points[index], frame.covariances[index]
+            index, left, right, frame.points[index], frame.covariances[index], _variances(frame, index)
         )
         try:
-            return self.estimator.measured(seen)[0]
+            return self._estimator.measured(seen)[0]
         except LostError as error:
             return lost_measurement(str(error))
+
+
+def _variances(frame: Frame, chosen: NDArray) -> Array:
+    """Mean variances (k,) of a coordinate of chosen stickers' centres, px²."""
+    return 0.25 * np.einsum("ckii->k", frame.spreads[:, chosen])
+
+
+def _eyes(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> Eyes:
+    settings, taught = estimator.settings, estimator.taught
+    own = camera.scene.owners == 0
+    count, light = int(own.sum()), camera.light
+    freedoms = np.arange(3 * count + 1)
+    limits = Limits(
+        GRAZING,
+        1.01 * SMALLEST_RADIUS_PX,
+        LONGEST_SMEAR_PX,
+        settings.largest_ray_gap,
+        LARGEST_MISFIT,
+        LARGEST_EXCESS,
+        PLAIN,
+        np.asarray(chi2.isf(EXCESS_CHANCE, np.maximum(freedoms, 1))),
+        CLEAR * camera.scene.radius,
+        light.optics.vignetting,
+        settings.line_error_px**2,
+    )
+    stickers = Stickers(
+        *(np.ascontiguousarray(v) for v in (camera.scene.places[own], taught.platform_places, camera.scene.normals[own])),
+        camera.scene.radius,
+    )
+    return Eyes(
+        _cameras(camera.rig, camera.from_base),
+        _cameras(estimator.rig, estimator.rig.from_camera),
+        stickers,
+        np.zeros(count, dtype=int),
+        camera.scene.hiding,
+        centre_noise(estimator.noise, light.optics.psf_px, settings.fit_size, light.sticker, light.ring),
+        limits,
+        np.ascontiguousarray(taught.base_from_camera),
+        invert(taught.base_from_camera),
+    )
 
 
 def _cameras(rig: StereoRig, moves: Sequence[Array]) -> Cameras:

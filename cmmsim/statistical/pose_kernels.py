@@ -222,14 +222,14 @@ def tabulated(table: Array, first: Array, steps: Array, by_light: Array, xx: flo
 def smeared(noise: CentreNoise, shape: tuple, light: float, centre: tuple, smear: tuple) -> tuple:
     """Covariance xx, xy, yy px² of the centre of an ellipse that moves by ``smear`` px, at its own place."""
     local, found, size = np.empty((1, 2)), np.empty((1, 5, 5)), noise.fit_size
-    one, moved, contrasts = np.empty((1, 2, 2)), np.empty((1, 2)), np.empty(1)
+    one, moved, greys = np.empty((1, 2, 2)), np.empty((1, 2)), np.empty((2, 1))
     for i in range(2):
         local[0, i] = centre[i] - np.rint(centre[i] - 0.5 * (size - 1))
         moved[0, i] = smear[i]
         for j in range(2):
             one[0, i, j] = shape[i + j]
-    contrasts[0] = noise.contrast * light
-    fit_covariances(local, one, moved, contrasts, noise.black + noise.ring * light, size, noise.settings, found)
+    greys[0, 0], greys[1, 0] = noise.contrast * light, noise.black + noise.ring * light
+    fit_covariances(local, one, moved, greys[0], greys[1], size, noise.settings, found)
     return found[0, 0, 0], found[0, 0, 1], found[0, 1, 1]
 
 

@@ -3,14 +3,16 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cmmsim.geometry.disc_kernels import place_discs
 from cmmsim.geometry.pose import Array
 from cmmsim.imaging.scene import ConvexSolid, Mesh, SceneBody
-from cmmsim.statistical.sticker_kernels import Solids, hidden_stickers
+
+if TYPE_CHECKING:
+    from cmmsim.statistical.sticker_kernels import Solids
 
 CLEAR = 1.4  # radii of a sticker within which nothing may stand before it and its ring, or its fit is spoilt
 
@@ -40,6 +42,8 @@ class StickerScene:
 
     def placed(self, moves: Array) -> tuple[Array, Array]:
         """Places and normals (m,3) in the axes of a camera at which bodies stand by ``moves`` (b,4,4)."""
+        from cmmsim.geometry.disc_kernels import place_discs  # compiles, so it is loaded where it is first needed
+
         places, normals = np.empty_like(self.places), np.empty_like(self.normals)
         place_discs(moves, self.owners, self.places, self.normals, places, normals)
         return places, normals
@@ -51,13 +55,17 @@ class StickerScene:
     def hidden(self, moves: Array, places: Array, normals: Array, asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Whether a solid stands before any part of the stickers (m,) with places and normals (m,3) in camera axes;
         only those ``asked`` (m,) are looked at."""
+        from cmmsim.statistical.sticker_kernels import hidden_stickers
+
         hidden = np.empty(len(asked), dtype=bool)
         hidden_stickers(moves, places, normals, self.owners, CLEAR * self.radius, self.hiding, asked, hidden)
         return hidden
 
     @cached_property
-    def hiding(self) -> Solids:
+    def hiding(self) -> "Solids":
         """The solids as ``hidden_stickers`` takes them."""
+        from cmmsim.statistical.sticker_kernels import Solids
+
         faces = [solid.faces for solid in self.solids]
         middles = np.array([solid.middle for solid in self.solids])
         radii = [np.linalg.norm(s.vertices - m, axis=1).max() for s, m in zip(self.solids, middles, strict=True)]

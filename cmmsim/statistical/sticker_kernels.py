@@ -27,13 +27,13 @@ def fit_covariances(
     shapes: Array,
     smears: Array,
     contrasts: Array,
-    ground: float,
+    grounds: Array,
     size: int,
     settings: FitSettings,
     covariances: Array,
 ) -> None:
     """Fill covariances (n,m,m) of the first m parameters that ``fit_window`` would state of n ellipses that are as its
-    model says: centres (n,2) in px of parts of ``size`` px, shapes (n,2,2), smears (n,2) px, contrasts (n,)."""
+    model says: centres (n,2) in px of parts of ``size`` px, shapes (n,2,2), smears (n,2) px, contrasts and grounds (n,)."""
     mask, window = np.empty((size, size), np.bool_), np.empty((size, size))
     shares, derivatives = np.empty((size, size)), np.empty((size, size, 5))
     normal, right, parameters = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS), np.empty(UNKNOWNS)
@@ -43,8 +43,8 @@ def fit_covariances(
         light_of_moving(parameters, shapes[n], smears[n], settings, shares, derivatives)
         for i in range(size):
             for j in range(size):
-                window[i, j] = ground + contrasts[n] * shares[i, j]
-        accumulate(window, mask, shares, derivatives, contrasts[n], ground, settings, normal, right)
+                window[i, j] = grounds[n] + contrasts[n] * shares[i, j]
+        accumulate(window, mask, shares, derivatives, contrasts[n], grounds[n], settings, normal, right)
         factor(normal)
         invert_factored(normal, covariances[n])
 
