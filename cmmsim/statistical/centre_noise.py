@@ -1,8 +1,8 @@
-"""The covariance of a sticker's centre, tabulated over its ellipse.
+"""How well a sticker's centre is known, tabulated over its ellipse.
 
-It is the mean over where the centre lies within a pixel of what the fit states there, `sticker_kernels.fit_covariances`.
-Times the mean half axis m it changes little with m, and smoothly with the ovalness p = (A_xx - A_yy) / 2 m and
-q = A_xy / m of the ellipse's shape A.
+It is the inverse of the mean, over where the centre lies within a pixel, of the covariance that the fit states there,
+`sticker_kernels.fit_covariances`. It grows with the rim: over the mean half axis m it changes little with m, and
+smoothly with the ovalness p = (A_xx - A_yy) / 2 m and q = A_xy / m of the ellipse's shape A.
 """
 
 from functools import lru_cache
@@ -45,7 +45,8 @@ def centre_noise(noise: CameraNoise, psf_px: float, fit_size: int, sticker: floa
     radii = np.linspace(SMALLEST_RADIUS_PX, 0.5 * fit_size, RADII)
     m, p, q = np.meshgrid(radii, OVAL, OVAL, indexing="ij")
     found = covariances(_shapes(m.ravel(), p.ravel(), q.ravel(), 0.5 * fit_size - EDGE_PX), 1.0)
-    table = (m.reshape(-1, 1) * found[:, [0, 0, 1], [0, 1, 1]]).reshape(*m.shape, 3)
+    known = np.linalg.inv(found)[:, [0, 0, 1], [0, 1, 1]] / m.reshape(-1, 1)
+    table = known.reshape(*m.shape, 3)
     usual = _shapes(np.array([0.3 * fit_size]), np.array([0.25]), np.array([0.0]), 0.5 * fit_size)
     growth = [float(np.trace(covariances(usual, light)[0])) for light in LIGHTS]
     by_light = np.polynomial.Polynomial.fit(LIGHTS, np.array(growth) / growth[-1], 2).convert().coef

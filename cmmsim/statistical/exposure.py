@@ -29,6 +29,9 @@ from cmmsim.radiometry.noise import CameraNoise
 from cmmsim.statistical.scene import StickerScene
 
 NAME = "statistical"
+THIN_PX, THIN_STD_PX = 0.885, 0.055
+"""Half of an ellipse's width at which half of the fits end at the smallest one, and how softly that sets in: measured
+in images, whose fits err by more than to first order there."""
 
 
 def refuse_images(*_: object, **__: object) -> NoReturn:
@@ -127,7 +130,7 @@ class StatisticalStereoCamera:
 @dataclass(frozen=True)
 class _Ellipses:
     """Centres (2,m,2) px, shapes (2,m,2,2) px and smears (2,m,2) px of the ellipses of m stickers, seen (2,m) whether
-    whole, and unit normal noise (2,m,5) of their centres and shapes."""
+    whole, and unit normal noise (2,m,6): of centres and shapes, and of how thin an ellipse may be."""
 
     centres: Array
     shapes: Array
@@ -164,7 +167,7 @@ class DrawnStickers:
             ends = (lens.project(camera.scene.placed(moves)[0])[0] for moves in (last, first))
             smears.append(np.subtract(*ends))
         short = np.linalg.norm(smears, axis=-1) < LONGEST_SMEAR_PX
-        noise = self.rng.standard_normal((*short.shape, 5))
+        noise = self.rng.standard_normal((*short.shape, 6))
         return _Ellipses(np.stack(centres), np.stack(shapes), np.stack(smears), np.stack(seen) & short, noise)
 
     def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
@@ -212,6 +215,7 @@ class DrawnStickers:
         settings, noise = observer.settings, observer.noise
         centres, shapes = self._found.centres[side, index], self._found.shapes[side, index]
         within = lies_inside(centres - corners, shapes, settings.fit_size)
+        within &= thinnest(shapes) > THIN_PX + THIN_STD_PX * self._found.noise[side, index, 5]
         contrasts, grounds = self.camera.greys(noise, side, centres)
         good = seen & within & (contrasts >= settings.limits.smallest_contrast)
         spread = np.tile(np.eye(5), (len(index), 1, 1))
@@ -227,7 +231,7 @@ class DrawnStickers:
             chosen,
         )
         spread[good] = chosen
-        drawn = np.einsum("kij,kj->ki", np.linalg.cholesky(spread), self._found.noise[side, index])
+        drawn = np.einsum("kij,kj->ki", np.linalg.cholesky(spread), self._found.noise[side, index, :5])
         return EllipseFits(
             centres + drawn[:, :2],
             spread[:, :2, :2],
@@ -240,3 +244,9 @@ class DrawnStickers:
         )
 
 
+
+
+def thinnest(shapes: Array) -> Array:
+    """Shorter half axes (k,) px of ellipses with shapes (k,2,2)."""
+    mean, half = 0.5 * (shapes[:, 0, 0] + shapes[:, 1, 1]), 0.5 * (shapes[:, 0, 0] - shapes[:, 1, 1])
+    return np.asarray(mean - np.hypot(half, shapes[:, 0, 1]))

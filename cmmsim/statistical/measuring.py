@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from cmmsim.detection.ellipse_fit import SMALLEST_RADIUS_PX
 from cmmsim.errors import CmmError, LostError
 from cmmsim.geometry.pose import Array, invert
 from cmmsim.geometry.stereo_rig import StereoRig
@@ -22,7 +21,7 @@ from cmmsim.pose_estimation.consistency import CHANCE, EXCESS_CHANCE, FEWEST, LA
 from cmmsim.pose_estimation.estimator import Measurement, PoseEstimator, lost_measurement
 from cmmsim.pose_estimation.observation import GRAZING, LONGEST_SMEAR_PX, StickerObservation
 from cmmsim.statistical.centre_noise import centre_noise
-from cmmsim.statistical.exposure import DrawnStickers, StatisticalStereoCamera
+from cmmsim.statistical.exposure import THIN_PX, THIN_STD_PX, DrawnStickers, StatisticalStereoCamera
 from cmmsim.statistical.pose_kernels import CAREFUL, Cameras, Eyes, Frame, Limits, Stickers, measure_frame, measure_frames
 from cmmsim.statistical.scene import CLEAR
 
@@ -118,9 +117,9 @@ class StatisticalTracker:
         return Frame(*np.empty((2, n), dtype=bool), *(np.empty(shape) for shape in shapes))
 
     def _draws(self, rng: np.random.Generator, frames: int) -> tuple[Array, NDArray[np.bool_]]:
-        """Unit normal noise (N,2,n,2) of centres, and which stickers (N,n) are not left out for their outlines."""
+        """Unit normal noise (N,2,n,3) of centres and of how thin ellipses may be, and which stickers (N,n) are not left out for their outlines."""
         n = len(self._estimator.platform.sticker_ids)
-        return rng.standard_normal((frames, 2, n, 2)), rng.random((frames, n)) >= OUTLINE_CHANCE
+        return rng.standard_normal((frames, 2, n, 3)), rng.random((frames, n)) >= OUTLINE_CHANCE
 
     def _carefully(self, frame: Frame) -> Measurement:
         """What the estimator makes of all of a frame's stickers."""
@@ -147,7 +146,8 @@ def _eyes(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> Eyes:
     freedoms = np.arange(3 * count + 1)
     limits = Limits(
         GRAZING,
-        1.01 * SMALLEST_RADIUS_PX,
+        THIN_PX,
+        THIN_STD_PX,
         LONGEST_SMEAR_PX,
         settings.largest_ray_gap,
         LARGEST_MISFIT,

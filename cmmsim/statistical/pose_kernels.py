@@ -43,9 +43,9 @@ class Stickers(NamedTuple):
 
 
 class CentreNoise(NamedTuple):
-    """Covariance xx, xy, yy of a centre, times the ellipse's mean radius m, over m and its ovalness p, q (a,b,c,3), from
-    ``first`` (3,) on in ``steps`` (3,); by_light (3,): the polynomial in the share of light by which it grows. contrast
-    and ground: grey values of full light; fit_size px and settings of the fit."""
+    """Inverse covariance xx, xy, yy of a centre over the ellipse's mean half axis m, by m and its ovalness p, q (a,b,c,3),
+    from ``first`` (3,) on in ``steps`` (3,); by_light (3,): the polynomial in the share of light by which the covariance
+    grows. contrast, ring and black: grey values of full light; fit_size px and settings of the fit."""
 
     table: Array
     first: Array
@@ -63,7 +63,8 @@ class Limits(NamedTuple):
     their freedom, beyond which they are larger than noise."""
 
     grazing: float
-    smallest_px: float
+    thin_px: float
+    thin_std_px: float
     longest_smear_px: float
     largest_gap: float
     largest_misfit: float
@@ -214,8 +215,9 @@ def tabulated(table: Array, first: Array, steps: Array, by_light: Array, xx: flo
         found_xx += weight * table[i + up, j + across, k + deep, 0]
         found_xy += weight * table[i + up, j + across, k + deep, 1]
         found_yy += weight * table[i + up, j + across, k + deep, 2]
-    scale = (by_light[0] + light * (by_light[1] + light * by_light[2])) / mean
-    return scale * found_xx, scale * found_xy, scale * found_yy
+    scale = by_light[0] + light * (by_light[1] + light * by_light[2])
+    scale /= mean * (found_xx * found_yy - found_xy * found_xy)
+    return scale * found_yy, -scale * found_xy, scale * found_xx
 
 
 @compiled
@@ -250,7 +252,8 @@ def see(side: int, eyes: Eyes, moves: Array, ends: Array, moving: bool, noise: A
     """Fill one image's pixels and covariances of the stickers that are ``used`` so far, and take out what is not seen.
 
     moves (b,4,4) camera_from_body of all solids, the platform first; ends (2,4,4): of the platform at the beginning and
-    the end of the exposure, where it is ``moving``; noise (n,2) unit normal.
+    the end of the exposure, where it is ``moving``; noise (n,3) unit normal: of the centres, and of how thin an ellipse may
+    be.
     """
     count, looking, stickers, limits = len(frame.used), eyes.looking, eyes.stickers, eyes.limits
     places, normals, hidden = np.empty((count, 3)), np.empty((count, 3)), np.empty(count, np.bool_)
@@ -281,7 +284,7 @@ def see(side: int, eyes: Eyes, moves: Array, ends: Array, moving: bool, noise: A
         length, smallest = math.hypot(smear_u, smear_v), 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy)
         frame.used[n] = (
             length < limits.longest_smear_px
-            and smallest > limits.smallest_px
+            and smallest > limits.thin_px + limits.thin_std_px * noise[n, 2]
             and holds(u + along, math.hypot(xx, xy), size)
             and holds(v + down, math.hypot(xy, yy), size)
         )
@@ -579,7 +582,7 @@ def look(eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, fra
     """Fill what both cameras find: pixels and covariances, and which stickers are used.
 
     poses (6,6): in the middle, at the beginning and at the end of the left camera's exposure, then of the right one's;
-    bodies (b,4,4): base_from_body of all solids but the platform; noise (2,n,2) unit normal; kept (n,) whether a sticker
+    bodies (b,4,4): base_from_body of all solids but the platform; noise (2,n,3) unit normal; kept (n,) whether a sticker
     is not left out by chance.
     """
     moving = False
@@ -667,7 +670,7 @@ def measure_frames(
     eyes: Eyes, poses: Array, bodies: Array, noise: Array, kept: Array, frame: Frame, found: Array, spreads: Array,
     counts: Array, states: Array,
 ) -> None:  # fmt: skip
-    """``measure_frame`` of N frames: poses (N,6,6), bodies (b,4,4) that stand still, noise (N,2,n,2), kept (N,n); fills
+    """``measure_frame`` of N frames: poses (N,6,6), bodies (b,4,4) that stand still, noise (N,2,n,3), kept (N,n); fills
     found (N,6), spreads (N,6,6), counts (N,) of stickers used, and states (N,)."""
     for k in range(len(poses)):
         states[k] = measure_frame(eyes, poses[k], bodies, noise[k], kept[k], frame, found[k], spreads[k])

@@ -45,6 +45,8 @@ def fit_covariances(
             for j in range(size):
                 window[i, j] = grounds[n] + contrasts[n] * shares[i, j]
         accumulate(window, mask, shares, derivatives, contrasts[n], grounds[n], settings, normal, right)
+        for k in range(UNKNOWNS):
+            normal[k, k] += 1e-9  # as the fit does
         factor(normal)
         invert_factored(normal, covariances[n])
 
