@@ -301,12 +301,14 @@ class Sensor:
         Raises CmmError for a sensor that needs images, or measures by planes.
         """
         at = finite_array(poses, (len(np.atleast_1d(poses)), 6), "poses are rows of six finite numbers")
-        along = None if pose_rates is None else finite_array(pose_rates, at.shape, "pose_rates must be as many as poses")
+        along = (
+            None if pose_rates is None else finite_array(pose_rates, at.shape, "pose_rates must be as many as poses")
+        )
         tracker, camera = self._new_tracker(), self.camera
         if isinstance(tracker, Tracker) or not isinstance(camera, StatisticalStereoCamera):
             raise CmmError(
-                f"many poses are measured at once by renderer {STATISTICAL.name!r} and method 'registration' only, not by "
-                f"{self.renderer!r} and {self.method!r}"
+                f"many poses are measured at once by renderer {STATISTICAL.name!r} and method 'registration' only, "
+                f"not by {self.renderer!r} and {self.method!r}"
             )
         rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
         self._frame += len(at)
@@ -317,7 +319,9 @@ class Sensor:
         """What measures frame after frame."""
         if self.renderer != STATISTICAL.name or self.method != "registration":
             return Tracker(self.estimator)
-        from cmmsim.statistical.measuring import StatisticalTracker  # compiles, so it is loaded where it is first needed
+        from cmmsim.statistical.measuring import (
+            StatisticalTracker,
+        )  # compiles, so it is loaded where it is first needed
 
         return StatisticalTracker(self.estimator)
 
@@ -341,7 +345,7 @@ def load_sensor(
 
     Parameters: seed of teaching and of the first run's noise; method "registration" or "planes"; taught: the result of
     an earlier teaching of the same cameras and bodies; progress(done, total), called while teaching; renderer:
-    "pyrender", "analytic" or "auto" instead of what the file says; changes: other entries than the file's, by dotted
+    "pyrender", "analytic", "auto" or "statistical" instead of what the file says; changes: other entries than the file's, by dotted
     key as ``{"camera.dark_noise": 40.0}``; known: the rig that measures where it is another than the one that draws.
     Raises UnknownSensorError, SensorFileError, UnknownOptionError, and TeachingError for what another one was taught.
     """

@@ -24,8 +24,8 @@ from cmmsim.imaging.formation import ImageFormation
 from cmmsim.imaging.renderer import Drawable, Renderer, choose_renderer
 from cmmsim.imaging.scene import Mesh, scene_body, solid_mesh
 from cmmsim.radiometry.noise import CameraNoise
-from cmmsim.statistical.conditions import require_proved
-from cmmsim.statistical.exposure import STATISTICAL, Light, StatisticalStereoCamera
+from cmmsim.statistical.conditions import Light, require_proved
+from cmmsim.statistical.exposure import STATISTICAL, StatisticalStereoCamera
 from cmmsim.statistical.scene import StickerScene
 
 

@@ -40,9 +40,7 @@ MOST_TOGETHER = 64  # triangles judged together
 ENOUGH = 0.8  # share of the layout that ends the search
 
 
-def bright_ellipses(
-    images: StereoImages | StickerExposure, observer: Observer
-) -> tuple[EllipseFits, EllipseFits]:
+def bright_ellipses(images: StereoImages | StickerExposure, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
     """Ellipses of any misfit fitted to all bright spots of the left and of the right image that a window holds."""
     if isinstance(images, StickerExposure):
         return images.bright(observer)

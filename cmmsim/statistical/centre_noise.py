@@ -1,7 +1,7 @@
 """How well a sticker's centre is known, tabulated over its ellipse.
 
 It is the inverse of the mean, over where the centre lies within a pixel, of the covariance that the fit states there,
-`sticker_kernels.fit_covariances`. It grows with the rim: over the mean half axis m it changes little with m, and
+`centre_kernels.fit_covariances`. It grows with the rim: over the mean half axis m it changes little with m, and
 smoothly with the ovalness p = (A_xx - A_yy) / 2 m and q = A_xy / m of the ellipse's shape A.
 """
 
@@ -12,8 +12,7 @@ import numpy as np
 from cmmsim.detection.ellipse_fit import SMALLEST_RADIUS_PX, fit_settings
 from cmmsim.geometry.pose import Array
 from cmmsim.radiometry.noise import CameraNoise
-from cmmsim.statistical.pose_kernels import CentreNoise
-from cmmsim.statistical.sticker_kernels import fit_covariances
+from cmmsim.statistical.centre_kernels import CentreNoise, fit_covariances
 
 OVAL = np.linspace(-0.78, 0.78, 14)  # of p and of q
 RADII = 8  # mean half axes, up to half of what is fitted
@@ -36,9 +35,9 @@ def centre_noise(noise: CameraNoise, psf_px: float, fit_size: int, sticker: floa
         found, total = np.empty((len(shapes), 5, 5)), np.zeros((len(shapes), 2, 2))
         for phase in np.stack(np.meshgrid(within, within), axis=-1).reshape(-1, 2):
             centres = np.tile(0.5 * (fit_size - 1) + phase, (len(shapes), 1))
-            greys = (np.full(len(shapes), grey) for grey in (light * (bright - dark), black + light * (dark - black)))
-            still = np.zeros((len(shapes), 2))
-            fit_covariances(centres, shapes, still, *greys, fit_size, settings, found)
+            contrasts = np.full(len(shapes), light * (bright - dark))
+            grounds, still = np.full(len(shapes), black + light * (dark - black)), np.zeros((len(shapes), 2))
+            fit_covariances(centres, shapes, still, contrasts, grounds, fit_size, settings, found)
             total += found[:, :2, :2]
         return total / phases**2
 

@@ -16,19 +16,18 @@ from numpy.typing import NDArray
 from cmmsim.detection.detector import DetectedCentres
 from cmmsim.detection.ellipse_fit import EllipseFits, fit_settings, lies_inside
 from cmmsim.errors import CmmError
-from cmmsim.geometry.camera import Optics, PinholeCamera
+from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.disc_image import SHAPE_BASIS, bending, project_discs, symmetric_root
 from cmmsim.geometry.pose import Array, pose_to_transform, rigid
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.exposure import Quality
 from cmmsim.imaging.renderer import Renderer
 from cmmsim.plugins import RENDERERS
-from cmmsim.pose_estimation.observation import LONGEST_SMEAR_PX, Observer
-from cmmsim.radiometry.images import StereoFrame, Windows
+from cmmsim.pose_estimation.observation import Observer
 from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.statistical.conditions import NAME, Light, require_short
 from cmmsim.statistical.scene import StickerScene
 
-NAME = "statistical"
 THIN_PX, THIN_STD_PX = 0.885, 0.055
 """Half of an ellipse's width at which half of the fits end at the smallest one, and how softly that sets in: measured
 in images, whose fits err by more than to first order there."""
@@ -41,15 +40,6 @@ def refuse_images(*_: object, **__: object) -> NoReturn:
 
 
 STATISTICAL = Renderer(NAME, refuse_images)
-
-
-@dataclass(frozen=True)
-class Light:
-    """Radiance, 0 to 1, of stickers and of their rings, and what the lens leaves of it."""
-
-    sticker: float
-    ring: float
-    optics: Optics
 
 
 @dataclass(frozen=True)
@@ -112,7 +102,7 @@ class StatisticalStereoCamera:
         return [move @ self.camera_from_base for move in self.rig.from_camera]
 
     def side(self, camera: PinholeCamera, moves: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Centres (m,2) and shapes (m,2,2) of the ellipses that are fitted in one image, px, and which are seen whole."""
+        """Centres (m,2) and shapes (m,2,2) of ellipses that are fitted in one image, px, and which are seen whole."""
         places, normals = self.scene.placed(moves)
         facing = (np.einsum("ni,ni->n", places, normals) < 0.0) & (places[:, 2] > self.scene.radius)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -156,19 +146,25 @@ class DrawnStickers:
     @cached_property
     def _found(self) -> "_Ellipses":
         """The ellipses of all stickers."""
-        camera, centres, shapes, smears, seen = self.camera, [], [], [], []
+        camera = self.camera
+        centres: list[Array] = []
+        shapes: list[Array] = []
+        smears: list[Array] = []
+        seen: list[NDArray[np.bool_]] = []
         for side, (lens, from_base) in enumerate(zip(camera.rig.cameras, camera.from_base, strict=True)):
             middle, first, last = (
                 from_base @ np.stack([pose_to_transform(pose), *self.bodies])
                 for pose in self.exposed[3 * side : 3 * side + 3]
             )
-            for values, found in zip((centres, shapes, seen), camera.side(lens, middle), strict=True):
-                values.append(found)
+            at, shape, whole = camera.side(lens, middle)
+            centres.append(at)
+            shapes.append(shape)
+            seen.append(whole)
             ends = (lens.project(camera.scene.placed(moves)[0])[0] for moves in (last, first))
-            smears.append(np.subtract(*ends))
-        short = np.linalg.norm(smears, axis=-1) < LONGEST_SMEAR_PX
-        noise = self.rng.standard_normal((*short.shape, 6))
-        return _Ellipses(np.stack(centres), np.stack(shapes), np.stack(smears), np.stack(seen) & short, noise)
+            smears.append(np.asarray(np.subtract(*ends)))
+        require_short(float(np.linalg.norm(smears, axis=-1).max(where=np.stack(seen), initial=0.0)))
+        noise = self.rng.standard_normal((2, len(seen[0]), 6))
+        return _Ellipses(np.stack(centres), np.stack(shapes), np.stack(smears), np.stack(seen), noise)
 
     def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
         """See ``StickerExposure``: in each window the sticker nearest to its middle."""
@@ -210,7 +206,9 @@ class DrawnStickers:
         observer: Observer,
     ) -> EllipseFits:
         """Stickers ``index`` (k,) fitted in parts of windows with first pixels ``corners`` (k,2) of one image."""
-        from cmmsim.statistical.sticker_kernels import fit_covariances  # compiles, so it is loaded where it is first needed
+        from cmmsim.statistical.centre_kernels import (
+            fit_covariances,
+        )  # compiles, so it is loaded where it is first needed
 
         settings, noise = observer.settings, observer.noise
         centres, shapes = self._found.centres[side, index], self._found.shapes[side, index]
@@ -242,8 +240,6 @@ class DrawnStickers:
             contrasts,
             grounds,
         )
-
-
 
 
 def thinnest(shapes: Array) -> Array:

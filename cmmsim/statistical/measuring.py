@@ -19,11 +19,22 @@ from cmmsim.geometry.pose import Array, invert
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.pose_estimation.consistency import CHANCE, EXCESS_CHANCE, FEWEST, LARGEST_EXCESS, LARGEST_MISFIT
 from cmmsim.pose_estimation.estimator import Measurement, PoseEstimator, lost_measurement
-from cmmsim.pose_estimation.observation import GRAZING, LONGEST_SMEAR_PX, StickerObservation
+from cmmsim.pose_estimation.observation import GRAZING, StickerObservation
+from cmmsim.radiometry.images import StereoImages
 from cmmsim.statistical.centre_noise import centre_noise
+from cmmsim.statistical.conditions import require_short
 from cmmsim.statistical.exposure import THIN_PX, THIN_STD_PX, DrawnStickers, StatisticalStereoCamera
-from cmmsim.statistical.pose_kernels import CAREFUL, Cameras, Eyes, Frame, Limits, Stickers, measure_frame, measure_frames
+from cmmsim.statistical.pose_kernels import (
+    CAREFUL,
+    Cameras,
+    Eyes,
+    Limits,
+    Stickers,
+    measure_frame,
+    measure_frames,
+)
 from cmmsim.statistical.scene import CLEAR
+from cmmsim.statistical.solving_kernels import Belief, Frame
 
 PLAIN = FEWEST + 2  # stickers from which on residuals alone tell a wrong one well
 OUTLINE_CHANCE = 2 * CHANCE  # of a good sticker to be left out for its outline in one of both images
@@ -63,12 +74,15 @@ class StatisticalTracker:
     def miss(self) -> None:
         """A frame passed that nobody saw."""
 
-    def measure(self, exposure: DrawnStickers) -> Measurement:
-        """Measure one frame, such as ``sensor.look`` returns."""
+    def measure(self, exposure: StereoImages) -> Measurement:
+        """Measure one frame, such as ``sensor.look`` returns; raises CmmError for images."""
+        if not isinstance(exposure, DrawnStickers):
+            raise CmmError("a sensor without images measures what its own look() returns; images go to measure_frame")
         frame, found, spread = self._frame(), np.empty(6), np.empty((6, 6))
         noise, kept = self._draws(exposure.rng, 1)
         eyes = self._eyes_of(exposure.camera)
         state = measure_frame(eyes, exposure.exposed, exposure.bodies, noise[0], kept[0], frame, found, spread)
+        require_short(frame.longest[0])
         if state == CAREFUL:
             return self._carefully(frame)
         used, estimator = frame.used, self._estimator
@@ -90,7 +104,7 @@ class StatisticalTracker:
             part, frame = slice(start, start + BLOCK), self._frame()
             noise, kept = self._draws(own, len(exposed[part]))
             filled = (values[part] for values in (found, spreads, stickers, states))
-            measure_frames(eyes, exposed[part], bodies, noise, kept, frame, *filled)
+            require_short(measure_frames(eyes, exposed[part], bodies, noise, kept, frame, *filled))
             for k in np.flatnonzero(states[part] == CAREFUL):
                 at = start + k
                 measure_frame(eyes, exposed[at], bodies, noise[k], kept[k], frame, found[at], spreads[at])
@@ -113,11 +127,12 @@ class StatisticalTracker:
 
     def _frame(self) -> Frame:
         n = len(self._estimator.platform.sticker_ids)
-        shapes = ((2, n, 2), (2, n, 2, 2), (n, 3), (n, 3, 3), (n, 3, 3), (n, 3), (n, 3))
+        shapes = ((2, n, 2), (2, n, 2, 2), (n, 3), (n, 3, 3), (n, 3, 3), (n, 3), (n, 3), (1,))
         return Frame(*np.empty((2, n), dtype=bool), *(np.empty(shape) for shape in shapes))
 
     def _draws(self, rng: np.random.Generator, frames: int) -> tuple[Array, NDArray[np.bool_]]:
-        """Unit normal noise (N,2,n,3) of centres and of how thin ellipses may be, and which stickers (N,n) are not left out for their outlines."""
+        """Unit normal noise (N,2,n,3) of centres and of how thin ellipses may be, and which stickers (N,n) are not
+        left out for their outlines."""
         n = len(self._estimator.platform.sticker_ids)
         return rng.standard_normal((frames, 2, n, 3)), rng.random((frames, n)) >= OUTLINE_CHANCE
 
@@ -140,36 +155,31 @@ def _variances(frame: Frame, chosen: NDArray) -> Array:
 
 
 def _eyes(camera: StatisticalStereoCamera, estimator: PoseEstimator) -> Eyes:
+    """What looks and what measures, as the kernels take it."""
     settings, taught = estimator.settings, estimator.taught
     own = camera.scene.owners == 0
     count, light = int(own.sum()), camera.light
-    freedoms = np.arange(3 * count + 1)
     limits = Limits(
         GRAZING,
         THIN_PX,
         THIN_STD_PX,
-        LONGEST_SMEAR_PX,
         settings.largest_ray_gap,
-        LARGEST_MISFIT,
-        LARGEST_EXCESS,
-        PLAIN,
-        np.asarray(chi2.isf(EXCESS_CHANCE, np.maximum(freedoms, 1))),
         CLEAR * camera.scene.radius,
         light.optics.vignetting,
         settings.line_error_px**2,
     )
-    stickers = Stickers(
-        *(np.ascontiguousarray(v) for v in (camera.scene.places[own], taught.platform_places, camera.scene.normals[own])),
-        camera.scene.radius,
-    )
+    totals = np.asarray(chi2.isf(EXCESS_CHANCE, np.maximum(np.arange(3 * count + 1), 1)))
+    places, normals = camera.scene.places[own], camera.scene.normals[own]
+    taught_places = np.ascontiguousarray(taught.platform_places)
     return Eyes(
         _cameras(camera.rig, camera.from_base),
         _cameras(estimator.rig, estimator.rig.from_camera),
-        stickers,
+        Stickers(places, taught_places, normals, camera.scene.radius),
         np.zeros(count, dtype=int),
         camera.scene.hiding,
         centre_noise(estimator.noise, light.optics.psf_px, settings.fit_size, light.sticker, light.ring),
         limits,
+        Belief(LARGEST_MISFIT, LARGEST_EXCESS, PLAIN, totals),
         np.ascontiguousarray(taught.base_from_camera),
         invert(taught.base_from_camera),
     )

@@ -12,9 +12,9 @@ from cmmsim.geometry.pose import Array
 from cmmsim.imaging.scene import ConvexSolid, Mesh, SceneBody
 
 if TYPE_CHECKING:
-    from cmmsim.statistical.sticker_kernels import Solids
+    from cmmsim.statistical.hiding_kernels import Solids
 
-CLEAR = 1.4  # radii of a sticker within which nothing may stand before it and its ring, or its fit is spoilt
+CLEAR = 1.75  # radii of a sticker within which nothing may stand before it and its ring: about what is fitted
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class StickerScene:
     def hidden(self, moves: Array, places: Array, normals: Array, asked: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Whether a solid stands before any part of the stickers (m,) with places and normals (m,3) in camera axes;
         only those ``asked`` (m,) are looked at."""
-        from cmmsim.statistical.sticker_kernels import hidden_stickers
+        from cmmsim.statistical.hiding_kernels import hidden_stickers
 
         hidden = np.empty(len(asked), dtype=bool)
         hidden_stickers(moves, places, normals, self.owners, CLEAR * self.radius, self.hiding, asked, hidden)
@@ -64,7 +64,7 @@ class StickerScene:
     @cached_property
     def hiding(self) -> "Solids":
         """The solids as ``hidden_stickers`` takes them."""
-        from cmmsim.statistical.sticker_kernels import Solids
+        from cmmsim.statistical.hiding_kernels import Solids
 
         faces = [solid.faces for solid in self.solids]
         middles = np.array([solid.middle for solid in self.solids])

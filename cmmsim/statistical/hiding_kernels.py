@@ -1,4 +1,4 @@
-"""Compiled: how well the fit of an ellipse would know it, and which stickers are hidden."""
+"""Compiled: which stickers convex solids hide."""
 
 from __future__ import annotations
 
@@ -7,48 +7,21 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compiled import Array, compiled
-from cmmsim.detection.fit_kernels import (
-    UNKNOWNS,
-    FitSettings,
-    accumulate,
-    light_of_moving,
-    mask_ring,
-)
 from cmmsim.geometry.disc_kernels import probe_discs
-from cmmsim.geometry.point_kernels import factor, invert_factored
 
 PROBES = 12  # points about a sticker, asked with its middle whether a solid hides them
 TOUCHING = 1e-6  # share of the way to a point in which meeting a solid is taken for lying on it
 
 
-@compiled
-def fit_covariances(
-    centres: Array,
-    shapes: Array,
-    smears: Array,
-    contrasts: Array,
-    grounds: Array,
-    size: int,
-    settings: FitSettings,
-    covariances: Array,
-) -> None:
-    """Fill covariances (n,m,m) of the first m parameters that ``fit_window`` would state of n ellipses that are as its
-    model says: centres (n,2) in px of parts of ``size`` px, shapes (n,2,2), smears (n,2) px, contrasts and grounds (n,)."""
-    mask, window = np.empty((size, size), np.bool_), np.empty((size, size))
-    shares, derivatives = np.empty((size, size)), np.empty((size, size, 5))
-    normal, right, parameters = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS), np.empty(UNKNOWNS)
-    for n in range(len(centres)):
-        parameters[0], parameters[1] = centres[n, 0], centres[n, 1]
-        mask_ring(parameters, shapes[n], settings.ring_reach, mask)
-        light_of_moving(parameters, shapes[n], smears[n], settings, shares, derivatives)
-        for i in range(size):
-            for j in range(size):
-                window[i, j] = grounds[n] + contrasts[n] * shares[i, j]
-        accumulate(window, mask, shares, derivatives, contrasts[n], grounds[n], settings, normal, right)
-        for k in range(UNKNOWNS):
-            normal[k, k] += 1e-9  # as the fit does
-        factor(normal)
-        invert_factored(normal, covariances[n])
+class Solids(NamedTuple):
+    """Convex solids b, in their own axes: faces ``starts[b]`` to ``starts[b + 1]`` of normals (f,3), outwards, and
+    offsets (f,); the ball of ``radii[b]`` about ``middles[b]`` (3,) holds all of it."""
+
+    starts: Array
+    normals: Array
+    offsets: Array
+    middles: Array
+    radii: Array
 
 
 @compiled
@@ -94,20 +67,16 @@ def to_body(move: Array, point: Array, into: Array) -> None:
             into[i] += move[j, i] * (point[j] - move[j, 3])
 
 
-class Solids(NamedTuple):
-    """Convex solids b, in their own axes: faces ``starts[b]`` to ``starts[b + 1]`` of normals (f,3), outwards, and
-    offsets (f,); the ball of ``radii[b]`` about ``middles[b]`` (3,) holds all of it."""
-
-    starts: Array
-    normals: Array
-    offsets: Array
-    middles: Array
-    radii: Array
-
-
 @compiled
 def hidden_stickers(
-    moves: Array, places: Array, normals: Array, owners: Array, clear: float, solids: Solids, asked: Array, hidden: Array
+    moves: Array,
+    places: Array,
+    normals: Array,
+    owners: Array,
+    clear: float,
+    solids: Solids,
+    asked: Array,
+    hidden: Array,
 ) -> None:
     """Fill ``hidden`` (n,): whether a solid stands before any point within ``clear`` m of a sticker, in its plane.
 
