@@ -345,8 +345,9 @@ def load_sensor(
 
     Parameters: seed of teaching and of the first run's noise; method "registration" or "planes"; taught: the result of
     an earlier teaching of the same cameras and bodies; progress(done, total), called while teaching; renderer:
-    "pyrender", "analytic", "auto" or "statistical" instead of what the file says; changes: other entries than the file's, by dotted
-    key as ``{"camera.dark_noise": 40.0}``; known: the rig that measures where it is another than the one that draws.
+    "pyrender", "analytic", "auto" or "statistical" instead of what the file says; changes: other entries than the
+    file's, by dotted key as ``{"camera.dark_noise": 40.0}``; known: the rig that measures where it is another than the
+    one that draws.
     Raises UnknownSensorError, SensorFileError, UnknownOptionError, and TeachingError for what another one was taught.
     """
     return Sensor(read_sensor_file(name, changes), seed, method, taught, progress, renderer, known)

@@ -85,7 +85,6 @@ def test_rows_agree_with_the_sensors_own_covariance_and_err_hardly_without_noise
     ("kind", "rows", "options"),
     [
         pytest.param("static_pose", 24, {"poses": 3, "captures": 2}, marks=pytest.mark.slow),
-        pytest.param("path_pose", 24, {"stretch_s": 0.2}, marks=pytest.mark.slow),
         pytest.param("static_pose", 400, {"poses": 5}, marks=pytest.mark.thorough),
         pytest.param("path_pose", 200, {}, marks=pytest.mark.thorough),
     ],
@@ -94,7 +93,7 @@ def test_rows_without_images_have_the_means_and_bands_of_rows_with_them(kind, ro
     """Figures of as many rows of both: their means by Welch's test, their bands by the Kolmogorov-Smirnov test."""
     figures = {}
     for start, renderer in enumerate(("analytic", "statistical")):
-        found = [row(kind, 1000 * start + k, {"renderer": renderer}, **options) for k in range(rows)]
+        found = [row(kind, 1000 * start + k, scenario(renderer=renderer), **options) for k in range(rows)]
         figures[renderer] = {name: np.array([one[name] for one in found]) for name in found[0]}
     for name, drawn in figures["analytic"].items():
         said = figures["statistical"][name]
