@@ -14,8 +14,8 @@ from cmmsim.geometry.point_kernels import factor, invert_factored
 
 class CentreNoise(NamedTuple):
     """Inverse covariance xx, xy, yy of a centre over the ellipse's mean half axis m, by m and its ovalness p, q
-    (a,b,c,3), from ``first`` (3,) on in ``steps`` (3,); by_light (3,): the polynomial in the share of light by which
-    the covariance grows. contrast, ring and black: grey values of full light; fit_size px and settings of the fit."""
+    (a,b,c,3), from ``first`` (3,) on in ``steps`` (3,); by_light (3,): of 1 / light², 1 / light and 1, whose sum is the
+    growth of the covariance in a share of light. contrast, ring and black: grey values of full light; fit_size px and settings of the fit."""
 
     table: Array
     first: Array
@@ -82,7 +82,7 @@ def tabulated(
         found_xx += weight * table[i + up, j + across, k + deep, 0]
         found_xy += weight * table[i + up, j + across, k + deep, 1]
         found_yy += weight * table[i + up, j + across, k + deep, 2]
-    scale = by_light[0] + light * (by_light[1] + light * by_light[2])
+    scale = by_light[0] / (light * light) + by_light[1] / light + by_light[2]
     scale /= mean * (found_xx * found_yy - found_xy * found_xy)
     return scale * found_yy, -scale * found_xy, scale * found_xx
 

@@ -48,7 +48,7 @@ def centre_noise(noise: CameraNoise, psf_px: float, fit_size: int, sticker: floa
     table = known.reshape(*m.shape, 3)
     usual = _shapes(np.array([0.3 * fit_size]), np.array([0.25]), np.array([0.0]), 0.5 * fit_size)
     growth = [float(np.trace(covariances(usual, light)[0])) for light in LIGHTS]
-    by_light = np.polynomial.Polynomial.fit(LIGHTS, np.array(growth) / growth[-1], 2).convert().coef
+    by_light = np.polynomial.Polynomial.fit(LIGHTS, LIGHTS**2 * np.array(growth) / growth[-1], 2).convert().coef
     first, steps = np.array([radii[0], OVAL[0], OVAL[0]]), np.array([np.diff(radii)[0], *2 * [np.diff(OVAL)[0]]])
     return CentreNoise(table, first, steps, by_light, bright - dark, dark - black, black, fit_size, settings)
 

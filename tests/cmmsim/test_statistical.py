@@ -86,20 +86,21 @@ def test_the_estimator_says_the_same_of_the_same_stickers(lens, known):
     assert compared > 35
 
 
-def test_the_table_is_what_the_fit_states():
-    """Of ellipses of any kind, with the mean over places within a pixel; to 2 % in a direction, rms."""
+@pytest.mark.parametrize("light", [1.0, 0.8])
+def test_the_table_is_what_the_fit_states(light):
+    """Of ellipses of any kind, with the mean over places within a pixel and any light; to 2 % in a direction, rms."""
     sensor = statistical("all")
     noise = StatisticalTracker(sensor.estimator)._eyes_of(sensor.camera).noise
     _, shapes = random_ellipses(np.random.default_rng(0), 60, noise.fit_size, radii=(3.8, 1.4))
     mean, found = np.zeros((60, 2, 2)), np.empty((60, 5, 5))
     places = (np.arange(4) + 0.5) / 4 - 0.5
-    greys = np.full(60, noise.contrast), np.full(60, noise.black + noise.ring)
+    greys = np.full(60, light * noise.contrast), np.full(60, noise.black + light * noise.ring)
     for shift in np.stack(np.meshgrid(places, places), axis=-1).reshape(-1, 2):
         centres = np.tile(0.5 * (noise.fit_size - 1) + shift, (60, 1))
         fit_covariances(centres, shapes, np.zeros((60, 2)), *greys, noise.fit_size, noise.settings, found)
         mean += found[:, :2, :2] / 16
     entries = [
-        tabulated(noise.table, noise.first, noise.steps, noise.by_light, *shape[[0, 0, 1], [0, 1, 1]], 1.0)
+        tabulated(noise.table, noise.first, noise.steps, noise.by_light, *shape[[0, 0, 1], [0, 1, 1]], light)
         for shape in shapes
     ]
     table = np.array(entries)[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
