@@ -15,7 +15,8 @@ from cmmsim.geometry.point_kernels import factor, invert_factored
 class CentreNoise(NamedTuple):
     """Inverse covariance xx, xy, yy of a centre over the ellipse's mean half axis m, by m and its ovalness p, q
     (a,b,c,3), from ``first`` (3,) on in ``steps`` (3,); by_light (3,): of 1 / light², 1 / light and 1, whose sum is the
-    growth of the covariance in a share of light. contrast, ring and black: grey values of full light; fit_size px and settings of the fit."""
+    growth of the covariance in a share of light. contrast, ring and black: grey values of full light; fit_size px and
+    settings of the fit."""
 
     table: Array
     first: Array
