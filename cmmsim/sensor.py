@@ -24,7 +24,7 @@ from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import marked_body, require_corner
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.known_rig import KnownRig
-from cmmsim.geometry.pose import Array, checked_pose, checked_transform
+from cmmsim.geometry.pose import Array, all_rigid, checked_pose, checked_transform
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
 from cmmsim.imaging.renderer import choose_renderer
@@ -240,14 +240,19 @@ class Sensor:
 
     def _placed(self, obstacles: Mapping[str, Array] | None) -> dict[str, Array]:
         """The obstacles, checked."""
-        placed: dict[str, Array] = {}
         obstacles = {} if obstacles is None else obstacles
         require_kind(obstacles, Mapping, "obstacles must be transforms by name, as {'link': base_from_body}, or None")
-        for name, place in obstacles.items():
+        for name in obstacles:
             if name not in self.true_cameras.obstacles:
                 raise UnknownBodyError(name, self.true_cameras.obstacles)
-            placed[name] = checked_transform(place, f"obstacle {name!r}: base_from_body")
-        return placed
+        plain = [place for place in obstacles.values() if isinstance(place, np.ndarray) and place.shape == (4, 4)]
+        if plain and len(plain) == len(obstacles):
+            together = np.array(plain)
+            if together.dtype == float and all_rigid(together):  # a robot's legs, every frame
+                return dict(zip(obstacles, together, strict=True))
+        return {
+            name: checked_transform(place, f"obstacle {name!r}: base_from_body") for name, place in obstacles.items()
+        }
 
     def capture(
         self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
