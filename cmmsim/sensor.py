@@ -18,13 +18,13 @@ from cmmsim.detection.detector import find_detector
 from cmmsim.detection_settings import StickerView
 from cmmsim.drift_watch import DriftWatch
 from cmmsim.drift_watch.watch import CHANCE
-from cmmsim.errors import CmmError, UnknownBodyError, UnknownOptionError
+from cmmsim.errors import CmmError, UnknownOptionError
 from cmmsim.files.schema import SensorFile, Timing
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import marked_body, require_corner
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.known_rig import KnownRig
-from cmmsim.geometry.pose import Array, all_rigid, checked_pose, checked_transform
+from cmmsim.geometry.pose import Array, checked_pose
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
 from cmmsim.imaging.renderer import choose_renderer
@@ -230,29 +230,13 @@ class Sensor:
         the sensor's exposure is not zero. Raises ShapeError, UnknownBodyError, and CmmError for too long a blur or for
         obstacles that are no transforms by name.
         """
-        checked, placed = checked_pose(pose), self._placed(obstacles)
+        checked, placed = checked_pose(pose), self.true_cameras.placed(obstacles)
         if pose_rate is not None:
             pose_rate = finite_array(pose_rate, (6,), "a pose rate is six finite numbers, m/s and rad/s")
         rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
         camera = self.true_cameras.at(self._frame)
         self._frame += 1
         return camera.look(checked, rng, placed, pose_rate=pose_rate)
-
-    def _placed(self, obstacles: Mapping[str, Array] | None) -> dict[str, Array]:
-        """The obstacles, checked."""
-        obstacles = {} if obstacles is None else obstacles
-        require_kind(obstacles, Mapping, "obstacles must be transforms by name, as {'link': base_from_body}, or None")
-        for name in obstacles:
-            if name not in self.true_cameras.obstacles:
-                raise UnknownBodyError(name, self.true_cameras.obstacles)
-        plain = [place for place in obstacles.values() if isinstance(place, np.ndarray) and place.shape == (4, 4)]
-        if plain and len(plain) == len(obstacles):
-            together = np.array(plain)
-            if together.dtype == float and all_rigid(together):  # a robot's legs, every frame
-                return dict(zip(obstacles, together, strict=True))
-        return {
-            name: checked_transform(place, f"obstacle {name!r}: base_from_body") for name, place in obstacles.items()
-        }
 
     def capture(
         self, pose: ArrayLike, obstacles: Mapping[str, Array] | None = None, pose_rate: ArrayLike | None = None
@@ -306,18 +290,16 @@ class Sensor:
         Raises CmmError for a sensor that needs images, or measures by planes.
         """
         at = finite_array(poses, (len(np.atleast_1d(poses)), 6), "poses are rows of six finite numbers")
-        along = (
-            None if pose_rates is None else finite_array(pose_rates, at.shape, "pose_rates must be as many as poses")
+        rates = finite_array(
+            0.0 * at if pose_rates is None else pose_rates, at.shape, "there is a pose_rate to each pose"
         )
-        tracker, camera = self._new_tracker(), self.camera
+        tracker, camera, placed = self._new_tracker(), self.camera, self.true_cameras.placed(obstacles)
         if isinstance(tracker, Tracker) or not isinstance(camera, StatisticalStereoCamera):
-            raise CmmError(
-                f"many poses are measured at once by renderer {STATISTICAL.name!r} and method 'registration' only, "
-                f"not by {self.renderer!r} and {self.method!r}"
-            )
+            able = f"renderer {STATISTICAL.name!r} and method 'registration' only"
+            raise CmmError(f"many poses are measured at once by {able}, not by {self.renderer!r} and {self.method!r}")
         rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
         self._frame += len(at)
-        found = tracker.measure_many(camera, camera.exposed(at, along), camera.placed(self._placed(obstacles)), rng)
+        found = tracker.measure_many(camera, camera.exposed(at, rates), camera.placed(placed), rng)
         return found.without(self._dropout_rng.random(len(at)) < self.timing.dropout)
 
     def _new_tracker(self) -> Tracker | StatisticalTracker:

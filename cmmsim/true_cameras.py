@@ -13,12 +13,12 @@ import numpy as np
 import trimesh
 
 from cmmsim.checks import require_kind
-from cmmsim.errors import CmmError
+from cmmsim.errors import CmmError, UnknownBodyError
 from cmmsim.files.schema import SensorFile
 from cmmsim.files.setup import MarkedBody, rig_from_file
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.known_rig import rig_changes
-from cmmsim.geometry.pose import Array, apply, pose_to_transform
+from cmmsim.geometry.pose import Array, all_rigid, apply, checked_transform, pose_to_transform
 from cmmsim.imaging.exposure import VirtualStereoCamera
 from cmmsim.imaging.formation import ImageFormation
 from cmmsim.imaging.renderer import Drawable, Renderer, choose_renderer
@@ -72,6 +72,22 @@ class TrueCameras:
         level = self._file.stickers.obstacle_level / 255.0
         self.obstacles.update({name: solid_mesh(mesh, level) for name, mesh in meshes.items()})
         self._draw_anew()
+
+    def placed(self, obstacles: Mapping[str, Array] | None) -> dict[str, Array]:
+        """Obstacles at base_from_body (4,4) each, checked. Raises as ``Sensor.look``."""
+        obstacles = {} if obstacles is None else obstacles
+        require_kind(obstacles, Mapping, "obstacles must be transforms by name, as {'link': base_from_body}, or None")
+        for name in obstacles:
+            if name not in self.obstacles:
+                raise UnknownBodyError(name, self.obstacles)
+        plain = [place for place in obstacles.values() if isinstance(place, np.ndarray) and place.shape == (4, 4)]
+        if plain and len(plain) == len(obstacles):
+            together = np.array(plain)
+            if together.dtype == float and all_rigid(together):  # a robot's legs, every frame
+                return dict(zip(obstacles, together, strict=True))
+        return {
+            name: checked_transform(place, f"obstacle {name!r}: base_from_body") for name, place in obstacles.items()
+        }
 
     def move(self, changes: Mapping[str, float], right_later: float) -> None:
         """As ``Sensor.move_rig``."""

@@ -174,7 +174,8 @@ def rod_transforms(starts: Array, ends: Array) -> Array:
     if len(short):
         k = short[0]
         raise CmmError(
-            f"a rod of {lengths[k]:g} m from {starts[k].tolist()} m points nowhere, at least {SHORTEST_ROD:g} m is needed"
+            f"a rod of {lengths[k]:g} m from {starts[k].tolist()} m points nowhere, at least {SHORTEST_ROD:g} m is "
+            "needed"
         )
     z = along / lengths[:, None]
     aside = _crossed(z, np.eye(3)[np.abs(z).argmin(axis=1)])
