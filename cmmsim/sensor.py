@@ -284,8 +284,8 @@ class Sensor:
         self, poses: ArrayLike, pose_rates: ArrayLike | None = None, obstacles: Mapping[str, Array] | None = None
     ) -> MeasuredPoses:
         """Measure the platform at each of the poses (N,6), in motion at pose_rates (N,6), behind obstacles that stand
-        still: one frame each, with noise and dropout of its own, and without drift. As ``measure``, but for more than
-        100,000 frames a second on two cores.
+        still: one frame each, with noise and dropout of its own, and without drift. As ``measure``, but some 40,000
+        frames a second and core.
 
         Raises CmmError for a sensor that needs images, or measures by planes.
         """
