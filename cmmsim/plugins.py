@@ -23,6 +23,7 @@ DEFAULT_DETECTOR = "maximum_likelihood"
 RENDERERS = {
     "analytic": "cmmsim.imaging.analytic:ANALYTIC",
     "pyrender": "cmmsim.imaging.pyrender_renderer:PYRENDER",
+    "statistical": "cmmsim.statistical.exposure:STATISTICAL",
 }
 AUTO = "auto"  # pyrender where OpenGL works, else analytic
 

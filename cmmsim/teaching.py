@@ -15,6 +15,7 @@ and platform at teaching.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +27,14 @@ from cmmsim.geometry.disc_image import sticker_outlines
 from cmmsim.geometry.pose import Array, apply, compose_covariance, invert
 from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import StereoRig
-from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
+from cmmsim.imaging.exposure import Quality
 from cmmsim.imaging.scene import placed_stickers
 from cmmsim.plugins import DEFAULT_DETECTOR
 from cmmsim.pose_estimation.estimator import FEWEST_NOMINAL, NOMINAL_TOLERANCE, by_planes
-from cmmsim.pose_estimation.observation import Observer, StickerObservation, faces_camera
+from cmmsim.pose_estimation.observation import Observer, StickerExposure, StickerObservation, faces_camera
 from cmmsim.pose_estimation.search import bright_ellipses, candidate_points, find_layout
 from cmmsim.pose_estimation.taught import Taught, setup_of
+from cmmsim.radiometry.images import StereoImages
 
 Progress = Callable[[int, int], None]
 SHIFT, TURN = 0.008, 0.03  # m, rad: reach of the teaching path about home
@@ -58,11 +60,23 @@ class TeachingPlan:
     platform_window: int = 16
 
 
+class Camera(Protocol):
+    """Two cameras before the true scene."""
+
+    def look(
+        self, pose: Array, rng: np.random.Generator, *, quality: Quality | None = None
+    ) -> StereoImages | StickerExposure:
+        """One exposure of the platform at a pose (6,)."""
+
+    def centre_error_px(self, quality: Quality) -> float:
+        """What drawing leaves in a sticker's centre, px rms."""
+
+
 @dataclass(frozen=True)
 class Teacher:
     """The instruments of teaching."""
 
-    camera: VirtualStereoCamera
+    camera: Camera
     observer: Observer
     platform: MarkedBody
     base: MarkedBody
@@ -77,7 +91,7 @@ class Teacher:
         report(0, steps)
         try:
             path = teaching_path(home, self.plan.poses)
-            ellipses = bright_ellipses(self.camera.look(path[0], rng).full(), self.observer)
+            ellipses = bright_ellipses(self.camera.look(path[0], rng), self.observer)
             points = candidate_points(ellipses, self.observer, self.observer.settings.limits)
             start = [
                 find_layout(body.nominal, points, NOMINAL_TOLERANCE, FEWEST_NOMINAL, body.name)[0]

@@ -13,17 +13,20 @@ import numpy as np
 import trimesh
 
 from cmmsim.checks import require_kind
-from cmmsim.errors import CmmError
+from cmmsim.errors import CmmError, UnknownBodyError
 from cmmsim.files.schema import SensorFile
 from cmmsim.files.setup import MarkedBody, rig_from_file
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.known_rig import rig_changes
-from cmmsim.geometry.pose import Array, apply, pose_to_transform
+from cmmsim.geometry.pose import Array, all_rigid, apply, checked_transform, pose_to_transform
 from cmmsim.imaging.exposure import VirtualStereoCamera
 from cmmsim.imaging.formation import ImageFormation
 from cmmsim.imaging.renderer import Drawable, Renderer, choose_renderer
 from cmmsim.imaging.scene import Mesh, scene_body, solid_mesh
 from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.statistical.conditions import Light, require_proved
+from cmmsim.statistical.exposure import STATISTICAL, StatisticalStereoCamera
+from cmmsim.statistical.scene import StickerScene
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,22 @@ class TrueCameras:
         self.obstacles.update({name: solid_mesh(mesh, level) for name, mesh in meshes.items()})
         self._draw_anew()
 
+    def placed(self, obstacles: Mapping[str, Array] | None) -> dict[str, Array]:
+        """Obstacles at base_from_body (4,4) each, checked. Raises as ``Sensor.look``."""
+        obstacles = {} if obstacles is None else obstacles
+        require_kind(obstacles, Mapping, "obstacles must be transforms by name, as {'link': base_from_body}, or None")
+        for name in obstacles:
+            if name not in self.obstacles:
+                raise UnknownBodyError(name, self.obstacles)
+        plain = [place for place in obstacles.values() if isinstance(place, np.ndarray) and place.shape == (4, 4)]
+        if plain and len(plain) == len(obstacles):
+            together = np.array(plain)
+            if together.dtype == float and all_rigid(together):  # a robot's legs, every frame
+                return dict(zip(obstacles, together, strict=True))
+        return {
+            name: checked_transform(place, f"obstacle {name!r}: base_from_body") for name, place in obstacles.items()
+        }
+
     def move(self, changes: Mapping[str, float], right_later: float) -> None:
         """As ``Sensor.move_rig``."""
         self.rig, self._right_later = self.rig.moved(rig_changes(changes)), right_later
@@ -86,7 +105,7 @@ class TrueCameras:
         self._require_in_sight(drift.changes, ", ".join(f"{name} by {value:g}" for name, value in changes.items()))
         self._drift = drift
 
-    def at(self, frame: int) -> VirtualStereoCamera:
+    def at(self, frame: int) -> VirtualStereoCamera | StatisticalStereoCamera:
         """Both cameras before the scene, as they are at a frame of a run, counted from 0."""
         return self.at_rest if self._drift is None else self.at_rest.moved(self._drift.after(frame))
 
@@ -96,8 +115,27 @@ class TrueCameras:
         return choose_renderer(self._asked_renderer)
 
     @cached_property
-    def at_rest(self) -> VirtualStereoCamera:
-        """Both cameras before the scene, without drift. Stickers are drawn first: what they hide need not be drawn."""
+    def at_rest(self) -> VirtualStereoCamera | StatisticalStereoCamera:
+        """Both cameras before the scene, without drift. Raises CmmError for a renderer that is not proved for them."""
+        return self._without_images() if self.renderer is STATISTICAL else self._drawing()
+
+    def _without_images(self) -> StatisticalStereoCamera:
+        """Cameras that say what would be found in their images."""
+        stickers = self._file.stickers
+        light = Light(stickers.sticker_level / 255.0, stickers.ring_level / 255.0, self._optics)
+        require_proved(self._file, self._noise, light)
+        return StatisticalStereoCamera(
+            self.rig,
+            self.camera_from_base,
+            StickerScene.of(self.scene, list(self.obstacles.values())),
+            light,
+            list(self.obstacles),
+            self._file.timing.exposure,
+            self._right_later,
+        )
+
+    def _drawing(self) -> VirtualStereoCamera:
+        """Cameras that draw. Stickers are drawn first: what they hide need not be drawn."""
         file = self._file
         patches = [p for body in self.scene for p in body.stickers] + [body.solid for body in self.scene]
         owners = [k for k, body in enumerate(self.scene) for _ in body.stickers] + [0, 1]

@@ -9,6 +9,7 @@ variance at the fitted grey value. The inverse of the normal matrix is the covar
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,9 @@ from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, Spot
 from cmmsim.geometry.disc_image import require_psf
 from cmmsim.geometry.pose import Array, frozen
 from cmmsim.radiometry.noise import CameraNoise
+
+if TYPE_CHECKING:
+    from cmmsim.detection.fit_kernels import FitSettings
 
 RING_REACH = 2.4  # pixels beyond this many sticker radii may lie outside the dark ring and are left out
 SMALLEST_RADIUS_PX = 0.8
@@ -69,27 +73,12 @@ def fit_ellipses(
     exposure, whose middle the centre is for. Raises CmmError for one too narrow to be followed.
     """
     require_psf(psf_px)
-    from cmmsim.detection.fit_kernels import UNKNOWNS, FitSettings, fit_windows
+    from cmmsim.detection.fit_kernels import UNKNOWNS, fit_windows
 
     n = len(windows)
     inner, parameters, misfits = np.empty((n, 2)), np.empty((n, UNKNOWNS)), np.empty(n)
     shapes, covariances = np.empty((n, 2, 2)), np.empty((n, ELLIPSE_UNKNOWNS, ELLIPSE_UNKNOWNS))
-    scale = noise.white_level / 255.0
-    greys = scale * _GREYS
-    variances = noise.variance(greys)
-    largest_step = _LARGEST_STEP * [1.0, 1.0, 1.0, 1.0, 1.0, scale, scale]
-    settings = FitSettings(
-        RING_REACH,
-        SMALLEST_RADIUS_PX,
-        largest_step,
-        iterations,
-        CONVERGED_PX,
-        float(psf_px),
-        max(SMEAR_STEP_PX, 0.5 * psf_px),
-        variances,
-        greys[0],
-        1.0 / (greys[1] - greys[0]),
-    )
+    settings = fit_settings(noise, psf_px, iterations)
     moved = np.zeros((n, 2)) if smears is None else np.ascontiguousarray(smears, dtype=float)
     pixels = np.ascontiguousarray(windows, dtype=float)
 
@@ -101,13 +90,33 @@ def fit_ellipses(
     fits = EllipseFits(
         parameters[:, :2] + inner + corners,
         covariances[:, :2, :2],
-        _inside(parameters[:, :2], shapes, fit_size),
+        lies_inside(parameters[:, :2], shapes, fit_size),
         shapes,
         covariances[:, 2:, 2:],
         misfits,
         *parameters[:, 5:].T,
     )
     return fits.within(limits or FitLimits(), noise)
+
+
+def fit_settings(noise: CameraNoise, psf_px: float, iterations: int = 8) -> "FitSettings":
+    """How windows with this noise and point spread are fitted."""
+    from cmmsim.detection.fit_kernels import FitSettings
+
+    scale = noise.white_level / 255.0
+    greys = scale * _GREYS
+    return FitSettings(
+        RING_REACH,
+        SMALLEST_RADIUS_PX,
+        _LARGEST_STEP * [1.0, 1.0, 1.0, 1.0, 1.0, scale, scale],
+        iterations,
+        CONVERGED_PX,
+        float(psf_px),
+        max(SMEAR_STEP_PX, 0.5 * psf_px),
+        noise.variance(greys),
+        greys[0],
+        1.0 / (greys[1] - greys[0]),
+    )
 
 
 def _in_two_threads(fit: Callable[[slice], None], count: int) -> None:
@@ -141,7 +150,7 @@ def largest_misfits(limits: FitLimits, noise: CameraNoise, contrast: Array, grou
     return limits.largest_misfit * (noise.rounding_excess(ground) + model)
 
 
-def _inside(centres: Array, shapes: Array, size: int) -> NDArray[np.bool_]:
+def lies_inside(centres: Array, shapes: Array, size: int) -> NDArray[np.bool_]:
     """Whether the whole ellipse lies inside the window and is larger than the smallest one."""
     reach = np.linalg.norm(shapes, axis=2)  # half extent along x and y
     inside = np.all((centres - reach > -0.5) & (centres + reach < size - 0.5), axis=1)

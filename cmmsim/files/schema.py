@@ -254,7 +254,9 @@ class SensorFile(Section):
         None, "", "built-in sensor, or file beside this one, whose entries hold where this file has none"
     )
     note: str = quantity("", "", "what a user must know of the figures")
-    renderer: Annotated[str, AfterValidator(require_renderer)] = quantity(AUTO, "", "what draws the images")
+    renderer: Annotated[str, AfterValidator(require_renderer)] = quantity(
+        AUTO, "", "what draws the images, or says what would be found in them"
+    )
     timing: Timing
     rig: Rig
     camera: Camera

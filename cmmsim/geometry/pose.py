@@ -60,6 +60,16 @@ def checked_transform(transform: ArrayLike, name: str = "a transform") -> Array:
     return values
 
 
+def all_rigid(transforms: Array) -> bool:
+    """Whether ``checked_transform`` passes all of the transforms (k,4,4): asked at once, without naming a wrong one."""
+    turns = transforms[:, :3, :3]
+    errors = np.abs(turns.swapaxes(1, 2) @ turns - np.eye(3)).max(initial=0.0)
+    last = np.abs(transforms[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0)
+    return bool(
+        errors <= RIGID and last <= RIGID and np.isfinite(transforms).all() and (np.linalg.det(turns) > 0.0).all()
+    )
+
+
 def transform_to_pose(transform: ArrayLike) -> Array:
     """Pose (6,) of a transform (4,4); beta lies in [-pi/2, pi/2]. Raises ShapeError when it is no rigid transform."""
     values = checked_transform(transform)

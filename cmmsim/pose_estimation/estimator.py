@@ -155,7 +155,7 @@ class PoseEstimator(Observer):
 
         Where the cameras are exposed for some time and many stickers are missing, streaks are looked for as well.
         """
-        ellipses, limits = bright_ellipses(images.full(), self), self.settings.limits
+        ellipses, limits = bright_ellipses(images, self), self.settings.limits
         if self.settings.exposed_share == 0.0:
             return self._found(ellipses, limits)[0]
         streaks = replace(limits, largest_misfit=np.inf)
@@ -179,7 +179,7 @@ class PoseEstimator(Observer):
         ``swept``: expected ones at the beginning and the end of the exposure. Where stickers are smeared over more than
         half a pixel and it is not told, a pose without point spread is worse than its covariance: ``measure_anew``.
         """
-        return self._measured(self.observe(images, expected, *self._stickers, swept))
+        return self.measured(self.observe(images, expected, *self._stickers, swept))
 
     def measure_anew(self, images: StereoImages, expected: Array) -> tuple[Measurement, Array]:
         """As ``measure`` where nothing is known of the movement: it is told from the streaks of the stickers.
@@ -189,9 +189,9 @@ class PoseEstimator(Observer):
         if self.settings.exposed_share == 0.0:
             return self.measure(images, expected)
         read = self.read(images, expected, *self._stickers)
-        streaks = find_streaks(read)
+        streaks = None if read.found is not None else find_streaks(read)
         try:
-            return self._measured(read.observed(None if streaks is None else streaks.swept))
+            return self.measured(read.observed(None if streaks is None else streaks.swept))
         except LostError as error:
             if streaks is None:
                 raise
@@ -210,16 +210,12 @@ class PoseEstimator(Observer):
         )
         return place, len(stickers)
 
-    def _measured(self, seen: StickerObservation) -> tuple[Measurement, Array]:
+    def measured(self, seen: StickerObservation) -> tuple[Measurement, Array]:
         """Measurement, and measured camera_from_platform (4,4), from stickers. Raises LostError."""
         camera_from_platform, covariance, used = self._solve(seen)
         base_from_platform = self.taught.base_from_camera @ camera_from_platform
         spread = compose_covariance(self.taught.base_from_camera, covariance)
         pose = transform_to_pose(base_from_platform)
-        if self.common_covariance is None:
-            common = self.taught.calibration_covariance(pose, self.method)
-        else:
-            common = self.common_covariance(pose)
         measurement = Measurement(
             pose,
             pose_covariance(base_from_platform, spread),
@@ -229,10 +225,16 @@ class PoseEstimator(Observer):
             used.right_pixels,
             self.platform.sticker_ids[used.index],
             True,
-            common_covariance=common,
+            common_covariance=self.common_at(pose),
             pixel_variances=used.pixel_variances,
         )
         return measurement, camera_from_platform
+
+    def common_at(self, pose: Array) -> Array:
+        """Covariance (6,6) that all poses have in common at a pose (6,)."""
+        if self.common_covariance is None:
+            return self.taught.calibration_covariance(pose, self.method)
+        return self.common_covariance(pose)
 
     def _solve(self, seen: StickerObservation) -> Solution:
         used, result = consistent(seen, self, self.platform, self.taught.platform_places)

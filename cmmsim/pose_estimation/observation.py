@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +83,17 @@ class StickerObservation:
         return StickerObservation(**kept, outlines=None if self.outlines is None else self.outlines.selected(keep))
 
 
+@runtime_checkable
+class StickerExposure(Protocol):
+    """An exposure without images: what the fit of ellipses would find in windows of them, and in whole ones."""
+
+    def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
+        """What is found in windows of ``size`` px with first pixels ``corners`` (2, k, 2): of 2k windows."""
+
+    def bright(self, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
+        """Ellipses in the left and in the right image."""
+
+
 @dataclass(frozen=True)
 class Observer:
     """What looks for stickers: the stereo rig and its cameras' noise as they are known, and how it looks."""
@@ -97,7 +109,7 @@ class Observer:
 
     def observe(
         self,
-        images: StereoImages,
+        images: StereoImages | StickerExposure,
         camera_from_body: Array,
         places: Array,
         normals: Array,
@@ -109,7 +121,9 @@ class Observer:
         """
         return self.read(images, camera_from_body, places, normals).observed(swept)
 
-    def read(self, images: StereoImages, camera_from_body: Array, places: Array, normals: Array) -> StickerWindows:
+    def read(
+        self, images: StereoImages | StickerExposure, camera_from_body: Array, places: Array, normals: Array
+    ) -> StickerWindows:
         """Read the windows of stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose."""
         centres = [apply(move @ camera_from_body, places) for move in self.rig.from_camera]
         turned = [normals @ (move @ camera_from_body)[:3, :3].T for move in self.rig.from_camera]
@@ -118,18 +132,22 @@ class Observer:
         index = np.flatnonzero(np.all(valid & facing, axis=0))
         size = self.settings.window_size + 2 * self.detector.margin_px
         corners = np.rint(pixels[:, index] - 0.5 * (size - 1)).astype(int)
-        if len(index) == 0:
-            windows: Windows = np.zeros((2, 0, size, size))
-            offsets = np.zeros((2, 0, 2))
-        else:
-            windows = self.evenly_lit(images.windows(corners, size), corners)
+        windows: Windows = np.zeros((2, len(index), 0, 0))
+        offsets, found = np.zeros((2, 0, 2)), None
+        if len(index):
+            if isinstance(images, StickerExposure):
+                found = images.detected(corners, size, self)
+            else:
+                windows = self.evenly_lit(images.windows(corners, size), corners)
             offsets = np.stack(
                 [
                     centre_offset(camera, c[index], t[index], self.settings.radius)
                     for camera, c, t in zip(self.rig.cameras, centres, turned, strict=True)
                 ]
             )
-        return StickerWindows(self, index, camera_from_body, places[index], normals[index], corners, windows, offsets)
+        return StickerWindows(
+            self, index, camera_from_body, places[index], normals[index], corners, windows, offsets, found
+        )
 
     def evenly_lit(self, windows: Windows, corners: NDArray[np.int_]) -> Windows:
         """Windows (2, n, size, size) with the light within each made even: that of its middle.
@@ -156,7 +174,8 @@ class StickerWindows:
 
     index (k,) into the body's stickers; camera_from_body (4,4) near which they are expected; places (k,3) m and normals
     (k,3) in body axes; corners (2,k,2) px of the first pixels of windows (2,k,h,h), evenly lit; offsets (2,k,2) px of
-    the ellipses' centres from those of the stickers (eccentricity).
+    the ellipses' centres from those of the stickers (eccentricity). found: what a detector finds in them, where there
+    are no images; then the windows are empty.
     """
 
     observer: Observer
@@ -167,6 +186,7 @@ class StickerWindows:
     corners: NDArray[np.int_]
     windows: Windows
     offsets: Array
+    found: DetectedCentres | None = None
 
     def observed(self, swept: tuple[Array, Array] | None = None) -> StickerObservation:
         """The stickers in these windows; ``swept`` as of ``Observer.observe``."""
@@ -175,7 +195,9 @@ class StickerWindows:
             return StickerObservation(self.index, none[:, :2], none[:, :2], none, np.zeros((0, 3, 3)), none[:, 0])
         rig, settings = self.observer.rig, self.observer.settings
         smears = None if swept is None else self._smears(swept)
-        fits = self._detected() if smears is None else _likelier(self._detected(), self._detected(smears))
+        fits = self.found or self._detected()
+        if smears is not None and self.found is None:
+            fits = _likelier(fits, self._detected(smears))
         seen_at = fits.centres.reshape(2, -1, 2) - self.offsets
         systematic = settings.centre_error_px**2 + self.observer.detector.bias_px**2
         spread = fits.covariances.reshape(2, -1, 2, 2) + systematic * np.eye(2)

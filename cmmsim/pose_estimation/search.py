@@ -21,8 +21,8 @@ from cmmsim.errors import LostError
 from cmmsim.geometry.pose import Array, apply
 from cmmsim.geometry.registration import rigid_starts
 from cmmsim.geometry.stereo_rig import StereoRig, linear_triangulation
-from cmmsim.pose_estimation.observation import Observer
-from cmmsim.radiometry.images import StereoFrame
+from cmmsim.pose_estimation.observation import Observer, StickerExposure
+from cmmsim.radiometry.images import StereoImages
 from cmmsim.radiometry.noise import GreyImage, cut_windows
 
 SMALLEST_AREA_PX = 8
@@ -40,8 +40,11 @@ MOST_TOGETHER = 64  # triangles judged together
 ENOUGH = 0.8  # share of the layout that ends the search
 
 
-def bright_ellipses(frame: StereoFrame, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
+def bright_ellipses(images: StereoImages | StickerExposure, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
     """Ellipses of any misfit fitted to all bright spots of the left and of the right image that a window holds."""
+    if isinstance(images, StickerExposure):
+        return images.bright(observer)
+    frame = images.full()
     noise, settings = observer.noise, observer.settings
     size = max(SMALLEST_WINDOW_PX, settings.window_size + ROOM_PX)
     limits, found = replace(settings.limits, largest_misfit=np.inf), []

@@ -13,6 +13,7 @@ from cmmsim.files.schema import unit
 from cmmsim.files.setup import marked_body
 from cmmsim.geometry.known_rig import KnownRig
 from cmmsim.imaging.renderer import choose_renderer
+from cmmsim.imaging.scene import rod_transforms
 from dynamics import Robot
 from dynamics.bodies import parts_of
 from identify.arrays import Array
@@ -35,9 +36,9 @@ def robot_meshes(robot: Robot) -> dict[str, trimesh.Trimesh]:
 def robot_transforms(robot: Robot, pose: Array) -> dict[str, Array]:
     """base_from_body (4, 4) of the rods of all legs with the platform at a pose (6,)."""
     parts = parts_of(robot.geometry)
-    return {
-        part.name: cmmsim.rod_transform(*ends) for part, ends in zip(parts.all, parts.rods(robot, pose), strict=True)
-    }
+    ends = np.asarray(parts.rods(robot, pose), dtype=float)
+    places = rod_transforms(ends[:, 0], ends[:, 1])
+    return dict(zip((part.name for part in parts.all), places, strict=True))
 
 
 def make_sensor(

@@ -43,7 +43,8 @@ class Scenario(Section):
     sensor_changes: dict[str, Any] = Field({}, description="entries that hold instead of the sensor file's")
     renderer: str = Field(
         "auto",
-        description="what draws the images: pyrender, analytic, auto: pyrender where OpenGL works, or module:name",
+        description="what draws the images: pyrender, analytic, auto: pyrender where OpenGL works, or module:name; "
+        "statistical: nothing, it says what would be found in them",
     )
     pose_method: Literal["registration", "planes"] = "registration"
     rig: Rig = Rig()

@@ -18,6 +18,7 @@ from tests.benchmarks.timing import OtherLoad, judge, resident_bytes
 
 pytestmark = [pytest.mark.thorough, pytest.mark.rendering]
 TIMES_STRAIGHTFORWARD = {"analytic": 20.0, "pyrender": 8.0}
+TIMES_IMAGED = 400.0  # 100,000 frames a second without images where the analytic renderer draws 250
 BATCH = 20
 MEMORY_FRAMES = {"analytic": 100_000, "pyrender": 20_000}
 KEPT = []  # what must live as long as OpenGL is used
@@ -52,6 +53,25 @@ def frame_seconds(sensor, poses):
     # A good sticker contradicts the others once in some thousand by chance, and is left out.
     assert all(m.ok and len(m.target_ids) >= 17 for m in found)
     return spent
+
+
+def test_without_images_against_drawn_ones(taught, record_property):
+    """Many poses at once on all cores, against one frame after the other by the analytic renderer."""
+    drawing, without = (cmmsim.load_sensor("ctrack780", taught=taught, renderer=r) for r in ("analytic", "statistical"))
+    few, many = path(drawing, 5 * BATCH), path(drawing, 100_000)
+    frame_seconds(drawing, few[:BATCH])
+    without.measure_many(many[:BATCH])
+    drawn, said = np.inf, np.inf
+    with OtherLoad() as load:
+        for start in range(0, len(few), BATCH):
+            drawn = min(drawn, frame_seconds(drawing, few[start : start + BATCH]))
+            began = time.perf_counter()
+            found = without.measure_many(many)
+            said = min(said, (time.perf_counter() - began) / len(many))
+    assert found.stickers.min() >= 14
+    record_property("statistical_frames_a_second", 1.0 / said)
+    record_property("statistical_times_analytic", drawn / said)
+    judge(drawn / said >= TIMES_IMAGED, f"{drawn / said:.0f} times analytic images, goal {TIMES_IMAGED:g}", load)
 
 
 def test_against_a_straightforward_pipeline(sensor, record_property):

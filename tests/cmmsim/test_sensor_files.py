@@ -26,7 +26,7 @@ BESIDE = {"translation": [-0.91, 0.01, 0.33], "rotation_vector": [0.02, -0.66, -
         ({"camera.bit_depth": 9}, "camera.bit_depth: .*8, 10 or 12.*9"),
         ({"rig.left": LEFT | {"distortion": [0.1, 0.0, 0.0, 0.0]}}, "rig.left.distortion.4: Field required"),
         ({"detection.detector": "hough"}, "detection.detector: unknown detector 'hough': valid are dual_.* or m"),
-        ({"renderer": "blender"}, "renderer: unknown renderer 'blender': valid are analytic, auto, pyrender, or m"),
+        ({"renderer": "blender"}, "renderer: unknown renderer 'blender': valid are analytic, auto, pyrender, stat"),
         # what contradicts itself
         ({"camera.black_level": 256.0}, "camera: .*black_level 256 must lie below .* 255"),
         ({"lens.psf_px": 0.0999}, "lens: .*psf_px 0.0999 must be 0 or at least 0.1 px"),

@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from scipy.stats import binom, chi2
+from scipy.stats import binom, chi2, ks_2samp, ttest_ind
 
 import cmmsim
 from cmmsim.files.sensor_file import read_sensor_file
@@ -81,6 +81,29 @@ def test_rows_agree_with_the_sensors_own_covariance_and_err_hardly_without_noise
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "rows", "options"),
+    [
+        pytest.param("static_pose", 24, {"poses": 3, "captures": 2}, marks=pytest.mark.slow),
+        pytest.param("static_pose", 400, {"poses": 5}, marks=pytest.mark.thorough),
+        pytest.param("path_pose", 200, {}, marks=pytest.mark.thorough),
+    ],
+)
+def test_rows_without_images_have_the_means_and_bands_of_rows_with_them(kind, rows, options):
+    """Figures of as many rows of both: their means by Welch's test, their bands by the Kolmogorov-Smirnov test."""
+    figures = {}
+    for start, renderer in enumerate(("analytic", "statistical")):
+        found = [row(kind, 1000 * start + k, scenario(renderer=renderer), **options) for k in range(rows)]
+        figures[renderer] = {name: np.array([one[name] for one in found]) for name in found[0]}
+    for name, drawn in figures["analytic"].items():
+        said = figures["statistical"][name]
+        if np.ptp(drawn) == np.ptp(said) == 0.0:
+            assert drawn[0] == said[0], name
+            continue
+        assert ttest_ind(drawn, said, equal_var=False).pvalue > 3e-4, (name, drawn.mean(), said.mean())
+        assert ks_2samp(drawn, said).pvalue > 3e-4, name
+
+
 def test_teaching_by_the_sensor_adds_its_own_error_and_is_seeded_by_the_row():
     taught = static(0, captures=1, teaching="sensor")
     assert taught == static(0, captures=1, teaching="sensor")

@@ -1,0 +1,248 @@
+"""One exposure of two cameras without images: what the fit of ellipses would find in windows of them.
+
+A sticker that is seen whole in an image is found where the centre of its ellipse is, and with its shape, both with
+noise of the covariance that the fit states there: the inverse of its normal matrix at the true ellipse. What the noise
+does to the fit beyond the first order is left out; so is a sticker of which anything is hidden.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmmsim.detection.detector import DetectedCentres
+from cmmsim.detection.ellipse_fit import EllipseFits, fit_settings, lies_inside
+from cmmsim.errors import CmmError
+from cmmsim.geometry.camera import PinholeCamera
+from cmmsim.geometry.disc_image import SHAPE_BASIS, bending, project_discs, symmetric_root
+from cmmsim.geometry.pose import Array, pose_to_transform, rigid
+from cmmsim.geometry.stereo_rig import StereoRig
+from cmmsim.imaging.exposure import Quality
+from cmmsim.imaging.renderer import Renderer
+from cmmsim.plugins import RENDERERS
+from cmmsim.pose_estimation.observation import Observer
+from cmmsim.radiometry.noise import CameraNoise
+from cmmsim.statistical.conditions import NAME, Light, require_short
+from cmmsim.statistical.scene import StickerScene
+
+THIN_PX, THIN_STD_PX = 0.885, 0.055
+"""Half of an ellipse's width at which half of the fits end at the smallest one, and how softly that sets in: measured
+in images, whose fits err by more than to first order there."""
+
+
+def refuse_images(*_: object, **__: object) -> NoReturn:
+    """Raise CmmError that names the renderers that draw."""
+    drawing = ", ".join(name for name in RENDERERS if name != NAME)
+    raise CmmError(f"renderer {NAME!r} draws no images, it only says what would be found in them; {drawing} draw them")
+
+
+STATISTICAL = Renderer(NAME, refuse_images)
+
+
+@dataclass(frozen=True)
+class StatisticalStereoCamera:
+    """Two cameras that look at the true scene and say what a fit would find; as `VirtualStereoCamera`, without images.
+
+    rig and camera_from_base (4,4), the true ones; light; exposure and right_later in s; obstacle_names: of the scene's
+    solids after platform and base.
+    """
+
+    rig: StereoRig
+    camera_from_base: Array
+    scene: StickerScene
+    light: Light
+    obstacle_names: Sequence[str] = ()
+    exposure: float = 0.0
+    right_later: float = 0.0
+
+    def look(
+        self,
+        pose: Array,
+        rng: np.random.Generator,
+        obstacles: Mapping[str, Array] | None = None,
+        quality: Quality | None = None,
+        pose_rate: Array | None = None,
+    ) -> "DrawnStickers":
+        """One exposure; parameters as of ``VirtualStereoCamera.look``. How many are averaged, the observer knows."""
+        rates = None if pose_rate is None else pose_rate[None]
+        return DrawnStickers(self, self.exposed(pose[None], rates)[0], self.placed(obstacles or {}), rng)
+
+    def moved(self, changes: Array) -> "StatisticalStereoCamera":
+        """The same cameras with changes (24,) of their rig's parameters."""
+        return replace(self, rig=self.rig.moved(changes))
+
+    def exposed(self, poses: Array, rates: Array | None) -> Array:
+        """Poses (N,6,6) of the platform at poses (N,6) in motion at rates (N,6): in the middle, at the beginning and at
+        the end of the left camera's exposure, then of the right one's."""
+        rates = np.zeros_like(poses) if rates is None else rates
+        half, lag = 0.5 * self.exposure * rates, self.right_later * rates
+        return np.stack([poses + later + share for later in (0.0, lag) for share in (0.0, -half, half)], axis=1)
+
+    def placed(self, obstacles: Mapping[str, Array]) -> Array:
+        """base_from_body (b,4,4) of the base and of all obstacles; those without a place lie far below."""
+        absent = rigid(np.eye(3), (0.0, 0.0, -1e3))
+        return np.stack([np.eye(4), *(obstacles.get(name, absent) for name in self.obstacle_names)])
+
+    def centre_error_px(self, quality: Quality) -> float:
+        """What drawing leaves in a sticker's centre: nothing is drawn."""
+        return 0.0
+
+    def greys(self, noise: CameraNoise, side: int, centres: Array) -> tuple[Array, Array]:
+        """Contrasts (k,) of stickers at centres (k,2) px of one image, and the grey values (k,) of their grounds."""
+        lit = self.light.optics.illumination(self.rig.cameras[side], centres)
+        grounds = np.asarray(noise.mean_grey(self.light.ring * lit))
+        return np.asarray(noise.mean_grey(self.light.sticker * lit)) - grounds, grounds
+
+    @cached_property
+    def from_base(self) -> list[Array]:
+        """Places (4,4) of the base in the axes of both cameras."""
+        return [move @ self.camera_from_base for move in self.rig.from_camera]
+
+    def side(self, camera: PinholeCamera, moves: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Centres (m,2) and shapes (m,2,2) of ellipses that are fitted in one image, px, and which are seen whole."""
+        places, normals = self.scene.placed(moves)
+        facing = (np.einsum("ni,ni->n", places, normals) < 0.0) & (places[:, 2] > self.scene.radius)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            middles, shapes = project_discs(camera.ideal, places, normals, np.full(len(places), self.scene.radius))
+        facing &= np.isfinite(shapes).all(axis=(1, 2))
+        middles, shapes = np.where(facing[:, None], middles, 0.0), np.where(facing[:, None, None], shapes, np.eye(2))
+        if not camera.distortion.is_zero:
+            local = camera.distortion_jacobian(middles) @ shapes
+            bent, holds = camera.distort(middles)
+            middles, shapes = bent + bending(camera, middles, shapes), symmetric_root(local @ local.swapaxes(-1, -2))
+            facing &= holds
+        return middles, shapes, facing & ~self.scene.hidden(moves, places, normals, facing)
+
+
+@dataclass(frozen=True)
+class _Ellipses:
+    """Centres (2,m,2) px, shapes (2,m,2,2) px and smears (2,m,2) px of the ellipses of m stickers, seen (2,m) whether
+    whole, and unit normal noise (2,m,6): of centres and shapes, and of how thin an ellipse may be."""
+
+    centres: Array
+    shapes: Array
+    smears: Array
+    seen: NDArray[np.bool_]
+    noise: Array
+
+
+class DrawnStickers:
+    """What a fit would find in one exposure, worked out as far as it is asked for.
+
+    camera; exposed (6,6) poses as of ``StatisticalStereoCamera.exposed``; bodies (b,4,4) as of its ``placed``; rng of
+    its noise.
+    """
+
+    full = windows = refuse_images
+
+    def __init__(
+        self, camera: StatisticalStereoCamera, exposed: Array, bodies: Array, rng: np.random.Generator
+    ) -> None:
+        self.camera, self.exposed, self.bodies, self.rng = camera, exposed, bodies, rng
+
+    @cached_property
+    def _found(self) -> "_Ellipses":
+        """The ellipses of all stickers."""
+        camera = self.camera
+        centres: list[Array] = []
+        shapes: list[Array] = []
+        smears: list[Array] = []
+        seen: list[NDArray[np.bool_]] = []
+        for side, (lens, from_base) in enumerate(zip(camera.rig.cameras, camera.from_base, strict=True)):
+            middle, first, last = (
+                from_base @ np.stack([pose_to_transform(pose), *self.bodies])
+                for pose in self.exposed[3 * side : 3 * side + 3]
+            )
+            at, shape, whole = camera.side(lens, middle)
+            centres.append(at)
+            shapes.append(shape)
+            seen.append(whole)
+            ends = (lens.project(camera.scene.placed(moves)[0])[0] for moves in (last, first))
+            smears.append(np.asarray(np.subtract(*ends)))
+        require_short(float(np.linalg.norm(smears, axis=-1).max(where=np.stack(seen), initial=0.0)))
+        noise = self.rng.standard_normal((2, len(seen[0]), 6))
+        return _Ellipses(np.stack(centres), np.stack(shapes), np.stack(smears), np.stack(seen), noise)
+
+    def detected(self, corners: NDArray[np.int_], size: int, observer: Observer) -> DetectedCentres:
+        """See ``StickerExposure``: in each window the sticker nearest to its middle."""
+        sides = [self._in_windows(side, corners[side], size, observer) for side in range(2)]
+        return EllipseFits(*(np.concatenate(values) for values in zip(*(vars(s).values() for s in sides), strict=True)))
+
+    def bright(self, observer: Observer) -> tuple[EllipseFits, EllipseFits]:
+        """See ``StickerExposure``."""
+        found = []
+        for side, camera in enumerate(self.camera.rig.cameras):
+            reach = np.linalg.norm(self._found.shapes[side], axis=2)
+            whole = self._found.seen[side] & np.all(
+                (self._found.centres[side] - reach > 0.0)
+                & (self._found.centres[side] + reach < (camera.width - 1, camera.height - 1)),
+                axis=1,
+            )
+            index = np.flatnonzero(whole)
+            fit_size = observer.settings.fit_size
+            corners = np.rint(self._found.centres[side, index] - 0.5 * (fit_size - 1)).astype(int)
+            found.append(self._fitted(side, index, corners, whole[index], observer))
+        return found[0], found[1]
+
+    def _in_windows(self, side: int, corners: NDArray[np.int_], size: int, observer: Observer) -> EllipseFits:
+        """Of the k windows of one image."""
+        gaps = np.abs(self._found.centres[side] - corners[:, None] - 0.5 * (size - 1)).max(axis=2)
+        gaps[:, ~self._found.seen[side]] = np.inf
+        index, fit_size = gaps.argmin(axis=1), observer.settings.fit_size
+        centres = self._found.centres[side, index]
+        inner = np.rint(centres - 0.5 * (fit_size - 1)).astype(int)
+        inner = np.clip(inner, corners, corners + size - fit_size)
+        return self._fitted(side, index, inner, np.isfinite(gaps.min(axis=1, initial=0.0)), observer)
+
+    def _fitted(
+        self,
+        side: int,
+        index: NDArray[np.int_],
+        corners: NDArray[np.int_],
+        seen: NDArray[np.bool_],
+        observer: Observer,
+    ) -> EllipseFits:
+        """Stickers ``index`` (k,) fitted in parts of windows with first pixels ``corners`` (k,2) of one image."""
+        from cmmsim.statistical.centre_kernels import (
+            fit_covariances,
+        )  # compiles, so it is loaded where it is first needed
+
+        settings, noise = observer.settings, observer.noise
+        centres, shapes = self._found.centres[side, index], self._found.shapes[side, index]
+        within = lies_inside(centres - corners, shapes, settings.fit_size)
+        within &= thinnest(shapes) > THIN_PX + THIN_STD_PX * self._found.noise[side, index, 5]
+        contrasts, grounds = self.camera.greys(noise, side, centres)
+        good = seen & within & (contrasts >= settings.limits.smallest_contrast)
+        spread = np.tile(np.eye(5), (len(index), 1, 1))
+        chosen = np.empty((int(good.sum()), 5, 5))
+        fit_covariances(
+            (centres - corners)[good],
+            shapes[good],
+            self._found.smears[side, index[good]],
+            contrasts[good],
+            grounds[good],
+            settings.fit_size,
+            fit_settings(noise, settings.optics.psf_px),
+            chosen,
+        )
+        spread[good] = chosen
+        drawn = np.einsum("kij,kj->ki", np.linalg.cholesky(spread), self._found.noise[side, index, :5])
+        return EllipseFits(
+            centres + drawn[:, :2],
+            spread[:, :2, :2],
+            good,
+            shapes + np.einsum("kp,pij->kij", drawn[:, 2:], SHAPE_BASIS),
+            spread[:, 2:, 2:],
+            np.ones(len(index)),
+            contrasts,
+            grounds,
+        )
+
+
+def thinnest(shapes: Array) -> Array:
+    """Shorter half axes (k,) px of ellipses with shapes (k,2,2)."""
+    mean, half = 0.5 * (shapes[:, 0, 0] + shapes[:, 1, 1]), 0.5 * (shapes[:, 0, 0] - shapes[:, 1, 1])
+    return np.asarray(mean - np.hypot(half, shapes[:, 0, 1]))

@@ -1,0 +1,113 @@
+"""Compiled: which stickers convex solids hide."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cmmsim.compiled import Array, compiled
+from cmmsim.geometry.disc_kernels import probe_discs
+
+PROBES = 12  # points about a sticker, asked with its middle whether a solid hides them
+TOUCHING = 1e-6  # share of the way to a point in which meeting a solid is taken for lying on it
+
+
+class Solids(NamedTuple):
+    """Convex solids b, in their own axes: faces ``starts[b]`` to ``starts[b + 1]`` of normals (f,3), outwards, and
+    offsets (f,); the ball of ``radii[b]`` about ``middles[b]`` (3,) holds all of it."""
+
+    starts: Array
+    normals: Array
+    offsets: Array
+    middles: Array
+    radii: Array
+
+
+@compiled
+def reaches(eye: Array, point: Array, middle: Array, radius: float) -> bool:
+    """Whether the line from ``eye`` to ``point`` (3,) comes within ``radius`` of ``middle`` (3,)."""
+    along, total, gap = 0.0, 0.0, 0.0
+    for i in range(3):
+        along += (point[i] - eye[i]) * (middle[i] - eye[i])
+        total += (point[i] - eye[i]) ** 2
+    share = min(max(along / total, 0.0), 1.0)
+    for i in range(3):
+        gap += (eye[i] + share * (point[i] - eye[i]) - middle[i]) ** 2
+    return gap < radius * radius
+
+
+@compiled
+def enters(eye: Array, point: Array, normals: Array, offsets: Array, wider: float, touching: float) -> bool:
+    """Whether the solid normal . x + offset <= ``wider`` stands between ``eye`` and ``point`` (3,), all in its axes;
+    ``touching``: share of the way to the point in which meeting it is taken for lying on it."""
+    enter, leave = -np.inf, np.inf
+    for k in range(len(normals)):
+        distance, closing = wider - offsets[k], 0.0
+        for i in range(3):
+            distance -= normals[k, i] * eye[i]
+            closing += normals[k, i] * (point[i] - eye[i])
+        if closing < 0.0:
+            enter = max(enter, distance / closing)
+        elif closing > 0.0:
+            leave = min(leave, distance / closing)
+        elif distance < 0.0:
+            return False
+        if enter >= leave or leave <= 0.0 or enter >= 1.0 - touching:
+            return False
+    return True
+
+
+@compiled
+def to_body(move: Array, point: Array, into: Array) -> None:
+    """Point (3,) in camera axes ``into`` axes of the body at camera_from_body ``move`` (4,4)."""
+    for i in range(3):
+        into[i] = 0.0
+        for j in range(3):
+            into[i] += move[j, i] * (point[j] - move[j, 3])
+
+
+@compiled
+def hidden_stickers(
+    moves: Array,
+    places: Array,
+    normals: Array,
+    owners: Array,
+    clear: float,
+    solids: Solids,
+    asked: Array,
+    hidden: Array,
+) -> None:
+    """Fill ``hidden`` (n,): whether a solid stands before any point within ``clear`` m of a sticker, in its plane.
+
+    moves (b,4,4) camera_from_body of the solids; places and normals (n,3) of stickers in camera axes; owners (n,) the
+    solids that carry them, which do not hide them. Only stickers that are ``asked`` (n,) are looked at.
+    """
+    camera, eyes, point, probes = np.zeros(3), np.empty((len(moves), 3)), np.empty(3), np.empty((1, PROBES + 1, 3))
+    reach = np.full(1, clear)
+    for b in range(len(moves)):
+        to_body(moves[b], camera, eyes[b])
+    for n in range(len(places)):
+        hidden[n] = False
+        if not asked[n]:
+            continue
+        probed = False
+        for b in range(len(moves)):
+            if b == owners[n] or hidden[n]:
+                continue
+            eye = eyes[b]
+            to_body(moves[b], places[n], point)
+            if not reaches(eye, point, solids.middles[b], solids.radii[b] + clear):
+                continue
+            first, last = solids.starts[b], solids.starts[b + 1]
+            faces, offsets = solids.normals[first:last], solids.offsets[first:last]
+            if not enters(eye, point, faces, offsets, clear, 0.0):
+                continue
+            if not probed:
+                probe_discs(places[n : n + 1], normals[n : n + 1], reach, probes)
+                probed = True
+            for k in range(PROBES + 1):
+                to_body(moves[b], probes[0, k], point)
+                if enters(eye, point, faces, offsets, 0.0, TOUCHING):
+                    hidden[n] = True
+                    break
