@@ -138,7 +138,7 @@ def test_summary_after_a_report_shows_goals_speed_what_was_missed_and_where_the_
         ("calibrate none mine --board mine/board.toml", "no folder none"),
         ("calibrate mine mine --board b --distortion fisheye", "'fisheye': valid are brown5, none, radial2"),
         ("calibrate mine mine --board b --sensor ctrack", "unknown sensor 'ctrack'"),
-        ("calibrate mine mine --board b --seed 0", "no random numbers without --render: leave out --seed"),
+        ("calibrate mine mine --board b --seed 0", "no random numbers without --render or --halves: leave out --seed"),
         ("calibrate mine mine --render 3", "leave out LEFT and RIGHT"),
         ("calibrate --render 1 --min-images 7 --fix-aspect", "nothing: leave out --fix-aspect and --min-images"),
         ("workspace --out mine", "mine is not empty"),

@@ -221,7 +221,7 @@ ALONE = {
         "stribeck_velocity_m_s")),
     "scenario.plant.parameters", "scenario.model.start_parameters",
     "scenario.rig.known", "scenario.rig.errors", "scenario.rig.drift",
-    "scenario.identification.nuisances",
+    "scenario.identification.nuisances", "scenario.control.law",
 }  # fmt: skip
 """Keys whose other values are names, or stand with others: not tried by `with_others`."""
 
