@@ -32,9 +32,21 @@ class Halves:
         independent, so that more of them help less than their number says."""
         return float(np.sqrt(2.0 / self.squares.shape[1]))
 
-    def to_dict(self) -> dict[str, float | int]:
+    @property
+    def verdict(self) -> str:
+        """What that says of the covariance, where it is beyond two standard deviations of a single split."""
+        if abs(self.mean_square - 1.0) <= 2.0 * self.chance:
+            return "they agree as they state"
+        return f"the stated covariance is too {'small' if self.mean_square > 1.0 else 'large'}"
+
+    def to_dict(self) -> dict[str, float | int | str]:
         """For JSON."""
-        return {"splits": len(self.squares), "mean_square": self.mean_square, "chance_of_one": self.chance}
+        return {
+            "splits": len(self.squares),
+            "mean_square": self.mean_square,
+            "chance_of_one": self.chance,
+            "verdict": self.verdict,
+        }
 
 
 def compare_halves(

@@ -28,7 +28,9 @@ class Movement:
     std: float
 
     def __str__(self) -> str:
-        return f"{self.name} by {self.amount:.3g} ± {self.std:.1g}"
+        own = self.name.rpartition(".")[2]
+        unit = own.rpartition("_")[2] if "_" in own else ""
+        return f"{self.name} by {self.amount:.3g} ± {self.std:.1g} {unit}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -62,11 +64,11 @@ class Finding:
         if self.noticed_s is None:
             return None
         moved = ", ".join(map(str, self.movements))
-        since = "was wrong from the start" if self.from_start else "moved during the run"
+        since, what = ("were wrong from the start", "an error") if self.from_start else ("moved", "a movement")
         return (
-            f"the cameras {since}: noticed after {self.noticed_s:.2f} s; at the end, {100 * self.explained:.0f} % of "
-            f"what the stickers show is explained by a movement of {moved} (a false alarm has a chance of "
-            f"{self.chance:g} a run)"
+            f"the cameras {since}: noticed after {self.noticed_s:.2f} s; at the end of the run, "
+            f"{100 * self.explained:.0f} % of what the stickers show is explained by {what} of {moved} (a false alarm "
+            f"has a chance of {self.chance:g} a run)"
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -239,6 +239,7 @@ def _print_summary(found: "Calibration", apart: "Halves | None", folder: Path) -
     if apart is not None:
         typer.echo(
             f"halves of the pictures differ by {apart.mean_square:.2f} times the variance that they state, on average "
-            f"over {len(apart.squares)} splits; 1 is expected, give or take {apart.chance:.2f} in a single split"
+            f"over {len(apart.squares)} splits; 1 is expected, give or take {apart.chance:.2f} in a single split: "
+            f"{apart.verdict}"
         )
     typer.echo(f"calibration: {folder}")

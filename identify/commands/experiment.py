@@ -47,7 +47,7 @@ def run(
     Reads a scenario, and the robot and sensor that it names.
 
     Writes into the folder: scenario.toml, trajectories.json, experiment.nc, result.json, covariance.nc, validation.nc,
-    model.nc, report.html and figures. The JSON is result.json.
+    model.nc, report.html and figures; with geometry.known=calibrated also geometry. The JSON is result.json.
 
     \b
     Examples:

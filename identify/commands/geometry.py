@@ -69,11 +69,14 @@ def geometry(
 
 
 def _print(entry: dict[str, Any], folder: Path) -> None:
-    rows = [
-        (said, *(f"{value:.2f}" for value in (*entry[key]["position_rms_um"], *entry[key]["orientation_rms_urad"])))
+    import numpy as np
+
+    known = [
+        (said, [*entry[key]["position_rms_um"], *entry[key]["orientation_rms_urad"]])
         for key, said in (("uncalibrated", "before"), ("unseen", "after"), ("expected", "expected after"))
         if key in entry
     ]
+    rows = [(said, *(f"{value:.2f}" for value in row)) for said, row in known if np.isfinite(row).all()]
     header = ("", "x\num", "y\num", "z\num", "alpha\nurad", "beta\nurad", "gamma\nurad")
     print_table(header, rows, (), "rms error of poses that were not measured")
     told = [name for name, one in entry["parameters"].items() if one["observable"]]

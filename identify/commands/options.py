@@ -87,7 +87,9 @@ Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness
 Settings = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="KEY=VALUE", help="Replace a value of the scenario: timing.frame_rate_hz=30; repeatable."
+        "--set",
+        metavar="KEY=VALUE",
+        help="Replace a value of the scenario: timing.frame_rate_hz=30; repeatable. cmmsim new scenario FILE lists all.",
     ),
 ]
 EstimatorSettings = Annotated[

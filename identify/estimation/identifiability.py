@@ -181,11 +181,11 @@ class Conditioning:
         """One line where the record is poorly conditioned."""
         if not self.poor:
             return ()
+        number = f"{self.poses_alone:.1e}, more than {POOR:.0e}" if np.isfinite(self.poses_alone) else "beyond rounding"
         return (
             f"the record is poorly conditioned: of {self.directions} independent combinations of parameters and gains, "
             f"{self.unshown} are known from the starting values rather than from the poses (the condition number of "
-            f"what the poses tell is {self.poses_alone:.1e}, more than {POOR:.0e}); move the robot faster, farther or "
-            "longer",
+            f"what the poses tell is {number}); move the robot faster, farther or longer",
         )
 
 

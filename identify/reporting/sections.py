@@ -50,10 +50,14 @@ def sensor_section(data: RunData) -> Section:
         return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"))
     if data.cameras_acquitted is not None:
         said.append(
-            "Its errors are the noise that it states, new in every frame."
+            "Its errors are the noise that it states, new in every frame"
+            + (", beside what is wrong in all frames alike." if data.result["identification"].get("nuisances") else ".")
             if data.cameras_acquitted
             else "Its errors are larger than the noise that it states, or depend on those of the frames before."
         )
+    watch = data.result.get("drift_watch")
+    if watch and watch.get("noticed_s") is None:
+        said.append("By the stickers' pattern and the gaps of the rays, the cameras stayed as they were calibrated.")
     common = [table for table in (tables.common_error_table(data.result),) if table.rows]
     shown = (tables.sensor_table(data.result), *common)
     return Section("Sensor", (" ".join(said),), ("stereo_frame", "ellipses"), tables=shown)

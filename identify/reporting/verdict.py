@@ -69,11 +69,12 @@ def verdict(result: dict[str, Any], acquitted: bool | None) -> Verdict:
         sentences.insert(0 if explained else 1, _unseen_sentence(result, explained))
     sentences += [f"Not met: {sentence(goal)}" for goal in missed if goal.name not in (goals.RESIDUALS, goals.CHANCE)]
     if not unseen:
-        return Verdict(explained, _headline_without_truth(explained), (*sentences, NO_TRUTH))
+        headline = EXPLAINED if explained else _blame(None, result)
+        return Verdict(explained, headline, (*sentences, NO_TRUTH))
     if not missed:
         return Verdict(True, "The identified model moves as the true robot does.", tuple(sentences))
     if not explained:
-        return Verdict(False, _blame(acquitted), tuple(sentences))
+        return Verdict(False, _blame(acquitted, result), tuple(sentences))
     counted = f"{len(missed)} of {len(every)} goals {'is' if len(missed) == 1 else 'are'} not met."
     return Verdict(False, f"The model explains the record, but {counted}", tuple(sentences))
 
@@ -123,9 +124,7 @@ def _unseen_sentence(result: dict[str, Any], explained: bool) -> str:
     runs = result["validation"]
     identified, started = (np.array([rms_row(run.get(key)) for run in runs]) for key in ("true", "initial_true"))
     turns = bool((identified[:, 3:] != 0).any())
-    text = (
-        f"{'On' if explained else 'All the same, on'} {len(runs)} trajectories that it never saw, the identified model "
-    )
+    text = f"On {len(runs)} trajectories that it never saw, the identified model "
     if np.isfinite(identified).all():
         text += f"stays within {_distance(identified, turns)} of the true robot (RMS of the worst axis)"
     else:
@@ -158,10 +157,17 @@ def _residual_sentence(result: dict[str, Any], explained: bool, acquitted: bool 
     said = "; ".join(parts)
     if explained:
         return f"What it leaves of the record is the cameras' noise: {said}."
-    return f"What it leaves of the record is more than the cameras' noise: {said}. {_cause(acquitted)}"
+    return f"What it leaves of the record is more than the cameras' noise: {said}. {_cause(acquitted, result)}"
 
 
-def _cause(acquitted: bool | None) -> str:
+def _drift_warning(result: dict[str, Any]) -> str | None:
+    """What the run's watch of the cameras says; None where they still fitted, or nobody watched."""
+    return (result.get("drift_watch") or {}).get("warning")
+
+
+def _cause(acquitted: bool | None, result: dict[str, Any]) -> str:
+    if warning := _drift_warning(result):
+        return f"{warning[0].upper()}{warning[1:]}. Calibrate them again; whether the model is right cannot be told."
     if acquitted:
         return (
             "The cameras are not the cause, for they miss the truth only by the noise that they state: the model's "
@@ -174,13 +180,12 @@ def _cause(acquitted: bool | None) -> str:
     return "The cameras miss the truth by more than they state, or not by chance: they may be the cause, or the model."
 
 
-def _blame(acquitted: bool | None) -> str:
+EXPLAINED = "The identified model explains the record to within the cameras' noise."
+
+
+def _blame(acquitted: bool | None, result: dict[str, Any]) -> str:
+    if _drift_warning(result):
+        return "Model and measurement disagree, and the cameras are not as they were calibrated."
     if acquitted:
         return "The model is not that of the robot."
-    return "Model and measurement disagree, by an error of the model or of the cameras."
-
-
-def _headline_without_truth(explained: bool) -> str:
-    if explained:
-        return "The identified model explains the record to within the cameras' noise."
     return "Model and measurement disagree, by an error of the model or of the cameras."

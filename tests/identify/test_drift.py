@@ -28,7 +28,7 @@ def test_a_run_with_a_drift_says_when_and_how_and_one_without_says_nothing():
     assert 0.0 < finding["noticed_s"] < 1.0
     assert finding["movements"][0]["name"] == "right.cx_px"
     assert finding["movements"][0]["amount"] == pytest.approx(0.3, rel=0.2)
-    assert finding["warning"].startswith("the cameras moved during the run: noticed after 0.")
+    assert finding["warning"].startswith("the cameras moved: noticed after 0.")
     still = recorded()
     assert read_finding(still)["noticed_s"] is None
     assert drift_warnings([still]) == ()
