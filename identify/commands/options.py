@@ -89,7 +89,8 @@ Settings = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Replace a value of the scenario: timing.frame_rate_hz=30; repeatable. cmmsim new scenario FILE lists all.",
+        help="Replace a value of the scenario: timing.frame_rate_hz=30; repeatable. What cmmsim new scenario FILE "
+        "writes has all keys.",
     ),
 ]
 EstimatorSettings = Annotated[
