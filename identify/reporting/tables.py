@@ -94,8 +94,8 @@ def common_error_table(result: dict[str, Any]) -> Table:
         for name, before in found.get("nuisance_prior_std", {}).items()
     )
     note = (
-        "True minus known, in the unit that ends the name; of the geometry in m and rad. Where a servo acts, it takes the "
-        "platform to where such an error does not show; then little is learnt of it."
+        "True minus known, in the unit that ends the name; of the geometry in m and rad. Where a servo acts, it takes "
+        "the platform to where such an error does not show; then little is learnt of it."
     )
     header = ("error", "standard deviation beforehand", "found ± standard deviation")
     return Table("What is wrong in all frames alike", header, rows, note, folded=True)
