@@ -101,7 +101,7 @@ def test_the_wheel_holds_every_file_of_the_packages(outside):
     assert [path for path in wanted if not (packages(outside) / path).exists()] == []
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.rendering
 def test_the_guides_example_and_its_complete_files_run_where_the_wheel_is_installed(outside):
     """What the files test is held to limits that it meets and could miss."""

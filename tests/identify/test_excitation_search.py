@@ -245,7 +245,7 @@ def test_command_compares_and_leaves_its_files_and_none_where_it_is_interrupted(
     assert not list((tmp_path / "other").glob("*"))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_threads_of_linear_algebra_do_not_change_what_is_found():
     """IPOPT's own rounds otherwise with two threads, by enough to end elsewhere."""
     problem = search_problem(rss6(), load_scenario("paper"), drawn(1))

@@ -111,6 +111,7 @@ def test_a_stage_can_be_repeated_with_the_same_numbers_and_not_from_half_a_recor
     assert again.result.read_bytes() == written
 
 
+@pytest.mark.thorough
 def test_planes_and_commands_identify_too(tmp_path, capfd):
     """Plane intersection in every frame is noisier, so that the goals of the default method are not asked of it; the
     command-driven search starts on a bound here."""

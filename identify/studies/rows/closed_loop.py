@@ -49,6 +49,7 @@ READS = Reads(
         "scenario.rig.errors",
         "scenario.rig.right_later_s",
         "scenario.rig.drift",
+        "scenario.geometry.known",
         "scenario.timing.",
         "sensor.timing.",
         "scenario.servo.",
