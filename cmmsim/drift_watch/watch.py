@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from cmmsim.common_errors import MeasuringGeometry
 from cmmsim.drift_watch.blocks import RIG, Sightings, base_rows, platform_rows, stacked
@@ -46,6 +47,7 @@ class DriftWatch:
         self.geometry, self.chance, self.watches_base = geometry, chance, base
         self._period, self._known = frame_period, known
         self._offset_std = float(np.hypot(offset_px, TAUGHT_OFFSET_PX))
+        self._threads = ThreadpoolController()
         self.restart()
 
     def restart(self) -> None:
@@ -139,17 +141,21 @@ class DriftWatch:
         return np.array_equal(self._base.index, seen)
 
     def _close(self) -> None:
-        """Count the frames that wait."""
+        """Count the frames that wait. Matrices are small: a second thread of the BLAS takes ten times as long."""
         if self._platform is None:
             return
-        rows = [platform_rows(self.geometry, self._platform)]
-        if self._base is not None:
-            rows.append(base_rows(self.geometry, self._base))
-        stickers = len(self.geometry.taught.platform_places), len(self.geometry.taught.base_places)
-        self._evidence.step(stacked(rows, stickers[: 1 + self.watches_base]), self._frames - self._counted)
+        with self._threads.limit(limits=1, user_api="blas"):
+            self._count(self._platform)
         self._platform = self._base = None
         self._counted = self._frames
         ratio = self._evidence.log_ratio
         self._largest = max(self._largest, ratio)
         if self._noticed is None and ratio > -np.log(self.chance):
             self._noticed = self._frames - 1
+
+    def _count(self, platform: Sightings) -> None:
+        rows = [platform_rows(self.geometry, platform)]
+        if self._base is not None:
+            rows.append(base_rows(self.geometry, self._base))
+        stickers = len(self.geometry.taught.platform_places), len(self.geometry.taught.base_places)
+        self._evidence.step(stacked(rows, stickers[: 1 + self.watches_base]), self._frames - self._counted)
