@@ -145,7 +145,7 @@ def test_an_experiment_states_the_load_and_keeps_the_drawn_one_in_its_truth():
 
 
 @pytest.mark.parametrize(
-    "count", [pytest.param(4, marks=pytest.mark.slow), pytest.param(40, marks=pytest.mark.thorough)]
+    "count", [pytest.param(count, marks=pytest.mark.thorough) for count in (4, 40)]
 )
 def test_gains_miss_the_truth_as_often_as_they_say_where_the_load_is_drawn(count):
     """Whole experiments, each with noise and a load of its own: errors of the gain in standard deviations have the

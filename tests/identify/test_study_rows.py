@@ -211,7 +211,7 @@ def test_identification_finds_the_parameters_to_what_it_states():
 
 @pytest.mark.parametrize(
     ("duration_s", "within"),
-    [pytest.param(3.0, 0.2, marks=pytest.mark.slow), pytest.param(10.0, 0.1, marks=pytest.mark.thorough)],
+    [pytest.param(*row, marks=pytest.mark.thorough) for row in ((3.0, 0.2), (10.0, 0.1))],
 )
 def test_identification_from_images_is_as_good_as_from_drawn_noise(duration_s, within):
     once = {"identification.method": "command_driven", "validation.count": 1, "validation.duration_s": 1.0}
