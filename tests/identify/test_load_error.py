@@ -144,9 +144,7 @@ def test_an_experiment_states_the_load_and_keeps_the_drawn_one_in_its_truth():
     np.testing.assert_array_equal(*(one.truth["parameter_value"].values for one in (heavy, known)))
 
 
-@pytest.mark.parametrize(
-    "count", [pytest.param(count, marks=pytest.mark.thorough) for count in (4, 40)]
-)
+@pytest.mark.parametrize("count", [pytest.param(count, marks=pytest.mark.thorough) for count in (4, 40)])
 def test_gains_miss_the_truth_as_often_as_they_say_where_the_load_is_drawn(count):
     """Whole experiments, each with noise and a load of its own: errors of the gain in standard deviations have the
     variance one (99.8 % of chance); were the load called exact, twice the deviation and more."""
