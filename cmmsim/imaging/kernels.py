@@ -260,6 +260,27 @@ def lay_layers(images: Array, group: Array, corners: Array, solids: Solids, line
 
 
 @compiled
+def enters(eye: Array, point: Array, normals: Array, offsets: Array, wider: float, touching: float) -> bool:
+    """Whether the solid normal . x + offset <= ``wider`` stands between ``eye`` and ``point`` (3,), all in its axes;
+    ``touching``: share of the way to the point in which meeting it is taken for lying on it."""
+    enter, leave = -np.inf, np.inf
+    for k in range(len(normals)):
+        distance, closing = wider - offsets[k], 0.0
+        for i in range(3):
+            distance -= normals[k, i] * eye[i]
+            closing += normals[k, i] * (point[i] - eye[i])
+        if closing < 0.0:
+            enter = max(enter, distance / closing)
+        elif closing > 0.0:
+            leave = min(leave, distance / closing)
+        elif distance < 0.0:
+            return False
+        if enter >= leave or leave <= 0.0 or enter >= 1.0 - touching:
+            return False
+    return True
+
+
+@compiled
 def hidden_points(
     body_from_camera: Array, points: Array, normals: Array, offsets: Array, touching: float, hidden: Array
 ) -> None:
@@ -271,16 +292,4 @@ def hidden_points(
             point[i] = eye[i] = body_from_camera[i, 3]
             for j in range(3):
                 point[i] += body_from_camera[i, j] * points[n, j]
-        enter, leave, beside = -np.inf, np.inf, False
-        for k in range(len(normals)):
-            distance, closing = -offsets[k], 0.0
-            for i in range(3):
-                distance -= normals[k, i] * eye[i]
-                closing += normals[k, i] * (point[i] - eye[i])
-            if closing < 0.0:
-                enter = max(enter, distance / closing)
-            elif closing > 0.0:
-                leave = min(leave, distance / closing)
-            else:
-                beside = beside or distance < 0.0
-        hidden[n] = not beside and enter < leave and leave > 0.0 and enter < 1.0 - touching
+        hidden[n] = enters(eye, point, normals, offsets, 0.0, touching)

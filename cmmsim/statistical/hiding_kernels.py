@@ -8,6 +8,7 @@ import numpy as np
 
 from cmmsim.compiled import Array, compiled
 from cmmsim.geometry.disc_kernels import probe_discs
+from cmmsim.imaging.kernels import enters
 
 PROBES = 12  # points about a sticker, asked with its middle whether a solid hides them
 TOUCHING = 1e-6  # share of the way to a point in which meeting a solid is taken for lying on it
@@ -35,27 +36,6 @@ def reaches(eye: Array, point: Array, middle: Array, radius: float) -> bool:
     for i in range(3):
         gap += (eye[i] + share * (point[i] - eye[i]) - middle[i]) ** 2
     return gap < radius * radius
-
-
-@compiled
-def enters(eye: Array, point: Array, normals: Array, offsets: Array, wider: float, touching: float) -> bool:
-    """Whether the solid normal . x + offset <= ``wider`` stands between ``eye`` and ``point`` (3,), all in its axes;
-    ``touching``: share of the way to the point in which meeting it is taken for lying on it."""
-    enter, leave = -np.inf, np.inf
-    for k in range(len(normals)):
-        distance, closing = wider - offsets[k], 0.0
-        for i in range(3):
-            distance -= normals[k, i] * eye[i]
-            closing += normals[k, i] * (point[i] - eye[i])
-        if closing < 0.0:
-            enter = max(enter, distance / closing)
-        elif closing > 0.0:
-            leave = min(leave, distance / closing)
-        elif distance < 0.0:
-            return False
-        if enter >= leave or leave <= 0.0 or enter >= 1.0 - touching:
-            return False
-    return True
 
 
 @compiled

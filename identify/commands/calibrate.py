@@ -137,12 +137,13 @@ def calibrate(
     given: dict[str, Any] = {"distortion": distortion, "min_images": min_images}
     options = CalibrationOptions(fix_aspect=fix_aspect, **{k: v for k, v in given.items() if v is not None})
     template = None if sensor is None else sensor_template(sensor, folder)
-    pairs, size = _view(left, right, read_board(board), template, progress)
+    described = read_board(board)
+    pairs, size = _view(left, right, described, template, progress)
     with progress.stage("adjust", 1 + 2 * (halves or 0)) as advance:
-        found = calibrate_from(read_board(board), pairs, size, options)
+        found = calibrate_from(described, pairs, size, options)
         advance()
         rng = np.random.default_rng(seed or 0)
-        apart = compare_halves(found.board, pairs, size, options, halves, rng, advance) if halves else None
+        apart = compare_halves(described, pairs, size, options, halves, rng, advance) if halves else None
     content = as_dict(found) | ({} if apart is None else {"halves": apart.to_dict()})
     refused = _write(folder, found, template, content)
     print_warnings([*found.warnings, *(template.disagreements(found) if template else []), *refused])

@@ -56,11 +56,11 @@ def identify(
     searches = output_error_searches(problem, scenario, warm, progress)
     searched = time.perf_counter()
     method = scenario.identification.method
-    solution, judged = searches[method].solution, searches[method].linearised
+    solution, judged = searches[method].solution, searches[method].linearised()
     with progress.stage("uncertainty", DRAWS) as advance:
         uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
     by_commands = searches["command_driven"]
-    driven = judged if method == "command_driven" else by_commands.linearised
+    driven = judged if method == "command_driven" else by_commands.linearised()
     explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit)
     judgement = judge(problem, scenario, solution, uncertainty, explained)
     ended = time.perf_counter()

@@ -36,7 +36,6 @@ class Search:
     problem: OutputErrorProblem
     solution: Solution
 
-    @property
     def linearised(self) -> OutputErrorProblem:
         """The problem with the common errors as the model shows them at the optimum. Raises LoopFailure."""
         return self.problem.with_common_errors(self.solution.parameters)

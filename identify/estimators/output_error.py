@@ -58,6 +58,6 @@ def _searched(evidence: Evidence, problem: OutputErrorProblem, method: str) -> E
     warm = linear_warm_start(problem, evidence.scenario)
     found = list(output_error_searches(problem, scenario, warm, SilentProgress()).values())
     seconds, last = time.perf_counter() - began, found[-1].solution
-    std = estimate_uncertainty(found[-1].linearised, last.parameters, mixed_generator(ROUTES_UNCERTAINTY)).std
+    std = estimate_uncertainty(found[-1].linearised(), last.parameters, mixed_generator(ROUTES_UNCERTAINTY)).std
     counts = sum(one.solution.iterations for one in found), sum(one.solution.evaluations for one in found)
     return Estimate(last.parameters, std, seconds, *counts, last.stop_reason)

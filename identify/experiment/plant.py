@@ -28,7 +28,7 @@ from identify.estimation.prior import starting_guess
 from identify.experiment.truth import build_truth
 from identify.loop_parameters import loop_settings, of_actuators
 from identify.random_streams import ENCODER_OFFSETS, TRUE_GEOMETRY, child
-from identify.record.geometry_errors import factor
+from identify.record.covariance import factor
 from identify.record.known_geometry import KnownGeometry, known_geometry
 from identify.record.payload import payload_vector
 from identify.scenario import Plant as PlantSwitches

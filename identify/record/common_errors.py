@@ -8,21 +8,21 @@ the same as estimating d beside everything else, d known beforehand by its covar
 d, as of a latency, or of cameras within a servo, the model is given the most likely d, and M taken there.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import xarray as xr
-from scipy.linalg import block_diag, cholesky
+from scipy.linalg import block_diag
 
 from identify.arrays import Array
 from identify.errors import RecordError
 from identify.files.dataset import POSE
-from identify.record.geometry_errors import NOTICED, GeometryErrors
+from identify.record.covariance import covariance_fault, factor, noticed_directions
+from identify.record.geometry_errors import GeometryErrors
 
 CHANGES, COVARIANCE = "common_error", "common_error_covariance"
 LATENCY = "timing.latency_s"
-ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -30,24 +30,14 @@ class CommonErrors:
     """names of the errors, each ending with its unit; changes (N, 6, k) of the measured poses per unit of each;
     covariance (k, k) of what is true minus what is known. latency_std: of the mean latency of the frames, s, which only
     a model of the loop can turn into poses; and so it is with the geometry of the robot, None where that is exact.
-    turned (k, k): another factor of the covariance, of whose directions so many are `noticed` (`ordered`)."""
+    whitener (6, 6): that of the poses' noise, which says which directions of the errors they notice; None: all."""
 
     names: tuple[str, ...]
     changes: Array
     covariance: Array
     latency_std: float = 0.0
     geometry: GeometryErrors | None = None
-    turned: Array | None = None
-    noticed: int | None = None
-
-    def ordered(self, whitener: Array) -> "CommonErrors":
-        """The same errors by independent directions of which those come first that poses show most, in deviations of
-        their noise (`whitener` (6, 6)), and how many of them are noticed at all."""
-        if not self.names:
-            return self
-        seen = (whitener @ self.modes).reshape(-1, len(self.names))
-        sizes, turns = np.linalg.svd(np.linalg.qr(seen, mode="r"))[1:]
-        return replace(self, turned=self.factor @ turns.T, noticed=int(np.sum(sizes > NOTICED)))
+    whitener: Array | None = None
 
     @property
     def all_names(self) -> tuple[str, ...]:
@@ -61,16 +51,24 @@ class CommonErrors:
         latency = [np.full((1, 1), self.latency_std)] if self.latency_std else []
         return np.asarray(block_diag(self.factor, *latency, *([self.geometry.factor] if self.geometry else [])))
 
-    @cached_property
+    @property
     def factor(self) -> Array:
-        """L (k, k) with L L^T the covariance."""
+        """L (k, k) with L L^T the covariance; with a whitener, its columns that are noticed most come first."""
+        return self._noticed[0]
+
+    @property
+    def noticed(self) -> int:
+        """How many columns of the factor poses notice."""
+        return self._noticed[1]
+
+    @cached_property
+    def _noticed(self) -> tuple[Array, int]:
         if not self.names:
-            return np.zeros((0, 0))
-        if self.turned is not None:
-            return self.turned
-        std = np.sqrt(np.diag(self.covariance))
-        unit = self.covariance / np.outer(std, std)
-        return std[:, None] * cholesky(unit + ROUNDING * np.eye(len(std)), lower=True)
+            return np.zeros((0, 0)), 0
+        root = factor(self.covariance)
+        if self.whitener is None:
+            return root, len(root)
+        return noticed_directions(root, self.whitener @ (self.changes @ root))
 
     @cached_property
     def modes(self) -> Array:
@@ -143,14 +141,10 @@ def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErro
             f"{CHANGES} has shape {changes.shape} and {COVARIANCE} {covariance.shape}, must be {expected} and "
             f"{(len(names),) * 2}"
         )
-    if not (np.isfinite(changes).all() and np.isfinite(covariance).all()):
-        raise RecordError(f"{CHANGES} or {COVARIANCE} is not finite")
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    unit = covariance / np.outer(std, std) if (std > 0.0).all() else covariance * np.nan
-    if not (np.isfinite(unit).all() and np.abs(unit - unit.T).max() < ROUNDING):
-        raise RecordError(f"{COVARIANCE} is no covariance: not symmetric, or with a variance that is not > 0")
-    if np.linalg.eigvalsh(unit)[0] < -ROUNDING:
-        raise RecordError(f"{COVARIANCE} is no covariance: it has an eigenvalue < 0")
+    if not np.isfinite(changes).all():
+        raise RecordError(f"{CHANGES} is not finite")
+    if fault := covariance_fault(covariance):
+        raise RecordError(f"{COVARIANCE} {fault}")
     kept = [k for k, name in enumerate(names) if kind_of(name) in kinds]
     return CommonErrors(tuple(names[k] for k in kept), changes[:, :, kept], covariance[np.ix_(kept, kept)])
 

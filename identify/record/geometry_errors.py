@@ -19,13 +19,11 @@ from dynamics import Robot
 from dynamics.closure import Closure
 from identify.arrays import Array
 from identify.errors import RecordError
+from identify.record.covariance import covariance_fault, factor, noticed_directions
 from identify.runtime import cores
 
 COVARIANCE = "geometry_covariance"
 PREFIX = "geometry."
-NOTICED = 0.1
-"""Standard deviations of the noise of all frames together, below which a direction of the geometry is left out."""
-ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -74,32 +72,13 @@ class GeometryErrors:
         chart, nominal = geometry.chart, self.robot.functions_of
         poses, off = chart.pose(chart.coordinates(self.poses)), geometry.deviations_from(nominal)
         by_numbers = Closure(nominal).derivatives(poses, self.robot.inverse_kinematics(poses), off)[0]
-        seen = self.whitener[:, list(chart.freedoms)] @ by_numbers @ root
-        sizes, turns = np.linalg.svd(np.linalg.qr(seen.reshape(-1, len(root)), mode="r"))[1:]
-        return np.asarray(root @ turns.T), int(np.sum(sizes > NOTICED))
+        return noticed_directions(root, self.whitener[:, list(chart.freedoms)] @ by_numbers @ root)
 
     @cached_property
     def _moved(self) -> list[tuple[Robot, Robot]]:
         """The robot with its geometry off by plus and by minus each direction that is noticed."""
         directions, count = self._noticed
         return [(self.robot.moved(one), self.robot.moved(-one)) for one in directions.T[:count]]
-
-
-def factor(covariance: Array) -> Array:
-    """L (g, g) with L L^T a covariance."""
-    std = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
-    return np.asarray(std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
-
-
-def covariance_fault(covariance: Array) -> str:
-    """Why a matrix (g, g) with positive diagonal is no covariance; empty where it is one."""
-    std = np.sqrt(np.diag(covariance))
-    unit = covariance / np.outer(std, std)
-    if np.abs(unit - unit.T).max() > ROUNDING:
-        return "is no covariance: it is not symmetric"
-    least = float(np.linalg.eigvalsh(unit)[0])
-    return f"is no covariance: as correlations it has the eigenvalue {least:.2g}, < 0" if least < -ROUNDING else ""
 
 
 def store_geometry_covariance(record: xr.Dataset, robot: Robot, covariance: Array) -> None:
@@ -127,8 +106,6 @@ def read_geometry_covariance(record: xr.Dataset, robot: Robot) -> Array | None:
             f"{COVARIANCE} has shape {covariance.shape} and is not of the {len(robot.geometry.number_names)} geometric "
             f"numbers of {robot.name}, in their order"
         )
-    if not (np.isfinite(covariance).all() and (np.diag(covariance) > 0.0).all()):
-        raise RecordError(f"{COVARIANCE} is not finite, or has a variance that is not > 0")
     if fault := covariance_fault(covariance):
         raise RecordError(f"{COVARIANCE} {fault}")
     return covariance

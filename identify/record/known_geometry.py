@@ -9,7 +9,7 @@ from dynamics import DynamicsError, Robot, load_robot
 from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.dataset import read_covariance
-from identify.record.geometry_errors import covariance_fault
+from identify.record.covariance import covariance_fault
 from identify.scenario import Scenario
 
 FOLDER = "geometry"

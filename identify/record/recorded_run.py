@@ -174,14 +174,18 @@ class RecordedRun:
     def _missed(self, run: ClosedLoopRun) -> Array:
         """What a run of the model misses of the measurements (n, 6); its common errors count as none."""
         seen = run.pose if self.driven or self.drawn is None else run.measured
-        whitened = np.asarray((seen - self.measured)[self.ok] @ self.whitener.T, dtype=float)
+        whitened = self._in_noise(seen - self.measured)
         if self.marginal is not None:
             whitened = whitened - self.marginal.had.reshape(whitened.shape)
         return self._without_common(whitened)
 
     def whiten(self, differences: Array) -> Array:
         """Pose differences (N, 6) at the good frames in standard deviations of the sensor, (n, 6)."""
-        return self._without_common(np.asarray(differences[self.ok] @ self.whitener.T, dtype=float))
+        return self._without_common(self._in_noise(differences))
+
+    def _in_noise(self, differences: Array) -> Array:
+        """The same in those of the noise alone."""
+        return np.asarray(differences[self.ok] @ self.whitener.T, dtype=float)
 
     def _without_common(self, rows: Array) -> Array:
         """Rows (n, 6, ...) in standard deviations of the noise, in those of noise and common errors."""
@@ -271,5 +275,5 @@ def _common_errors(record: xr.Dataset, scenario: Scenario, run: RecordedRun) -> 
     if "geometry" in kinds and (covariance := read_geometry_covariance(record, run.robot)) is not None:
         geometry = GeometryErrors(run.robot, covariance, run.reference.poses, run.whitener)
     latency_std = scenario.timing.latency_std_s if "latency" in kinds else 0.0
-    of_poses = read_common_errors(record, kinds).ordered(run.whitener)
-    return replace(of_poses, latency_std=latency_std, geometry=geometry)
+    of_poses = read_common_errors(record, kinds)
+    return replace(of_poses, latency_std=latency_std, geometry=geometry, whitener=run.whitener)
