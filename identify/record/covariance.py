@@ -1,4 +1,4 @@
-"""Covariances of errors that are one draw a run: whether one is one, its factor, and the directions that poses notice."""
+"""Covariances of errors that are one draw a run: is one valid, its factor, the directions that poses notice."""
 
 import numpy as np
 
