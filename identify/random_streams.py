@@ -24,8 +24,9 @@ NOISE, LATENCY, PREDICTION = 4, 5, 6
 """Of each run: the sensor's noise, the latency of its frames, the noise in what is predicted of it."""
 DESIGN, LOAD, CALIBRATION, MEAN_LATENCY = 7, 8, 9, 10
 """The exciting trajectories of several runs, the true load, what is known of the cameras, and the true mean latency."""
-TRACKED = 24
-"""Of each motion that is followed: the drawn poses by which the shares of its error are known."""
+TRACKED, EXPOSURES = 24, 25
+"""Of each motion that is followed: the drawn poses by which the shares of its error are known. And by how much the
+right camera truly exposes later."""
 
 UNCERTAINTY = 5
 """Mixed with a record's seed: the repeated experiments behind an identification's standard deviations."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,11 @@ from cmmsim.radiometry.images import FrameImages, StereoFrame, StereoImages
 Solution = tuple[Array, Array, StickerObservation]
 
 
+def _nothing_in_common(pose: Array) -> Array:
+    """Of a pose (6,), the covariance (6,6) that it has in common with others: none, or not known where it is lost."""
+    return np.full((6, 6), 0.0 if np.isfinite(pose).all() else np.nan)
+
+
 @dataclass(frozen=True)
 class Measurement:
     """Pose of the platform in the base frame, and what it was made from.
@@ -38,7 +44,8 @@ class Measurement:
 
     points (n,3) and point_covariances (n,3,3) in the camera frame, m; left_pixels and right_pixels (n,2) sticker
     centres in the images as they are, distorted, and pixel_variances (n,) of a coordinate, px²; target_ids (n,) such as
-    "A1". When nothing could be measured ok is False, reason says why, and pose and covariances are NaN.
+    "A1"; common_at: what gives the common part at a pose (6,). When nothing could be measured ok is False, reason says
+    why, and pose and covariances are NaN.
     """
 
     pose: Array
@@ -50,8 +57,13 @@ class Measurement:
     target_ids: NDArray[np.str_]
     ok: bool
     reason: str = ""
-    common_covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    common_at: Callable[[Array], Array] = _nothing_in_common
     pixel_variances: Array = field(default_factory=lambda: np.zeros(0))
+
+    @cached_property
+    def common_covariance(self) -> Array:
+        """Covariance (6,6) of the common part; found when it is asked for, which takes longer than to measure."""
+        return self.common_at(self.pose)
 
     @property
     def single_covariance(self) -> Array:
@@ -93,8 +105,7 @@ def measurement_without_stickers(pose: Array, covariance: Array, reason: str = "
     """A pose (6,) and its covariance (6,6) that no sticker stands behind; the reason why there is none where NaN."""
     points, covariances, pixels = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 2))
     names = np.array([], dtype=str)
-    common = np.full((6, 6), np.nan) if reason else np.zeros((6, 6))
-    return Measurement(pose, covariance, points, covariances, pixels, pixels, names, not reason, reason, common)
+    return Measurement(pose, covariance, points, covariances, pixels, pixels, names, not reason, reason)
 
 
 def by_registration(observation: StickerObservation, places: Array) -> Solution:
@@ -225,7 +236,7 @@ class PoseEstimator(Observer):
             used.right_pixels,
             self.platform.sticker_ids[used.index],
             True,
-            common_covariance=self.common_at(pose),
+            common_at=self.common_at,
             pixel_variances=used.pixel_variances,
         )
         return measurement, camera_from_platform

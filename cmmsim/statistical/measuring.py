@@ -88,7 +88,7 @@ class StatisticalTracker:
         used, estimator = frame.used, self._estimator
         return Measurement(
             found, spread, frame.points[used], frame.covariances[used], frame.pixels[0, used], frame.pixels[1, used],
-            estimator.platform.sticker_ids[used], True, "", estimator.common_at(found), _variances(frame, used),
+            estimator.platform.sticker_ids[used], True, "", estimator.common_at, _variances(frame, used),
         )  # fmt: skip
 
     def measure_many(

@@ -1,4 +1,5 @@
-"""The rig as the estimator knows it: exactly, as calibrated from pictures of a board, or as well as a calibration says.
+"""The rig as the estimator knows it: exactly, as calibrated from pictures of a board, or as well as a calibration says,
+that of a file or what fifteen photographs leave.
 
 The cameras that take the pictures are the sensor file's in each case.
 """
@@ -16,7 +17,7 @@ from cmmsim.calibration import PairView, board_poses, calibrate, default_board, 
 from cmmsim.calibration.detection import find_board
 from cmmsim.files import SensorFile
 from cmmsim.files.setup import rig_from_file
-from cmmsim.geometry.known_rig import KnownRig
+from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, StereoRig
 from cmmsim.imaging.renderer import choose_renderer
 from cmmsim.radiometry.noise import CameraNoise
@@ -34,9 +35,9 @@ def known_rig(
 ) -> KnownRig | None:
     """What is known of the rig of a scenario's sensor file; None where it is known exactly.
 
-    `calibrated`: a board is drawn in front of the true cameras, found in the pictures and calibrated from. A path: the
-    rig that one calibration with that covariance would have found. Raises ScenarioError for a file that holds no
-    calibration, or that of another rig, CalibrationError where the pictures do not determine the cameras.
+    `calibrated`: a board is drawn in front of the true cameras, found in the pictures and calibrated from. A path, or
+    `photographs`: the rig that one calibration with that covariance would have found. Raises ScenarioError for a file
+    that holds no calibration, or that of another rig, CalibrationError where the pictures do not determine the cameras.
     """
     section, (rig, _) = scenario.rig, rig_from_file(file.rig)
     if section.exact:
@@ -46,7 +47,8 @@ def known_rig(
         return KnownRig(rig, np.zeros((len(PARAMETER_NAMES),) * 2), exposure)
     if section.known == "calibrated":
         return replace(calibrated_rig(file, section.pairs, rng, progress or SilentProgress()), exposure_std=exposure)
-    return KnownRig.drawn(rig, stated_covariance(Path(section.known), rig), rng, exposure)
+    stated = PHOTOGRAPHED if section.known == "photographs" else stated_covariance(Path(section.known), rig)
+    return KnownRig.drawn(rig, stated, rng, exposure)
 
 
 def calibrated_rig(file: SensorFile, pairs: int, rng: np.random.Generator, progress: Progress) -> KnownRig:
@@ -82,8 +84,8 @@ def stated_covariance(path: Path, rig: StereoRig) -> Array:
         size = content["image_size_px"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ScenarioError(
-            f"rig.known = {str(path)!r} is neither exact, calibrated, nor the calibration.json of `cmmsim calibrate`: "
-            f"{type(error).__name__} {error}"
+            f"rig.known = {str(path)!r} is neither exact, calibrated, photographs, nor the calibration.json of "
+            f"`cmmsim calibrate`: {type(error).__name__} {error}"
         ) from None
     if list(names) != list(PARAMETER_NAMES) or matrix.shape != (len(PARAMETER_NAMES),) * 2:
         raise ScenarioError(

@@ -22,7 +22,17 @@ from identify.experiment.plant import Plant, PlatformLoad, build_plant, drawn_lo
 from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop, make_sensor, sensor_file, with_renderer
 from identify.filtering import spline_derivatives, without_gaps
 from identify.progress import Advance, Progress, SilentProgress
-from identify.random_streams import ANCHOR, CALIBRATION, LATENCY, LOAD, MEAN_LATENCY, NOISE, TEACHING, stream_seed
+from identify.random_streams import (
+    ANCHOR,
+    CALIBRATION,
+    EXPOSURES,
+    LATENCY,
+    LOAD,
+    MEAN_LATENCY,
+    NOISE,
+    TEACHING,
+    stream_seed,
+)
 from identify.record import recording
 from identify.record.common_errors import CommonErrors, store_common_errors
 from identify.record.drift import store_finding
@@ -133,6 +143,7 @@ def run_plant(
     scenario, times = plant.scenario, plant.scenario.timing.frame_times(duration_s)
     check_travel(plant.nominal, trajectory, times, **scenario.excitation.singularity_limits)
     reference = trajectory.reference(times)
+    _part_exposures(sensor, scenario, seed)
     watch = _watched(sensor, scenario, len(times))
     eye = SensorInLoop(sensor, plant.robot, stream_seed(seed, NOISE, run), advance)
     latencies = _true_latencies(scenario, len(times), seed, run)
@@ -152,6 +163,14 @@ def run_plant(
         store_payload(record, layout, load.stated, load.std)
         store_payload(truth, layout, load.true)
     return Experiment(record, truth)
+
+
+def _part_exposures(sensor: PoseSensor, scenario: Scenario, seed: int) -> None:
+    """Have the right camera expose later than the left by what is not known of it, one draw for all runs of a seed."""
+    rig = scenario.rig
+    if isinstance(sensor, cmmsim.Sensor) and rig.right_later_s is None and rig.right_later_std_s:
+        drawn = np.random.default_rng(stream_seed(seed, EXPOSURES)).standard_normal()
+        sensor.move_rig(rig.errors, rig.right_later_std_s * drawn)
 
 
 def _watched(sensor: PoseSensor, scenario: Scenario, frames: int) -> DriftWatch | None:

@@ -56,7 +56,7 @@ def make_sensor(
     file = sensor_file(scenario)
     check_platform(robot, file, scenario.sensor)
     sensor = cmmsim.Sensor(file, seed, scenario.pose_method, taught, renderer=scenario.renderer, known=known)
-    sensor.move_rig(scenario.rig.errors, scenario.rig.right_later_s)
+    sensor.move_rig(scenario.rig.errors, scenario.rig.right_later_s or 0.0)
     sensor.drift_rig(scenario.rig.drift, scenario.timing.frames(scenario.excitation.duration_s))
     sensor.add_bodies(robot_meshes(robot))
     return sensor

@@ -217,7 +217,7 @@ class PriorValue(Section):
     std: float = quantity(..., "SI", "its standard deviation", gt=0)
 
 
-RIG_KNOWN = ["exact", "calibrated"]
+RIG_KNOWN = ["exact", "calibrated", "photographs"]
 """How well a rig may be known, beside the path of a calibration's result."""
 
 
@@ -226,14 +226,16 @@ class Rig(Section):
 
     known: str = Field(
         "exact",
-        description="exact; calibrated: from pictures of a board that the run takes first; or a calibration.json, "
-        "whose covariance says how well",
+        description="exact; calibrated: from pictures of a board that the run takes first; photographs: as fifteen "
+        "photographs of a board leave it; or a calibration.json, whose covariance says how well",
     )
     pairs: int = quantity(20, "1", "pairs of pictures of the board, where calibrated", ge=3, le=500)
     errors: dict[str, float] = Field(
         {}, description='true minus known, of which no covariance knows: { "left.cx_px" = 0.1 }, px, m or rad'
     )
-    right_later_s: float = quantity(0.0, "s", "by how much the right camera truly exposes later", ge=-0.1, le=0.1)
+    right_later_s: float | None = quantity(
+        None, "s", "by how much the right camera truly exposes later; left out: drawn", ge=-0.1, le=0.1
+    )
     right_later_std_s: float = quantity(0.0, "s", "how well that is known to be nothing", ge=0, le=0.1)
     drift: dict[str, float] = Field(
         {},

@@ -127,7 +127,3 @@ def random_ellipses(rng, count, size, radii=(3.8, 2.4)):
     angle = rng.uniform(0.0, np.pi, count)
     turn = np.stack([np.stack([np.cos(angle), -np.sin(angle)], -1), np.stack([np.sin(angle), np.cos(angle)], -1)], 1)
     return 0.5 * (size - 1) + rng.uniform(-1.0, 1.0, (count, 2)), turn @ np.diag(radii) @ turn.transpose(0, 2, 1)
-
-
-PHOTOGRAPHED = np.diag([*2 * (1.0, 1.0, 0.5, 0.5, 2e-3, 2e-3, 1e-4, 1e-4, 0.0), *3 * (5e-5,), *3 * (1e-4,)]) ** 2
-"""Covariance of a rig as fifteen photographs of a board leave it: focal lengths to 1 px, principal points to 0.5 px."""

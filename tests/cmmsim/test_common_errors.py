@@ -10,13 +10,13 @@ from cmmsim.common_errors import NAMES, MeasuringGeometry
 from cmmsim.errors import CmmError
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import rig_from_file
-from cmmsim.geometry.known_rig import KnownRig, rig_changes
+from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig, rig_changes
 from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
 from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES, triangulate
 from cmmsim.pose_estimation.estimator import lost_measurement
 from cmmsim.pose_estimation.observation import faces_camera
-from tests.cmmsim.sensors import PHOTOGRAPHED, exact
+from tests.cmmsim.sensors import exact
 
 BOX = np.array([0.01, 0.01, 0.01, 0.04, 0.04, 0.04])
 OFF = {"left.fx_px": 0.5, "right.cx_px": 0.2, "left.cy_px": -0.1, "right_from_left.ry_rad": 2e-5, "right.k1": 2e-4}
@@ -104,7 +104,7 @@ def test_the_common_part_is_that_of_many_calibrations_and_is_added_to_the_noise_
     errors = np.array([measured(geometry, rig, pose[None])[0] - pose for rig in rigs])
     assert np.mean(np.einsum("ni,ij,nj->n", errors, np.linalg.inv(stated), errors)) == pytest.approx(6.0, abs=0.9)
     sensor = exact()
-    one = replace(sensor.measure(pose), common_covariance=stated)
+    one = replace(sensor.measure(pose), common_at=lambda _: stated)
     noisy = errors + rng.multivariate_normal(np.zeros(6), one.covariance, len(errors))
     weights = np.linalg.inv(one.single_covariance)
     assert np.mean(np.einsum("ni,ij,nj->n", noisy, weights, noisy)) == pytest.approx(6.0, abs=0.9)

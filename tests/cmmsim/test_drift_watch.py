@@ -13,13 +13,13 @@ from scipy.stats import binom
 from cmmsim.common_errors import MeasuringGeometry
 from cmmsim.drift_watch import DriftWatch
 from cmmsim.errors import CmmError
-from cmmsim.geometry.known_rig import KnownRig, rig_changes
+from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig, rig_changes
 from cmmsim.geometry.pose import apply, pose_to_transform, transform_to_pose
 from cmmsim.geometry.registration import register
 from cmmsim.geometry.stereo_rig import PLACE_NAMES, triangulate
 from cmmsim.pose_estimation.estimator import Measurement, lost_measurement
 from cmmsim.pose_estimation.observation import StickerObservation, faces_camera
-from tests.cmmsim.sensors import PHOTOGRAPHED, exact
+from tests.cmmsim.sensors import exact
 
 NOISE_PX = 0.0085  # of a centre, as of the built-in sensor
 RATE = 60.0

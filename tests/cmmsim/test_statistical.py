@@ -11,7 +11,7 @@ from scipy.stats import chi2, chi2_contingency, ks_2samp, kstest
 
 import cmmsim
 from cmmsim.errors import LostError
-from cmmsim.geometry.known_rig import KnownRig
+from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig
 from cmmsim.geometry.pose import invert
 from cmmsim.geometry.stereo_rig import triangulate
 from cmmsim.pose_estimation.observation import StickerObservation
@@ -21,7 +21,6 @@ from cmmsim.statistical.measuring import StatisticalTracker
 from cmmsim.statistical.pose_kernels import MEASURED, measure_frame
 from tests.cmmsim.sensors import (
     LENSES,
-    PHOTOGRAPHED,
     camera_from,
     exact,
     pose_errors,

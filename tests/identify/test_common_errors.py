@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 
 import cmmsim
-from cmmsim.geometry.known_rig import KnownRig
+from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig
 from identify.errors import RecordError
 from identify.estimation.identification import identify, output_error_problem
 from identify.record.common_errors import CommonErrors, Marginal, read_common_errors, store_common_errors
 from identify.record.recording import poses
 from identify.reporting.tables import common_error_table
-from tests.cmmsim.sensors import PHOTOGRAPHED
 from tests.identify.synthetic import SIGMA, quick, rss6, run_plant, truth
 
 NAMES = ("left.fx_px", "left.cx_px", "right.cx_px", "taught.base.rz_rad", "taught.platform.tx_m")

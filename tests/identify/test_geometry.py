@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import cmmsim
-from cmmsim.geometry.known_rig import KnownRig
+from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig
 from cmmsim.pose_estimation.estimator import lost_measurement, measurement_without_stickers
 from dynamics import built_in_robots, load_robot
 from dynamics.errors import UnreachablePoseError
@@ -21,7 +21,6 @@ from identify.geometry.observability import check_enough, combinations
 from identify.geometry.static_poses import FrameKnowledge, StaticPoses, read_static_poses
 from identify.progress import SilentProgress
 from identify.record.geometry_errors import covariance_fault
-from tests.cmmsim.sensors import PHOTOGRAPHED
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.static_poses import TOLERANCE, designer, drawn, poses_of, scenario, unseen_errors
 

@@ -48,6 +48,7 @@ READS = Reads(
         *PICTURES,
         "scenario.rig.errors",
         "scenario.rig.right_later_s",
+        "scenario.rig.right_later_std_s",
         "scenario.rig.drift",
         "scenario.geometry.known",
         "scenario.timing.",

@@ -6,6 +6,7 @@ the home pose, so that the sensor's entries act on it. The exciting and the unse
 itself, seeded by the row.
 """
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Literal
 
@@ -19,7 +20,7 @@ from identify.arrays import Array
 from identify.estimation.identification import identify as identify_record
 from identify.estimation.result import IdentificationResult
 from identify.excitation.design import design_trajectories
-from identify.experiment.plant import build_plant
+from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import Experiment, excitation_run, run_plant, taught_sensor
 from identify.experiment.truth import true_poses
 from identify.loop_parameters import model_settings
@@ -28,6 +29,7 @@ from identify.random_streams import stream_seed
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, scenario_from_toml
 from identify.scenario.sections import Section
+from identify.studies.rows.coverage import coverage
 from identify.studies.rows.kind import NOISE_OFF, PLANT, SENSOR, Column, Idle, Kind, Reads, Row, timing
 from identify.studies.rows.sensor import DrawnSensor, rms_um, stated_um
 from identify.trajectory import TrajectorySet
@@ -55,6 +57,8 @@ COLUMNS = {
     "identified_groups": Column("1", "base parameters that the record identifies"),
     "group_std_percent": Column("%", "stated standard deviation of identified groups, relative, median", main=True),
     "normalised_error": Column("1", "error of identified groups over the stated one, rms; 1 where stated well"),
+    "intervals": Column("1", "quantities that the record identifies: parameters, and groups of several"),
+    "covered_percent": Column("%", "of their 95 % intervals, those that hold the truth", main=True),
     "noise_ratio": Column(
         "1", "mean squared residual over the variance of the noise; 1 where noise is all that is left"
     ),
@@ -69,6 +73,10 @@ COLUMNS = {
     "unseen_orientation_rms_urad": Column(
         "urad", "error of the model's orientation on unseen trajectories, rms over axes", main=True
     ),
+    "poses_covered_percent": Column("%", "of true coordinates on unseen trajectories, those within the 95 % predicted"),
+    "unaware_intervals": Column("1", "the same without a word of what all frames have in common"),
+    "unaware_covered_percent": Column("%", "the same without a word of what all frames have in common"),
+    "unaware_poses_covered_percent": Column("%", "the same without a word of what all frames have in common"),
 }
 
 
@@ -77,6 +85,9 @@ class IdentificationOptions(Section):
 
     sensor: Literal["drawn", "images"] = Field("drawn", description="noise of the stated covariance, or images")
     trajectory_seed: int = Field(0, ge=0, description="seed of the exciting and of the unseen trajectories")
+    unaware: bool = Field(
+        False, description="identify also without a word of what is not exact: cameras, teaching, clocks, geometry"
+    )
 
 
 DRAWN = {"options.sensor": lambda sensor: sensor == "drawn"}
@@ -117,20 +128,30 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Identific
     records = [experiment.record]
     if scenario.identification.scale_anchor == "payload":
         records.append(excitation_run(plant, sensor, trajectories.excitation, number, payload=True).record)
-    result = identify_record(records, robot, scenario)
     unseen = [
         run_plant(plant, sensor, trajectory, scenario.validation.duration_s, number, run)
         for run, trajectory in enumerate(trajectories.validation, start=1)
     ]
+    result = identify_record(records, robot, scenario)
+    row = _record_figures(experiment) | _parameter_figures(result, truth) | _unseen_figures(result, plant, unseen)
+    row |= coverage(result, plant, unseen, number)
+    if not options.unaware:
+        return row
+    unaware = scenario.with_overrides({"identification.nuisances": []})
+    covered = coverage(identify_record(records, robot, unaware), replace(plant, scenario=unaware), unseen, number)
+    return row | {f"unaware_{name}": value for name, value in covered.items()}
+
+
+def _unseen_figures(result: IdentificationResult, plant: Plant, unseen: list[Experiment]) -> Row:
+    """Errors of the identified model on unseen trajectories."""
+    robot, scenario = plant.nominal, plant.scenario
     references = [recorded_reference(one.record) for one in unseen]
     models = [model_run(robot, scenario, result.estimate, reference) for reference in references]
     errors = np.concatenate(models) - np.concatenate([true_poses(one.truth) for one in unseen])
-    return (
-        _record_figures(experiment)
-        | _parameter_figures(result, truth)
-        | prediction_figures(robot, scenario, (result.estimate, result.covariance), truth, references)
-        | {"unseen_position_rms_um": rms_um(errors[:, :3]), "unseen_orientation_rms_urad": rms_um(errors[:, 3:])}
-    )
+    return prediction_figures(robot, scenario, (result.estimate, result.covariance), plant.parameters, references) | {
+        "unseen_position_rms_um": rms_um(errors[:, :3]),
+        "unseen_orientation_rms_urad": rms_um(errors[:, 3:]),
+    }
 
 
 def _record_figures(experiment: Experiment) -> Row:

@@ -1,0 +1,51 @@
+"""Whether stated intervals hold: of what a record identifies, and of the poses that its model predicts."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from identify.arrays import Array
+from identify.estimation.bounds import HALF_WIDTH
+from identify.estimation.result import IdentificationResult
+from identify.experiment.plant import Plant
+from identify.experiment.run import Experiment
+from identify.experiment.truth import true_poses
+from identify.progress import SilentProgress
+from identify.studies.rows.kind import Row
+from identify.validation.unseen import predicted_runs
+
+
+def coverage(result: IdentificationResult, plant: Plant, unseen: Sequence[Experiment], seed: int) -> Row:
+    """How many intervals of what is identified hold the truth, and how many true coordinates on unseen trajectories are
+    where they are predicted."""
+    held = [inside for *_, identified, inside in quantities(result, plant.parameters) if identified]
+    found = _poses_covered(result, plant, unseen, seed)
+    row: Row = {"intervals": len(held), "poses_covered_percent": 100.0 * float(np.mean(found))}
+    return row | ({"covered_percent": 100.0 * float(np.mean(held))} if held else {})
+
+
+def _poses_covered(result: IdentificationResult, plant: Plant, unseen: Sequence[Experiment], seed: int) -> Array:
+    """Whether each true coordinate (frames, m) is within its 95 % interval."""
+    robot, free, records = plant.nominal, plant.nominal.geometry.chart.basis, [one.record for one in unseen]
+    estimated = result.estimate, result.covariance
+    predicted = predicted_runs(robot, plant.scenario, records, *estimated, seed, SilentProgress())
+    pairs = [(true_poses(one.truth) - of_one.poses, of_one) for one, of_one in zip(unseen, predicted, strict=True)]
+    errors = np.concatenate([error @ free for error, _ in pairs])
+    variances = np.concatenate(
+        [np.diagonal(free.T @ of_one.covariance @ free, axis1=1, axis2=2) for _, of_one in pairs]
+    )
+    return np.abs(errors) < HALF_WIDTH * np.sqrt(variances)
+
+
+def quantities(result: IdentificationResult, truth: Array) -> Iterator[tuple[str, float, float, bool, bool]]:
+    """Every parameter and every group of several, given the true parameters (p,): name, error in standard deviations,
+    relative standard deviation, whether it counts as identified, and whether its 95 % interval holds the truth."""
+    groups = result.groups
+    several = np.count_nonzero(groups.combinations, axis=1) > 1
+    parameters = (result.names, truth, result.intervals, np.ones(len(truth), dtype=bool))
+    combined = (groups.expressions, groups.combinations @ truth[result.layout.dynamic], result.group_intervals, several)
+    for found, (names, true, intervals, counted) in ((result, parameters), (groups, combined)):
+        for k in np.flatnonzero(counted):
+            error, std, (low, high) = found.estimate[k] - true[k], found.std[k], intervals[k]
+            inside = bool(low <= true[k] <= high)
+            yield names[k], error / std, std / abs(true[k]), bool(found.identifiable[k]), inside
