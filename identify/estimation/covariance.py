@@ -43,13 +43,13 @@ FEWEST = 50
 @dataclass(frozen=True)
 class Uncertainty:
     """Covariance (p, p) of the estimate, were there no bounds, and the parts of it (p, p) that errors of the starting
-    guess make, and errors that all poses of a record have in common; information (p, p) that the poses alone hold;
-    gradient (p,): J^T r of poses and all that is known beside them, at the estimate; misfit of the record; unstable:
-    repeated experiments that ended early and were left out."""
+    guess make, and, by their kinds, errors that all poses of a record have in common; information (p, p) that the poses
+    alone hold; gradient (p,): J^T r of poses and all that is known beside them, at the estimate; misfit of the record;
+    unstable: repeated experiments that ended early and were left out."""
 
     covariance: Array
     of_guess: Array
-    of_common: Array
+    of_common: dict[str, Array]
     information: Array
     gradient: Array
     misfit: Misfit
@@ -94,17 +94,23 @@ def estimate_uncertainty(
     prior = _information(known_rows @ units)
     covariance = units @ (scores + prior) @ units.T
     of_guess = np.asarray(_information(problem.guess.rows @ units @ units.T))
-    of_common = units @ sum(_common_scores(run, j) for run, (_, j) in zip(problem.runs, shown, strict=True)) @ units.T
+    of_common: dict[str, Array] = {}
+    for run, (_, jacobian) in zip(problem.runs, shown, strict=True):
+        for kind, spread in _common_scores(run, jacobian).items():
+            of_common[kind] = of_common.get(kind, 0.0) + units @ spread @ units.T
     return Uncertainty(
         (covariance + covariance.T) / 2, of_guess, of_common, information, np.asarray(gradient), misfit, unstable
     )
 
 
-def _common_scores(run: RecordedRun, jacobian: Array) -> Array:
-    """Covariance (p, p) of the scores J^T r that errors in common to all poses of a record make; J (n, 6, p)."""
+def _common_scores(run: RecordedRun, jacobian: Array) -> dict[str, Array]:
+    """Covariance (p, p) of the scores J^T r that each kind of errors in common to all poses of a record makes; J (n, 6,
+    p)."""
     if run.marginal is None:
-        return np.zeros((jacobian.shape[2],) * 2)
-    return _information(run.marginal.whitened_modes.T @ jacobian.reshape(-1, jacobian.shape[2]))
+        return {}
+    modes = run.marginal.whiten(run.marginal.modes)
+    rows = jacobian.reshape(-1, jacobian.shape[2])
+    return {kind: _information(one.T @ rows) for kind, one in run.common.by_kind(modes).items()}
 
 
 def load_score_covariance(runs: Sequence[RecordedRun], information: Sequence[Array], units: Array) -> Array:

@@ -210,14 +210,14 @@ def conditioning(
 
 @dataclass(frozen=True)
 class Judgement:
-    """identifiable (p,) bool; prior_share, common_share (p,): of the variance, what errors of the guess make, and what
-    those make that all poses of a record have in common; intervals (p, 2) and group_intervals: 95 %, cut at the bounds;
-    base_rank: independent groups that the references excite by the paper's rule; active_bounds: what holds the estimate
-    back; warnings: what a reader must know before believing any of it."""
+    """identifiable (p,) bool; prior_share (p,): of the variance, what errors of the guess make; common_share (p,) by
+    kind: what those make that all poses of a record have in common; intervals (p, 2) and group_intervals: 95 %, cut at
+    the bounds; base_rank: independent groups that the references excite by the paper's rule; active_bounds: what holds
+    the estimate back; warnings: what a reader must know before believing any of it."""
 
     identifiable: NDArray[np.bool_]
     prior_share: Array
-    common_share: Array
+    common_share: dict[str, Array]
     intervals: Array
     groups: GroupEstimates
     group_intervals: Array
@@ -255,7 +255,9 @@ def judge(
     return Judgement(
         identifiable=criterion.judge(each, uncertainty.covariance),
         prior_share=prior_share,
-        common_share=variance_share(each, uncertainty.of_common, uncertainty.covariance),
+        common_share={
+            kind: variance_share(each, part, uncertainty.covariance) for kind, part in uncertainty.of_common.items()
+        },
         intervals=bounded.intervals(each),
         groups=group_estimates(base, guess, criterion, estimate, uncertainty),
         group_intervals=bounded.intervals(group_rows(base)),

@@ -31,14 +31,14 @@ class IdentificationResult:
     """What one record says about the parameters of a robot, in the order of its `layout`; SI.
 
     initial, warm_start, estimate, std (p,), covariance (p, p), the last two as they were without bounds; intervals (p,
-    2): 95 %, cut at the bounds; identifiable (p,) bool; prior_share, common_share (p,): of the variance, what errors of
-    the starting guess make, and what those that all poses of a record have in common; groups, group_intervals: what the
-    record says of the base parameters; base_rank: independent groups that the trajectory excites by the paper's rule;
-    iterations and evaluations: of all searches; stop_reason: of the last; searches: their names in order, and costs:
-    after each iteration, one tuple a search; active_bounds: what holds the estimate back, as "platform.Izz <= Ixx +
-    Iyy"; noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what the sensor's noise
-    alone would leave, give or take noise_ratio_std; whiteness: test of the residuals of the model driven by the logged
-    commands.
+    2): 95 %, cut at the bounds; identifiable (p,) bool; prior_share (p,): of the variance, what errors of the starting
+    guess make, and common_share (p,) by kind: what those that all poses of a record have in common; groups,
+    group_intervals: what the record says of the base parameters; base_rank: independent groups that the trajectory
+    excites by the paper's rule; iterations and evaluations: of all searches; stop_reason: of the last; searches: their
+    names in order, and costs: after each iteration, one tuple a search; active_bounds: what holds the estimate back, as
+    "platform.Izz <= Ixx + Iyy"; noise_ratio: mean squared whitened residual, to compare with expected_noise_ratio, what
+    the sensor's noise alone would leave, give or take noise_ratio_std; whiteness: test of the residuals of the model
+    driven by the logged commands.
     """
 
     layout: ParameterLayout
@@ -50,7 +50,7 @@ class IdentificationResult:
     intervals: Array
     identifiable: NDArray[np.bool_]
     prior_share: Array
-    common_share: Array
+    common_share: dict[str, Array]
     groups: GroupEstimates
     group_intervals: Array
     conditioning: Conditioning
@@ -146,7 +146,7 @@ class IdentificationResult:
             "identifiable": bool(self.identifiable[k]),
             "rests_on_prior": bool(self.rests_on_prior[k]),
             "prior_share": self.prior_share[k],
-            "common_share": self.common_share[k],
+            "common_share": {kind: share[k] for kind, share in self.common_share.items()},
         }
 
     def _group(self, k: int) -> dict[str, Any]:

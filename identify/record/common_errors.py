@@ -51,6 +51,13 @@ class CommonErrors:
         latency = [np.full((1, 1), self.latency_std)] if self.latency_std else []
         return np.asarray(block_diag(self.factor, *latency, *([self.geometry.factor] if self.geometry else [])))
 
+    def by_kind(self, modes: Array) -> dict[str, Array]:
+        """Of what independent numbers of standard deviation one, whose factor is `whole_factor`, do (..., k), the part
+        of each kind (..., k); errors of one kind say nothing of those of another."""
+        root, kinds = self.whole_factor, np.array([kind_of(name) for name in self.all_names])
+        per_error = modes @ np.linalg.pinv(root)
+        return {kind: (per_error * (kinds == kind)) @ root for kind in dict.fromkeys(kinds.tolist())}
+
     @property
     def factor(self) -> Array:
         """L (k, k) with L L^T the covariance; with a whitener, its columns that are noticed most come first."""
@@ -95,11 +102,6 @@ class Marginal:
         """From whitened modes (m, k) of m residuals, and what the model has of them (m,)."""
         directions, seen, _ = np.linalg.svd(modes, full_matrices=False)
         return cls(modes, np.broadcast_to(had, len(modes)), directions, seen)
-
-    @property
-    def whitened_modes(self) -> Array:
-        """What the modes are (m, k) in whitened residuals, but for a rotation among them."""
-        return self.directions * (self.seen / np.sqrt(1.0 + self.seen**2))
 
     def whiten(self, rows: Array) -> Array:
         """Residuals (m,) or their derivatives (m, p) with a covariance of one."""
@@ -150,5 +152,6 @@ def read_common_errors(record: xr.Dataset, kinds: tuple[str, ...]) -> CommonErro
 
 
 def kind_of(name: str) -> str:
-    """Kind of a common error of measured poses by its name: rig, teaching, or exposure."""
-    return {"taught": "teaching", "exposure": "exposure"}.get(name.split(".")[0], "rig")
+    """Kind of a common error by its name: rig, teaching, exposure, latency or geometry."""
+    kinds = {"taught": "teaching", "exposure": "exposure", "timing": "latency", "geometry": "geometry"}
+    return kinds.get(name.split(".")[0], "rig")

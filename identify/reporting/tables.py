@@ -95,10 +95,23 @@ def common_error_table(result: dict[str, Any]) -> Table:
     )
     note = (
         "True minus known, in the unit that ends the name; of the geometry in m and rad. Where a servo acts, it takes "
-        "the platform to where such an error does not show; then little is learnt of it."
+        f"the platform to where such an error does not show; then little is learnt of it.{_shares(found)}"
     )
     header = ("error", "standard deviation beforehand", "found ± standard deviation")
     return Table("What is wrong in all frames alike", header, rows, note, folded=True)
+
+
+KINDS = {"rig": "cameras", "teaching": "taught frames", "exposure": "exposures apart"}
+"""Words for kinds of errors that all frames have in common; the others are words."""
+
+
+def _shares(found: dict[str, Any]) -> str:
+    """What each kind of common error makes of the variance of what is identified, at most, in a sentence."""
+    identified = [one.get("common_share") for one in found["parameters"].values() if one["identifiable"]]
+    shares = [one for one in identified if isinstance(one, dict)]  # older results have none, or one for all kinds
+    largest = {kind: max(one[kind] for one in shares) for kind in (shares[0] if shares else ())}
+    said = ", ".join(f"{KINDS.get(kind, kind)} {number(100.0 * share, 2)} %" for kind, share in largest.items())
+    return f" Largest share of the variance of an identified parameter: {said}." if said else ""
 
 
 def excitation_error_table(result: dict[str, Any], beside_paper: bool = False) -> Table:

@@ -131,6 +131,9 @@ def _text(model: BaseModel, before: Callable[[BaseModel, str], str | None], only
     return "\n".join(lines + sections) + "\n"
 
 
+DOTTED = """; a name with a dot stands in quotes, which a shell leaves inside of others: 'key={"a.b"=0.1}'"""
+
+
 def one_line(error: ValidationError, model: type[BaseModel]) -> str:
     """All complaints of a validation in one line, each with key, value, unit and, where wrong, the valid names."""
     return "; ".join(_complaint(details, model) for details in error.errors())
@@ -168,7 +171,8 @@ def _complaint(details: ErrorDetails, model: type[BaseModel]) -> str:
         return f"{key} is missing"
     unit = f" [{u}]" if path and path[-1] in fields and (u := _unit(fields[path[-1]])) else ""
     message = details["msg"]
-    return f"{key} = {details['input']!r}{unit}: {message[0].lower()}{message[1:]}"
+    nested = isinstance(details["input"], dict) and details["type"] == "float_type"
+    return f"{key} = {details['input']!r}{unit}: {message[0].lower()}{message[1:]}{DOTTED if nested else ''}"
 
 
 def _owner(path: list[str], model: type[BaseModel]) -> type[BaseModel] | None:

@@ -69,7 +69,9 @@ def test_parameters_are_found_in_spite_of_common_errors_and_the_errors_with_them
     assert result.identifiable.sum() >= 20
     z = ((result.estimate - truth()) / result.std)[result.identifiable]
     assert np.sqrt(np.mean(z**2)) < 1.5
-    assert 0.0 < result.common_share[result.identifiable].max() <= 1.0
+    shares = np.array([result.common_share[kind] for kind in ("rig", "teaching")])[:, result.identifiable]
+    assert (shares >= 0.0).all()
+    assert 0.0 < shares.sum(axis=0).max() <= 1.0
     found = result.common_errors
     assert found.names == NAMES
     assert (np.abs(found.estimate - drawn) < 4.0 * found.std).all()

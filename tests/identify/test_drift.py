@@ -55,6 +55,8 @@ def test_a_drift_that_no_run_can_have_is_refused_before_anything_is_taught(drift
         make_sensor(scenario, rss6(), 0)
     with pytest.raises(ScenarioError, match=r"rig\.watch"):
         quick(**{"rig.watch": "everything"})
+    with pytest.raises(ScenarioError, match="a name with a dot stands in quotes"):
+        quick(**{DRIFT_KEY: {"right": {"cx_px": 0.1}}})
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"noticed_s": 1.0}', "3"])

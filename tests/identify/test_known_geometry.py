@@ -82,7 +82,7 @@ def test_parameters_are_found_in_spite_of_a_poor_calibration_and_the_geometry_wi
     assert result.identifiable.sum() >= 20
     z = ((result.estimate - truth()) / result.std)[result.identifiable]
     assert np.sqrt(np.mean(z**2)) < 1.5
-    assert 0.01 < result.common_share[result.identifiable].max() < 1.0
+    assert 0.01 < result.common_share["geometry"][result.identifiable].max() < 1.0
     assert not any("does not explain" in warning for warning in result.warnings)
     found, off = result.common_errors, true.geometry.deviations_from(known.robot.geometry)
     assert found.names == tuple(f"geometry.{name}" for name in known.robot.geometry.number_names)
