@@ -13,6 +13,8 @@ from identify.progress import print_table, terminal_progress
 from identify.runtime import STOPPED
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from identify.studies.runner import Outcome, Workers
     from identify.studies.study_file import Study
 
@@ -55,6 +57,10 @@ def study(
         int | None,
         typer.Option(min=0, help="Processes on this machine; 0: none but this one.", show_default="one a core"),
     ] = None,
+    beside: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of a finished study with the same factors, drawn beside this one; repeatable."),
+    ] = None,
     yes: Annotated[bool, typer.Option("--yes", help=f"Do run more than {MANY_ROWS} rows.")] = False,
     show: Annotated[bool, typer.Option("--show", help="Only print the file of the study, to start from.")] = False,
     list_: Annotated[bool, typer.Option("--list", help="Only list the built-in studies.")] = False,
@@ -76,7 +82,8 @@ def study(
 
     Writes into the folder study.json, the resolved study; rows.jsonl, finished rows as they come; study.parquet, one
     table of factors, figures with units, seeds, seconds and errors; study.nc, the figures by factors and repeat;
-    summary.md, summary.json, which is also the JSON; and figures as PNG, PDF and SVG.
+    summary.md and summary.json, which is also the JSON, renewed now and then while it runs; and figures as PNG, PDF and
+    SVG, with --beside also those of both studies side by side.
 
     \b
     Examples:
@@ -121,14 +128,17 @@ def study(
     if chosen.rows > MANY_ROWS and not yes:
         raise StudyError(f"study {chosen.name!r} has {chosen.rows:,} rows; to run more than {MANY_ROWS:,}, say --yes")
     from identify.studies.runner import run_study
+    from identify.studies.table import rows_beside
 
+    others = [rows_beside(chosen, other) for other in beside or ()]
     folder = out or Path("runs") / f"study-{chosen.name}"
     try:
-        outcome = run_study(chosen, folder, terminal_progress(quiet, rate="rows/s"), _workers(scheduler, workers))
+        progress, so_far = terminal_progress(quiet, rate="rows/s"), partial(_summary, chosen, folder, figures=False)
+        outcome = run_study(chosen, folder, progress, _workers(scheduler, workers), so_far)
     except StudyInterrupted as stopped:
         typer.echo(f"{stopped}; the same command goes on from there", err=True)
         raise typer.Exit(STOPPED) from None
-    summary = _summary(chosen, folder, outcome)
+    summary = _summary(chosen, folder, outcome.frame, others=others)
     tell(summary, json, quiet, lambda: _say(folder, outcome, summary["theory"]))
     _judge(outcome, summary["theory"])
 
@@ -144,13 +154,13 @@ def _workers(scheduler: str | None, workers: int | None) -> "Workers":
     return partial(running_cluster, scheduler) if scheduler else partial(local_cluster, workers or cores())
 
 
-def _summary(study: "Study", folder: Path, outcome: "Outcome") -> dict[str, Any]:
-    """Write the summary, and return what it holds."""
+def _summary(study: "Study", folder: Path, frame: "pd.DataFrame", **how: Any) -> dict[str, Any]:
+    """Write the summary of a table of rows, and return what it holds."""
     from identify.studies import summary
     from identify.studies.table import written
 
     with written(folder / summary.MARKDOWN, "; all rows are kept, and the same command writes it again"):
-        return summary.write(folder, study, outcome.frame)
+        return summary.write(folder, study, frame, **how)
 
 
 def _say(folder: Path, outcome: "Outcome", laws: list[dict[str, Any]]) -> None:

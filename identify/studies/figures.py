@@ -1,6 +1,6 @@
 """Figures of a study, PNG, PDF and SVG: its figures against each factor with bands, two factors as a map, the laws."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -64,13 +64,28 @@ TICKS: list[list[float]] = [
 """Numbers within each decade that may stand on a logarithmic axis, as many as find room."""
 MOST_TICKS = 7
 
+Others = Sequence[tuple[str, pd.DataFrame]]
+"""Names and finished rows of other studies."""
+
 
 def draw(folder: Path, study: Study, done: pd.DataFrame, shown: list[str], verdicts: list[Verdict]) -> None:
     """Write the figures of a study's finished rows; `shown`: the figures of the rows that are drawn."""
     if not len(done) or not shown:
         return
+    _write(folder, _figures(study, done, shown, verdicts))
+
+
+def draw_side_by_side(folder: Path, study: Study, done: pd.DataFrame, shown: list[str], others: Others) -> None:
+    """Write the figures against each factor with the finished rows of other studies, by their names, beside them."""
+    names, tables = zip((study.name, done), *others, strict=True)
+    together = pd.concat([table.assign(study=name) for name, table in zip(names, tables, strict=True)])
+    named = study.model_copy(update={"factors": study.factors | {"study": list(names)}})
+    _write(folder, ((f"side_by_side_{path}", factor_figure(named, together, path, shown)) for path in study.factors))
+
+
+def _write(folder: Path, figures: Iterable[tuple[str, Figure]]) -> None:
     with mpl.rc_context(STYLE):
-        for name, figure in _figures(study, done, shown, verdicts):
+        for name, figure in figures:
             for kind in FORMATS:
                 write_figure(folder / f"{name}.{kind}", figure)
 

@@ -15,9 +15,9 @@ from identify.progress import Progress
 from identify.runtime import honoured, raise_noted
 from identify.studies.design import Case, Design, Finished, Setup, prepare
 from identify.studies.rows import find_kind
-from identify.studies.store import TABLE, VIEW, Journal, open_folder, resolved
+from identify.studies.store import VIEW, Journal, open_folder, resolved
 from identify.studies.study_file import Study
-from identify.studies.table import FIRST, LAST, tidy_table, write_table, write_view
+from identify.studies.table import FIRST, LAST, TABLE, tidy_table, write_table, write_view
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,23 @@ def _serial(setup: Setup, batches: "Batches") -> Iterator[list[Finished]]:
         yield finished
 
 
-def run_study(study: Study, folder: Path, progress: Progress, workers: Workers = in_this_process) -> Outcome:
+SoFar = Callable[[pd.DataFrame], object]
+"""Gets the table of what is done so far."""
+
+SO_FAR_S, SO_FAR_SHARE = 30.0, 0.02
+"""How often results so far are shown, seconds; and what share of the time that may take."""
+
+
+def run_study(
+    study: Study,
+    folder: Path,
+    progress: Progress,
+    workers: Workers = in_this_process,
+    so_far: SoFar = lambda frame: None,
+) -> Outcome:
     """Run a study in its folder, or go on with it there; the same study gives the same figures whatever the workers.
 
+    so_far: gets the table of what is done now and then while it runs.
     Raises StudyError: see `identify.studies.design.prepare` and `identify.studies.store.open_folder`; the
     disk is full; the workers are lost. Finished rows are kept, and the same call goes on from there. Raises
     StudyInterrupted: Ctrl-C, likewise.
@@ -76,7 +90,8 @@ def run_study(study: Study, folder: Path, progress: Progress, workers: Workers =
         found = int(journal.finished.sum())
         try:
             with honoured():
-                _compute_pending(study.name, setup, design, journal, progress, workers)
+                shown = _now_and_then(lambda: so_far(tidy_table(study, journal.rows())))
+                _compute_pending(study.name, setup, design, journal, progress, workers, shown)
         except KeyboardInterrupt:
             done = sum(1 for _ in journal.rows())  # it may have come while some were being noted
             raise StudyInterrupted(f"stopped: {done} of {len(design)} rows are done and kept") from None
@@ -86,8 +101,30 @@ def run_study(study: Study, folder: Path, progress: Progress, workers: Workers =
     return Outcome(frame, found, journal.beyond)
 
 
+def _now_and_then(show: Callable[[], object]) -> Callable[[], None]:
+    """What shows, but not more often than it may."""
+    next_time = time.perf_counter() + SO_FAR_S
+
+    def perhaps() -> None:
+        nonlocal next_time
+        began = time.perf_counter()
+        if began < next_time:
+            return
+        show()
+        took = time.perf_counter() - began
+        next_time = began + took + max(SO_FAR_S, took / SO_FAR_SHARE)
+
+    return perhaps
+
+
 def _compute_pending(
-    name: str, setup: Setup, design: Design, journal: Journal, progress: Progress, workers: Workers
+    name: str,
+    setup: Setup,
+    design: Design,
+    journal: Journal,
+    progress: Progress,
+    workers: Workers,
+    shown: Callable[[], None],
 ) -> None:
     left = len(design) - int(journal.finished.sum())
     if not left:
@@ -98,6 +135,7 @@ def _compute_pending(
         for finished in execute(setup, batches):
             journal.append(finished)
             advance(len(finished))
+            shown()
 
 
 BATCH_SECONDS = 0.25

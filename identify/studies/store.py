@@ -28,9 +28,9 @@ from identify.files.atomic import write_text
 from identify.files.versions import same_versions, versions
 from identify.studies.design import Finished, Setup
 from identify.studies.study_file import Study
-from identify.studies.table import study_in, written
+from identify.studies.table import TABLE, study_in, written
 
-STUDY, JOURNAL, TABLE, VIEW, LOCK = "study.json", "rows.jsonl", "study.parquet", "study.nc", ".lock"
+STUDY, JOURNAL, VIEW, LOCK = "study.json", "rows.jsonl", "study.nc", ".lock"
 VERSIONS = "versions"
 
 MAY_CHANGE = ("study.title", "study.theory", "study.figures", "study.repeats", "scenario.description")

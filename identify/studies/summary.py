@@ -15,7 +15,7 @@ from identify.files.atomic import write_text
 from identify.files.run_folder import save_result
 from identify.files.versions import versions
 from identify.studies import theory
-from identify.studies.figures import draw
+from identify.studies.figures import Others, draw, draw_side_by_side
 from identify.studies.labels import labelled, unit_of
 from identify.studies.rows import KINDS
 from identify.studies.study_file import Study
@@ -32,10 +32,11 @@ Points = list[tuple[dict[str, Any], dict[str, Statistics]]]
 """Factors and statistics of points."""
 
 
-def write(folder: Path, study: Study, frame: pd.DataFrame) -> dict[str, Any]:
-    """Write summary.json, summary.md and figures/*.png into a study's folder; `frame` is its table.
+def write(folder: Path, study: Study, frame: pd.DataFrame, figures: bool = True, others: Others = ()) -> dict[str, Any]:
+    """Write summary.json, summary.md and, where wanted, figures into a study's folder; `frame` is its table.
 
-    Returns what summary.json holds. Raises OSError where it cannot be written.
+    others: names and finished rows of other studies, which are drawn beside its own. Returns what summary.json holds.
+    Raises OSError where it cannot be written.
     """
     done = frame[frame["error"] == ""]
     names = [name for name in figure_names(frame, study) if pd.api.types.is_numeric_dtype(frame[name])]
@@ -67,7 +68,10 @@ def write(folder: Path, study: Study, frame: pd.DataFrame) -> dict[str, Any]:
     save_result(folder / JSON, entry)
     shown = main_figures(study, names)
     write_text(folder / MARKDOWN, _markdown(study, entry, verdicts, points, shown))
-    draw(folder / "figures", study, done, shown, verdicts)
+    if figures:
+        draw(folder / "figures", study, done, shown, verdicts)
+    if others and len(done):
+        draw_side_by_side(folder / "figures", study, done, shown, others)
     return entry
 
 

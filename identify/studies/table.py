@@ -30,6 +30,7 @@ FIRST = ("row", "repeat", "seed_entropy", "seed_spawn_key")
 LAST = ("seconds", "error")
 """Columns of a study's table before its factors and behind its figures."""
 
+TABLE = "study.parquet"
 STUDY_KEY, VERSIONS_KEY = b"cmmsim.study", b"cmmsim.versions"
 
 
@@ -95,6 +96,19 @@ def read_table(path: Path | str) -> tuple[pd.DataFrame, Study]:
     if entry is None:
         raise StudyError(f"no table {path}")
     return pd.read_parquet(path), Study.model_validate(entry["study"])
+
+
+def rows_beside(study: Study, folder: Path) -> tuple[str, pd.DataFrame]:
+    """Name and finished rows of another study, of its folder, to be shown beside those of a study.
+
+    Raises StudyError: no table there, or rows of another kind or with other factors.
+    """
+    frame, other = read_table(folder / TABLE)
+    if other.kind != study.kind or set(other.factors) != set(study.factors):
+        ours, theirs = (f"rows of kind {one.kind!r} by {', '.join(one.factors)}" for one in (study, other))
+        raise StudyError(f"{folder} has {theirs}, and this study {ours}: they cannot stand side by side")
+    label = other.name if other.name != study.name else folder.name
+    return label, frame[frame["error"] == ""]
 
 
 def study_in(path: Path) -> dict[str, Any] | None:

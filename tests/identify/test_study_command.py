@@ -158,6 +158,19 @@ def test_where_no_scheduler_answers_there_is_one_line_and_nothing_left_or_what_w
     unchanged("runs", "--repeats", 3, "--scheduler", "nonsense")
 
 
+def test_another_study_is_drawn_beside_one_and_refused_where_it_has_other_factors(mine, capsys):
+    assert command("study", mine, "--workers", 0, "--quiet", "--set", "repeats=3", "--out", "other") == 0
+    assert command("study", mine, "--workers", 0, "--quiet", "--beside", "other") == 0
+    drawn = Path("runs/study-mine/figures/side_by_side_sensor.camera.dark_noise.svg").read_text()
+    assert "study mine" in drawn
+    assert "study other" in drawn
+    capsys.readouterr()
+    levels = "sensor.rig.baseline=[0.5,1.0]"
+    assert command("study", mine, "--workers", 0, "--set", levels, "--out", "new", "--beside", "other") == 1
+    assert "other has rows of kind" in capsys.readouterr().err
+    assert not Path("new").exists()
+
+
 def test_wrong_calls_are_refused_in_the_words_of_the_options(mine, capsys):
     for words, evidence in (
         ((), "--list"),

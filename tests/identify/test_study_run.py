@@ -68,6 +68,18 @@ def test_batches_hold_every_row_once_and_a_quarter_second_of_work(row_seconds, w
     assert sizes[-1] <= max(1, 5000 // workers // 100)
 
 
+def test_what_is_done_is_shown_while_a_study_runs_but_not_all_the_time(whole, tmp_path, monkeypatch):
+    """As it is in the table at the end; with no time between, after every batch, which is a row here."""
+    for every, most in ((0.0, 18), (1e3, 0)):
+        monkeypatch.setattr(runner, "SO_FAR_S", every)
+        monkeypatch.setattr(runner, "SO_FAR_SHARE", np.inf)
+        seen = []
+        run_study(small_study(), tmp_path / str(every), SilentProgress(), so_far=seen.append)
+        assert min(most, 2) <= len(seen) <= most
+        for frame in seen:
+            same_numbers(frame, whole[1].iloc[: len(frame)])
+
+
 @pytest.mark.parametrize(
     ("error", "said"),
     [(KeyboardInterrupt, "stopped: 7 of 18 rows are done and kept"), (SystemError("crash"), "crash")],
