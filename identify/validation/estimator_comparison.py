@@ -109,17 +109,39 @@ def compare_on_run(
     """
     folder, record = files.folder, files.experiment
     scenario, truth = load_scenario(folder.scenario), read_truth(folder.experiment)
+    robot, channels = known_geometry(scenario, folder.path).robot, folder.path / "instruments.nc"
+    write_groups(channels, {"": instrumented(record, truth, scenario, instruments, seed)})
+    unseen = zip(files.validation, read_truth_runs(folder.validation), strict=True)
+    return compare_on_record(
+        (record, truth), read_channels(channels), robot, scenario, list(unseen), estimators, progress
+    )
+
+
+def instrumented(
+    record: xr.Dataset, truth: xr.Dataset, scenario: Scenario, instruments: JointInstruments, seed: int
+) -> xr.Dataset:
+    """What instruments at the joints, whose noise is of a seed, read during a run."""
     draws = np.random.default_rng(stream_seed(int(record.attrs["seed"]), LATENCY, 0))
     latencies = scenario.timing.drawn_latencies(record.sizes["time"], draws)
-    rng, channels = mixed_generator(INSTRUMENTS, seed), folder.path / "instruments.nc"
-    write_groups(channels, {"": measure_joints(record, truth, scenario.timing, instruments, rng, latencies)})
-    known, robot = true_parameters(truth), known_geometry(scenario, folder.path).robot
+    return measure_joints(record, truth, scenario.timing, instruments, mixed_generator(INSTRUMENTS, seed), latencies)
+
+
+def compare_on_record(
+    experiment: tuple[xr.Dataset, xr.Dataset],
+    channels: xr.Dataset,
+    robot: Robot,
+    scenario: Scenario,
+    unseen: Sequence[tuple[xr.Dataset, xr.Dataset]],
+    estimators: Mapping[str, Estimator],
+    progress: Progress,
+) -> list[Score]:
+    """Scores on a record, with its truth and channels of its joints, judged also by unseen (record, truth) pairs."""
+    record, truth = experiment
+    known = true_parameters(truth)
     true = np.array([known[name] for name in robot.layout.names])
-    problem = output_error_problem([record], robot, scenario)
-    gains = true[robot.layout.joint_pid]
-    evidence = Evidence(problem, scenario, joint_channels(read_channels(channels), record), gains)
-    unseen = zip(files.validation, read_truth_runs(folder.validation), strict=True)
-    return compare(evidence, examination(evidence, true, list(unseen)), estimators, progress)
+    problem, gains = output_error_problem([record], robot, scenario), true[robot.layout.joint_pid]
+    evidence = Evidence(problem, scenario, joint_channels(channels, record), gains)
+    return compare(evidence, examination(evidence, true, unseen), estimators, progress)
 
 
 def examination(evidence: Evidence, true: Array, unseen: Sequence[tuple[xr.Dataset, xr.Dataset]]) -> Examination:

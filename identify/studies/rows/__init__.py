@@ -12,12 +12,13 @@ from typing import Any
 from identify.errors import StudyError
 from identify.plugins import is_own, own_function
 from identify.studies.rows.closed_loop import CLOSED_LOOP
+from identify.studies.rows.estimators import ESTIMATION
 from identify.studies.rows.identification import IDENTIFICATION
 from identify.studies.rows.kind import Kind
 from identify.studies.rows.path_pose import PATH_POSE
 from identify.studies.rows.static_pose import STATIC_POSE
 
-KINDS: dict[str, Kind] = {kind.name: kind for kind in (STATIC_POSE, PATH_POSE, IDENTIFICATION, CLOSED_LOOP)}
+KINDS: dict[str, Kind] = {kind.name: kind for kind in (STATIC_POSE, PATH_POSE, IDENTIFICATION, ESTIMATION, CLOSED_LOOP)}
 
 
 def find_kind(name: str) -> Kind:

@@ -6,11 +6,12 @@ the home pose, so that the sensor's entries act on it. The exciting and the unse
 itself, seeded by the row.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
 import numpy as np
+import xarray as xr
 from pydantic import Field
 
 from cmmsim.visibility import expected_covariance
@@ -27,8 +28,9 @@ from identify.loop_parameters import model_settings
 from identify.progress import SilentProgress
 from identify.random_streams import stream_seed
 from identify.record.recorded_run import recorded_reference
+from identify.scenario import Plant as PlantSwitches
 from identify.scenario import Scenario, scenario_from_toml
-from identify.scenario.sections import Section
+from identify.scenario.sections import Rig, Section
 from identify.studies.rows.coverage import coverage
 from identify.studies.rows.kind import NOISE_OFF, PLANT, SENSOR, Column, Idle, Kind, Reads, Row, timing
 from identify.studies.rows.sensor import DrawnSensor, rms_um, stated_um
@@ -80,11 +82,16 @@ COLUMNS = {
 }
 
 
-class IdentificationOptions(Section):
+class RecordOptions(Section):
     """How the record is made."""
 
     sensor: Literal["drawn", "images"] = Field("drawn", description="noise of the stated covariance, or images")
     trajectory_seed: int = Field(0, ge=0, description="seed of the exciting and of the unseen trajectories")
+
+
+class IdentificationOptions(RecordOptions):
+    """How the record is made, and what is identified from it."""
+
     unaware: bool = Field(
         False, description="identify also without a word of what is not exact: cameras, teaching, clocks, geometry"
     )
@@ -117,13 +124,25 @@ READS = Reads(
 )
 
 
-def compute(scenario: Scenario, seed: np.random.SeedSequence, options: IdentificationOptions) -> Row:
-    """One row. Raises EstimationError and what experiment and sensor raise."""
+@dataclass(frozen=True)
+class Recorded:
+    """What a row identifies from: the plant, its run of the exciting trajectory and all records, of which that is the
+    first, and its runs of the unseen trajectories; number: the seed of them all."""
+
+    plant: Plant
+    excitation: Experiment
+    records: list[xr.Dataset]
+    unseen: list[Experiment]
+    number: int
+
+
+def recorded(scenario: Scenario, seed: np.random.SeedSequence, options: RecordOptions) -> Recorded:
+    """Run the plant of a row with its sensor. Raises what experiment and sensor raise."""
     number = stream_seed(seed, EXPERIMENT)
     plant = build_plant(scenario, _robot(scenario.robot), number)
-    robot, truth = plant.nominal, plant.parameters
-    trajectories = _trajectories(scenario.to_toml(), options.trajectory_seed)
-    sensor = _drawn(scenario) if options.sensor == "drawn" else taught_sensor(scenario, robot, number, SilentProgress())
+    trajectories = _trajectories(scenario, options.trajectory_seed)
+    drawn = options.sensor == "drawn"
+    sensor = _drawn(scenario) if drawn else taught_sensor(scenario, plant.nominal, number, SilentProgress())
     experiment = excitation_run(plant, sensor, trajectories.excitation, number)
     records = [experiment.record]
     if scenario.identification.scale_anchor == "payload":
@@ -132,13 +151,21 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: Identific
         run_plant(plant, sensor, trajectory, scenario.validation.duration_s, number, run)
         for run, trajectory in enumerate(trajectories.validation, start=1)
     ]
-    result = identify_record(records, robot, scenario)
-    row = _record_figures(experiment) | _parameter_figures(result, truth) | _unseen_figures(result, plant, unseen)
-    row |= coverage(result, plant, unseen, number)
+    return Recorded(plant, experiment, records, unseen, number)
+
+
+def compute(scenario: Scenario, seed: np.random.SeedSequence, options: IdentificationOptions) -> Row:
+    """One row. Raises EstimationError and what experiment and sensor raise."""
+    made = recorded(scenario, seed, options)
+    plant, unseen = made.plant, made.unseen
+    result = identify_record(made.records, plant.nominal, scenario)
+    row = _record_figures(made.excitation) | _parameter_figures(result, plant.parameters)
+    row |= _unseen_figures(result, plant, unseen) | coverage(result, plant, unseen, made.number)
     if not options.unaware:
         return row
     unaware = scenario.with_overrides({"identification.nuisances": []})
-    covered = coverage(identify_record(records, robot, unaware), replace(plant, scenario=unaware), unseen, number)
+    result = identify_record(made.records, plant.nominal, unaware)
+    covered = coverage(result, replace(plant, scenario=unaware), unseen, made.number)
     return row | {f"unaware_{name}": value for name, value in covered.items()}
 
 
@@ -216,8 +243,15 @@ def _robot(name: str) -> Robot:
     return load_robot(name)
 
 
+def _trajectories(scenario: Scenario, seed: int) -> TrajectorySet:
+    """The trajectories of a scenario, which know neither the plant nor what is known of the rig: rows that differ in
+    these share them."""
+    design = {"rig": Rig(), "plant": PlantSwitches(), "renderer": "auto"}
+    return _designed(scenario.model_copy(update=design).to_toml(), seed)
+
+
 @lru_cache(maxsize=64)
-def _trajectories(scenario_toml: str, seed: int) -> TrajectorySet:
+def _designed(scenario_toml: str, seed: int) -> TrajectorySet:
     scenario = scenario_from_toml(scenario_toml)
     return design_trajectories(_robot(scenario.robot), scenario, seed)
 

@@ -1,0 +1,77 @@
+"""Rows of kind `estimators`: a record, and how far from the truth each of several estimators comes with it.
+
+The record is that of kind `identification`; instruments at the joints are simulated from its truth, for those
+estimators that need them. All of a row's estimators have the same record, so that rows compare them as pairs.
+"""
+
+import math
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from identify.estimators.estimator import find_estimators
+from identify.experiment.joint_instruments import instruments_of
+from identify.plugins import ESTIMATORS
+from identify.progress import SilentProgress
+from identify.scenario import Scenario
+from identify.studies.rows.identification import READS, RecordOptions, recorded
+from identify.studies.rows.kind import Column, Kind, Row
+from identify.validation.estimator_comparison import START, Score, compare_on_record, instrumented
+
+FIGURES = {
+    "groups_percent": ("%", "error of the base parameters that the record shows, median", 100.0, "group_median"),
+    "gains_percent": ("%", "error of the gains of the joint controller, rms", 100.0, "gain_distance"),
+    "position_um": ("um", "position of the model on unseen trajectories, rms of the worst axis and run", 1.0, None),
+    "orientation_urad": ("urad", "orientation of the same", 1.0, None),
+    "seconds": ("s", "time of the estimate", 1.0, None),
+}
+"""Figures of each estimator by the ends of their names: unit, meaning, factor and, where it differs, the score's
+field."""
+
+STARTING = START.replace(" ", "_")
+
+
+class EstimatorOptions(RecordOptions):
+    """How the record is made, and who estimates."""
+
+    estimators: list[str] = Field([], description="names, or module:function of one's own; none: all built-in ones")
+
+    @field_validator("estimators")
+    @classmethod
+    def _known(cls, names: list[str]) -> list[str]:
+        find_estimators(names)
+        return names
+
+
+COLUMNS = {
+    f"{name}_{end}": Column(unit, f"{name.replace('_', ' ')}: {what}", main=end == "position_um")
+    for name in (STARTING, *ESTIMATORS)
+    for end, (unit, what, *_) in FIGURES.items()
+}
+
+
+def compute(scenario: Scenario, seed: np.random.SeedSequence, options: EstimatorOptions) -> Row:
+    """One row; what an estimator does not give is left out. Raises EstimationError and what experiment and sensor
+    raise."""
+    made = recorded(scenario, seed, options)
+    robot, run = made.plant.nominal, made.excitation
+    channels = instrumented(run.record, run.truth, scenario, instruments_of(robot), made.number)
+    unseen = [(one.record, one.truth) for one in made.unseen]
+    chosen = find_estimators(options.estimators or None)
+    scores = compare_on_record((run.record, run.truth), channels, robot, scenario, unseen, chosen, SilentProgress())
+    return {name: value for score in scores for name, value in _figures(score).items() if math.isfinite(value)}
+
+
+def _figures(score: Score) -> Row:
+    name = score.name.replace(" ", "_").replace(":", ".")
+    return {f"{name}_{end}": factor * getattr(score, field or end) for end, (*_, factor, field) in FIGURES.items()}
+
+
+ESTIMATION = Kind(
+    "estimators",
+    compute,
+    "a record of the exciting trajectory, and the errors of several estimators on it",
+    COLUMNS,
+    EstimatorOptions,
+    READS,
+)
