@@ -176,7 +176,7 @@ def _refine(bright: NDArray[np.uint8], rough: Array, shapes: Array, board: Board
     for size in np.unique(sizes)[::-1]:
         chosen = np.flatnonzero(sizes == size)
         corners = np.rint(rough[chosen] - 0.5 * (size - 1)).astype(int)
-        windows = cut_windows(bright, corners, int(size)).astype(float)
+        windows = cut_windows(bright, corners, int(size))
         alone = _without_neighbours(windows, rough[chosen] - corners, shapes[chosen], reach)
         spread = _point_spread(alone[:PROBED], corners[:PROBED]) if spread is None else spread
         fits = fit_ellipses(alone, corners, PLAIN_NOISE, int(size), LIMITS, FIT_ITERATIONS, spread)
@@ -190,11 +190,14 @@ def _refine(bright: NDArray[np.uint8], rough: Array, shapes: Array, board: Board
 
 def _point_spread(windows: Array, corners: NDArray[np.int_]) -> float:
     """Sigma in px of the Gaussian blur with which ellipses fit these windows best: that of lens and focus together."""
-    misfits = [
-        np.median(fit_ellipses(windows, corners, PLAIN_NOISE, windows.shape[1], LIMITS, FIT_ITERATIONS, spread).misfits)
-        for spread in SPREADS_PX
-    ]
-    return SPREADS_PX[int(np.argmin(misfits))]
+    best, least = SPREADS_PX[0], np.inf
+    for spread in SPREADS_PX:  # the misfit has one minimum: it falls towards the true blur and rises from there on
+        fits = fit_ellipses(windows, corners, PLAIN_NOISE, windows.shape[1], LIMITS, FIT_ITERATIONS, spread)
+        misfit = float(np.median(fits.misfits))
+        if not misfit < least:
+            break
+        best, least = spread, misfit
+    return best
 
 
 def _dot_shapes(rough: Array, board: Board) -> Array:
@@ -206,16 +209,13 @@ def _dot_shapes(rough: Array, board: Board) -> Array:
     return np.stack([m - middle for m in moved], axis=2)
 
 
-def _without_neighbours(windows: Array, centres: Array, shapes: Array, reach: float) -> Array:
+def _without_neighbours(windows: NDArray[np.uint8], centres: Array, shapes: Array, reach: float) -> Array:
     """Windows (n,h,h) whose pixels beyond ``reach`` dot radii are set to the ground around the dot."""
-    ticks = np.arange(windows.shape[1], dtype=float)
-    x, y = ticks[None, None, :] - centres[:, 0, None, None], ticks[None, :, None] - centres[:, 1, None, None]
-    inverse = np.linalg.inv(shapes)[..., None, None]
-    distance = np.hypot(inverse[:, 0, 0] * x + inverse[:, 0, 1] * y, inverse[:, 1, 0] * x + inverse[:, 1, 1] * y)
-    around = np.where((distance > GROUND_FROM) & (distance <= reach), windows, np.nan).reshape(len(windows), -1)
-    known, ground = np.isfinite(around).any(axis=1), np.zeros(len(windows))
-    ground[known] = np.nanmedian(around[known], axis=1)
-    return np.where(distance <= reach, windows, ground[:, None, None])
+    from cmmsim.calibration.dot_kernels import isolate_dots  # compiles, so it is loaded where it is first needed
+
+    alone = np.array(windows, dtype=float)
+    isolate_dots(alone, np.ascontiguousarray(centres), np.linalg.inv(shapes), GROUND_FROM, reach)
+    return alone
 
 
 def covered_radius(bright: NDArray[np.uint8], centres: Array, steps: Array) -> float:

@@ -7,11 +7,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cmmsim.calibration.board import Board
 from cmmsim.errors import CalibrationError
 from cmmsim.geometry.camera import Optics, PinholeCamera
-from cmmsim.geometry.pose import Array, apply, frozen, invert, rigid, rotation_exp
+from cmmsim.geometry.pose import Array, apply, frozen, invert
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.formation import ImageFormation, Side
 from cmmsim.imaging.renderer import Drawable, Renderer
@@ -31,6 +32,7 @@ DEPTH_RANGE = (0.8, 1.2)  # of the depth at which the optical axes come nearest
 CELLS = 3  # each image is divided into 3 x 3 cells that the board visits in turn
 GRAZING = 0.35  # cosine between the board's normal and the view of either camera, at the least
 TRIES = 4000  # poses drawn for one image before giving up
+AT_ONCE = 200  # poses that are looked at together, of which the first good one is taken
 # Its images
 TILE_PX = 64
 SUPERSAMPLING = 12
@@ -97,55 +99,80 @@ def board_poses(rig: StereoRig, board: Board, count: int, rng: np.random.Generat
 
 def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generator) -> Array:
     """One pose in the cell whose turn it is, or in any where that cell shows no whole board to both cameras."""
-    corners = plate_corners(board)
-    middle, side = corners.mean(axis=0), number % 2
-    camera, from_left = rig.cameras[side], rig.from_camera[side]
-    for attempt in range(TRIES):
-        cell = (4 + 2 * number) % CELLS**2 if attempt < TRIES // 2 else int(rng.integers(CELLS**2))
-        depth = meeting_depth(rig) * rng.uniform(*DEPTH_RANGE)
-        place = apply(invert(from_left), _point_in_cell(camera, cell, depth, rng))
-        rotation = _facing(0.5 * _right_eye(rig) - place) @ _tilt(rng)
-        pose = rigid(rotation, place - rotation @ middle)
-        if rig.project(apply(pose, corners))[1].all() and _front_to_both(rig, pose, middle):
-            return pose
+    corners, depth = plate_corners(board), meeting_depth(rig)
+    for first in range(0, TRIES, AT_ONCE):
+        before = rng.bit_generator.state
+        drawn = _drawn_numbers(number, first, AT_ONCE, rng)
+        poses = _poses_of(rig, corners.mean(axis=0), depth, number % 2, *drawn)
+        good = rig.project(_placed(poses, corners))[1].all(axis=(0, 2)) & _front_to_both(rig, poses, corners)
+        if good.any():
+            chosen = int(np.argmax(good))
+            rng.bit_generator.state = before  # as if no pose had been drawn beyond the chosen one
+            _drawn_numbers(number, first, chosen + 1, rng)
+            return np.asarray(poses[chosen])
     width, height = np.ptp(corners[:, :2], axis=0)
     raise CalibrationError(
         f"none of {TRIES} poses shows the whole board of {width:.3g} x {height:.3g} m to both "
-        f"cameras at about {meeting_depth(rig):.3g} m: take a smaller one"
+        f"cameras at about {depth:.3g} m: take a smaller one"
     )
 
 
-def _point_in_cell(camera: PinholeCamera, cell: int, depth: float, rng: np.random.Generator) -> Array:
-    """A point (3,) in camera axes that shows anywhere in one cell of the image, lens distortion aside."""
-    row, column = divmod(cell, CELLS)
-    pixel = (np.array([column, row]) + rng.random(2)) / CELLS * (camera.width, camera.height)
-    return depth * np.append((pixel - camera.centre) / camera.focal_lengths, 1.0)
+def _drawn_numbers(number: int, first: int, count: int, rng: np.random.Generator) -> tuple[NDArray[np.int_], Array]:
+    """For each of ``count`` poses from the ``first`` on, the cell (n,) and six numbers (n,6) from 0 to 1."""
+    turn = (4 + 2 * number) % CELLS**2
+    if first < TRIES // 2:
+        return np.full(count, turn), rng.random((count, 6))
+    drawn = [(int(rng.integers(CELLS**2)), rng.random(6)) for _ in range(count)]
+    return np.array([cell for cell, _ in drawn]), np.array([numbers for _, numbers in drawn])
+
+
+def _poses_of(rig: StereoRig, middle: Array, depth: float, side: int, cells: NDArray[np.int_], numbers: Array) -> Array:
+    """Poses left_from_board (n,4,4) of a board with this middle (3,) that shows in cells (n,) of one camera's image at
+    about this depth; numbers (n,6), 0 to 1, say where exactly and how tilted.
+
+    Its front looks at the middle of the baseline, then it is turned within its plane, then tilted about a random axis
+    in it.
+    """
+    camera, from_left = rig.cameras[side], rig.from_camera[side]
+    low, high = DEPTH_RANGE
+    depths = depth * (low + (high - low) * numbers[:, 0])
+    corner = np.column_stack([cells % CELLS, cells // CELLS])
+    pixels = (corner + numbers[:, 1:3]) / CELLS * (camera.width, camera.height)
+    ideal = np.column_stack([(pixels - camera.centre) / camera.focal_lengths, np.ones(len(cells))])
+    places = apply(invert(from_left), depths[:, None] * ideal)
+    about, tilt, turn = 2.0 * np.pi * numbers[:, 3], LARGEST_TILT * numbers[:, 4], np.pi * (2.0 * numbers[:, 5] - 1.0)
+    axes = np.column_stack([np.cos(about), np.sin(about), np.zeros(len(cells))])
+    tilted = Rotation.from_rotvec(tilt[:, None] * axes) * Rotation.from_euler("z", turn[:, None])
+    poses = np.zeros((len(cells), 4, 4))
+    poses[:, :3, :3] = _facing(0.5 * _right_eye(rig) - places) @ tilted.as_matrix()
+    poses[:, :3, 3], poses[:, 3, 3] = places - poses[:, :3, :3] @ middle, 1.0
+    return poses
 
 
 def _right_eye(rig: StereoRig) -> Array:
     return invert(rig.right_from_left)[:3, 3]
 
 
+def _placed(poses: Array, points: Array) -> Array:
+    """Points (k,3) carried by each of the transforms (n,4,4): (n,k,3)."""
+    return np.asarray(points @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3])
+
+
 def _facing(towards: Array) -> Array:
-    """Rotation (3,3) of a board whose front looks along ``towards`` (3,), its x axis horizontal in the left image."""
-    z = -towards / np.linalg.norm(towards)
+    """Rotations (n,3,3) of boards whose fronts look along ``towards`` (n,3), their x axes horizontal in the left
+    image."""
+    z = -towards / np.linalg.norm(towards, axis=1, keepdims=True)
     x = np.cross([0.0, 1.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(z, x), z])
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=2)
 
 
-def _tilt(rng: np.random.Generator) -> Array:
-    """A turn within the board's plane, then a tilt about a random axis in it."""
-    about, tilt, turn = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.0, LARGEST_TILT), rng.uniform(-np.pi, np.pi)
-    axis = np.array([np.cos(about), np.sin(about), 0.0])
-    return rotation_exp(tilt * axis) @ rotation_exp(np.array([0.0, 0.0, turn]))
-
-
-def _front_to_both(rig: StereoRig, pose: Array, middle: Array) -> bool:
-    """Whether both cameras see the front, at more than a grazing angle."""
-    place = apply(pose, middle)
-    return all(
-        float(pose[:3, 2] @ view) > GRAZING * float(np.linalg.norm(view)) for view in (place, place - _right_eye(rig))
+def _front_to_both(rig: StereoRig, poses: Array, corners: Array) -> NDArray[np.bool_]:
+    """Whether both cameras see the fronts of boards at poses (n,4,4), at more than a grazing angle."""
+    places = poses[:, :3, :3] @ corners.mean(axis=0) + poses[:, :3, 3]
+    views = np.stack([places, places - _right_eye(rig)])
+    return np.asarray(
+        (np.einsum("ni,sni->sn", poses[:, :3, 2], views) > GRAZING * np.linalg.norm(views, axis=2)).all(axis=0)
     )
 
 

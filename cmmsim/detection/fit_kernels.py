@@ -111,16 +111,30 @@ def accumulate(
     normal: Array,
     right: Array,
 ) -> float:
-    """Add up the normal matrix (7,7), lower triangle, and right-hand side (7,); returns the weighted squared misfit."""
+    """Add up the normal matrix (7,7), lower triangle, and right-hand side (7,); returns the weighted squared misfit.
+
+    Pixels wholly outside or inside of the ellipse share a mean, and only their residuals' sums are needed.
+    """
     normal[:], right[:], misfit = 0.0, 0.0, 0.0
     row_of = np.empty(UNKNOWNS)
     row_of[6] = 1.0
+    outside, outside_sum, outside_squares, inside, inside_sum, inside_squares = 0, 0.0, 0.0, 0, 0.0, 0.0
     for row in range(window.shape[0]):
         for column in range(window.shape[1]):
             if not mask[row, column]:
                 continue
             share, change = shares[row, column], derivatives[row, column]
             mean = ground + contrast * share
+            if share == 0.0:
+                outside += 1
+                outside_sum += window[row, column] - mean
+                outside_squares += (window[row, column] - mean) ** 2
+                continue
+            if share == 1.0:
+                inside += 1
+                inside_sum += window[row, column] - mean
+                inside_squares += (window[row, column] - mean) ** 2
+                continue
             weight = 1.0 / variance_at(mean, settings)
             residual = window[row, column] - mean
             misfit += weight * residual * residual
@@ -134,7 +148,13 @@ def accumulate(
                 right[i] += weighted * residual
                 for j in range(0 if on_rim else 5, i + 1):
                     normal[i, j] += weighted * row_of[j]
-    return misfit
+    dark, bright = 1.0 / variance_at(ground, settings), 1.0 / variance_at(ground + contrast, settings)
+    normal[6, 6] += dark * outside + bright * inside
+    normal[5, 5] += bright * inside
+    normal[6, 5] += bright * inside
+    right[6] += dark * outside_sum + bright * inside_sum
+    right[5] += bright * inside_sum
+    return misfit + dark * outside_squares + bright * inside_squares
 
 
 @compiled

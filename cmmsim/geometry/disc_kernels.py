@@ -106,16 +106,30 @@ def reach_of_pixel(m: Array) -> float:
 @compiled
 def cover_pixel(x: float, y: float, m: Array) -> tuple[float, float, float, float, float, float]:
     """Share of the pixel with middle (x, y), px from the ellipse's centre, and its derivatives by [c_x, c_y, A_xx,
-    A_xy, A_yy]: along each side the boundary moves by v = dc + dA A^-1 (x - c)."""
+    A_xy, A_yy]."""
+    a_x, a_y = into_disc(x - 0.5, y - 0.5, m)
+    low, left = side_share(a_x, a_y, m[0, 0], m[1, 0]), side_share(a_x, a_y, m[0, 1], m[1, 1])
+    high = side_share(a_x + m[0, 1], a_y + m[1, 1], m[0, 0], m[1, 0])
+    right = side_share(a_x + m[0, 0], a_y + m[1, 0], m[0, 1], m[1, 1])
+    return cover_within(x, y, m, low, high, left, right)
+
+
+@compiled
+def into_disc(x: float, y: float, m: Array) -> tuple[float, float]:
+    """A place in px from the ellipse's centre, in disc units."""
+    return m[0, 0] * x + m[0, 1] * y, m[1, 0] * x + m[1, 1] * y
+
+
+@compiled
+def cover_within(
+    x: float, y: float, m: Array, of_low: tuple, of_high: tuple, of_left: tuple, of_right: tuple
+) -> tuple[float, float, float, float, float, float]:
+    """``cover_pixel`` from the ``side_share`` of its four sides, of which two run along x and two along y: along each
+    the boundary moves by v = dc + dA A^-1 (x - c)."""
     det = 1.0 / (m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0])
     left, right, low, high = x - 0.5, x + 0.5, y - 0.5, y + 0.5
-    a_x, a_y = m[0, 0] * left + m[0, 1] * low, m[1, 0] * left + m[1, 1] * low  # the corner (left, low)
-    b_x, b_y = a_x + m[0, 0], a_y + m[1, 0]  # (right, low)
-    d_x, d_y = a_x + m[0, 1], a_y + m[1, 1]  # (left, high)
-    area_low, low_in, low_out = side_share(a_x, a_y, m[0, 0], m[1, 0])
-    area_high, high_in, high_out = side_share(d_x, d_y, m[0, 0], m[1, 0])
-    area_left, left_in, left_out = side_share(a_x, a_y, m[0, 1], m[1, 1])
-    area_right, right_in, right_out = side_share(b_x, b_y, m[0, 1], m[1, 1])
+    (area_low, low_in, low_out), (area_high, high_in, high_out) = of_low, of_high
+    (area_left, left_in, left_out), (area_right, right_in, right_out) = of_left, of_right
     share = 0.5 * det * (area_low - area_high + area_right - area_left)
 
     in_low, in_high, in_left, in_right = low_out - low_in, high_out - high_in, left_out - left_in, right_out - right_in
@@ -143,21 +157,41 @@ def inverse_of(shape: Array) -> Array:
 
 @compiled
 def cover_window(centre_x: float, centre_y: float, shape: Array, shares: Array, derivatives: Array) -> None:
-    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5); only pixels on the rim need more than a distance."""
+    """Fill ``shares`` (h, w) and ``derivatives`` (h, w, 5); only pixels on the rim need more than a distance, and
+    neighbours have a side in common."""
+    height, width = shares.shape
     m = inverse_of(shape)
     reach = reach_of_pixel(m)
-    for row in range(shares.shape[0]):
-        for column in range(shares.shape[1]):
+    inner, outer = (1.0 - reach) ** 2 if reach < 1.0 else -1.0, (1.0 + reach) ** 2
+    extent_x, extent_y = math.hypot(shape[0, 0], shape[0, 1]), math.hypot(shape[1, 0], shape[1, 1])
+    first, last = max(0, math.ceil(centre_x - extent_x - 0.5)), min(width, math.floor(centre_x + extent_x + 1.5))
+    top, bottom = max(0, math.ceil(centre_y - extent_y - 0.5)), min(height, math.floor(centre_y + extent_y + 1.5))
+    below, row_below = np.empty((width, 3)), np.full(width, -2)  # upper sides of pixels, and the rows of these
+    shares[:] = 0.0
+    derivatives[:] = 0.0
+    for row in range(top, bottom):
+        beside, right = -2, (0.0, 0.0, 0.0)  # right side of the pixel in that column
+        for column in range(first, last):
             x, y = column - centre_x, row - centre_y
-            distance = math.sqrt((m[0, 0] * x + m[0, 1] * y) ** 2 + (m[1, 0] * x + m[1, 1] * y) ** 2)
-            if abs(distance - 1.0) < reach:
-                share, by_x, by_y, by_xx, by_xy, by_yy = cover_pixel(x, y, m)
+            u, v = into_disc(x, y, m)
+            distance2 = u * u + v * v
+            if distance2 <= inner:
+                shares[row, column] = 1.0
+            elif distance2 < outer:
+                a_x, a_y = into_disc(x - 0.5, y - 0.5, m)
+                left = right if beside == column - 1 else side_share(a_x, a_y, m[0, 1], m[1, 1])
+                if row_below[column] == row - 1:
+                    low = below[column, 0], below[column, 1], below[column, 2]
+                else:
+                    low = side_share(a_x, a_y, m[0, 0], m[1, 0])
+                high = side_share(a_x + m[0, 1], a_y + m[1, 1], m[0, 0], m[1, 0])
+                beside, right = column, side_share(a_x + m[0, 0], a_y + m[1, 0], m[0, 1], m[1, 1])
+                below[column, 0], below[column, 1], below[column, 2] = high
+                row_below[column] = row
+                share, by_x, by_y, by_xx, by_xy, by_yy = cover_within(x, y, m, low, high, left, right)
                 shares[row, column] = share
                 into = derivatives[row, column]
                 into[0], into[1], into[2], into[3], into[4] = by_x, by_y, by_xx, by_xy, by_yy
-            else:
-                shares[row, column] = 1.0 if distance < 1.0 else 0.0
-                derivatives[row, column] = 0.0
 
 
 @compiled
@@ -205,6 +239,7 @@ def blur_window(
     shares[:] = 0.0
     derivatives[:] = 0.0
     across_x, passed_x, across_y, passed_y = np.empty(width), np.empty(width), np.empty(height), np.empty(height)
+    whole = np.zeros((height, width + 1))  # what passes all pixels left of a column
     m, count = inverse_of(shape), rim_points(shape, psf_px)
     scale = 2.0 * math.pi / count * (shape[0, 0] * shape[1, 1] - shape[0, 1] * shape[1, 0])
     reach = REACH * psf_px + 0.5
@@ -219,8 +254,7 @@ def blur_window(
         carried(y, low, high, psf_px, across_y, passed_y)
         for row in range(low, high + 1):
             through = across_y[row] * n_x
-            for column in range(min(left, width)):  # all that lies left of here has been passed
-                shares[row, column] += through
+            whole[row, min(left, width)] += through
             for column in range(left, right + 1):
                 shares[row, column] += through * passed_x[column]
                 light = across_y[row] * across_x[column]
@@ -230,6 +264,11 @@ def blur_window(
                 into[2] += light * u * n_x
                 into[3] += light * (v * n_x + u * n_y)
                 into[4] += light * v * n_y
+    for row in range(height):
+        through = 0.0
+        for column in range(width - 1, -1, -1):
+            through += whole[row, column + 1]
+            shares[row, column] += through
 
 
 @compiled

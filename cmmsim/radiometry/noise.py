@@ -142,8 +142,17 @@ class CameraNoise:
         self, radiance: NDArray[np.float32], rng: np.random.Generator, pattern: FixedPattern | None = None
     ) -> GreyImage:
         """One exposure of a radiance image (float32, 0 to 1); ``pattern`` of the same shape, where pixels differ."""
-        grey = np.rint(np.clip(self._analog(radiance, rng, pattern), 0.0, float(self.white_level)))
-        return np.asarray(grey.astype(self.image_type))
+        if not self.enabled:
+            grey = np.rint(np.clip(self.mean_grey(radiance), 0.0, float(self.white_level)))
+            return np.asarray(grey.astype(self.image_type))
+        from cmmsim.radiometry.noise_kernels import expose_pixels  # compiles, so it is loaded where it is first needed
+
+        grey = np.empty(radiance.shape, dtype=self.image_type)
+        normal = rng.standard_normal(radiance.shape, dtype=np.float32)
+        none = np.empty(0, dtype=np.float32)
+        differing = (none, none) if pattern is None else (pattern.sensitivity.ravel(), pattern.offset.ravel())
+        expose_pixels(radiance.ravel(), normal.ravel(), self._figures, *differing, grey.ravel())
+        return grey
 
     def mean_of_exposures(
         self, radiance: NDArray[np.float32], rng: np.random.Generator, frames: int, pattern: FixedPattern | None = None
@@ -159,15 +168,17 @@ class CameraNoise:
             total += self.expose(radiance, rng, pattern)
         return total / frames
 
-    def _analog(
-        self, radiance: NDArray[np.float32], rng: np.random.Generator, pattern: FixedPattern | None
-    ) -> NDArray[np.floating]:
-        if not self.enabled:
-            return self.mean_grey(radiance)
-        light = radiance * np.float32(self.electrons_at_white)
-        electrons = np.minimum(light if pattern is None else light * pattern.sensitivity, np.float32(self.full_well))
-        noise = rng.standard_normal(radiance.shape, dtype=np.float32)
-        noise *= np.sqrt(electrons + np.float32(self.dark_noise**2))
-        if pattern is not None:
-            noise += pattern.offset
-        return np.float32(self.black_level) + np.float32(self.gain) * (electrons + noise)
+    @property
+    def _figures(self) -> NDArray[np.float32]:
+        """Electrons at white, full well, variance in the dark, black level, gain and largest grey value (6,)."""
+        return np.array(
+            [
+                self.electrons_at_white,
+                self.full_well,
+                self.dark_noise**2,
+                self.black_level,
+                self.gain,
+                self.white_level,
+            ],
+            dtype=np.float32,
+        )

@@ -69,6 +69,8 @@ def calibrated_rig(file: SensorFile, pairs: int, rng: np.random.Generator, progr
 
 def _as_read(image: NDArray[np.unsignedinteger[Any]], noise: CameraNoise) -> NDArray[np.uint8]:
     """An image (h, w) in 8 bit, as pictures of a board are read from files."""
+    if image.dtype == np.uint8:
+        return image
     return np.asarray(np.round(image * (255.0 / noise.white_level)), dtype=np.uint8)
 
 

@@ -18,8 +18,10 @@ from cmmsim.calibration import (
     calibrate,
     find_board,
     render_pairs,
+    rendered_boards,
     sensor_template,
 )
+from cmmsim.calibration.dot_kernels import isolate_dots
 from cmmsim.files.sensor_file import sensor_text
 from cmmsim.geometry.camera import Distortion, Optics, PinholeCamera
 from cmmsim.geometry.disc_image import centre_offset
@@ -149,6 +151,31 @@ def test_no_board_is_a_reason_and_not_an_error():
     rows = np.flatnonzero((half > 120).any(axis=1))
     half[rows[0] : rows[len(rows) // 2]] = 20
     assert find_board(half, DOTS) == "no dots of 9 x 7 found"
+
+
+def test_poses_do_not_depend_on_how_many_are_looked_at_together(monkeypatch):
+    """Nor does what is drawn after them; one pose at a time is the plain way. Large boards take thousands of tries."""
+    board = DOTS.model_copy(update={"spacing": 0.08})
+    found = []
+    for count in (1, rendered_boards.AT_ONCE):
+        monkeypatch.setattr(rendered_boards, "AT_ONCE", count)
+        rng = np.random.default_rng(4)
+        found.append((np.stack(board_poses(BENT, board, 2, rng)), rng.random()))
+    np.testing.assert_allclose(found[0][0], found[1][0], atol=1e-14)
+    assert found[0][1] == found[1][1]
+
+
+def test_a_dot_alone_has_the_median_of_its_ground_for_neighbours():
+    rng = np.random.default_rng(0)
+    windows, centres = rng.integers(0, 255, (20, 30, 30)).astype(float), rng.uniform(13.0, 17.0, (20, 2))
+    inverses = np.linalg.inv(rng.uniform(-1.5, 1.5, (20, 2, 2)) + 5.0 * np.eye(2))
+    alone, ticks = windows.copy(), np.arange(30.0)
+    isolate_dots(alone, centres, inverses, 1.2, 2.0)
+    places = np.stack(np.meshgrid(ticks, ticks), axis=-1)
+    for window, found, centre, inverse in zip(windows, alone, centres, inverses, strict=True):
+        distance = np.linalg.norm((places - centre) @ inverse.T, axis=2)
+        ground = np.median(window[(distance > 1.2) & (distance <= 2.0)])
+        np.testing.assert_array_equal(found, np.where(distance <= 2.0, window, ground))
 
 
 def test_boards_that_cannot_be_drawn_are_refused():

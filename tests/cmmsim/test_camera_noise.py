@@ -107,6 +107,21 @@ def test_bit_depth_and_saturation(bits):
     assert full.mean_grey(np.array(1.0)) == pytest.approx((BLACK + GAIN * 900.0) * scale)
 
 
+def test_grey_values_are_those_of_the_model_in_plain_numpy():
+    """With the same stream: electrons up to the full well, shot and dark noise, offset, gain, limits."""
+    noise = replace(NOISE, full_well=900.0, prnu=0.05, dsnu=12.0, bit_depth=10, black_level=60.0)
+    radiance = np.random.default_rng(5).random((3, 40, 50), dtype=np.float32)
+    pattern = draw_pattern(radiance.shape, noise.prnu, noise.dsnu, np.random.default_rng(6))
+    for differing in (None, pattern):
+        seen, offset = (1.0, 0.0) if differing is None else (pattern.sensitivity, pattern.offset)
+        electrons = np.minimum(radiance.astype(float) * WHITE * seen, 900.0)
+        drawn = np.random.default_rng(7).standard_normal(radiance.shape, dtype=np.float32)
+        value = 60.0 + GAIN * (electrons + drawn * np.sqrt(electrons + DARK_NOISE**2) + offset)
+        found = noise.expose(radiance, np.random.default_rng(7), differing).astype(float)
+        whole = np.abs(value - np.floor(value) - 0.5) > 1e-3  # elsewhere single precision decides
+        np.testing.assert_array_equal(found[whole], np.clip(np.rint(value), 0.0, 1023.0)[whole])
+
+
 def test_averaging_reduces_what_changes_but_not_the_pattern():
     """The variance of averaged exposures over many patterns, sampled, is as stated."""
     noise = replace(NOISE, full_well=1e6, prnu=0.02, dsnu=10.0, frames=25)
