@@ -8,13 +8,13 @@ cmmsim.geometry.disc_image. The fits also tell the dots' radius, whatever the bo
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.calibration.board import Board
+from cmmsim.calibration.dot_search import search_dots
 from cmmsim.detection.detector import FitLimits
 from cmmsim.detection.ellipse_fit import fit_ellipses
 from cmmsim.geometry.pose import Array
@@ -25,8 +25,6 @@ LARGEST_POINT_GAP = 0.25  # of the distance of neighbours, by which a point may 
 LARGEST_RADIUS_GAP = 0.1  # of a dot's radius, by which the measured one may differ: more costs its correction 20 %
 FINE_WINDOW_SHARE = 0.3  # half window of cornerSubPix over the distance of neighbouring corners
 
-SMALLEST_AREA_PX = 20.0
-FIND_SIDE_PX = 1600  # dots are first looked for in an image of at most this size: faster, and less noise
 FIT_ITERATIONS = 5
 WINDOW_REACH = 2.2  # dot radii around the centre that are looked at
 GROUND_FROM = 1.2  # dot radii from which the ground is taken
@@ -123,10 +121,7 @@ def find_dots(grey: NDArray[np.uint8], board: Board) -> tuple[Array, float] | No
     """Dot centres (rows * columns, 2) px in the board's order, NaN where a dot is no clean ellipse, and the dots'
     measured radius, m; None: no board."""
     bright = 255 - grey if board.dark else grey
-    rough = None
-    for side in (FIND_SIDE_PX, max(grey.shape)):
-        if rough is None:
-            rough = _found_by_opencv(bright, board, min(1.0, side / max(grey.shape)))
+    rough = search_dots(bright, board)
     if rough is None:
         return None
     shapes = _dot_shapes(rough, board)
@@ -135,35 +130,6 @@ def find_dots(grey: NDArray[np.uint8], board: Board) -> tuple[Array, float] | No
         return centres, board.dot_radius * float(np.nanmedian(ratios))
     reach = 0.5 * board.nearest
     return centres, reach * covered_radius(bright, rough, shapes * (reach / board.dot_radius))
-
-
-def _found_by_opencv(bright: NDArray[np.uint8], board: Board, scale: float) -> Array | None:
-    """OpenCV's centres (n, 2) px; it returns (n, 1, 2) up to version 4 and (n, 2) from version 5 on."""
-    small = bright if scale == 1.0 else cv2.resize(bright, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    small = cv2.GaussianBlur(small, (3, 3), 0.0)
-    kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.kind == "asymmetric_dots" else cv2.CALIB_CB_SYMMETRIC_GRID
-    for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
-        found, centres = cv2.findCirclesGrid(
-            small, (board.columns, board.rows), flags=flags, blobDetector=_blob_detector(small.size)
-        )
-        if found:
-            rough = np.asarray(centres, dtype=float).reshape(-1, 2)
-            return (rough + 0.5) / scale - 0.5  # the first pixel's corner, not its middle, stays in place
-    return None
-
-
-def _blob_detector(pixels: int) -> Any:
-    opencv: Any = cv2  # its type stubs leave the blob detector out
-    options = opencv.SimpleBlobDetector_Params()
-    options.filterByColor, options.blobColor = True, 255
-    options.filterByArea, options.minArea = True, SMALLEST_AREA_PX
-    options.maxArea = max(0.01 * pixels, 2.0 * SMALLEST_AREA_PX)
-    options.filterByConvexity, options.minConvexity = True, 0.85
-    options.filterByInertia, options.minInertiaRatio = True, 0.08
-    options.filterByCircularity = False
-    options.minThreshold, options.maxThreshold, options.thresholdStep = 20.0, 240.0, 10.0
-    options.minDistBetweenBlobs = 3.0
-    return opencv.SimpleBlobDetector_create(options)
 
 
 def _refine(bright: NDArray[np.uint8], rough: Array, shapes: Array, board: Board) -> tuple[Array, Array]:
