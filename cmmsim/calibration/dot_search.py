@@ -25,14 +25,14 @@ LARGEST_GRID_GAP = 0.3  # of the distance of neighbours, by which a dot may lie 
 
 def search_dots(bright: NDArray[np.uint8], board: Board) -> Array | None:
     """Rough centres (rows * columns, 2) px of bright dots in the board's order; None where they are not found."""
-    rough = _read_at_once(bright, board) if board.kind == "dots" else None
+    rough = read_at_once(bright, board) if board.kind == "dots" else None
     for side in (FIND_SIDE_PX, max(bright.shape)):
         if rough is None:
-            rough = _found_by_opencv(bright, board, min(1.0, side / max(bright.shape)))
+            rough = found_by_opencv(bright, board, min(1.0, side / max(bright.shape)))
     return rough
 
 
-def _read_at_once(bright: NDArray[np.uint8], board: Board) -> Array | None:
+def read_at_once(bright: NDArray[np.uint8], board: Board) -> Array | None:
     """The centres by one threshold, Otsu's; None where that does not show exactly the board's grid."""
     points = _bright_spots(bright)
     if len(points) != len(board.points):
@@ -73,7 +73,7 @@ def _sharpest_corners(points: Array) -> Array:
     return np.asarray(hull[np.sort(np.argsort(-cosine)[:4])])
 
 
-def _found_by_opencv(bright: NDArray[np.uint8], board: Board, scale: float) -> Array | None:
+def found_by_opencv(bright: NDArray[np.uint8], board: Board, scale: float) -> Array | None:
     """OpenCV's centres (n, 2) px; it returns (n, 1, 2) up to version 4 and (n, 2) from version 5 on."""
     small = bright if scale == 1.0 else cv2.resize(bright, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     small = cv2.GaussianBlur(small, (3, 3), 0.0)

@@ -158,10 +158,10 @@ def accumulate(
 
 
 @compiled
-def start_ellipse(window: Array, parameters: Array) -> None:
-    """First parameters (7,) from the moments; a uniform ellipse has spread A A / 4."""
-    ground, contrast, x, y, xx, xy, yy = moments(window)
-    xx, xy, yy = bound_radii(xx, xy, yy, (0.5 * SMALLEST_START_PX) ** 2, (0.25 * window.shape[1]) ** 2)
+def start_ellipse(spot: tuple, size: int, parameters: Array) -> None:
+    """First parameters (7,) from the moments of a window of ``size`` px; a uniform ellipse has spread A A / 4."""
+    ground, contrast, x, y, xx, xy, yy = spot
+    xx, xy, yy = bound_radii(xx, xy, yy, (0.5 * SMALLEST_START_PX) ** 2, (0.25 * size) ** 2)
     root = math.sqrt(xx * yy - xy * xy)
     scale = 2.0 / math.sqrt(xx + yy + 2.0 * root)  # the root of a matrix M is (M + sqrt(det) 1) / sqrt(...)
     parameters[0], parameters[1] = x, y
@@ -312,6 +312,6 @@ def fit_windows(
         left = min(max(int(np.rint(spot[2] - 0.5 * (size - 1))), 0), room)
         top = min(max(int(np.rint(spot[3] - 0.5 * (size - 1))), 0), room)
         part = windows[k, top : top + size, left : left + size]
-        start_ellipse(part, parameters[k])
+        start_ellipse(moments(part) if room else spot, size, parameters[k])
         misfits[k] = fit_window(part, smears[k], settings, parameters[k], shapes[k], covariances[k])
         corners[k, 0], corners[k, 1] = left, top
