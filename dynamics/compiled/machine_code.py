@@ -15,7 +15,7 @@ import llvmlite.binding as llvm
 import numpy as np
 
 from dynamics.compiled.object_files import load_object, save_object
-from dynamics.compiled.translation import llvm_text
+from dynamics.compiled.translation import AnyFunction, llvm_text, shapes
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class MachineFunction:
 
 
 def compiled_functions(
-    content: bytes, build: Callable[[], list[ca.Function]], hot: Collection[str] = ()
+    content: bytes, build: Callable[[], list[AnyFunction]], hot: Collection[str] = ()
 ) -> dict[str, MachineFunction]:
     """The functions that `build()` returns, by name; `content` is what they depend on besides this package.
 
@@ -73,7 +73,7 @@ def compiled_functions(
     return _load(compiled)
 
 
-def _compile(functions: list[ca.Function], hot: Collection[str]) -> bytes:
+def _compile(functions: list[AnyFunction], hot: Collection[str]) -> bytes:
     """A line of JSON with the shapes of inputs and outputs of each function, and the code of all.
 
     LLVM's passes find pairs of equal operations; they gain a seventh in speed, for some tenths of a second each."""
@@ -84,10 +84,8 @@ def _compile(functions: list[ca.Function], hot: Collection[str]) -> bytes:
     builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2))
     for name in hot:
         builder.getFunctionPassManager().run(module.get_function(name), builder)
-    shapes = {
-        f.name(): ([f.nnz_in(k) for k in range(f.n_in())], [f.size_out(k) for k in range(f.n_out())]) for f in functions
-    }
-    return json.dumps(shapes).encode() + b"\n" + bytes(machine.emit_object(module))
+    shaped = {function.name(): shapes(function) for function in functions}
+    return json.dumps(shaped).encode() + b"\n" + bytes(machine.emit_object(module))
 
 
 def _load(compiled: bytes) -> dict[str, MachineFunction]:

@@ -122,6 +122,11 @@ class Leg(BaseModel, ABC):
         None, description="+1 or -1: which solution of the inverse kinematics; default: nearest to zero at home"
     )
 
+    @property
+    def side(self) -> float | ca.SX:
+        """+1 or -1, the sign of the root that its branch takes; +1 as long as none is chosen."""
+        return 1.0 if self.branch is None else self.branch
+
     def assembled(self, joint: np.ndarray, number: int) -> Self:
         """The leg with its branch chosen, for the position (3,) of A at home.
 

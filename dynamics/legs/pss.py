@@ -50,13 +50,13 @@ class PssLeg(Leg):
     def coordinate(self, position: ca.SX) -> ca.SX:
         along, across = self._parts(position)
         root = ca.sqrt(self.link_length**2 - ca.dot(across, across))
-        return along - float(self.branch or 1) * root
+        return along - self.side * root
 
     def link(self, position: ca.SX) -> ca.SX:
         """From the slider to A (3,), m."""
         _, across = self._parts(position)
         root = ca.sqrt(self.link_length**2 - ca.dot(across, across))
-        return across + float(self.branch or 1) * root * self.slider_axis
+        return across + self.side * root * self.slider_axis
 
     def reach(self, position: ca.SX) -> ca.SX:
         """sin^2 of the angle between the link and the plane across the slider's axis."""

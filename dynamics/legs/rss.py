@@ -95,7 +95,7 @@ class RssLeg(Leg):
         zero, axis = self.crank_zero_direction, self.crank_axis
         along, across, chord = self._chord(position)
         square = along**2 + across**2
-        root = float(self.branch or 1) * ca.sqrt(square - chord**2)
+        root = self.side * ca.sqrt(square - chord**2)
         inverse = 1 / square
         cosine = (along * chord - across * root) * inverse
         sine = (across * chord + along * root) * inverse

@@ -10,53 +10,51 @@ Legs enter through the motion of their platform joints A only, so derivatives ar
 three vectors of length 3 and chained through dA/dq.
 """
 
+from collections.abc import Callable, Sequence
+
 import casadi as ca
 import numpy as np
 
+from dynamics.compiled.lanes import PartedFunction
 from dynamics.expressions import function, symmetric_from_lower
 from dynamics.geometry import AnyGeometry
 from dynamics.kinematics.platform import PlatformJointMotion, pose_rate_to_twist, twist_bias
+from dynamics.legs.leg import Leg
 from dynamics.parameters import parameter_layout
 from dynamics.rigid_body.jacobians import freedoms
 from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 
 
-def motion_functions(geometry: AnyGeometry) -> list[ca.Function]:
+def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction]:
     """What the closed loop integrates."""
     return [equation_of_motion(geometry), motion_derivatives(geometry), rate_map_derivative(geometry)]
 
 
-def equation_of_motion(geometry: AnyGeometry) -> ca.Function:
+def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
     """(q, rate (m,), rigid (p,)) -> M (m, m), b (m,), J_theta (n, m), J_theta_dot rate (n,), theta (n,)."""
     layout, (q, rate) = parameter_layout(geometry.legs), _coordinates(geometry, "q", "rate")
-    (pose, pose_rate, rest), free = _poses(geometry, q, rate, 0 * rate), freedoms(geometry)
+    motion, free = _poses(geometry, q, rate, 0 * rate), freedoms(geometry)
     rigid = ca.SX.sym("rigid", layout.rigid.stop)
-    joints = _joints(geometry)
+    joints, (legs, sides), parts = _joints(geometry), _legs(geometry), []
+    for number, leg in enumerate(legs):
+        own, moving, gradient = rigid[layout.leg_rows(number)], joints.of(number), joints.gradient[number]
+        mass = gradient.T @ leg.mass(moving[0], own) @ gradient
+        force = gradient.T @ leg.force(*moving, own, ca.DM(geometry.gravity))
+        row = leg.gradient(moving[0]).T @ gradient @ free
+        joint = [leg.acceleration(*moving), leg.coordinate(moving[0])]
+        parts.append([_of_freedoms(mass, free), free.T @ force, row, *joint])
     to_twist = pose_rate_to_twist(joints.pose)
-    mass = to_twist.T @ platform_mass(joints.pose, rigid[0:4]) @ to_twist
-    bias = _platform_columns(geometry, joints) @ rigid[0:4]
-    rows, accelerations, coordinates = [], [], []
-    for number, leg in enumerate(geometry.legs):
-        own, motion = rigid[layout.leg_rows(number)], joints.of(number)
-        gradient = joints.gradient[number]
-        mass += gradient.T @ leg.mass(motion[0], own) @ gradient
-        bias += gradient.T @ leg.force(*motion, own, ca.DM(geometry.gravity))
-        rows.append(leg.gradient(motion[0]).T @ gradient)
-        accelerations.append(leg.acceleration(*motion))
-        coordinates.append(leg.coordinate(motion[0]))
-    outputs = [
-        symmetric_from_lower(free.T @ symmetric_from_lower(mass) @ free),
-        free.T @ bias,
-        ca.vertcat(*rows) @ free,
-        ca.vertcat(*accelerations),
-        ca.vertcat(*coordinates),
-    ]
-    return function(
-        "equation_of_motion", [q, rate, rigid, *geometry.symbols], _at(joints, outputs, pose, pose_rate, rest)
-    )
+    mass = _of_freedoms(to_twist.T @ platform_mass(joints.pose, rigid[0:4]) @ to_twist, free)
+    bias = free.T @ _platform_columns(geometry, joints) @ rigid[0:4]
+
+    def end(masses: Sequence[ca.SX], forces: Sequence[ca.SX], *rows: Sequence[ca.SX]) -> list[ca.SX]:
+        return [symmetric_from_lower(sum(masses, mass)), sum(forces, bias), *(ca.vertcat(*row) for row in rows)]
+
+    at = [joints.pose, joints.rate, joints.gain], motion
+    return _parted("equation_of_motion", [q, rate, rigid, *geometry.symbols], parts, end, sides, at)
 
 
-def motion_derivatives(geometry: AnyGeometry) -> ca.Function:
+def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
     """(q, rate, acceleration (m,), torque (n,), rigid (p,)) -> derivatives at fixed acceleration and net joint torque.
 
     Of the residual M q_ddot + b - J_theta^T torque: with respect to q (m, m), rate (m, m) and rigid (m, p). Of the
@@ -66,32 +64,30 @@ def motion_derivatives(geometry: AnyGeometry) -> ca.Function:
     layout, (q, rate, acceleration) = parameter_layout(geometry.legs), _coordinates(geometry, "q", "rate", "gain")
     motion, free = _poses(geometry, q, rate, acceleration), freedoms(geometry)
     torque, rigid = ca.SX.sym("torque", layout.joints), ca.SX.sym("rigid", layout.rigid.stop)
-    joints = _joints(geometry)
+    joints, (legs, sides), parts = _joints(geometry), _legs(geometry), []
+    for number, leg in enumerate(legs):
+        own, gradient = rigid[layout.leg_rows(number)], joints.gradient[number]
+        local, net_force, force, joint = _leg_derivatives(
+            leg, joints.of(number), torque[number], own, ca.DM(geometry.gravity)
+        )
+        by_pose = gradient.T @ _by_pose(force, joints, number) + joints.curvature(number, net_force)
+        by_rate = gradient.T @ _by_rate(force, joints, number)
+        of_joint = [_by_pose(joint, joints, number) @ free, _by_rate(joint, joints, number) @ free]
+        parts.append([free.T @ by_pose @ free, free.T @ by_rate @ free, free.T @ gradient.T @ local, *of_joint])
     platform = _platform_columns(geometry, joints)
-    by_pose = ca.jacobian(platform @ rigid[0:4], joints.pose)
-    by_rate = ca.jacobian(platform @ rigid[0:4], joints.rate)
-    columns = ca.SX.zeros(6, layout.rigid.stop)
-    columns[:, 0:4] = platform
-    joint_by_pose, joint_by_rate = [], []
-    for number in range(layout.joints):
-        own = rigid[layout.leg_rows(number)]
-        local, net_force, force, joint = _leg_derivatives(geometry, number, joints, torque[number], own)
-        gradient = joints.gradient[number]
-        by_pose += gradient.T @ _by_pose(force, joints, number) + joints.curvature(number, net_force)
-        by_rate += gradient.T @ _by_rate(force, joints, number)
-        joint_by_pose.append(_by_pose(joint, joints, number))
-        joint_by_rate.append(_by_rate(joint, joints, number))
-        columns[:, layout.leg_rows(number)] = gradient.T @ local
-    outputs = [
-        free.T @ by_pose @ free,
-        free.T @ by_rate @ free,
-        free.T @ columns,
-        ca.vertcat(*joint_by_pose) @ free,
-        ca.vertcat(*joint_by_rate) @ free,
-    ]
-    return function(
-        "motion_derivatives", [q, rate, acceleration, torque, rigid, *geometry.symbols], _at(joints, outputs, *motion)
-    )
+    alone = [free.T @ ca.jacobian(platform @ rigid[0:4], of) @ free for of in (joints.pose, joints.rate)]
+
+    def end(
+        by_pose: Sequence[ca.SX], by_rate: Sequence[ca.SX], local: Sequence[ca.SX], *of_joints: Sequence[ca.SX]
+    ) -> list[ca.SX]:
+        columns = ca.SX.zeros(free.shape[1], layout.rigid.stop)
+        columns[:, 0:4] = free.T @ platform
+        for number, own in enumerate(local):
+            columns[:, layout.leg_rows(number)] = own
+        return [sum(by_pose, alone[0]), sum(by_rate, alone[1]), columns, *(ca.vertcat(*rows) for rows in of_joints)]
+
+    inputs = [q, rate, acceleration, torque, rigid, *geometry.symbols]
+    return _parted("motion_derivatives", inputs, parts, end, sides, ([joints.pose, joints.rate, joints.gain], motion))
 
 
 def rate_map_derivative(geometry: AnyGeometry) -> ca.Function:
@@ -124,21 +120,60 @@ def _joints(geometry: AnyGeometry) -> PlatformJointMotion:
     return PlatformJointMotion(geometry.platform_joints, *[ca.SX.sym(name, 6) for name in ("pose", "rate", "gain")])
 
 
+def _parted(
+    name: str,
+    inputs: list[ca.SX],
+    parts: list[list[ca.SX]],
+    end: Callable[..., list[ca.SX]],
+    sides: tuple[ca.SX, np.ndarray],
+    at: tuple[Sequence[ca.SX], Sequence[ca.SX]],
+) -> PartedFunction:
+    """A function of what each leg has of its own, some expressions a leg, and of what becomes of them: `end` gets the
+    first of all legs, the second, and so on; symbols are replaced `at` values."""
+    columns = [ca.vertcat(*(ca.densify(ca.vec(one)) for one in part)) for part in parts]
+    symbols = [ca.SX.sym(f"leg{number}", column.numel()) for number, column in enumerate(columns, 1)]
+    outputs = end(*zip(*map(_shaped, symbols, parts), strict=True))
+    return PartedFunction(
+        function(f"{name}_parts", [*inputs, sides[0]], ca.substitute(columns, *map(list, at))),
+        function(name, [*inputs, *symbols], ca.substitute(outputs, *map(list, at))),
+        sides[1],
+    )
+
+
+def _shaped(column: ca.SX, like: list[ca.SX]) -> list[ca.SX]:
+    """The entries of a column in matrices of the shapes of others."""
+    ends = np.cumsum([0, *(one.numel() for one in like)]).tolist()
+    return [ca.reshape(own, *one.shape) for own, one in zip(ca.vertsplit(column, ends), like, strict=True)]
+
+
+def _of_freedoms(matrix: ca.SX, free: ca.DM) -> ca.SX:
+    """What of a symmetric matrix (6, 6) the platform's freedoms see (m, m)."""
+    return free.T @ symmetric_from_lower(matrix) @ free
+
+
+def _legs(geometry: AnyGeometry) -> tuple[list[Leg], tuple[ca.SX, np.ndarray]]:
+    """The legs with symbols for the branches that they are on, so that legs which differ in a sign are alike; and these
+    with their values."""
+    sides = ca.SX.sym("sides", len(geometry.legs))
+    pairs = zip(geometry.legs, ca.vertsplit(sides), strict=True)
+    values = np.array([leg.side for leg in geometry.legs], dtype=float)
+    return [leg.model_copy(update={"branch": side}) for leg, side in pairs], (sides, values)
+
+
 def _at(joints: PlatformJointMotion, outputs: list[ca.SX], *motion: ca.SX) -> list[ca.SX]:
     """Expressions in pose, rate and acceleration of the platform at others."""
     return ca.substitute(outputs, [joints.pose, joints.rate, joints.gain], list(motion))
 
 
 def _leg_derivatives(
-    geometry: AnyGeometry, number: int, joints: PlatformJointMotion, torque: ca.SX, own: ca.SX
+    leg: Leg, motion: tuple[ca.SX, ca.SX, ca.SX], torque: ca.SX, own: ca.SX, gravity: ca.DM
 ) -> tuple[ca.SX, ca.SX, list[ca.SX], list[ca.SX]]:
     """Columns (3, p) of the leg's own parameters, net force (3,), and derivatives of that force and of theta_ddot with
     respect to position, velocity and acceleration of A."""
-    leg = geometry.legs[number]
     position, velocity, acceleration = (ca.SX.sym(name, 3) for name in ("position", "velocity", "acceleration"))
-    moving = leg.force(position, velocity, acceleration, own, ca.DM(geometry.gravity))
+    moving = leg.force(position, velocity, acceleration, own, gravity)
     unit = ca.SX.sym("parameters", own.numel())
-    columns = ca.jacobian(leg.force(position, velocity, acceleration, unit, ca.DM(geometry.gravity)), unit)
+    columns = ca.jacobian(leg.force(position, velocity, acceleration, unit, gravity), unit)
     force = moving - leg.gradient(position) * torque
     by_acceleration = leg.mass(position, own)
     joint = leg.acceleration(position, velocity, acceleration)
@@ -153,7 +188,7 @@ def _leg_derivatives(
         leg.gradient(position).T,
     ]
     inputs = [position, velocity, acceleration]
-    columns, force, *rows = ca.substitute(ca.cse(expressions), inputs, list(joints.of(number)))
+    columns, force, *rows = ca.substitute(ca.cse(expressions), inputs, list(motion))
     return columns, force, rows[:3], rows[3:]
 
 

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from dynamics.compiled.kernel import entry
+from dynamics.compiled.lanes import NAMES, PartedFunction, graph_of, lane_groups
 from dynamics.compiled.machine_code import compiled_functions
 from dynamics.compiled.object_files import CacheWarning, load_object
-from dynamics.compiled.translation import _CALLED, _MEANING, _NAMES
+from dynamics.compiled.translation import _CALLED, _MEANING
 from dynamics.errors import DynamicsError
 from dynamics.rigid_body.equation_of_motion import motion_functions
 from dynamics.rigid_body.virtual_work import robot_functions
@@ -44,7 +45,8 @@ def square(build=_square, content=b"square"):
 def test_every_function_of_a_robot_is_that_of_the_virtual_machine(robot):
     """All outputs, bit by bit, at a batch of random states with a single row of parameters."""
     rng, names = np.random.default_rng(6), []
-    for function in robot_functions(robot.geometry) + motion_functions(robot.geometry):
+    for given in [*robot_functions(robot.geometry), *motion_functions(robot.geometry)]:
+        function = given.whole if isinstance(given, PartedFunction) else given
         pose = robot.home_pose + BOX * rng.uniform(-1, 1, (5, 6))
         sizes = [function.nnz_in(k) for k in range(1, function.n_in())]
         inputs = [pose, *[rng.normal(size=(5, size)) if size == 6 else rng.uniform(size=(1, size)) for size in sizes]]
@@ -60,13 +62,36 @@ def test_every_function_of_a_robot_is_that_of_the_virtual_machine(robot):
 @pytest.mark.parametrize("name", [*_MEANING, *_CALLED])
 def test_every_operation_is_that_of_the_virtual_machine_whatever_its_arguments(own_cache, name):
     """Bit by bit, signs of zeros included, on all pairs of special and of random numbers."""
-    code = next(code for code, known in _NAMES.items() if known == name)
+    function, x, y = machine_function(name)
+    found = compiled_functions(name.encode(), lambda: [function])["f"](x[:, None], y[:, None])[0].ravel()
+    check_bits(found, function(ca.DM(x).T, ca.DM(y).T).full().ravel())
+
+
+@pytest.mark.parametrize("name", [*_MEANING, *_CALLED])
+def test_operations_in_lanes_are_those_one_by_one(own_cache, name):
+    """Bit by bit as above, of three parts alike, and a fourth that is not and has the same operation inside."""
+    function, x, y = machine_function(name)
+    z, (p, q, r) = np.roll(x, 5), (ca.SX.sym(name) for name in "pqr")
+    alike = [function(first, second) for first, second in ((p, q), (q, r), (r, p))]
+    parts = ca.Function("parts", [p, q, r, ca.SX.sym("none", 0)], [*alike, ca.cos(function(q, p)) * r])
+    columns = [ca.SX.sym("column") for _ in range(4)]
+    end = ca.Function("f", [p, q, r, *columns], [ca.vertcat(*columns)])
+    given = PartedFunction(parts, end, np.zeros(0))
+    assert sorted(group.lanes for group in lane_groups(graph_of(parts, np.zeros(0)))) == [(0, 1, 2), (3,)]
+    found = compiled_functions(name.encode(), lambda: [given])["f"](x[:, None], y[:, None], z[:, None])[0][..., 0]
+    check_bits(found, given.whole(*(ca.DM(of).T for of in (x, y, z))).full().T)
+
+
+def machine_function(name):
+    """A function of x and y with this operation in it, and all pairs of special and of random numbers."""
+    code = next(code for code, known in NAMES.items() if known == name)
     ways = [ca.Function("f", [X, Y], [f()]) for f in (lambda: ca.SX.binary(code, X, Y), lambda: X**2.7)]
     function = next(f for f in ways if code in [f.instruction_id(k) for k in range(f.n_instructions())])
     values = np.array([*SPECIAL, *np.random.default_rng(1).normal(size=6)])
-    x, y = (part.ravel() for part in np.meshgrid(values, values))
-    found = compiled_functions(name.encode(), lambda: [function])["f"](x[:, None], y[:, None])[0].ravel()
-    expected = function(ca.DM(x).T, ca.DM(y).T).full().ravel()
+    return function, *(part.ravel() for part in np.meshgrid(values, values))
+
+
+def check_bits(found, expected):
     np.testing.assert_array_equal(found, expected)
     numbers = ~np.isnan(expected)
     np.testing.assert_array_equal(np.signbit(found[numbers]), np.signbit(expected[numbers]))
