@@ -39,12 +39,16 @@ def rows_of(name, repeats=None):
     return study, tidy_table(study, compute(prepare(study), [design.case(number) for number in range(len(design))]))
 
 
+ANSWERS = {"estimators", "excitation_methods", "friction_timing", "inexact", "interval_coverage", "parameter_groups"}
+"""Studies that ask what no law says; what came out is in the documentation."""
+
+
 @pytest.mark.parametrize("name", STUDIES.names())
 def test_study_can_be_run_and_says_why_its_laws_hold(name):
     study = load_study(name)
     prepare(study)
     assert study.title
-    assert study.theory
+    assert bool(study.theory) == (name not in ANSWERS)
     assert all(law.why for law in study.theory)
     assert all(law.order in (None, study.factors.get(law.factor)) for law in study.theory)
 
