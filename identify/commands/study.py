@@ -127,14 +127,19 @@ def study(
     chosen = load_study(name).with_settings(changes)
     if chosen.rows > MANY_ROWS and not yes:
         raise StudyError(f"study {chosen.name!r} has {chosen.rows:,} rows; to run more than {MANY_ROWS:,}, say --yes")
+    from identify.runtime import cores
+    from identify.studies.memory import check_memory
     from identify.studies.runner import run_study
     from identify.studies.table import rows_beside
 
+    count = cores() if workers is None else workers
+    if scheduler is None:
+        check_memory(chosen, max(count, 1))
     others = [rows_beside(chosen, other) for other in beside or ()]
     folder = out or Path("runs") / f"study-{chosen.name}"
     try:
         progress, so_far = terminal_progress(quiet, rate="rows/s"), partial(_summary, chosen, folder, figures=False)
-        outcome = run_study(chosen, folder, progress, _workers(scheduler, workers), so_far)
+        outcome = run_study(chosen, folder, progress, _workers(scheduler, count), so_far)
     except StudyInterrupted as stopped:
         typer.echo(f"{stopped}; the same command goes on from there", err=True)
         raise typer.Exit(STOPPED) from None
@@ -143,15 +148,14 @@ def study(
     _judge(outcome, summary["theory"])
 
 
-def _workers(scheduler: str | None, workers: int | None) -> "Workers":
+def _workers(scheduler: str | None, workers: int) -> "Workers":
     if workers == 0:
         from identify.studies.runner import in_this_process
 
         return in_this_process
-    from identify.runtime import cores
     from identify.studies.dask_cluster import local_cluster, running_cluster
 
-    return partial(running_cluster, scheduler) if scheduler else partial(local_cluster, workers or cores())
+    return partial(running_cluster, scheduler) if scheduler else partial(local_cluster, workers)
 
 
 def _summary(study: "Study", folder: Path, frame: "pd.DataFrame", **how: Any) -> dict[str, Any]:

@@ -4,7 +4,9 @@ import socket
 import threading
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
+import psutil
 import pytest
 
 from identify.commands import study as study_command
@@ -169,6 +171,18 @@ def test_another_study_is_drawn_beside_one_and_refused_where_it_has_other_factor
     assert command("study", mine, "--workers", 0, "--set", levels, "--out", "new", "--beside", "other") == 1
     assert "other has rows of kind" in capsys.readouterr().err
     assert not Path("new").exists()
+
+
+def test_rows_that_need_more_memory_than_there_is_are_refused_with_the_workers_that_would_fit(
+    tmp_path, capsys, monkeypatch
+):
+    """216,000 frames of an hour take some 4 GB."""
+    for there, evidence in ((9e9, "--workers 2 fits"), (3e9, "shorten")):
+        monkeypatch.setattr(psutil, "virtual_memory", lambda there=there: SimpleNamespace(total=there))
+        words = ("--set", "scenario.excitation.duration_s=[10.0,3600.0]", "--workers", 3, "--out", tmp_path / "a")
+        assert command("study", "parameter_groups", *words) == 1
+        assert evidence in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()
 
 
 def test_wrong_calls_are_refused_in_the_words_of_the_options(mine, capsys):

@@ -14,7 +14,7 @@ from identify.experiment.joint_instruments import instruments_of
 from identify.plugins import ESTIMATORS
 from identify.progress import SilentProgress
 from identify.scenario import Scenario
-from identify.studies.rows.identification import READS, RecordOptions, recorded
+from identify.studies.rows.identification import READS, RecordOptions, memory, recorded
 from identify.studies.rows.kind import Column, Kind, Row
 from identify.validation.estimator_comparison import START, Score, compare_on_record, instrumented
 
@@ -74,4 +74,5 @@ ESTIMATION = Kind(
     COLUMNS,
     EstimatorOptions,
     READS,
+    memory=memory,
 )

@@ -256,6 +256,16 @@ def _designed(scenario_toml: str, seed: int) -> TrajectorySet:
     return design_trajectories(_robot(scenario.robot), scenario, seed)
 
 
+PROCESS, HELD = 0.5e9, 5
+"""Bytes of a process before its first row; sensitivities of all poses by all parameters that a row holds at once."""
+
+
+def memory(scenario: Scenario) -> float:
+    """Bytes of a process that identifies from the records of a scenario, as was measured with up to 24,000 frames."""
+    parameters = len(_robot(scenario.robot).layout.names)
+    return PROCESS + HELD * 8.0 * 6 * parameters * scenario.timing.frames(scenario.excitation.duration_s)
+
+
 IDENTIFICATION = Kind(
     "identification",
     compute,
@@ -263,4 +273,5 @@ IDENTIFICATION = Kind(
     COLUMNS,
     IdentificationOptions,
     READS,
+    memory=memory,
 )
