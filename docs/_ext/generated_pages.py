@@ -32,6 +32,58 @@ FIGURES: dict[str, Callable[[Path], str]] = {
     "dynamics_speed.md": kept_figures.dynamics_speed,
     "robots.md": kept_figures.robots,
     "laws.md": kept_figures.laws,
+    "answer_friction_timing.md": kept_figures.answer(
+        "friction_timing",
+        {"scenario.timing.frame_rate_hz": "frame rate, Hz", "scenario.timing.latency_s": "latency, s"},
+        {
+            "coulomb_error_percent": "error of Coulomb friction, %",
+            "coulomb_std_percent": "as stated, %",
+            "viscous_error_percent": "error of viscous friction, %",
+        },
+    ),
+    "answer_parameter_groups.md": kept_figures.answer(
+        "parameter_groups",
+        {"sensor.camera.dark_noise": "dark noise, electrons"},
+        {
+            "pose_noise_um": "noise of a position, µm",
+            "coulomb_std_percent": "Coulomb friction, %",
+            "viscous_std_percent": "viscous friction, %",
+            "gains_std_percent": "joint gains, %",
+            "group_std_percent": "groups of masses and inertias, %",
+        },
+    ),
+    "answer_excitation_methods.md": kept_figures.answer(
+        "excitation_methods",
+        {"scenario.excitation.method": "method"},
+        {
+            "identified_groups": "groups identified",
+            "group_std_percent": "their deviation, %",
+            "coulomb_std_percent": "Coulomb friction, %",
+            "unseen_position_rms_um": "position on unseen motion, µm",
+        },
+    ),
+    "answer_interval_coverage.md": kept_figures.answer(
+        "interval_coverage",
+        {"scenario.robot": "robot"},
+        {
+            "intervals": "quantities identified",
+            "covered_percent": "of their 95 % intervals hold, %",
+            "poses_covered_percent": "of unseen poses within 95 % of the prediction, %",
+        },
+    ),
+    "answer_inexact.md": kept_figures.answer(
+        "inexact",
+        {"scenario.rig.known": "cameras known"},
+        {
+            "intervals": "quantities identified",
+            "covered_percent": "of their 95 % intervals hold, %",
+            "poses_covered_percent": "of unseen poses within 95 % of the prediction, %",
+            "unaware_intervals": "unaware: quantities identified",
+            "unaware_covered_percent": "unaware: intervals hold, %",
+            "unaware_poses_covered_percent": "unaware: poses, %",
+        },
+    ),
+    "answer_estimators.md": kept_figures.leaderboard,
 }
 
 

@@ -139,6 +139,49 @@ def laws(folder: Path) -> str:
     return _table(("study", "law, and why", "measured exponent, 99 % interval"), rows, "---") + when
 
 
+def answer(name: str, factors: dict[str, str], shown: dict[str, str]) -> Callable[[Path], str]:
+    """The table of a built-in study that asks a question, of its kept summary: factors and figures with their heads."""
+
+    def table(folder: Path) -> str:
+        content = kept(folder / "answers", name)
+        rows = [
+            (
+                *(str(point["factors"][path]) for path in factors),
+                *(_average(figure, point["figures"]) for figure in shown),
+            )
+            for point in content["points"]
+        ]
+        return _table((*factors.values(), *shown.values()), rows) + _kept_rows(content)
+
+    return table
+
+
+def leaderboard(folder: Path) -> str:
+    """Median errors of the nine estimators, rms over the kept experiments."""
+    content = kept(folder / "answers", "estimators")
+    (point,) = content["points"]
+    ends = ("groups_percent", "gains_percent", "position_um", "orientation_urad", "seconds")
+    names = [name.removesuffix("_position_um") for name in point["figures"] if name.endswith("_position_um")]
+    rows = [(f"`{name}`", *(_average(f"{name}_{end}", point["figures"]) for end in ends)) for name in names]
+    heads = ("estimator", "groups, %", "gains, %", "position, µm", "orientation, µrad", "time, s")
+    return _table(heads, rows) + _kept_rows(content)
+
+
+def _average(name: str, figures: dict[str, Any]) -> str:
+    """Mean of shares and counts, rms of all else, with its 95 % band."""
+    if name not in figures:
+        return "none"
+    kind = "mean" if "covered" in name or name.endswith(("intervals", "groups")) else "rms"
+    middle, band = figures[name][kind], figures[name][f"{kind}_band"]
+    return f"{middle:.3g}" if band is None else f"{middle:.3g} ({band[0]:.3g} to {band[1]:.3g})"
+
+
+def _kept_rows(content: dict[str, Any]) -> str:
+    rows = content["rows"]
+    lost = f"; {rows['failed']} failed" if rows["failed"] else ""
+    return f"\n\n{rows['done']} experiments{lost}, seed {content['seed']}; `cmmsim study {content['name']}`.\n"
+
+
 def _faster(value: float) -> str:
     return f"{value:.1f} times faster"
 
