@@ -82,7 +82,8 @@ def main_figures(study: Study, names: list[str]) -> list[str]:
     Raises StudyError: the study chooses one that no row has.
     """
     if study.figures is not None:
-        missing = [name for name in study.figures if names and name not in names]
+        known = KINDS[study.kind].columns if study.kind in KINDS else {}  # of which the first rows may have none
+        missing = [name for name in study.figures if names and name not in names and name not in known]
         if missing:
             raise StudyError(f"figures has {missing[0]!r}, and the rows have {', '.join(names)}")
         return [name for name in study.figures if name in names]

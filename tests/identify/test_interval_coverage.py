@@ -7,9 +7,7 @@ its own weighing of the platform. The sensor is taught anew for every ten: what 
 record, and must not in all of them.
 """
 
-import json
 import multiprocessing
-from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
@@ -17,19 +15,17 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from cmmsim.files import read_sensor_file
-from cmmsim.files.setup import rig_from_file
-from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from dynamics import built_in_robots, load_robot
 from identify.estimation.identification import identify
 from identify.excitation.design import design_trajectories
 from identify.experiment.plant import build_plant
-from identify.experiment.run import excitation_run, run_plant, taught_sensor
-from identify.experiment.truth import true_poses
+from identify.experiment.run import excitation_run, taught_sensor
 from identify.progress import SilentProgress
 from identify.scenario import load_scenario
-from identify.validation.unseen import predicted_runs
-from tests.cmmsim.sensors import PHOTOGRAPHED
+from identify.studies.dask_cluster import local_cluster
+from identify.studies.rows.coverage import quantities as quantities_of
+from identify.studies.runner import run_study
+from identify.studies.study_file import load_study
 
 pytestmark = [pytest.mark.thorough, pytest.mark.xdist_group("coverage")]  # whose experiments are made once
 
@@ -96,20 +92,8 @@ def row_of(number: int, result, truth: np.ndarray) -> dict:
         "experiment": number,
         "noise_ratio": result.noise_ratio,
         "expected_noise_ratio": result.expected_noise_ratio,
-        "quantities": {name: figures for name, *figures in _quantities(result, truth)},
+        "quantities": {name: figures for name, *figures in quantities_of(result, truth)},
     }
-
-
-def _quantities(result, truth: np.ndarray) -> Iterator[tuple[str, float, float, bool, bool]]:
-    groups = result.groups
-    several = np.count_nonzero(groups.combinations, axis=1) > 1
-    parameters = (result.names, truth, result.intervals, np.ones(len(truth), dtype=bool))
-    combined = (groups.expressions, groups.combinations @ truth[:-3], result.group_intervals, several)
-    for found, (names, true, intervals, counted) in ((result, parameters), (groups, combined)):
-        for k in np.flatnonzero(counted):
-            error, std, (low, high) = found.estimate[k] - true[k], found.std[k], intervals[k]
-            inside = bool(low <= true[k] <= high)
-            yield names[k], error / std, std / abs(true[k]), bool(found.identifiable[k]), inside
 
 
 @pytest.fixture(scope="module")
@@ -158,68 +142,25 @@ def test_intervals_of_every_robot_cover(robot, record_property):
     assert 0.90 <= np.mean(hits) <= 0.99, np.mean(hits)
 
 
-INEXACT = KNOWN_GAIN | {
-    "timing.latency_s": 0.006,
-    "timing.latency_std_s": 0.002,
-    "rig.right_later_std_s": 2e-4,
-}
-"""What a laboratory knows of its clocks: the mean latency to 2 ms, and to 0.2 ms that both cameras expose at once."""
-
-
-def photographed(path) -> str:
-    """The calibration.json that fifteen photographs of a board left of the built-in sensor's cameras."""
-    rig, _ = rig_from_file(read_sensor_file("ctrack780").rig)
-    parameters = {name: {"estimate": value} for name, value in zip(PARAMETER_NAMES, rig.parameters, strict=True)}
-    covariance = {"names": PARAMETER_NAMES, "matrix": PHOTOGRAPHED.tolist()}
-    size = [rig.left.width, rig.left.height]
-    path.write_text(json.dumps({"parameters": parameters, "covariance": covariance, "image_size_px": size}))
-    return str(path)
-
-
-def inexact_rows(count: int, processes: int, known: str) -> list[dict]:
-    """Rows of experiments with cameras, taught frames, latency and exposures of their own, each with `predicted`: the
-    shares of true poses of an unseen motion within 95 % of what is predicted; and `silent`: the row without a word of
-    what is not exact."""
-    scenario = load_scenario("paper").with_overrides(CHANGES | INEXACT | {"rig.known": known})
-    trajectories = design_trajectories(load_robot("rss6"), scenario, 0)
-    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
-        return list(pool.map(partial(_inexact, scenario, trajectories), range(count)))
-
-
-def _inexact(scenario, trajectories, number: int) -> dict:
-    later = scenario.rig.right_later_std_s * np.random.default_rng([number, 77]).standard_normal()
-    scenario = scenario.with_overrides({"rig.right_later_s": later})
-    robot = load_robot(scenario.robot)
-    plant, true = build_plant(scenario, robot), robot.parameter_sets[scenario.plant.parameters].vector
-    sensor = taught_sensor(scenario, robot, number, SilentProgress())
-    record = excitation_run(plant, sensor, trajectories.excitation, number).record
-    unseen = run_plant(plant, sensor, trajectories.validation[0], 3.0, number, 1)
-    row = {}
-    for name, changes in (("told", {}), ("silent", {"identification.nuisances": []})):
-        model = scenario.with_overrides(changes)
-        result = identify(record, robot, model)
-        done = predicted_runs(
-            robot, model, [unseen.record], result.estimate, result.covariance, number, SilentProgress()
-        )
-        within = np.abs(true_poses(unseen.truth) - done[0].poses) < 1.96 * done[0].std
-        row[name] = row_of(number, result, true) | {"predicted": float(within.mean())}
-    return row
-
-
 @pytest.mark.parametrize("known", ["calibrated", "photographs"])
 def test_intervals_cover_where_cameras_teaching_and_clocks_are_known_only_so_well(known, tmp_path, record_property):
-    """Of parameters, and of the platform's poses on an unseen motion. Without a word of what is not exact, models are
-    called wrong, or their intervals hold far more seldom."""
-    rows = inexact_rows(200, 2, known if known == "calibrated" else photographed(tmp_path / "calibration.json"))
-    share, spread = check_coverage([row["told"] for row in rows])
-    predicted = float(np.mean([row["told"]["predicted"] for row in rows]))
-    silent = [hit for row in rows for *_, seen, hit in row["silent"]["quantities"].values() if seen]
-    record_property(f"covered_{known}", share)
-    record_property(f"covered_std_{known}", spread)
-    record_property(f"covered_poses_{known}", predicted)
-    record_property(
-        f"identified_{known}", sum(seen for row in rows for *_, seen, _ in row["told"]["quantities"].values())
-    )
-    record_property(f"covered_silent_{known}", float(np.mean(silent)) if silent else 0.0)
-    record_property(f"identified_silent_{known}", len(silent))
-    assert LOWEST <= predicted <= HIGHEST
+    """Of parameters, and of the platform's poses on an unseen motion: rows of the study `inexact`. Without a word of
+    what
+    is not exact, models are called wrong, or their intervals hold far more seldom."""
+    study = load_study("inexact").with_settings({"scenario.rig.known": [known]})
+    frame = run_study(study, tmp_path, SilentProgress(), partial(local_cluster, 2)).frame
+    held, poses = share_covered(frame, "intervals", "covered_percent"), frame["poses_covered_percent"].mean() / 100
+    unaware = share_covered(frame, "unaware_intervals", "unaware_covered_percent")
+    for name, figure in (("", held), ("poses_", poses), ("unaware_", unaware)):
+        record_property(f"covered_{name}{known}", float(figure))
+    record_property(f"identified_{known}", float(frame["intervals"].sum()))
+    record_property(f"identified_unaware_{known}", float(frame["unaware_intervals"].sum()))
+    assert not frame["error"].any()
+    assert LOWEST <= held <= HIGHEST
+    assert LOWEST <= poses <= HIGHEST
+    assert unaware < 0.8
+
+
+def share_covered(frame, intervals, percent) -> float:
+    """Of all intervals of all rows, those that hold the truth; rows without one say nothing."""
+    return float((frame[intervals] * frame[percent].fillna(0.0)).sum() / (100.0 * max(frame[intervals].sum(), 1.0)))
