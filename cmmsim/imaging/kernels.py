@@ -145,25 +145,6 @@ class Discs(NamedTuple):
 
 
 @compiled
-def half_planes_of(corners: Array, half_planes: Array) -> int:
-    """Fill half_planes with a, b, c of a x + b y <= c for the sides of a convex polygon (n,2); returns their number,
-    sides of no length being left out."""
-    n, count, middle_x, middle_y = len(corners), 0, 0.0, 0.0
-    for k in range(n):
-        middle_x += corners[k, 0] / n
-        middle_y += corners[k, 1] / n
-    for k in range(n):
-        x, y = corners[k]
-        a, b = corners[(k + 1) % n, 1] - y, x - corners[(k + 1) % n, 0]
-        if abs(a) + abs(b) > 1e-6:
-            outwards = 1.0 if a * (x - middle_x) + b * (y - middle_y) > 0.0 else -1.0
-            half_planes[count, 0], half_planes[count, 1] = outwards * a, outwards * b
-            half_planes[count, 2] = outwards * (a * x + b * y)
-            count += 1
-    return count
-
-
-@compiled
 def polygon_holds(half_planes: Array, x: float, y: float, width: int, height: int) -> bool:
     """Whether the box from (x, y) on lies wholly inside a convex polygon."""
     for k in range(len(half_planes)):

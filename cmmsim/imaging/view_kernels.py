@@ -8,7 +8,7 @@ import numpy as np
 
 from cmmsim.compiled import Array, compiled
 from cmmsim.geometry.disc_kernels import place_discs, probe_discs, project_all
-from cmmsim.imaging.kernels import Discs, Solids, enters, half_planes_of, lay_layers
+from cmmsim.imaging.kernels import Discs, Solids, enters, lay_layers
 
 PROBES = 8  # points on a disc's rim, asked with its middle whether a solid hides them
 NEAREST = 1e-3  # m: a solid that comes nearer has no outline
@@ -59,6 +59,25 @@ def convex_hull(points: Array) -> Array:
             count += 1
         count -= 1  # where one chain ends the other begins
     return hull[: max(count, 1)]
+
+
+@compiled
+def half_planes_of(corners: Array, half_planes: Array) -> int:
+    """Fill half_planes with a, b, c of a x + b y <= c for the sides of a convex polygon (n,2); returns their number,
+    sides of no length being left out."""
+    n, count, middle_x, middle_y = len(corners), 0, 0.0, 0.0
+    for k in range(n):
+        middle_x += corners[k, 0] / n
+        middle_y += corners[k, 1] / n
+    for k in range(n):
+        x, y = corners[k]
+        a, b = corners[(k + 1) % n, 1] - y, x - corners[(k + 1) % n, 0]
+        if abs(a) + abs(b) > 1e-6:
+            outwards = 1.0 if a * (x - middle_x) + b * (y - middle_y) > 0.0 else -1.0
+            half_planes[count, 0], half_planes[count, 1] = outwards * a, outwards * b
+            half_planes[count, 2] = outwards * (a * x + b * y)
+            count += 1
+    return count
 
 
 @compiled
