@@ -37,7 +37,7 @@ def measure_at_rest(
     def block(part: slice) -> ManySeen:
         return measure_exposures(estimator, camera.look_many(poses[part], rngs[part], obstacles), expected[part])
 
-    threads = _threads() if camera.formation.renderer is ANALYTIC else 1  # OpenGL draws in one thread only
+    threads = threads_at_most() if camera.formation.renderer is ANALYTIC else 1  # OpenGL draws in one thread only
     if threads == 1 or len(parts) < 2:
         return [block(part) for part in parts]
     with ThreadPoolExecutor(threads) as pool:
@@ -50,7 +50,7 @@ def expected_at(estimator: PoseEstimator, poses: Array) -> Array:
     return np.array([camera_from_base @ pose_to_transform(pose) for pose in poses]).reshape(-1, 4, 4)
 
 
-def _threads() -> int:
+def threads_at_most() -> int:
     """One a core, or as many as NUMBA_NUM_THREADS says."""
     from numba.core.config import NUMBA_NUM_THREADS  # type: ignore[attr-defined]  # set when it loads, which is slow
 

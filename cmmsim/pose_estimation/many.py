@@ -84,7 +84,7 @@ class ManySeen:
             seen.right_pixels[own],
             ids[own],
             True,
-            common_covariance=self.estimator.common_at(pose),
+            common_at=self.estimator.common_at,
             pixel_variances=seen.pixel_variances[own],
         )
 
