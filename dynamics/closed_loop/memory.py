@@ -65,8 +65,8 @@ class Memory(NamedTuple):
 
 
 LAYOUT = {
-    "task": "equation_of_motion! motion_derivatives! rate_map_derivative! servo_motion! evaluate_terms! evaluate! "
-    "decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! servo_knows! measured! lp li ld kp kd ki "
+    "task": "equation_of_motion! free_acceleration! motion_derivatives! rate_map_derivative! servo_motion! "
+    "evaluate_terms! evaluate! decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! servo_knows! measured! lp li ld kp kd ki "
     "stiffness damping motor_inertia period torques! torque_limit rigid:r coulomb:n viscous:n friction=friction",
     "now": "known=known served=known derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
     "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
@@ -75,8 +75,9 @@ LAYOUT = {
     # first what `equation_of_motion` and `motion_derivatives` return, in their order
     "known": "mass:mm bias:m jacobian:nm bias_acceleration:n angle:n velocity:n factor:mm inputs:i valid!",
     "derivatives": "by_pose:mm by_rate:mm columns:mr crank_by_pose:nm crank_by_rate:nm inputs:d",
-    "evaluation": "state:s slope:s time factor:mm bias:m jacobian:nm bias_acceleration:n angle:n velocity:n spring:n "
-    "error:n torque:n net_torque:n stick_force:n force:n response:nm compliance:nn stuck_factor:nn",
+    # first what `free_acceleration` takes, in its order
+    "evaluation": "factor:mm bias:m jacobian:nm push:n state:s slope:s time bias_acceleration:n angle:n velocity:n "
+    "spring:n error:n torque:n net_torque:n stick_force:n force:n response:nm compliance:nn stuck_factor:nn",
     "tangent": "x:xw trial:xw k:4xw issued:cnw time:w length:w stage_time:w margin:w command:nw command_slope:nw "
     "command_rate:nw last_command:nw velocity:nw torque:nw force:nw last_measured:mw integral:mw demand:mw moved:mw",
 }

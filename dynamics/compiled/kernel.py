@@ -40,9 +40,16 @@ types.Record.mangling_args = property(_record_symbol)  # type: ignore[method-ass
 def kernel(function: Callable[..., Any]) -> Any:
     """A kernel that only kernels call: compiled with each of them, without a door for Python."""
     function.kernel = True  # type: ignore[attr-defined]
-    options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # which numba's stubs do not know
-    return njit(nogil=True, error_model="numpy", **options)(function)
+    return njit(nogil=True, error_model="numpy", **_ONLY_KERNELS)(function)
 
+
+def part(function: Callable[..., Any]) -> Any:
+    """A kernel of a few operations, which becomes a part of those that call it: a call would cost as much."""
+    function.kernel = True  # type: ignore[attr-defined]
+    return njit(nogil=True, error_model="numpy", forceinline=True, **_ONLY_KERNELS)(function)
+
+
+_ONLY_KERNELS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # unknown to numba's stubs
 
 def entry(function: Callable[..., Any]) -> Any:
     """A kernel that Python calls, or kernels by its address: kept in the user's cache with all that it calls."""

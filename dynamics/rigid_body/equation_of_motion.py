@@ -27,11 +27,13 @@ from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 
 def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction]:
     """What the closed loop integrates."""
-    return [equation_of_motion(geometry), motion_derivatives(geometry), rate_map_derivative(geometry)]
+    functions = equation_of_motion, free_acceleration, motion_derivatives, rate_map_derivative
+    return [make(geometry) for make in functions]
 
 
 def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
-    """(q, rate (m,), rigid (p,)) -> M (m, m), b (m,), J_theta (n, m), J_theta_dot rate (n,), theta (n,)."""
+    """(q, rate (m,), rigid (p,)) -> M (m, m), b (m,), J_theta (n, m), J_theta_dot rate (n,), theta (n,), its rate (n,),
+    and the Cholesky factor of M (m, m), see `cholesky`."""
     layout, (q, rate) = parameter_layout(geometry.legs), _coordinates(geometry, "q", "rate")
     motion, free = _poses(geometry, q, rate, 0 * rate), freedoms(geometry)
     rigid = ca.SX.sym("rigid", layout.rigid.stop)
@@ -48,10 +50,22 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
     bias = free.T @ _platform_columns(geometry, joints) @ rigid[0:4]
 
     def end(masses: Sequence[ca.SX], forces: Sequence[ca.SX], *rows: Sequence[ca.SX]) -> list[ca.SX]:
-        return [symmetric_from_lower(sum(masses, mass)), sum(forces, bias), *(ca.vertcat(*row) for row in rows)]
+        jacobian, *of_joints = (ca.vertcat(*row) for row in rows)
+        total = symmetric_from_lower(sum(masses, mass))
+        velocity = ca.vertcat(*(_dot(ca.horzsplit(row), ca.vertsplit(rate)) for row in ca.vertsplit(jacobian)))
+        return [total, sum(forces, bias), jacobian, *of_joints, velocity, cholesky(total)]
 
     at = [joints.pose, joints.rate, joints.gain], motion
     return _parted("equation_of_motion", [q, rate, rigid, *geometry.symbols], parts, end, sides, at)
+
+
+def free_acceleration(geometry: AnyGeometry) -> ca.Function:
+    """(Cholesky factor (m, m), b (m,), J_theta (n, m), torque (n,)) -> q_ddot (m,) under torques at free joints."""
+    size, joints = len(geometry.chart.freedoms), len(geometry.legs)
+    factor, bias = ca.SX.sym("factor", size, size), ca.SX.sym("bias", size)
+    jacobian, torque = ca.SX.sym("jacobian", joints, size), ca.SX.sym("torque", joints)
+    push = [_dot(ca.vertsplit(jacobian[:, j]), ca.vertsplit(torque), -bias[j]) for j in range(size)]
+    return function("free_acceleration", [factor, bias, jacobian, torque], [ca.vertcat(*_solved(factor, push))])
 
 
 def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
@@ -103,6 +117,40 @@ def rate_map_derivative(geometry: AnyGeometry) -> ca.Function:
         rows.append(at_joint.T @ joints.gradient_rate[number] + along)
     outputs = [ca.vertcat(*rows) @ freedoms(geometry)]
     return function("rate_map_derivative", [q, rate, *geometry.symbols], _at(joints, outputs, *motion))
+
+
+def cholesky(matrix: ca.SX) -> ca.SX:
+    """Factor L (m, m) of a symmetric matrix, with the reciprocals of its diagonal: these are NaN or infinite where the
+    matrix is not positive definite."""
+    size = matrix.shape[0]
+    factor = ca.SX.zeros(size, size)
+    for i in range(size):
+        for j in range(i + 1):
+            left = matrix[i, j]
+            for k in range(j):
+                left -= factor[i, k] * factor[j, k]
+            # CasADi makes divisions, which take long, of products with a reciprocal, unless it is hidden from it.
+            factor[i, j] = left * factor[j, j] if i > j else ca.fabs(1 / ca.sqrt(left))
+    return factor
+
+
+def _solved(factor: ca.SX, right: list[ca.SX]) -> list[ca.SX]:
+    """x of L L^T x = right, as `linear_algebra_kernels.solve` has it."""
+    size, found = len(right), list(right)
+    for i in range(size):
+        for k in range(i):
+            found[i] -= factor[i, k] * found[k]
+        found[i] *= factor[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            found[i] -= factor[k, i] * found[k]
+        found[i] *= factor[i, i]
+    return found
+
+
+def _dot(row: Sequence[ca.SX], column: Sequence[ca.SX], start: ca.SX | float = 0.0) -> ca.SX:
+    """The sum of products behind a start, added in order."""
+    return sum((one * other for one, other in zip(row, column, strict=True)), ca.SX(start))
 
 
 def _coordinates(geometry: AnyGeometry, *names: str) -> list[ca.SX]:
