@@ -16,7 +16,7 @@ from dynamics.closed_loop.linear_algebra_kernels import (
     solve_rows,
 )
 from dynamics.closed_loop.motion_kernels import OK, dry_level, dry_slope, hold_compliance, mode_margin, stuck_joints
-from dynamics.compiled.kernel import Array, Record, call, entry, invoke, kernel
+from dynamics.compiled.kernel import Array, Record, call, call_columns, entry, invoke, kernel
 
 FRACTION = (0.0, 0.5, 0.5, 1.0)
 WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
@@ -38,71 +38,69 @@ def differentiate_motion(
 
 
 @kernel
-def torque_tangent(task: Record, now: Record, at: Record, d: Record, x: Array, d_error: Array) -> None:
-    """Derivative of the net torque of every joint; for stuck joints without the friction that holds them."""
-    count, first, width = len(now.mode), 2 * len(at.bias), now.width
-    coulomb, viscous = len(task.rigid), len(task.rigid) + count
-    lp = viscous + count
-    clear(d.torque[:], width)
+def share_with_columns(task: Record, now: Record, at: Record) -> None:
+    """What the derivatives of a slope have in common beside the derivatives of the equation of motion."""
+    known = now.derivatives
+    copy_rows(at.jacobian, known.jacobian, len(at.bias))
+    copy_rows(at.factor, known.factor, len(at.bias))
+    known.gains[0], known.gains[1], known.gains[2] = task.lp, task.li, task.ld
+    for i in range(len(now.mode)):
+        mode, slips = now.mode[i], now.mode[i] != 0
+        known.damping[i] = task.ld
+        if slips:
+            known.damping[i] += task.viscous[i] + task.coulomb[i] * dry_slope(task.friction, at.velocity[i], mode)
+        for j in range(len(at.bias)):
+            known.pushing[i, j] = at.jacobian[i, j] if slips else 0.0
+
+
+@kernel
+def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record) -> None:
+    """What the parameters do at a fixed state: to -M q_ddot - b (`d.push`), and to the torque of each joint without the
+    friction that holds it (`d.direct`)."""
+    count, first, rigid = len(now.mode), 2 * len(at.bias), len(task.rigid)
+    lp = rigid + 2 * count
+    for i in range(len(at.bias)):
+        for k in range(rigid):
+            d.push[i, k] = -now.derivatives.columns[i, k]
     for i in range(count):
-        damping, mode = task.ld, now.mode[i]
-        if mode != 0:
-            damping += task.viscous[i] + task.coulomb[i] * dry_slope(task.friction, at.velocity[i], mode)
-        row = d.torque[i]
-        add_row(task.lp, d_error[i], row, width)
-        add_row(task.ld, d.command_rate[i], row, width)
-        add_row(-damping, d.velocity[i], row, width)
-        add_row(task.li, x[first + i], row, width)
-        row[lp] += at.error[i]
-        row[lp + 1] += at.state[first + i]
-        row[lp + 2] += now.command_rate[i] - at.velocity[i]
-        if mode != 0:
-            row[coulomb + i] -= dry_level(task.friction, at.velocity[i], mode)
-            row[viscous + i] -= at.velocity[i]
+        mode = now.mode[i]
+        d.direct[i, lp] = at.error[i]
+        d.direct[i, lp + 1] = at.state[first + i]
+        d.direct[i, lp + 2] = now.command_rate[i] - at.velocity[i]
+        d.direct[i, rigid + i] = -dry_level(task.friction, at.velocity[i], mode) if mode != 0 else 0.0
+        d.direct[i, rigid + count + i] = -at.velocity[i] if mode != 0 else 0.0
 
 
 @entry
 def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Derivative of the slope at one state, into `d.k[k]`: implicitly, for those of the state and the time in `d.trial`
-    and `d.stage_time`. Also that of the net torques, into `d.torque`.
+    """Derivative of the slope at one state, and behind it of the net torques, into `d.k[k]`: implicitly, for those of
+    the state and the time in `d.trial` and `d.stage_time`. See `slope_derivative`.
     """
-    x, out = d.trial[:], d.k[k]
     size, count, width, known = len(at.bias), len(now.mode), now.width, now.derivatives
-    pose, rate = x[:size], x[size : 2 * size]
-    d_acceleration, d_error = out[size : 2 * size], out[2 * size :]
+    pose, rate = d.trial[:size], d.trial[size : 2 * size]
+    acceleration, torque = d.k[k, size : 2 * size], d.k[k, 2 * size + count :]
     state = at.state
     differentiate_motion(task, now, state[:size], state[size : 2 * size], at.slope[size : 2 * size], at.net_torque[:])
-    copy_rows(rate, out[:size], width)
-    copy_rows(d.command[:], d_error, width)
+    share_with_columns(task, now, at)
+    fixed_state_tangent(task, now, at, d)
+    copy_rows(d.command[:], d.acting[:], width)
     for i in range(count):
         if now.ramping:
-            add_row(at.time, d.command_slope[i], d_error[i], width)
-            add_row(now.command_slope[i], d.stage_time[:], d_error[i], width)
-    clear(d.velocity[:], width)
-    add_product(-1.0, at.jacobian, pose, d_error, width)
-    add_product(0.5, known.crank_by_rate, pose, d.velocity[:], width)
-    add_product(1.0, at.jacobian, rate, d.velocity[:], width)
-    torque_tangent(task, now, at, d, x, d_error)
-    clear(d_acceleration, width)
-    for i in range(size):
-        add_row(-1.0, known.columns[i], d_acceleration[i], len(task.rigid))
-    add_product(-1.0, known.by_pose, pose, d_acceleration, width)
-    add_product(-1.0, known.by_rate, rate, d_acceleration, width)
-    for i in range(count):
-        if now.mode[i] != 0:
-            for j in range(size):
-                add_row(at.jacobian[i, j], d.torque[i], d_acceleration[j], width)
-    solve_rows(at.factor, size, d_acceleration, width)
+            add_row(at.time, d.command_slope[i], d.acting[i], width)
+            add_row(now.command_slope[i], d.stage_time[:], d.acting[i], width)
+    call_columns(task.slope_derivative, known.by_pose, d.trial, d.k[k], width)
     stuck = stuck_joints(now)
+    if len(stuck) == 0:
+        return OK
     clear(d.force[:], width)
     for s in range(len(stuck)):
         for j in range(size):
             add_row(known.crank_by_pose[stuck[s], j], pose[j], d.force[s], width)
             add_row(known.crank_by_rate[stuck[s], j], rate[j], d.force[s], width)
-            add_row(at.jacobian[stuck[s], j], d_acceleration[j], d.force[s], width)
-    give_back(at, d, len(stuck), d_acceleration, width)
+            add_row(at.jacobian[stuck[s], j], acceleration[j], d.force[s], width)
+    give_back(at, d, len(stuck), acceleration, width)
     for s in range(len(stuck)):
-        add_row(1.0, d.force[s], d.torque[stuck[s]], width)
+        add_row(1.0, d.force[s], torque[stuck[s]], width)
     return OK
 
 
@@ -116,13 +114,12 @@ def give_back(at: Record, d: Record, stuck: int, rows: Array, width: int) -> Non
 
 
 @kernel
-def tangent_moved(now: Record, at: Record, d: Record, stage: int, h: float, fraction: float, out: Array) -> None:
-    """out = x + fraction (h slope's derivative + d_length slope) at a stage."""
-    for i in range(len(out)):
-        for k in range(now.width):
-            out[i, k] = d.x[i, k] + fraction * h * d.k[stage, i, k]
+def move_tangent(now: Record, at: Record, d: Record, stage: int, h: float, fraction: float, moved: Array) -> None:
+    """Add fraction (h slope's derivative + d_length slope) at a stage."""
+    for i in range(len(moved)):
+        add_row(fraction * h, d.k[stage, i], moved[i], now.width)
         if now.length_moves:
-            add_row(fraction * at[stage].slope[i], d.length[:], out[i], now.width)
+            add_row(fraction * at[stage].slope[i], d.length[:], moved[i], now.width)
 
 
 @kernel
@@ -150,7 +147,8 @@ def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
         d.stage_time[column] = 1.0
         copy_rows(d.x[:], d.trial[:], width)
         invoke(task.slope_tangent, task, now, end, d, 0)
-        add_row(1.0 if end.stick_force[joint] > 0 else -1.0, d.torque[joint], d.margin[:], width)
+        torque = d.k[0, 2 * size + len(now.mode) + joint]
+        add_row(1.0 if end.stick_force[joint] > 0 else -1.0, torque, d.margin[:], width)
         d.margin[len(task.rigid) + joint] -= task.friction.static_level
     approach = d.margin[column]
     fill(d.length[:], 0.0)
@@ -173,15 +171,14 @@ def step_tangent(task: Record, now: Record, at: Record, d: Record, h: float, eve
         add_row(-1.0, d.time[:], d.length[:], now.width)
     now.length_moves = cut or now.time_moves
     for k in range(4):
-        if k == 0:
-            copy_rows(d.x[:], d.trial[:], now.width)
-        else:
-            tangent_moved(now, at, d, k - 1, h, FRACTION[k], d.trial[:])
+        copy_rows(d.x[:], d.trial[:], now.width)
+        if k > 0:
+            move_tangent(now, at, d, k - 1, h, FRACTION[k], d.trial[:])
         copy(d.time[:], d.stage_time[:])
         add_row(FRACTION[k], d.length[:], d.stage_time[:], now.width)
         invoke(task.slope_tangent, task, now, at[k], d, k)
     for k in range(4):
-        tangent_moved(now, at, d, k, h, WEIGHT[k], d.x[:])
+        move_tangent(now, at, d, k, h, WEIGHT[k], d.x[:])
     if cut:
         length_tangent(task, now, at[END], d)
     add_row(1.0, d.length[:], d.time[:], now.width)

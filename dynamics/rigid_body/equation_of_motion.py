@@ -15,20 +15,27 @@ from collections.abc import Callable, Sequence
 import casadi as ca
 import numpy as np
 
-from dynamics.compiled.lanes import PartedFunction
+from dynamics.compiled.lanes import ColumnFunction, PartedFunction
 from dynamics.expressions import function, symmetric_from_lower
 from dynamics.geometry import AnyGeometry
 from dynamics.kinematics.platform import PlatformJointMotion, pose_rate_to_twist, twist_bias
 from dynamics.legs.leg import Leg
 from dynamics.parameters import parameter_layout
+from dynamics.rigid_body.accelerations import cholesky, free_acceleration, slope_derivative, summed
 from dynamics.rigid_body.jacobians import freedoms
 from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 
 
-def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction]:
+def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction | ColumnFunction]:
     """What the closed loop integrates."""
-    functions = equation_of_motion, free_acceleration, motion_derivatives, rate_map_derivative
-    return [make(geometry) for make in functions]
+    size, layout = len(geometry.chart.freedoms), parameter_layout(geometry.legs)
+    return [
+        equation_of_motion(geometry),
+        free_acceleration(size, layout.joints),
+        motion_derivatives(geometry),
+        rate_map_derivative(geometry),
+        slope_derivative(layout, size),
+    ]
 
 
 def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
@@ -52,20 +59,13 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
     def end(masses: Sequence[ca.SX], forces: Sequence[ca.SX], *rows: Sequence[ca.SX]) -> list[ca.SX]:
         jacobian, *of_joints = (ca.vertcat(*row) for row in rows)
         total = symmetric_from_lower(sum(masses, mass))
-        velocity = ca.vertcat(*(_dot(ca.horzsplit(row), ca.vertsplit(rate)) for row in ca.vertsplit(jacobian)))
+        velocity = ca.vertcat(
+            *(summed(ca.SX(0), ca.horzsplit(row), ca.vertsplit(rate)) for row in ca.vertsplit(jacobian))
+        )
         return [total, sum(forces, bias), jacobian, *of_joints, velocity, cholesky(total)]
 
     at = [joints.pose, joints.rate, joints.gain], motion
     return _parted("equation_of_motion", [q, rate, rigid, *geometry.symbols], parts, end, sides, at)
-
-
-def free_acceleration(geometry: AnyGeometry) -> ca.Function:
-    """(Cholesky factor (m, m), b (m,), J_theta (n, m), torque (n,)) -> q_ddot (m,) under torques at free joints."""
-    size, joints = len(geometry.chart.freedoms), len(geometry.legs)
-    factor, bias = ca.SX.sym("factor", size, size), ca.SX.sym("bias", size)
-    jacobian, torque = ca.SX.sym("jacobian", joints, size), ca.SX.sym("torque", joints)
-    push = [_dot(ca.vertsplit(jacobian[:, j]), ca.vertsplit(torque), -bias[j]) for j in range(size)]
-    return function("free_acceleration", [factor, bias, jacobian, torque], [ca.vertcat(*_solved(factor, push))])
 
 
 def motion_derivatives(geometry: AnyGeometry) -> PartedFunction:
@@ -117,40 +117,6 @@ def rate_map_derivative(geometry: AnyGeometry) -> ca.Function:
         rows.append(at_joint.T @ joints.gradient_rate[number] + along)
     outputs = [ca.vertcat(*rows) @ freedoms(geometry)]
     return function("rate_map_derivative", [q, rate, *geometry.symbols], _at(joints, outputs, *motion))
-
-
-def cholesky(matrix: ca.SX) -> ca.SX:
-    """Factor L (m, m) of a symmetric matrix, with the reciprocals of its diagonal: these are NaN or infinite where the
-    matrix is not positive definite."""
-    size = matrix.shape[0]
-    factor = ca.SX.zeros(size, size)
-    for i in range(size):
-        for j in range(i + 1):
-            left = matrix[i, j]
-            for k in range(j):
-                left -= factor[i, k] * factor[j, k]
-            # CasADi makes divisions, which take long, of products with a reciprocal, unless it is hidden from it.
-            factor[i, j] = left * factor[j, j] if i > j else ca.fabs(1 / ca.sqrt(left))
-    return factor
-
-
-def _solved(factor: ca.SX, right: list[ca.SX]) -> list[ca.SX]:
-    """x of L L^T x = right, as `linear_algebra_kernels.solve` has it."""
-    size, found = len(right), list(right)
-    for i in range(size):
-        for k in range(i):
-            found[i] -= factor[i, k] * found[k]
-        found[i] *= factor[i, i]
-    for i in range(size - 1, -1, -1):
-        for k in range(i + 1, size):
-            found[i] -= factor[k, i] * found[k]
-        found[i] *= factor[i, i]
-    return found
-
-
-def _dot(row: Sequence[ca.SX], column: Sequence[ca.SX], start: ca.SX | float = 0.0) -> ca.SX:
-    """The sum of products behind a start, added in order."""
-    return sum((one * other for one, other in zip(row, column, strict=True)), ca.SX(start))
 
 
 def _coordinates(geometry: AnyGeometry, *names: str) -> list[ca.SX]:
