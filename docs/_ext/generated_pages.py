@@ -78,9 +78,15 @@ FIGURES: dict[str, Callable[[Path], str]] = {
             "intervals": "quantities identified",
             "covered_percent": "of their 95 % intervals hold, %",
             "poses_covered_percent": "of unseen poses within 95 % of the prediction, %",
-            "unaware_intervals": "unaware: quantities identified",
-            "unaware_covered_percent": "unaware: intervals hold, %",
-            "unaware_poses_covered_percent": "unaware: poses, %",
+        },
+    ),
+    "answer_inexact_unaware.md": kept_figures.answer(
+        "inexact_unaware",
+        {"scenario.rig.known": "cameras known"},
+        {
+            "unaware_intervals": "quantities identified",
+            "unaware_covered_percent": "of their 95 % intervals hold, %",
+            "unaware_poses_covered_percent": "of unseen poses within 95 % of the prediction, %",
         },
     ),
     "answer_estimators.md": kept_figures.leaderboard,

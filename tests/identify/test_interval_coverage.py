@@ -150,15 +150,19 @@ def test_intervals_cover_where_cameras_teaching_and_clocks_are_known_only_so_wel
     study = load_study("inexact").with_settings({"scenario.rig.known": [known]})
     frame = run_study(study, tmp_path, SilentProgress(), partial(local_cluster, 2)).frame
     held, poses = share_covered(frame, "intervals", "covered_percent"), frame["poses_covered_percent"].mean() / 100
-    unaware = share_covered(frame, "unaware_intervals", "unaware_covered_percent")
-    for name, figure in (("", held), ("poses_", poses), ("unaware_", unaware)):
-        record_property(f"covered_{name}{known}", float(figure))
-    record_property(f"identified_{known}", float(frame["intervals"].sum()))
-    record_property(f"identified_unaware_{known}", float(frame["unaware_intervals"].sum()))
+    record_property(f"covered_{known}", float(held))
+    record_property(f"covered_poses_{known}", float(poses))
     assert not frame["error"].any()
     assert LOWEST <= held <= HIGHEST
     assert LOWEST <= poses <= HIGHEST
-    assert unaware < 0.8
+
+
+def test_intervals_that_know_nothing_of_it_do_not_hold(tmp_path):
+    """Models are called wrong, and identify nothing, or their intervals hold far more seldom."""
+    study = load_study("inexact").with_settings({"options.unaware": True, "repeats": 30})
+    frame = run_study(study, tmp_path, SilentProgress(), partial(local_cluster, 2)).frame
+    assert share_covered(frame, "unaware_intervals", "unaware_covered_percent") < 0.8
+    assert frame["unaware_intervals"].sum() < 0.5 * frame["intervals"].sum()
 
 
 def share_covered(frame, intervals, percent) -> float:
