@@ -8,6 +8,7 @@ the same whatever motion shows them.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +96,12 @@ def base_parameters(matrix: Array, layout: ParameterLayout) -> BaseParameters:
     order = np.argsort(seen[pivots])
     unseen = tuple(name for k, name in enumerate(names) if k not in seen)
     return BaseParameters(names, combinations[order], tuple(int(k) for k in seen[pivots][order]), unseen, gap)
+
+
+@lru_cache(maxsize=8)
+def structure(robot: Robot) -> BaseParameters:
+    """Base parameters of a robot, whatever moves it, found once. Raises EstimationError as `structural_regressor`."""
+    return base_parameters(structural_regressor(robot), robot.layout)
 
 
 def structural_regressor(robot: Robot, motions: int = MOTIONS, seed: int = 0) -> Array:

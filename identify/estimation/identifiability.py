@@ -40,10 +40,9 @@ from dynamics.parameters import JOINT_PID
 from identify.arrays import Array
 from identify.estimation.base_parameters import (
     BaseParameters,
-    base_parameters,
     rank_by_threshold,
     reference_regressor,
-    structural_regressor,
+    structure,
 )
 from identify.estimation.bounded_least_squares import Solution
 from identify.estimation.bounds import bounded_estimate, combined_std
@@ -236,7 +235,7 @@ def judge(
 ) -> Judgement:
     """Judge what a search found, given its uncertainty and how well it explains the records."""
     robot, guess, estimate = problem.runs[0].robot, problem.guess, solution.parameters
-    base, known = base_parameters(structural_regressor(robot), robot.layout), problem.known_information()
+    base, known = structure(robot), problem.known_information()
     criterion = identifiability(guess, robot, model_holds=explanation.model_holds)
     each = np.eye(len(estimate))
     gain = robot.layout.names.index("joint_pid.lp")

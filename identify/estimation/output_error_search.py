@@ -137,7 +137,9 @@ def _closed_loop_start(problem: OutputErrorProblem, driven: Array) -> Array:
 
 def _with_common_errors(problem: OutputErrorProblem, starts: list[Array]) -> tuple[OutputErrorProblem, Array]:
     """The problem that knows what poses have in common, as a model shows it that runs with the best of some parameters
-    (p,); and these."""
+    (p,); and these. A single start is known to run."""
+    if len(starts) == 1 and not any(run.common.all_names for run in problem.runs):
+        return problem, problem.bounds.nearest(starts[0])
     inside = [start for start in map(problem.bounds.nearest, starts) if np.isfinite(problem.cost(start))]
     told = problem.with_common_errors(inside[0])
     best = min(inside, key=told.cost)

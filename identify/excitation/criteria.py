@@ -28,7 +28,7 @@ from scipy.linalg import qr, solve_triangular
 
 from dynamics import Robot
 from identify.arrays import Array
-from identify.estimation.base_parameters import base_parameters, structural_regressor
+from identify.estimation.base_parameters import structure
 from identify.excitation.motion import Unknowns, log_determinant, motion, played_times, regressor
 from identify.plugins import CRITERIA, chosen
 from identify.scenario import Scenario
@@ -79,7 +79,7 @@ def log_observability(
     `typical` is the z of a trajectory that excites everything; it only sets the scale. `smoothing` [rad/s or m/s]
     smooths the sign of Coulomb friction, which makes the function differentiable.
     """
-    base = base_parameters(structural_regressor(robot), robot.layout)
+    base = structure(robot)
     times = played_times(unknowns.fundamental_hz, unknowns.harmonics, duration_s)
     z = ca.MX.sym("z", unknowns.size)
     if unknowns.coordinates * len(times) < base.rank:

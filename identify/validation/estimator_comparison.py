@@ -22,7 +22,7 @@ from dynamics import DynamicsError, Robot
 from dynamics.errors import ParameterError, SimulationError
 from identify.arrays import Array
 from identify.errors import EstimationError
-from identify.estimation.base_parameters import base_parameters, structural_regressor
+from identify.estimation.base_parameters import structure
 from identify.estimation.covariance import estimate_uncertainty
 from identify.estimation.identifiability import IDENTIFIABLE_SHARE, group_estimates, identifiability
 from identify.estimation.identification import output_error_problem
@@ -152,7 +152,7 @@ def examination(evidence: Evidence, true: Array, unseen: Sequence[tuple[xr.Datas
     if not unseen:
         raise EstimationError("no unseen trajectory to judge the estimators on")
     robot = evidence.run.robot
-    base = base_parameters(structural_regressor(robot), robot.layout)
+    base = structure(robot)
     driven = evidence.problem.driven_by_commands()
     uncertainty = estimate_uncertainty(driven, true, np.random.default_rng(0))
     guess = evidence.problem.guess

@@ -18,7 +18,7 @@ from dynamics.control.inverse_dynamics import Model
 from dynamics.errors import DynamicsError, SimulationError
 from dynamics.inertia import acceleration_changes, grouped, physical_inertias
 from identify.arrays import Array
-from identify.estimation.base_parameters import base_parameters, structural_regressor
+from identify.estimation.base_parameters import structure
 from identify.experiment.sensor_in_loop import OFF_PLATFORM_M, platform_distances, sensor_file
 from identify.loop_parameters import model_settings
 from identify.progress import Progress, SilentProgress
@@ -138,7 +138,7 @@ def _holding(robot: Robot, parameters: Array) -> Iterator[Finding]:
 
 
 def _visible(robot: Robot) -> Iterator[Finding]:
-    found = base_parameters(structural_regressor(robot), robot.layout)
+    found = structure(robot)
     unseen = f"no motion shows {', '.join(found.unseen)}" if found.unseen else "all are seen"
     text = f"{found.rank} base parameters of {len(robot.parameter_names)}; {unseen}"
     yield Finding("base parameters", found.rank > 0, found.rank, None, "1", None, text)
