@@ -90,6 +90,26 @@ FIGURES: dict[str, Callable[[Path], str]] = {
         },
     ),
     "answer_estimators.md": kept_figures.leaderboard,
+    "answer_control_value.md": kept_figures.answer(
+        "control_value",
+        {"options.law": "law", "options.model_error": "error of the model, starting model 1"},
+        {
+            "position_rms_um": "position, µm",
+            "orientation_rms_urad": "orientation, µrad",
+            "position_share_percent": "position over that of `pid`, %",
+            "orientation_share_percent": "orientation over that of `pid`, %",
+        },
+    ),
+    "answer_control_laws.md": kept_figures.answer(
+        "control_laws",
+        {"options.law": "law", "options.model": "model"},
+        {
+            "position_rms_um": "position, µm",
+            "orientation_rms_urad": "orientation, µrad",
+            "position_share_percent": "position over that of `pid`, %",
+            "orientation_share_percent": "orientation over that of `pid`, %",
+        },
+    ),
 }
 
 
