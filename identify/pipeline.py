@@ -25,7 +25,7 @@ from identify.files.run_folder import RunFolder, check_entries, load_result, rms
 from identify.files.versions import versions
 from identify.geometry.outcome import GeometryOutcome
 from identify.geometry.run import calibrated_for_a_run
-from identify.loop_parameters import check_parameter_set
+from identify.loop_parameters import check_parameter_set, settled_drive, with_drive
 from identify.progress import Progress
 from identify.record import recording
 from identify.record.checks import check_length, check_trajectory
@@ -173,7 +173,7 @@ def _identified(
 ) -> _Identified:
     began, robot = time.perf_counter(), known_geometry(scenario, folder).robot
     result = identification.identify(list(records.values()), robot, scenario, progress)
-    reference = recorded_reference(next(iter(records.values())))
+    reference, scenario = recorded_reference(next(iter(records.values()))), with_drive(scenario, result.drive.law)
     before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))
     return _Identified(records, result, (before, after), time.perf_counter() - began)
 
@@ -230,6 +230,7 @@ def validate(folder: Path, progress: Progress, workers: int | None = None, taugh
     files.check_made_of(*RECORDS, run_folder.covariance.name, result=result)
     covariance = files.covariance_of(robot)
     models = _identified_models(robot, run_folder, result)
+    scenario = with_drive(scenario, settled_drive(result["identification"]))
     taught = taught or taught_sensor(scenario, robot, trajectories.seed, progress).taught
     runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, workers, progress, known)
     recording.write_runs(run_folder.validation, [(unseen.record, unseen.truth) for unseen in runs])

@@ -132,7 +132,8 @@ def _failure(problem: LoopProblem, status: int, frame: int, memory: Memory, reco
 
 def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
     start, chart, sizes = problem.start, problem.robot.geometry.chart, problem.sizes
-    slope = start.joint_integral_sensitivity
+    slope, still = start.joint_integral_sensitivity, np.zeros((sizes.joints, sizes.parameters))
+    by_command = still if start.command_sensitivity is None else start.command_sensitivity
     given = {
         "reference": chart.coordinates(problem.reference.poses),
         "reference_rate": chart.coordinates(problem.reference.rates),
@@ -141,12 +142,22 @@ def _plan(problem: LoopProblem, commands: np.ndarray) -> Plan:
         "lost": np.zeros(0, bool) if problem.lost is None else np.ascontiguousarray(problem.lost),
         "noise": np.zeros((0, 0)) if problem.noise is None else chart.coordinates(problem.noise),
         "start_commands": start.commands,
-        "start_integral_sensitivity": np.zeros((sizes.joints, sizes.parameters)) if slope is None else slope,
+        "start_integral_sensitivity": still if slope is None else slope,
+        "start_servo_sensitivity": _servo_sensitivity(problem, by_command),
+        "start_command_sensitivity": by_command,
     }
     views = {name: np.ascontiguousarray(array).view() for name, array in given.items()}
     for view in views.values():  # kernels are compiled for each kind of array that they are given, so all are of one
         view.flags.writeable = False
     return Plan(**views, spans=command_schedule(problem))
+
+
+def _servo_sensitivity(problem: LoopProblem, by_command: np.ndarray) -> np.ndarray:
+    """How the servo's integral (m, p), which makes the command at rest, follows the parameters as that does (n, p)."""
+    ki, size = problem.settings.servo.ki, problem.sizes.coordinates
+    if not ki or not by_command.any() or problem.feedforward is not None:
+        return np.zeros((size, by_command.shape[1]))
+    return np.linalg.solve(problem.servo_robot.coordinate_jacobian(problem.start.pose), by_command) / ki
 
 
 def _fill(
@@ -164,7 +175,9 @@ def _fill(
     for name, found in addresses.items():
         task[name] = found
     task.servo_motion = servo_motion.address
-    rigid, task.coulomb, task.viscous, (task.lp, task.li, task.ld) = problem.robot.layout.split(problem.parameters)
+    rigid, task.coulomb, task.viscous, gains = problem.robot.layout.split(problem.parameters)
+    law = settings.drives.joint_law(gains)
+    task.lp, task.li, task.ld, task.lx, task.rate_weight, task.lx_by, task.reads = law
     task.kp, task.kd, task.ki = settings.servo.kp, settings.servo.kd, settings.servo.ki
     task.friction = settings.friction.record
     task.period = problem.period

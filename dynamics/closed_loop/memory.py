@@ -25,6 +25,8 @@ class Plan(NamedTuple):
     noise: np.ndarray
     start_commands: np.ndarray
     start_integral_sensitivity: np.ndarray
+    start_servo_sensitivity: np.ndarray
+    start_command_sensitivity: np.ndarray
     spans: CommandSchedule
 
 
@@ -66,8 +68,9 @@ class Memory(NamedTuple):
 
 LAYOUT = {
     "task": "equation_of_motion! motion_derivatives! rate_map_derivative! servo_motion! evaluate_terms! evaluate! "
-    "decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! servo_knows! measured! lp li ld kp kd ki "
-    "stiffness damping motor_inertia period torques! torque_limit rigid:r coulomb:n viscous:n friction=friction",
+    "decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! servo_knows! measured! lp li ld lx "
+    "rate_weight lx_by:3 reads:3 kp kd ki stiffness damping motor_inertia period torques! torque_limit rigid:r "
+    "coulomb:n viscous:n friction=friction",
     "now": "known=known served=known derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
     "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
     "command_rate:n last_command:n impulse:n last_measured:m servo_integral:m demand:m change:m rest:m "
@@ -82,14 +85,14 @@ LAYOUT = {
 }
 """Fields of the records: a name with its dimensions by their letters (see `record_type`), one number without. `!` marks
 integers, `=` another record. Angle and velocity of elastic joints are those of the motors; the mass matrix is kept as
-its Cholesky factor; issued commands stay while they are on their way, the last one zero."""
+its Cholesky factor; issued commands stay while they are on their way, the last one is of those of the start."""
 
 
 @lru_cache(maxsize=64)
 def record_type(name: str, sizes: Sizes) -> np.dtype:
     """Layout of a record for a robot."""
     n, m, r = sizes.joints, sizes.coordinates, sizes.rigid
-    length = {"n": n, "m": m, "r": r, "s": 2 * m + 3 * n, "x": 2 * m + n, "4": 4}
+    length = {"n": n, "m": m, "r": r, "s": 2 * m + 3 * n, "x": 2 * m + n, "3": 3, "4": 4}
     g = sizes.geometry
     length |= {
         "M": 2 * m + g,

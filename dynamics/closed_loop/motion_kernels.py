@@ -118,13 +118,23 @@ def evaluate_terms(task: Record, now: Record, at: Record, d: Record, k: int) -> 
             at.spring[i] = task.stiffness * wound + task.damping * winding
             at.angle[i], at.velocity[i] = motor, motor_rate
         at.error[i] = now.command[i] + now.command_slope[i] * at.time - at.angle[i]
-        damped = task.ld * (now.command_rate[i] - at.velocity[i])
+        damped = task.ld * (task.rate_weight * now.command_rate[i] - at.velocity[i])
         at.torque[i] = task.lp * at.error[i] + damped + task.li * state[first + i]
+        if task.lx > 0:
+            at.torque[i] -= task.lx * at.angle[i]
         if task.torques:
             at.torque[i], at.error[i] = now.command[i] + now.command_slope[i] * at.time, 0.0
         if task.torque_limit > 0:
             at.torque[i] = min(max(at.torque[i], -task.torque_limit), task.torque_limit)
     return OK
+
+
+@kernel
+def follows_law(task: Record, at: Record, joint: int) -> float:
+    """1 where the drive's law says what the torque is, 0 where that is commanded, or at its limit."""
+    if task.torques or (task.torque_limit > 0 and abs(at.torque[joint]) >= task.torque_limit):
+        return 0.0
+    return 1.0
 
 
 @kernel

@@ -15,7 +15,15 @@ from dynamics.closed_loop.linear_algebra_kernels import (
     fill,
     solve_rows,
 )
-from dynamics.closed_loop.motion_kernels import OK, dry_level, dry_slope, hold_compliance, mode_margin, stuck_joints
+from dynamics.closed_loop.motion_kernels import (
+    OK,
+    dry_level,
+    dry_slope,
+    follows_law,
+    hold_compliance,
+    mode_margin,
+    stuck_joints,
+)
 from dynamics.compiled.kernel import Array, Record, call, entry, invoke, kernel
 
 FRACTION = (0.0, 0.5, 0.5, 1.0)
@@ -45,17 +53,22 @@ def torque_tangent(task: Record, now: Record, at: Record, d: Record, x: Array, d
     lp = viscous + count
     clear(d.torque[:], width)
     for i in range(count):
-        damping, mode = task.ld, now.mode[i]
+        law, mode, row = follows_law(task, at, i), now.mode[i], d.torque[i]
+        damping = law * task.ld
         if mode != 0:
             damping += task.viscous[i] + task.coulomb[i] * dry_slope(task.friction, at.velocity[i], mode)
-        row = d.torque[i]
-        add_row(task.lp, d_error[i], row, width)
-        add_row(task.ld, d.command_rate[i], row, width)
+        add_row(law * task.lp, d_error[i], row, width)
+        add_row(law * task.rate_weight * task.ld, d.command_rate[i], row, width)
         add_row(-damping, d.velocity[i], row, width)
-        add_row(task.li, x[first + i], row, width)
-        row[lp] += at.error[i]
-        row[lp + 1] += at.state[first + i]
-        row[lp + 2] += now.command_rate[i] - at.velocity[i]
+        add_row(law * task.li, x[first + i], row, width)
+        row[lp] += law * task.reads[0] * at.error[i]
+        row[lp + 1] += law * task.reads[1] * at.state[first + i]
+        row[lp + 2] += law * task.reads[2] * (task.rate_weight * now.command_rate[i] - at.velocity[i])
+        if task.lx > 0:
+            for j in range(len(at.bias)):
+                add_row(-law * task.lx * at.jacobian[i, j], x[j], row, width)
+            for j in range(3):
+                row[lp + j] -= law * task.lx_by[j] * at.angle[i]
         if mode != 0:
             row[coulomb + i] -= dry_level(task.friction, at.velocity[i], mode)
             row[viscous + i] -= at.velocity[i]

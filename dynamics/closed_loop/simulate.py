@@ -14,7 +14,6 @@ import numpy as np
 from dynamics.checks import Shape, check_type, flag, floats, mask, shown, whole
 from dynamics.closed_loop.problem import (
     Controller,
-    Drives,
     EveryFrame,
     FrameTiming,
     LoopProblem,
@@ -87,11 +86,11 @@ def simulate(
     sensitivities = flag("sensitivities", sensitivities, SimulationError) or start_sensitivities
     compiled = flag("compiled", compiled, SimulationError)
     _check_reach(robot, reference)
-    frames, parameters = len(reference.poses), checked_loop_parameters(robot, parameters)
+    frames, parameters = len(reference.poses), checked_loop_parameters(robot, parameters, settings.drives)
     feedforward = _checked_rows("feedforward", feedforward, (frames, robot.layout.joints))
     if start is None:
         known, fed = (servo_robot, settings.elasticity), feedforward is not None
-        start = equilibrium(robot, parameters, reference.poses[0], settings.servo, *known, fed)
+        start = equilibrium(robot, parameters, reference.poses[0], settings.servo, *known, fed, settings.drives)
         start = _driven(robot, parameters, settings, start)
     else:
         check_type("start", start, StartState, SimulationError)
@@ -230,8 +229,6 @@ def _check_together(problem: LoopProblem, servo_robot: Robot | None) -> None:
         "drives that take torques need a controller or commands: the servo commands joints": driven
         and not controlled
         and problem.commands is None,
-        "sensitivities are those of the joint PID: pass settings with the usual drives": derived
-        and problem.settings.drives != Drives(),
         "commands take the place of any controller: pass controller=None": controlled and problem.commands is not None,
     }
     for words, excluded in refusals.items():

@@ -10,10 +10,12 @@ from collections.abc import Sequence
 import xarray as xr
 
 from dynamics import DynamicsError, Robot
+from dynamics.closed_loop import Drives
 from dynamics.closed_loop.problem import checked_loop_parameters
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation.common_errors import common_error_estimates
 from identify.estimation.covariance import DRAWS, estimate_uncertainty
+from identify.estimation.drive_choice import choose_drive
 from identify.estimation.explanation import explanation
 from identify.estimation.identifiability import judge
 from identify.estimation.output_error import OutputErrorProblem
@@ -22,6 +24,7 @@ from identify.estimation.prior import StartingGuess, starting_guess
 from identify.estimation.result import IdentificationResult
 from identify.estimation.scale_anchor import read_anchor
 from identify.estimation.warm_start import linear_warm_start
+from identify.loop_parameters import with_drive
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
 from identify.record.drift import drift_warnings
@@ -46,11 +49,13 @@ def identify(
     start, or that bears the noise. Raises ScenarioError: a parameter set that the robot does not have, or a starting
     guess that no model has. Raises dynamics.DynamicsError: poses that the robot cannot reach.
     """
-    progress = progress or SilentProgress()
+    progress, began = progress or SilentProgress(), time.perf_counter()
     records = [record] if isinstance(record, xr.Dataset) else list(record)
+    drive = choose_drive(lambda named: output_error_problem(records, robot, named), scenario, progress)
+    scenario = with_drive(scenario, drive.law)
     problem = output_error_problem(records, robot, scenario)
     rng = mixed_generator(UNCERTAINTY, recorded_seed(records[0]))
-    began = time.perf_counter()
+    chosen = time.perf_counter()
     warm = linear_warm_start(problem, scenario)
     warmed = time.perf_counter()
     searches = output_error_searches(problem, scenario, warm, progress)
@@ -66,6 +71,7 @@ def identify(
     ended = time.perf_counter()
     return IdentificationResult(
         layout=robot.layout,
+        drive=drive,
         initial=problem.guess.values,
         warm_start=warm,
         estimate=solution.parameters,
@@ -82,8 +88,13 @@ def identify(
         expected_noise_ratio=explained.misfit.expected,
         noise_ratio_std=explained.misfit.std,
         whiteness=explained.whiteness,
-        seconds={"warm_start": warmed - began, "search": searched - warmed, "uncertainty": ended - searched},
-        **vars(judgement) | {"warnings": (*drift_warnings(records), *judgement.warnings)},
+        seconds={
+            "drive": chosen - began,
+            "warm_start": warmed - chosen,
+            "search": searched - warmed,
+            "uncertainty": ended - searched,
+        },
+        **vars(judgement) | {"warnings": (*drift_warnings(records), *drive.warnings(), *judgement.warnings)},
     )
 
 
@@ -112,9 +123,10 @@ def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: 
 def _guess(robot: Robot, scenario: Scenario) -> StartingGuess:
     """The scenario's starting guess. Raises ScenarioError where the robot has none of the name, or no model has it."""
     settings = scenario.identification
-    guess = starting_guess(robot, scenario.model.start_parameters, settings.start_std, settings.prior)
+    law = scenario.model.drive_law
+    guess = starting_guess(robot, scenario.model.start_parameters, settings.start_std, settings.prior, law)
     try:
-        checked_loop_parameters(robot, guess.values)
+        checked_loop_parameters(robot, guess.values, Drives(law=law))
     except DynamicsError as error:
         known = ", ".join(settings.prior) or "nothing"
         raise ScenarioError(

@@ -66,7 +66,9 @@ class Knowledge:
 def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
     """The scenario's starting guess with its prior, anchor and sensor."""
     settings = scenario.identification
-    guess = starting_guess(robot, scenario.model.start_parameters, settings.start_std, settings.prior)
+    guess = starting_guess(
+        robot, scenario.model.start_parameters, settings.start_std, settings.prior, scenario.model.drive_law
+    )
     prior = np.eye(len(robot.layout.names))
     anchor = settings.scale_anchor
     if anchor in MEASURED_PARAMETER:

@@ -45,6 +45,19 @@ FRICTION_CONSTANTS: dict[str, tuple[tuple[str, ...], ...]] = {
 }
 """The constants each law needs, one key of each; it takes no others."""
 
+DriveName = Literal["pid", "pd", "pi", "cascade"]
+"""Laws by which drives make torques of joint commands: the paper's PID, parts of it, or P-PI; `closed_loop.drives`."""
+
+AUTO = "auto"
+
+DRIVE_GAINS: dict[str, tuple[str, ...]] = {
+    "pid": ("lp", "li", "ld"),
+    "pd": ("lp", "ld"),
+    "pi": ("lp", "li"),
+    "cascade": ("lp", "li", "ld"),
+}
+"""Gains that each of them reads."""
+
 ACTUATOR_KEYS = {
     "smoothing_velocity": ("smoothing_velocity_rad_s", "smoothing_velocity_m_s"),
     "stribeck_velocity": ("stribeck_velocity_rad_s", "stribeck_velocity_m_s"),
@@ -81,7 +94,8 @@ class Servo(Section):
 
 
 class Control(Section):
-    """The law by which `cmmsim track` makes the robot follow a motion. All other runs are under the law pid."""
+    """The law by which `cmmsim track` makes the robot follow a motion. All other runs are under the law pid. The torque
+    limit is that of all runs, and the model knows it."""
 
     law: str = Field("pid", description=f"{', '.join(LAWS)}, or module:function")
     observer: bool = Field(
@@ -137,6 +151,10 @@ class Plant(_Friction):
     """
 
     parameters: str = Field("identified", description="named parameter set of the robot file, the truth")
+    drive: DriveName = Field("pid", description="law of the drives: the paper's PID, PD, PI, or a P-PI cascade")
+    drive_gains: dict[str, float] = Field(
+        {}, description="of the drives, instead of the set's: { lp = 10.5, li = 30.0, ld = 0.3 }, in the units of these"
+    )
     steps_per_frame: int = quantity(16, "1", "integration steps a frame; elastic joints take more", ge=1, le=10_000)
     geometry_error_m: float = quantity(
         0.0, "m", "standard deviation of each coordinate of the joint centres from the robot file's", ge=0, le=1e-3
@@ -157,12 +175,35 @@ class Plant(_Friction):
     motor_inertia_kg_m2: float = quantity(3e-4, "kg m2", "share of a driven body's inertia before that spring", gt=0)
     motor_mass_kg: float = quantity(0.3, "kg", "share of its mass, where actuators slide", gt=0)
 
+    @property
+    def drive_law(self) -> DriveName:
+        """Law of the drives."""
+        return self.drive
+
+    @model_validator(mode="after")
+    def _gains_are_those_of_the_law(self) -> "Plant":
+        reads = DRIVE_GAINS[self.drive]
+        for name, value in self.drive_gains.items():
+            if name not in reads or not value > 0:
+                raise ValueError(
+                    f"drive_gains.{name} = {value:g}: the law {self.drive} has the gains {', '.join(reads)}, all > 0"
+                )
+        return self
+
 
 class Model(_Friction):
     """The estimator's model of the robot."""
 
     start_parameters: str = Field("initial", description="named parameter set of the robot file, the starting guess")
+    drive: Literal["pid", "pd", "pi", "cascade", "auto"] = Field(
+        "pid", description="law of the drives; auto: that for which the record speaks"
+    )
     steps_per_frame: int = quantity(4, "1", "integration steps a frame", ge=1, le=10_000)
+
+    @property
+    def drive_law(self) -> DriveName:
+        """Law of the drives; where the record is to tell, that of the paper until it has."""
+        return "pid" if self.drive == "auto" else self.drive
 
 
 class Excitation(Section):

@@ -1,12 +1,12 @@
 """One run of a robot that follows a motion under a law with a model, by the sensor or by what stands for it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynamics.closed_loop import ClosedLoopRun, Drives, RateSensor, Reference
+from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
 from dynamics.control.gains import check_torque_gains
 from dynamics.control.inverse_dynamics import Model
 from dynamics.control.law import Assignment, Feedback, Law, LawInLoop
@@ -16,7 +16,7 @@ from identify.arrays import Array
 from identify.errors import ScenarioError, TrajectoryError
 from identify.experiment.plant import Plant
 from identify.experiment.sensor_in_loop import SensorInLoop
-from identify.loop_parameters import model_settings, of_actuators
+from identify.loop_parameters import model_settings
 from identify.plugins import LAWS, chosen
 from identify.scenario import Scenario
 from identify.tracking.motions import NamedMotion
@@ -121,8 +121,7 @@ def prepared(
         check_motion(robot, desired, times, **scenario.excitation.singularity_limits)
     except DynamicsError as error:
         raise TrajectoryError(f"the robot may not follow {motion.name}: {error}") from error
-    limit = of_actuators(robot, scenario.control, "torque_limit")
-    settings = replace(model_settings(robot, scenario), drives=Drives(torque_limit=limit))
+    settings = model_settings(robot, scenario)
     model, asked = Model(robot, parameters, settings.friction), feedback(scenario)
     usual = np.full(len(times), scenario.timing.latency_s)
     found = chosen_law(

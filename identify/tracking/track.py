@@ -96,7 +96,9 @@ def model_parameters(plant: Plant, model: str, run_folder: Path | None) -> Array
     if model == "true":
         return plant.parameters
     if model == "initial":
-        return starting_guess(robot, plant.scenario.model.start_parameters, 1.0).values
+        return starting_guess(
+            robot, plant.scenario.model.start_parameters, 1.0, drive=plant.scenario.model.drive_law
+        ).values
     assert run_folder is not None
     path, own = run_folder / "result.json", plant.scenario.robot
     RunFolder(run_folder).require("scenario.toml", "result.json")

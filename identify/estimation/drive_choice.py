@@ -1,0 +1,118 @@
+"""Which law the drives have: the evidence of a record for each of those that are known, and how sure it makes one.
+
+Each law is a model of its own: warm start, then the search for the optimum of the output error under the logged
+commands, whose residuals are white. About the optimum the cost is a parabola, so that the evidence, the probability of
+the record with all parameters integrated out over what was known of them before, is (Laplace's method)
+
+    ln p(record | law) = -(cost + ln det W - ln det P) / 2 + the same for all,
+
+W the information of poses and prior at the optimum, P that of the prior: a gain that a law has and the record does not
+need costs what it could have been. Before the record all laws are as probable. Where the best of them misses the
+record by more than noise explains, all costs are divided by its share: what no law explains rules none out.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynamics import DynamicsError
+from dynamics.closed_loop.drives import DRIVES, DriveName
+from identify.errors import EstimationError
+from identify.estimation.output_error import OutputErrorProblem
+from identify.estimation.output_error_search import output_error_searches
+from identify.estimation.warm_start import linear_warm_start
+from identify.progress import Progress, SilentProgress
+from identify.scenario import Scenario
+from identify.scenario.sections import AUTO
+
+SURE = 0.95
+"""Probability from which on a record tells the law."""
+
+
+@dataclass(frozen=True)
+class DriveChoice:
+    """The law of the drives, and how probable each is: 1 for one that the scenario names."""
+
+    law: DriveName
+    probabilities: Mapping[str, float]
+
+    @property
+    def asked(self) -> bool:
+        """Whether the record was asked."""
+        return len(self.probabilities) > 1
+
+    @property
+    def sure(self) -> bool:
+        """Whether the record tells the law."""
+        return self.probabilities[self.law] >= SURE
+
+    def warnings(self) -> tuple[str, ...]:
+        """One line where the record cannot tell."""
+        if self.sure:
+            return ()
+        said = ", ".join(f"{name} {value:.0%}" for name, value in self.probabilities.items() if value >= 0.01)
+        return (
+            f"the record cannot tell the law of the drives ({said}): the gains are those of {self.law}; move the robot "
+            "faster or longer, or state the law in model.drive",
+        )
+
+
+def choose_drive(
+    problem_of: Callable[[Scenario], OutputErrorProblem], scenario: Scenario, progress: Progress
+) -> DriveChoice:
+    """The law that a scenario names or, where it leaves that to the record, the most probable; problem_of: the output
+    error of a scenario that names one.
+
+    Raises EstimationError: no law gives a model that runs; and as `problem_of` does.
+    """
+    if scenario.model.drive != AUTO:
+        return DriveChoice(scenario.model.drive_law, {scenario.model.drive_law: 1.0})
+    found: dict[DriveName, Evidence] = {}
+    failed: EstimationError | None = None
+    with progress.stage("laws of the drives", len(DRIVES)) as advance:
+        for law in DRIVES:
+            own = scenario.with_overrides({"model.drive": law, "identification.method": "command_driven"})
+            try:
+                found[law] = evidence(problem_of(own), own)
+            except (EstimationError, DynamicsError) as error:
+                failed = EstimationError(f"no law of the drives gives a model that runs; {law}: {error}")
+            advance()
+    if not found:
+        assert failed is not None
+        raise failed
+    return DriveChoice(*_weighed(found))
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a record says of a law: cost at the optimum, that of the poses alone over their number, and ln det W - ln
+    det P."""
+
+    cost: float
+    misfit: float
+    narrowed: float
+
+
+def evidence(problem: OutputErrorProblem, scenario: Scenario) -> Evidence:
+    """The evidence for the law of a problem, under a scenario whose method is command_driven.
+
+    Raises EstimationError: no model that runs.
+    """
+    search = output_error_searches(problem, scenario, linear_warm_start(problem, scenario), SilentProgress())
+    found = search["command_driven"]
+    parameters, judged = found.solution.parameters, found.linearised()
+    cost, factor, _ = judged.linearise(parameters)
+    known, _ = judged.known(parameters)
+    poses = 6 * sum(int(np.count_nonzero(run.ok)) for run in judged.runs)
+    narrowed = 2 * np.log(np.abs(np.diag(factor))).sum() - np.linalg.slogdet(judged.known_information())[1]
+    return Evidence(cost, (cost - float(known @ known)) / poses, float(narrowed))
+
+
+def _weighed(found: Mapping[DriveName, Evidence]) -> tuple[DriveName, dict[str, float]]:
+    """The most probable law, and the probability of each; a law that gives no model has none."""
+    misfit = max(1.0, min(one.misfit for one in found.values()))
+    logarithms = {law: -(one.cost / misfit + one.narrowed) / 2 for law, one in found.items()}
+    best = max(logarithms, key=lambda law: logarithms[law])
+    weights = {law: float(np.exp(logarithms[law] - logarithms[best])) if law in found else 0.0 for law in DRIVES}
+    return best, {law: weight / sum(weights.values()) for law, weight in weights.items()}
