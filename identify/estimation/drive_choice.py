@@ -18,9 +18,10 @@ import numpy as np
 
 from dynamics import DynamicsError
 from dynamics.closed_loop.drives import DRIVES, DriveName
+from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.output_error import OutputErrorProblem
-from identify.estimation.output_error_search import output_error_searches
+from identify.estimation.output_error_search import Search, output_error_searches
 from identify.estimation.warm_start import linear_warm_start
 from identify.progress import Progress, SilentProgress
 from identify.scenario import Scenario
@@ -28,6 +29,10 @@ from identify.scenario.sections import AUTO
 
 SURE = 0.95
 """Probability from which on a record tells the law."""
+
+FIRST, HOPELESS = 4, 10.0
+"""Iterations for every law at first, and how many times the best cost they may leave for it to go on: laws that the
+record shows are there by then, while others may search for long."""
 
 
 @dataclass(frozen=True)
@@ -68,20 +73,36 @@ def choose_drive(
     """
     if scenario.model.drive != AUTO:
         return DriveChoice(scenario.model.drive_law, {scenario.model.drive_law: 1.0})
-    found: dict[DriveName, Evidence] = {}
-    failed: EstimationError | None = None
-    with progress.stage("laws of the drives", len(DRIVES)) as advance:
+    with progress.stage("laws of the drives", 2 * len(DRIVES)) as advance:
+        first, failed = {}, []
         for law in DRIVES:
-            own = scenario.with_overrides({"model.drive": law, "identification.method": "command_driven"})
+            own = _asking(scenario, law, FIRST)
             try:
-                found[law] = evidence(problem_of(own), own)
+                problem = problem_of(own)
+                first[law] = _searched(problem, own, linear_warm_start(problem, own))
             except (EstimationError, DynamicsError) as error:
-                failed = EstimationError(f"no law of the drives gives a model that runs; {law}: {error}")
+                failed.append(f"{law}: {error}")
             advance()
-    if not found:
-        assert failed is not None
-        raise failed
+        if not first:
+            raise EstimationError(f"no law of the drives gives a model that runs: {'; '.join(failed)}")
+        limit = HOPELESS * min(one.solution.costs[-1] for one in first.values())
+        found = {}
+        for law, one in first.items():
+            if one.solution.costs[-1] <= limit:
+                own = _asking(scenario, law, scenario.identification.max_iterations)
+                found[law] = evidence(_searched(problem_of(own), own, one.solution.parameters))
+        advance(len(DRIVES))
     return DriveChoice(*_weighed(found))
+
+
+def _asking(scenario: Scenario, law: DriveName, iterations: int) -> Scenario:
+    searched = {"identification.method": "command_driven", "identification.max_iterations": iterations}
+    return scenario.with_overrides({"model.drive": law, **searched})
+
+
+def _searched(problem: OutputErrorProblem, scenario: Scenario, start: Array) -> Search:
+    """The search for the optimum under the logged commands. Raises EstimationError: no model that runs."""
+    return output_error_searches(problem, scenario, start, SilentProgress())["command_driven"]
 
 
 @dataclass(frozen=True)
@@ -94,13 +115,8 @@ class Evidence:
     narrowed: float
 
 
-def evidence(problem: OutputErrorProblem, scenario: Scenario) -> Evidence:
-    """The evidence for the law of a problem, under a scenario whose method is command_driven.
-
-    Raises EstimationError: no model that runs.
-    """
-    search = output_error_searches(problem, scenario, linear_warm_start(problem, scenario), SilentProgress())
-    found = search["command_driven"]
+def evidence(found: Search) -> Evidence:
+    """What a finished search says of its law. Raises LoopFailure."""
     parameters, judged = found.solution.parameters, found.linearised()
     cost, factor, _ = judged.linearise(parameters)
     known, _ = judged.known(parameters)
