@@ -95,7 +95,7 @@ class Plant:
             mismatch=self._mismatch(run),
             prismatic=self.robot.layout.prismatic,
         )
-        switches = self.scenario.plant.model_dump(exclude_none=True)
+        switches = self.scenario.plant.model_dump(exclude_none=True, exclude={"drive_gains"})  # parameters hold them
         return truth.assign_attrs({f"plant_{name}": value for name, value in switches.items()})
 
     def _mismatch(self, run: ClosedLoopRun) -> dict[str, ArrayLike]:

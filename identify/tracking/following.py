@@ -1,12 +1,12 @@
 """One run of a robot that follows a motion under a law with a model, by the sensor or by what stands for it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynamics.closed_loop import ClosedLoopRun, RateSensor, Reference
+from dynamics.closed_loop import ClosedLoopRun, DriveName, RateSensor, Reference
 from dynamics.control.gains import check_torque_gains
 from dynamics.control.inverse_dynamics import Model
 from dynamics.control.law import Assignment, Feedback, Law, LawInLoop
@@ -88,13 +88,20 @@ def by_drawing(covariance: Array, lost: NDArray[np.bool_], rng: np.random.Genera
 
 
 def follow(
-    plant: Plant, law: str, parameters: Array, motion: NamedMotion, seen: Seen, latencies: Array | None = None
+    plant: Plant,
+    law: str,
+    parameters: Array,
+    motion: NamedMotion,
+    seen: Seen,
+    latencies: Array | None = None,
+    drive: DriveName | None = None,
 ) -> Followed:
-    """Follow a motion under a law with a model of these parameters (p,); latencies (N,), s, where they vary.
+    """Follow a motion under a law with a model of these parameters (p,); latencies (N,), s, where they vary; drive: the
+    law of its drives, where that is not the scenario's model's.
 
     Raises what `prepared` does, and LoopFailure: a loop that is lost.
     """
-    in_loop = prepared(plant, law, parameters, motion, seen, latencies)
+    in_loop = prepared(plant, law, parameters, motion, seen, latencies, drive)
     times = plant.scenario.timing.frame_times(motion.duration_s)
     reference = Reference(motion.motion.pose(times), motion.motion.pose_rate(times))
     run = plant.run(reference, RateSensor(seen.measure), latencies, law=in_loop)
@@ -106,7 +113,13 @@ def follow(
 
 
 def prepared(
-    plant: Plant, law: str, parameters: Array, motion: NamedMotion, seen: Seen, latencies: Array | None = None
+    plant: Plant,
+    law: str,
+    parameters: Array,
+    motion: NamedMotion,
+    seen: Seen,
+    latencies: Array | None = None,
+    drive: DriveName | None = None,
 ) -> LawInLoop:
     """A law ready to follow a motion.
 
@@ -122,6 +135,7 @@ def prepared(
     except DynamicsError as error:
         raise TrajectoryError(f"the robot may not follow {motion.name}: {error}") from error
     settings = model_settings(robot, scenario)
+    settings = replace(settings, drives=replace(settings.drives, law=drive or settings.drives.law))
     model, asked = Model(robot, parameters, settings.friction), feedback(scenario)
     usual = np.full(len(times), scenario.timing.latency_s)
     found = chosen_law(

@@ -185,9 +185,9 @@ def test_the_identified_model_is_that_of_a_run(tmp_path):
     run.scenario.write_text(chosen.scenario.to_toml())
     estimates = {name: {"estimate": float(k)} for k, name in enumerate(rss6().layout.names)}
     save_result(run.result, {"identification": {"parameters": estimates}})
-    known = tracking.model_parameters(chosen, "identified", tmp_path)
+    known = tracking.known_model(chosen, "identified", tmp_path).parameters
     assert np.array_equal(known, np.arange(len(estimates)))
-    said = refusal(RecordError, tracking.model_parameters, plant(robot="rus6"), "identified", tmp_path)
+    said = refusal(RecordError, tracking.known_model, plant(robot="rus6"), "identified", tmp_path)
     assert "holds a run of rss6, not of rus6" in said
 
 
