@@ -195,7 +195,7 @@ def conditioning(
     """Conditioning of an estimate (p,) from the information (p, p) of the poses and of what is known beside them."""
     everything = np.linalg.eigvalsh((information + known) * np.outer(guess.std, guess.std))
     count = base.combinations.shape[1]
-    gains = count + np.flatnonzero(~guess.fixed[count:])
+    gains = count + np.flatnonzero(np.diag(information)[count:])  # without those that the law of the drives lacks
     seen = np.concatenate([base.pivots, gains])
     size = np.concatenate([np.sqrt(base.combinations**2 @ guess.std[:count] ** 2), guess.std[gains]])
     values = np.concatenate([base.combinations @ estimate[:count], estimate[gains]])

@@ -51,9 +51,11 @@ def identify(
     """
     progress, began = progress or SilentProgress(), time.perf_counter()
     records = [record] if isinstance(record, xr.Dataset) else list(record)
-    drive = choose_drive(lambda named: output_error_problem(records, robot, named), scenario, progress)
-    scenario = with_drive(scenario, drive.law)
     problem = output_error_problem(records, robot, scenario)
+    drive = choose_drive(lambda named: output_error_problem(records, robot, named), scenario, progress)
+    if drive.asked:
+        scenario = with_drive(scenario, drive.law)
+        problem = output_error_problem(records, robot, scenario)
     rng = mixed_generator(UNCERTAINTY, recorded_seed(records[0]))
     chosen = time.perf_counter()
     warm = linear_warm_start(problem, scenario)
