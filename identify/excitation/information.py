@@ -22,7 +22,8 @@ joint error that the PID needs for them,
 
     d(pose)/d(Xi) = -S Y,    d(pose)/d(lp, li, ld) = S (e, e / s, e s).
 
-One period in the steady state counts for all, so the start of the run is left out.
+One period in the steady state counts for all, so the start of the run is left out, as are what the drives of a cascade
+have beside a PID's terms.
 """
 
 from dataclasses import dataclass

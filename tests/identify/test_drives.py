@@ -2,19 +2,21 @@
 
 import os
 from concurrent.futures import ProcessPoolExecutor
+from typing import get_args
 
 import numpy as np
 import pytest
 
 from dynamics.closed_loop import stability
-from dynamics.closed_loop.drives import DRIVES, cascade_gains
-from identify.errors import ScenarioError
+from dynamics.closed_loop.drives import DRIVES, READS, cascade_gains
+from identify.errors import EstimationError, ScenarioError
 from identify.estimation.drive_choice import choose_drive
 from identify.estimation.identification import identify, output_error_problem
 from identify.experiment.plant import build_plant
 from identify.loop_parameters import settled_drive, with_drive
 from identify.progress import SilentProgress
-from identify.scenario.sections import DRIVE_GAINS
+from identify.reporting.parameter_tables import drive_sentence, unidentified
+from identify.scenario.sections import DRIVE_GAINS, DriveName
 from tests.identify.synthetic import LAYOUT, NAMES, quick, rss6, run_plant
 
 GAINS = {"lp": 10.5, "li": 11.4, "ld": 0.164}
@@ -123,3 +125,30 @@ def test_a_law_that_was_settled_holds_for_the_stages_that_follow():
     asked = quick(**{"model.drive": "auto"})
     assert with_drive(asked, settled_drive({"drive": {"law": "pi"}})).model.drive == "pi"
     assert with_drive(quick(), "pi").model.drive == "pid"
+
+
+def test_scenarios_know_the_laws_and_gains_that_the_drives_have():
+    assert get_args(DriveName) == DRIVES
+    assert dict(READS) == DRIVE_GAINS
+
+
+def test_the_report_says_how_the_law_is_known():
+    usual = {"law": "pid", "decided_by": "scenario", "sure": True, "probabilities": {"pid": 1.0}, "fixed_at_zero": []}
+    assert drive_sentence({"drive": usual}) == drive_sentence({}) == ""
+    told = {"law": "pd", "decided_by": "record", "sure": False, "probabilities": {"pid": 0.3, "pd": 0.7, "pi": 0.0}}
+    said = drive_sentence({"drive": usual | told})
+    assert said == (
+        "The law of the drives is a PD: no integral; the record cannot tell: this is the most probable (probability "
+        "70 %; pid 30 %)."
+    )
+    left = {"joint_pid.li": {"identifiable": False}, "joint_pid.lp": {"identifiable": True}}
+    reasons = unidentified({"parameters": left, "drive": told | {"fixed_at_zero": ["joint_pid.li"]}})
+    assert reasons == [("the law of the drives has no such gain", ["joint_pid.li"])]
+
+
+def test_a_record_of_which_no_law_gives_a_model_is_refused_with_the_reasons():
+    def problem_of(named):
+        raise EstimationError(f"nothing under {named.model.drive}")
+
+    with pytest.raises(EstimationError, match="no law of the drives gives a model that runs: pid: nothing under pid; "):
+        choose_drive(problem_of, quick(**{"model.drive": "auto"}), SilentProgress())
