@@ -15,7 +15,7 @@ from identify.arrays import Array
 from identify.errors import RecordError, ScenarioError
 from identify.files.run_folder import load_result
 from identify.scenario import Model, Plant, Scenario
-from identify.scenario.sections import ACTUATOR_KEYS, AUTO, Section
+from identify.scenario.sections import ACTUATOR_KEYS, AUTO, FILTERED, Section
 
 NOMINAL = "initial"
 """The parameter set that is meant where none is named."""
@@ -39,13 +39,22 @@ def loop_settings(robot: Robot, scenario: Scenario, side: Plant | Model) -> Loop
         timing=FrameTiming(timing.frame_rate_hz, timing.latency_s, timing.hold),
         friction=FrictionLaw(side.friction, velocities[0], side.static_ratio, velocities[1]),
         steps_per_frame=side.steps_per_frame,
-        drives=Drives(torque_limit=of_actuators(robot, scenario.control, "torque_limit"), law=side.drive_law),
+        drives=Drives(
+            torque_limit=of_actuators(robot, scenario.control, "torque_limit"),
+            law=side.drive_law,
+            filter_time=side.derivative_filter_s if side.drive_law == FILTERED else None,
+        ),
     )
 
 
 def with_drive(scenario: Scenario, law: DriveName) -> Scenario:
     """The scenario with the law of the drives that an identification settled, where it leaves that to the record."""
-    return scenario.with_overrides({"model.drive": law}) if scenario.model.drive == AUTO else scenario
+    return scenario.with_overrides(drive_settings(law)) if scenario.model.drive == AUTO else scenario
+
+
+def drive_settings(law: DriveName) -> dict[str, str | None]:
+    """Settings of a model whose drives have a law, where the scenario leaves it to the record, by dotted path."""
+    return {"model.drive": law} | ({} if law == FILTERED else {"model.derivative_filter_s": None})
 
 
 def settled_drive(identification: Any) -> DriveName:

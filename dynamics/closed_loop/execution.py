@@ -177,7 +177,8 @@ def _fill(
     task.servo_motion = servo_motion.address
     rigid, task.coulomb, task.viscous, gains = problem.robot.layout.split(problem.parameters)
     law = settings.drives.joint_law(gains)
-    task.lp, task.li, task.ld, task.lx, task.rate_weight, task.lx_by, task.reads = law
+    for name, value in law._asdict().items():
+        task[name] = value
     task.kp, task.kd, task.ki = settings.servo.kp, settings.servo.kd, settings.servo.ki
     task.friction = settings.friction.record
     task.period = problem.period
@@ -190,10 +191,11 @@ def _fill(
         task.motor_inertia = settings.elasticity.motor_inertia
     task.rigid = rigid
     rest = np.zeros(sizes.joints)
+    filtered = rest[: sizes.filters] if start.filtered_rate is None else start.filtered_rate[: sizes.filters]
     motor = [rest if part is None else part for part in (start.motor_angle, start.motor_rate)]
     chart = problem.robot.geometry.chart
     now.state = np.concatenate(
-        [chart.coordinates(start.pose), chart.coordinates(start.pose_rate), start.joint_integral, *motor]
+        [chart.coordinates(start.pose), chart.coordinates(start.pose_rate), start.joint_integral, filtered, *motor]
     )
     now.servo_integral, now.last_measured = start.servo_integral, chart.coordinates(start.last_measured)
     now.last_command = start.commands[-1] if problem.feedforward is None else 0.0

@@ -48,14 +48,16 @@ def keep_state(task: Record, now: Record, d: Record, record: Record, k: int) -> 
     for i in range(count):
         record.joint_integral[k, i] = now.state[2 * size + i]
         if task.stiffness > 0:
-            record.motor_angle[k, i] = now.state[2 * size + count + i]
-            record.motor_rate[k, i] = now.state[2 * size + 2 * count + i]
+            record.motor_angle[k, i] = now.state[len(now.state) - 2 * count + i]
+            record.motor_rate[k, i] = now.state[len(now.state) - count + i]
+        if task.filter_time > 0:
+            record.filtered_rate[k, i] = now.state[2 * size + count + i]
     if not task.sensitivities:
         return
     keep_rows(now, d.x[:size], record.pose_sensitivity[k], record.start_sensitivity[k])
     if k + 1 == len(record.pose):
-        rows = len(d.x)
-        keep_rows(now, d.x[:], record.end_sensitivity[:rows], record.end_start_sensitivity[:rows])
+        rows = 2 * size + count
+        keep_rows(now, d.x[:rows], record.end_sensitivity[:rows], record.end_start_sensitivity[:rows])
         keep_rows(now, d.integral[:], record.end_sensitivity[rows:], record.end_start_sensitivity[rows:])
 
 

@@ -33,7 +33,7 @@ class Plan(NamedTuple):
 RECORDED = (
     "pose:fm pose_rate:fm torque:fn command:fn measured:fm measured_ok:f joint_integral:fn servo_integral:fm "
     "pose_sensitivity:fmp start_sensitivity:fms end_sensitivity:Sp end_start_sensitivity:Ss "
-    "motor_angle:en motor_rate:en"
+    "motor_angle:en motor_rate:en filtered_rate:Fn"
 )
 """What a run writes (see `ClosedLoopRun`), with its dimensions by their letters (see `empty_record`)."""
 
@@ -47,6 +47,7 @@ def empty_record(problem: LoopProblem) -> Any:
     length["p"] = sizes.parameters if problem.sensitivities else 0
     length["s"] = sizes.start if problem.start_sensitivities else 0
     length["e"] = frames if problem.settings.elasticity else 0
+    length["F"] = frames if sizes.filters else 0
     shapes = [tuple(length[letter] for letter in letters) for letters in re.findall(r":(\w+)", RECORDED)]
     return Record(*[np.zeros(shape, bool if len(shape) == 1 else float) for shape in shapes])
 
@@ -69,8 +70,8 @@ class Memory(NamedTuple):
 LAYOUT = {
     "task": "equation_of_motion! motion_derivatives! rate_map_derivative! servo_motion! evaluate_terms! evaluate! "
     "decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! servo_knows! measured! lp li ld lx "
-    "rate_weight lx_by:3 reads:3 kp kd ki stiffness damping motor_inertia period torques! torque_limit rigid:r "
-    "coulomb:n viscous:n friction=friction",
+    "rate_weight lx_by:3 reads:3 kp kd ki stiffness damping motor_inertia period torques! torque_limit filter_time "
+    "rigid:r coulomb:n viscous:n friction=friction",
     "now": "known=known served=known derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
     "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
     "command_rate:n last_command:n impulse:n last_measured:m servo_integral:m demand:m change:m rest:m "
@@ -91,8 +92,8 @@ its Cholesky factor; issued commands stay while they are on their way, the last 
 @lru_cache(maxsize=64)
 def record_type(name: str, sizes: Sizes) -> np.dtype:
     """Layout of a record for a robot."""
-    n, m, r = sizes.joints, sizes.coordinates, sizes.rigid
-    length = {"n": n, "m": m, "r": r, "s": 2 * m + 3 * n, "x": 2 * m + n, "3": 3, "4": 4}
+    n, m, r, f = sizes.joints, sizes.coordinates, sizes.rigid, sizes.filters
+    length = {"n": n, "m": m, "r": r, "s": 2 * m + 3 * n + f, "x": 2 * m + n + f, "3": 3, "4": 4}
     g = sizes.geometry
     length |= {
         "M": 2 * m + g,

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from dynamics.checks import Shape, check_choice, check_type, floats, real, whole
-from dynamics.closed_loop.drives import ABOVE_ZERO, PID, READS, Drives
+from dynamics.closed_loop.drives import ABOVE_ZERO, PID, READS, DriveName, Drives
 from dynamics.closed_loop.joints import FrictionLaw, JointElasticity
 from dynamics.errors import SimulationError
 from dynamics.legs.numbers import MOST_NUMBERS
@@ -123,7 +123,7 @@ class Reference:
         return f"Reference({len(self.poses)} frames)"
 
 
-OPTIONAL = ("joint_integral_sensitivity", "command_sensitivity", "motor_angle", "motor_rate")
+OPTIONAL = ("joint_integral_sensitivity", "command_sensitivity", "motor_angle", "motor_rate", "filtered_rate")
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,8 @@ class StartState:
     last_measured (6,): the pose measured one frame before; both are records.
     joint_integral_sensitivity, command_sensitivity (n, p): how the joint PID integral and the commands before, with the
     servo integral that makes them, follow the parameters; None where they are just given.
-    motor_angle (n,) and motor_rate (n,): of elastic joints only.
+    motor_angle (n,) and motor_rate (n,): of elastic joints only. filtered_rate (n,): of the errors, in drives that
+    filter it; None: none.
     Raises SimulationError for a wrong shape or a number that is not finite; the sizes of a robot are asked for when a
     run begins.
     """
@@ -151,6 +152,7 @@ class StartState:
     command_sensitivity: np.ndarray | None = None
     motor_angle: np.ndarray | None = None
     motor_rate: np.ndarray | None = None
+    filtered_rate: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         poses: dict[str, Shape] = dict.fromkeys(("pose", "pose_rate", "last_measured"), (6,))
@@ -166,7 +168,9 @@ class StartState:
     def check_sizes(self, robot: Robot) -> None:
         """Raise SimulationError, naming the part, where this is no state of a robot."""
         joints, parameters = robot.layout.joints, len(robot.layout.names)
-        wanted: dict[str, tuple[int, ...]] = dict.fromkeys(("joint_integral", "motor_angle", "motor_rate"), (joints,))
+        wanted: dict[str, tuple[int, ...]] = dict.fromkeys(
+            ("joint_integral", "motor_angle", "motor_rate", "filtered_rate"), (joints,)
+        )
         wanted |= {"servo_integral": (len(robot.coordinate_names),), "commands": (len(self.commands), joints)}
         wanted |= dict.fromkeys(("joint_integral_sensitivity", "command_sensitivity"), (joints, parameters))
         for name, shape in wanted.items():
@@ -179,12 +183,13 @@ class StartState:
 class Sizes:
     """Numbers of joints, of coordinates of the platform, of parameters of the rigid bodies, and room for so many
     geometric numbers, the last arguments of functions (see `Robot.moved`): the same for most robots, as kernels are
-    compiled for sizes."""
+    compiled for sizes; filters: joints whose drives filter a rate."""
 
     joints: int
     coordinates: int
     rigid: int
     geometry: int = 0
+    filters: int = 0
 
     @property
     def parameters(self) -> int:
@@ -240,11 +245,12 @@ class LoopProblem:
             joints=motion.outputs[2][0],
             coordinates=motion.inputs[0],
             rigid=motion.inputs[2],
+            filters=motion.outputs[2][0] if self.settings.drives.filter_time else 0,
             geometry=max(MOST_NUMBERS * motion.outputs[2][0], len(motion.constants), len(known.constants)),
         )
 
 
-def checked_loop_parameters(robot: Robot, parameters: object, drives: Drives = PID) -> np.ndarray:
+def checked_loop_parameters(robot: Robot, parameters: object, drive: DriveName = "pid") -> np.ndarray:
     """The dynamic parameters of a robot and lp, li, ld, as the law of its drives needs them. Raises SimulationError, or
     ParameterError for a dynamic one."""
     layout = robot.layout
@@ -252,8 +258,8 @@ def checked_loop_parameters(robot: Robot, parameters: object, drives: Drives = P
     layout.check(values[layout.dynamic])
     for name, value in zip(layout.joint_pid_names, values[layout.joint_pid], strict=True):
         gain = name.split(".")[1]
-        least, above = (None, 0) if gain in ABOVE_ZERO[drives.law] else (0, None)
-        if gain not in READS[drives.law]:
+        least, above = (None, 0) if gain in ABOVE_ZERO[drive] else (0, None)
+        if gain not in READS[drive]:
             least = None
         real(name, value, SimulationError, least=least, above=above)
     return values
@@ -283,7 +289,7 @@ def equilibrium(
     """
     check_type("robot", robot, Robot, SimulationError)
     check_type("servo", servo, ServoGains, SimulationError)
-    parameters, pose = checked_loop_parameters(robot, parameters, drives), floats("pose", pose, (6,))
+    parameters, pose = checked_loop_parameters(robot, parameters, drives.law), floats("pose", pose, (6,))
     rest, free, law = np.zeros(6), robot.geometry.chart.basis, drives.joint_law(parameters[robot.layout.joint_pid])
     check_start_pose(robot, parameters, pose)
     angles = robot.inverse_kinematics(pose)

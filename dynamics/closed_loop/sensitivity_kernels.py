@@ -54,16 +54,20 @@ def torque_tangent(task: Record, now: Record, at: Record, d: Record, x: Array, d
     clear(d.torque[:], width)
     for i in range(count):
         law, mode, row = follows_law(task, at, i), now.mode[i], d.torque[i]
-        damping = law * task.ld
+        damping = law * task.ld if task.filter_time == 0 else 0.0
         if mode != 0:
             damping += task.viscous[i] + task.coulomb[i] * dry_slope(task.friction, at.velocity[i], mode)
         add_row(law * task.lp, d_error[i], row, width)
-        add_row(law * task.rate_weight * task.ld, d.command_rate[i], row, width)
+        if task.filter_time > 0:
+            add_row(law * task.ld, x[first + count + i], row, width)
+        else:
+            add_row(law * task.rate_weight * task.ld, d.command_rate[i], row, width)
         add_row(-damping, d.velocity[i], row, width)
         add_row(law * task.li, x[first + i], row, width)
         row[lp] += law * task.reads[0] * at.error[i]
         row[lp + 1] += law * task.reads[1] * at.state[first + i]
-        row[lp + 2] += law * task.reads[2] * (task.rate_weight * now.command_rate[i] - at.velocity[i])
+        rate = task.rate_weight * now.command_rate[i] - at.velocity[i]
+        row[lp + 2] += law * task.reads[2] * (rate if task.filter_time == 0 else at.state[first + count + i])
         if task.lx > 0:
             for j in range(len(at.bias)):
                 add_row(-law * task.lx * at.jacobian[i, j], x[j], row, width)
@@ -74,6 +78,16 @@ def torque_tangent(task: Record, now: Record, at: Record, d: Record, x: Array, d
             row[viscous + i] -= at.velocity[i]
 
 
+@kernel
+def filtered_tangent(task: Record, now: Record, d: Record, filtered: Array, out: Array) -> None:
+    """Derivative of the slope of the filtered rates of the errors."""
+    clear(out, now.width)
+    for i in range(len(now.mode)):
+        add_row(task.rate_weight / task.filter_time, d.command_rate[i], out[i], now.width)
+        add_row(-1 / task.filter_time, d.velocity[i], out[i], now.width)
+        add_row(-1 / task.filter_time, filtered[i], out[i], now.width)
+
+
 @entry
 def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
     """Derivative of the slope at one state, into `d.k[k]`: implicitly, for those of the state and the time in `d.trial`
@@ -82,7 +96,7 @@ def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> i
     x, out = d.trial[:], d.k[k]
     size, count, width, known = len(at.bias), len(now.mode), now.width, now.derivatives
     pose, rate = x[:size], x[size : 2 * size]
-    d_acceleration, d_error = out[size : 2 * size], out[2 * size :]
+    d_acceleration, d_error = out[size : 2 * size], out[2 * size : 2 * size + count]
     state = at.state
     differentiate_motion(task, now, state[:size], state[size : 2 * size], at.slope[size : 2 * size], at.net_torque[:])
     copy_rows(rate, out[:size], width)
@@ -96,6 +110,8 @@ def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> i
     add_product(0.5, known.crank_by_rate, pose, d.velocity[:], width)
     add_product(1.0, at.jacobian, rate, d.velocity[:], width)
     torque_tangent(task, now, at, d, x, d_error)
+    if task.filter_time > 0:
+        filtered_tangent(task, now, d, x[2 * size + count :], out[2 * size + count :])
     clear(d_acceleration, width)
     for i in range(size):
         add_row(-1.0, known.columns[i], d_acceleration[i], len(task.rigid))

@@ -86,7 +86,7 @@ def simulate(
     sensitivities = flag("sensitivities", sensitivities, SimulationError) or start_sensitivities
     compiled = flag("compiled", compiled, SimulationError)
     _check_reach(robot, reference)
-    frames, parameters = len(reference.poses), checked_loop_parameters(robot, parameters, settings.drives)
+    frames, parameters = len(reference.poses), checked_loop_parameters(robot, parameters, settings.drives.law)
     feedforward = _checked_rows("feedforward", feedforward, (frames, robot.layout.joints))
     if start is None:
         known, fed = (servo_robot, settings.elasticity), feedforward is not None

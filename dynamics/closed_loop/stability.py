@@ -71,7 +71,7 @@ def _with_desired(robot: _NearRest, settings: LoopSettings) -> np.ndarray:
     period, servo = 1 / timing.frame_rate_hz, _servo(robot, settings)
     whole = floor(timing.latency_s / period + 1e-9)
     rest = max(0.0, timing.latency_s - whole * period)
-    inner, kept = 2 * size + joints, whole + 2
+    inner, kept = len(robot.motion) - 3 * joints, whole + 2
     states = inner + 2 * size + kept * joints
     start, desired = np.eye(states, states + size), np.eye(size, states + size, states)
     coordinates, integral = start[:size] - desired, start[inner + size : inner + 2 * size]
@@ -143,7 +143,7 @@ class _NearRest(NamedTuple):
 
 
 def _near_rest(robot: Robot, parameters: np.ndarray, pose: np.ndarray, drives: Drives) -> _NearRest:
-    parameters = checked_loop_parameters(robot, parameters, drives)
+    parameters = checked_loop_parameters(robot, parameters, drives.law)
     check_start_pose(robot, parameters, pose)
     jacobian, law = robot.coordinate_jacobian(pose), drives.joint_law(parameters[robot.layout.joint_pid])
     holding = robot.static_torque(pose, parameters[robot.layout.dynamic])
@@ -157,25 +157,35 @@ def _radius(robot: _NearRest, settings: LoopSettings) -> float:
 
 
 def _joint_loop(robot: Robot, parameters: np.ndarray, pose: np.ndarray, law: JointLaw) -> np.ndarray:
-    """d/dt of [q, q_dot, joint integrals, command, slope of the command, U_dot] by these, square: a command changes
-    with its slope, and what the drive takes for U_dot need not be that. An integral that nothing reads dies out."""
+    """d/dt of [q, q_dot, joint integrals, filtered rates where there are any, command, slope of the command, U_dot] by
+    these, square: a command changes with its slope, and what the drive takes for U_dot need not be that. An integral
+    that nothing reads dies out."""
     q, joints = robot.coordinates(pose), robot.layout.joints
     rigid, _, viscous, _ = robot.layout.split(parameters)
-    lp, li, ld = law.lp, law.li, law.ld
+    lp, li, ld, filtering = law.lp, law.li, law.ld, law.filter_time > 0
     at_rest, size = np.zeros(len(q)), len(q)
     holding = robot.static_torque(pose, parameters[robot.layout.dynamic])
     mass, _, jacobian, *_ = _values(robot, "equation_of_motion", q, at_rest, rigid)
     by_pose, by_rate, *_ = _values(robot, "motion_derivatives", q, at_rest, at_rest, holding, rigid)
     push = np.linalg.solve(mass, jacobian.T)
-    inner = 2 * size + joints
+    inner = 2 * size + joints * (1 + filtering)
     system = np.zeros((inner + 3 * joints, inner + 3 * joints))
-    at, moving, summed = slice(0, size), slice(size, 2 * size), slice(2 * size, inner)
+    at, moving, summed = slice(0, size), slice(size, 2 * size), slice(2 * size, 2 * size + joints)
+    filtered = slice(2 * size + joints, inner)
     command, slope, rate = (slice(inner + k * joints, inner + (k + 1) * joints) for k in range(3))
     system[at, moving] = np.eye(size)
     system[moving, at] = -np.linalg.solve(mass, by_pose) - (lp + law.lx) * push @ jacobian
-    system[moving, moving] = -np.linalg.solve(mass, by_rate) - push @ ((ld + viscous)[:, None] * jacobian)
+    system[moving, moving] = -np.linalg.solve(mass, by_rate) - push @ (
+        (ld * (not filtering) + viscous)[:, None] * jacobian
+    )
     system[moving, summed] = li * push
-    system[moving, command], system[moving, rate] = lp * push, law.weight * ld * push
+    system[moving, command] = lp * push
+    if filtering:
+        system[moving, filtered] = ld * push
+        system[filtered, moving], system[filtered, rate] = -jacobian / law.filter_time, np.eye(joints) / law.filter_time
+        system[filtered, filtered] = -np.eye(joints) / law.filter_time
+    else:
+        system[moving, rate] = law.rate_weight * ld * push
     system[summed, at], system[summed, command] = -jacobian, np.eye(joints)
     system[summed, summed] = -np.eye(joints) if li == 0 else 0.0
     system[command, slope] = np.eye(joints)

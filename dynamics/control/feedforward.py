@@ -30,7 +30,7 @@ def joint_commands(model: Model, motion: Motion, timing: FrameTiming, frames: in
     period = 1 / timing.frame_rate_hz
     along = spans(model, motion, np.arange(frames) * period + timing.latency_s, period)
     law = drives.joint_law(model.parameters[model.robot.layout.joint_pid])
-    lp, li, ld, c, stiff = law.lp, law.li, law.ld, law.weight, law.lp + law.lx
+    lp, li, ld, c, stiff = law.lp, law.li, law.ld, law.rate_weight, law.lp + law.lx
     before, integral = model.held(motion.pose(np.zeros(1))[0], drives)
     commands = np.empty_like(along.mean)
     held = timing.hold == "zero"

@@ -231,7 +231,7 @@ class Observer:
         )
         pid = not self._drives.torques
         by_error = law.lp * error + li * integral - law.lx * angle[:, 0]
-        torque = by_error + ld * (law.weight * command_rate - velocity) if pid else command
+        torque = by_error + ld * (law.rate_weight * command_rate - velocity) if pid else command
         limit = self._drives.torque_limit
         torque = torque if limit is None else np.clip(torque, -limit, limit)
         net = torque + disturbance - (self._viscous + more) * velocity - self._coulomb * level

@@ -11,18 +11,19 @@ need costs what it could have been. Before the record all laws are as probable. 
 record by more than noise explains, all costs are divided by its share: what no law explains rules none out.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dynamics import DynamicsError
-from dynamics.closed_loop.drives import DRIVES, DriveName
+from dynamics.closed_loop.drives import DriveName
 from identify.arrays import Array
 from identify.errors import EstimationError
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import Search, output_error_searches
 from identify.estimation.warm_start import linear_warm_start
+from identify.loop_parameters import drive_settings
 from identify.progress import Progress, SilentProgress
 from identify.scenario import Scenario
 from identify.scenario.sections import AUTO
@@ -73,9 +74,10 @@ def choose_drive(
     """
     if scenario.model.drive != AUTO:
         return DriveChoice(scenario.model.drive_law, {scenario.model.drive_law: 1.0})
-    with progress.stage("laws of the drives", 2 * len(DRIVES)) as advance:
+    laws = scenario.model.drives_considered
+    with progress.stage("laws of the drives", 2 * len(laws)) as advance:
         first, failed = {}, []
-        for law in DRIVES:
+        for law in laws:
             own = _asking(scenario, law, FIRST)
             try:
                 problem = problem_of(own)
@@ -91,13 +93,13 @@ def choose_drive(
             if one.solution.costs[-1] <= limit:
                 own = _asking(scenario, law, scenario.identification.max_iterations)
                 found[law] = evidence(_searched(problem_of(own), own, one.solution.parameters))
-        advance(len(DRIVES))
-    return DriveChoice(*_weighed(found))
+        advance(len(laws))
+    return DriveChoice(*_weighed(found, laws))
 
 
 def _asking(scenario: Scenario, law: DriveName, iterations: int) -> Scenario:
     searched = {"identification.method": "command_driven", "identification.max_iterations": iterations}
-    return scenario.with_overrides({"model.drive": law, **searched})
+    return scenario.with_overrides({**drive_settings(law), **searched})
 
 
 def _searched(problem: OutputErrorProblem, scenario: Scenario, start: Array) -> Search:
@@ -125,10 +127,10 @@ def evidence(found: Search) -> Evidence:
     return Evidence(cost, (cost - float(known @ known)) / poses, float(narrowed))
 
 
-def _weighed(found: Mapping[DriveName, Evidence]) -> tuple[DriveName, dict[str, float]]:
+def _weighed(found: Mapping[DriveName, Evidence], laws: Sequence[DriveName]) -> tuple[DriveName, dict[str, float]]:
     """The most probable law, and the probability of each; a law that gives no model has none."""
     misfit = max(1.0, min(one.misfit for one in found.values()))
     logarithms = {law: -(one.cost / misfit + one.narrowed) / 2 for law, one in found.items()}
     best = max(logarithms, key=lambda law: logarithms[law])
-    weights = {law: float(np.exp(logarithms[law] - logarithms[best])) if law in found else 0.0 for law in DRIVES}
+    weights = {law: float(np.exp(logarithms[law] - logarithms[best])) if law in found else 0.0 for law in laws}
     return best, {law: weight / sum(weights.values()) for law, weight in weights.items()}

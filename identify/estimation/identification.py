@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import xarray as xr
 
 from dynamics import DynamicsError, Robot
-from dynamics.closed_loop import Drives
 from dynamics.closed_loop.problem import checked_loop_parameters
 from identify.errors import EstimationError, ScenarioError
 from identify.estimation.common_errors import common_error_estimates
@@ -128,7 +127,7 @@ def _guess(robot: Robot, scenario: Scenario) -> StartingGuess:
     law = scenario.model.drive_law
     guess = starting_guess(robot, scenario.model.start_parameters, settings.start_std, settings.prior, law)
     try:
-        checked_loop_parameters(robot, guess.values, Drives(law=law))
+        checked_loop_parameters(robot, guess.values, law)
     except DynamicsError as error:
         known = ", ".join(settings.prior) or "nothing"
         raise ScenarioError(

@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import lsq_linear
+from scipy.signal import lfilter
 
 from dynamics import Robot
-from dynamics.closed_loop.drives import JointLaw, joint_law
+from dynamics.closed_loop.drives import JointLaw
 from identify.arrays import Array
 from identify.estimation.bounds import SMALLEST_SHARE
 from identify.estimation.output_error import OutputErrorProblem
@@ -52,7 +53,8 @@ def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
     """
     guess, noise = problem.guess, 0.1
     count, pid = len(guess.values), guess.layout.joint_pid
-    law = joint_law(guess.drive, guess.values[pid])
+    drives = problem.runs[0].settings.drives
+    law = drives.joint_law(guess.values[pid])
     matrix, right, common = _stacked(problem, scenario, law)
     lower = np.concatenate([np.zeros(count), np.full(matrix.shape[1] - count, -np.inf)])
     for _ in range(REWEIGHTINGS):
@@ -63,7 +65,7 @@ def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
         solution = bounded_fit(whitened[:, :-1], whitened[:, -1], guess, problem.anchor, lower)
         noise = max(noise * float(np.sqrt(np.mean((whitened @ np.append(solution, -1.0)) ** 2))), 1e-9)
         if law.lx:
-            law = joint_law(guess.drive, np.maximum(solution[:count], SMALLEST_SHARE * guess.values)[pid])
+            law = drives.joint_law(np.maximum(solution[:count], SMALLEST_SHARE * guess.values)[pid])
             matrix, right, common = _stacked(problem, scenario, law)
     return np.maximum(solution[:count], 0.0)
 
@@ -121,7 +123,8 @@ def joint_balance(
     angle_integral = running_integral(angle, rate_hz)
     count, joints = len(measured), robot.layout.joints
     start = np.broadcast_to(-np.eye(joints), (count, joints, joints))
-    pid = np.stack([command - angle, integral - angle_integral, law.weight * command_rate - velocity], axis=2)
+    rate = low_pass(law.rate_weight * command_rate - velocity, law.filter_time, rate_hz)
+    pid = np.stack([command - angle, integral - angle_integral, rate], axis=2)
     by_gains = law.reads * pid - law.lx_by * angle[:, :, None]
     columns = np.concatenate([torque_map @ regressor, -by_gains, start], axis=2)
     slipping = np.abs(velocity) > SLIPPING_SHARE * velocity.std(axis=0)
@@ -144,6 +147,14 @@ def effective_command(commands: Array, scenario: Scenario) -> tuple[Array, Array
     felt = spline(np.clip(times - lag, 0.0, None))
     rate = spline(np.clip(times - timing.latency_s - period, 0.0, None), nu=1)
     return felt, rate, running_integral(felt, rate_hz)
+
+
+def low_pass(samples: Array, time_constant: float, rate_hz: float) -> Array:
+    """Samples (N, ...) through a filter of first order (s; 0: none), which knows the first of them from before."""
+    if not time_constant:
+        return samples
+    half, rest = 0.5 / (rate_hz * time_constant), samples[:1]
+    return rest + lfilter([half, half], [1 + half, half - 1], samples - rest, axis=0)
 
 
 def running_integral(samples: Array, rate_hz: float) -> Array:

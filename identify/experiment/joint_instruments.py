@@ -106,9 +106,10 @@ def measure_joints(
     angle, command = truth[at_encoder].values, record["command"].values
     known = true_parameters(truth)
     gains = np.array([known[f"joint_pid.{name}"] for name in JOINT_PID])
-    law = joint_law(truth.attrs.get("plant_drive", "pid"), gains)
+    law = joint_law(truth.attrs.get("plant_drive", "pid"), gains, truth.attrs.get("plant_derivative_filter_s"))
     each = np.full(len(command), timing.latency_s) if latencies is None else latencies
-    sampled, at_jump = truth["joint_torque"].values, np.array([law.lp, law.weight * law.ld])
+    sampled = truth["joint_torque"].values
+    at_jump = np.array([law.lp, 0.0 if law.filter_time else law.rate_weight * law.ld])
     torque = frame_mean(sampled, command, law.held(sampled[0], angle[0])[0], at_jump, timing, each)
     torque = torque + instruments.torque_noise * rng.standard_normal(torque.shape)
     read = angle + instruments.encoder_noise * rng.standard_normal(angle.shape)

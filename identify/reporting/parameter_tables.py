@@ -92,6 +92,7 @@ DRIVES = {
     "pd": "a PD: no integral",
     "pi": "a PI: no derivative",
     "cascade": "a P-PI cascade, position around velocity",
+    "pid_filtered": "a PID whose rate is filtered",
 }
 """Laws of the drives in words."""
 

@@ -6,7 +6,6 @@ import numpy as np
 import xarray as xr
 
 from dynamics import DynamicsError, Robot
-from dynamics.closed_loop import Drives
 from dynamics.closed_loop.problem import checked_loop_parameters
 from identify.arrays import Array
 from identify.errors import RecordError
@@ -32,7 +31,7 @@ def parameter_vector(robot: Robot, identification: dict[str, Any], column: str) 
     """
     values = parameter_column(identification, column, robot.layout.names)
     try:
-        return checked_loop_parameters(robot, values, Drives(law=settled_drive(identification)))
+        return checked_loop_parameters(robot, values, settled_drive(identification))
     except DynamicsError as error:
         raise RecordError(f"{column}: {error}") from None
 

@@ -1,7 +1,7 @@
 """The sections of a scenario. Each field states its unit and its limits; what a section checks concerns it alone."""
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -45,16 +45,29 @@ FRICTION_CONSTANTS: dict[str, tuple[tuple[str, ...], ...]] = {
 }
 """The constants each law needs, one key of each; it takes no others."""
 
-DriveName = Literal["pid", "pd", "pi", "cascade"]
-"""Laws by which drives make torques of joint commands: the paper's PID, parts of it, or P-PI; `closed_loop.drives`."""
+DriveName = Literal["pid", "pd", "pi", "cascade", "pid_filtered"]
+"""Laws by which drives make torques of joint commands: the paper's PID, parts of it, P-PI, or with a filtered rate; see
+`closed_loop.drives`."""
+
+FILTERED: DriveName = "pid_filtered"
 
 AUTO = "auto"
+
+
+def check_filter(drive: str, seconds: float | None) -> None:
+    """Raise ValueError for a drive without its filter, or a filter that belongs to another."""
+    if (drive == FILTERED) != (seconds is not None):
+        raise ValueError(
+            f"drive = {drive!r} with derivative_filter_s = {seconds}: the law {FILTERED} needs it, and no other has it"
+        )
+
 
 DRIVE_GAINS: dict[str, tuple[str, ...]] = {
     "pid": ("lp", "li", "ld"),
     "pd": ("lp", "ld"),
     "pi": ("lp", "li"),
     "cascade": ("lp", "li", "ld"),
+    "pid_filtered": ("lp", "li", "ld"),
 }
 """Gains that each of them reads."""
 
@@ -151,7 +164,8 @@ class Plant(_Friction):
     """
 
     parameters: str = Field("identified", description="named parameter set of the robot file, the truth")
-    drive: DriveName = Field("pid", description="law of the drives: the paper's PID, PD, PI, or a P-PI cascade")
+    drive: DriveName = Field("pid", description="law of the drives: the paper's PID, PD, PI, P-PI, or a filtered PID")
+    derivative_filter_s: float | None = quantity(None, "s", "time constant of the drive pid_filtered", gt=0, le=1)
     drive_gains: dict[str, float] = Field(
         {}, description="of the drives, instead of the set's: { lp = 10.5, li = 30.0, ld = 0.3 }, in the units of these"
     )
@@ -182,6 +196,7 @@ class Plant(_Friction):
 
     @model_validator(mode="after")
     def _gains_are_those_of_the_law(self) -> "Plant":
+        check_filter(self.drive, self.derivative_filter_s)
         reads = DRIVE_GAINS[self.drive]
         for name, value in self.drive_gains.items():
             if name not in reads or not value > 0:
@@ -195,8 +210,11 @@ class Model(_Friction):
     """The estimator's model of the robot."""
 
     start_parameters: str = Field("initial", description="named parameter set of the robot file, the starting guess")
-    drive: Literal["pid", "pd", "pi", "cascade", "auto"] = Field(
+    drive: Literal["pid", "pd", "pi", "cascade", "pid_filtered", "auto"] = Field(
         "pid", description="law of the drives; auto: that for which the record speaks"
+    )
+    derivative_filter_s: float | None = quantity(
+        None, "s", "time constant of the drive pid_filtered, which auto considers where it is stated", gt=0, le=1
     )
     steps_per_frame: int = quantity(4, "1", "integration steps a frame", ge=1, le=10_000)
 
@@ -204,6 +222,17 @@ class Model(_Friction):
     def drive_law(self) -> DriveName:
         """Law of the drives; where the record is to tell, that of the paper until it has."""
         return "pid" if self.drive == "auto" else self.drive
+
+    @property
+    def drives_considered(self) -> tuple[DriveName, ...]:
+        """Laws of the drives that `auto` chooses between."""
+        return tuple(law for law in get_args(DriveName) if law != FILTERED or self.derivative_filter_s)
+
+    @model_validator(mode="after")
+    def _filter_fits_the_law(self) -> "Model":
+        if self.drive != AUTO:
+            check_filter(self.drive, self.derivative_filter_s)
+        return self
 
 
 class Excitation(Section):

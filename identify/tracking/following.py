@@ -19,6 +19,7 @@ from identify.experiment.sensor_in_loop import SensorInLoop
 from identify.loop_parameters import model_settings
 from identify.plugins import LAWS, chosen
 from identify.scenario import Scenario
+from identify.scenario.sections import FILTERED
 from identify.tracking.motions import NamedMotion
 
 FASTEST = 0.5
@@ -135,7 +136,10 @@ def prepared(
     except DynamicsError as error:
         raise TrajectoryError(f"the robot may not follow {motion.name}: {error}") from error
     settings = model_settings(robot, scenario)
-    settings = replace(settings, drives=replace(settings.drives, law=drive or settings.drives.law))
+    if drive is not None:
+        known = scenario.model.derivative_filter_s or scenario.plant.derivative_filter_s
+        filter_time = known if drive == FILTERED else None
+        settings = replace(settings, drives=replace(settings.drives, law=drive, filter_time=filter_time))
     model, asked = Model(robot, parameters, settings.friction), feedback(scenario)
     usual = np.full(len(times), scenario.timing.latency_s)
     found = chosen_law(

@@ -228,7 +228,8 @@ def unseen_errors(parameters: ArrayLike, robot: Robot, scenario: Scenario, seed:
     Raises dynamics.DynamicsError: parameters of another shape, not finite, or outside their range. Raises
     TrajectoryError: no unseen trajectory keeps the robot's limits.
     """
-    values, plant = checked_loop_parameters(robot, parameters), build_plant(scenario, robot, seed)
+    values = checked_loop_parameters(robot, parameters, scenario.model.drive_law)
+    plant = build_plant(scenario, robot, seed)
     times = scenario.timing.frame_times(scenario.validation.duration_s)
     references = [path.reference(times) for path in unseen_trajectories(robot, scenario, seed)]
     model = [model_run(robot, scenario, values, reference) for reference in references]

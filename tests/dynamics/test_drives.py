@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import make_interp_spline
 
 from dynamics.closed_loop import Drives, FrameTiming, LoopSettings, ServoGains, simulate, stability
-from dynamics.closed_loop.drives import DRIVES, CascadeGains, cascade_gains
+from dynamics.closed_loop.drives import DRIVES, FILTERED, CascadeGains, cascade_gains
 from dynamics.errors import SimulationError
 from tests.dynamics.conftest import assert_same, at_rest
 from tests.dynamics.test_sensitivities import _assert_derivative
@@ -15,15 +15,20 @@ from tests.dynamics.test_sensitivities import _assert_derivative
 LIMIT = 3.3  # N m: the robot needs some 2 to 3 to hold itself
 
 
+LAWS = [pytest.param(law, marks=[pytest.mark.thorough] if law == FILTERED else []) for law in DRIVES]
+"""All; loops with filters are kernels of their own, which take long to compile."""
+
+
 def drives_of(law):
     """A law by its name, or the PID at a limit that it meets."""
-    return Drives(torque_limit=LIMIT) if law == "limit" else Drives(law=law)
+    filter_time = 0.008 if law == "pid_filtered" else None
+    return Drives(torque_limit=LIMIT) if law == "limit" else Drives(law=law, filter_time=filter_time)
 
 
-@pytest.mark.parametrize("law", DRIVES)
+@pytest.mark.parametrize("law", LAWS)
 def test_the_robot_rests_where_it_starts(loop, law):
     """The command at rest, its torque and the servo's integral hold it; a PD holds by an error alone."""
-    settings = loop.settings(drives=Drives(law=law))
+    settings = loop.settings(drives=drives_of(law))
     run = loop.run(at_rest(loop.robot.home_pose, 30), settings)
     np.testing.assert_allclose(run.pose, run.pose[:1].repeat(30, 0), atol=1e-12)
     held = loop.robot.static_torque(loop.robot.home_pose, loop.parameters[loop.robot.layout.dynamic])
@@ -36,7 +41,7 @@ def _dense(loop, law, gains, frames=900, hz=600.0):
     """A run at many frames a second, and joint coordinates, their integral, rates and commands held for a frame."""
     values = loop.parameters.copy()
     values[loop.robot.layout.joint_pid] = gains
-    settings = LoopSettings(ServoGains(0.3, 0.001, 2.4), FrameTiming(hz), drives=Drives(law=law))
+    settings = LoopSettings(ServoGains(0.3, 0.001, 2.4), FrameTiming(hz), drives=drives_of(law))
     run = simulate(loop.robot, values, loop.reference(frames, hz), settings)
     angle = loop.robot.inverse_kinematics(run.pose)
     integral = make_interp_spline(run.time, angle, k=5).antiderivative()(run.time)
@@ -71,7 +76,34 @@ def test_a_law_is_the_pid_without_what_it_does_not_read(loop, law):
     np.testing.assert_array_equal(other.pose, run.pose)
 
 
-CASES = {law: drives_of(law) for law in (*DRIVES[1:], "limit")}
+@pytest.mark.thorough
+def test_the_filter_is_one_of_first_order(loop):
+    """Its differential equation solved along the recorded joint rates, which a spline carries between frames."""
+    run, angle, rate, error_integral = _dense(loop, "pid_filtered", np.array([10.5, 11.4, 0.164]), 300)
+    fine = np.linspace(run.time[0], run.time[-1], 20 * (len(run.time) - 1) + 1)
+    turning = make_interp_spline(run.time, rate, k=3)(fine)
+    before = np.vstack([run.start.commands[-1:], run.command[:-1]])
+    asked = np.repeat(600 * (run.command - before), 20, axis=0)[: len(fine)]
+    filtered, step = np.zeros_like(turning), 1 / 12000
+    for k in range(len(fine) - 1):
+        mean = asked[k] - (turning[k] + turning[k + 1]) / 2
+        filtered[k + 1] = mean + (filtered[k] - mean) * np.exp(-step / 0.008)
+    torque = 10.5 * (run.command - angle) + 11.4 * error_integral + 0.164 * filtered[::20]
+    np.testing.assert_allclose(run.torque, torque + run.torque[0] - torque[0], atol=2e-4 * np.ptp(run.torque))
+    np.testing.assert_allclose(run.filtered_rate, filtered[::20], atol=2e-3 * np.ptp(filtered))
+
+
+@pytest.mark.thorough
+def test_a_run_from_the_state_of_another_repeats_its_rest(loop):
+    """The filtered rates are part of the state."""
+    settings = loop.settings(drives=drives_of("pid_filtered"))
+    reference, start = loop.half_way(45, 20, settings)
+    rest, run = loop.run(reference, settings, start=start), loop.run(45, settings)
+    np.testing.assert_array_equal(rest.pose, run.pose[20:])
+    assert np.abs(start.filtered_rate).max() > 0
+
+
+CASES = [*LAWS[1:], "limit"]
 
 
 @pytest.mark.parametrize("driven", [False, True], ids=["closed loop", "logged commands"])
@@ -79,7 +111,7 @@ CASES = {law: drives_of(law) for law in (*DRIVES[1:], "limit")}
 def test_sensitivities_are_finite_differences_of_the_run(loop, case, driven):
     """Of every law, and where torques are cut at their limit; logged commands begin with latency, so that those of
     the start act, too."""
-    settings = loop.settings(latency_s=0.7 / 60, drives=CASES[case])
+    settings = loop.settings(latency_s=0.7 / 60, drives=drives_of(case))
     reference, given = loop.reference(45, scale=2.0), {}
     if driven:
         given["commands"] = loop.run(reference, settings).command
@@ -100,7 +132,7 @@ def test_sensitivities_are_finite_differences_of_the_run(loop, case, driven):
 
 def test_sensitivities_of_the_start_are_finite_differences(loop):
     """Of the pose, its rate and both integrals, from a start given half way, under the cascade."""
-    settings = loop.settings(drives=Drives(law="cascade"))
+    settings = loop.settings(drives=drives_of("cascade"))
     reference, start = loop.half_way(45, 20, settings)
     ours = loop.run(reference, settings, start=start, start_sensitivities=True).start_sensitivity
     for entry, name in ((0, "pose"), (6, "pose_rate"), (12, "joint_integral"), (18, "servo_integral")):
@@ -112,18 +144,18 @@ def test_sensitivities_of_the_start_are_finite_differences(loop):
         np.testing.assert_allclose(ours[:, :, entry], numeric, atol=1e-5 * np.abs(numeric).max())
 
 
-@pytest.mark.parametrize("law", ["pd", pytest.param("cascade", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("law", ["pd", pytest.param("cascade", marks=pytest.mark.slow), LAWS[-1]])
 def test_compiled_and_plain_runs_agree(loop, law):
-    settings = loop.settings(latency_s=0.01, drives=Drives(law=law, torque_limit=4.0))
+    settings = loop.settings(latency_s=0.01, drives=replace(drives_of(law), torque_limit=4.0))
     assert_same(*loop.both(loop.reference(4), settings, sensitivities=True))
 
 
 def test_the_linear_loop_says_what_a_cascade_bears(loop):
     """The rate weight is none: the loop of the cascade is another than that of the PID with the same gains."""
     robot, values = loop.robot, loop.parameters
-    settings = [loop.settings(drives=Drives(law=law)) for law in DRIVES]
+    settings = [loop.settings(drives=drives_of(law)) for law in DRIVES]
     radii = [stability.spectral_radius(robot, values, each, robot.home_pose) for each in settings]
-    assert len(set(np.round(radii, 6))) == 4
+    assert len(set(np.round(radii, 6))) == len(DRIVES)
 
 
 @pytest.mark.parametrize(
@@ -132,14 +164,34 @@ def test_the_linear_loop_says_what_a_cascade_bears(loop):
         ("pd", [0.0, 1.0, 1.0], "joint_pid.lp is 0"),
         ("cascade", [1.0, 1.0, 0.0], "joint_pid.ld is 0"),
         ("pi", [1.0, 0.0, 0.0], "joint_pid.li is 0"),
+        ("pid_filtered", [1.0, 0.0, 0.0], "joint_pid.li is 0"),
     ],
 )
 def test_a_law_without_a_gain_that_it_needs_is_refused(loop, law, gains, said):
     values = np.append(loop.parameters[:64], gains)
     with pytest.raises(SimulationError, match=said):
-        loop.run(3, loop.settings(drives=Drives(law=law)), values)
+        loop.run(3, loop.settings(drives=drives_of(law)), values)
 
 
 def test_an_unknown_law_is_refused_with_the_valid_names():
-    with pytest.raises(SimulationError, match="`pdi`; valid: pid, pd, pi, cascade"):
+    with pytest.raises(SimulationError, match="`pdi`; valid: pid, pd, pi, cascade, pid_filtered"):
         Drives(law="pdi")
+
+
+def test_a_filtered_rate_follows_the_unfiltered_one_late(loop):
+    """The plain lines: its derivative is what is missing, over the time constant, in steps of a 60th of that."""
+    settings = replace(loop.settings(7200.0, steps=1), drives=drives_of(FILTERED))
+    rates, start = loop.reference(3, 7200.0), loop.run(at_rest(loop.robot.home_pose, 2)).start
+    moving = replace(start, pose_rate=np.array([0.02, 0, 0, 0, 0.05, 0]), filtered_rate=np.full(6, 0.1))
+    run = loop.run(rates, settings, start=moving, commands=np.tile(start.commands, (3, 1)), compiled=False)
+    turning = np.einsum("nij,nj->ni", loop.robot.pose_jacobian(run.pose), run.pose_rate)
+    wanted = 0.1 + (-turning[:2].mean(axis=0) - 0.1) * (1 - np.exp(-1 / 7200 / 0.008))
+    np.testing.assert_allclose(run.filtered_rate[1], wanted, rtol=1e-4)
+    torque = 10.5 * (start.commands[0] - loop.robot.inverse_kinematics(run.pose)) + 0.164 * run.filtered_rate
+    np.testing.assert_allclose(run.torque, torque + 11.4 * run.joint_integral, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("law", "seconds"), [("pid_filtered", None), ("pid_filtered", 0.0), ("pi", 0.01)])
+def test_a_filter_belongs_to_its_law(law, seconds):
+    with pytest.raises(SimulationError, match="filter_time"):
+        Drives(law=law, filter_time=seconds)

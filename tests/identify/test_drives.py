@@ -21,6 +21,9 @@ from tests.identify.synthetic import LAYOUT, NAMES, quick, rss6, run_plant
 
 GAINS = {"lp": 10.5, "li": 11.4, "ld": 0.164}
 CASCADE = {"lp": 10.5, "li": 30.0, "ld": 0.3}
+LAWS = ("pid", "pd", "pi", "cascade")
+"""Those whose loops are the same kernels."""
+
 FRICTION_AND_PID = [i for i, name in enumerate(NAMES) if name.startswith("joint")]
 
 
@@ -33,7 +36,7 @@ def under(law, seconds=5.0, gains=None, model=None, **more):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("law", DRIVES[1:])
+@pytest.mark.parametrize("law", LAWS[1:])
 def test_the_gains_of_a_named_law_are_within_their_intervals(law):
     """Of the truth, as friction is; a gain that the law does not read is none, and said to be."""
     scenario = under(law)
@@ -66,9 +69,23 @@ def test_a_torque_limit_that_is_met_does_not_bias():
     assert aware < 1.1 * 6 * len(run.time) < unaware
 
 
+@pytest.mark.thorough
+def test_a_filter_is_seen_and_the_gains_beside_it_are_within_their_intervals():
+    """Among all laws, where its time constant is stated; without a filter in the plant none is seen."""
+    asked = {"model.drive": "auto", "model.derivative_filter_s": 0.01, "excitation.duration_s": 10.0}
+    scenario = quick(**asked, **{"plant.drive": "pid_filtered", "plant.derivative_filter_s": 0.01})
+    record, _ = run_plant(scenario, seed=1)
+    result, true = identify(record, rss6(), scenario), build_plant(scenario, rss6()).parameters
+    assert (result.drive.law, result.drive.sure) == ("pid_filtered", True)
+    assert np.abs((result.estimate - true) / result.std)[FRICTION_AND_PID].max() < 3
+    record, _ = run_plant(quick(**asked), seed=2)
+    without = identify(record, rss6(), quick(**asked)).drive
+    assert (without.law, without.sure) == ("pid", True)
+
+
 def case(number):
     """(law, choice) of a seeded case: law by turns, gains some 20 % about the usual ones, trajectory and noise."""
-    rng, law = np.random.default_rng([number, 17]), DRIVES[number % len(DRIVES)]
+    rng, law = np.random.default_rng([number, 17]), LAWS[number % len(LAWS)]
     usual = CASCADE if law == "cascade" else GAINS
     while True:
         gains = {name: float(value * np.exp(0.2 * rng.standard_normal())) for name, value in usual.items()}
@@ -108,7 +125,9 @@ def test_the_law_is_right_in_95_of_100_cases_or_said_to_be_unknown():
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"model.drive": "pdi"}, "model.drive = 'pdi'.*'pid', 'pd', 'pi', 'cascade' or 'auto'"),
+        ({"model.drive": "pdi"}, "model.drive = 'pdi'.*'pid', 'pd', 'pi', 'cascade', 'pid_filtered' or 'auto'"),
+        ({"plant.drive": "pid_filtered"}, "derivative_filter_s = None: the law pid_filtered needs it"),
+        ({"model.derivative_filter_s": 0.01}, "drive = 'pid' with derivative_filter_s = 0.01"),
         (
             {"plant.drive": "pd", "plant.drive_gains": {"li": 3.0}},
             "gains.li = 3: the law pd has the gains lp, ld",
