@@ -42,7 +42,7 @@ from identify.reporting.run_result import add_truth, parameter_vector, predictio
 from identify.scenario import Scenario, load_scenario
 from identify.scenario.scenario import estimator_settings, with_estimator_settings
 from identify.trajectory import TrajectorySet, check_travel, load_trajectories, save_trajectories
-from identify.validation.unseen import model_run, predicted_runs, run_unseen
+from identify.validation.unseen import model_on_record, model_run, predicted_runs, run_unseen
 
 
 def run(scenario: Scenario, seed: int, folder: Path, progress: Progress, workers: int | None = None) -> None:
@@ -173,8 +173,8 @@ def _identified(
 ) -> _Identified:
     began, robot = time.perf_counter(), known_geometry(scenario, folder).robot
     result = identification.identify(list(records.values()), robot, scenario, progress)
-    reference, scenario = recorded_reference(next(iter(records.values()))), with_drive(scenario, result.drive.law)
-    before, after = (model_run(robot, scenario, values, reference) for values in (result.initial, result.estimate))
+    first, scenario = next(iter(records.values())), with_drive(scenario, result.drive.law)
+    before, after = (model_on_record(robot, scenario, values, first) for values in (result.initial, result.estimate))
     return _Identified(records, result, (before, after), time.perf_counter() - began)
 
 
@@ -235,8 +235,9 @@ def validate(folder: Path, progress: Progress, workers: int | None = None, taugh
     runs = run_unseen(scenario, trajectories.validation, trajectories.seed, taught, workers, progress, known)
     recording.write_runs(run_folder.validation, [(unseen.record, unseen.truth) for unseen in runs])
     records = [files.experiment, *(run.record for run in runs)]
-    references = [recorded_reference(seen) for seen in records]
-    model_poses = [[model_run(robot, scenario, values, reference) for values in models] for reference in references]
+    model_poses = [[model_on_record(robot, scenario, values, files.experiment) for values in models]]
+    for reference in (recorded_reference(seen) for seen in records[1:]):
+        model_poses.append([model_run(robot, scenario, values, reference) for values in models])
     predictions = predicted_runs(robot, scenario, records[1:], models[1], covariance, trajectories.seed, progress)
     deviations = [None, *(prediction.std for prediction in predictions)]
     drawn = [

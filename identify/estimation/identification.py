@@ -19,7 +19,7 @@ from identify.estimation.explanation import explanation
 from identify.estimation.identifiability import judge
 from identify.estimation.output_error import OutputErrorProblem
 from identify.estimation.output_error_search import output_error_searches
-from identify.estimation.prior import StartingGuess, starting_guess
+from identify.estimation.prior import StartingGuess, model_guess
 from identify.estimation.result import IdentificationResult
 from identify.estimation.scale_anchor import read_anchor
 from identify.estimation.warm_start import linear_warm_start
@@ -27,6 +27,7 @@ from identify.loop_parameters import with_drive
 from identify.progress import Progress, SilentProgress
 from identify.random_streams import UNCERTAINTY, mixed_generator
 from identify.record.drift import drift_warnings
+from identify.record.law import SERVO, recorded_law
 from identify.record.provenance import recorded_seed
 from identify.record.recorded_run import recorded_run
 from identify.runtime import one_thread
@@ -50,6 +51,7 @@ def identify(
     """
     progress, began = progress or SilentProgress(), time.perf_counter()
     records = [record] if isinstance(record, xr.Dataset) else list(record)
+    scenario = under_its_law(scenario, records)
     problem = output_error_problem(records, robot, scenario)
     drive = choose_drive(lambda named: output_error_problem(records, robot, named), scenario, progress)
     if drive.asked:
@@ -99,6 +101,14 @@ def identify(
     )
 
 
+def under_its_law(scenario: Scenario, records: Sequence[xr.Dataset]) -> Scenario:
+    """The scenario with the method that fits the law under which a record was made: the model can close the loop of the
+    servo, and under any other law gets the logged commands."""
+    if all(recorded_law(record) == SERVO for record in records):
+        return scenario
+    return scenario.with_overrides({"identification.method": "command_driven"})
+
+
 def output_error_problem(records: Sequence[xr.Dataset], robot: Robot, scenario: Scenario) -> OutputErrorProblem:
     """The output-error problem of one or several records; the first brings the scale anchor.
 
@@ -125,7 +135,7 @@ def _guess(robot: Robot, scenario: Scenario) -> StartingGuess:
     """The scenario's starting guess. Raises ScenarioError where the robot has none of the name, or no model has it."""
     settings = scenario.identification
     law = scenario.model.drive_law
-    guess = starting_guess(robot, scenario.model.start_parameters, settings.start_std, settings.prior, law)
+    guess = model_guess(robot, scenario)
     try:
         checked_loop_parameters(robot, guess.values, law)
     except DynamicsError as error:

@@ -17,7 +17,7 @@ from dynamics.parameters import ParameterLayout
 from identify.arrays import Array
 from identify.estimation.scale_anchor import ScaleAnchor
 from identify.loop_parameters import check_parameter_set
-from identify.scenario import PriorValue
+from identify.scenario import PriorValue, Scenario
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,12 @@ def starting_guess(
     guess = StartingGuess(robot.layout, values, std, drive)
     values[guess.fixed], std[guess.fixed] = 0.0, FIXED * std[guess.fixed]
     return guess
+
+
+def model_guess(robot: Robot, scenario: Scenario) -> StartingGuess:
+    """The starting guess of a scenario's model. Raises as `starting_guess`."""
+    settings, model = scenario.identification, scenario.model
+    return starting_guess(robot, model.start_parameters, settings.start_std, settings.prior, model.drive_law)
 
 
 WEIGHTLESS = 0.01

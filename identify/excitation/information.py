@@ -38,7 +38,7 @@ from dynamics import Robot
 from dynamics.closed_loop import LoopFailure, simulate
 from identify.arrays import Array
 from identify.errors import TrajectoryError
-from identify.estimation.prior import StartingGuess, starting_guess
+from identify.estimation.prior import StartingGuess, model_guess
 from identify.estimation.scale_anchor import MEASURED_PARAMETER, default_std
 from identify.excitation.criteria import Criterion, smoothing_of
 from identify.excitation.motion import Unknowns, log_determinant, regressor, sample_times, tracked_motion
@@ -67,9 +67,7 @@ class Knowledge:
 def knowledge(robot: Robot, scenario: Scenario) -> Knowledge:
     """The scenario's starting guess with its prior, anchor and sensor."""
     settings = scenario.identification
-    guess = starting_guess(
-        robot, scenario.model.start_parameters, settings.start_std, settings.prior, scenario.model.drive_law
-    )
+    guess = model_guess(robot, scenario)
     prior = np.eye(len(robot.layout.names))
     anchor = settings.scale_anchor
     if anchor in MEASURED_PARAMETER:

@@ -107,8 +107,8 @@ class Servo(Section):
 
 
 class Control(Section):
-    """The law by which `cmmsim track` makes the robot follow a motion. All other runs are under the law pid. The torque
-    limit is that of all runs, and the model knows it."""
+    """The law by which `cmmsim track` makes the robot follow a motion. All other runs are under the law pid, but for
+    the excitation, which has a key of its own. The torque limit is that of all runs, and the model knows it."""
 
     law: str = Field("pid", description=f"{', '.join(LAWS)}, or module:function")
     observer: bool = Field(
@@ -259,6 +259,11 @@ class Excitation(Section):
     max_joint_velocity_m_s: float = quantity(0.2, "m/s", "the same, where actuators slide", gt=0)
     least_leverage: float = quantity(0.05, "1", "least leverage of an actuator on its leg (J_a1)", ge=0, lt=1)
     most_condition: float = quantity(20.0, "1", "largest condition number of J_a2 without unit, of the 2-norm", ge=1)
+    law: str = Field(
+        "pid",
+        description=f"law of the run, which knows the starting model: {', '.join(LAWS)}, or module:function; under "
+        "another than pid the model gets the logged commands",
+    )
     generations: int = quantity(324, "1", "generations of the evolutionary method (the paper: 324)", ge=1, le=100_000)
 
     @property
@@ -271,6 +276,12 @@ class Excitation(Section):
     def _can_be_found(cls, criterion: str) -> str:
         check_choice(criterion, "criterion", CRITERIA, ValueError)
         return criterion
+
+    @field_validator("law")
+    @classmethod
+    def _law_can_be_found(cls, law: str) -> str:
+        check_choice(law, "law", LAWS, ValueError)
+        return law
 
 
 class Filter(Section):

@@ -15,6 +15,7 @@ from identify.errors import RecordError, ScenarioError
 from identify.estimation.identification import identify
 from identify.estimation.prior import starting_guess
 from identify.excitation.design import design_trajectories
+from identify.experiment.law_in_loop import NamedMotion, Seen, prepared
 from identify.experiment.plant import Plant, build_plant
 from identify.experiment.run import excitation_run, taught_sensor
 from identify.experiment.sensor_in_loop import SensorInLoop, with_renderer
@@ -24,8 +25,8 @@ from identify.loop_parameters import parameter_column, settled_drive
 from identify.progress import Progress
 from identify.random_streams import LATENCY, NOISE, TRACKED, child, stream_seed
 from identify.scenario import Scenario, load_scenario
-from identify.tracking.following import Seen, by_drawing, by_images, follow, prepared
-from identify.tracking.motions import NamedMotion, motions
+from identify.tracking.following import by_drawing, by_images, follow
+from identify.tracking.motions import motions
 
 MODELS = ("initial", "identified", "true")
 """The scenario's starting model, the identified one, and the plant's parameters."""

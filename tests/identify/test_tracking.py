@@ -9,13 +9,14 @@ from dynamics import load_robot
 from dynamics.control.law import LawInLoop
 from dynamics.errors import SimulationError
 from identify.errors import RecordError, ScenarioError, TrajectoryError
+from identify.experiment.law_in_loop import NamedMotion, prepared
 from identify.experiment.plant import build_plant
 from identify.files.run_folder import RunFolder, save_result
 from identify.scenario import load_scenario
 from identify.studies.rows.sensor import DrawnSensor
 from identify.tracking import track as tracking
-from identify.tracking.following import by_drawing, follow, prepared
-from identify.tracking.motions import NamedMotion, circle, read_motion, square
+from identify.tracking.following import by_drawing, follow
+from identify.tracking.motions import circle, read_motion, square
 from tests.identify.commands import command, one_line, refusal
 from tests.identify.synthetic import SIGMA, rss6, trajectory
 
