@@ -38,10 +38,12 @@ record shows are there by then, while others may search for long."""
 
 @dataclass(frozen=True)
 class DriveChoice:
-    """The law of the drives, and how probable each is: 1 for one that the scenario names."""
+    """The law of the drives, and how probable each is: 1 for one that the scenario names; in_loop: whether it acted as
+    the record was made, which it does not where the drives took torques."""
 
     law: DriveName
     probabilities: Mapping[str, float]
+    in_loop: bool = True
 
     @property
     def asked(self) -> bool:
@@ -54,7 +56,12 @@ class DriveChoice:
         return self.probabilities[self.law] >= SURE
 
     def warnings(self) -> tuple[str, ...]:
-        """One line where the record cannot tell."""
+        """One line where the record cannot tell the law, or says nothing of it."""
+        if not self.in_loop:
+            return (
+                "the drives took torques: the law by which they follow joint commands is not in this record, and its "
+                "gains are those of the starting values",
+            )
         if self.sure:
             return ()
         said = ", ".join(f"{name} {value:.0%}" for name, value in self.probabilities.items() if value >= 0.01)
@@ -65,15 +72,18 @@ class DriveChoice:
 
 
 def choose_drive(
-    problem_of: Callable[[Scenario], OutputErrorProblem], scenario: Scenario, progress: Progress
+    problem_of: Callable[[Scenario], OutputErrorProblem], scenario: Scenario, progress: Progress, in_loop: bool = True
 ) -> DriveChoice:
     """The law that a scenario names or, where it leaves that to the record, the most probable; problem_of: the output
-    error of a scenario that names one.
+    error of a scenario that names one; in_loop: whether the law acted in the record.
 
     Raises EstimationError: no law gives a model that runs; and as `problem_of` does.
     """
+    law = scenario.model.drive_law
+    if not in_loop:
+        return DriveChoice(law, {law: 1.0}, in_loop)
     if scenario.model.drive != AUTO:
-        return DriveChoice(scenario.model.drive_law, {scenario.model.drive_law: 1.0})
+        return DriveChoice(law, {law: 1.0})
     laws = scenario.model.drives_considered
     with progress.stage("laws of the drives", 2 * len(laws)) as advance:
         first, failed = {}, []

@@ -242,6 +242,8 @@ def judge(
     gain = robot.layout.names.index("joint_pid.lp")
     prior_share = variance_share(each, uncertainty.of_guess, uncertainty.covariance)
     gain_left = float(np.sqrt(uncertainty.of_guess[gain, gain]) / estimate[gain])
+    if not uncertainty.information[gain, gain]:  # commands that are torques show the scale themselves
+        gain_left = 0.0
     conditioned = conditioning(uncertainty.information, known, base, guess, estimate)
     bounded = bounded_estimate(
         estimate,

@@ -53,7 +53,8 @@ def identify(
     records = [record] if isinstance(record, xr.Dataset) else list(record)
     scenario = under_its_law(scenario, records)
     problem = output_error_problem(records, robot, scenario)
-    drive = choose_drive(lambda named: output_error_problem(records, robot, named), scenario, progress)
+    in_loop = not any(run.settings.drives.torques for run in problem.runs)
+    drive = choose_drive(lambda named: output_error_problem(records, robot, named), scenario, progress, in_loop)
     if drive.asked:
         scenario = with_drive(scenario, drive.law)
         problem = output_error_problem(records, robot, scenario)
@@ -69,7 +70,7 @@ def identify(
         uncertainty = estimate_uncertainty(judged, solution.parameters, rng, advance)
     by_commands = searches["command_driven"]
     driven = judged if method == "command_driven" else by_commands.linearised()
-    explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit)
+    explained = explanation(driven, by_commands.solution.parameters, uncertainty.misfit, rng)
     judgement = judge(problem, scenario, solution, uncertainty, explained)
     ended = time.perf_counter()
     return IdentificationResult(

@@ -146,9 +146,10 @@ class IdentificationResult:
             "decided_by": "record" if self.drive.asked else "scenario",
             "sure": self.drive.sure,
             "probabilities": dict(self.drive.probabilities),
+            "in_loop": self.drive.in_loop,
             "fixed_at_zero": [f"joint_pid.{name}" for name in JOINT_PID if name not in READS[law]],
         }
-        if law == "cascade":
+        if law == "cascade" and self.drive.in_loop:
             own, by_gains = cascade_gains(self.estimate[gains])
             std = np.sqrt(np.diag(by_gains @ self.covariance[gains, gains] @ by_gains.T))
             units = "1/s", self.layout.unit("joint_pid.ld"), self.layout.unit("joint_pid.lp")

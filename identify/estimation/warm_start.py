@@ -48,7 +48,8 @@ REWEIGHTINGS = 3
 def linear_warm_start(problem: OutputErrorProblem, scenario: Scenario) -> Array:
     """Parameters (p,) fitted to the measured poses and commands of the problem's runs.
 
-    Each run has its own starting torques; what a known payload adds stands on the right side. The residual's size is
+    Each run has its own starting torques; what a known payload adds stands on the right side, as do torques that were
+    commanded. The residual's size is
     estimated from the fit itself, so that the starting guess counts as much as it should.
     """
     guess, noise = problem.guess, 0.1
@@ -78,6 +79,13 @@ def _stacked(problem: OutputErrorProblem, scenario: Scenario, law: JointLaw) -> 
     for place, run in enumerate(runs):
         balance, slipping = joint_balance(run.robot, run.without_gaps(), run.logged, scenario, law)
         columns = balance[slipping]
+        if run.settings.drives.torques:
+            columns[:, layout.joint_pid] = 0.0
+            matrices.append(columns[:, :count])
+            felt = effective_command(run.logged, scenario)[0][slipping]
+            right.append(felt - columns[:, :count] @ run.payload)
+            common.append(np.zeros((len(columns), 0)))
+            continue
         matrix = np.zeros((len(columns), count + joints * len(runs)))
         matrix[:, :count] = columns[:, :count]
         matrix[:, count + joints * place :][:, :joints] = columns[:, count:]

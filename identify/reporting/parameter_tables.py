@@ -40,6 +40,8 @@ def scale_sentence(identification: Mapping[str, Any]) -> str:
     anchor = identification["scale_anchor"]
     said, gain = ANCHORS.get(anchor, anchor), identification["parameters"].get("joint_pid.lp", {})
     share = gain.get("prior_share") or 0.0
+    if not identification.get("drive", {}).get("in_loop", True):
+        return "The overall scale is that of the torques that were commanded."
     if anchor == "prior" or share <= RESTS_ON_PRIOR:
         return f"The overall scale is fixed by {said}."
     return (
@@ -100,6 +102,8 @@ DRIVES = {
 def drive_sentence(identification: Mapping[str, Any]) -> str:
     """What law the drives have, and how that is known; nothing of the usual one that nobody asked about."""
     drive = identification.get("drive")
+    if drive is not None and not drive.get("in_loop", True):
+        return "The drives took torques: the record says nothing of the law by which they follow joint commands."
     if drive is None or (drive["decided_by"] == "scenario" and drive["law"] == "pid"):
         return ""
     said = f"The law of the drives is {DRIVES[drive['law']]}"
@@ -127,14 +131,17 @@ def unidentified(identification: Mapping[str, Any]) -> list[tuple[str, list[str]
         return [("the model does not explain the record, so that no estimate can be trusted", left)]
     fixed = set(identification.get("drive", {}).get("fixed_at_zero", ()))
     shown = (alone | {name for name in parameters if name.startswith("joint_pid.")}) - fixed
+    outside = set() if identification.get("drive", {}).get("in_loop", True) else shown - alone
+    shown -= outside
     kinds = {
         "the law of the drives has no such gain": [name for name in left if name in fixed],
+        "the drives took torques, and these gains had no part in the run": [name for name in left if name in outside],
         "motion shows them only in sums with others, and not one by one; the sums are what is known": [
             name for name in left if name in summed
         ],
         "this record shows them too badly. It neither halves what the starting value left open, nor leaves less than "
         "half of their size in doubt. More or faster motion may show them": [n for n in left if n in shown],
-        "no motion of this robot depends on them": [name for name in left if name not in summed | shown | fixed],
+        "no motion of this robot depends on them": [n for n in left if n not in summed | shown | fixed | outside],
     }
     return [(reason, names) for reason, names in kinds.items() if names]
 

@@ -35,6 +35,7 @@ from identify.loop_parameters import settled_drive, with_drive
 from identify.progress import Progress
 from identify.random_streams import INSTRUMENTS, LATENCY, mixed_generator, stream_seed
 from identify.record.known_geometry import known_geometry
+from identify.record.law import takes_torques
 from identify.record.provenance import RunFiles
 from identify.record.recorded_run import recorded_reference
 from identify.scenario import Scenario, load_scenario
@@ -111,6 +112,11 @@ def compare_on_run(
     """
     folder, record = files.folder, files.experiment
     scenario, truth = load_scenario(folder.scenario), read_truth(folder.experiment)
+    if takes_torques(record):
+        raise EstimationError(
+            "the commands of this record are torques, and the estimators compared need joint commands: record the "
+            "excitation under excitation.law = pid or feedforward"
+        )
     if scenario.model.drive == AUTO:
         scenario = with_drive(scenario, settled_drive(load_result(folder.result).get("identification")))
     robot, channels = known_geometry(scenario, folder.path).robot, folder.path / "instruments.nc"

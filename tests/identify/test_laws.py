@@ -9,6 +9,7 @@ from identify.experiment.plant import build_plant
 from identify.experiment.run import excitation_run
 from identify.experiment.truth import true_poses
 from identify.record.law import recorded_law, takes_torques
+from identify.record.recorded_run import recorded_run
 from identify.studies.rows.sensor import DrawnSensor
 from identify.validation.unseen import model_on_record
 from tests.identify.synthetic import NAMES, SIGMA, quick, rss6, short_run, trajectory
@@ -39,6 +40,52 @@ def test_a_record_under_a_feedforward_is_identified_by_its_commands(observer):
     assert result.identifiable[GAINS].all()
     after = model_on_record(rss6(), scenario, result.estimate, made.record)
     assert np.abs((after - true_poses(made.truth))[:, :3]).max() < 5e-6
+
+
+@pytest.mark.slow
+def test_a_record_of_torques_shows_base_parameters_without_the_gains():
+    """Under computed torque with the starting model: friction and base parameters within their intervals, residuals
+    that are white, and gains that nobody claims to know."""
+    scenario, plant, made = excited("computed_torque", seconds=4.0)
+    assert takes_torques(made.record)
+    assert made.record["command"].attrs["units"] == "N m"
+    result, true = identify(made.record, rss6(), scenario), plant.parameters
+    assert np.abs((result.estimate - true) / result.std)[FRICTION].max() < 3.5
+    groups = result.groups
+    off = ((groups.estimate - groups.combinations @ true[:64]) / groups.std)[groups.identifiable]
+    assert len(off) > 30
+    assert np.abs(off).max() < 3.5
+    assert result.whiteness.p_value > 0.01
+    assert not result.identifiable[GAINS].any()
+    np.testing.assert_allclose(result.estimate[GAINS], result.initial[GAINS], rtol=1e-9)
+    assert not result.to_dict()["drive"]["in_loop"]
+    assert any("the drives took torques" in warning for warning in result.warnings)
+
+
+@pytest.mark.thorough
+def test_base_parameters_of_torques_err_as_much_as_their_intervals_say():
+    """Over twelve seeds: the mean squared normalised error of friction and groups is one, but for chance."""
+    squares = []
+    for seed in range(12):
+        scenario, plant, made = excited("computed_torque", seed=seed, seconds=4.0)
+        result, true = identify(made.record, rss6(), scenario), plant.parameters
+        groups = result.groups
+        off = ((groups.estimate - groups.combinations @ true[:64]) / groups.std)[groups.identifiable]
+        friction = ((result.estimate - true) / result.std)[FRICTION]
+        squares.append([np.mean(off**2), np.mean(friction**2)])
+    assert (np.mean(squares, axis=0) < 1.4).all(), squares
+
+
+def test_derivatives_of_fitted_spans_are_finite_differences():
+    """Of the poses, by the platform's mass and the friction of a joint: each span's start follows."""
+    scenario, plant, made = excited("computed_torque", seconds=2.0)
+    run, values = recorded_run(made.record, rss6(), scenario), plant.parameters
+    slopes = run.simulate(values).pose_sensitivity
+    for index, size in ((0, 1e-3), (FRICTION[1], 1e-5), (FRICTION[7], 1e-5)):
+        ends = [run.simulate(values + sign * size * np.eye(len(values))[index]).pose for sign in (1, -1)]
+        numeric = (ends[0] - ends[1]) / (2 * size)
+        own = slopes[:, :, index]
+        assert np.median(np.abs(own - numeric)) < 0.02 * np.sqrt(np.mean(numeric**2))
 
 
 def test_a_record_that_says_nothing_is_the_servos():
