@@ -3,7 +3,7 @@
 Sensor
     load_sensor(name_or_path, seed) -> Sensor   built in (`built_in_names() -> list[str]`), or a TOML file
     Sensor.measure(pose) -> Measurement         pose (6,) m, rad and its covariance (6,6); teaches itself on first use
-    Sensor.measure_many(poses) -> MeasuredPoses many poses at once, by the renderer "statistical", without images
+    Sensor.measure_many(poses) -> MeasuredPoses many poses at once, with images or, "statistical", without
     Sensor.capture(pose) -> StereoFrame         both whole images
     Sensor.teach() -> Taught                    what other sensors with the same cameras and bodies may take over
     require_opengl()                            raises OpenGLMissingError where pyrender cannot draw

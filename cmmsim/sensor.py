@@ -18,7 +18,7 @@ from cmmsim.detection.detector import find_detector
 from cmmsim.detection_settings import StickerView
 from cmmsim.drift_watch import DriftWatch
 from cmmsim.drift_watch.watch import CHANCE
-from cmmsim.errors import CmmError, UnknownOptionError
+from cmmsim.errors import CmmError, LostError, UnknownOptionError
 from cmmsim.files.schema import SensorFile, Timing
 from cmmsim.files.sensor_file import read_sensor_file
 from cmmsim.files.setup import marked_body, require_corner
@@ -28,8 +28,10 @@ from cmmsim.geometry.pose import Array, checked_pose
 from cmmsim.geometry.stereo_rig import PARAMETER_NAMES
 from cmmsim.imaging.exposure import Quality, VirtualStereoCamera
 from cmmsim.imaging.renderer import choose_renderer
+from cmmsim.many_frames import expected_at, measure_at_rest, measure_moving
 from cmmsim.plugins import is_own, require_renderer
 from cmmsim.pose_estimation.estimator import METHODS, Measurement, PoseEstimator, lost_measurement
+from cmmsim.pose_estimation.many import ManySeen, MeasuredPoses
 from cmmsim.pose_estimation.observation import DetectionSettings, Observer
 from cmmsim.pose_estimation.taught import Taught, require_taught_for, setup_of
 from cmmsim.radiometry.images import StereoFrame, StereoImages
@@ -40,7 +42,7 @@ from cmmsim.tracker import Tracker
 from cmmsim.true_cameras import TrueCameras
 
 if TYPE_CHECKING:
-    from cmmsim.statistical.measuring import MeasuredPoses, StatisticalTracker
+    from cmmsim.statistical.measuring import StatisticalTracker
 
 TEACHING_STREAM, RUN_STREAM, DROPOUT_STREAM = 0, 1, 2
 
@@ -281,26 +283,70 @@ class Sensor:
             raise CmmError(f"{what} poses by registration only, not by {self.method}")
 
     def measure_many(
-        self, poses: ArrayLike, pose_rates: ArrayLike | None = None, obstacles: Mapping[str, Array] | None = None
+        self,
+        poses: ArrayLike,
+        pose_rates: ArrayLike | None = None,
+        obstacles: Mapping[str, Array] | None = None,
+        near: ArrayLike | None = None,
     ) -> MeasuredPoses:
         """Measure the platform at each of the poses (N,6), in motion at pose_rates (N,6), behind obstacles that stand
-        still: one frame each, with noise and dropout of its own, and without drift. As ``measure``, but some 40,000
-        frames a second and core.
+        still: one frame each, with noise and dropout of its own, and without drift.
 
-        Raises CmmError for a sensor that needs images, or measures by planes.
+        Nothing is searched or tracked: stickers are looked for near poses (N,6), or where they are where that is not
+        said. Each frame has the noise that ``measure`` would have given it. At rest, frames are drawn and measured in
+        blocks on all cores, moving ones with images one by one; without images, 40,000 frames a second and core.
+        Raises CmmError for a sensor without images that measures by planes.
         """
-        at = finite_array(poses, (len(np.atleast_1d(poses)), 6), "poses are rows of six finite numbers")
+        at = _rows(poses, "poses are rows of six finite numbers")
         rates = finite_array(
             0.0 * at if pose_rates is None else pose_rates, at.shape, "there is a pose_rate to each pose"
         )
-        tracker, camera, placed = self._new_tracker(), self.camera, self.true_cameras.placed(obstacles)
-        if isinstance(tracker, Tracker) or not isinstance(camera, StatisticalStereoCamera):
-            able = f"renderer {STATISTICAL.name!r} and method 'registration' only"
-            raise CmmError(f"many poses are measured at once by {able}, not by {self.renderer!r} and {self.method!r}")
-        rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
-        self._frame += len(at)
-        found = tracker.measure_many(camera, camera.exposed(at, rates), camera.placed(placed), rng)
+        camera, placed = self.camera, self.true_cameras.placed(obstacles)
+        still = not rates.any() or (self.timing.exposure == 0.0 and not self.true_cameras.right_later)
+        if isinstance(camera, StatisticalStereoCamera):
+            tracker = self._new_tracker()
+            if isinstance(tracker, Tracker):
+                able = f"by registration only, not by {self.method}, with renderer {STATISTICAL.name!r}"
+                raise CmmError(f"many poses are measured at once {able}")
+            rng = np.random.default_rng([self._run_seed, RUN_STREAM, self._frame])
+            self._frame += len(at)
+            found = tracker.measure_many(camera, camera.exposed(at, rates), camera.placed(placed), rng)
+        elif still:
+            found = MeasuredPoses.of([each.found for each in self._at_rest(camera, at, near, placed)])
+        else:
+            found = MeasuredPoses.of_each(
+                measure_moving(camera, self.estimator, at, rates, self._frame_rngs(len(at)), placed)
+            )
         return found.without(self._dropout_rng.random(len(at)) < self.timing.dropout)
+
+    def measure_each(self, poses: ArrayLike, near: ArrayLike) -> list[Measurement]:
+        """As ``measure_many`` of a platform at rest at poses (N,6), with all that a measurement holds; none drops out.
+
+        Without images, stickers are looked for in windows near poses (N,6), too.
+        """
+        at, camera = _rows(poses, "poses are rows of six finite numbers"), self.camera
+        if not isinstance(camera, StatisticalStereoCamera):
+            return [one for each in self._at_rest(camera, at, near, {}) for one in each.measurements()]
+        found, estimator = [], self.estimator
+        for pose, expected in zip(at, expected_at(estimator, np.asarray(near, dtype=float)), strict=True):
+            try:
+                found.append(estimator.measure(self.look(pose), expected)[0])
+            except LostError as error:
+                found.append(lost_measurement(str(error)))
+        return found
+
+    def _at_rest(
+        self, camera: VirtualStereoCamera, poses: Array, near: ArrayLike | None, placed: Mapping[str, Array]
+    ) -> list[ManySeen]:
+        """The next frames, of a platform at rest at poses (N,6), in blocks."""
+        around = finite_array(poses if near is None else near, poses.shape, "there is a pose near each pose")
+        return measure_at_rest(camera, self.estimator, poses, around, self._frame_rngs(len(poses)), placed)
+
+    def _frame_rngs(self, count: int) -> list[np.random.Generator]:
+        """Streams of noise of the next frames."""
+        first = self._frame
+        self._frame += count
+        return [np.random.default_rng([self._run_seed, RUN_STREAM, first + k]) for k in range(count)]
 
     def _new_tracker(self) -> Tracker | StatisticalTracker:
         """What measures frame after frame."""
@@ -316,6 +362,11 @@ class Sensor:
     def camera(self) -> VirtualStereoCamera | StatisticalStereoCamera:
         """The two cameras before the true scene, as they are at teaching."""
         return self.true_cameras.at_rest
+
+
+def _rows(poses: ArrayLike, what: str) -> Array:
+    """Poses (N,6), checked."""
+    return finite_array(poses, (len(np.atleast_1d(poses)), 6), what)
 
 
 def load_sensor(

@@ -60,7 +60,7 @@ class TrueCameras:
             for stream, (body, section) in enumerate(zip(bodies, (file.platform, file.base), strict=True))
         ]
         self.obstacles: dict[str, Mesh] = {}
-        self._right_later = 0.0
+        self.right_later = 0.0
         self._drift: Drift | None = None
 
     def add_bodies(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
@@ -91,7 +91,7 @@ class TrueCameras:
 
     def move(self, changes: Mapping[str, float], right_later: float) -> None:
         """As ``Sensor.move_rig``."""
-        self.rig, self._right_later = self.rig.moved(rig_changes(changes)), right_later
+        self.rig, self.right_later = self.rig.moved(rig_changes(changes)), right_later
         self._draw_anew()
 
     def drift(self, changes: Mapping[str, float], frames: int) -> None:
@@ -131,7 +131,7 @@ class TrueCameras:
             light,
             list(self.obstacles),
             self._file.timing.exposure,
-            self._right_later,
+            self.right_later,
         )
 
     def _drawing(self) -> VirtualStereoCamera:
@@ -150,7 +150,7 @@ class TrueCameras:
             list(self.obstacles),
             file.timing.exposure,
             file.camera.pattern_seed,
-            self._right_later,
+            self.right_later,
         )
 
     def _draw_anew(self) -> None:

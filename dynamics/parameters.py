@@ -18,6 +18,15 @@ PLATFORM = Body("platform", ("Ixx", "Iyy", "Izz"))
 JOINT_PID = ("lp", "li", "ld")
 
 
+LANES = 8
+"""Derivatives that are computed at once."""
+
+
+def room_for_derivatives(parameters: int, start: int) -> int:
+    """Of one number by the parameters, the length of a step and the entries of a start: a multiple of LANES."""
+    return -(-(parameters + 1 + start) // LANES) * LANES
+
+
 @dataclass(frozen=True)
 class ParameterLayout:
     """Which parameters a robot has: those of its bodies, dry and viscous friction of its joints, and the joint PID.
@@ -70,6 +79,10 @@ class ParameterLayout:
     def names(self) -> tuple[str, ...]:
         """Of all: the dynamic parameters, then lp, li, ld."""
         return self.dynamic_names + self.joint_pid_names
+
+    def derivatives(self, coordinates: int) -> int:
+        """Room for the derivatives of one number of the loop, of a platform with so many coordinates."""
+        return room_for_derivatives(len(self.names), 3 * coordinates + self.joints)
 
     @property
     def rigid(self) -> slice:

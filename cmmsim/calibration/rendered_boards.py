@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from cmmsim.calibration.board import Board
 from cmmsim.errors import CalibrationError
 from cmmsim.geometry.camera import Optics, PinholeCamera
-from cmmsim.geometry.pose import Array, apply, frozen, invert
+from cmmsim.geometry.pose import Array, apply, apply_each, frozen, invert
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.formation import ImageFormation, Side
 from cmmsim.imaging.renderer import Drawable, Renderer
@@ -104,7 +104,7 @@ def _draw_pose(rig: StereoRig, board: Board, number: int, rng: np.random.Generat
         before = rng.bit_generator.state
         drawn = _drawn_numbers(number, first, AT_ONCE, rng)
         poses = _poses_of(rig, corners.mean(axis=0), depth, number % 2, *drawn)
-        good = rig.project(_placed(poses, corners))[1].all(axis=(0, 2)) & _front_to_both(rig, poses, corners)
+        good = rig.project(apply_each(poses, corners))[1].all(axis=(0, 2)) & _front_to_both(rig, poses, corners)
         if good.any():
             chosen = int(np.argmax(good))
             rng.bit_generator.state = before  # as if no pose had been drawn beyond the chosen one
@@ -151,11 +151,6 @@ def _poses_of(rig: StereoRig, middle: Array, depth: float, side: int, cells: NDA
 
 def _right_eye(rig: StereoRig) -> Array:
     return invert(rig.right_from_left)[:3, 3]
-
-
-def _placed(poses: Array, points: Array) -> Array:
-    """Points (k,3) carried by each of the transforms (n,4,4): (n,k,3)."""
-    return np.asarray(points @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3])
 
 
 def _facing(towards: Array) -> Array:

@@ -43,7 +43,7 @@ import numpy as np
 
 from cmmsim.errors import CmmError
 from cmmsim.geometry.camera import PinholeCamera
-from cmmsim.geometry.pose import Array, apply, frozen
+from cmmsim.geometry.pose import Array, frozen
 from cmmsim.geometry.stereo_rig import StereoRig
 
 RIM_POINTS = 24  # of a bent ellipse, over which its fit is integrated
@@ -70,15 +70,15 @@ def sticker_outlines(
 ) -> tuple[Array, Array]:
     """Centres (2, n, 2) px and shapes A (2, n, 2, 2) px of the ellipses of n stickers in the images as they are.
 
-    Parameters: camera_from_body (4,4); places (n,3) m and normals (n,3) in body axes; radius m. Distortion is taken as
-    linear across a sticker.
+    Parameters: camera_from_body (4,4), or one for each sticker (n,4,4); places (n,3) m and normals (n,3) in body axes;
+    radius m. Distortion is taken as linear across a sticker.
     """
     centres, shapes = [], []
     for camera, from_camera in zip(rig.cameras, rig.from_camera, strict=True):
         move = from_camera @ camera_from_body
-        middles, shape = project_discs(
-            camera.ideal, apply(move, places), normals @ move[:3, :3].T, np.full(len(places), radius)
-        )
+        centre = np.einsum("...ij,...j->...i", move[..., :3, :3], places) + move[..., :3, 3]
+        normal = np.einsum("...ij,...j->...i", move[..., :3, :3], normals)
+        middles, shape = project_discs(camera.ideal, centre, normal, np.full(len(places), radius))
         if not camera.distortion.is_zero:
             local = camera.distortion_jacobian(middles) @ shape
             middles, shape = camera.distort(middles)[0], symmetric_root(local @ local.swapaxes(-1, -2))

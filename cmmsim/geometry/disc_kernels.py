@@ -83,9 +83,12 @@ def side_share(start_x: float, start_y: float, step_x: float, step_y: float) -> 
     step2 = step_x * step_x + step_y * step_y
     dot = start_x * step_x + start_y * step_y
     cross = start_x * step_y - start_y * step_x
-    root = math.sqrt(max(dot * dot - step2 * (start2 - 1.0), 0.0))
+    within = step2 - cross * cross  # dot² - step² (start² - 1), by Lagrange's identity
+    if within <= 0.0:  # the line passes the disc: one sector
+        return math.atan2(cross, start2 + dot), 0.0, 0.0
+    root = math.sqrt(within)
     enter, leave = min(max((-dot - root) / step2, 0.0), 1.0), min(max((-dot + root) / step2, 0.0), 1.0)
-    if enter == leave:  # outside: one sector
+    if enter == leave:  # the side does, not its line
         return math.atan2(cross, start2 + dot), enter, leave
     area = (leave - enter) * cross
     if enter > 0.0:
@@ -104,33 +107,51 @@ def reach_of_pixel(m: Array) -> float:
 
 
 @compiled
-def cover_pixel(x: float, y: float, m: Array) -> tuple[float, float, float, float, float, float]:
-    """Share of the pixel with middle (x, y), px from the ellipse's centre, and its derivatives by [c_x, c_y, A_xx,
-    A_xy, A_yy]."""
-    a_x, a_y = into_disc(x - 0.5, y - 0.5, m)
-    low, left = side_share(a_x, a_y, m[0, 0], m[1, 0]), side_share(a_x, a_y, m[0, 1], m[1, 1])
-    high = side_share(a_x + m[0, 1], a_y + m[1, 1], m[0, 0], m[1, 0])
-    right = side_share(a_x + m[0, 0], a_y + m[1, 0], m[0, 1], m[1, 1])
-    return cover_within(x, y, m, low, high, left, right)
-
-
-@compiled
 def into_disc(x: float, y: float, m: Array) -> tuple[float, float]:
     """A place in px from the ellipse's centre, in disc units."""
     return m[0, 0] * x + m[0, 1] * y, m[1, 0] * x + m[1, 1] * y
 
 
 @compiled
+def sides_of(column: int, row: int, x: float, y: float, m: Array, before: tuple, below: Array) -> tuple:
+    """``side_share`` of the four sides of the pixel in this column and row with middle (x, y): low, high, left, right.
+
+    Neighbours have a side in common: ``before`` is (column, *right side) of the last pixel asked for in this row, and
+    ``below`` (w,4) holds (row, *upper side) of the last one in each column, which is renewed.
+    """
+    a_x, a_y = into_disc(x - 0.5, y - 0.5, m)  # the corner (left, low)
+    if before[0] == column - 1:
+        left = before[1], before[2], before[3]
+    else:
+        left = side_share(a_x, a_y, m[0, 1], m[1, 1])
+    last = below[column]
+    if last[0] == row - 1:
+        low = last[1], last[2], last[3]
+    else:
+        low = side_share(a_x, a_y, m[0, 0], m[1, 0])
+    high = side_share(a_x + m[0, 1], a_y + m[1, 1], m[0, 0], m[1, 0])
+    right = side_share(a_x + m[0, 0], a_y + m[1, 0], m[0, 1], m[1, 1])
+    last[0], last[1], last[2], last[3] = row, high[0], high[1], high[2]
+    return low, high, left, right
+
+
+@compiled
+def share_within(m: Array, low: tuple, high: tuple, left: tuple, right: tuple) -> float:
+    """Share of a pixel from the ``side_share`` of its sides."""
+    return 0.5 / (m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0]) * (low[0] - high[0] + right[0] - left[0])
+
+
+@compiled
 def cover_within(
     x: float, y: float, m: Array, of_low: tuple, of_high: tuple, of_left: tuple, of_right: tuple
 ) -> tuple[float, float, float, float, float, float]:
-    """``cover_pixel`` from the ``side_share`` of its four sides, of which two run along x and two along y: along each
-    the boundary moves by v = dc + dA A^-1 (x - c)."""
-    det = 1.0 / (m[0, 0] * m[1, 1] - m[0, 1] * m[1, 0])
+    """Share of the pixel with middle (x, y), px from the ellipse's centre, and its derivatives by [c_x, c_y, A_xx,
+    A_xy, A_yy], from the ``side_share`` of its four sides, of which two run along x and two along y: along each the
+    boundary moves by v = dc + dA A^-1 (x - c)."""
     left, right, low, high = x - 0.5, x + 0.5, y - 0.5, y + 0.5
-    (area_low, low_in, low_out), (area_high, high_in, high_out) = of_low, of_high
-    (area_left, left_in, left_out), (area_right, right_in, right_out) = of_left, of_right
-    share = 0.5 * det * (area_low - area_high + area_right - area_left)
+    (_, low_in, low_out), (_, high_in, high_out) = of_low, of_high
+    (_, left_in, left_out), (_, right_in, right_out) = of_left, of_right
+    share = share_within(m, of_low, of_high, of_left, of_right)
 
     in_low, in_high, in_left, in_right = low_out - low_in, high_out - high_in, left_out - left_in, right_out - right_in
     mid_low, mid_high = left + 0.5 * (low_in + low_out), left + 0.5 * (high_in + high_out)
@@ -144,6 +165,13 @@ def cover_within(
     by_xy = (m[0, 1] + m[1, 0]) * share - across_1 - up_0
     by_yy = m[1, 1] * share - up_1
     return share, in_left - in_right, in_low - in_high, by_xx, by_xy, by_yy
+
+
+@compiled
+def rim_between(reach: float) -> tuple:
+    """Squared distances, in disc units, up to which a pixel that reaches so far from its middle lies wholly inside of a
+    disc, and from which on outside."""
+    return (1.0 - reach) ** 2 if reach < 1.0 else -1.0, (1.0 + reach) ** 2
 
 
 @compiled
@@ -162,15 +190,15 @@ def cover_window(centre_x: float, centre_y: float, shape: Array, shares: Array, 
     height, width = shares.shape
     m = inverse_of(shape)
     reach = reach_of_pixel(m)
-    inner, outer = (1.0 - reach) ** 2 if reach < 1.0 else -1.0, (1.0 + reach) ** 2
+    inner, outer = rim_between(reach)
     extent_x, extent_y = math.hypot(shape[0, 0], shape[0, 1]), math.hypot(shape[1, 0], shape[1, 1])
     first, last = max(0, math.ceil(centre_x - extent_x - 0.5)), min(width, math.floor(centre_x + extent_x + 1.5))
     top, bottom = max(0, math.ceil(centre_y - extent_y - 0.5)), min(height, math.floor(centre_y + extent_y + 1.5))
-    below, row_below = np.empty((width, 3)), np.full(width, -2)  # upper sides of pixels, and the rows of these
+    below = np.full((width, 4), -2.0)
     shares[:] = 0.0
     derivatives[:] = 0.0
     for row in range(top, bottom):
-        beside, right = -2, (0.0, 0.0, 0.0)  # right side of the pixel in that column
+        before = -2.0, 0.0, 0.0, 0.0
         for column in range(first, last):
             x, y = column - centre_x, row - centre_y
             u, v = into_disc(x, y, m)
@@ -178,16 +206,8 @@ def cover_window(centre_x: float, centre_y: float, shape: Array, shares: Array, 
             if distance2 <= inner:
                 shares[row, column] = 1.0
             elif distance2 < outer:
-                a_x, a_y = into_disc(x - 0.5, y - 0.5, m)
-                left = right if beside == column - 1 else side_share(a_x, a_y, m[0, 1], m[1, 1])
-                if row_below[column] == row - 1:
-                    low = below[column, 0], below[column, 1], below[column, 2]
-                else:
-                    low = side_share(a_x, a_y, m[0, 0], m[1, 0])
-                high = side_share(a_x + m[0, 1], a_y + m[1, 1], m[0, 0], m[1, 0])
-                beside, right = column, side_share(a_x + m[0, 0], a_y + m[1, 0], m[0, 1], m[1, 1])
-                below[column, 0], below[column, 1], below[column, 2] = high
-                row_below[column] = row
+                low, high, left, right = sides_of(column, row, x, y, m, before, below)
+                before = float(column), right[0], right[1], right[2]
                 share, by_x, by_y, by_xx, by_xy, by_yy = cover_within(x, y, m, low, high, left, right)
                 shares[row, column] = share
                 into = derivatives[row, column]

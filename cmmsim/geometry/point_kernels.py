@@ -130,3 +130,37 @@ def rigid_step(
     factor(normal)
     invert_factored(normal, covariance)
     solve_factored(normal, change)
+
+
+@compiled
+def turn_by(vector: Array, rotation: Array) -> None:
+    """Turn a rotation (3,3) by a rotation vector (3,) (Rodrigues)."""
+    angle = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    first = math.sin(angle) / angle if angle > 1e-9 else 1.0
+    second = 0.5 * (math.sin(0.5 * angle) / (0.5 * angle)) ** 2 if angle > 1e-9 else 0.5
+    for j in range(3):
+        x = vector[1] * rotation[2, j] - vector[2] * rotation[1, j]
+        y = vector[2] * rotation[0, j] - vector[0] * rotation[2, j]
+        z = vector[0] * rotation[1, j] - vector[1] * rotation[0, j]
+        rotation[0, j] += first * x + second * (vector[1] * z - vector[2] * y)
+        rotation[1, j] += first * y + second * (vector[2] * x - vector[0] * z)
+        rotation[2, j] += first * z + second * (vector[0] * y - vector[1] * x)
+
+
+@compiled
+def rigid_fits(
+    source: Array, target: Array, weights: Array, starts: Array, steps: int, transforms: Array, covariances: Array
+) -> None:
+    """Rigid fits target = transform(source) by ``steps`` of Gauss-Newton, the points ``starts[f]`` to ``starts[f + 1]``
+    belonging to fit f.
+
+    source and target (k,3) m; weights (k,3,3); transforms (f,4,4) from start to result; fills covariances (f,6,6).
+    """
+    change = np.empty(6)
+    for f in range(len(transforms)):
+        own = slice(starts[f], starts[f + 1])
+        for _ in range(steps if starts[f + 1] > starts[f] else 0):
+            rigid_step(source[own], target[own], weights[own], transforms[f], covariances[f], change)
+            turn_by(change[3:], transforms[f, :3, :3])
+            for i in range(3):
+                transforms[f, i, 3] += change[i]

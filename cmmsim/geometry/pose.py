@@ -72,12 +72,16 @@ def all_rigid(transforms: Array) -> bool:
 
 def transform_to_pose(transform: ArrayLike) -> Array:
     """Pose (6,) of a transform (4,4); beta lies in [-pi/2, pi/2]. Raises ShapeError when it is no rigid transform."""
-    values = checked_transform(transform)
-    r = values[:3, :3]
-    alpha = np.arctan2(-r[1, 2], r[2, 2])
-    beta = np.arctan2(r[0, 2], np.hypot(r[1, 2], r[2, 2]))
-    gamma = np.arctan2(-r[0, 1], r[0, 0])
-    return np.array([*values[:3, 3], alpha, beta, gamma])
+    return poses_of(checked_transform(transform))
+
+
+def poses_of(transforms: Array) -> Array:
+    """Poses (..., 6) of rigid transforms (..., 4, 4)."""
+    r = transforms[..., :3, :3]
+    alpha = np.arctan2(-r[..., 1, 2], r[..., 2, 2])
+    beta = np.arctan2(r[..., 0, 2], np.hypot(r[..., 1, 2], r[..., 2, 2]))
+    gamma = np.arctan2(-r[..., 0, 1], r[..., 0, 0])
+    return np.concatenate([transforms[..., :3, 3], np.stack([alpha, beta, gamma], axis=-1)], axis=-1)
 
 
 def rigid(rotation: ArrayLike, translation: ArrayLike) -> Array:
@@ -95,6 +99,11 @@ def invert(transform: Array) -> Array:
 def apply(transform: Array, points: Array) -> Array:
     """Points (..., 3) carried by a transform (4,4)."""
     return points @ transform[:3, :3].T + transform[:3, 3]
+
+
+def apply_each(transforms: Array, points: Array) -> Array:
+    """Points (n,3) carried by each of the transforms (..., 4,4): (..., n, 3)."""
+    return np.asarray(points @ transforms[..., :3, :3].swapaxes(-1, -2) + transforms[..., None, :3, 3])
 
 
 def skew(vectors: Array) -> Array:
@@ -124,27 +133,34 @@ def rotation_log(rotation: Array) -> Array:
 
 
 def euler_rates_matrix(pose: Array) -> Array:
-    """Matrix (3,3) from [d alpha, d beta, d gamma] to the rotation vector, in the axes of the output frame."""
-    ca, sa = np.cos(pose[3]), np.sin(pose[3])
-    cb, sb = np.cos(pose[4]), np.sin(pose[4])
-    return np.array([[1.0, 0.0, sb], [0.0, ca, -sa * cb], [0.0, sa, ca * cb]])
+    """Matrix (..., 3, 3) from [d alpha, d beta, d gamma] of poses (..., 6) to the rotation vector, in the axes of the
+    output frame."""
+    ca, sa = np.cos(pose[..., 3]), np.sin(pose[..., 3])
+    cb, sb = np.cos(pose[..., 4]), np.sin(pose[..., 4])
+    rates = np.zeros((*pose.shape[:-1], 3, 3))
+    rates[..., 0, 0], rates[..., 0, 2] = 1.0, sb
+    rates[..., 1, 1], rates[..., 1, 2] = ca, -sa * cb
+    rates[..., 2, 1], rates[..., 2, 2] = sa, ca * cb
+    return rates
 
 
 def pose_jacobian(pose: Array) -> Array:
-    """Change (6,6) of a pose (6,) by the small error [dt, dphi] of its transform."""
-    jacobian = np.eye(6)
-    jacobian[3:, 3:] = np.linalg.inv(euler_rates_matrix(pose))
+    """Change (..., 6, 6) of poses (..., 6) by the small errors [dt, dphi] of their transforms."""
+    jacobian = np.zeros((*pose.shape[:-1], 6, 6))
+    jacobian[..., :3, :3] = np.eye(3)
+    jacobian[..., 3:, 3:] = np.linalg.inv(euler_rates_matrix(pose))
     return jacobian
 
 
 def pose_covariance(transform: Array, covariance: Array) -> Array:
-    """Covariance (6,6) of the pose from that of the transform's small error [dt, dphi] (first order)."""
-    jacobian = pose_jacobian(transform_to_pose(transform))
-    return np.asarray(jacobian @ covariance @ jacobian.T)
+    """Covariances (..., 6, 6) of the poses of transforms (..., 4, 4) from those of their small errors [dt, dphi] (first
+    order)."""
+    jacobian = pose_jacobian(poses_of(transform))
+    return np.asarray(jacobian @ covariance @ jacobian.swapaxes(-1, -2))
 
 
 def compose_covariance(outer: Array, covariance: Array) -> Array:
-    """Covariance (6,6) of the error of ``outer @ inner`` from that of ``inner``; ``outer`` (4,4) is exact."""
+    """Covariance (..., 6, 6) of the error of ``outer @ inner`` from that of ``inner``; ``outer`` (4,4) is exact."""
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = outer[:3, :3]
     return turn @ covariance @ turn.T

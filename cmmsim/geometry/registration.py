@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cmmsim.errors import LostError
-from cmmsim.geometry.pose import Array, apply, rigid, rotation_exp
+from cmmsim.geometry.pose import Array, rigid
 
 STEPS = 2  # of Gauss-Newton after the unweighted start
 SMALLEST_SPREAD = 0.005  # m; points closer than this to one line do not determine a rotation
@@ -58,23 +59,42 @@ def require_spread(points: Array) -> None:
         )
 
 
+def spreads(points: Array, weights: Array) -> Array:
+    """How far (f,) those of points (n,3) with weights (f,n,1) of 1, not 0, are from lying on one line: the second
+    singular value of their differences from their middle, m."""
+    middles = (weights * points).sum(axis=1) / np.maximum(weights.sum(axis=1), 1.0)
+    gaps = weights * (points - middles[:, None])
+    squares = np.linalg.eigvalsh(gaps.swapaxes(1, 2) @ gaps)[:, 1]
+    return np.sqrt(np.maximum(squares, 0.0))
+
+
 def register(source: Array, target: Array, covariances: Array) -> Registration:
     """Maximum-likelihood transform with target = transform(source) + noise.
 
     Parameters: source (n,3) known points; target (n,3) measured points, m; covariances (n,3,3) of the measured ones.
     Raises LostError when fewer than three points off one line are given.
     """
-    from cmmsim.geometry.point_kernels import rigid_step  # compiles, so it is loaded where it is first needed
-
     require_spread(source)
-    transform = rigid_start(source, target)
-    weights = np.linalg.inv(covariances)
+    all_of_it = np.array([0, len(source)])
+    fit = register_each(source, target, covariances, all_of_it, rigid_start(source, target)[None])
+    return Registration(fit.transform[0], fit.covariance[0], fit.misfit)
+
+
+def register_each(
+    source: Array, target: Array, covariances: Array, starts: NDArray[np.int_], transforms: Array
+) -> Registration:
+    """``register`` of several sets of points, points ``starts[f]`` to ``starts[f + 1]`` belonging to set f, from rough
+    ``transforms`` (f,4,4).
+
+    Parameters: source (k,3) and target (k,3) m, covariances (k,3,3). Of the result transform is (f,4,4), covariance
+    (f,6,6), misfit (k,).
+    """
+    from cmmsim.geometry.point_kernels import rigid_fits  # compiles, so it is loaded where it is first needed
+
+    weights, found = np.linalg.inv(covariances), np.array(transforms)
     source, target = np.ascontiguousarray(source, dtype=float), np.ascontiguousarray(target, dtype=float)
-    covariance, change = np.empty((6, 6)), np.empty(6)
-    for _ in range(STEPS):
-        rigid_step(source, target, weights, transform, covariance, change)
-        transform[:3, :3] = rotation_exp(change[3:]) @ transform[:3, :3]
-        transform[:3, 3] += change[:3]
-    residuals = target - apply(transform, source)
-    misfit = np.einsum("ni,nij,nj->n", residuals, weights, residuals)
-    return Registration(transform, covariance, misfit)
+    spread = np.zeros((len(found), 6, 6))
+    rigid_fits(source, target, weights, starts, STEPS, found, spread)
+    each = np.repeat(found, np.diff(starts), axis=0)
+    residuals = target - np.einsum("kij,kj->ki", each[:, :3, :3], source) - each[:, :3, 3]
+    return Registration(found, spread, np.einsum("ni,nij,nj->n", residuals, weights, residuals))

@@ -1,36 +1,24 @@
-"""One exposure of two cameras: the poses that they see, the light of windows or whole images over it, and noise.
-
-Most of the scene stands still during an exposure: a window that nothing reaches shows the background and is not drawn,
-one that no moving body reaches is drawn once.
-"""
+"""Exposures of two cameras: the poses that they see, and the light and noise of windows or whole images over them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from cmmsim.errors import CmmError
-from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.pose import Array, apply, pose_to_transform, rigid
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.imaging.formation import ImageFormation, Side
-from cmmsim.imaging.renderer import View
 from cmmsim.imaging.scene import DiscStack
+from cmmsim.imaging.whole_image import whole_image
 from cmmsim.radiometry.images import StereoFrame, Windows
 from cmmsim.radiometry.noise import CameraNoise, FixedPattern, draw_pattern
 
 LARGEST_STEP_PX = 0.3  # between two sub-frames no sticker moves farther
 MOST_SUB_FRAMES = 500
 SUPERSAMPLING = 9
-PASTED_SIZE = 24  # px side of the finely drawn window around a bright spot
-LARGEST_PASTED_SIZE = 96  # px: a larger spot is left coarse
-DARK_RIM = 8  # px of the surroundings that are drawn finely with a spot that is longer than a sticker
-BRIGHT = 0.4  # radiance above which a spot is drawn finely
-TILE = 64  # px side of the pieces that are bent and blurred at a time
-COARSE = 2  # drawn samples a pixel and axis away from bright spots
 
 
 def sub_frame_poses(pose: Array, pose_rate: Array, exposure: float, sticker_pixels: Callable[[Array], Array]) -> Array:
@@ -50,96 +38,6 @@ def sub_frame_poses(pose: Array, pose_rate: Array, exposure: float, sticker_pixe
         )
     share = (2.0 * np.arange(count) + 1.0) / count - 1.0
     return pose + share[:, None] * half
-
-
-def exposed_windows(
-    formation: ImageFormation,
-    camera: PinholeCamera,
-    moments: Sequence[Array],
-    corners: NDArray[np.int_],
-    size: int,
-    supersampling: int,
-    sub_pixels: int | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean and largest radiance (k, size, size) over moments with bodies (b,4,4) each, without vignetting.
-
-    Parameters: corners (k,2) px; supersampling and sub_pixels as of ``ImageFormation.windows``.
-    """
-    reached = formation.reached(camera, moments, corners, size, sub_pixels)
-    moves = np.ptp(np.stack(moments), axis=0).any(axis=(1, 2))[formation.drawable.body_index]
-    drawn_often = np.asarray(reached[:, :, moves].any(axis=(0, 2)))
-    drawn_once = np.asarray(reached.any(axis=(0, 2))) & ~drawn_often
-
-    def draw(bodies: Array, which: NDArray[np.bool_]) -> NDArray[np.float32]:
-        if not which.any():
-            return np.empty((0, size, size), dtype=np.float32)
-        sides = [Side(camera, bodies, corners[which])]
-        return formation.windows(sides, size, supersampling, sub_pixels, shade=False)[0]
-
-    mean = np.full((len(corners), size, size), formation.background, dtype=np.float32)
-    mean[drawn_once] = draw(moments[0], drawn_once)
-    total = draw(moments[0], drawn_often)
-    largest = total.copy()
-    for bodies in moments[1:]:
-        window = draw(bodies, drawn_often)
-        total += window
-        np.maximum(largest, window, out=largest)
-    brightest = mean.copy()
-    mean[drawn_often], brightest[drawn_often] = total / np.float32(len(moments)), largest
-    return mean, brightest
-
-
-def whole_image(
-    formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array], supersampling: int
-) -> NDArray[np.float32]:
-    """Mean radiance (height, width) of one camera's image over moments with bodies (b,4,4) each.
-
-    It is drawn coarsely, and as finely as windows are around each bright spot.
-    """
-    image, bright = _coarse(formation, camera, moments)
-    corners, size = _spots(bright, fixed_size=len(moments) == 1 and formation.draws_pixels([camera]))
-    if len(corners):
-        fine = exposed_windows(formation, camera, moments, corners, size, supersampling)[0]
-        for (x, y), window in zip(corners, fine, strict=True):
-            image[y : y + size, x : x + size] = window
-    if formation.optics.vignetting == 0.0:
-        return image
-    pixels = np.stack(np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), axis=-1)
-    return image * formation.optics.illumination(camera, pixels).astype(np.float32)
-
-
-def _coarse(
-    formation: ImageFormation, camera: PinholeCamera, moments: Sequence[Array]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Mean radiance (height, width) with COARSE² drawn samples a pixel, and where it is bright at any moment."""
-    if len(moments) == 1 and formation.draws_pixels([camera]):
-        view = View(camera.ideal, moments[0], (0, 0), (camera.width, camera.height))
-        image = formation.renderer.draw(formation.drawable, [view], COARSE, formation.background)[0]
-        return image, image > BRIGHT
-    rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
-    x, y = np.meshgrid(TILE * np.arange(columns), TILE * np.arange(rows))
-    corners = np.column_stack([x.ravel(), y.ravel()])
-    mean, brightest = (
-        tiles.reshape(rows, columns, TILE, TILE)
-        .swapaxes(1, 2)
-        .reshape(rows * TILE, columns * TILE)[: camera.height, : camera.width]
-        for tiles in exposed_windows(formation, camera, moments, corners, TILE, COARSE, sub_pixels=1)
-    )
-    return mean, brightest > BRIGHT
-
-
-def _spots(bright: NDArray[np.bool_], fixed_size: bool) -> tuple[NDArray[np.int_], int]:
-    """First pixels (k, 2) of the windows around bright spots, and their side in px."""
-    _, _, stats, centres = cv2.connectedComponentsWithStats(bright.astype(np.uint8))
-    keep = np.isfinite(centres[1:]).all(axis=1)
-    sides = stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
-    size = PASTED_SIZE
-    if not fixed_size:
-        keep &= sides <= LARGEST_PASTED_SIZE - 2 * DARK_RIM
-        size = max(size, int(sides[keep].max(initial=0)) + 2 * DARK_RIM)
-    size = min(size, *bright.shape)
-    highest = np.array(bright.shape[::-1]) - size
-    return np.clip(np.rint(centres[1:][keep]).astype(int) - size // 2, 0, highest), size
 
 
 @dataclass(frozen=True)
@@ -188,6 +86,12 @@ class VirtualStereoCamera:
         moments = [self._placed(p, p + lag, obstacles or {}) for p in poses]
         return LiveImages(self, moments, rng, quality or Quality())
 
+    def look_many(
+        self, poses: Array, rngs: Sequence[np.random.Generator], obstacles: Mapping[str, Array]
+    ) -> "ManyLiveImages":
+        """Exposures of the platform at rest at poses (N,6), each with its own noise, as ``look`` for each of them."""
+        return ManyLiveImages(self, [self._placed(pose, pose, obstacles) for pose in poses], rngs)
+
     def moved(self, changes: Array) -> "VirtualStereoCamera":
         """The same cameras with changes (24,) of their rig's parameters; their pixels stay what they are."""
         camera = replace(self, rig=self.rig.moved(changes))
@@ -201,8 +105,23 @@ class VirtualStereoCamera:
 
         ``placed``: camera_from_body (b,4,4) of all bodies for the left and the right camera.
         """
-        sides = [Side(*side) for side in zip(self.rig.cameras, placed, corners, strict=True)]
-        return np.stack(self.formation.windows(sides, size, supersampling))
+        return self.radiances([placed], [corners], size, supersampling)[0]
+
+    def radiances(
+        self,
+        placed: Sequence[Sequence[Array]],
+        corners: Sequence[NDArray[np.int_]],
+        size: int,
+        supersampling: int,
+    ) -> list[NDArray[np.float32]]:
+        """As ``radiance`` for each of several exposures, whose windows are drawn together."""
+        sides = [
+            Side(*side)
+            for at, first in zip(placed, corners, strict=True)
+            for side in zip(self.rig.cameras, at, first, strict=True)
+        ]
+        windows = self.formation.windows(sides, size, supersampling)
+        return [np.stack(pair) for pair in zip(windows[::2], windows[1::2], strict=True)]
 
     def whole_exposure(self, side: int, moments: Sequence[Array], supersampling: int) -> NDArray[np.float32]:
         """Mean radiance (height, width) of one whole image over the moments of an exposure."""
@@ -225,6 +144,11 @@ class VirtualStereoCamera:
         rngs = [np.random.default_rng([self.pattern_seed, side]) for side in range(2)]
         shapes = [(camera.height, camera.width) for camera in self.rig.cameras]
         return [draw_pattern(shape, prnu, dsnu, rng) for shape, rng in zip(shapes, rngs, strict=True)]
+
+    def pattern_in(self, corners: NDArray[np.int_], size: int) -> FixedPattern | None:
+        """What differs from pixel to pixel in windows (2, n, size, size) at ``corners`` (2, n, 2)."""
+        cut = [p.windows(at, size) for p, at in zip(self.patterns, corners, strict=True) if p is not None]
+        return FixedPattern(np.stack([c.sensitivity for c in cut]), np.stack([c.offset for c in cut])) if cut else None
 
     def _placed(self, left: Array, right: Array, obstacles: Mapping[str, Array]) -> list[Array]:
         """camera_from_body (b,4,4) of all bodies for the left and the right camera, each at its own pose (6,) of the
@@ -279,11 +203,30 @@ class LiveImages:
             radiance += self._camera.radiance(placed, corners, size, self._quality.supersampling)
         if len(self._moments) > 1:
             radiance /= np.float32(len(self._moments))
-        pattern = self._pattern(corners, size)
+        pattern = self._camera.pattern_in(corners, size)
         if self._quality.exposures == 1:
             return self._camera.noise.expose(radiance, self._rng, pattern)
         return self._camera.noise.mean_of_exposures(radiance, self._rng, self._quality.exposures, pattern)
 
-    def _pattern(self, corners: NDArray[np.int_], size: int) -> FixedPattern | None:
-        cut = [p.windows(at, size) for p, at in zip(self._camera.patterns, corners, strict=True) if p is not None]
-        return FixedPattern(np.stack([c.sensitivity for c in cut]), np.stack([c.offset for c in cut])) if cut else None
+
+class ManyLiveImages:
+    """Exposures of a scene that stands still in each, drawn as far as they are read; placed: camera_from_body (b,4,4)
+    of all bodies for both cameras of each exposure; rngs: of its noise."""
+
+    def __init__(
+        self, camera: VirtualStereoCamera, placed: Sequence[Sequence[Array]], rngs: Sequence[np.random.Generator]
+    ) -> None:
+        self._camera, self._placed, self._rngs = camera, placed, rngs
+
+    def windows_of(self, exposures: NDArray[np.int_], corners: NDArray[np.int_], size: int) -> Windows:
+        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2), of ``exposures`` (n,) in
+        rising order."""
+        camera = self._camera
+        shown = np.unique(exposures)
+        own = np.split(corners, np.searchsorted(exposures, shown[1:]), axis=1)
+        drawn = camera.radiances([self._placed[k] for k in shown], own, size, Quality().supersampling)
+        grey = [
+            camera.noise.expose(light, self._rngs[k], camera.pattern_in(at, size))
+            for k, light, at in zip(shown, drawn, own, strict=True)
+        ]
+        return np.concatenate(grey, axis=1, dtype=camera.noise.image_type)

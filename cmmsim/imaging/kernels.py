@@ -8,7 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from cmmsim.compiled import Array, compiled
-from cmmsim.geometry.disc_kernels import cover_pixel, inverse_of, reach_of_pixel
+from cmmsim.geometry.disc_kernels import (
+    into_disc,
+    inverse_of,
+    reach_of_pixel,
+    rim_between,
+    share_within,
+    sides_of,
+)
 
 
 @compiled
@@ -138,25 +145,6 @@ class Discs(NamedTuple):
 
 
 @compiled
-def half_planes_of(corners: Array, half_planes: Array) -> int:
-    """Fill half_planes with a, b, c of a x + b y <= c for the sides of a convex polygon (n,2); returns their number,
-    sides of no length being left out."""
-    n, count, middle_x, middle_y = len(corners), 0, 0.0, 0.0
-    for k in range(n):
-        middle_x += corners[k, 0] / n
-        middle_y += corners[k, 1] / n
-    for k in range(n):
-        x, y = corners[k]
-        a, b = corners[(k + 1) % n, 1] - y, x - corners[(k + 1) % n, 0]
-        if abs(a) + abs(b) > 1e-6:
-            outwards = 1.0 if a * (x - middle_x) + b * (y - middle_y) > 0.0 else -1.0
-            half_planes[count, 0], half_planes[count, 1] = outwards * a, outwards * b
-            half_planes[count, 2] = outwards * (a * x + b * y)
-            count += 1
-    return count
-
-
-@compiled
 def polygon_holds(half_planes: Array, x: float, y: float, width: int, height: int) -> bool:
     """Whether the box from (x, y) on lies wholly inside a convex polygon."""
     for k in range(len(half_planes)):
@@ -224,17 +212,24 @@ def lay_disc(image: Array, centre_x: float, centre_y: float, k: int, discs: Disc
     """Lay disc ``k`` over a window (h, w), its centre given in px of the window."""
     height, width = image.shape
     m = inverse_of(discs.shapes[k])
-    reach = reach_of_pixel(m)
+    inner, outer = rim_between(reach_of_pixel(m))
     extent_x, extent_y = discs.extents[k]
-    for row in range(max(0, math.ceil(centre_y - extent_y - 0.5)), min(height, math.floor(centre_y + extent_y + 1.5))):
-        for column in range(
-            max(0, math.ceil(centre_x - extent_x - 0.5)), min(width, math.floor(centre_x + extent_x + 1.5))
-        ):
+    first, last = max(0, math.ceil(centre_x - extent_x - 0.5)), min(width, math.floor(centre_x + extent_x + 1.5))
+    top, bottom = max(0, math.ceil(centre_y - extent_y - 0.5)), min(height, math.floor(centre_y + extent_y + 1.5))
+    below = np.full((width, 4), -2.0)
+    for row in range(top, bottom):
+        before = -2.0, 0.0, 0.0, 0.0
+        for column in range(first, last):
             x, y = column - centre_x, row - centre_y
-            distance = math.sqrt((m[0, 0] * x + m[0, 1] * y) ** 2 + (m[1, 0] * x + m[1, 1] * y) ** 2)
-            if distance >= 1.0 + reach:
+            u, v = into_disc(x, y, m)
+            distance2 = u * u + v * v
+            if distance2 >= outer:
                 continue
-            share = 1.0 if distance <= 1.0 - reach else cover_pixel(x, y, m)[0]
+            share = 1.0
+            if distance2 > inner:
+                low, high, left, right = sides_of(column, row, x, y, m, before, below)
+                before = float(column), right[0], right[1], right[2]
+                share = share_within(m, low, high, left, right)
             share *= shown_share(discs.behind[k], covers, row, column)
             image[row, column] += share * (discs.levels[k] - image[row, column])
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
@@ -14,9 +13,8 @@ from cmmsim.checks import finite_array
 from cmmsim.errors import CmmError, SensorFileError
 from cmmsim.files.schema import Body, Stickers, unit
 from cmmsim.files.setup import MarkedBody
-from cmmsim.geometry.camera import PinholeCamera
 from cmmsim.geometry.plane_frame import PLANE_NAMES
-from cmmsim.geometry.pose import Array, apply, invert
+from cmmsim.geometry.pose import Array, invert
 
 SUNK = 0.0003  # m the solid surface lies below the sticker planes
 RING_SUNK = 0.0001  # m the dark ring lies below its sticker
@@ -47,26 +45,6 @@ class ConvexSolid:
         hidden = np.empty(len(flat), dtype=bool)
         hidden_points(invert(camera_from_body), flat, self._normals, self._offsets, TOUCHING, hidden)
         return hidden.reshape(points.shape[:-1])
-
-    def outline(self, camera: PinholeCamera, camera_from_body: Array) -> Outline | None:
-        """The solid's outline in the image; None unless all of it lies before the camera."""
-        points = apply(camera_from_body, self.vertices)
-        if points[:, 2].min() <= 1e-3:
-            return None
-        pixels = camera.project(points)[0]
-        return Outline(np.asarray(cv2.convexHull(pixels.astype(np.float32))[:, 0], dtype=float))
-
-
-class Outline:
-    """A convex polygon (n,2) px of either sense of rotation: ``half_planes`` (m,3) are a, b, c of a x + b y <= c, and
-    ``box`` (4,) its lowest x, y and highest x, y."""
-
-    def __init__(self, corners: Array) -> None:
-        from cmmsim.imaging.kernels import half_planes_of  # compiles, so it is loaded where it is first needed
-
-        self.box = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
-        half_planes = np.empty((len(corners), 3))
-        self.half_planes = half_planes[: half_planes_of(corners, half_planes)]
 
 
 @dataclass(frozen=True)

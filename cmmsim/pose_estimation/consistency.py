@@ -19,13 +19,21 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from cmmsim.errors import LostError
 from cmmsim.files.setup import MarkedBody
 from cmmsim.geometry.disc_image import sticker_outlines
-from cmmsim.geometry.pose import Array, apply, skew
-from cmmsim.geometry.registration import Registration, register
+from cmmsim.geometry.pose import Array, skew
+from cmmsim.geometry.registration import (
+    SMALLEST_SPREAD,
+    Registration,
+    register,
+    register_each,
+    rigid_starts,
+    spreads,
+)
 from cmmsim.pose_estimation.observation import Observer, StickerObservation
 
 CHANCE = 1e-4  # of a good sticker to be left out, for its place and for each of its two ellipses
@@ -84,21 +92,28 @@ def consistent(
         observation = observation.selected(np.arange(len(observation.index)) != worst)
 
 
-def place_misfits(result: Registration, points: Array, places: Array, covariances: Array) -> Array:
+def place_misfits(
+    result: Registration, points: Array, places: Array, covariances: Array, of: NDArray[np.int_] | None = None
+) -> Array:
     """Squared residuals (n,) of a registration, each in units of its own covariance.
 
-    Parameters: points (n,3) measured with covariances (n,3,3), and places (n,3) known. Directions in which a sticker
-    alone determines the pose are left out.
+    Parameters: points (n,3) measured with covariances (n,3,3), and places (n,3) known; of (n,): to which of several
+    registrations each belongs. Directions in which a sticker alone determines the pose are left out.
     """
-    turned = places @ result.transform[:3, :3].T
+    transform, covariance = (result.transform, result.covariance) if of is None else _of(result, of)
+    turned = np.einsum("...ij,...j->...i", transform[..., :3, :3], places)
     jacobian = np.concatenate([np.broadcast_to(np.eye(3), (len(turned), 3, 3)), -skew(turned)], axis=2)
     # in the axes in which the noise is the unit matrix
     whiten = np.linalg.inv(np.linalg.cholesky(covariances))
     pulled = whiten @ jacobian
-    redundancy, axes = np.linalg.eigh(np.eye(3) - pulled @ result.covariance @ pulled.swapaxes(1, 2))
-    residuals = np.einsum("nji,njk,nk->ni", axes, whiten, points - apply(result.transform, places))
+    redundancy, axes = np.linalg.eigh(np.eye(3) - pulled @ covariance @ pulled.swapaxes(1, 2))
+    residuals = np.einsum("nji,njk,nk->ni", axes, whiten, points - turned - transform[..., :3, 3])
     shown = redundancy > SMALLEST_REDUNDANCY
     return np.asarray((residuals**2 / np.where(shown, redundancy, np.inf)).sum(axis=1))
+
+
+def _of(result: Registration, which: NDArray[np.int_]) -> tuple[Array, Array]:
+    return result.transform[which], result.covariance[which]
 
 
 def outline_misfits(observation: StickerObservation, shapes: Array) -> Array:
@@ -109,13 +124,43 @@ def outline_misfits(observation: StickerObservation, shapes: Array) -> Array:
     return np.asarray((change * np.linalg.solve(observation.outlines.covariances, change[..., None])[..., 0]).sum(-1))
 
 
+def all_consistent(
+    observation: StickerObservation, observer: Observer, body: MarkedBody, places: Array, count: int
+) -> tuple[Registration, Array]:
+    """Registrations of ``count`` exposures in which all stickers agree with each other at once, as ``consistent`` has
+    it, and by how much (count,) their covariances grow: NaN in those in which they do not, or too few are seen.
+
+    The observation's index says exposure and sticker, as of ``Observer.read``.
+    """
+    of, sticker = np.divmod(observation.index, len(places))
+    shown, points = np.zeros((count, len(places), 1)), np.zeros((count, len(places), 3))
+    shown[of, sticker], points[of, sticker] = 1.0, observation.points
+    seen: NDArray[np.int_] = np.bincount(of, minlength=count).astype(int)
+    enough = (seen >= FEWEST) & (spreads(places, shown) >= SMALLEST_SPREAD)
+    rough = np.tile(np.eye(4), (count, 1, 1))
+    rough[enough] = rigid_starts(places, points[enough], shown[enough, :, 0])
+    observation = observation.selected(enough[of])
+    of, sticker = np.divmod(observation.index, len(places))
+    starts = np.searchsorted(of, np.arange(count + 1)).astype(int)
+    result = register_each(places[sticker], observation.points, observation.covariances, starts, rough)
+    totals = np.bincount(of, result.misfit, count)
+    place = place_misfits(result, observation.points, places[sticker], observation.covariances, of)
+    place = place / excesses(totals[of] - place, 3 * seen[of] - 9)
+    normals, radius = body.sticker_normals[sticker], observer.settings.radius
+    shapes = sticker_outlines(observer.rig, result.transform[of], places[sticker], normals, radius)[1]
+    wrong = np.maximum(place, outline_misfits(observation, shapes).max(axis=0)) > LARGEST_MISFIT
+    excess = excesses(totals, 3 * seen - 6)
+    agree = enough & (np.bincount(of, wrong, count) == 0) & (excess <= LARGEST_EXCESS)
+    return result, np.where(agree, excess, np.nan)
+
+
 def _checks(
     observation: StickerObservation, result: Registration, observer: Observer, body: MarkedBody, places: Array
 ) -> StickerChecks:
     index = observation.index
     place = place_misfits(result, observation.points, places[index], observation.covariances)
     total, freedom = float(result.misfit.sum()), 3 * len(index) - 9  # without a sticker, its place misfit is missing
-    place = place / [residual_excess(total - own, freedom) for own in place]
+    place = place / excesses(total - place, np.full(len(place), freedom))
     normals, radius = body.sticker_normals[index], observer.settings.radius
     shapes = sticker_outlines(observer.rig, result.transform, places[index], normals, radius)[1]
     return StickerChecks(place, outline_misfits(observation, shapes).max(axis=0))
@@ -124,6 +169,13 @@ def _checks(
 def residual_excess(total: float, freedom: int) -> float:
     """Mean square of residuals in units of their noise where it is larger than noise makes it, else 1."""
     return total / freedom if total > _largest_total(freedom) else 1.0
+
+
+def excesses(totals: NDArray, freedoms: NDArray[np.int_]) -> Array:
+    """``residual_excess`` of each of several sums (n,) of squares; 1 without freedom."""
+    freedoms = np.maximum(freedoms, 1)
+    largest = np.array([_largest_total(freedom) for freedom in range(1, int(freedoms.max(initial=1)) + 1)])
+    return np.where(totals > largest[freedoms - 1], totals / freedoms, 1.0)
 
 
 @lru_cache(maxsize=64)

@@ -13,7 +13,7 @@ from cmmsim.detection.detector import DetectedCentres, Detector, FitLimits, Spot
 from cmmsim.detection.ellipse_fit import MAXIMUM_LIKELIHOOD, SMEAR_STEP_PX, EllipseFits, fit_ellipses
 from cmmsim.geometry.camera import Optics
 from cmmsim.geometry.disc_image import centre_offset
-from cmmsim.geometry.pose import Array, apply
+from cmmsim.geometry.pose import Array, apply, apply_each
 from cmmsim.geometry.stereo_rig import StereoRig, triangulate
 from cmmsim.plugins import DEFAULT_DETECTOR
 from cmmsim.radiometry.images import StereoImages, Windows
@@ -94,6 +94,15 @@ class StickerExposure(Protocol):
         """Ellipses in the left and in the right image."""
 
 
+@runtime_checkable
+class ManyExposures(Protocol):
+    """Exposures of two cameras, each read for itself."""
+
+    def windows_of(self, exposures: NDArray[np.int_], corners: NDArray[np.int_], size: int) -> Windows:
+        """Grey values (2, n, size, size) of windows with first pixels ``corners`` (2, n, 2), of ``exposures`` (n,) in
+        rising order."""
+
+
 @dataclass(frozen=True)
 class Observer:
     """What looks for stickers: the stereo rig and its cameras' noise as they are known, and how it looks."""
@@ -122,12 +131,21 @@ class Observer:
         return self.read(images, camera_from_body, places, normals).observed(swept)
 
     def read(
-        self, images: StereoImages | StickerExposure, camera_from_body: Array, places: Array, normals: Array
+        self,
+        images: StereoImages | StickerExposure | ManyExposures,
+        camera_from_body: Array,
+        places: Array,
+        normals: Array,
     ) -> StickerWindows:
-        """Read the windows of stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose."""
-        centres = [apply(move @ camera_from_body, places) for move in self.rig.from_camera]
-        turned = [normals @ (move @ camera_from_body)[:3, :3].T for move in self.rig.from_camera]
-        pixels, valid = self.rig.project(apply(camera_from_body, places))
+        """Read the windows of stickers at ``places`` (n,3) with ``normals`` (n,3), body axes, near an expected pose.
+
+        Of many exposures camera_from_body is (N,4,4), and sticker k of exposure j has the index j n + k: all of them
+        are looked for, fitted and triangulated like the stickers of a single one.
+        """
+        moves = [move @ camera_from_body for move in self.rig.from_camera]
+        centres = [apply_each(move, places).reshape(-1, 3) for move in moves]
+        turned = [(normals @ move[..., :3, :3].swapaxes(-1, -2)).reshape(-1, 3) for move in moves]
+        pixels, valid = self.rig.project(apply_each(camera_from_body, places).reshape(-1, 3))
         facing = np.stack([faces_camera(c, t) for c, t in zip(centres, turned, strict=True)])
         index = np.flatnonzero(np.all(valid & facing, axis=0))
         size = self.settings.window_size + 2 * self.detector.margin_px
@@ -137,6 +155,8 @@ class Observer:
         if len(index):
             if isinstance(images, StickerExposure):
                 found = images.detected(corners, size, self)
+            elif isinstance(images, ManyExposures):
+                windows = self.evenly_lit(images.windows_of(index // len(places), corners, size), corners)
             else:
                 windows = self.evenly_lit(images.windows(corners, size), corners)
             offsets = np.stack(
@@ -145,8 +165,9 @@ class Observer:
                     for camera, c, t in zip(self.rig.cameras, centres, turned, strict=True)
                 ]
             )
+        sticker = index % len(places)
         return StickerWindows(
-            self, index, camera_from_body, places[index], normals[index], corners, windows, offsets, found
+            self, index, camera_from_body, places[sticker], normals[sticker], corners, windows, offsets, found
         )
 
     def evenly_lit(self, windows: Windows, corners: NDArray[np.int_]) -> Windows:
@@ -172,10 +193,10 @@ class Observer:
 class StickerWindows:
     """Grey values around the k stickers of a body that both cameras of an observer should see.
 
-    index (k,) into the body's stickers; camera_from_body (4,4) near which they are expected; places (k,3) m and normals
-    (k,3) in body axes; corners (2,k,2) px of the first pixels of windows (2,k,h,h), evenly lit; offsets (2,k,2) px of
-    the ellipses' centres from those of the stickers (eccentricity). found: what a detector finds in them, where there
-    are no images; then the windows are empty.
+    index (k,) into the body's stickers; camera_from_body (4,4) or (N,4,4) near which they are expected; places (k,3) m
+    and normals (k,3) in body axes; corners (2,k,2) px of the first pixels of windows (2,k,h,h), evenly lit; offsets
+    (2,k,2) px of the ellipses' centres from those of the stickers (eccentricity). found: what a detector finds in them,
+    where there are no images; then the windows are empty.
     """
 
     observer: Observer

@@ -8,7 +8,6 @@ left or much contradicts, the estimator itself is asked with the same stickers.
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from cmmsim.geometry.pose import Array, invert
 from cmmsim.geometry.stereo_rig import StereoRig
 from cmmsim.pose_estimation.consistency import CHANCE, EXCESS_CHANCE, FEWEST, LARGEST_EXCESS, LARGEST_MISFIT
 from cmmsim.pose_estimation.estimator import Measurement, PoseEstimator, lost_measurement
+from cmmsim.pose_estimation.many import MeasuredPoses
 from cmmsim.pose_estimation.observation import GRAZING, StickerObservation
 from cmmsim.radiometry.images import StereoImages
 from cmmsim.statistical.centre_noise import centre_noise
@@ -39,24 +39,6 @@ from cmmsim.statistical.solving_kernels import Belief, Frame
 PLAIN = FEWEST + 2  # stickers from which on residuals alone tell a wrong one well
 OUTLINE_CHANCE = 2 * CHANCE  # of a good sticker to be left out for its outline in one of both images
 BLOCK = 512  # frames that share a stream of noise and a thread's turn
-
-
-@dataclass(frozen=True)
-class MeasuredPoses:
-    """N frames: poses (N,6) m, rad and covariances (N,6,6), NaN where lost; stickers (N,) used, 0 where lost."""
-
-    poses: Array
-    covariances: Array
-    stickers: NDArray[np.int_]
-
-    def without(self, dropped: NDArray[np.bool_]) -> "MeasuredPoses":
-        """The same frames, of which those that are ``dropped`` (N,) are lost."""
-        gone = dropped[:, None]
-        return MeasuredPoses(
-            np.where(gone, np.nan, self.poses),
-            np.where(gone[:, None], np.nan, self.covariances),
-            np.where(dropped, 0, self.stickers),
-        )
 
 
 class StatisticalTracker:

@@ -170,7 +170,13 @@ def _fill(
     """Machine code, laws, parameters and gains, and the state at the first frame."""
     task, now, start, sizes = memory.task, memory.now, problem.start, problem.sizes
     settings = problem.settings
-    for name in ("equation_of_motion", "motion_derivatives", "rate_map_derivative"):
+    for name in (
+        "equation_of_motion",
+        "free_acceleration",
+        "motion_derivatives",
+        "rate_map_derivative",
+        "slope_derivative",
+    ):
         task[name] = own[name].address
     for name, found in addresses.items():
         task[name] = found

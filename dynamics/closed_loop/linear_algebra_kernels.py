@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from dynamics.compiled.kernel import Array, kernel
+from dynamics.compiled.kernel import Array, kernel, part
 
 
-@kernel
+@part
 def cholesky(matrix: Array, size: int, factor: Array) -> bool:
     """Factor L (size, size) of a symmetric matrix, with the reciprocals of its diagonal; False if it has none."""
     for i in range(size):
@@ -22,20 +22,22 @@ def cholesky(matrix: Array, size: int, factor: Array) -> bool:
     return True
 
 
-@kernel
+@part
 def solve(factor: Array, size: int, vector: Array) -> None:
     """Solve L L^T x = vector (size,) in place."""
     for i in range(size):
+        left = vector[i]
         for k in range(i):
-            vector[i] -= factor[i, k] * vector[k]
-        vector[i] *= factor[i, i]
+            left -= factor[i, k] * vector[k]
+        vector[i] = left * factor[i, i]
     for i in range(size - 1, -1, -1):
+        left = vector[i]
         for k in range(i + 1, size):
-            vector[i] -= factor[k, i] * vector[k]
-        vector[i] *= factor[i, i]
+            left -= factor[k, i] * vector[k]
+        vector[i] = left * factor[i, i]
 
 
-@kernel
+@part
 def dot(row: Array, vector: Array) -> float:
     """Scalar product, summed in order."""
     total = 0.0
@@ -44,21 +46,21 @@ def dot(row: Array, vector: Array) -> float:
     return total
 
 
-@kernel
+@part
 def copy(source: Array, into: Array) -> None:
     """Copy a vector. Assigning slices would do it in numba, too, and take a second to compile."""
     for k in range(len(source)):
         into[k] = source[k]
 
 
-@kernel
+@part
 def fill(into: Array, value: float) -> None:
     """Set all entries of a vector."""
     for k in range(len(into)):
         into[k] = value
 
 
-@kernel
+@part
 def clear(rows: Array, width: int) -> None:
     """Zero the columns in use of some rows."""
     for i in range(len(rows)):
@@ -66,7 +68,7 @@ def clear(rows: Array, width: int) -> None:
             rows[i, k] = 0.0
 
 
-@kernel
+@part
 def copy_rows(source: Array, into: Array, width: int) -> None:
     """Copy the columns in use of some rows."""
     for i in range(len(source)):
@@ -74,7 +76,7 @@ def copy_rows(source: Array, into: Array, width: int) -> None:
             into[i, k] = source[i, k]
 
 
-@kernel
+@part
 def add_row(factor: float, row: Array, into: Array, width: int) -> None:
     """Add factor times a row of derivatives to another, over the columns in use."""
     for k in range(width):

@@ -12,6 +12,7 @@ import numpy as np
 from dynamics.closed_loop.command_schedule import CommandSchedule
 from dynamics.closed_loop.joints import FRICTION
 from dynamics.closed_loop.problem import MAX_DELAY_FRAMES, LoopProblem, Sizes
+from dynamics.parameters import room_for_derivatives
 
 
 class Plan(NamedTuple):
@@ -68,21 +69,27 @@ class Memory(NamedTuple):
 
 
 LAYOUT = {
-    "task": "equation_of_motion! motion_derivatives! rate_map_derivative! servo_motion! evaluate_terms! evaluate! "
-    "decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! servo_knows! measured! lp li ld lx "
-    "rate_weight lx_by:3 reads:3 kp kd ki stiffness damping motor_inertia period torques! torque_limit filter_time "
-    "rigid:r coulomb:n viscous:n friction=friction",
+    "task": "equation_of_motion! free_acceleration! motion_derivatives! rate_map_derivative! slope_derivative! "
+    "servo_motion! evaluate_terms! evaluate! decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! "
+    "servo_knows! measured! lp li ld lx rate_weight lx_by:3 reads:3 kp kd ki stiffness damping motor_inertia period "
+    "torques! torque_limit filter_time rigid:r coulomb:n viscous:n friction=friction",
     "now": "known=known served=known derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
     "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
     "command_rate:n last_command:n impulse:n last_measured:m servo_integral:m demand:m change:m rest:m "
     "pose_and_rate:M rate_map:nm",
     # first what `equation_of_motion` and `motion_derivatives` return, in their order
     "known": "mass:mm bias:m jacobian:nm bias_acceleration:n angle:n velocity:n factor:mm inputs:i valid!",
-    "derivatives": "by_pose:mm by_rate:mm columns:mr crank_by_pose:nm crank_by_rate:nm inputs:d",
-    "evaluation": "state:s slope:s time factor:mm bias:m jacobian:nm bias_acceleration:n angle:n velocity:n spring:n "
-    "error:n torque:n net_torque:n stick_force:n force:n response:nm compliance:nn stuck_factor:nn",
-    "tangent": "x:xw trial:xw k:4xw issued:cnw time:w length:w stage_time:w margin:w command:nw command_slope:nw "
-    "command_rate:nw last_command:nw velocity:nw torque:nw force:nw last_measured:mw integral:mw demand:mw moved:mw",
+    # and what else the columns of `slope_derivative` share
+    "derivatives": "by_pose:mm by_rate:mm columns:mr crank_by_pose:nm crank_by_rate:nm jacobian:nm pushing:nm "
+    "factor:mm damping:n by_error:n by_integral:n by_command_rate:n inputs:d",
+    # first what `free_acceleration` takes, in its order
+    "evaluation": "factor:mm bias:m jacobian:nm push:n state:s slope:s time bias_acceleration:n angle:n velocity:n "
+    "spring:n error:n torque:n net_torque:n stick_force:n force:n response:nm compliance:nn stuck_factor:nn",
+    # first the rows of `slope_derivative`; k: what it returns of each stage,
+    # and before the torques the slopes of filtered rates, whose trials are `filtered`
+    "tangent": "trial:bw acting:nw command_rate:nw push:mw direct:nw k:4yw x:xw filtered:fw issued:cnw time:w length:w "
+    "stage_time:w margin:w command:nw command_slope:nw last_command:nw force:nw last_measured:mw integral:mw "
+    "demand:mw moved:mw",
 }
 """Fields of the records: a name with its dimensions by their letters (see `record_type`), one number without. `!` marks
 integers, `=` another record. Angle and velocity of elastic joints are those of the motors; the mass matrix is kept as
@@ -94,12 +101,13 @@ def record_type(name: str, sizes: Sizes) -> np.dtype:
     """Layout of a record for a robot."""
     n, m, r, f = sizes.joints, sizes.coordinates, sizes.rigid, sizes.filters
     length = {"n": n, "m": m, "r": r, "s": 2 * m + 3 * n + f, "x": 2 * m + n + f, "3": 3, "4": 4}
+    length |= {"b": 2 * m + n, "f": max(f, 1), "y": 2 * m + 2 * n + f}
     g = sizes.geometry
     length |= {
         "M": 2 * m + g,
         "i": 2 * m + r + g,
         "d": 3 * m + n + r + g,
-        "w": sizes.parameters + 1 + sizes.start,
+        "w": room_for_derivatives(sizes.parameters, sizes.start),
         "c": MAX_DELAY_FRAMES + 3,
     }
     fields: list[Any] = []

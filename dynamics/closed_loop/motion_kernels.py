@@ -87,12 +87,12 @@ def know_motion(task: Record, known: Record, state: Array) -> int:
         return OK
     copy(state[: 2 * size], known.inputs[: 2 * size])
     call(task.equation_of_motion, known.inputs, known.mass)
-    known.valid = cholesky(known.mass, size, known.factor)
-    if not known.valid:
-        return SINGULAR_MASS if all_finite(known.mass) else LEFT_REACH
-    for i in range(len(known.angle)):
-        known.velocity[i] = dot(known.jacobian[i], state[size : 2 * size])
-    return OK
+    known.valid = True
+    for i in range(size):
+        known.valid = known.valid and 0 <= known.factor[i, i] < np.inf
+    if known.valid:
+        return OK
+    return SINGULAR_MASS if all_finite(known.mass) else LEFT_REACH
 
 
 @entry
@@ -153,13 +153,10 @@ def hold_compliance(at: Record, joints: Array) -> None:
 
 
 @kernel
-def accelerate_freely(at: Record, torque: Array, acceleration: Array) -> None:
+def accelerate_freely(task: Record, at: Record, torque: Array, acceleration: Array) -> None:
     """Acceleration (m,) of the platform under joint torques (n,)."""
-    for j in range(len(at.bias)):
-        acceleration[j] = -at.bias[j]
-        for i in range(len(torque)):
-            acceleration[j] += at.jacobian[i, j] * torque[i]
-    solve(at.factor, len(at.bias), acceleration)
+    copy(torque, at.push)
+    call(task.free_acceleration, at.factor, acceleration)
 
 
 @kernel
@@ -187,10 +184,12 @@ def accelerate(task: Record, now: Record, at: Record) -> None:
             if now.mode[i] == 0:
                 at.stick_force[i] = left
                 at.net_torque[i] -= left
-        accelerate_freely(at, at.spring, acceleration)
+        accelerate_freely(task, at, at.spring, acceleration)
         return
-    accelerate_freely(at, at.net_torque, acceleration)
+    accelerate_freely(task, at, at.net_torque, acceleration)
     stuck = stuck_joints(now)
+    if len(stuck) == 0:
+        return
     hold_compliance(at, stuck)
     for s in range(len(stuck)):
         at.force[s] = dot(at.jacobian[stuck[s]], acceleration) + at.bias_acceleration[stuck[s]]
@@ -238,7 +237,7 @@ def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> in
             at.net_torque[i] -= slip_friction(task, i, at.velocity[i], now.mode[i])
     size = len(at.bias)
     free = at.slope[size : 2 * size]
-    accelerate_freely(at, at.net_torque, free)
+    accelerate_freely(task, at, at.net_torque, free)
     fill(at.force[:], 0.0)
     for _ in range(1000):
         change = 0.0

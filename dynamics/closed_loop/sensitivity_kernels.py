@@ -24,7 +24,7 @@ from dynamics.closed_loop.motion_kernels import (
     mode_margin,
     stuck_joints,
 )
-from dynamics.compiled.kernel import Array, Record, call, entry, invoke, kernel
+from dynamics.compiled.kernel import Array, Record, call, call_columns, entry, invoke, kernel
 
 FRACTION = (0.0, 0.5, 0.5, 1.0)
 WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
@@ -46,92 +46,101 @@ def differentiate_motion(
 
 
 @kernel
-def torque_tangent(task: Record, now: Record, at: Record, d: Record, x: Array, d_error: Array) -> None:
-    """Derivative of the net torque of every joint; for stuck joints without the friction that holds them."""
-    count, first, width = len(now.mode), 2 * len(at.bias), now.width
-    coulomb, viscous = len(task.rigid), len(task.rigid) + count
-    lp = viscous + count
-    clear(d.torque[:], width)
-    for i in range(count):
-        law, mode, row = follows_law(task, at, i), now.mode[i], d.torque[i]
-        damping = law * task.ld if task.filter_time == 0 else 0.0
-        if mode != 0:
-            damping += task.viscous[i] + task.coulomb[i] * dry_slope(task.friction, at.velocity[i], mode)
-        add_row(law * task.lp, d_error[i], row, width)
-        if task.filter_time > 0:
-            add_row(law * task.ld, x[first + count + i], row, width)
-        else:
-            add_row(law * task.rate_weight * task.ld, d.command_rate[i], row, width)
-        add_row(-damping, d.velocity[i], row, width)
-        add_row(law * task.li, x[first + i], row, width)
-        row[lp] += law * task.reads[0] * at.error[i]
-        row[lp + 1] += law * task.reads[1] * at.state[first + i]
-        rate = task.rate_weight * now.command_rate[i] - at.velocity[i]
-        row[lp + 2] += law * task.reads[2] * (rate if task.filter_time == 0 else at.state[first + count + i])
-        if task.lx > 0:
-            for j in range(len(at.bias)):
-                add_row(-law * task.lx * at.jacobian[i, j], x[j], row, width)
-            for j in range(3):
-                row[lp + j] -= law * task.lx_by[j] * at.angle[i]
-        if mode != 0:
-            row[coulomb + i] -= dry_level(task.friction, at.velocity[i], mode)
-            row[viscous + i] -= at.velocity[i]
+def share_with_columns(task: Record, now: Record, at: Record) -> None:
+    """What the derivatives of a slope have in common beside the derivatives of the equation of motion."""
+    known = now.derivatives
+    copy_rows(at.jacobian, known.jacobian, len(at.bias))
+    copy_rows(at.factor, known.factor, len(at.bias))
+    filtering = task.filter_time > 0
+    for i in range(len(now.mode)):
+        mode, slips, law = now.mode[i], now.mode[i] != 0, follows_law(task, at, i)
+        known.by_error[i] = law * (task.lp + task.lx)
+        known.by_integral[i] = law * task.li
+        known.by_command_rate[i] = 0.0 if filtering else law * task.rate_weight * task.ld
+        known.damping[i] = 0.0 if filtering else law * task.ld
+        if slips:
+            known.damping[i] += task.viscous[i] + task.coulomb[i] * dry_slope(task.friction, at.velocity[i], mode)
+        for j in range(len(at.bias)):
+            known.pushing[i, j] = at.jacobian[i, j] if slips else 0.0
 
 
 @kernel
-def filtered_tangent(task: Record, now: Record, d: Record, filtered: Array, out: Array) -> None:
-    """Derivative of the slope of the filtered rates of the errors."""
-    clear(out, now.width)
-    for i in range(len(now.mode)):
-        add_row(task.rate_weight / task.filter_time, d.command_rate[i], out[i], now.width)
-        add_row(-1 / task.filter_time, d.velocity[i], out[i], now.width)
-        add_row(-1 / task.filter_time, filtered[i], out[i], now.width)
+def fixed_state_tangent(task: Record, now: Record, at: Record, d: Record) -> None:
+    """What the parameters do at a fixed state: to -M q_ddot - b (`d.push`), and to the torque of each joint without the
+    friction that holds it (`d.direct`)."""
+    count, first, rigid = len(now.mode), 2 * len(at.bias), len(task.rigid)
+    lp = rigid + 2 * count
+    for i in range(len(at.bias)):
+        for k in range(rigid):
+            d.push[i, k] = -now.derivatives.columns[i, k]
+    for i in range(count):
+        mode, row, law = now.mode[i], d.direct[i], follows_law(task, at, i)
+        rate = task.rate_weight * now.command_rate[i] - at.velocity[i]
+        if task.lx > 0 or task.filter_time > 0:
+            fill(row, 0.0)
+            add_row(-law * task.lx, d.acting[i], row, now.width)  # with lx added to lp, it is of error less command
+        if task.filter_time > 0:
+            rate = at.state[first + count + i]
+            add_row(law * task.ld, d.filtered[i], row, now.width)
+        for k in (lp, lp + 1, lp + 2, rigid + i, rigid + count + i):
+            if task.lx == 0 and task.filter_time == 0:
+                row[k] = 0.0
+        row[lp] += law * task.reads[0] * at.error[i]
+        row[lp + 1] += law * task.reads[1] * at.state[first + i]
+        row[lp + 2] += law * task.reads[2] * rate
+        for k in range(3):
+            row[lp + k] -= law * task.lx_by[k] * at.angle[i]
+        row[rigid + i] -= dry_level(task.friction, at.velocity[i], mode) if mode != 0 else 0.0
+        row[rigid + count + i] -= at.velocity[i] if mode != 0 else 0.0
+
+
+@kernel
+def filtered_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> None:
+    """Derivative of the slopes of filtered rates, which in `d.k[k]` stand before the net torques."""
+    size, count, width = len(at.bias), len(now.mode), now.width
+    first = 2 * size + count
+    slopes, torque = d.k[k, first : first + count], d.k[k, first + count :]
+    copy_rows(slopes, torque, width)
+    clear(slopes, width)
+    add_product(-0.5 / task.filter_time, now.derivatives.crank_by_rate, d.trial[:size], slopes, width)
+    add_product(-1 / task.filter_time, at.jacobian, d.trial[size : 2 * size], slopes, width)
+    for i in range(count):
+        add_row(task.rate_weight / task.filter_time, d.command_rate[i], slopes[i], width)
+        add_row(-1 / task.filter_time, d.filtered[i], slopes[i], width)
 
 
 @entry
 def slope_tangent(task: Record, now: Record, at: Record, d: Record, k: int) -> int:
-    """Derivative of the slope at one state, into `d.k[k]`: implicitly, for those of the state and the time in `d.trial`
-    and `d.stage_time`. Also that of the net torques, into `d.torque`.
+    """Derivative of the slope at one state, and behind it of the net torques, into `d.k[k]`: implicitly, for those of
+    the state and the time in `d.trial`, `d.filtered` and `d.stage_time`. See `slope_derivative`.
     """
-    x, out = d.trial[:], d.k[k]
     size, count, width, known = len(at.bias), len(now.mode), now.width, now.derivatives
-    pose, rate = x[:size], x[size : 2 * size]
-    d_acceleration, d_error = out[size : 2 * size], out[2 * size : 2 * size + count]
+    pose, rate = d.trial[:size], d.trial[size : 2 * size]
+    acceleration, torque = d.k[k, size : 2 * size], d.k[k, len(d.k[k]) - count :]
     state = at.state
     differentiate_motion(task, now, state[:size], state[size : 2 * size], at.slope[size : 2 * size], at.net_torque[:])
-    copy_rows(rate, out[:size], width)
-    copy_rows(d.command[:], d_error, width)
+    share_with_columns(task, now, at)
+    copy_rows(d.command[:], d.acting[:], width)
     for i in range(count):
         if now.ramping:
-            add_row(at.time, d.command_slope[i], d_error[i], width)
-            add_row(now.command_slope[i], d.stage_time[:], d_error[i], width)
-    clear(d.velocity[:], width)
-    add_product(-1.0, at.jacobian, pose, d_error, width)
-    add_product(0.5, known.crank_by_rate, pose, d.velocity[:], width)
-    add_product(1.0, at.jacobian, rate, d.velocity[:], width)
-    torque_tangent(task, now, at, d, x, d_error)
+            add_row(at.time, d.command_slope[i], d.acting[i], width)
+            add_row(now.command_slope[i], d.stage_time[:], d.acting[i], width)
+    fixed_state_tangent(task, now, at, d)
+    call_columns(task.slope_derivative, known.by_pose, d.trial, d.k[k], width)
     if task.filter_time > 0:
-        filtered_tangent(task, now, d, x[2 * size + count :], out[2 * size + count :])
-    clear(d_acceleration, width)
-    for i in range(size):
-        add_row(-1.0, known.columns[i], d_acceleration[i], len(task.rigid))
-    add_product(-1.0, known.by_pose, pose, d_acceleration, width)
-    add_product(-1.0, known.by_rate, rate, d_acceleration, width)
-    for i in range(count):
-        if now.mode[i] != 0:
-            for j in range(size):
-                add_row(at.jacobian[i, j], d.torque[i], d_acceleration[j], width)
-    solve_rows(at.factor, size, d_acceleration, width)
+        filtered_tangent(task, now, at, d, k)
     stuck = stuck_joints(now)
+    if len(stuck) == 0:
+        return OK
     clear(d.force[:], width)
     for s in range(len(stuck)):
         for j in range(size):
             add_row(known.crank_by_pose[stuck[s], j], pose[j], d.force[s], width)
             add_row(known.crank_by_rate[stuck[s], j], rate[j], d.force[s], width)
-            add_row(at.jacobian[stuck[s], j], d_acceleration[j], d.force[s], width)
-    give_back(at, d, len(stuck), d_acceleration, width)
+            add_row(at.jacobian[stuck[s], j], acceleration[j], d.force[s], width)
+    give_back(at, d, len(stuck), acceleration, width)
     for s in range(len(stuck)):
-        add_row(1.0, d.force[s], d.torque[stuck[s]], width)
+        add_row(1.0, d.force[s], torque[stuck[s]], width)
     return OK
 
 
@@ -145,13 +154,22 @@ def give_back(at: Record, d: Record, stuck: int, rows: Array, width: int) -> Non
 
 
 @kernel
-def tangent_moved(now: Record, at: Record, d: Record, stage: int, h: float, fraction: float, out: Array) -> None:
-    """out = x + fraction (h slope's derivative + d_length slope) at a stage."""
-    for i in range(len(out)):
-        for k in range(now.width):
-            out[i, k] = d.x[i, k] + fraction * h * d.k[stage, i, k]
+def move_tangent(
+    now: Record, at: Record, d: Record, stage: int, h: float, fraction: float, moved: Array, first: int
+) -> None:
+    """Add fraction (h slope's derivative + d_length slope) at a stage to rows of unknowns, from the `first` on."""
+    for i in range(len(moved)):
+        add_row(fraction * h, d.k[stage, first + i], moved[i], now.width)
         if now.length_moves:
-            add_row(fraction * at[stage].slope[i], d.length[:], out[i], now.width)
+            add_row(fraction * at[stage].slope[first + i], d.length[:], moved[i], now.width)
+
+
+@kernel
+def try_tangent(now: Record, d: Record) -> None:
+    """Begin a trial at the derivatives as they are."""
+    count = len(d.trial)
+    copy_rows(d.x[:count], d.trial[:], now.width)
+    copy_rows(d.x[count:], d.filtered[:], now.width)
 
 
 @kernel
@@ -177,9 +195,10 @@ def length_tangent(task: Record, now: Record, end: Record, d: Record) -> None:
     else:
         copy(d.time[:], d.stage_time[:])
         d.stage_time[column] = 1.0
-        copy_rows(d.x[:], d.trial[:], width)
+        try_tangent(now, d)
         invoke(task.slope_tangent, task, now, end, d, 0)
-        add_row(1.0 if end.stick_force[joint] > 0 else -1.0, d.torque[joint], d.margin[:], width)
+        torque = d.k[0, len(d.k[0]) - len(now.mode) + joint]
+        add_row(1.0 if end.stick_force[joint] > 0 else -1.0, torque, d.margin[:], width)
         d.margin[len(task.rigid) + joint] -= task.friction.static_level
     approach = d.margin[column]
     fill(d.length[:], 0.0)
@@ -202,15 +221,16 @@ def step_tangent(task: Record, now: Record, at: Record, d: Record, h: float, eve
         add_row(-1.0, d.time[:], d.length[:], now.width)
     now.length_moves = cut or now.time_moves
     for k in range(4):
-        if k == 0:
-            copy_rows(d.x[:], d.trial[:], now.width)
-        else:
-            tangent_moved(now, at, d, k - 1, h, FRACTION[k], d.trial[:])
+        try_tangent(now, d)
+        if k > 0:
+            move_tangent(now, at, d, k - 1, h, FRACTION[k], d.trial[:], 0)
+            late = len(d.trial)
+            move_tangent(now, at, d, k - 1, h, FRACTION[k], d.filtered[: len(d.x) - late], late)
         copy(d.time[:], d.stage_time[:])
         add_row(FRACTION[k], d.length[:], d.stage_time[:], now.width)
         invoke(task.slope_tangent, task, now, at[k], d, k)
     for k in range(4):
-        tangent_moved(now, at, d, k, h, WEIGHT[k], d.x[:])
+        move_tangent(now, at, d, k, h, WEIGHT[k], d.x[:], 0)
     if cut:
         length_tangent(task, now, at[END], d)
     add_row(1.0, d.length[:], d.time[:], now.width)

@@ -89,9 +89,8 @@ def simulate(
     frames, parameters = len(reference.poses), checked_loop_parameters(robot, parameters, settings.drives.law)
     feedforward = _checked_rows("feedforward", feedforward, (frames, robot.layout.joints))
     if start is None:
-        known, fed = (servo_robot, settings.elasticity), feedforward is not None
-        start = equilibrium(robot, parameters, reference.poses[0], settings.servo, *known, fed, settings.drives)
-        start = _driven(robot, parameters, settings, start)
+        known, at = (parameters.tobytes(), reference.poses[0].tobytes()), (servo_robot, feedforward is not None)
+        start = _at_rest(robot, *known, settings, *at)
     else:
         check_type("start", start, StartState, SimulationError)
         start.check_sizes(robot)
@@ -174,6 +173,21 @@ def prepare(robot: Robot) -> None:
     reference = Reference(np.tile(robot.home_pose, (2, 1)), np.zeros((2, 6)))
     settings = LoopSettings(ServoGains(0.0, 0.0, 0.0), FrameTiming(60.0))
     simulate(robot, next(iter(robot.parameter_sets.values())).vector, reference, settings)
+
+
+@lru_cache(maxsize=16)
+def _at_rest(
+    robot: Robot, parameters: bytes, pose: bytes, settings: LoopSettings, servo_robot: Robot | None, fed_forward: bool
+) -> StartState:
+    """The state of rest at a pose (6,), for all parameters; found once for the runs of one model, and frozen."""
+    values, elasticity = np.frombuffer(parameters), settings.elasticity
+    servo, drives = settings.servo, settings.drives
+    start = equilibrium(robot, values, np.frombuffer(pose), servo, servo_robot, elasticity, fed_forward, drives)
+    start = _driven(robot, values, settings, start)
+    for part in vars(start).values():
+        if part is not None:
+            part.setflags(write=False)
+    return start
 
 
 def _driven(robot: Robot, parameters: np.ndarray, settings: LoopSettings, rest: StartState) -> StartState:

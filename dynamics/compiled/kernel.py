@@ -40,8 +40,16 @@ types.Record.mangling_args = property(_record_symbol)  # type: ignore[method-ass
 def kernel(function: Callable[..., Any]) -> Any:
     """A kernel that only kernels call: compiled with each of them, without a door for Python."""
     function.kernel = True  # type: ignore[attr-defined]
-    options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # which numba's stubs do not know
-    return njit(nogil=True, error_model="numpy", **options)(function)
+    return njit(nogil=True, error_model="numpy", **_ONLY_KERNELS)(function)
+
+
+def part(function: Callable[..., Any]) -> Any:
+    """A kernel of a few operations, which becomes a part of those that call it: a call would cost as much."""
+    function.kernel = True  # type: ignore[attr-defined]
+    return njit(nogil=True, error_model="numpy", forceinline=True, **_ONLY_KERNELS)(function)
+
+
+_ONLY_KERNELS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # unknown to numba's stubs
 
 
 def entry(function: Callable[..., Any]) -> Any:
@@ -121,11 +129,27 @@ def _call(context: Any, address: Any, inputs: Any, outputs: Any) -> Any:
     return types.void(address, inputs, outputs), code
 
 
+def _call_columns(context: Any, address: Any, common: Any, rows: Any, into: Any, width: Any) -> Any:
+    def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        arrays = zip(signature.args[1:4], values[1:4], strict=True)
+        given = [*(context.make_array(kind)(context, builder, value=value).data for kind, value in arrays), values[4]]
+        kind = ir.FunctionType(ir.VoidType(), [value.type for value in given])
+        builder.call(builder.inttoptr(values[0], kind.as_pointer()), given)
+        return context.get_dummy_value()
+
+    return types.void(address, common, rows, into, types.int64), code
+
+
 invoke: Any = intrinsic(_invoke)
 """Calls an entry by its address with four records and a number; returns its status."""
 
 call: Any = intrinsic(_call)
 """Calls a `MachineFunction` by its address with its inputs and outputs, which lie in memory one after the other."""
+
+
+call_columns: Any = intrinsic(_call_columns)
+"""Calls a `ColumnFunction` by its address with what columns have in common, the first of their rows, the first of those
+that it writes, and the number of columns."""
 
 
 def _invoke_plain(address: int, *arguments: Any) -> int:
@@ -135,6 +159,11 @@ def _invoke_plain(address: int, *arguments: Any) -> int:
 def _call_plain(address: int, inputs: np.ndarray, outputs: np.ndarray) -> None:
     single = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
     single(int(address))(inputs.ctypes.data, outputs.ctypes.data)
+
+
+def _call_columns_plain(address: int, common: np.ndarray, rows: np.ndarray, into: np.ndarray, width: int) -> None:
+    function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)
+    function(int(address))(common.ctypes.data, rows.ctypes.data, into.ctypes.data, int(width))
 
 
 @lru_cache(maxsize=1)
@@ -152,7 +181,7 @@ def plain(compiled: Any) -> Callable[..., Any]:
     lines = {name: getattr(value, "py_func", value) for name, value in names.items()}
     kernels = [name for name, value in lines.items() if isinstance(value, FunctionType) and hasattr(value, "kernel")]
     called: dict[str, Any] = {name: plain(names[name]) for name in kernels}
-    called |= {"invoke": _invoke_plain, "call": _call_plain}
+    called |= {"invoke": _invoke_plain, "call": _call_plain, "call_columns": _call_columns_plain}
     return FunctionType(source.__code__, source.__globals__ | called, source.__name__, source.__defaults__)
 
 

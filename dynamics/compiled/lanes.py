@@ -48,6 +48,22 @@ class PartedFunction:
         return ca.Function(self.name(), inputs, self.end.call([*inputs, *columns]))
 
 
+@dataclass(frozen=True)
+class ColumnFunction:
+    """A function of columns: the first `common` inputs are the same for all, the others and the outputs have a row an
+    entry, with `room` for so many columns. It is computed for `lanes` of them at once, and what is behind the last one
+    asked for is overwritten up to there."""
+
+    function: ca.Function
+    common: int
+    room: int
+    lanes: int
+
+    def name(self) -> str:
+        """That of the function."""
+        return str(self.function.name())
+
+
 class Node(NamedTuple):
     """One value: CasADi's name of the operation that makes it, and the values that go into that; value: a constant;
     entry: the number of an input, and the place in it."""

@@ -99,7 +99,7 @@ def _load(compiled: bytes) -> dict[str, MachineFunction]:
             inputs,
             [(rows, columns) for rows, columns in outputs],
             engine.get_function_address(name),
-            over_rows(engine.get_function_address(f"{name}.rows")),
+            over_rows(engine.get_function_address(f"{name}.rows")),  # functions of columns have none
             engine,
         )
         for name, (inputs, outputs) in json.loads(shapes).items()

@@ -7,57 +7,17 @@ Parts of a function that are alike are computed in vectors, one lane each (`lane
 """
 
 import casadi as ca
-import numpy as np
 
-from dynamics.compiled.lanes import Graph, Group, Node, PartedFunction, graph_of, lane_groups
+from dynamics.compiled.lanes import LEAVES, ColumnFunction, Graph, Group, Node, PartedFunction, graph_of, lane_groups
+from dynamics.compiled.operations import CALLED, MEANING, OF_VECTORS, constant, lanes_for, type_name
 from dynamics.errors import DynamicsError
 
-AnyFunction = ca.Function | PartedFunction
-
-_TRUTH = "uitofp {i1} {last} to {double}"
-_MEANING: dict[str, tuple[str, ...]] = {
-    "ADD": ("fadd {double} {0}, {1}",),
-    "SUB": ("fsub {double} {0}, {1}",),
-    "MUL": ("fmul {double} {0}, {1}",),
-    "DIV": ("fdiv {double} {0}, {1}",),
-    "NEG": ("fneg {double} {0}",),
-    "SQ": ("fmul {double} {0}, {0}",),
-    "TWICE": ("fadd {double} {0}, {0}",),
-    "INV": ("fdiv {double} {one}, {0}",),
-    "LT": ("fcmp olt {double} {0}, {1}", _TRUTH),
-    "LE": ("fcmp ole {double} {0}, {1}", _TRUTH),
-    "EQ": ("fcmp oeq {double} {0}, {1}", _TRUTH),
-    "NE": ("fcmp une {double} {0}, {1}", _TRUTH),
-    "NOT": ("fcmp oeq {double} {0}, {zero}", _TRUTH),
-    "IF_ELSE_ZERO": ("fcmp une {double} {0}, {zero}", "select {i1} {last}, {double} {1}, {double} {zero}"),
-    "SIGN": (
-        "fcmp ogt {double} {0}, {zero}",
-        "select {i1} {last}, {double} {one}, {double} {0}",
-        "fcmp olt {double} {0}, {zero}",
-        "select {i1} {last}, {double} {minus}, {double} {before}",
-    ),
-}
-"""Instructions of LLVM by the names of CasADi's operations; {last} and {before} are the results of the ones above."""
-
-_OF_VECTORS = {
-    **{name: f"llvm.{name.lower()}" for name in ("SQRT", "FABS", "FLOOR", "CEIL")},
-    "FMIN": "llvm.minnum",
-    "FMAX": "llvm.maxnum",
-}
-"""Functions of LLVM that processors have, for vectors, too."""
-
-_CALLED = {
-    **{name: f"{called}.f64" for name, called in _OF_VECTORS.items()},
-    **{name: f"llvm.{name.lower()}.f64" for name in ("SIN", "COS", "EXP", "LOG", "POW")},
-    **{name: name.lower() for name in ("TAN", "ASIN", "ACOS", "ATAN", "ATAN2", "SINH", "COSH", "TANH")},
-    "CONSTPOW": "llvm.pow.f64",
-}
-"""Functions of LLVM and of the C library that operations call."""
+AnyFunction = ca.Function | PartedFunction | ColumnFunction
 
 
 def llvm_text(functions: list[AnyFunction]) -> str:
     """The LLVM text of SX functions. Raises DynamicsError, naming it, for an operation that is not known here."""
-    bodies = [_Body(function) for function in functions]
+    bodies = [_ColumnBody(one) if isinstance(one, ColumnFunction) else _Body(one) for one in functions]
     declared = sorted({called for body in bodies for called in body.called})
     return "\n".join([*(f"declare {called}" for called in declared), *(body.text() for body in bodies)])
 
@@ -73,12 +33,14 @@ def shapes(function: AnyFunction) -> tuple[list[int], list[tuple[int, int]]]:
 
 def _last(function: AnyFunction) -> ca.Function:
     """What makes the outputs of a function."""
+    if isinstance(function, ColumnFunction):
+        return function.function
     return function.end if isinstance(function, PartedFunction) else function
 
 
 def _inputs(function: AnyFunction) -> int:
     """The number of its inputs; behind them its end may have parts."""
-    return int(function.inputs if isinstance(function, PartedFunction) else function.n_in())
+    return int(function.inputs if isinstance(function, PartedFunction) else _last(function).n_in())
 
 
 class _Body:
@@ -117,7 +79,7 @@ class _Body:
         graph = graph_of(function.parts, function.constants)
         values, columns = _Values(self, graph, []), [[""] * len(of) for of in graph.outputs]
         for group in lane_groups(graph):
-            width = _width(len(group.lanes))
+            width = lanes_for(len(group.lanes))
             for row, vector in enumerate(self._group(group, values, width)):
                 for lane, part in enumerate(group.lanes):
                     columns[part][row] = self._entry(vector, lane, width)
@@ -138,18 +100,18 @@ class _Body:
         """What an operation makes of numbers, or of vectors with so many lanes in use."""
         if operation == "ASSIGN":
             return operands[0]
-        if operation in _OF_VECTORS and width > 1:
-            return self._call(f"{_OF_VECTORS[operation]}.v{width}f64", operands, _type(width))
-        if operation in _CALLED:
+        if operation in OF_VECTORS and width > 1:
+            return self._call(f"{OF_VECTORS[operation]}.v{width}f64", operands, type_name(width))
+        if operation in CALLED:
             entries = [[self._entry(of, lane, width) for of in operands] for lane in range(lanes)]
-            return self._vector([self._call(_CALLED[operation], of, "double") for of in entries], width)
-        if operation not in _MEANING:
-            known = ", ".join(sorted({*_MEANING, *_CALLED}))
+            return self._vector([self._call(CALLED[operation], of, "double") for of in entries], width)
+        if operation not in MEANING:
+            known = ", ".join(sorted({*MEANING, *CALLED}))
             raise DynamicsError(f"{self._name}: no machine code for the operation {operation}; known: {known}")
-        words = {"double": _type(width), "i1": _type(width, "i1")}
-        words |= {name: _constant([value] * width) for name, value in (("zero", 0.0), ("one", 1.0), ("minus", -1.0))}
+        words = {"double": type_name(width), "i1": type_name(width, "i1")}
+        words |= {name: constant([value] * width) for name, value in (("zero", 0.0), ("one", 1.0), ("minus", -1.0))}
         last = before = ""
-        for line in _MEANING[operation]:
+        for line in MEANING[operation]:
             last, before = self.new(line.format(*operands, last=last, before=before, **words)), last
         return last
 
@@ -167,15 +129,15 @@ class _Body:
         if (known := self._vectors.get(tuple(filled))) is None:
             known, once = "poison", len(set(filled)) == 1
             for lane, entry in enumerate(filled[: 1 if once else width]):
-                known = self.new(f"insertelement {_type(width)} {known}, double {entry}, i64 {lane}")
+                known = self.new(f"insertelement {type_name(width)} {known}, double {entry}, i64 {lane}")
             if once:
                 mask = f"<{width} x i32> zeroinitializer"
-                known = self.new(f"shufflevector {_type(width)} {known}, {_type(width)} poison, {mask}")
+                known = self.new(f"shufflevector {type_name(width)} {known}, {type_name(width)} poison, {mask}")
             self._vectors[tuple(filled)] = known
         return known
 
     def _entry(self, vector: str, lane: int, width: int) -> str:
-        return vector if width == 1 else self.new(f"extractelement {_type(width)} {vector}, i64 {lane}")
+        return vector if width == 1 else self.new(f"extractelement {type_name(width)} {vector}, i64 {lane}")
 
     def input(self, number: int, entry: int) -> str:
         """An entry of an input."""
@@ -187,6 +149,50 @@ class _Body:
         self._count += 1
         self._lines.append(f"%v{self._count} = {text}")
         return f"%v{self._count}"
+
+
+class _ColumnBody(_Body):
+    """The lines of a function of columns: what all share first, then a loop over so many columns at once."""
+
+    def __init__(self, given: ColumnFunction) -> None:
+        self._given = given
+        super().__init__(given.function)
+
+    def text(self) -> str:
+        """The function: `void name(const double *common, const double *rows, double *into, long width)`."""
+        lines = "\n".join(self._lines)
+        signature = "(ptr noalias readonly %inputs, ptr noalias readonly %rows, ptr noalias %into, i64 %width)"
+        return f"define void @{self._name}{signature} nounwind {{\n{lines}\n}}\n"
+
+    def _write(self, graph: Graph, parts: list[list[str]]) -> None:
+        common, values, lanes = self._given.common, _Values(self, graph, parts), self._given.lanes
+        varies: list[bool] = []
+        for number, node in enumerate(graph.nodes):
+            of_column = node.operation == "INPUT" and node.entry[0] >= common
+            varies.append(of_column or any(varies[k] for k in node.operands))
+            if not varies[-1] and node.operation not in LEAVES:
+                values.of(number)
+        self._lines += ["br label %ask", "ask:", "%k = phi i64 [0, %0], [%next, %do]"]
+        self._lines += ["%goes = icmp slt i64 %k, %width", "br i1 %goes, label %do, label %done", "do:"]
+        vectors: dict[int, str] = {}
+        for number in [number for number, of_column in enumerate(varies) if of_column]:
+            operation, operands, _, (place, entry) = graph.nodes[number]
+            if operation == "INPUT":
+                address = self._place("rows", self._inputs[place][entry] - sum(self._sizes[0][:common]))
+                vectors[number] = self.new(f"load {type_name(lanes)}, ptr {address}, align 8")
+            else:
+                of = [vectors[k] if varies[k] else self._vector([values.of(k)] * lanes, lanes) for k in operands]
+                vectors[number] = self.result(operation, of, lanes, lanes)
+        for places, nodes in zip(self._outputs, graph.outputs, strict=True):
+            for row, found in zip(places, nodes, strict=True):
+                address = self._place("into", row)
+                self._lines.append(f"store {type_name(lanes)} {vectors[found]}, ptr {address}, align 8")
+        self._lines += [f"%next = add i64 %k, {lanes}", "br label %ask", "done:", "ret void"]
+
+    def _place(self, name: str, row: int) -> str:
+        """Where the present columns of a row are."""
+        begin = self.new(f"getelementptr double, ptr %{name}, i64 {row * self._given.room}")
+        return self.new(f"getelementptr double, ptr {begin}, i64 %k")
 
 
 class _Values:
@@ -209,27 +215,12 @@ class _Values:
 
     def _written(self, node: Node) -> str:
         if node.operation == "CONST":
-            return _constant([node.value])
+            return constant([node.value])
         if node.operation != "INPUT":
             return self._body.result(node.operation, [self._known[k] for k in node.operands])
         number, entry = node.entry
         first = self._body.own_inputs
         return self._parts[number - first][entry] if number >= first else self._body.input(number, entry)
-
-
-def _type(width: int, of: str = "double") -> str:
-    return of if width == 1 else f"<{width} x {of}>"
-
-
-def _width(lanes: int) -> int:
-    """The lanes of a vector that holds so many: a power of two."""
-    return 1 << (lanes - 1).bit_length()
-
-
-def _constant(values: list[float]) -> str:
-    """Constants as an operand, by their bits: decimals may not be what they say."""
-    bits = [f"0x{np.float64(value).view(np.uint64):016X}" for value in values]
-    return bits[0] if len(bits) == 1 else f"<{', '.join(f'double {one}' for one in bits)}>"
 
 
 def _places(name: str, sparsities: list[ca.Sparsity]) -> list[list[int]]:

@@ -15,23 +15,32 @@ from collections.abc import Callable, Sequence
 import casadi as ca
 import numpy as np
 
-from dynamics.compiled.lanes import PartedFunction
+from dynamics.compiled.lanes import ColumnFunction, PartedFunction
 from dynamics.expressions import function, symmetric_from_lower
 from dynamics.geometry import AnyGeometry
 from dynamics.kinematics.platform import PlatformJointMotion, pose_rate_to_twist, twist_bias
 from dynamics.legs.leg import Leg
 from dynamics.parameters import parameter_layout
+from dynamics.rigid_body.accelerations import cholesky, free_acceleration, slope_derivative, summed
 from dynamics.rigid_body.jacobians import freedoms
 from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 
 
-def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction]:
+def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction | ColumnFunction]:
     """What the closed loop integrates."""
-    return [equation_of_motion(geometry), motion_derivatives(geometry), rate_map_derivative(geometry)]
+    size, layout = len(geometry.chart.freedoms), parameter_layout(geometry.legs)
+    return [
+        equation_of_motion(geometry),
+        free_acceleration(size, layout.joints),
+        motion_derivatives(geometry),
+        rate_map_derivative(geometry),
+        slope_derivative(layout, size),
+    ]
 
 
 def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
-    """(q, rate (m,), rigid (p,)) -> M (m, m), b (m,), J_theta (n, m), J_theta_dot rate (n,), theta (n,)."""
+    """(q, rate (m,), rigid (p,)) -> M (m, m), b (m,), J_theta (n, m), J_theta_dot rate (n,), theta (n,), its rate (n,),
+    and the Cholesky factor of M (m, m), see `cholesky`."""
     layout, (q, rate) = parameter_layout(geometry.legs), _coordinates(geometry, "q", "rate")
     motion, free = _poses(geometry, q, rate, 0 * rate), freedoms(geometry)
     rigid = ca.SX.sym("rigid", layout.rigid.stop)
@@ -48,7 +57,12 @@ def equation_of_motion(geometry: AnyGeometry) -> PartedFunction:
     bias = free.T @ _platform_columns(geometry, joints) @ rigid[0:4]
 
     def end(masses: Sequence[ca.SX], forces: Sequence[ca.SX], *rows: Sequence[ca.SX]) -> list[ca.SX]:
-        return [symmetric_from_lower(sum(masses, mass)), sum(forces, bias), *(ca.vertcat(*row) for row in rows)]
+        jacobian, *of_joints = (ca.vertcat(*row) for row in rows)
+        total = symmetric_from_lower(sum(masses, mass))
+        velocity = ca.vertcat(
+            *(summed(ca.SX(0), ca.horzsplit(row), ca.vertsplit(rate)) for row in ca.vertsplit(jacobian))
+        )
+        return [total, sum(forces, bias), jacobian, *of_joints, velocity, cholesky(total)]
 
     at = [joints.pose, joints.rate, joints.gain], motion
     return _parted("equation_of_motion", [q, rate, rigid, *geometry.symbols], parts, end, sides, at)

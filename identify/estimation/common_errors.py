@@ -16,12 +16,23 @@ from identify.record.recorded_run import RecordedRun
 
 @dataclass(frozen=True)
 class CommonErrorEstimates:
-    """names of the errors of one record, each ending with its unit; prior_std, estimate and std (k,) of each."""
+    """names of the errors of one record, each ending with its unit; prior_std, estimate and std (k,) of each.
+
+    Of the robot's parameters the estimates depend by by_parameters (k, p); covariance (k, k): of the errors, were those
+    known.
+    """
 
     names: tuple[str, ...]
     prior_std: Array
     estimate: Array
     std: Array
+    covariance: Array
+    by_parameters: Array
+
+    def with_parameters(self, covariance: Array) -> Array:
+        """Covariance (p + k, p + k) of parameters, of which that is known (p, p), and errors together."""
+        beside = self.by_parameters @ covariance
+        return np.block([[covariance, beside.T], [beside, self.covariance + beside @ self.by_parameters.T]])
 
 
 def most_likely(run: RecordedRun, parameters: Array) -> Array:
@@ -46,10 +57,11 @@ def common_error_estimates(problem: OutputErrorProblem, parameters: Array) -> Co
     run = problem.runs[0]
     if run.marginal is None:
         nothing = np.zeros(0)
-        return CommonErrorEstimates((), nothing, nothing, nothing)
+        empty, beside = np.zeros((0, 0)), np.zeros((0, len(parameters)))
+        return CommonErrorEstimates((), nothing, nothing, nothing, empty, beside)
     names, factor, modes = run.common.all_names, run.common.whole_factor, run.marginal.modes
-    slopes = run.without_common_errors().residuals(parameters)[1]
-    rows = np.column_stack([slopes.reshape(len(modes), -1), modes])
+    slopes = run.without_common_errors().residuals(parameters)[1].reshape(len(modes), -1)
+    rows = np.column_stack([slopes, modes])
     information = rows.T @ rows
     count = len(parameters)
     information[:count, :count] += problem.known_information()
@@ -58,4 +70,8 @@ def common_error_estimates(problem: OutputErrorProblem, parameters: Array) -> Co
     covariance = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
     spread = factor @ covariance[count:, count:] @ factor.T
     prior_std = np.sqrt(np.diag(factor @ factor.T))
-    return CommonErrorEstimates(names, prior_std, factor @ most_likely(run, parameters), np.sqrt(np.diag(spread)))
+    left = np.linalg.inv(np.eye(modes.shape[1]) + modes.T @ modes)
+    estimate, std = factor @ most_likely(run, parameters), np.sqrt(np.diag(spread))
+    return CommonErrorEstimates(
+        names, prior_std, estimate, std, factor @ left @ factor.T, -factor @ left @ modes.T @ slopes
+    )

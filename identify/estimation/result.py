@@ -106,6 +106,11 @@ class IdentificationResult:
         }
         return pd.DataFrame(columns, index=pd.Index(self.names, name="parameter"))
 
+    @property
+    def whole_covariance(self) -> Array:
+        """Covariance (p + k, p + k) of the estimates, and behind them of what all poses have in common."""
+        return self.common_errors.with_parameters(self.covariance)
+
     def save(self, path: Path | str) -> None:
         """Write a JSON file whose "identification" is that of a run's result.json; commands take its estimates."""
         save_result(path, {"identification": self.to_dict()})

@@ -102,21 +102,31 @@ def measured(sensor: cmmsim.Sensor, robot: Robot, poses: Array, frames: int, see
         for row, pose in enumerate(poses):
             bodies = robot_transforms(robot, pose)
             sensor.start_run(stream_seed(seed, NOISE, FIRST_POSE_RUN + row))
-            good = []
-            for _ in range(frames):
-                if (one := sensor.measure(pose, bodies)).ok:
-                    good.append(one)
-                advance()
-            if good:
-                values = np.array([one.pose for one in good])
-                means[row], counts[row] = values.mean(axis=0), len(good)
-                stated[row] = np.mean([one.covariance for one in good], axis=0)
+            values, covariances = _frames_at(sensor, pose, bodies, frames)
+            advance(frames)
+            if len(values):
+                means[row], counts[row] = values.mean(axis=0), len(values)
+                stated[row] = covariances.mean(axis=0)
                 away = values - means[row]
                 scatter += float(np.sum(away * np.linalg.solve(stated[row], away.T).T)) / away.shape[1]
-                spare += len(good) - 1
+                spare += len(values) - 1
     seen, share = counts > 0, min(scatter / spare, 1.0) if spare else 0.0
     kept = 1 - share * (1 - 1 / np.maximum(counts, 1))
     return Sighted(means, stated * kept[:, None, None], seen, int(len(poses) * frames - counts.sum()))
+
+
+def _frames_at(sensor: cmmsim.Sensor, pose: Array, bodies: dict[str, Array], frames: int) -> tuple[Array, Array]:
+    """Poses (k, 6) and covariances (k, 6, 6) of the frames at a pose that gave one: images are searched as a whole
+    until they give one, in all others stickers are looked for near that."""
+    left = frames
+    while left:
+        first, left = sensor.measure(pose, bodies), left - 1
+        if not first.ok:
+            continue
+        rest = sensor.measure_many(np.tile(pose, (left, 1)), obstacles=bodies, near=np.tile(first.pose, (left, 1)))
+        ok = rest.stickers > 0
+        return np.stack([first.pose, *rest.poses[ok]]), np.stack([first.covariance, *rest.covariances[ok]])
+    return np.zeros((0, 6)), np.zeros((0, 6, 6))
 
 
 def drawn(

@@ -19,6 +19,7 @@ from tests.benchmarks.timing import OtherLoad, judge, resident_bytes
 pytestmark = [pytest.mark.thorough, pytest.mark.rendering]
 TIMES_STRAIGHTFORWARD = {"analytic": 20.0, "pyrender": 8.0}
 TIMES_IMAGED = 400.0  # 100,000 frames a second without images where the analytic renderer draws 250
+TIMES_ONE_BY_ONE = 3.0  # of frames with images measured many at once, on two cores
 BATCH = 20
 MEMORY_FRAMES = {"analytic": 100_000, "pyrender": 20_000}
 KEPT = []  # what must live as long as OpenGL is used
@@ -72,6 +73,27 @@ def test_without_images_against_drawn_ones(taught, record_property):
     record_property("statistical_frames_a_second", 1.0 / said)
     record_property("statistical_times_analytic", drawn / said)
     judge(drawn / said >= TIMES_IMAGED, f"{drawn / said:.0f} times analytic images, goal {TIMES_IMAGED:g}", load)
+
+
+def test_images_many_at_once_against_one_by_one(taught, record_property):
+    """The same frames at rest, in rounds that alternate; on two cores."""
+    sensor = cmmsim.load_sensor("ctrack780", seed=0, taught=taught, renderer="analytic")
+    few, many = path(sensor, 5 * BATCH), path(sensor, 1000)
+    frame_seconds(sensor, few[:BATCH])
+    sensor.measure_many(many[: 5 * BATCH])
+    alone, together, processor = np.inf, np.inf, np.inf
+    with OtherLoad() as load:
+        for start in range(0, len(few), BATCH):
+            alone = min(alone, frame_seconds(sensor, few[start : start + BATCH]))
+            began, used = time.perf_counter(), time.process_time()
+            found = sensor.measure_many(many)
+            together = min(together, (time.perf_counter() - began) / len(many))
+            processor = min(processor, (time.process_time() - used) / len(many))
+    assert found.stickers.min() >= 17
+    record_property("analytic_frames_a_second_together", 1.0 / together)
+    record_property("analytic_frames_a_processor_second_together", 1.0 / processor)
+    record_property("analytic_times_one_by_one", alone / together)
+    judge(alone / together >= TIMES_ONE_BY_ONE, f"{alone / together:.1f} times, goal {TIMES_ONE_BY_ONE:g}", load)
 
 
 def test_against_a_straightforward_pipeline(sensor, record_property):

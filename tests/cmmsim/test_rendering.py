@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import ConvexHull
 
 import cmmsim
 from cmmsim.geometry.disc_image import coverage
@@ -13,7 +14,9 @@ from cmmsim.geometry.pose import apply, pose_to_transform
 from cmmsim.imaging import analytic, pyrender_renderer
 from cmmsim.imaging.exposure import SUPERSAMPLING
 from cmmsim.imaging.kernels import Discs, Solids, cover_by_polygon, lay_layers, polygon_holds
-from cmmsim.imaging.scene import ConvexSolid
+from cmmsim.imaging.renderer import Drawable
+from cmmsim.imaging.scene import ConvexSolid, solid_mesh
+from cmmsim.imaging.view_kernels import convex_hull, outlined
 from tests.cmmsim.sensors import (
     CAMERA,
     centre_errors,
@@ -115,20 +118,39 @@ def test_solid_hides_what_a_ray_caster_says():
 
 
 def test_outline_covers_what_sampling_says():
-    solid = ConvexSolid(np.asarray(cmmsim.rod(0.02, 0.004).vertices))
-    outline = solid.outline(CAMERA, pose_to_transform([0.0, 0.0, 1.5, 0.9, 0.4, 0.0]))
+    rod = cmmsim.rod(0.02, 0.004)
+    scene = analytic.scene_of(Drawable([solid_mesh(rod, 0.5)], [0], 1.5))
+    move = pose_to_transform([0.0, 0.0, 1.5, 0.9, 0.4, 0.0])
+    solids = outlined(scene, move[None], CAMERA.focal_lengths, CAMERA.centre, np.array([-1]))
+    half_planes = solids.half_planes[: solids.starts[1]]
+    pixels = CAMERA.project(apply(move, np.asarray(rod.vertices)))[0]
+    np.testing.assert_allclose(solids.boxes[0], [*pixels.min(axis=0), *pixels.max(axis=0)], atol=1e-4)
     corner, fine, coarse = (1004.5, 744.5), np.empty((40, 40)), np.empty((40, 40))
-    cover_by_polygon(outline.half_planes, *corner, 200, fine)
-    cover_by_polygon(outline.half_planes, *corner, 6, coarse)
+    cover_by_polygon(half_planes, *corner, 200, fine)
+    cover_by_polygon(half_planes, *corner, 6, coarse)
     assert np.abs(coarse - fine).max() < 0.1
     x, y = np.meshgrid(np.arange(40), np.arange(40))
     inside = [
-        polygon_holds(outline.half_planes, corner[0] + i, corner[1] + j, 1, 1)
+        polygon_holds(half_planes, corner[0] + i, corner[1] + j, 1, 1)
         for i, j in zip(x.ravel(), y.ravel(), strict=True)
     ]
     np.testing.assert_allclose(fine.ravel()[inside], 1.0, atol=1e-6)
     area = fine.sum()
     assert 0.9 * area < np.sum(inside) + 0.5 * np.sum((fine > 0) & (fine < 1)) < 1.1 * area
+
+
+@pytest.mark.parametrize("count", [3, 4, 10, 60])
+def test_convex_hull_is_that_of_qhull(count):
+    """Of points on a grid, too, where many lie on one line."""
+    rng = np.random.default_rng(count)
+    for points in (rng.normal(size=(count, 2)), rng.integers(0, 5, (count, 2)).astype(float), np.zeros((count, 2))):
+        found = convex_hull(points.copy())
+        if np.linalg.matrix_rank(points - points[0]) < 2:
+            assert set(map(tuple, found)) <= set(map(tuple, points))
+            continue
+        expected = points[ConvexHull(points).vertices]
+        assert set(map(tuple, found)) == set(map(tuple, expected))
+        assert len(found) == len(set(map(tuple, expected)))
 
 
 def test_auto_falls_back_to_analytic_with_one_line(monkeypatch):

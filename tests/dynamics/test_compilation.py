@@ -12,12 +12,13 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from dynamics.compiled.kernel import entry
-from dynamics.compiled.lanes import NAMES, PartedFunction, graph_of, lane_groups
+from dynamics.compiled.kernel import call_columns, entry, kernel, plain
+from dynamics.compiled.lanes import NAMES, ColumnFunction, PartedFunction, graph_of, lane_groups
 from dynamics.compiled.machine_code import compiled_functions
 from dynamics.compiled.object_files import CacheWarning, load_object
-from dynamics.compiled.translation import _CALLED, _MEANING
+from dynamics.compiled.operations import CALLED, MEANING
 from dynamics.errors import DynamicsError
+from dynamics.rigid_body.accelerations import slope_derivative
 from dynamics.rigid_body.equation_of_motion import motion_functions
 from dynamics.rigid_body.virtual_work import robot_functions
 from tests.dynamics.conftest import BOX
@@ -46,20 +47,52 @@ def test_every_function_of_a_robot_is_that_of_the_virtual_machine(robot):
     """All outputs, bit by bit, at a batch of random states with a single row of parameters."""
     rng, names = np.random.default_rng(6), []
     for given in [*robot_functions(robot.geometry), *motion_functions(robot.geometry)]:
+        if isinstance(given, ColumnFunction):
+            names.append(given.name())
+            continue
         function = given.whole if isinstance(given, PartedFunction) else given
         pose = robot.home_pose + BOX * rng.uniform(-1, 1, (5, 6))
-        sizes = [function.nnz_in(k) for k in range(1, function.n_in())]
-        inputs = [pose, *[rng.normal(size=(5, size)) if size == 6 else rng.uniform(size=(1, size)) for size in sizes]]
+        sizes = [function.nnz_in(k) for k in range(function.n_in())]
+        first = [pose] if sizes[0] == 6 else []
+        inputs = [
+            *first,
+            *[rng.normal(size=(5, size)) if size == 6 else rng.uniform(size=(1, size)) for size in sizes[len(first) :]],
+        ]
         found = robot.functions[function.name()](*inputs)
         for row in range(5):
-            expected = function.call([ca.DM(part[row % len(part)]) for part in inputs])
+            at = [part[row % len(part)].reshape(function.size_in(k)) for k, part in enumerate(inputs)]
+            expected = function.call([*map(ca.DM, at)])
             for ours, theirs in zip(found, expected, strict=True):
                 np.testing.assert_array_equal(ours[row], theirs.full(), err_msg=function.name(), strict=True)
         names.append(function.name())
     assert sorted(robot.functions) == sorted(names)
 
 
-@pytest.mark.parametrize("name", [*_MEANING, *_CALLED])
+@pytest.mark.parametrize("width", [1, 8, 13])
+def test_a_function_of_columns_is_that_of_the_virtual_machine_column_by_column(robot, width):
+    """Bit by bit, as far as it was asked for and to the end of that vector; what is behind stays."""
+    given, rng = slope_derivative(robot.layout, len(robot.coordinate_names)), np.random.default_rng(8)
+    inputs = [rng.normal(size=given.function.size_in(k)) for k in range(given.common)]
+    rows = rng.normal(
+        size=(sum(given.function.nnz_in(k) for k in range(given.common, given.function.n_in())), given.room)
+    )
+    into = np.full((sum(given.function.nnz_out(k) for k in range(given.function.n_out())), given.room), 7.0)
+    common = np.concatenate([part.ravel() for part in inputs])
+    plain(call_columns_of)(robot.functions["slope_derivative"].address, common, rows, into, width)
+    ends = np.cumsum([given.function.nnz_in(k) for k in range(given.common, given.function.n_in())])[:-1]
+    last = -(-width // given.lanes) * given.lanes
+    for column in range(last):
+        expected = given.function.call([*map(ca.DM, inputs), *map(ca.DM, np.split(rows[:, column], ends))])
+        np.testing.assert_array_equal(into[:, column], np.concatenate([part.full().ravel() for part in expected]))
+    assert (into[:, last:] == 7.0).all()
+
+
+@kernel
+def call_columns_of(address, common, rows, into, width):
+    call_columns(address, common, rows, into, width)
+
+
+@pytest.mark.parametrize("name", [*MEANING, *CALLED])
 def test_every_operation_is_that_of_the_virtual_machine_whatever_its_arguments(own_cache, name):
     """Bit by bit, signs of zeros included, on all pairs of special and of random numbers."""
     function, x, y = machine_function(name)
@@ -67,7 +100,7 @@ def test_every_operation_is_that_of_the_virtual_machine_whatever_its_arguments(o
     check_bits(found, function(ca.DM(x).T, ca.DM(y).T).full().ravel())
 
 
-@pytest.mark.parametrize("name", [*_MEANING, *_CALLED])
+@pytest.mark.parametrize("name", [*MEANING, *CALLED])
 def test_operations_in_lanes_are_those_one_by_one(own_cache, name):
     """Bit by bit as above, of three parts alike, and a fourth that is not and has the same operation inside."""
     function, x, y = machine_function(name)

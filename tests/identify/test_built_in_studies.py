@@ -39,7 +39,8 @@ def rows_of(name, repeats=None):
     return study, tidy_table(study, compute(prepare(study), [design.case(number) for number in range(len(design))]))
 
 
-ANSWERS = {"estimators", "excitation_methods", "friction_timing", "inexact", "interval_coverage", "parameter_groups"}
+ANSWERS = {"control_laws", "control_value", "estimators", "excitation_methods", "friction_timing", "inexact"}
+ANSWERS |= {"interval_coverage", "parameter_groups"}
 """Studies that ask what no law says; what came out is in the documentation."""
 
 

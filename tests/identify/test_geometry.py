@@ -9,6 +9,7 @@ import pytest
 import cmmsim
 from cmmsim.geometry.known_rig import PHOTOGRAPHED, KnownRig
 from cmmsim.pose_estimation.estimator import lost_measurement, measurement_without_stickers
+from cmmsim.pose_estimation.many import MeasuredPoses
 from dynamics import built_in_robots, load_robot
 from dynamics.errors import UnreachablePoseError
 from identify.errors import EstimationError, RecordError
@@ -187,6 +188,12 @@ class Eye:
         if pose[0] > 0.01 or self.frame % 2:
             return lost_measurement("dark")
         return measurement_without_stickers(pose + 1e-6 * self.rng.standard_normal(6), 2e-12 * np.eye(6))
+
+    def measure_many(self, poses, obstacles, near):
+        assert np.abs(near - poses).max() < 6e-6
+        found = [self.measure(pose, obstacles) for pose in poses]
+        ok = np.array([18 * one.ok for one in found])
+        return MeasuredPoses(np.array([one.pose for one in found]), np.array([one.covariance for one in found]), ok)
 
 
 def test_means_leave_lost_frames_out_and_do_not_average_what_does_not_scatter():

@@ -17,8 +17,11 @@ from identify.studies.rows.identification import IDENTIFICATION
 from identify.studies.rows.kind import Kind
 from identify.studies.rows.path_pose import PATH_POSE
 from identify.studies.rows.static_pose import STATIC_POSE
+from identify.studies.rows.tracking import TRACKING
 
-KINDS: dict[str, Kind] = {kind.name: kind for kind in (STATIC_POSE, PATH_POSE, IDENTIFICATION, ESTIMATION, CLOSED_LOOP)}
+KINDS: dict[str, Kind] = {
+    kind.name: kind for kind in (STATIC_POSE, PATH_POSE, IDENTIFICATION, ESTIMATION, CLOSED_LOOP, TRACKING)
+}
 
 
 def find_kind(name: str) -> Kind:

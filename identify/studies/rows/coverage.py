@@ -27,14 +27,15 @@ def coverage(result: IdentificationResult, plant: Plant, unseen: Sequence[Experi
 def _poses_covered(result: IdentificationResult, plant: Plant, unseen: Sequence[Experiment], seed: int) -> Array:
     """Whether each true coordinate (frames, m) is within its 95 % interval."""
     robot, free, records = plant.nominal, plant.nominal.geometry.chart.basis, [one.record for one in unseen]
-    estimated = result.estimate, result.covariance
-    predicted = predicted_runs(robot, plant.scenario, records, *estimated, seed, SilentProgress())
+    errors = dict(zip(result.common_errors.names, result.common_errors.estimate.tolist(), strict=True))
+    estimated = result.estimate, result.whole_covariance
+    predicted = predicted_runs(robot, plant.scenario, records, *estimated, seed, SilentProgress(), errors)
     pairs = [(true_poses(one.truth) - of_one.poses, of_one) for one, of_one in zip(unseen, predicted, strict=True)]
-    errors = np.concatenate([error @ free for error, _ in pairs])
+    misses = np.concatenate([error @ free for error, _ in pairs])
     variances = np.concatenate(
         [np.diagonal(free.T @ of_one.covariance @ free, axis1=1, axis2=2) for _, of_one in pairs]
     )
-    return np.abs(errors) < HALF_WIDTH * np.sqrt(variances)
+    return np.abs(misses) < HALF_WIDTH * np.sqrt(variances)
 
 
 def quantities(result: IdentificationResult, truth: Array) -> Iterator[tuple[str, float, float, bool, bool]]:

@@ -139,8 +139,8 @@ class Recorded:
 def recorded(scenario: Scenario, seed: np.random.SeedSequence, options: RecordOptions) -> Recorded:
     """Run the plant of a row with its sensor. Raises what experiment and sensor raise."""
     number = stream_seed(seed, EXPERIMENT)
-    plant = build_plant(scenario, _robot(scenario.robot), number)
-    trajectories = _trajectories(scenario, options.trajectory_seed)
+    plant = build_plant(scenario, robot_named(scenario.robot), number)
+    trajectories = designed_trajectories(scenario, options.trajectory_seed)
     drawn = options.sensor == "drawn"
     sensor = _drawn(scenario) if drawn else taught_sensor(scenario, plant.nominal, number, SilentProgress())
     experiment = excitation_run(plant, sensor, trajectories.excitation, number)
@@ -236,17 +236,18 @@ def prediction_figures(
 
 
 def _drawn(scenario: Scenario) -> DrawnSensor:
-    home = _robot(scenario.robot).home_pose
+    home = robot_named(scenario.robot).home_pose
     covariance = expected_covariance(scenario.sensor, home, scenario.pose_method, changes=scenario.sensor_changes)
     return DrawnSensor(covariance, scenario.timing.dropout)
 
 
 @lru_cache(maxsize=4)
-def _robot(name: str) -> Robot:
+def robot_named(name: str) -> Robot:
+    """A robot, loaded once a process."""
     return load_robot(name)
 
 
-def _trajectories(scenario: Scenario, seed: int) -> TrajectorySet:
+def designed_trajectories(scenario: Scenario, seed: int) -> TrajectorySet:
     """The trajectories of a scenario, which know neither the plant nor what is known of the rig: rows that differ in
     these share them."""
     design = {"rig": Rig(), "plant": PlantSwitches(), "renderer": "auto"}
@@ -256,7 +257,7 @@ def _trajectories(scenario: Scenario, seed: int) -> TrajectorySet:
 @lru_cache(maxsize=64)
 def _designed(scenario_toml: str, seed: int) -> TrajectorySet:
     scenario = scenario_from_toml(scenario_toml)
-    return design_trajectories(_robot(scenario.robot), scenario, seed)
+    return design_trajectories(robot_named(scenario.robot), scenario, seed)
 
 
 PROCESS, HELD = 0.5e9, 5
@@ -265,7 +266,7 @@ PROCESS, HELD = 0.5e9, 5
 
 def memory(scenario: Scenario) -> float:
     """Bytes of a process that identifies from the records of a scenario, as was measured with up to 24,000 frames."""
-    parameters = len(_robot(scenario.robot).layout.names)
+    parameters = len(robot_named(scenario.robot).layout.names)
     return PROCESS + HELD * 8.0 * 6 * parameters * scenario.timing.frames(scenario.excitation.duration_s)
 
 

@@ -6,7 +6,9 @@ no picture is searched as a whole. The timing's dropout loses pictures, and chan
 exact unless asked for otherwise: the rows show observation noise alone.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from pydantic import Field
@@ -22,6 +24,7 @@ from identify.studies.rows.kind import BOX, NOISE_OFF, PICTURES, Column, Idle, K
 from identify.studies.rows.sensor import POSE_COLUMNS, RowSensor, Teaching, pose_figures, rms_um, row_sensor
 
 POSES, SENSOR, DROPOUT = 0, 1, 2
+TOGETHER = 256  # pictures that are drawn and measured at once
 PREDICTION_ERROR = np.repeat([1e-4, 5e-4], 3)
 """Standard deviation [m, rad] of the pose near which a picture's stickers are looked for: what a tracker predicts."""
 
@@ -95,32 +98,32 @@ def compute(scenario: Scenario, seed: np.random.SeedSequence, options: StaticPos
     captures = options.captures if options.hold_s is None else max(1, scenario.timing.frames(options.hold_s))
     seen: list[_Seen] = []
     lost = ""
-    for number in range(options.poses):
-        pose = eye.sensor.home + box * rng.uniform(-1.0, 1.0, 6)
-        for _ in range(captures):
-            try:
-                measured = _measured(eye, pose, rng, dropout)
-            except cmmsim.LostError as error:
-                lost = str(error)
-                continue
-            errors = _sticker_errors(eye, measured, pose)
-            seen.append(_Seen(number, measured.pose - pose, measured.covariance, *errors))
+    planned = _pictures(eye.sensor.home, box, (options.poses, captures), rng)
+    while together := list(islice(planned, TOGETHER)):
+        poses, near = (np.array(values) for values in list(zip(*together, strict=True))[1:])
+        # those that drop out are measured, too, so that the next have the noise they had
+        for (number, pose, _), measured in zip(together, eye.sensor.measure_each(poses, near), strict=True):
+            if dropout.random() < (share := eye.sensor.timing.dropout):
+                lost = f"dropped frame (a share of {share:.3g} drops out)"
+            elif not measured.ok:
+                lost = measured.reason
+            else:
+                errors = _sticker_errors(eye, measured, pose)
+                seen.append(_Seen(number, measured.pose - pose, measured.covariance, *errors))
     if not seen:
         raise EstimationError(f"no pose was found in any of {captures * options.poses} pictures: {lost}")
     return _row(eye, seen, captures * options.poses)
 
 
-def _measured(
-    eye: RowSensor, pose: Array, rng: np.random.Generator, dropout: np.random.Generator
-) -> cmmsim.Measurement:
-    """What a picture of a pose (6,) gives. Raises LostError."""
-    estimator = eye.sensor.estimator
-    predicted = pose + PREDICTION_ERROR * rng.standard_normal(6)
-    expected = invert(estimator.taught.base_from_camera) @ cmmsim.pose_to_transform(predicted)
-    images = eye.sensor.look(pose)  # also of one that drops out, so that the next have the noise they had
-    if dropout.random() < (share := eye.sensor.timing.dropout):
-        raise cmmsim.LostError(f"dropped frame (a share of {share:.3g} drops out)")
-    return estimator.measure(images, expected)[0]
+def _pictures(
+    home: Array, box: Array, count: tuple[int, int], rng: np.random.Generator
+) -> Iterator[tuple[int, Array, Array]]:
+    """Of each of so many poses, and so many pictures of it: its number, the pose (6,), and that near which stickers are
+    looked for."""
+    for number in range(count[0]):
+        pose = home + box * rng.uniform(-1.0, 1.0, 6)
+        for _ in range(count[1]):
+            yield number, pose, pose + PREDICTION_ERROR * rng.standard_normal(6)
 
 
 def _sticker_errors(eye: RowSensor, seen: cmmsim.Measurement, pose: Array) -> tuple[Array, Array]:

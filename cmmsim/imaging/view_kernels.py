@@ -1,0 +1,201 @@
+"""Compiled: what a camera shows of a scene of discs and convex solids, see ``analytic``."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cmmsim.compiled import Array, compiled
+from cmmsim.geometry.disc_kernels import place_discs, probe_discs, project_all
+from cmmsim.imaging.kernels import Discs, Solids, enters, lay_layers
+
+PROBES = 8  # points on a disc's rim, asked with its middle whether a solid hides them
+NEAREST = 1e-3  # m: a solid that comes nearer has no outline
+
+
+class Scene(NamedTuple):
+    """Discs at places (m,3) with normals (m,3), radii and levels (m,), in the axes of their owners (m,); convex solids
+    of bodies (s,), with levels (s,), middles (s,3), vertices (v,3) from vertex_starts[k] on, and faces normal . x +
+    offset <= 0 (f,3), (f,) from face_starts[k] on."""
+
+    places: Array
+    normals: Array
+    radii: Array
+    disc_levels: Array
+    owners: Array
+    bodies: Array
+    levels: Array
+    middles: Array
+    vertices: Array
+    vertex_starts: Array
+    face_normals: Array
+    face_offsets: Array
+    face_starts: Array
+
+
+@compiled
+def convex_hull(points: Array) -> Array:
+    """Corners (k,2) of the convex hull of points (n,2) (Andrew's monotone chain)."""
+    n = len(points)
+    for i in range(1, n):  # few and never many: sorted by x, then y
+        for j in range(i, 0, -1):
+            before, after = points[j - 1], points[j]
+            if before[0] < after[0] or (before[0] == after[0] and before[1] <= after[1]):
+                break
+            for axis in range(2):
+                before[axis], after[axis] = after[axis], before[axis]
+    hull, count = np.empty((2 * n, 2)), 0
+    for way in range(2):
+        least = count + 1
+        for step in range(n):
+            point = points[step if way == 0 else n - 1 - step]
+            while count > least:
+                a, b = hull[count - 2], hull[count - 1]
+                if (b[0] - a[0]) * (point[1] - a[1]) - (b[1] - a[1]) * (point[0] - a[0]) > 0.0:
+                    break
+                count -= 1
+            hull[count, 0], hull[count, 1] = point[0], point[1]
+            count += 1
+        count -= 1  # where one chain ends the other begins
+    return hull[: max(count, 1)]
+
+
+@compiled
+def half_planes_of(corners: Array, half_planes: Array) -> int:
+    """Fill half_planes with a, b, c of a x + b y <= c for the sides of a convex polygon (n,2); returns their number,
+    sides of no length being left out."""
+    n, count, middle_x, middle_y = len(corners), 0, 0.0, 0.0
+    for k in range(n):
+        middle_x += corners[k, 0] / n
+        middle_y += corners[k, 1] / n
+    for k in range(n):
+        x, y = corners[k]
+        a, b = corners[(k + 1) % n, 1] - y, x - corners[(k + 1) % n, 0]
+        if abs(a) + abs(b) > 1e-6:
+            outwards = 1.0 if a * (x - middle_x) + b * (y - middle_y) > 0.0 else -1.0
+            half_planes[count, 0], half_planes[count, 1] = outwards * a, outwards * b
+            half_planes[count, 2] = outwards * (a * x + b * y)
+            count += 1
+    return count
+
+
+@compiled
+def shown_discs(scene: Scene, moves: Array, focal: Array, principal: Array, near: float) -> tuple:
+    """The discs turned towards the camera, far to near and outer before inner: which (m,), the centres (m,2) px, shapes
+    (m,2,2) px and extents (m,2) px of their ellipses, and points (m,k,3) m on them."""
+    total = len(scene.radii)
+    places, normals = np.empty((total, 3)), np.empty((total, 3))
+    place_discs(moves, scene.owners, scene.places, scene.normals, places, normals)
+    kept, count = np.empty(total, np.int64), 0
+    for n in range(total):
+        facing = places[n, 0] * normals[n, 0] + places[n, 1] * normals[n, 1] + places[n, 2] * normals[n, 2] < 0.0
+        if not (facing and places[n, 2] - scene.radii[n] > near):
+            continue
+        depth, at = np.rint(1e3 * places[n, 2]), count
+        while at > 0:
+            other = kept[at - 1]
+            ahead = np.rint(1e3 * places[other, 2])
+            if ahead > depth or (ahead == depth and scene.radii[other] >= scene.radii[n]):
+                break
+            kept[at] = other
+            at -= 1
+        kept[at] = n
+        count += 1
+    kept = kept[:count]
+    pixels, shapes, extents = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty((count, 2))
+    probes, places, normals, radii = np.empty((count, PROBES + 1, 3)), places[kept], normals[kept], scene.radii[kept]
+    project_all(places, normals, radii, focal, principal, pixels, shapes)
+    probe_discs(places, normals, radii, probes)
+    for n in range(count):
+        for i in range(2):
+            extents[n, i] = np.sqrt(shapes[n, i, 0] ** 2 + shapes[n, i, 1] ** 2)
+    return kept, pixels, shapes, extents, probes
+
+
+@compiled
+def stand_before(
+    scene: Scene, moves: Array, owners: Array, probes: Array, near: float, touching: float, slots: Array
+) -> Array:
+    """Whether solids stand before discs (m,h), of each solid that does before any; ``slots`` (s,) is filled with its
+    column, or -1. owners (m,) and probes (m,k,3) of the discs."""
+    behind, hiding = np.zeros((len(owners), len(slots)), np.bool_), 0
+    eye, point = np.empty(3), np.empty(3)
+    for k in range(len(slots)):
+        slots[k] = -1
+        move = moves[scene.bodies[k]]
+        if move[2, 3] < -near:
+            continue
+        own = slice(scene.face_starts[k], scene.face_starts[k + 1])
+        for i in range(3):
+            eye[i] = -(move[0, i] * move[0, 3] + move[1, i] * move[1, 3] + move[2, i] * move[2, 3])
+        for n in range(len(owners)):
+            if owners[n] == scene.bodies[k]:
+                continue
+            for p in range(probes.shape[1]):
+                for i in range(3):
+                    point[i] = eye[i]
+                    for j in range(3):
+                        point[i] += move[j, i] * probes[n, p, j]
+                if enters(eye, point, scene.face_normals[own], scene.face_offsets[own], 0.0, touching):
+                    slots[k] = hiding
+                    behind[n, hiding] = True
+                    break
+        hiding += slots[k] >= 0
+    return behind[:, :hiding]
+
+
+@compiled
+def outlined(scene: Scene, moves: Array, focal: Array, principal: Array, slots: Array) -> Solids:
+    """The solids wholly before the camera from far to near; ``slots`` (s,): where the cover of each is kept, or -1."""
+    total = len(slots)
+    depths, half_planes = np.empty(total), np.empty((len(scene.vertices), 3))
+    for k in range(total):
+        move, middle = moves[scene.bodies[k]], scene.middles[k]
+        depths[k] = move[2, 0] * middle[0] + move[2, 1] * middle[1] + move[2, 2] * middle[2] + move[2, 3]
+    order = np.argsort(depths)[::-1]
+    starts, boxes, shown, filled = np.zeros(total + 1, np.int64), np.empty((total, 4)), np.empty(total, np.int64), 0
+    for k in order:
+        move, vertices = moves[scene.bodies[k]], scene.vertices[scene.vertex_starts[k] : scene.vertex_starts[k + 1]]
+        pixels, nearest = np.empty((len(vertices), 2)), np.inf
+        for v in range(len(vertices)):
+            x, y, z = vertices[v]
+            depth = move[2, 0] * x + move[2, 1] * y + move[2, 2] * z + move[2, 3]
+            nearest = min(nearest, depth)
+            for i in range(2):
+                at = move[i, 0] * x + move[i, 1] * y + move[i, 2] * z + move[i, 3]
+                pixels[v, i] = np.float32(at / depth * focal[i] + principal[i])  # finer edges would not show
+        if nearest <= NEAREST:
+            continue
+        hull = convex_hull(pixels)
+        for i in range(2):
+            boxes[filled, i], boxes[filled, 2 + i] = hull[:, i].min(), hull[:, i].max()
+        first = starts[filled]
+        starts[filled + 1] = first + half_planes_of(hull, half_planes[first:])
+        shown[filled] = k
+        filled += 1
+    shown = shown[:filled]
+    return Solids(half_planes, starts[: filled + 1], boxes[:filled], scene.levels[shown], slots[shown])
+
+
+@compiled
+def draw_view(
+    scene: Scene,
+    moves: Array,
+    focal: Array,
+    principal: Array,
+    near: float,
+    touching: float,
+    images: Array,
+    group: Array,
+    corners: Array,
+    lines: int,
+) -> None:
+    """Draw the windows ``images[group]`` (h, w) with first pixels ``corners`` (n, 2) of one exposure of a camera with a
+    perfect lens, focal lengths (2,) and principal point (2,) px, at which bodies stand by ``moves`` (b,4,4)."""
+    kept, pixels, shapes, extents, probes = shown_discs(scene, moves, focal, principal, near)
+    slots = np.empty(len(scene.bodies), np.int64)
+    behind = stand_before(scene, moves, scene.owners[kept], probes, near, touching, slots)
+    solids = outlined(scene, moves, focal, principal, slots)
+    discs = Discs(pixels, shapes, extents, scene.disc_levels[kept], behind)
+    lay_layers(images, group, corners, solids, lines, discs)

@@ -1,0 +1,128 @@
+"""Rows of kind `tracking`: the plant follows unseen trajectories under a law with a model, and under `pid` beside it.
+
+Both see the same motions with the same noise. The model is the starting one, that identified from a record of the row's
+own, or the true one; or one between the truth and the starting model; or, in all parameters, wrong by a share.
+"""
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from identify.estimation.identification import identify as identify_record
+from identify.experiment.plant import Plant, build_plant
+from identify.experiment.run import excitation_run, taught_sensor
+from identify.experiment.sensor_in_loop import PoseSensor, SensorInLoop
+from identify.progress import SilentProgress
+from identify.random_streams import LATENCY, NOISE, stream_seed
+from identify.scenario import Scenario
+from identify.scenario.sections import Section
+from identify.studies.rows.identification import designed_trajectories, robot_named
+from identify.studies.rows.kind import LIMITS, NOISE_OFF, PATH, PICTURES, PLANT, Column, Kind, Reads, Row
+from identify.studies.rows.sensor import rms_um
+from identify.tracking.following import Followed, by_images, follow
+from identify.tracking.motions import NamedMotion, motions
+from identify.tracking.track import FIRST_RUN, KnownModel, known_model
+
+EXPERIMENT, SIGNS = 0, 1
+
+COLUMNS = {
+    "position_rms_um": Column("um", "deviation of the true from the desired position, rms", main=True),
+    "orientation_rms_urad": Column("urad", "deviation of the true from the desired orientation, rms", main=True),
+    "pid_position_rms_um": Column("um", "that of the position under the law pid, rms"),
+    "pid_orientation_rms_urad": Column("urad", "that of the orientation under the law pid, rms"),
+    "position_share_percent": Column("%", "position's deviation over that under the law pid", main=True),
+    "orientation_share_percent": Column("%", "orientation's deviation over that under the law pid", main=True),
+    "observer_normalised_error": Column("1", "mean squared error of the observer over the stated one"),
+    "effort_rms": Column("N m or N", "torque or force of the actuators, rms"),
+    "lost_frames": Column("1", "frames that the sensor lost"),
+}
+
+
+class TrackingOptions(Section):
+    """Who leads the robot, and what is known of it."""
+
+    law: str = Field("feedforward", description="pid, feedforward, computed_torque, or module:function")
+    model: Literal["initial", "identified", "true"] = Field("true", description="the model that the law knows")
+    model_error: float | None = Field(
+        None, ge=0, description="instead: how far the model is from the truth, 1: as far as the starting one"
+    )
+    off: float = Field(
+        0.0, ge=0, lt=1, description="share by which each parameter is too large or too small, at random"
+    )
+    trajectory_seed: int = Field(0, ge=0, description="seed of the trajectory from which the model is identified")
+
+
+READS = Reads(
+    (
+        *PICTURES, *PATH, *LIMITS, "scenario.robot", "scenario.rig.", "scenario.geometry.known", "scenario.timing.",
+        "sensor.timing.", "scenario.servo.", "scenario.plant.", "scenario.model.", "scenario.control.",
+        "scenario.validation.", "scenario.excitation.", "scenario.identification.",
+    ),
+    idle=(NOISE_OFF, *PLANT),
+)  # fmt: skip
+
+
+def compute(scenario: Scenario, seed: np.random.SeedSequence, options: TrackingOptions) -> Row:
+    """One row. Raises what sensor, identification and laws raise, such as LoopFailure."""
+    number, robot = stream_seed(seed, EXPERIMENT), robot_named(scenario.robot)
+    scenario = scenario.with_overrides({"rig.watch": "none"})  # of which no figure would speak
+    plant = build_plant(scenario, robot, number)
+    sensor = taught_sensor(scenario, robot, number, SilentProgress())
+    signs = np.random.default_rng(stream_seed(seed, SIGNS)).choice([-1.0, 1.0], len(plant.parameters))
+    model = _model(plant, sensor, number, options)
+    model = replace(model, parameters=model.parameters * (1.0 + options.off * signs))
+    unseen = motions(robot, scenario, number)[: scenario.validation.count]
+    done = [_followed(plant, sensor, options.law, model, motion, number + k) for k, motion in enumerate(unseen)]
+    beside = [_followed(plant, sensor, "pid", model, motion, number + k) for k, motion in enumerate(unseen)]
+    free, common = robot.geometry.chart.basis, sensor.taught.calibration_covariance(robot.home_pose)
+    normalised = [one.normalised_squared_error(robot.coordinates(one.run.pose), free.T @ common @ free) for one in done]
+    known = [value for value in normalised if value is not None]
+    return _figures(done, beside) | ({"observer_normalised_error": float(np.mean(known))} if known else {})
+
+
+def _model(plant: Plant, sensor: PoseSensor, number: int, options: TrackingOptions) -> KnownModel:
+    """The model that the law knows."""
+    if options.model_error is not None:
+        start = known_model(plant, "initial", None)
+        between = plant.parameters + options.model_error * (start.parameters - plant.parameters)
+        return replace(start, parameters=between)
+    if options.model != "identified":
+        return known_model(plant, options.model, None)
+    trajectory = designed_trajectories(plant.scenario, options.trajectory_seed).excitation
+    record = excitation_run(plant, sensor, trajectory, number).record
+    found = identify_record(record, plant.nominal, plant.scenario)
+    return KnownModel(found.estimate, found.drive.law)
+
+
+def _followed(
+    plant: Plant, sensor: PoseSensor, law: str, model: KnownModel, motion: NamedMotion, number: int
+) -> Followed:
+    """A run under a law, whose noise and latencies are of a number."""
+    timing = plant.scenario.timing
+    rng = np.random.default_rng(stream_seed(number, LATENCY, FIRST_RUN))
+    eye = SensorInLoop(sensor, plant.robot, stream_seed(number, NOISE, FIRST_RUN))
+    latencies = timing.drawn_latencies(timing.frames(motion.duration_s), rng)
+    return follow(plant, law, model.parameters, motion, by_images(eye), latencies, model.drive)
+
+
+def _figures(done: list[Followed], beside: list[Followed]) -> Row:
+    row: Row = {}
+    for name, axes, unit in (("position", slice(0, 3), "um"), ("orientation", slice(3, 6), "urad")):
+        own, pid = (rms_um(np.concatenate([one.errors for one in runs])[:, axes]) for runs in (done, beside))
+        row |= {f"{name}_rms_{unit}": own, f"pid_{name}_rms_{unit}": pid}
+        row |= {f"{name}_share_percent": 100.0 * own / pid} if pid else {}
+    torque = np.concatenate([one.run.torque for one in done])
+    lost = sum(int((~one.run.measured_ok).sum()) for one in done)
+    return row | {"effort_rms": float(np.sqrt(np.mean(torque**2))), "lost_frames": lost}
+
+
+TRACKING = Kind(
+    "tracking",
+    compute,
+    "unseen trajectories followed under a law with a model, and how far the robot is from them",
+    COLUMNS,
+    TrackingOptions,
+    READS,
+)
