@@ -224,7 +224,7 @@ class Observer:
         li, ld, stiff = law.li, law.ld, law.lp + law.lx
         q, rate, integral, disturbance, more = np.split(state, [m, 2 * m, 2 * m + n, 2 * m + 2 * n])
         found = self._motion(q[None], rate[None], self._rigid)
-        mass, bias, jacobian, _, angle = (part[0] for part in found)
+        mass, bias, jacobian, _, angle, *_ = (part[0] for part in found)
         velocity, error = jacobian @ rate, command - angle[:, 0]
         level, by_velocity, unsure, width = self._expected_friction(
             velocity, jacobian, covariance[m : 2 * m, m : 2 * m]
