@@ -8,7 +8,10 @@ from dynamics.geometry import MovableGeometry, RobotGeometry
 from dynamics.rigid_body.equation_of_motion import motion_functions
 from dynamics.rigid_body.virtual_work import robot_functions
 
-HOT = ("equation_of_motion", "free_acceleration", "motion_derivatives", "rate_map_derivative", "forward_dynamics")
+HOT = (
+    *("equation_of_motion", "free_acceleration", "response", "motion_derivatives", "rate_map_derivative"),
+    "forward_dynamics",
+)
 """What inner loops evaluate."""
 
 

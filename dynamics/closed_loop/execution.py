@@ -36,6 +36,12 @@ FAILURES = {
     TOO_MANY_EVENTS: "more stick-slip events than a frame can hold",
     MEASURED_OUT_OF_REACH: "the measured pose is out of reach, so that the servo has no command; there",
 }
+MACHINE_CODE = (
+    *("equation_of_motion", "free_acceleration", "response", "motion_derivatives", "rate_map_derivative"),
+    "slope_derivative",
+)
+"""Functions of a robot that kernels call, by their names."""
+
 CALLED = (evaluate_terms, evaluate, decide_modes, stop_joints, slope_tangent, stop_tangent)
 """Kernels that are called by address, by their names."""
 
@@ -170,13 +176,7 @@ def _fill(
     """Machine code, laws, parameters and gains, and the state at the first frame."""
     task, now, start, sizes = memory.task, memory.now, problem.start, problem.sizes
     settings = problem.settings
-    for name in (
-        "equation_of_motion",
-        "free_acceleration",
-        "motion_derivatives",
-        "rate_map_derivative",
-        "slope_derivative",
-    ):
+    for name in MACHINE_CODE:
         task[name] = own[name].address
     for name, found in addresses.items():
         task[name] = found

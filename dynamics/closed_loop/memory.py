@@ -69,10 +69,10 @@ class Memory(NamedTuple):
 
 
 LAYOUT = {
-    "task": "equation_of_motion! free_acceleration! motion_derivatives! rate_map_derivative! slope_derivative! "
-    "servo_motion! evaluate_terms! evaluate! decide_modes! stop_joints! slope_tangent! stop_tangent! sensitivities! "
-    "servo_knows! measured! lp li ld lx rate_weight lx_by:3 reads:3 kp kd ki stiffness damping motor_inertia period "
-    "torques! torque_limit filter_time rigid:r coulomb:n viscous:n friction=friction",
+    "task": "equation_of_motion! free_acceleration! response! motion_derivatives! rate_map_derivative! "
+    "slope_derivative! servo_motion! evaluate_terms! evaluate! decide_modes! stop_joints! slope_tangent! stop_tangent! "
+    "sensitivities! servo_knows! measured! lp li ld lx rate_weight lx_by:3 reads:3 kp kd ki stiffness damping "
+    "motor_inertia period torques! torque_limit filter_time rigid:r coulomb:n viscous:n friction=friction",
     "now": "known=known served=known derivatives=derivatives mode:n! stuck:n! ramping! events! events_left! "
     "start_moves! time_moves! length_moves! width! step_column! elapsed state:s command:n command_slope:n "
     "command_rate:n last_command:n impulse:n last_measured:m servo_integral:m demand:m change:m rest:m "
@@ -82,9 +82,9 @@ LAYOUT = {
     # and what else the columns of `slope_derivative` share
     "derivatives": "by_pose:mm by_rate:mm columns:mr crank_by_pose:nm crank_by_rate:nm jacobian:nm pushing:nm "
     "factor:mm damping:n by_error:n by_integral:n by_command_rate:n inputs:d",
-    # first what `free_acceleration` takes, in its order
-    "evaluation": "factor:mm bias:m jacobian:nm push:n state:s slope:s time bias_acceleration:n angle:n velocity:n "
-    "spring:n error:n torque:n net_torque:n stick_force:n force:n response:nm compliance:nn stuck_factor:nn",
+    # first what `response` and, from the factor on, `free_acceleration` take, in their order
+    "evaluation": "row:m factor:mm bias:m jacobian:nm push:n state:s slope:s time bias_acceleration:n angle:n "
+    "velocity:n spring:n error:n torque:n net_torque:n stick_force:n force:n response:nm compliance:nn stuck_factor:nn",
     # first the rows of `slope_derivative`; k: what it returns of each stage,
     # and before the torques the slopes of filtered rates, whose trials are `filtered`
     "tangent": "trial:bw acting:nw command_rate:nw push:mw direct:nw k:4yw x:xw filtered:fw issued:cnw time:w length:w "

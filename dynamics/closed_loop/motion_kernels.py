@@ -140,12 +140,11 @@ def follows_law(task: Record, at: Record, joint: int) -> float:
 
 
 @kernel
-def hold_compliance(at: Record, joints: Array) -> None:
+def hold_compliance(task: Record, at: Record, joints: Array) -> None:
     """M^-1 J^T (n, m) and J M^-1 J^T (n, n) of some joints, in their order, and the Cholesky factor of the latter."""
-    size = len(at.bias)
     for s in range(len(joints)):
-        copy(at.jacobian[joints[s]], at.response[s])
-        solve(at.factor, size, at.response[s])
+        copy(at.jacobian[joints[s]], at.row)
+        call(task.response, at.row, at.response[s])
         for r in range(s + 1):
             at.compliance[s, r] = dot(at.jacobian[joints[r]], at.response[s])
             at.compliance[r, s] = at.compliance[s, r]
@@ -190,7 +189,7 @@ def accelerate(task: Record, now: Record, at: Record) -> None:
     stuck = stuck_joints(now)
     if len(stuck) == 0:
         return
-    hold_compliance(at, stuck)
+    hold_compliance(task, at, stuck)
     for s in range(len(stuck)):
         at.force[s] = dot(at.jacobian[stuck[s]], acceleration) + at.bias_acceleration[stuck[s]]
     solve(at.stuck_factor, len(stuck), at.force)
@@ -230,7 +229,7 @@ def decide_modes(task: Record, now: Record, at: Record, d: Record, k: int) -> in
             now.mode[i] = 0 if abs(left) < breakaway(task, i) else 1 if left >= 0 else -1
     if task.stiffness > 0 or len(joints) == 0:
         return OK
-    hold_compliance(at, joints)
+    hold_compliance(task, at, joints)
     for i in range(len(now.mode)):
         at.net_torque[i] = at.torque[i]
         if now.mode[i] != 0:

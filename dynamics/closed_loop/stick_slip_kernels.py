@@ -119,7 +119,7 @@ def stop_joints(task: Record, now: Record, at: Record, d: Record, k: int) -> int
         fill(rate, 0.0)
         clear(d.x[size : 2 * size], now.width)
         return OK
-    hold_compliance(at, stuck)
+    hold_compliance(task, at, stuck)
     for s in range(len(stuck)):
         at.force[s] = dot(at.jacobian[stuck[s]], rate)
     solve(at.stuck_factor, len(stuck), at.force)

@@ -22,6 +22,12 @@ def free_acceleration(size: int, joints: int) -> ca.Function:
     return function("free_acceleration", [factor, bias, jacobian, torque], [ca.vertcat(*_solved(factor, push))])
 
 
+def response(size: int) -> ca.Function:
+    """(row (m,), Cholesky factor (m, m)) -> M^-1 row (m,)."""
+    row, factor = ca.SX.sym("row", size), ca.SX.sym("factor", size, size)
+    return function("response", [row, factor], [ca.vertcat(*_solved(factor, ca.vertsplit(row)))])
+
+
 def slope_derivative(layout: ParameterLayout, m: int) -> ColumnFunction:
     """Derivatives of the slope of the state of a platform with m coordinates, and of the net torque of joints, as if
     none was stuck.

@@ -21,7 +21,7 @@ from dynamics.geometry import AnyGeometry
 from dynamics.kinematics.platform import PlatformJointMotion, pose_rate_to_twist, twist_bias
 from dynamics.legs.leg import Leg
 from dynamics.parameters import parameter_layout
-from dynamics.rigid_body.accelerations import cholesky, free_acceleration, slope_derivative, summed
+from dynamics.rigid_body.accelerations import cholesky, free_acceleration, response, slope_derivative, summed
 from dynamics.rigid_body.jacobians import freedoms
 from dynamics.rigid_body.virtual_work import platform_columns, platform_mass
 
@@ -34,6 +34,7 @@ def motion_functions(geometry: AnyGeometry) -> list[ca.Function | PartedFunction
         free_acceleration(size, layout.joints),
         motion_derivatives(geometry),
         rate_map_derivative(geometry),
+        response(size),
         slope_derivative(layout, size),
     ]
 

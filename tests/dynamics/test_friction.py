@@ -16,7 +16,7 @@ from dynamics.closed_loop.problem import LoopProblem
 from dynamics.compiled.machine_code import compiled_functions
 from dynamics.expressions import function
 from dynamics.kinematics.chart import Chart
-from dynamics.rigid_body.accelerations import cholesky, free_acceleration, slope_derivative
+from dynamics.rigid_body.accelerations import cholesky, free_acceleration, response, slope_derivative
 from tests.dynamics.conftest import BOX, at_rest
 
 MASS, STIFFNESS, COULOMB = 0.8, 20.0, 1.0
@@ -37,6 +37,7 @@ def _six_masses():
         function("motion_derivatives", [pose, rate, acceleration, torque, rigid], [zero, zero, columns, zero, zero]),
         function("rate_map_derivative", [pose, rate], [zero]),
         free_acceleration(6, 6),
+        response(6),
         slope_derivative(load_robot("rss6").layout, 6),
     ]
 
